@@ -1,0 +1,1 @@
+"""The `rotavg` command: one module per subcommand."""
