@@ -1,0 +1,28 @@
+# Two commands: `make demo` and `make test`. Both set everything up by themselves in .venv, build, install and log.
+
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: setup demo test bench lint clean
+
+setup:
+	@$(PYTHON) tools/setup_environment.py
+
+# make demo [GRAPH=path.g2o [TRUTH=truth.csv]]
+demo: setup
+	@$(BIN)/rotavg demo $(if $(GRAPH),--graph "$(GRAPH)") $(if $(TRUTH),--truth "$(TRUTH)")
+
+# make test [ARGS="-k node -x"]
+test: setup
+	@$(BIN)/python -m pytest $(ARGS)
+
+bench: setup
+	@$(BIN)/rotavg benchmark $(ARGS)
+
+lint: setup
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+
+clean:
+	rm -rf .venv build install log
