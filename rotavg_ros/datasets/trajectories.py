@@ -1,0 +1,304 @@
+"""Ground-truth trajectories of robots: positions and world-from-body orientations, one row per pose.
+
+Ground robots follow a path in the plane, x forward and z up, which a terrain may tilt; the sphere, the torus and the
+parking garage are truly three-dimensional. Every world leads the robot back to where it has been.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+FloatArray = NDArray[np.float64]
+
+
+class World(str, Enum):
+    """Where the robot drives."""
+
+    CORRIDOR = "corridor"  # one bent corridor, up and down
+    BUILDING = "building"  # laps of a rectangular corridor with rooms to look into
+    GRID = "grid"  # a random walk on a lattice, as in the Manhattan datasets
+    CITY = "city"  # rectangles of city blocks, all through one home crossing
+    LAPS = "laps"  # one smooth closed track, again and again
+    ROAM = "roam"  # aimless driving in a square
+    SPHERE = "sphere"  # a spiral over a sphere
+    TORUS = "torus"  # a coil around a torus
+    GARAGE = "garage"  # up the ramps of a parking garage and down again
+
+
+PLANAR_WORLDS = (World.CORRIDOR, World.BUILDING, World.GRID, World.CITY, World.LAPS, World.ROAM)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of the body in the world frame.
+
+    Attributes (N poses):
+        position: ``(N, 3)`` metres.
+        world_from_body: ``(N, 4)`` xyzw.
+    """
+
+    position: FloatArray
+    world_from_body: FloatArray
+
+
+def drive(
+    world: World,
+    num_poses: int,
+    rng: np.random.Generator,
+    *,
+    step_m: float,
+    laps: float,
+    turn_radius_m: float,
+    tilt_deg: float = 0.0,
+    sway_deg: float = 0.0,
+) -> Trajectory:
+    """A robot's way through a world.
+
+    Args:
+        world: where.
+        num_poses: N.
+        rng: source of every random choice.
+        step_m: distance between consecutive poses.
+        laps: about how often every place is visited.
+        turn_radius_m: scale on which corners of the path are rounded.
+        tilt_deg: typical slope of the terrain (ground worlds).
+        sway_deg: standard deviation of a smooth roll, pitch and yaw on top (a hand-held or walking carrier); yaw only
+            in a plane world without tilt.
+    """
+    if world in PLANAR_WORLDS:
+        path = _PATHS[world](num_poses, rng, step_m, laps)
+        lane = np.stack([_smooth_noise(num_poses, 12, rng) for _ in range(2)], axis=1) * 0.2 * step_m
+        if world is World.GRID:
+            trajectory = _on_terrain(path, np.zeros(0), 0.0, tilt_deg, rng)
+        else:
+            trajectory = _on_terrain(path, lane, turn_radius_m / step_m, tilt_deg, rng)
+    else:
+        trajectory = _SPATIAL[world](num_poses, rng, step_m, laps)
+    if sway_deg == 0:
+        return trajectory
+    sway = np.stack([_smooth_noise(num_poses, 6, rng) for _ in range(3)], axis=1) * np.radians(sway_deg)
+    if world in PLANAR_WORLDS and tilt_deg == 0:
+        sway[:, :2] = 0
+    swayed = Rotation.from_quat(trajectory.world_from_body) * Rotation.from_rotvec(sway)
+    return Trajectory(trajectory.position, swayed.as_quat(canonical=True))
+
+
+def chain_rotations(steps: FloatArray) -> FloatArray:
+    """Running products ``steps[0] ∘ steps[1] ∘ … ∘ steps[k]`` for every k, shapes ``(N, 4)`` xyzw.
+
+    Prefix products by doubling (Hillis & Steele 1986): log₂ N vectorised multiplications instead of a loop over N.
+    """
+    products = Rotation.from_quat(steps).as_quat()
+    shift = 1
+    while shift < len(products):
+        tail = Rotation.from_quat(products[:-shift]) * Rotation.from_quat(products[shift:])
+        products = np.concatenate((products[:shift], tail.as_quat()))
+        shift *= 2
+    return np.where(products[:, 3:] < 0, -products, products)
+
+
+# --- paths in the plane, (N, 2) metres ---------------------------------------------------------------------------------
+
+
+def _corridor(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> FloatArray:
+    length = num_poses * step_m / laps
+    bends = np.cumsum(rng.choice([-np.pi / 2, -np.pi / 4, 0, np.pi / 4, np.pi / 2], size=rng.integers(1, 5)))
+    legs = rng.uniform(0.5, 1.5, len(bends))
+    legs *= length / legs.sum()
+    corners = np.concatenate((np.zeros((1, 2)), np.cumsum(legs[:, None] * _direction(bends), axis=0)))
+    return _walk_along(corners, _fold(np.arange(num_poses) * step_m, length))
+
+
+def _building(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> FloatArray:
+    # Rooms add about 60 % to the length of a lap.
+    perimeter = num_poses * step_m / laps / 1.6
+    width = perimeter / 2 * rng.uniform(0.5, 0.75)
+    size = np.array([width, perimeter / 2 - width])
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * size
+    num_doors = rng.integers(4, 13)
+    door_at = np.sort(rng.uniform(0, perimeter, num_doors))
+    doors = _walk_along(corners, door_at)
+    depth = perimeter * rng.uniform(0.02, 0.09, num_doors) * rng.choice([-1, 1], num_doors)
+    inward = _walk_along(corners, np.minimum(door_at + 1e-6 * perimeter, perimeter)) - doors
+    inward = inward[:, ::-1] * [-1, 1] / np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
+    rooms = doors + depth[:, None] * inward
+
+    corner_at = np.array([0, size[0], size.sum(), size.sum() + size[0]])
+    stop_at = np.concatenate((corner_at, np.repeat(door_at, 3)))
+    stops = np.concatenate((corners[:4], np.stack((doors, rooms, doors), axis=1).reshape(-1, 2)))
+    order = np.argsort(stop_at, kind="stable")
+    num_laps = int(np.ceil(num_poses * step_m / perimeter)) + 1
+    visited = rng.random((num_laps, num_doors)) < 0.7
+    chosen = np.concatenate((np.ones((num_laps, 4), dtype=bool), np.repeat(visited, 3, axis=1)), axis=1)[:, order]
+    waypoints = np.broadcast_to(stops[order], (num_laps, len(order), 2))[chosen]
+    return _walk_along(waypoints, np.arange(num_poses) * step_m)
+
+
+def _grid(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> FloatArray:
+    turns = rng.choice([-1, 0, 0, 0, 1], size=num_poses)
+    heading = np.cumsum(turns) % 4
+    moves = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[heading]
+    side = max(3, round(np.sqrt(num_poses / laps)))
+    return step_m * _fold(np.cumsum(moves, axis=0).astype(float) + side // 2, side)
+
+
+def _city(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> FloatArray:
+    length = num_poses * step_m
+    # A rectangle of a × b blocks, a, b ≤ 3, is 8 blocks long on average; four quadrants to choose from.
+    block = length / (8 * max(laps, 1) * 4)
+    waypoints = [np.zeros(2)]
+    driven, arriving = 0.0, np.zeros(2)
+    while driven < length + block:
+        sides = rng.integers(1, 4, 2) * rng.choice([-1, 1], 2) * block
+        along_x, along_y = np.array([sides[0], 0]), np.array([0, sides[1]])
+        first, second = (along_x, along_y) if rng.random() < 0.5 else (along_y, along_x)
+        if np.dot(first, arriving) < 0:  # no U-turn at home
+            first, second = second, first
+        waypoints += [first, first + second, second, np.zeros(2)]
+        driven += 2 * np.abs(sides).sum()
+        arriving = -second
+    return _walk_along(np.stack(waypoints), np.arange(num_poses) * step_m)
+
+
+def _laps(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> FloatArray:
+    angle = np.linspace(0, 2 * np.pi, 400)
+    harmonics = np.arange(2, 6)
+    waves = rng.normal(0, 0.25, 4) / harmonics
+    radius = 1 + (waves * np.cos(harmonics * angle[:, None] + rng.uniform(0, 2 * np.pi, 4))).sum(1)
+    track = radius[:, None] * _direction(angle) * [1, rng.uniform(0.4, 1)]
+    lap_length = np.linalg.norm(np.diff(track, axis=0), axis=1).sum()
+    track *= num_poses * step_m / laps / lap_length
+    return _walk_along(track, np.arange(num_poses) * step_m % (num_poses * step_m / laps))
+
+
+def _roam(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> FloatArray:
+    heading = np.cumsum(_smooth_noise(num_poses, rng.uniform(5, 30), rng) * rng.uniform(0.05, 0.3))
+    side = 1.5 * step_m * np.sqrt(num_poses / laps)
+    return _fold(np.cumsum(step_m * _direction(heading), axis=0) + side / 2, side)
+
+
+_PATHS = {
+    World.CORRIDOR: _corridor,
+    World.BUILDING: _building,
+    World.GRID: _grid,
+    World.CITY: _city,
+    World.LAPS: _laps,
+    World.ROAM: _roam,
+}
+
+
+def _on_terrain(
+    path: FloatArray, lane: FloatArray, smoothing: float, tilt_deg: float, rng: np.random.Generator
+) -> Trajectory:
+    """Put a path on hills and let the robot look where it goes; ``smoothing`` in poses."""
+    headings = np.arctan2(*np.diff(path, axis=0, append=2 * path[-1:] - path[-2:-1]).T[::-1])
+    if smoothing > 0:
+        path = gaussian_filter1d(path, smoothing, axis=0, mode="nearest") + lane
+        headings = gaussian_filter1d(np.unwrap(headings), smoothing, mode="nearest")
+    position = np.concatenate((path, np.zeros((len(path), 1))), axis=1)
+    yaw = np.zeros_like(position)
+    yaw[:, 2] = headings
+    world_from_body = Rotation.from_rotvec(yaw)
+    if tilt_deg > 0:
+        extent = max(float(np.ptp(path, axis=0).max()), 1e-9)
+        waves = 2 * np.pi / extent * rng.uniform(0.5, 2.5, (6, 1)) * _direction(rng.uniform(0, 2 * np.pi, 6))
+        phase = path @ waves.T + rng.uniform(0, 2 * np.pi, 6)
+        slope_of_wave = np.tan(np.radians(tilt_deg)) / np.sqrt(6 / 2)
+        position[:, 2] = (np.sin(phase) * slope_of_wave / np.linalg.norm(waves, axis=1)).sum(1)
+        slope = (np.cos(phase) * slope_of_wave) @ (waves / np.linalg.norm(waves, axis=1, keepdims=True))
+        steepness = np.linalg.norm(slope, axis=1, keepdims=True)
+        # The smallest rotation that takes "up" to the terrain's normal.
+        axis = np.stack((slope[:, 1], -slope[:, 0], np.zeros(len(slope))), axis=1) / np.maximum(steepness, 1e-12)
+        world_from_body = Rotation.from_rotvec(axis * np.arctan(steepness)) * world_from_body
+    return Trajectory(position, world_from_body.as_quat(canonical=True))
+
+
+# --- trajectories in space ---------------------------------------------------------------------------------------------
+
+
+def _sphere(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> Trajectory:
+    # Rings about one to two steps apart, so that each ring sees the one below it.
+    ring_spacing = rng.uniform(0.8, 2.0) * step_m
+    radius = np.sqrt(num_poses * step_m * ring_spacing / (4 * np.pi))
+    latitude = np.linspace(-0.45, 0.45, num_poses) * np.pi
+    # Equal steps: the ring at this latitude has the circumference 2π · radius · cos(latitude).
+    longitude = np.cumsum(step_m / (radius * np.cos(latitude)))
+    normal = np.stack(
+        (np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)), axis=1
+    )
+    return _with_frames(radius * normal, normal)
+
+
+def _torus(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> Trajectory:
+    aspect = rng.uniform(0.2, 0.5)
+    coil_spacing = rng.uniform(0.8, 2.0) * step_m
+    major = np.sqrt(num_poses * step_m * coil_spacing / (4 * np.pi**2 * aspect))
+    minor = aspect * major
+    around_tube = np.arange(num_poses) * step_m / minor
+    around_axis = around_tube * minor * coil_spacing / (4 * np.pi**2 * minor * major) * 2 * np.pi
+    outward = np.stack((np.cos(around_axis), np.sin(around_axis), np.zeros(num_poses)), axis=1)
+    normal = np.cos(around_tube)[:, None] * outward
+    normal[:, 2] = np.sin(around_tube)
+    return _with_frames(major * outward + minor * normal, normal)
+
+
+def _garage(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> Trajectory:
+    floors = max(1.0, laps)
+    # Up and down again: every floor is driven twice.
+    round_length = num_poses * step_m / (2 * floors)
+    width = round_length / 2 * rng.uniform(0.5, 0.8)
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * [width, round_length / 2 - width]
+    climbed = _fold(np.arange(num_poses) * step_m, floors * round_length)
+    path = _walk_along(corners, climbed % round_length)
+    rounding = round_length / step_m / 40
+    path = gaussian_filter1d(path, rounding, axis=0, mode="nearest")
+    height = climbed / round_length * np.tan(np.radians(rng.uniform(1, 5))) * round_length
+    position = np.concatenate((path, height[:, None]), axis=1)
+    headings = np.unwrap(np.arctan2(*np.diff(path, axis=0, append=2 * path[-1:] - path[-2:-1]).T[::-1]))
+    headings = gaussian_filter1d(headings, 2, mode="nearest")
+    slope = np.gradient(gaussian_filter1d(height, rounding, mode="nearest")) / step_m
+    euler = np.stack((headings, -np.arctan(slope)), axis=1)
+    return Trajectory(position, Rotation.from_euler("ZY", euler).as_quat(canonical=True))
+
+
+_SPATIAL = {World.SPHERE: _sphere, World.TORUS: _torus, World.GARAGE: _garage}
+
+
+def _with_frames(position: FloatArray, up: FloatArray) -> Trajectory:
+    """Body frames that look along the path (x) with the given unit vector upward (z)."""
+    forward = np.gradient(position, axis=0)
+    forward -= (forward * up).sum(1, keepdims=True) * up
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    matrix = np.stack((forward, np.cross(up, forward), up), axis=2)
+    return Trajectory(position, Rotation.from_matrix(matrix).as_quat(canonical=True))
+
+
+# --- helpers -----------------------------------------------------------------------------------------------------------
+
+
+def _direction(angle: FloatArray) -> FloatArray:
+    return np.stack((np.cos(angle), np.sin(angle)), axis=-1)
+
+
+def _fold(distance: FloatArray, length: float) -> FloatArray:
+    """Reflect at both ends of [0, length]: forth and back."""
+    return length - np.abs(distance % (2 * length) - length)
+
+
+def _walk_along(waypoints: FloatArray, distance: FloatArray) -> FloatArray:
+    """Points of a polyline at the given distances from its start."""
+    at = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1))))
+    return np.stack([np.interp(distance, at, column) for column in waypoints.T], axis=1)
+
+
+def _smooth_noise(length: int, scale: float, rng: np.random.Generator) -> FloatArray:
+    """Gaussian noise of unit variance that varies over about ``scale`` samples."""
+    padding = int(4 * scale) + 1
+    noise = gaussian_filter1d(rng.normal(size=length + 2 * padding), scale)[padding : padding + length]
+    return noise * np.sqrt(2 * np.sqrt(np.pi) * scale)
