@@ -1,0 +1,216 @@
+"""g2o pose graphs and their TORO and iSAM dialects.
+
+An edge line stores the pose of the target in the source frame, so its rotation is the inverse of
+``target_from_source``. Edges between consecutive ids, in either direction, are odometry.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.datasets.dead_reckoning import chain_poses
+from rotavg_ros.datasets.graph_file import GraphFile, GraphFileError, writing
+from rotavg_ros.datasets.text_rows import Row, parse_rows, read_blocks, shown, unit_quaternions, write_rows
+from rotavg_ros.rotations import inverse
+from rotavg_ros.view_graph import EdgeKind
+
+Precision = Callable[[np.ndarray], np.ndarray]  # (K, 6 or 21) upper triangle, row by row → (K,) rad⁻²
+
+
+@dataclass(frozen=True)
+class EdgeTag:
+    """How the numbers after an edge's two ids are laid out."""
+
+    translation: int  # how many numbers: x y, or x y z
+    rotation: int  # θ, roll pitch yaw, or qx qy qz qw
+    precision: Precision
+
+    @property
+    def planar(self) -> bool:
+        return self.rotation == 1
+
+    @property
+    def information(self) -> int:
+        return 6 if self.planar else 21
+
+
+def _toro_planar(information: np.ndarray) -> np.ndarray:
+    """Ixx Ixy Iyy Iθθ Ixθ Iyθ."""
+    return information[:, 3]
+
+
+def _isam_planar(root: np.ndarray) -> np.ndarray:
+    """The upper triangle of a square root of the information. Some exports use another order; it has no Rθθ there."""
+    return np.where(root[:, 5] > 0, root[:, 2] ** 2 + root[:, 4] ** 2 + root[:, 5] ** 2, np.nan)
+
+
+def _g2o_planar(information: np.ndarray) -> np.ndarray:
+    return information[:, 5]
+
+
+def _mean_angular(information: np.ndarray) -> np.ndarray:
+    """Mean of I44, I55 and I66."""
+    return np.asarray(information[:, [15, 18, 20]].mean(axis=1))
+
+
+EDGE_TAGS = {
+    b"EDGE_SE2": EdgeTag(translation=2, rotation=1, precision=_g2o_planar),
+    b"EDGE2": EdgeTag(translation=2, rotation=1, precision=_toro_planar),
+    b"ODOMETRY": EdgeTag(translation=2, rotation=1, precision=_isam_planar),
+    b"EDGE_SE3:QUAT": EdgeTag(translation=3, rotation=4, precision=_mean_angular),
+    b"EDGE3": EdgeTag(translation=3, rotation=3, precision=_mean_angular),
+}
+# Numbers after the id. Only the id counts: poses in a file are somebody's estimate, not a measurement.
+VERTEX_TAGS = {b"VERTEX_SE2": 3, b"VERTEX2": 3, b"VERTEX_SE3:QUAT": 7, b"VERTEX3": 6}
+# What tells nothing about relative rotations between poses.
+SKIPPED_TAGS = frozenset(
+    b"FIX VERTEX_XY VERTEX_TRACKXYZ VERTEX_XYZ VERTEX_POINT_XYZ LANDMARK EDGE_SE2_XY EDGE_BEARING_SE2_XY EDGE_SE2_XY_CALIB "
+    b"EDGE_SE3_TRACKXYZ EDGE_SE3_XYZ EDGE_POINT_XYZ EDGE_XY EDGE_PRIOR_SE2 EDGE_PRIOR_SE2_XY EDGE_SE2_PRIOR "
+    b"EDGE_PRIOR_SE3 EDGE_SE3_PRIOR VERTEX_TAG ROBOTLASER1 RAWLASER1".split()
+)
+
+
+def read(path: Path) -> GraphFile:
+    """Read a pose graph of EDGE_SE2, EDGE_SE3:QUAT, TORO's EDGE2 and EDGE3 and iSAM's ODOMETRY edges.
+
+    Landmarks, priors, parameters and self-edges are skipped and counted. Precision is Iθθ, or the mean of the
+    three angular diagonal entries.
+
+    Raises:
+        GraphFileError: naming the line that is at fault.
+    """
+    skipped: Counter[str] = Counter()
+    lone_ids: list[np.ndarray] = []
+    edges: list[_Edges] = []
+    for block in read_blocks(path):
+        by_tag: dict[bytes, tuple[list[int], list[Row]]] = {}
+        for line, (tag, *row) in block:
+            lines, rows = by_tag.setdefault(tag, ([], []))
+            lines.append(line)
+            rows.append(row)
+        for tag, (lines, rows) in by_tag.items():
+            if tag in EDGE_TAGS:
+                edges.append(_parse_edges(path, EDGE_TAGS[tag], lines, rows))
+            elif tag in VERTEX_TAGS:
+                lone_ids.append(_parse_vertices(path, VERTEX_TAGS[tag], lines, rows))
+            elif tag in SKIPPED_TAGS or tag.startswith(b"PARAMS"):
+                skipped[tag.decode()] += len(lines)
+            else:
+                known = ", ".join(sorted(known.decode() for known in EDGE_TAGS))
+                what = f"unknown tag {shown(tag)}; is this a g2o file? Edges may be {known}"
+                raise GraphFileError.at(path, lines[0], what)
+    if not edges:
+        raise GraphFileError.at(path, None, "no edges between poses; there is nothing to solve")
+    every = _Edges.concatenate(edges)
+    self_edge = every.ids[:, 0] == every.ids[:, 1]
+    if self_edge.any():
+        skipped["self-edge"] = int(self_edge.sum())
+        lone_ids.append(every.ids[self_edge, 0])
+        every = every.select(~self_edge)
+        if not len(every.line):
+            raise GraphFileError.at(path, None, "every edge joins a pose with itself; there is nothing to solve")
+    consecutive = np.abs(every.ids[:, 0] - every.ids[:, 1]) == 1
+    return GraphFile.from_ids(
+        every.ids[:, 0],
+        every.ids[:, 1],
+        inverse(torch.from_numpy(every.source_from_target)).numpy(),
+        lone_ids=np.concatenate(lone_ids) if lone_ids else None,
+        kind=np.where(consecutive, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE),
+        precision=every.precision,
+        planar=all(part.planar for part in edges),
+        edge_translation=every.translation,
+        skipped=dict(skipped),
+    )
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """Parsed edge lines: ``(K,)`` line numbers, ``(K, 2)`` ids and the measurement."""
+
+    line: np.ndarray
+    ids: np.ndarray
+    source_from_target: np.ndarray
+    translation: np.ndarray
+    precision: np.ndarray
+    planar: bool
+
+    @classmethod
+    def concatenate(cls, parts: list[_Edges]) -> _Edges:
+        """All edges in the order of their lines."""
+        names = ("line", "ids", "source_from_target", "translation", "precision")
+        arrays = [np.concatenate([getattr(part, name) for part in parts]) for name in names]
+        return cls(*arrays, planar=all(part.planar for part in parts)).select(np.argsort(arrays[0]))
+
+    def select(self, rows: np.ndarray) -> _Edges:
+        return _Edges(
+            self.line[rows],
+            self.ids[rows],
+            self.source_from_target[rows],
+            self.translation[rows],
+            self.precision[rows],
+            self.planar,
+        )
+
+
+def _parse_edges(path: Path, tag: EdgeTag, lines: list[int], rows: list[Row]) -> _Edges:
+    num_pose = tag.translation + tag.rotation
+    ids, numbers = parse_rows(path, lines, rows, 2, num_pose + tag.information)
+    translation, rotation, information = np.split(numbers, [tag.translation, num_pose], axis=1)
+    if tag.planar:
+        source_from_target = Rotation.from_rotvec(np.pad(rotation, ((0, 0), (2, 0)))).as_quat()
+        translation = np.pad(translation, ((0, 0), (0, 1)))
+    elif tag.rotation == 4:
+        source_from_target = unit_quaternions(path, lines, rotation)
+    else:
+        source_from_target = Rotation.from_euler("xyz", rotation).as_quat()
+    return _Edges(np.array(lines), ids, source_from_target, translation, tag.precision(information), tag.planar)
+
+
+def _parse_vertices(path: Path, num_values: int, lines: list[int], rows: list[Row]) -> np.ndarray:
+    """Ids of the vertices. Their poses may be anything: a diverged estimate does not spoil the measurements."""
+    for line, row in zip(lines, rows, strict=True):
+        if len(row) != 1 + num_values:
+            what = f"{len(row)} numbers where {1 + num_values} belong; the line is malformed or the file truncated"
+            raise GraphFileError.at(path, line, what)
+    return parse_rows(path, lines, [row[:1] for row in rows], 1, 0)[0][:, 0]
+
+
+def write(path: Path, graph_file: GraphFile, body_from_world: np.ndarray | None = None) -> None:
+    """Write EDGE_SE2 or EDGE_SE3:QUAT lines, after VERTEX lines that chain the edges' translations.
+
+    The format knows no unknown precision (written as 1) and no edge kind (consecutive ids are odometry).
+
+    Args:
+        body_from_world: ``(N, 4)`` xyzw orientations of the vertices; default: those a breadth-first tree of
+            the edges, odometry first, gives.
+    """
+    graph, ids, planar = graph_file.graph, graph_file.node_ids, graph_file.planar
+    translation = graph_file.edge_translation
+    if translation is None:
+        translation = np.zeros((graph.num_edges, 3))
+    positions, world_from_body = chain_poses(graph, translation, body_from_world)
+    source_from_target = inverse(graph.target_from_source).cpu().numpy()
+    precision = np.nan_to_num(graph.precision.cpu().numpy(), nan=1.0)
+    ends = [ids[graph.source.cpu().numpy()], ids[graph.target.cpu().numpy()]]
+    with writing(path) as temporary, temporary.open("w", encoding="ascii") as file:
+        if planar:
+            write_rows(file, f"VERTEX_SE2 %d{' %.15g' * 3}\n", [ids, positions[:, :2], _heading(world_from_body)])
+            columns = [*ends, translation[:, :2], _heading(source_from_target), precision]
+            write_rows(file, f"EDGE_SE2 %d %d{' %.15g' * 3} 1 0 0 1 0 %.15g\n", columns)
+        else:
+            write_rows(file, f"VERTEX_SE3:QUAT %d{' %.15g' * 7}\n", [ids, positions, world_from_body])
+            information = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 %.15g 0 0 %.15g 0 %.15g"
+            columns = [*ends, translation, source_from_target, precision, precision, precision]
+            write_rows(file, f"EDGE_SE3:QUAT %d %d{' %.15g' * 7} {information}\n", columns)
+
+
+def _heading(quaternions: np.ndarray) -> np.ndarray:
+    """Angle about z in [-π, π] of ``(K, 4)`` planar rotations with w ≥ 0."""
+    return np.asarray(2 * np.arctan2(quaternions[:, 2], quaternions[:, 3]))
