@@ -211,6 +211,18 @@ def write(path: Path, graph_file: GraphFile, body_from_world: np.ndarray | None 
             write_rows(file, f"EDGE_SE3:QUAT %d %d{' %.15g' * 7} {information}\n", columns)
 
 
+def not_stored(graph_file: GraphFile) -> list[str]:
+    """What of this graph the format has no room for, in words."""
+    graph = graph_file.graph
+    lost = {
+        "which edges are odometry (consecutive ids will be)": bool(
+            (graph.is_odometry.cpu().numpy() != graph_file.consecutive).any()
+        ),
+        "that precisions are unknown (written as 1)": bool(graph.precision.isnan().any()),
+    }
+    return [name for name, is_lost in lost.items() if is_lost] + graph_file.extras
+
+
 def _heading(quaternions: np.ndarray) -> np.ndarray:
     """Angle about z in [-π, π] of ``(K, 4)`` planar rotations with w ≥ 0."""
     return np.asarray(2 * np.arctan2(quaternions[:, 2], quaternions[:, 3]))

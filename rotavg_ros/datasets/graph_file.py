@@ -1,7 +1,7 @@
 """A view-graph as files know it: with the ids, stamps, translations and ground truth that the solver does not need.
 
 :func:`read_graph` and :func:`write_graph` choose the format; the formats themselves are modules with a
-``read(path)`` and a ``write(path, graph_file, …)`` each.
+``read(path)``, a ``write(path, graph_file)`` and a ``not_stored(graph_file)`` each.
 """
 
 from __future__ import annotations
@@ -61,6 +61,22 @@ class GraphFile:
     stamps_ns: np.ndarray | None = None
     position_gt: np.ndarray | None = None
     skipped: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def consecutive(self) -> np.ndarray:
+        """``(M,)`` bool: the edge joins two consecutive ids, which makes it odometry in formats without kinds."""
+        source, target = (self.node_ids[end.cpu().numpy()] for end in (self.graph.source, self.graph.target))
+        return np.asarray(np.abs(source - target) == 1)
+
+    @property
+    def extras(self) -> list[str]:
+        """What is known of the nodes besides their ids, in words."""
+        known = {
+            "stamps": self.stamps_ns,
+            "ground-truth orientations": self.body_from_world_gt,
+            "ground-truth positions": self.position_gt,
+        }
+        return [name for name, values in known.items() if values is not None]
 
     @classmethod
     def from_ids(
@@ -125,10 +141,19 @@ def write_graph(path: str | Path, graph_file: GraphFile) -> None:
         GraphFileError: an unknown suffix, or a place that cannot be written.
     """
     path = Path(path)
+    _format(_format_of_suffix(path)).write(path, graph_file)
+
+
+def not_stored(path: str | Path, graph_file: GraphFile) -> list[str]:
+    """What of this graph the format that ``path`` stands for has no room for, in words."""
+    return _format(_format_of_suffix(Path(path))).not_stored(graph_file)  # type: ignore[no-any-return]
+
+
+def _format_of_suffix(path: Path) -> str:
     name = _FORMAT_OF_SUFFIX.get(path.suffix.lower())
     if name is None:
         raise GraphFileError.at(path, None, f"unknown suffix {path.suffix!r}; use .g2o, .npz or .txt (1DSfM EGs.txt)")
-    _format(name).write(path, graph_file)
+    return name
 
 
 def _format_of_content(head: bytes) -> str:

@@ -96,6 +96,11 @@ def write(path: Path, graph_file: GraphFile) -> None:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
+def not_stored(graph_file: GraphFile) -> list[str]:
+    """Nothing: the format has room for all of a :class:`GraphFile`."""
+    return []
+
+
 def _load(path: Path) -> tuple[dict[str, np.ndarray], bool | None]:
     """The arrays we know, in int64 and float64 and of the right shapes, and the stated planarity."""
     with reading(path):
@@ -106,7 +111,7 @@ def _load(path: Path) -> tuple[dict[str, np.ndarray], bool | None]:
                 names = sorted(archive.files)
                 arrays = {name: archive[name] for name in _SHAPES if name in names}
                 planar = bool(archive["planar"]) if "planar" in names else None
-        except Exception as error:  # a damaged archive can fail anywhere in zipfile, zlib or the array headers
+        except Exception as error:  # noqa: BLE001  a damaged archive can fail anywhere in zipfile, zlib or the array headers
             reason = " ".join(str(error).split())[:120] or type(error).__name__
             raise GraphFileError.at(path, None, f"not a readable npz archive of plain arrays: {reason}") from None
     missing = [name for name in _REQUIRED if name not in arrays]

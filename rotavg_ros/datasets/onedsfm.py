@@ -60,3 +60,15 @@ def write(path: Path, graph_file: GraphFile) -> None:
         translation = np.zeros((graph.num_edges, 3))
     with writing(path) as temporary, temporary.open("w", encoding="ascii") as file:
         write_rows(file, f"%d %d{' %.15g' * 12}\n", [*ends, matrix, translation])
+
+
+def not_stored(graph_file: GraphFile) -> list[str]:
+    """What of this graph the format has no room for, in words."""
+    graph = graph_file.graph
+    joined = np.unique(np.concatenate((graph.source.cpu().numpy(), graph.target.cpu().numpy())))
+    lost = {
+        "which edges are odometry": bool(graph.is_odometry.any()),
+        "precisions": not bool(graph.precision.isnan().all()),
+        "nodes without an edge": len(joined) < graph.num_nodes,
+    }
+    return [name for name, is_lost in lost.items() if is_lost] + graph_file.extras

@@ -1,0 +1,79 @@
+"""Convert a view-graph between formats, chosen by suffix.
+
+  .g2o .graph .toro   g2o pose graph (TORO's and iSAM's tags are read, g2o's written)
+  .txt                1DSfM EGs.txt
+  .npz                arrays, see the README
+
+Says what the output format has no room for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+from rotavg_ros.cli.progress import working
+from rotavg_ros.datasets.ground_truth import attach_stamps, attach_truth
+
+
+class Format(NamedTuple):
+    """What holds a view-graph.
+
+    The module is imported when used and has ``read_graph(path) -> GraphFile``, ``write_graph(path, graph_file)``
+    and ``not_stored(path, graph_file) -> list[str]``: what of this graph the format has no room for.
+    """
+
+    suffixes: tuple[str, ...]
+    is_folder: bool
+    module: str
+
+
+# The last one also gets the suffixes that nobody knows: it can tell by content, and what it cannot it explains.
+FORMATS = (
+    Format((".g2o", ".graph", ".toro", ".npz", ".txt"), is_folder=False, module="rotavg_ros.datasets.graph_file"),
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``rotavg convert``."""
+    parser.add_argument("input", type=Path, metavar="INPUT")
+    parser.add_argument("output", type=Path, metavar="OUTPUT")
+    parser.add_argument(
+        "--stamps", type=Path, metavar="TXT", help="text file with one stamp in seconds per node, ascending by id"
+    )
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        metavar="CSV",
+        help="ground truth: id,qx,qy,qz,qw (world_from_body), or headerless stamp, x, y, heading within 0.15 s",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Read, attach what came in further files, write."""
+    with working(f"converting {arguments.input}"):
+        graph_file = format_of(arguments.input).read_graph(arguments.input)
+        if arguments.stamps is not None:
+            graph_file = attach_stamps(graph_file, arguments.stamps)
+        if arguments.truth is not None:
+            graph_file = attach_truth(graph_file, arguments.truth)
+        output_format = format_of(arguments.output)
+        output_format.write_graph(arguments.output, graph_file)
+        lost = output_format.not_stored(arguments.output, graph_file)
+    counts = f"{graph_file.graph.num_nodes} nodes, {graph_file.graph.num_edges} edges"
+    left_out = f"; no room for: {', '.join(lost)}" if lost else ""
+    skipped = "".join(f"; skipped {count} × {kind}" for kind, count in graph_file.skipped.items())
+    print(f"{arguments.input} → {arguments.output}: {counts}{skipped}{left_out}")
+    return 0
+
+
+def format_of(path: Path) -> ModuleType:
+    """The module that reads and writes ``path``."""
+    is_folder = path.is_dir()
+    chosen = next(
+        (f for f in FORMATS if (f.is_folder if is_folder else path.suffix.lower() in f.suffixes)), FORMATS[-1]
+    )
+    return importlib.import_module(chosen.module)

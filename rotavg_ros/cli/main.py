@@ -1,0 +1,98 @@
+"""The `rotavg` command. Subcommands are imported only when chosen, so that help and errors come at once."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from typing import NamedTuple, NoReturn
+
+from rotavg_ros.errors import UserError
+from rotavg_ros.version import __version__
+
+
+class Command(NamedTuple):
+    """A subcommand; its module has ``add_arguments(parser)`` and ``run(arguments) -> exit code``."""
+
+    name: str
+    module: str
+    help: str
+
+
+COMMANDS = (
+    Command("solve", "rotavg_ros.cli.solve", "solve view-graph files (g2o, 1DSfM, npz)"),
+    Command("convert", "rotavg_ros.cli.convert", "convert view-graphs between formats"),
+)
+
+
+class UsageError(UserError):
+    """Words on the command line that do not make a command."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Reports mistakes in the one line that every mistake gets."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"{message}; see {self.prog} --help")
+
+
+EXIT_USER_ERROR = 2
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one subcommand.
+
+    Args:
+        arguments: the words after ``rotavg``; default: those of this process.
+
+    Returns:
+        The exit code: 0, or 2 for a mistake in what the user gave (one line on stderr), or 130 after Ctrl-C.
+    """
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        return _run(arguments)
+    except UserError as error:
+        print_error(error)
+        return EXIT_USER_ERROR
+    except KeyboardInterrupt:
+        print("rotavg: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # Whoever read our output (`| head`) has seen enough. Python would complain again when it closes stdout.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def print_error(error: UserError) -> None:
+    """The one line that a mistake of the user's gets."""
+    print(f"rotavg: error: {error}", file=sys.stderr)
+
+
+def _run(arguments: list[str]) -> int:
+    # Only the chosen subcommand gets its arguments; the others are known by name and one line of help.
+    chosen = next((word for word in arguments if not word.startswith("-")), None)
+    parser = _Parser(
+        prog="rotavg", description="Rotation averaging with outlier rejection, for files, bags and robots."
+    )
+    parser.add_argument("--version", action="version", version=f"rotavg {__version__}")
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    run = None
+    for command in COMMANDS:
+        subparser = subparsers.add_parser(command.name, help=command.help)
+        if command.name == chosen:
+            module = importlib.import_module(command.module)
+            subparser.description = (module.__doc__ or command.help).strip()
+            subparser.formatter_class = argparse.RawDescriptionHelpFormatter
+            module.add_arguments(subparser)
+            run = module.run
+    parsed = parser.parse_args(arguments)
+    assert run is not None, "argparse accepts only the names in COMMANDS"
+    exit_code: int = run(parsed)
+    return exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

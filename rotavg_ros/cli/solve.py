@@ -1,0 +1,227 @@
+"""Solve view-graph files: absolute orientations and an outlier score for every edge.
+
+Reads g2o (also TORO's tags), 1DSfM EGs.txt and npz. Writes to DIR, or to DIR/<stem> for several graphs:
+  orientations.csv  id,qx,qy,qz,qw,component   world_from_body, ascending by id
+  edges.csv         source,target,outlier_score,outlier   in the order of the file (or edges.npz)
+  summary.json      counts, seconds, memory, device, method, version
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from rotavg_ros import Solution, ViewGraph, solve
+from rotavg_ros.cli.main import EXIT_USER_ERROR, print_error
+from rotavg_ros.cli.progress import working
+from rotavg_ros.datasets.csv_writer import Column, write_csv
+from rotavg_ros.datasets.graph_file import GraphFile, read_graph
+from rotavg_ros.errors import UserError
+from rotavg_ros.rotations import canonical, inverse
+from rotavg_ros.solver import METHODS
+from rotavg_ros.version import __version__
+from rotavg_ros.view_graph import EdgeKind
+
+OUTLIER_THRESHOLD = 0.5
+_ORIENTATIONS, _EDGES, _SUMMARY = "orientations.csv", "edges", "summary.json"
+_EDGE_FORMATS = ("csv", "npz")
+
+
+class SolveError(UserError):
+    """Graphs, options and output folder that do not fit together."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One graph and the folder for its answer."""
+
+    graph: Path
+    output: Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``rotavg solve``."""
+    parser.add_argument("graphs", nargs="+", type=Path, metavar="GRAPH", help="view-graph file")
+    parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for the answer")
+    parser.add_argument("--method", default="neurora", metavar="NAME", help=f"{', '.join(METHODS)} (default: neurora)")
+    parser.add_argument(
+        "--profile", default="auto", choices=("auto", "slam", "sfm"), help="auto: slam if any edge is odometry"
+    )
+    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default: auto")
+    parser.add_argument(
+        "--refine", type=_step_count, metavar="N", help="at most N refinement steps; 0 skips (default: the method's)"
+    )
+    parser.add_argument("--edges", default="csv", choices=(*_EDGE_FORMATS, "none"), help="default: csv")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Solve every graph; a bad one does not keep the others from being solved."""
+    jobs = plan(arguments.graphs, arguments.output)
+    options = {"method": arguments.method, "device": arguments.device, "refinement_steps": arguments.refine}
+    errors: list[UserError] = []
+    warm = False
+    for job in jobs:
+        try:
+            start = time.perf_counter()
+            with working(f"reading {job.graph}"):
+                graph_file = read_graph(job.graph)
+            read_seconds = time.perf_counter() - start
+            profile = arguments.profile
+            if not warm:
+                solve(_warm_up_graph(graph_file.graph), profile=profile, **options)
+                warm = True
+            with working(f"solving {job.graph}"):
+                start = time.perf_counter()
+                solution = solve(graph_file.graph, profile=profile, **options)
+                solve_seconds = time.perf_counter() - start
+            summary = summarize(job.graph, graph_file, solution, read_seconds, solve_seconds)
+            write_answer(job.output, graph_file, solution, summary, arguments.edges)
+        except UserError as error:
+            errors.append(error)
+        else:
+            print(
+                f"{job.graph}: {summary['nodes']} nodes, {summary['edges']} edges, {summary['outliers']} outliers, "
+                f"{summary['components']} components, {solve_seconds:.2f} s → {job.output}",
+                flush=True,
+            )
+    for error in errors:
+        print_error(error)
+    return EXIT_USER_ERROR if errors else 0
+
+
+def plan(graphs: list[Path], output: Path) -> list[Job]:
+    """Where each answer goes, after everything has been checked that can be before any work.
+
+    Raises:
+        SolveError: two graphs with one stem, an output folder that cannot be written, or a graph that an
+            output would overwrite.
+    """
+    if len(graphs) == 1:
+        jobs = [Job(graphs[0], output)]
+    else:
+        jobs = [Job(graph, output / graph.stem) for graph in graphs]
+    first_of: dict[Path, Path] = {}
+    for job in jobs:
+        other = first_of.setdefault(job.output, job.graph)
+        if other is not job.graph:
+            raise SolveError(f"{other} and {job.graph} would both go to {job.output}; solve them one by one")
+        _check_writable(job.output)
+        for name in (_ORIENTATIONS, _SUMMARY, *(f"{_EDGES}.{suffix}" for suffix in _EDGE_FORMATS)):
+            for graph in graphs:
+                if graph.resolve() == (job.output / name).resolve():
+                    raise SolveError(f"{graph} would be overwritten by the answer; choose another --output")
+    return jobs
+
+
+def summarize(
+    path: Path, graph_file: GraphFile, solution: Solution, read_seconds: float, solve_seconds: float
+) -> dict[str, object]:
+    """The content of ``summary.json``."""
+    return {
+        "graph": str(path),
+        "nodes": graph_file.graph.num_nodes,
+        "edges": graph_file.graph.num_edges,
+        "components": int(solution.component.max()) + 1,
+        "outliers": int((solution.outlier_score > OUTLIER_THRESHOLD).sum()),
+        "skipped": graph_file.skipped,
+        "stage_seconds": solution.stage_seconds,
+        "read_seconds": read_seconds,
+        "solve_seconds": solve_seconds,
+        "peak_memory_bytes": _peak_memory_bytes(),
+        "device": solution.device,
+        "method": solution.method,
+        "profile": solution.profile,
+        "version": __version__,
+    }
+
+
+def write_answer(
+    output: Path, graph_file: GraphFile, solution: Solution, summary: dict[str, object], edges: str
+) -> None:
+    """Write all files under temporary names, then put them in place; an edges file of an older answer goes.
+
+    Raises:
+        SolveError: the folder cannot be written; an older answer is then still intact.
+    """
+    writers: dict[str, Callable[[BinaryIO], object]] = {
+        _ORIENTATIONS: lambda file: write_csv(file, _orientation_columns(graph_file, solution)),
+    }
+    columns = _edge_columns(graph_file, solution)
+    if edges == "csv":
+        writers[f"{_EDGES}.csv"] = lambda file: write_csv(file, columns)
+    elif edges == "npz":
+        writers[f"{_EDGES}.npz"] = lambda file: np.savez(file, **{column.name: column.values for column in columns})
+    writers[_SUMMARY] = lambda file: file.write((json.dumps(summary, indent=2) + "\n").encode())
+    temporary = {name: output / f".{name}.{os.getpid()}.tmp" for name in writers}
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        for name, write in writers.items():
+            with temporary[name].open("wb") as file:
+                write(file)
+        for name in writers:
+            os.replace(temporary[name], output / name)
+        for suffix in _EDGE_FORMATS:
+            if f"{_EDGES}.{suffix}" not in writers:
+                (output / f"{_EDGES}.{suffix}").unlink(missing_ok=True)
+    except OSError as error:
+        raise SolveError(f"{output}: cannot be written: {error.strerror or error}") from None
+    finally:
+        for path in temporary.values():
+            path.unlink(missing_ok=True)
+
+
+def _orientation_columns(graph_file: GraphFile, solution: Solution) -> list[Column]:
+    world_from_body = canonical(inverse(solution.body_from_world)).cpu().numpy()
+    quaternion = [Column(name, world_from_body[:, i], decimals=12) for i, name in enumerate(("qx", "qy", "qz", "qw"))]
+    return [Column("id", graph_file.node_ids), *quaternion, Column("component", solution.component.cpu().numpy())]
+
+
+def _edge_columns(graph_file: GraphFile, solution: Solution) -> list[Column]:
+    graph, ids = graph_file.graph, graph_file.node_ids
+    score = solution.outlier_score.cpu().numpy()
+    return [
+        Column("source", ids[graph.source.cpu().numpy()]),
+        Column("target", ids[graph.target.cpu().numpy()]),
+        Column("outlier_score", score, decimals=6),
+        Column("outlier", (score > OUTLIER_THRESHOLD).astype(np.int64)),
+    ]
+
+
+def _warm_up_graph(like: ViewGraph) -> ViewGraph:
+    """A constant triangle, so that one-time costs (loading weights, first kernels) are not taken for solving.
+
+    It has odometry if ``like`` has, so that the same profile is chosen.
+    """
+    has_odometry = bool(like.is_odometry.any())
+    kind = [EdgeKind.ODOMETRY if has_odometry else EdgeKind.LOOP_CLOSURE] * 2 + [EdgeKind.LOOP_CLOSURE]
+    return ViewGraph.create([0, 1, 0], [1, 2, 2], [[0.0, 0.0, 0.0, 1.0]] * 3, kind=kind)
+
+
+def _check_writable(folder: Path) -> None:
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise SolveError(f"{existing} is not a folder; choose another --output")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise SolveError(f"{existing}: permission denied; choose another --output")
+
+
+def _peak_memory_bytes() -> int:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # Linux counts in KiB
+
+
+def _step_count(text: str) -> int:
+    count = int(text)
+    if count < 0:
+        raise argparse.ArgumentTypeError("must be 0 or more")
+    return count

@@ -1,0 +1,64 @@
+"""Numeric csv files, written tens of times faster than row by row: digits are computed for whole columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+
+_BLOCK_ROWS = 1 << 16
+
+
+class Column(NamedTuple):
+    """A named column of ``(K,)`` numbers. ``decimals`` is 0 for integers and at most 12, for values below 10⁶."""
+
+    name: str
+    values: np.ndarray
+    decimals: int = 0
+
+
+def write_csv(file: BinaryIO, columns: Sequence[Column]) -> None:
+    """Write a header and one line per row.
+
+    Raises:
+        ValueError: a value that is not finite.
+    """
+    file.write((",".join(column.name for column in columns) + "\n").encode("ascii"))
+    for start in range(0, len(columns[0].values), _BLOCK_ROWS):
+        block = slice(start, start + _BLOCK_ROWS)
+        parts = []
+        for column in columns:
+            parts += [_digits(column.values[block], column.decimals), _literal(b",", len(column.values[block]))]
+        parts[-1][0][:] = ord("\n")
+        characters = np.concatenate([part[0] for part in parts], axis=1)
+        keep = np.concatenate([part[1] for part in parts], axis=1)
+        file.write(characters[keep].tobytes())
+
+
+def _digits(values: np.ndarray, decimals: int) -> tuple[np.ndarray, np.ndarray]:
+    """``(K, W)`` characters of right-aligned numbers, and which of them to keep (not the leading zeros)."""
+    if decimals:
+        if not np.isfinite(values).all():
+            raise ValueError("a csv column holds a value that is not finite")
+        values = np.rint(np.asarray(values, dtype=np.float64) * 10.0**decimals)
+    number = values.astype(np.int64)
+    rest = np.abs(number)
+    num_digits = max(decimals + 1, len(str(rest.max(initial=0))))
+    characters, keep = [], []
+    for place in range(num_digits):
+        if place == decimals and decimals:
+            point, always = _literal(b".", len(number))
+            characters.append(point)
+            keep.append(always)
+        significant = (rest > 0) | (place <= decimals)
+        rest, digit = np.divmod(rest, 10)
+        characters.append((digit + ord("0")).astype(np.uint8)[:, None])
+        keep.append(significant[:, None])
+    characters.append(_literal(b"-", len(number))[0])
+    keep.append((number < 0)[:, None])
+    return np.concatenate(characters[::-1], axis=1), np.concatenate(keep[::-1], axis=1)
+
+
+def _literal(character: bytes, num_rows: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.full((num_rows, 1), ord(character), dtype=np.uint8), np.ones((num_rows, 1), dtype=bool)
