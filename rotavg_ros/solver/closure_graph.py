@@ -1,0 +1,183 @@
+"""The closure graph: a SLAM pose graph with its odometry chains drawn together.
+
+A keyframe between two odometry edges and without a closure carries no information of its own, so a run of k odometry
+steps is one *segment* with k times the variance, and what is left has as many nodes as closures have ends. All
+orientations are written as a correction of the odometry's,
+
+    R_v = R_v⁰ C_v        (R⁰: composed along the spanning forest; C: a rotation of the world frame),
+
+so a segment says C_b ≈ C_a, and any other edge says C_v ≈ e⁰_uv C_u with e⁰_uv its residual under R⁰. Inside a segment the
+least-squares solution turns in proportion to the variance passed, which makes the contraction exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.fine_net import edge_residual
+from rotavg_ros.solver.spanning_tree import SpanningForest, accumulate_to_root, compose_orientations
+from rotavg_ros.view_graph import ViewGraph
+
+
+@dataclass(frozen=True)
+class ClosureGraph:
+    """K key nodes and E edges: S segments first, then every other edge of the view-graph in its order.
+
+    Attributes:
+        nodes: ``(K,)`` view-graph nodes, ascending.
+        roots: ``(components,)`` key nodes whose correction stays the identity.
+        source, target: ``(E,)`` key nodes.
+        residual: ``(E, 4)`` float64 e⁰; the identity on segments.
+        is_odometry: ``(E,)`` bool; all segments, and odometry edges outside the forest.
+        steps: ``(E,)`` variance in units of one edge of its kind: odometry edges passed, 1 for a closure.
+        path_steps: ``(E,)`` odometry steps between the edge's ends along the forest; inf where a bridge is passed.
+        view_graph_edge: ``(E - S,)`` the view-graph edge of each edge that is no segment.
+        segment_of_edge: ``(M,)`` the segment that holds each view-graph edge, -1 for those above.
+        odometry_orientation: ``(N, 4)`` R⁰, body_from_world.
+    """
+
+    nodes: np.ndarray
+    roots: np.ndarray
+    source: np.ndarray
+    target: np.ndarray
+    residual: Tensor
+    is_odometry: np.ndarray
+    steps: np.ndarray
+    path_steps: np.ndarray
+    view_graph_edge: np.ndarray
+    segment_of_edge: np.ndarray
+    odometry_orientation: Tensor
+    # Every view-graph node lies `fraction` of the way (in variance) from key node `above` to key node `below`.
+    above: np.ndarray
+    below: np.ndarray
+    fraction: np.ndarray
+
+    @property
+    def num_nodes(self) -> int:
+        return len(self.nodes)
+
+    @property
+    def num_segments(self) -> int:
+        return len(self.source) - len(self.view_graph_edge)
+
+    @property
+    def is_closure(self) -> np.ndarray:
+        return ~self.is_odometry
+
+    def orientations(self, correction: Tensor) -> Tensor:
+        """Corrections of the key nodes ``(K, 4)`` → orientations of all nodes, body_from_world ``(N, 4)``."""
+        fraction = torch.from_numpy(self.fraction)
+        spread = rotations.slerp(correction[self.above], correction[self.below], fraction)
+        return rotations.normalize(rotations.multiply(self.odometry_orientation, spread))
+
+    def edge_values(self, value: np.ndarray, segment_value: np.ndarray | None = None) -> np.ndarray:
+        """Values of this graph's edges ``(E,)`` → values of the view-graph's edges ``(M,)``."""
+        segments = value[: self.num_segments] if segment_value is None else segment_value
+        out = np.empty(len(self.segment_of_edge))
+        on_segment = self.segment_of_edge >= 0
+        out[on_segment] = segments[self.segment_of_edge[on_segment]]
+        out[self.view_graph_edge] = value[self.num_segments :]
+        return out
+
+
+def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
+    """Draw the odometry chains of ``graph`` (on the CPU) together along ``forest``."""
+    num_nodes, num_edges = graph.num_nodes, graph.num_edges
+    source, target = graph.source.numpy(), graph.target.numpy()
+    is_odometry = graph.is_odometry.numpy()
+    parent, parent_edge = forest.parent, forest.parent_edge
+
+    tree_odometry = np.zeros(num_edges, dtype=bool)
+    tree_odometry[parent_edge[parent_edge >= 0]] = True
+    tree_odometry &= is_odometry
+
+    is_root = parent_edge < 0
+    hangs_on_odometry = ~is_root & tree_odometry[parent_edge]
+    children = np.bincount(parent[hangs_on_odometry], minlength=num_nodes)
+    is_key = is_root | ~hangs_on_odometry | (children != 1)
+    is_key[source[~tree_odometry]] = True
+    is_key[target[~tree_odometry]] = True
+    nodes = np.flatnonzero(is_key)
+    key_of_node = np.cumsum(is_key) - 1
+
+    above_node = _follow(np.where(is_key, np.arange(num_nodes), parent))
+    only_child = np.arange(num_nodes)
+    only_child[parent[hangs_on_odometry]] = np.flatnonzero(hangs_on_odometry)
+    below_node = _follow(np.where(is_key, np.arange(num_nodes), only_child))
+    depth = accumulate_to_root(forest, hangs_on_odometry.astype(np.float64))
+    length = depth[below_node] - depth[above_node]
+    fraction = np.divide(depth - depth[above_node], length, out=np.zeros(num_nodes), where=length > 0)
+
+    # A segment ends at a key node that hangs on odometry; it starts at the next key node above.
+    segment_end = nodes[hangs_on_odometry[nodes]]
+    segment_start = above_node[parent[segment_end]]
+    segment_of_key = np.full(num_nodes, -1, dtype=np.int64)
+    segment_of_key[segment_end] = np.arange(len(segment_end))
+    segment_of_edge = np.full(num_edges, -1, dtype=np.int64)
+    below_edge = np.flatnonzero(hangs_on_odometry)
+    segment_of_edge[parent_edge[below_edge]] = segment_of_key[below_node[below_edge]]
+    other = np.flatnonzero(~tree_odometry)
+
+    orientation = compose_orientations(forest, graph)
+    residual = edge_residual(
+        orientation, graph.target_from_source[other], graph.source[other], graph.target[other]
+    )
+    chain = _odometry_chain(forest, hangs_on_odometry)
+    path_steps = np.where(
+        chain[source[other]] == chain[target[other]],
+        _path_length(forest, depth, source[other], target[other]),
+        np.inf,
+    )
+    segment_steps = depth[segment_end] - depth[segment_start]
+    return ClosureGraph(
+        nodes=nodes,
+        roots=key_of_node[forest.roots],
+        source=key_of_node[np.concatenate((segment_start, source[other]))],
+        target=key_of_node[np.concatenate((segment_end, target[other]))],
+        residual=torch.cat((rotations.identity(len(segment_end)), rotations.canonical(residual))),
+        is_odometry=np.concatenate((np.ones(len(segment_end), dtype=bool), is_odometry[other])),
+        steps=np.concatenate((segment_steps, np.ones(len(other)))),
+        path_steps=np.concatenate((segment_steps, path_steps)),
+        view_graph_edge=other,
+        segment_of_edge=segment_of_edge,
+        odometry_orientation=orientation,
+        above=key_of_node[above_node],
+        below=key_of_node[below_node],
+        fraction=fraction,
+    )
+
+
+def _follow(pointer: np.ndarray) -> np.ndarray:
+    """The fixed point that each chain of pointers ends in."""
+    while True:
+        farther = pointer[pointer]
+        if np.array_equal(farther, pointer):
+            return pointer
+        pointer = farther
+
+
+def _odometry_chain(forest: SpanningForest, hangs_on_odometry: np.ndarray) -> np.ndarray:
+    """A number per node, equal where odometry alone connects two nodes along the forest."""
+    return _follow(np.where(hangs_on_odometry, forest.parent, np.arange(len(forest.parent))))
+
+
+def _path_length(forest: SpanningForest, depth: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Length of the ways between nodes of the same tree, by lifting both to their lowest common ancestor."""
+    level = accumulate_to_root(forest, np.ones(len(depth))).astype(np.int64)
+    jumps = [forest.parent]
+    while not np.array_equal(jumps[-1][jumps[-1]], jumps[-1]):
+        jumps.append(jumps[-1][jumps[-1]])
+    low, high = np.where(level[a] >= level[b], a, b), np.where(level[a] >= level[b], b, a)
+    excess = level[low] - level[high]
+    for power, jump in enumerate(jumps):
+        low = np.where((excess >> power) & 1 == 1, jump[low], low)
+    for jump in reversed(jumps):
+        apart = jump[low] != jump[high]
+        low, high = np.where(apart, jump[low], low), np.where(apart, jump[high], high)
+    ancestor = np.where(low == high, low, forest.parent[low])
+    return depth[a] + depth[b] - 2 * depth[ancestor]

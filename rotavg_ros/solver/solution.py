@@ -1,0 +1,31 @@
+"""What a solve returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Absolute orientations and the verdict on every edge (N nodes, M edges).
+
+    Attributes:
+        body_from_world: ``(N, 4)`` float64 xyzw, w ≥ 0; the first node of every component is the identity.
+        outlier_score: ``(M,)`` float64, probability that the edge's true noise exceeds 20° (SfM) or 10° (SLAM).
+        component: ``(N,)`` int64, connected component, numbered by first node.
+        uncertainty: ``(N,)`` float64 radians, standard deviation of each component of the orientation error relative
+            to the component's first node; NaN where the method gives none.
+        stage_seconds: wall-clock seconds of each stage that ran.
+        method, profile, device: what was run, with "auto" resolved.
+    """
+
+    body_from_world: Tensor
+    outlier_score: Tensor
+    component: Tensor
+    uncertainty: Tensor
+    stage_seconds: dict[str, float]
+    method: str
+    profile: str
+    device: str
