@@ -24,6 +24,11 @@ def resources() -> list[str]:
     return [str(path.relative_to(ROOT)) for path in sorted((ROOT / "resource").glob("*.*"))]
 
 
+def message_definitions() -> list[str]:
+    """The .msg files of rotavg_msgs, for reading and writing bags where no ROS is installed, relative to this file."""
+    return [str(path.relative_to(ROOT)) for path in sorted((ROOT / "msg_defs" / "msg").glob("*.msg"))]
+
+
 setup(
     name=NAME,
     version=VERSION,
@@ -36,6 +41,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/resource", resources()),
+        (f"share/{NAME}/msg", message_definitions()),
     ],
     install_requires=requirements("requirements/runtime.txt"),
     zip_safe=False,

@@ -3,6 +3,7 @@
   .g2o .graph .toro   g2o pose graph (TORO's and iSAM's tags are read, g2o's written)
   .txt                1DSfM EGs.txt
   .npz                arrays, see the README
+  a folder            rosbag2 (MCAP): edges, chained odometry, ground truth; also read: .mcap, .db3, .bag
 
 Says what the output format has no room for.
 """
@@ -17,6 +18,11 @@ from typing import NamedTuple
 
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.ground_truth import attach_stamps, attach_truth
+from rotavg_ros.errors import UserError
+
+
+class ConvertError(UserError):
+    """An output that is there already."""
 
 
 class Format(NamedTuple):
@@ -33,6 +39,7 @@ class Format(NamedTuple):
 
 # The last one also gets the suffixes that nobody knows: it can tell by content, and what it cannot it explains.
 FORMATS = (
+    Format(("", ".mcap", ".db3", ".bag"), is_folder=True, module="rotavg_ros.bags.graph_bag"),
     Format((".g2o", ".graph", ".toro", ".npz", ".txt"), is_folder=False, module="rotavg_ros.datasets.graph_file"),
 )
 
@@ -41,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``rotavg convert``."""
     parser.add_argument("input", type=Path, metavar="INPUT")
     parser.add_argument("output", type=Path, metavar="OUTPUT")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing OUTPUT")
     parser.add_argument(
         "--stamps", type=Path, metavar="TXT", help="text file with one stamp in seconds per node, ascending by id"
     )
@@ -54,6 +62,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, attach what came in further files, write."""
+    if arguments.output.exists() and not arguments.overwrite:
+        raise ConvertError(f"{arguments.output}: exists already; choose another OUTPUT or give --overwrite")
     with working(f"converting {arguments.input}"):
         graph_file = format_of(arguments.input).read_graph(arguments.input)
         if arguments.stamps is not None:
@@ -72,8 +82,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 def format_of(path: Path) -> ModuleType:
     """The module that reads and writes ``path``."""
-    is_folder = path.is_dir()
-    chosen = next(
-        (f for f in FORMATS if (f.is_folder if is_folder else path.suffix.lower() in f.suffixes)), FORMATS[-1]
-    )
+    if path.is_dir():
+        chosen = next(known for known in FORMATS if known.is_folder)
+    elif path.is_file() and not path.suffix:
+        chosen = FORMATS[-1]
+    else:
+        chosen = next((known for known in FORMATS if path.suffix.lower() in known.suffixes), FORMATS[-1])
     return importlib.import_module(chosen.module)

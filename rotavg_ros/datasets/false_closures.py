@@ -13,7 +13,7 @@ from rotavg_ros.datasets.graph_file import GraphFile
 from rotavg_ros.errors import UserError
 from rotavg_ros.view_graph import EdgeKind
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 BoolArray = NDArray[np.bool_]
 
 # A loop closure (or a slipping odometry edge) whose true noise exceeds this is an outlier.
@@ -44,7 +44,7 @@ class SpoiledGraph:
     @property
     def is_outlier(self) -> BoolArray:
         """``(M,)`` bool: noise above 10°."""
-        return self.noise > np.radians(FALSE_CLOSURE_DEG)
+        return np.asarray(self.noise > np.radians(FALSE_CLOSURE_DEG))
 
 
 def replace_closures(

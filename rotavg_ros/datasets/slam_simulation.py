@@ -338,7 +338,7 @@ def _noise_levels(
     """Standard deviation per axis of every edge, radians; the mean square angle is as asked for."""
     axes = 1 if config.dimensions == 2 else 3
     spread = np.exp(config.noise_spread * rng.normal(size=count) - config.noise_spread**2)
-    return np.radians(root_mean_square_deg) / np.sqrt(axes) * spread
+    return np.asarray(np.radians(root_mean_square_deg) / np.sqrt(axes) * spread)
 
 
 def _rotation_vectors(planar: bool, count: int, rng: np.random.Generator) -> FloatArray:

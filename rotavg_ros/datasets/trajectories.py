@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 
 class World(str, Enum):
@@ -100,10 +100,11 @@ def chain_rotations(steps: FloatArray) -> FloatArray:
         tail = Rotation.from_quat(products[:-shift]) * Rotation.from_quat(products[shift:])
         products = np.concatenate((products[:shift], tail.as_quat()))
         shift *= 2
-    return np.where(products[:, 3:] < 0, -products, products)
+    canonical: FloatArray = np.where(products[:, 3:] < 0, -products, products)
+    return canonical
 
 
-# --- paths in the plane, (N, 2) metres ---------------------------------------------------------------------------------
+# --- paths in the plane, (N, 2) metres ------------------------------------------------------------
 
 
 def _corridor(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> FloatArray:
@@ -219,7 +220,7 @@ def _on_terrain(
     return Trajectory(position, world_from_body.as_quat(canonical=True))
 
 
-# --- trajectories in space ---------------------------------------------------------------------------------------------
+# --- trajectories in space ------------------------------------------------------------------------
 
 
 def _sphere(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> Trajectory:
@@ -279,7 +280,7 @@ def _with_frames(position: FloatArray, up: FloatArray) -> Trajectory:
     return Trajectory(position, Rotation.from_matrix(matrix).as_quat(canonical=True))
 
 
-# --- helpers -----------------------------------------------------------------------------------------------------------
+# --- helpers --------------------------------------------------------------------------------------
 
 
 def _direction(angle: FloatArray) -> FloatArray:
@@ -288,7 +289,7 @@ def _direction(angle: FloatArray) -> FloatArray:
 
 def _fold(distance: FloatArray, length: float) -> FloatArray:
     """Reflect at both ends of [0, length]: forth and back."""
-    return length - np.abs(distance % (2 * length) - length)
+    return np.asarray(length - np.abs(distance % (2 * length) - length))
 
 
 def _walk_along(waypoints: FloatArray, distance: FloatArray) -> FloatArray:
@@ -300,5 +301,6 @@ def _walk_along(waypoints: FloatArray, distance: FloatArray) -> FloatArray:
 def _smooth_noise(length: int, scale: float, rng: np.random.Generator) -> FloatArray:
     """Gaussian noise of unit variance that varies over about ``scale`` samples."""
     padding = int(4 * scale) + 1
-    noise = gaussian_filter1d(rng.normal(size=length + 2 * padding), scale)[padding : padding + length]
-    return noise * np.sqrt(2 * np.sqrt(np.pi) * scale)
+    noise: FloatArray = gaussian_filter1d(rng.normal(size=length + 2 * padding), scale)[padding : padding + length]
+    noise *= np.sqrt(2 * np.sqrt(np.pi) * scale)
+    return noise

@@ -1,0 +1,172 @@
+"""The view-graph in a bag: one that :mod:`rotavg_ros.bags.graph_to_bag` wrote, or odometry and stamped closures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION
+from rotavg_ros.bags.messages import Edge, Keyframe, read_edge, read_odometry
+from rotavg_ros.bags.reader import BagReader, BagReadError
+from rotavg_ros.bags.topics import EDGE_TOPIC, GRAPH_NOTE, ODOM_TOPIC, TRANSLATION_TOPIC, TRUTH_TOPIC
+from rotavg_ros.datasets.graph_file import GraphFile
+from rotavg_ros.view_graph import EdgeKind
+
+# A stamp that names a keyframe may be this far from the odometry message that is meant.
+MAX_STAMP_DISTANCE_NS = 50_000_000
+
+# Rotations in a plane have no roll and pitch beyond rounding.
+_PLANAR_TOLERANCE = 1e-9
+
+_CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass
+class _Content:
+    """What the known topics of a bag hold, in the order of recording."""
+
+    edges: list[Edge] = field(default_factory=list)
+    translations: list[list[float]] = field(default_factory=list)
+    odometry: list[tuple[int, list[float], list[float]]] = field(default_factory=list)
+    truth: list[tuple[int, list[float], list[float]]] = field(default_factory=list)
+    note: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def by_id(self) -> bool:
+        return bool(self.edges) and all(end.id is not None for edge in self.edges for end in (edge.source, edge.target))
+
+
+def read_graph_bag(path: str | Path) -> GraphFile:
+    """Read the graph in a bag.
+
+    Where the edges name their ends by id, they are the graph, in the order of the edges' own numbers. Where they name
+    them by stamp, every odometry message is a keyframe, consecutive ones are joined by odometry edges, and an end
+    belongs to the nearest odometry message within 0.05 s; edges without such a message are skipped and counted.
+
+    Raises:
+        BagReadError: an unreadable bag, one without edges, or one that needs odometry and has none.
+    """
+    with BagReader(path) as bag:
+        bag.require(EDGE_TOPIC, RELATIVE_ROTATION)
+        content = _read(bag)
+        if not content.by_id:
+            bag.require(ODOM_TOPIC, ODOMETRY)
+            if not content.odometry:
+                raise BagReadError(f"{path}: {ODOM_TOPIC} has no messages, so there are no keyframes")
+    return _with_truth(_from_ids(content) if content.by_id else _from_stamps(content), content)
+
+
+def _read(bag: BagReader) -> _Content:
+    note = json.loads(bag.note(GRAPH_NOTE) or "{}")
+    content = _Content(note=note)
+    known = {EDGE_TOPIC: RELATIVE_ROTATION, ODOM_TOPIC: ODOMETRY, TRUTH_TOPIC: ODOMETRY}
+    topics = [topic for topic, kind in known.items() if bag.topics.get(topic) == kind]
+    if TRANSLATION_TOPIC in bag.topics:
+        topics.append(TRANSLATION_TOPIC)
+    for topic, _, message in bag.decoded(topics):
+        if topic == EDGE_TOPIC:
+            content.edges.append(read_edge(message))
+        elif topic == TRANSLATION_TOPIC:
+            content.translations.append([message.vector.x, message.vector.y, message.vector.z])
+        elif topic == ODOM_TOPIC:
+            content.odometry.append(read_odometry(message))
+        else:
+            content.truth.append(read_odometry(message))
+    return content
+
+
+def _from_ids(content: _Content) -> GraphFile:
+    order = sorted(range(len(content.edges)), key=lambda position: content.edges[position].id)
+    edges = [content.edges[position] for position in order]
+    ends = np.array([(edge.source.id, edge.target.id) for edge in edges], dtype=np.int64)
+    source_from_target = np.stack([edge.source_from_target for edge in edges])
+    note = content.note
+    graph_file = GraphFile.from_ids(
+        ends[:, 0],
+        ends[:, 1],
+        source_from_target * _CONJUGATE,
+        lone_ids=np.array(note.get("lone_ids", []), dtype=np.int64),
+        kind=np.array([edge.kind for edge in edges]),
+        precision=np.array([edge.precision for edge in edges]),
+        planar=bool(note.get("planar", _is_planar(source_from_target))),
+        edge_translation=np.array(content.translations)[order] if len(content.translations) == len(edges) else None,
+    )
+    stamp_of = {end.id: end.stamp_ns for edge in edges for end in (edge.source, edge.target)}
+    stamp_of.update(zip(note.get("lone_ids", []), note.get("lone_stamps_ns", []), strict=False))
+    stamps_ns = np.array([stamp_of.get(node_id, 0) for node_id in graph_file.node_ids.tolist()], dtype=np.int64)
+    return replace(graph_file, stamps_ns=stamps_ns)
+
+
+def _from_stamps(content: _Content) -> GraphFile:
+    poses = sorted({stamp: (position, rotation) for stamp, position, rotation in content.odometry}.items())
+    stamps_ns = np.array([stamp for stamp, _ in poses], dtype=np.int64)
+    position = np.array([pose[0] for _, pose in poses])
+    world_from_body = Rotation.from_quat([pose[1] for _, pose in poses])
+    ends = np.array([[_nearest(stamps_ns, end) for end in (edge.source, edge.target)] for edge in content.edges])
+    ends = ends.reshape(-1, 2)
+    usable = (ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])
+    closures = [edge for edge, keep in zip(content.edges, usable, strict=True) if keep]
+
+    num_steps = len(stamps_ns) - 1
+    previous_from_next = (world_from_body[:-1].inv() * world_from_body[1:]).as_quat().reshape(-1, 4)
+    steps = world_from_body[:-1].inv().apply(np.diff(position, axis=0)).reshape(-1, 3)
+    measured = np.array([edge.source_from_target for edge in closures]).reshape(-1, 4)
+    source_from_target = np.concatenate((previous_from_next, measured))
+    source = np.concatenate((np.arange(num_steps), ends[usable, 0]))
+    target = np.concatenate((np.arange(1, num_steps + 1), ends[usable, 1]))
+    order = np.argsort(np.maximum(source, target), kind="stable")
+    translations = None
+    if len(content.translations) == len(content.edges):
+        translations = np.concatenate((steps, np.array(content.translations).reshape(-1, 3)[usable]))[order]
+    skipped = {"edges without odometry at their stamp": int((~usable).sum())} if not usable.all() else {}
+    graph_file = GraphFile.from_ids(
+        source[order],
+        target[order],
+        (source_from_target * _CONJUGATE)[order],
+        lone_ids=np.arange(len(stamps_ns)),
+        kind=np.array([EdgeKind.ODOMETRY] * num_steps + [edge.kind for edge in closures])[order],
+        precision=np.array([np.nan] * num_steps + [edge.precision for edge in closures])[order],
+        planar=_is_planar(source_from_target),
+        edge_translation=translations,
+        skipped=skipped,
+    )
+    return replace(graph_file, stamps_ns=stamps_ns)
+
+
+def _nearest(stamps_ns: NDArray[np.int64], end: Keyframe) -> int:
+    """Index of the stamp that an end means, or -1."""
+    right = int(np.searchsorted(stamps_ns, end.stamp_ns))
+    candidates = [index for index in (right - 1, right) if 0 <= index < len(stamps_ns)]
+    best = min(candidates, key=lambda index: abs(int(stamps_ns[index]) - end.stamp_ns))
+    return best if abs(int(stamps_ns[best]) - end.stamp_ns) <= MAX_STAMP_DISTANCE_NS else -1
+
+
+def _with_truth(graph_file: GraphFile, content: _Content) -> GraphFile:
+    """Ground truth belongs to the node of the same stamp; stamps that were made up for the bag are dropped again."""
+    assert graph_file.stamps_ns is not None
+    nodes_at: dict[int, list[int]] = {}
+    for node, stamp in enumerate(graph_file.stamps_ns.tolist()):
+        nodes_at.setdefault(stamp, []).append(node)
+    num_nodes = len(graph_file.node_ids)
+    position, orientation = np.full((num_nodes, 3), np.nan), np.full((num_nodes, 4), np.nan)
+    for stamp, true_position, true_orientation in content.truth:
+        if nodes := nodes_at.get(stamp):
+            node = nodes.pop(0) if len(nodes) > 1 else nodes[0]
+            position[node], orientation[node] = true_position, np.array(true_orientation) * _CONJUGATE
+    if content.truth:
+        graph_file = replace(graph_file, body_from_world_gt=orientation)
+        if content.note.get("position_gt", True):
+            graph_file = replace(graph_file, position_gt=position)
+    if not content.note.get("stamps", True):
+        graph_file = replace(graph_file, stamps_ns=None)
+    return graph_file
+
+
+def _is_planar(quaternions: NDArray[np.float64]) -> bool:
+    return bool((np.abs(quaternions[:, :2]) < _PLANAR_TOLERANCE).all())

@@ -1,0 +1,130 @@
+"""A view-graph file as a bag, from which :mod:`rotavg_ros.bags.graph_from_bag` reads it back without loss.
+
+Topics: ``/relative_rotations`` carries every edge, odometry included, by the id and the stamp of both ends;
+``/odom`` is odometry chained (where there is odometry); ``/ground_truth`` and ``/relative_translations`` (one per edge,
+in the edges' order of publication) are there if the file has them.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION, VECTOR
+from rotavg_ros.bags.messages import (
+    Edge,
+    Keyframe,
+    edge_message,
+    odometry_message,
+    vector_message,
+)
+from rotavg_ros.bags.topics import EDGE_TOPIC, GRAPH_NOTE, ODOM_TOPIC, TRANSLATION_TOPIC, TRUTH_TOPIC
+from rotavg_ros.bags.writer import BagWriter
+from rotavg_ros.datasets.dead_reckoning import chain_poses
+from rotavg_ros.datasets.graph_file import GraphFile
+
+# Stamps of a graph that has none: as if a keyframe had been taken every 0.1 s.
+START_STAMP_NS = 1_700_000_000_000_000_000
+DEFAULT_PERIOD_NS = 100_000_000
+
+
+def write_graph_bag(path: str | Path, graph_file: GraphFile, *, overwrite: bool = False) -> None:
+    """Write a graph as a rosbag2 MCAP folder; each edge is published when the later of its ends exists.
+
+    Raises:
+        BagWriteError: the folder exists (without ``overwrite``), or its place cannot be written.
+    """
+    graph = graph_file.graph
+    stamps_ns = graph_file.stamps_ns
+    if stamps_ns is None:
+        stamps_ns = START_STAMP_NS + DEFAULT_PERIOD_NS * np.arange(graph.num_nodes)
+    source, target = graph.source.cpu().numpy(), graph.target.cpu().numpy()
+    published_ns = np.maximum(stamps_ns[source], stamps_ns[target])
+    # At one instant: where the robot is, where it truly is, then what it measured.
+    events: list[tuple[int, int, int]] = []
+    has_odometry = bool(graph.is_odometry.any())
+    if has_odometry:
+        events += [(int(stamp), 0, node) for node, stamp in enumerate(stamps_ns)]
+    truth_known = (
+        np.zeros(graph.num_nodes, dtype=bool)
+        if graph_file.body_from_world_gt is None
+        else np.isfinite(graph_file.body_from_world_gt).all(axis=1)
+    )
+    events += [(int(stamps_ns[node]), 1, int(node)) for node in np.flatnonzero(truth_known)]
+    events += [(int(stamp), 2, edge) for edge, stamp in enumerate(published_ns)]
+
+    with BagWriter(path, overwrite=overwrite) as bag:
+        bag.set_note(GRAPH_NOTE, json.dumps(_note(graph_file)))
+        bag.add_topic(EDGE_TOPIC, RELATIVE_ROTATION)
+        if has_odometry:
+            bag.add_topic(ODOM_TOPIC, ODOMETRY)
+        if truth_known.any():
+            bag.add_topic(TRUTH_TOPIC, ODOMETRY)
+        if graph_file.edge_translation is not None:
+            bag.add_topic(TRANSLATION_TOPIC, VECTOR)
+        odom_position, odom_orientation = _dead_reckoning(graph_file) if has_odometry else (None, None)
+        truth_position, truth_orientation = _truth(graph_file, truth_known)
+        edges = _edges(graph_file, stamps_ns, published_ns)
+        sequence = 0
+        for stamp, what, index in sorted(events):
+            if what == 0:
+                assert odom_position is not None and odom_orientation is not None
+                message = odometry_message(stamp, odom_position[index], odom_orientation[index], "odom")
+                bag.write(ODOM_TOPIC, stamp, message)
+            elif what == 1:
+                message = odometry_message(stamp, truth_position[index], truth_orientation[index], "map")
+                bag.write(TRUTH_TOPIC, stamp, message)
+            else:
+                sequence += 1
+                bag.write(EDGE_TOPIC, stamp, edge_message(replace(edges[index], sequence=sequence)))
+                if graph_file.edge_translation is not None:
+                    translation = vector_message(stamp, graph_file.edge_translation[index], "")
+                    bag.write(TRANSLATION_TOPIC, stamp, translation)
+
+
+def _note(graph_file: GraphFile) -> dict[str, object]:
+    graph = graph_file.graph
+    lone = np.ones(graph.num_nodes, dtype=bool)
+    lone[graph.source.numpy()] = lone[graph.target.numpy()] = False
+    return {
+        "planar": graph_file.planar,
+        "stamps": graph_file.stamps_ns is not None,
+        "position_gt": graph_file.position_gt is not None,
+        "lone_ids": graph_file.node_ids[lone].tolist(),
+        "lone_stamps_ns": [] if graph_file.stamps_ns is None else graph_file.stamps_ns[lone].tolist(),
+    }
+
+
+def _dead_reckoning(graph_file: GraphFile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    translation = graph_file.edge_translation
+    if translation is None:
+        translation = np.zeros((graph_file.graph.num_edges, 3))
+    return chain_poses(graph_file.graph, translation)
+
+
+def _truth(graph_file: GraphFile, known: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    position, orientation = np.zeros((len(known), 3)), np.zeros((len(known), 4))
+    if graph_file.position_gt is not None:
+        position = np.nan_to_num(graph_file.position_gt)
+    if known.any():
+        assert graph_file.body_from_world_gt is not None
+        orientation[known] = Rotation.from_quat(graph_file.body_from_world_gt[known]).inv().as_quat(canonical=True)
+    return position, orientation
+
+
+def _edges(graph_file: GraphFile, stamps_ns: NDArray[np.int64], published_ns: NDArray[np.int64]) -> list[Edge]:
+    graph = graph_file.graph
+    keyframes = list(map(Keyframe, graph_file.node_ids.tolist(), stamps_ns.tolist()))
+    source_from_target = graph.target_from_source.cpu().numpy() * [-1, -1, -1, 1]
+    columns = (graph.source, graph.target, graph.precision, graph.kind)
+    return [
+        Edge(stamp, index, 0, keyframes[source], keyframes[target], rotation, precision, kind)
+        for index, (stamp, rotation, source, target, precision, kind) in enumerate(
+            zip(published_ns.tolist(), source_from_target, *(column.tolist() for column in columns), strict=True)
+        )
+    ]

@@ -1,0 +1,175 @@
+"""Reading bags, with errors that a user can act on."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import ReaderError as Rosbag1Error
+from rosbags.rosbag2 import ReaderError as Rosbag2Error
+
+from rotavg_ros.bags.message_types import typestore
+from rotavg_ros.errors import UserError
+
+# Files that are bags by themselves.
+RECORDING_SUFFIXES = (".mcap", ".db3", ".bag")
+
+
+class BagReadError(UserError):
+    """A bag that cannot be read as what it should be; the message names it, what is wrong and what to do."""
+
+
+@dataclass(frozen=True)
+class BagMessage:
+    """One recorded message.
+
+    Attributes:
+        topic, message_type: e.g. ``/odom``, ``nav_msgs/msg/Odometry``.
+        time_ns: when it was recorded.
+        data: as serialised (CDR in ROS 2 bags).
+    """
+
+    topic: str
+    message_type: str
+    time_ns: int
+    data: bytes
+
+
+class BagReader:
+    """A rosbag2 folder (MCAP or sqlite3, compressed or not), a single recording or a ROS 1 bag, opened by ``with``.
+
+    Raises:
+        BagReadError: no such bag, a truncated or foreign file, an unknown compression.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._path = _bag_of(Path(path))
+        self._reader: AnyReader | None = None
+
+    def __enter__(self) -> BagReader:
+        try:
+            self._reader = AnyReader([self._path], default_typestore=typestore())
+            self._reader.open()
+        except Exception as error:
+            self._reader = None
+            raise self._unreadable(error) from None
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._reader is not None:
+            with suppress(AnyReaderError):
+                self._reader.close()
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Message type of every topic, in the order of their names."""
+        return {connection.topic: connection.msgtype for connection in sorted(self._all(), key=lambda c: c.topic)}
+
+    @property
+    def is_ros2(self) -> bool:
+        return bool(self._open().is2)
+
+    @property
+    def start_ns(self) -> int:
+        return int(self._open().start_time)
+
+    @property
+    def duration_s(self) -> float:
+        return max(0.0, self._open().duration / 1e9)
+
+    def num_messages(self, topics: Collection[str] | None = None) -> int:
+        """Number of messages on the given topics; default: all."""
+        return sum(c.msgcount for c in self._all() if topics is None or c.topic in topics)
+
+    def note(self, key: str) -> str | None:
+        """A line of the bag's own metadata, as :meth:`BagWriter.set_note` writes it."""
+        storage = getattr(self._open().readers[0], "storage", None)  # ROS 1 bags have none
+        custom = getattr(getattr(storage, "metadata", None), "custom", None) or {}
+        value = custom.get(key)
+        return None if value is None else str(value)
+
+    def require(self, topic: str, message_type: str) -> None:
+        """Refuse a bag without that topic, naming the candidates.
+
+        Raises:
+            BagReadError: there is no such topic, or it has another type.
+        """
+        found = self.topics
+        if found.get(topic) == message_type:
+            return
+        candidates = [name for name, kind in found.items() if kind == message_type]
+        hint = f"topics of that type: {', '.join(candidates)}" if candidates else "the bag has no topic of that type"
+        if topic in found:
+            raise BagReadError(f"{self._path}: topic {topic} has type {found[topic]}, not {message_type}; {hint}")
+        raise BagReadError(f"{self._path}: no topic {topic} ({message_type}); {hint}")
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
+        """Messages in the order of recording, still serialised; default: of all topics."""
+        for connection, time_ns, data in self._records(topics):
+            yield BagMessage(connection.topic, connection.msgtype, time_ns, data)
+
+    def decoded(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+        """Messages as (topic, time in ns, message)."""
+        reader = self._open()
+        for connection, time_ns, data in self._records(topics):
+            try:
+                message = reader.deserialize(data, connection.msgtype)
+            except Exception as error:  # whatever garbled bytes make the decoder stumble over
+                raise BagReadError(
+                    f"{self._path}: a message on {connection.topic} cannot be decoded ({_one_line(error)}); "
+                    "the bag is damaged"
+                ) from None
+            yield connection.topic, time_ns, message
+
+    def _records(self, topics: Collection[str] | None) -> Iterator[tuple[Connection, int, bytes]]:
+        connections = [c for c in self._all() if topics is None or c.topic in topics]
+        if not connections:
+            return
+        records = self._open().messages(connections)
+        while True:
+            try:
+                record = next(records)
+            except StopIteration:
+                return
+            except Exception as error:
+                raise self._unreadable(error) from None
+            yield record
+
+    def _open(self) -> AnyReader:
+        assert self._reader is not None, "use the reader in a with statement"
+        return self._reader
+
+    def _all(self) -> Sequence[Connection]:
+        return self._open().connections
+
+    def _unreadable(self, error: Exception) -> BagReadError:
+        if isinstance(error, PermissionError):
+            return BagReadError(f"{self._path}: permission denied; check the rights of the bag's files")
+        known = isinstance(error, AnyReaderError | Rosbag1Error | Rosbag2Error)
+        what = _one_line(error) if known else f"{type(error).__name__}: {_one_line(error)}"
+        return BagReadError(f"{self._path}: not a readable bag, or a truncated one ({what})")
+
+
+def _bag_of(path: Path) -> Path:
+    """The bag that a path means: itself, or the rosbag2 folder around a recording."""
+    if not path.exists():
+        raise BagReadError(f"{path}: no such bag; check the path")
+    if path.is_dir():
+        if not (path / "metadata.yaml").exists():
+            raise BagReadError(f"{path}: is no rosbag2 folder (it has no metadata.yaml); give a bag")
+        return path
+    if path.suffix not in RECORDING_SUFFIXES:
+        raise BagReadError(f"{path}: give a rosbag2 folder, or a file with suffix {', '.join(RECORDING_SUFFIXES)}")
+    return path.parent if (path.parent / "metadata.yaml").exists() else path
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,124 @@
+"""Writing rosbag2 folders: MCAP, complete or absent."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from rotavg_ros.bags.message_types import typestore
+from rotavg_ros.errors import UserError
+
+_UNLIMITED = QosTime(2147483647, 4294967295)
+
+
+class BagWriteError(UserError):
+    """A bag that cannot be written; the message names the folder and what to do."""
+
+
+class BagWriter:
+    """A rosbag2 folder in the making: it appears under its name when the ``with`` block ends well.
+
+    Args:
+        path: the bag's folder, which must not exist.
+        overwrite: replace an existing bag (only a folder that is a bag, or an empty one).
+
+    Raises:
+        BagWriteError: the folder exists, or its place cannot be written.
+    """
+
+    def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
+        self._path = Path(path)
+        self._overwrite = overwrite
+        # The bag grows inside a hidden folder beside its place, since a recording is named after its own folder.
+        self._workplace = self._path.with_name(f".{self._path.name}.unfinished")
+        self._writer: Writer | None = None
+        self._connections: dict[str, Connection] = {}
+
+    def __enter__(self) -> BagWriter:
+        self._refuse_existing()
+        try:
+            shutil.rmtree(self._workplace, ignore_errors=True)
+            self._writer = Writer(self._workplace / self._path.name, version=8, storage_plugin=StoragePlugin.MCAP)
+            self._writer.open()
+        except OSError as error:
+            raise self._cannot_write(error) from None
+        return self
+
+    def add_topic(self, topic: str, message_type: str, *, latched: bool = False) -> None:
+        """Declare a topic; written with reliable QoS, transient_local where ``latched``."""
+        assert self._writer is not None
+        qos = Qos(
+            history=QosHistory.KEEP_LAST,
+            depth=1 if latched else 100,
+            reliability=QosReliability.RELIABLE,
+            durability=QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+            deadline=_UNLIMITED,
+            lifespan=_UNLIMITED,
+            liveliness=QosLiveliness.AUTOMATIC,
+            liveliness_lease_duration=_UNLIMITED,
+            avoid_ros_namespace_conventions=False,
+        )
+        self._connections[topic] = self._writer.add_connection(
+            topic, message_type, typestore=typestore(), offered_qos_profiles=[qos]
+        )
+
+    def write(self, topic: str, stamp_ns: int, message: Any) -> None:
+        """Append a message to a declared topic; messages should come in the order of their stamps."""
+        connection = self._connections[topic]
+        self.write_raw(topic, stamp_ns, typestore().serialize_cdr(message, connection.msgtype))
+
+    def write_raw(self, topic: str, stamp_ns: int, cdr: bytes | memoryview) -> None:
+        """Append a message that is serialised already."""
+        assert self._writer is not None
+        try:
+            self._writer.write(self._connections[topic], int(stamp_ns), cdr)
+        except OSError as error:
+            raise self._cannot_write(error) from None
+
+    def set_note(self, key: str, value: str) -> None:
+        """A line of the bag's own metadata (``custom_data``)."""
+        assert self._writer is not None
+        self._writer.set_custom_data(key, value)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        assert self._writer is not None
+        try:
+            if error is None:
+                self._writer.close()
+                self._take_place()
+        except OSError as failure:
+            raise self._cannot_write(failure) from None
+        finally:
+            if error is not None:
+                with suppress(Exception):
+                    self._writer.abort()
+            shutil.rmtree(self._workplace, ignore_errors=True)
+
+    def _take_place(self) -> None:
+        if self._path.exists():
+            shutil.rmtree(self._path)
+        (self._workplace / self._path.name).rename(self._path)
+
+    def _refuse_existing(self) -> None:
+        if not self._path.exists():
+            return
+        if not self._overwrite:
+            raise BagWriteError(f"{self._path}: exists already; choose another --output or give --overwrite")
+        if not self._path.is_dir() or not _is_bag_or_empty(list(self._path.iterdir())):
+            raise BagWriteError(f"{self._path}: is not a bag, so --overwrite leaves it alone; choose another --output")
+
+    def _cannot_write(self, error: OSError) -> BagWriteError:
+        return BagWriteError(f"{self._path}: cannot be written: {error.strerror or error}")
+
+
+def _is_bag_or_empty(content: Sequence[Path]) -> bool:
+    return not content or any(path.name == "metadata.yaml" for path in content)
