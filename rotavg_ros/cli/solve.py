@@ -16,8 +16,9 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -66,37 +67,49 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve every graph; a bad one does not keep the others from being solved."""
-    jobs = plan(arguments.graphs, arguments.output)
-    options = {"method": arguments.method, "device": arguments.device, "refinement_steps": arguments.refine}
     errors: list[UserError] = []
-    warm = False
-    for job in jobs:
+    for job in plan(arguments.graphs, arguments.output):
         try:
-            start = time.perf_counter()
-            with working(f"reading {job.graph}"):
-                graph_file = read_graph(job.graph)
-            read_seconds = time.perf_counter() - start
-            profile = arguments.profile
-            if not warm:
-                solve(_warm_up_graph(graph_file.graph), profile=profile, **options)
-                warm = True
-            with working(f"solving {job.graph}"):
-                start = time.perf_counter()
-                solution = solve(graph_file.graph, profile=profile, **options)
-                solve_seconds = time.perf_counter() - start
-            summary = summarize(job.graph, graph_file, solution, read_seconds, solve_seconds)
-            write_answer(job.output, graph_file, solution, summary, arguments.edges)
-        except UserError as error:
-            errors.append(error)
+            summary = solve_file(job, arguments)
+        except UserError as mistake:
+            errors.append(mistake)
         else:
             print(
                 f"{job.graph}: {summary['nodes']} nodes, {summary['edges']} edges, {summary['outliers']} outliers, "
-                f"{summary['components']} components, {solve_seconds:.2f} s → {job.output}",
+                f"{summary['components']} components, {summary['solve_seconds']:.2f} s → {job.output}",
                 flush=True,
             )
     for error in errors:
         print_error(error)
     return EXIT_USER_ERROR if errors else 0
+
+
+def solve_file(job: Job, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Read, solve and write one graph.
+
+    Returns:
+        The content of its ``summary.json``.
+    """
+    solve_graph = partial(
+        solve,
+        method=arguments.method,
+        profile=arguments.profile,
+        device=arguments.device,
+        refinement_steps=arguments.refine,
+    )
+    start = time.perf_counter()
+    with working(f"reading {job.graph}"):
+        graph_file = read_graph(job.graph)
+    read_seconds = time.perf_counter() - start
+    # One-time costs (loading weights, first kernels) are not the graph's.
+    solve_graph(_warm_up_graph(has_odometry=bool(graph_file.graph.is_odometry.any())))
+    start = time.perf_counter()
+    with working(f"solving {job.graph}"):
+        solution = solve_graph(graph_file.graph)
+    solve_seconds = time.perf_counter() - start
+    summary = summarize(job.graph, graph_file, solution, read_seconds, solve_seconds)
+    write_answer(job.output, graph_file, solution, summary, arguments.edges)
+    return summary
 
 
 def plan(graphs: list[Path], output: Path) -> list[Job]:
@@ -125,7 +138,7 @@ def plan(graphs: list[Path], output: Path) -> list[Job]:
 
 def summarize(
     path: Path, graph_file: GraphFile, solution: Solution, read_seconds: float, solve_seconds: float
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """The content of ``summary.json``."""
     return {
         "graph": str(path),
@@ -145,9 +158,7 @@ def summarize(
     }
 
 
-def write_answer(
-    output: Path, graph_file: GraphFile, solution: Solution, summary: dict[str, object], edges: str
-) -> None:
+def write_answer(output: Path, graph_file: GraphFile, solution: Solution, summary: dict[str, Any], edges: str) -> None:
     """Write all files under temporary names, then put them in place; an edges file of an older answer goes.
 
     Raises:
@@ -157,10 +168,11 @@ def write_answer(
         _ORIENTATIONS: lambda file: write_csv(file, _orientation_columns(graph_file, solution)),
     }
     columns = _edge_columns(graph_file, solution)
+    arrays: dict[str, Any] = {column.name: column.values for column in columns}
     if edges == "csv":
         writers[f"{_EDGES}.csv"] = lambda file: write_csv(file, columns)
     elif edges == "npz":
-        writers[f"{_EDGES}.npz"] = lambda file: np.savez(file, **{column.name: column.values for column in columns})
+        writers[f"{_EDGES}.npz"] = lambda file: np.savez(file, **arrays)
     writers[_SUMMARY] = lambda file: file.write((json.dumps(summary, indent=2) + "\n").encode())
     temporary = {name: output / f".{name}.{os.getpid()}.tmp" for name in writers}
     try:
@@ -197,12 +209,8 @@ def _edge_columns(graph_file: GraphFile, solution: Solution) -> list[Column]:
     ]
 
 
-def _warm_up_graph(like: ViewGraph) -> ViewGraph:
-    """A constant triangle, so that one-time costs (loading weights, first kernels) are not taken for solving.
-
-    It has odometry if ``like`` has, so that the same profile is chosen.
-    """
-    has_odometry = bool(like.is_odometry.any())
+def _warm_up_graph(*, has_odometry: bool) -> ViewGraph:
+    """A constant triangle, with odometry or without, so that ``--profile auto`` chooses as for the graph to come."""
     kind = [EdgeKind.ODOMETRY if has_odometry else EdgeKind.LOOP_CLOSURE] * 2 + [EdgeKind.LOOP_CLOSURE]
     return ViewGraph.create([0, 1, 0], [1, 2, 2], [[0.0, 0.0, 0.0, 1.0]] * 3, kind=kind)
 

@@ -23,30 +23,29 @@ def chain_poses(
     Returns:
         ``(N, 3)`` positions in the world frame, metres, and ``(N, 4)`` world-from-body orientations, w ≥ 0.
     """
-    parent, edge = _spanning_tree(graph)
-    chained = torch.from_numpy(edge >= 0)
-    edge_of_child = torch.from_numpy(np.maximum(edge, 0))
-    translation = torch.as_tensor(edge_translation, dtype=torch.float64).reshape(-1, 3)
-    rotation = identity(graph.num_nodes)
-    position = torch.zeros(graph.num_nodes, 3, dtype=torch.float64)
-    if graph.num_edges:
-        source_from_target = inverse(graph.target_from_source.cpu())[edge_of_child]
-        forward = (graph.source.cpu()[edge_of_child] == torch.from_numpy(parent))[:, None]
-        step = translation[edge_of_child]
-        step = torch.where(forward, step, -rotate(inverse(source_from_target), step))
-        turn = torch.where(forward, source_from_target, inverse(source_from_target))
-        position[chained], rotation[chained] = step[chained], turn[chained]
-    if body_from_world is not None:
-        known = inverse(torch.as_tensor(body_from_world, dtype=torch.float64))
-        position, rotation = rotate(known[parent], position), identity(graph.num_nodes)
-    # Every node's pose is relative to an ancestor twice as far away after each round, until that is the root.
-    ancestor = torch.from_numpy(parent)
+    parent, edge = (torch.from_numpy(array) for array in _spanning_tree(graph))
+    child = torch.nonzero(edge >= 0).squeeze(1)
+    edge = edge[child]
+    source_from_target = inverse(graph.target_from_source.cpu()[edge])
+    step = torch.as_tensor(edge_translation, dtype=torch.float64).reshape(-1, 3)[edge]
+    forward = (graph.target.cpu()[edge] == child)[:, None]
+    position, rotation = torch.zeros(graph.num_nodes, 3, dtype=torch.float64), identity(graph.num_nodes)
+    if body_from_world is None:
+        # Pose of every node in the frame of its parent.
+        rotation[child] = torch.where(forward, source_from_target, inverse(source_from_target))
+        position[child] = torch.where(forward, step, -rotate(inverse(source_from_target), step))
+    else:
+        # Position of every node relative to its parent, in the world frame.
+        world_from_body = inverse(torch.as_tensor(body_from_world, dtype=torch.float64))
+        step = rotate(world_from_body[graph.source.cpu()[edge]], step)
+        position[child] = torch.where(forward, step, -step)
+    # After each round a node's pose is relative to an ancestor twice as far up, until that is the root.
+    ancestor = parent
     while not torch.equal(ancestor, ancestor[ancestor]):
         position = position[ancestor] + rotate(rotation[ancestor], position)
         rotation = multiply(rotation[ancestor], rotation)
         ancestor = ancestor[ancestor]
-    world_from_body = canonical(rotation if body_from_world is None else known)
-    return position.numpy(), world_from_body.numpy()
+    return position.numpy(), canonical(rotation if body_from_world is None else world_from_body).numpy()
 
 
 def _spanning_tree(graph: ViewGraph) -> tuple[np.ndarray, np.ndarray]:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros.datasets.dead_reckoning import chain_poses
 from rotavg_ros.datasets.graph_file import GraphFile, GraphFileError, writing
+from rotavg_ros.datasets.planar import heading_of_quaternion, quaternion_of_heading
 from rotavg_ros.datasets.text_rows import Row, parse_rows, read_blocks, shown, unit_quaternions, write_rows
 from rotavg_ros.rotations import inverse
 from rotavg_ros.view_graph import EdgeKind
@@ -71,9 +72,9 @@ EDGE_TAGS = {
 VERTEX_TAGS = {b"VERTEX_SE2": 3, b"VERTEX2": 3, b"VERTEX_SE3:QUAT": 7, b"VERTEX3": 6}
 # What tells nothing about relative rotations between poses.
 SKIPPED_TAGS = frozenset(
-    b"FIX VERTEX_XY VERTEX_TRACKXYZ VERTEX_XYZ VERTEX_POINT_XYZ LANDMARK EDGE_SE2_XY EDGE_BEARING_SE2_XY EDGE_SE2_XY_CALIB "
-    b"EDGE_SE3_TRACKXYZ EDGE_SE3_XYZ EDGE_POINT_XYZ EDGE_XY EDGE_PRIOR_SE2 EDGE_PRIOR_SE2_XY EDGE_SE2_PRIOR "
-    b"EDGE_PRIOR_SE3 EDGE_SE3_PRIOR VERTEX_TAG ROBOTLASER1 RAWLASER1".split()
+    b"FIX LANDMARK VERTEX_XY VERTEX_XYZ VERTEX_TRACKXYZ VERTEX_POINT_XYZ VERTEX_TAG "
+    b"EDGE_XY EDGE_SE2_XY EDGE_SE2_XY_CALIB EDGE_BEARING_SE2_XY EDGE_SE3_XYZ EDGE_SE3_TRACKXYZ EDGE_POINT_XYZ "
+    b"EDGE_PRIOR_SE2 EDGE_PRIOR_SE2_XY EDGE_SE2_PRIOR EDGE_PRIOR_SE3 EDGE_SE3_PRIOR ROBOTLASER1 RAWLASER1".split()
 )
 
 
@@ -124,7 +125,7 @@ def read(path: Path) -> GraphFile:
         lone_ids=np.concatenate(lone_ids) if lone_ids else None,
         kind=np.where(consecutive, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE),
         precision=every.precision,
-        planar=all(part.planar for part in edges),
+        planar=every.planar,
         edge_translation=every.translation,
         skipped=dict(skipped),
     )
@@ -144,9 +145,15 @@ class _Edges:
     @classmethod
     def concatenate(cls, parts: list[_Edges]) -> _Edges:
         """All edges in the order of their lines."""
-        names = ("line", "ids", "source_from_target", "translation", "precision")
-        arrays = [np.concatenate([getattr(part, name) for part in parts]) for name in names]
-        return cls(*arrays, planar=all(part.planar for part in parts)).select(np.argsort(arrays[0]))
+        together = cls(
+            np.concatenate([part.line for part in parts]),
+            np.concatenate([part.ids for part in parts]),
+            np.concatenate([part.source_from_target for part in parts]),
+            np.concatenate([part.translation for part in parts]),
+            np.concatenate([part.precision for part in parts]),
+            planar=all(part.planar for part in parts),
+        )
+        return together.select(np.argsort(together.line))
 
     def select(self, rows: np.ndarray) -> _Edges:
         return _Edges(
@@ -164,13 +171,15 @@ def _parse_edges(path: Path, tag: EdgeTag, lines: list[int], rows: list[Row]) ->
     ids, numbers = parse_rows(path, lines, rows, 2, num_pose + tag.information)
     translation, rotation, information = np.split(numbers, [tag.translation, num_pose], axis=1)
     if tag.planar:
-        source_from_target = Rotation.from_rotvec(np.pad(rotation, ((0, 0), (2, 0)))).as_quat()
+        source_from_target = quaternion_of_heading(rotation[:, 0])
         translation = np.pad(translation, ((0, 0), (0, 1)))
     elif tag.rotation == 4:
         source_from_target = unit_quaternions(path, lines, rotation)
     else:
         source_from_target = Rotation.from_euler("xyz", rotation).as_quat()
-    return _Edges(np.array(lines), ids, source_from_target, translation, tag.precision(information), tag.planar)
+    with np.errstate(over="ignore"):  # absurdly large entries become inf, which counts as unknown
+        precision = tag.precision(information)
+    return _Edges(np.array(lines), ids, source_from_target, translation, precision, tag.planar)
 
 
 def _parse_vertices(path: Path, num_values: int, lines: list[int], rows: list[Row]) -> np.ndarray:
@@ -191,7 +200,7 @@ def write(path: Path, graph_file: GraphFile, body_from_world: np.ndarray | None 
         body_from_world: ``(N, 4)`` xyzw orientations of the vertices; default: those a breadth-first tree of
             the edges, odometry first, gives.
     """
-    graph, ids, planar = graph_file.graph, graph_file.node_ids, graph_file.planar
+    graph, ids = graph_file.graph, graph_file.node_ids
     translation = graph_file.edge_translation
     if translation is None:
         translation = np.zeros((graph.num_edges, 3))
@@ -200,9 +209,10 @@ def write(path: Path, graph_file: GraphFile, body_from_world: np.ndarray | None 
     precision = np.nan_to_num(graph.precision.cpu().numpy(), nan=1.0)
     ends = [ids[graph.source.cpu().numpy()], ids[graph.target.cpu().numpy()]]
     with writing(path) as temporary, temporary.open("w", encoding="ascii") as file:
-        if planar:
-            write_rows(file, f"VERTEX_SE2 %d{' %.15g' * 3}\n", [ids, positions[:, :2], _heading(world_from_body)])
-            columns = [*ends, translation[:, :2], _heading(source_from_target), precision]
+        if graph_file.planar:
+            vertices = [ids, positions[:, :2], heading_of_quaternion(world_from_body)]
+            write_rows(file, f"VERTEX_SE2 %d{' %.15g' * 3}\n", vertices)
+            columns = [*ends, translation[:, :2], heading_of_quaternion(source_from_target), precision]
             write_rows(file, f"EDGE_SE2 %d %d{' %.15g' * 3} 1 0 0 1 0 %.15g\n", columns)
         else:
             write_rows(file, f"VERTEX_SE3:QUAT %d{' %.15g' * 7}\n", [ids, positions, world_from_body])
@@ -221,8 +231,3 @@ def not_stored(graph_file: GraphFile) -> list[str]:
         "that precisions are unknown (written as 1)": bool(graph.precision.isnan().any()),
     }
     return [name for name, is_lost in lost.items() if is_lost] + graph_file.extras
-
-
-def _heading(quaternions: np.ndarray) -> np.ndarray:
-    """Angle about z in [-π, π] of ``(K, 4)`` planar rotations with w ≥ 0."""
-    return np.asarray(2 * np.arctan2(quaternions[:, 2], quaternions[:, 3]))

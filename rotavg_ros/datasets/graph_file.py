@@ -22,6 +22,8 @@ from rotavg_ros.view_graph import ViewGraph
 # Ids are non-negative so that they fit the unsigned 64-bit ids of the messages and of gtsam's keys.
 MAX_NODE_ID = np.iinfo(np.int64).max
 
+_NUMBER_STARTS = frozenset(bytes([character]) for character in b"0123456789+-.")
+
 # Format modules by suffix; imported when used, since they import this module.
 _FORMAT_OF_SUFFIX = {".g2o": "g2o", ".graph": "g2o", ".toro": "g2o", ".npz": "npz", ".txt": "onedsfm"}
 
@@ -129,7 +131,7 @@ def read_graph(path: str | Path) -> GraphFile:
         head = file.read(4096)
     if not head:
         raise GraphFileError.at(path, None, "the file is empty; expected a view-graph (g2o, EGs.txt or npz)")
-    return _format(_format_of_content(head)).read(path)  # type: ignore[no-any-return]
+    return _format(_format_of_content(path, head)).read(path)  # type: ignore[no-any-return]
 
 
 def write_graph(path: str | Path, graph_file: GraphFile) -> None:
@@ -156,11 +158,11 @@ def _format_of_suffix(path: Path) -> str:
     return name
 
 
-def _format_of_content(head: bytes) -> str:
-    if head.startswith(b"PK"):  # npz files are zip archives
+def _format_of_content(path: Path, head: bytes) -> str:
+    if head.startswith(b"PK") or path.suffix.lower() == ".npz":  # npz files are zip archives
         return "npz"
     first_line = next((line for line in head.splitlines() if line.strip() and not line.lstrip().startswith(b"#")), b"")
-    return "onedsfm" if first_line.lstrip()[:1].isdigit() else "g2o"
+    return "onedsfm" if first_line.lstrip()[:1] in _NUMBER_STARTS else "g2o"
 
 
 def _format(name: str) -> ModuleType:

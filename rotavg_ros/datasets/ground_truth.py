@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from rotavg_ros.datasets.graph_file import GraphFile, GraphFileError
+from rotavg_ros.datasets.planar import quaternion_of_heading
 from rotavg_ros.datasets.text_rows import parse_rows, read_blocks, refuse, shown, unit_quaternions
 from rotavg_ros.rotations import canonical, inverse
 
@@ -73,8 +73,7 @@ def attach_truth(graph_file: GraphFile, path: str | Path) -> GraphFile:
         nearest = _nearest(stamps, graph_file.stamps_ns)
         matched = np.abs(stamps[nearest] - graph_file.stamps_ns) <= MAX_STAMP_DISTANCE_NS
         x_y_heading = numbers[nearest[matched]]
-        heading = np.pad(x_y_heading[:, 2:], ((0, 0), (2, 0)))
-        body_from_world[matched] = _body_from_world(Rotation.from_rotvec(heading).as_quat())
+        body_from_world[matched] = _body_from_world(quaternion_of_heading(x_y_heading[:, 2]))
         position[matched] = np.pad(x_y_heading[:, :2], ((0, 0), (0, 1)))
         position_gt = position
     if not matched.any():

@@ -9,8 +9,10 @@ Other arrays are ignored.
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +34,8 @@ _SHAPES: dict[str, tuple[int, ...]] = {  # of one row
 }
 _REQUIRED = ("source", "target", "target_from_source")
 _INTEGER = ("source", "target", "kind", "node_ids", "stamps_ns")
+# Sine of half a tilt that is rounding.
+_PLANAR_TOLERANCE = 1e-9
 _PER_NODE = ("body_from_world_gt", "stamps_ns", "position_gt")
 
 
@@ -56,8 +60,9 @@ def read(path: Path) -> GraphFile:
     proper = source != target
     if not proper.any():
         raise GraphFileError.at(path, None, "no edges between nodes; there is nothing to solve")
-    if planar is None:
-        planar = bool((quaternions[:, :2] == 0).all())
+    turns_about_z = bool((np.abs(quaternions[:, :2]) <= _PLANAR_TOLERANCE).all())
+    if planar and not turns_about_z:
+        raise GraphFileError.at(path, None, "is declared planar, but has rotations that are not about z")
     graph_file = GraphFile.from_ids(
         source[proper],
         target[proper],
@@ -65,20 +70,22 @@ def read(path: Path) -> GraphFile:
         lone_ids=np.concatenate((source[~proper], arrays.get("node_ids", source[:0]))),
         kind=kind[proper],
         precision=arrays["precision"][proper] if "precision" in arrays else None,
-        planar=planar,
+        planar=turns_about_z if planar is None else planar,
         edge_translation=translation[proper] if translation is not None else None,
         skipped={} if proper.all() else {"self-edge": int((~proper).sum())},
     )
-    rows = {name: _rows_of_nodes(path, name, arrays, graph_file.node_ids) for name in _PER_NODE if name in arrays}
+    rows: dict[str, Any] = {
+        name: _rows_of_nodes(path, name, arrays, graph_file.node_ids) for name in _PER_NODE if name in arrays
+    }
     if "body_from_world_gt" in rows:
         rows["body_from_world_gt"] = _ground_truth(path, rows["body_from_world_gt"])
-    return replace(graph_file, **rows)  # type: ignore[arg-type]
+    return replace(graph_file, **rows)
 
 
 def write(path: Path, graph_file: GraphFile) -> None:
     """Write everything a :class:`GraphFile` holds, except what was skipped."""
     graph, ids = graph_file.graph, graph_file.node_ids
-    arrays = {
+    arrays: dict[str, Any] = {
         "source": ids[graph.source.cpu().numpy()],
         "target": ids[graph.target.cpu().numpy()],
         "target_from_source": graph.target_from_source.cpu().numpy(),
@@ -93,7 +100,7 @@ def write(path: Path, graph_file: GraphFile) -> None:
             arrays[name] = values
     # np.savez would append .npz to the temporary name, but not to an open file.
     with writing(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
+        np.savez(file, **arrays)
 
 
 def not_stored(graph_file: GraphFile) -> list[str]:
@@ -106,6 +113,9 @@ def _load(path: Path) -> tuple[dict[str, np.ndarray], bool | None]:
     with reading(path):
         file = path.open("rb")
     with file:
+        if not zipfile.is_zipfile(file):
+            raise GraphFileError.at(path, None, "not an npz archive, or a truncated one; write it with numpy.savez")
+        file.seek(0)
         try:
             with np.load(file, allow_pickle=False) as archive:
                 names = sorted(archive.files)
@@ -131,18 +141,18 @@ def _checked(path: Path, name: str, array: np.ndarray) -> np.ndarray:
         raise GraphFileError.at(path, None, f"{name} holds {array.dtype}; it must hold {needed}")
     if integer and array.dtype == np.uint64 and (array > np.iinfo(np.int64).max).any():
         raise GraphFileError.at(path, None, f"{name} holds a value above {np.iinfo(np.int64).max}, which is too large")
-    return array.astype(np.int64 if integer else np.float64)
+    return np.asarray(array, dtype=np.int64 if integer else np.float64)
 
 
 def _rows_of_nodes(path: Path, name: str, arrays: dict[str, np.ndarray], node_ids: np.ndarray) -> np.ndarray:
     """Rows ascending by id: of ``node_ids`` or of the ids that occur; or, if there are more rows, row = id."""
-    rows = arrays[name]
+    rows: np.ndarray = arrays[name]
     if "node_ids" in arrays and len(rows) == len(arrays["node_ids"]):
         rows = rows[np.argsort(arrays["node_ids"], kind="stable")]
     if len(rows) == len(node_ids):
         return rows
     if len(rows) > node_ids[-1]:
-        return rows[node_ids]
+        return np.asarray(rows[node_ids])
     what = f"{name} has {len(rows)} rows for {len(node_ids)} nodes; give one row per node, ascending by id"
     raise GraphFileError.at(path, None, what)
 

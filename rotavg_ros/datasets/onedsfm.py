@@ -30,9 +30,10 @@ def read(path: Path) -> GraphFile:
         lines, rows = [line for line, _ in block], [row for _, row in block]
         block_ids, block_numbers = parse_rows(path, lines, rows, 2, 12)
         matrix = block_numbers[:, :9].reshape(-1, 3, 3)
-        defect = np.abs(matrix @ matrix.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0)
-        not_rotation = (defect > _ORTHOGONALITY_TOLERANCE) | (np.linalg.det(matrix) < 0)
-        refuse(path, lines, not_rotation, "the nine numbers after the ids are not a rotation matrix")
+        with np.errstate(over="ignore", invalid="ignore"):
+            defect = np.abs(matrix @ matrix.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0)
+            is_rotation = (defect <= _ORTHOGONALITY_TOLERANCE) & (np.linalg.det(matrix) > 0)
+        refuse(path, lines, ~is_rotation, "the nine numbers after the ids are not a rotation matrix")
         ids.append(block_ids)
         numbers.append(block_numbers)
     all_ids, all_numbers = np.concatenate(ids or [np.empty((0, 2), np.int64)]), np.concatenate(numbers or [np.empty(0)])

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TextIO
 
 import numpy as np
+import numpy.typing as npt
 
 from rotavg_ros.datasets.graph_file import MAX_NODE_ID, GraphFileError, reading
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE
@@ -59,7 +60,8 @@ def parse_rows(path: Path, lines: list[int], rows: list[Row], num_ids: int, num_
 
 def unit_quaternions(path: Path, lines: list[int] | np.ndarray | None, quaternions: np.ndarray) -> np.ndarray:
     """``(K, 4)`` quaternions normalised, or a refusal that names the first one farther than 1e-3 from unit length."""
-    norm = np.linalg.norm(quaternions, axis=1)
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(quaternions, axis=1)
     not_unit = ~(np.abs(norm - 1) <= UNIT_NORM_TOLERANCE)
     where = int(np.argmax(not_unit)) if not_unit.any() else 0
     what = f"a quaternion of length {norm[where]:.6g}; it must be of unit length" if len(norm) else ""
@@ -67,8 +69,9 @@ def unit_quaternions(path: Path, lines: list[int] | np.ndarray | None, quaternio
     return np.asarray(quaternions / norm[:, None])
 
 
-def refuse(path: Path, lines: list[int] | np.ndarray | None, bad: np.ndarray, what: str) -> None:
+def refuse(path: Path, lines: list[int] | np.ndarray | None, bad: npt.ArrayLike, what: str) -> None:
     """Raise for the first row marked in ``bad``; ``lines`` are None where rows are edges of a binary file."""
+    bad = np.asarray(bad)
     if not bad.any():
         return
     row = int(np.argmax(bad))

@@ -1,0 +1,17 @@
+"""Rotations about z, as planar pose graphs and ground truth state them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def quaternion_of_heading(heading: np.ndarray) -> np.ndarray:
+    """``(K,)`` angles in radians to ``(K, 4)`` xyzw, for any finite angle."""
+    half = np.asarray(heading) / 2
+    zero = np.zeros_like(half)
+    return np.stack((zero, zero, np.sin(half), np.cos(half)), axis=-1)
+
+
+def heading_of_quaternion(quaternions: np.ndarray) -> np.ndarray:
+    """``(K, 4)`` rotations about z with w ≥ 0 to ``(K,)`` angles in [-π, π] radians."""
+    return np.asarray(2 * np.arctan2(quaternions[:, 2], quaternions[:, 3]))
