@@ -1,0 +1,318 @@
+"""The online estimator: odometry and edges in, ticks, answers out. The node and the offline replay share it whole."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.online import quaternion, state_file
+from rotavg_ros.online.answer import Answer
+from rotavg_ros.online.gauge import component_roots, extend_along_edges, fix_gauge, joins_components
+from rotavg_ros.online.graph_builder import GraphBuilder
+from rotavg_ros.online.growing_view_graph import GraphSnapshot
+from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS, EdgeMeasurement, RejectedInputError, RejectReason
+from rotavg_ros.online.options import EstimatorOptions
+from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.view_graph import EdgeLabel
+
+if TYPE_CHECKING:
+    from rotavg_ros.solver import Solution
+
+
+# The signature of :func:`rotavg_ros.solve`.
+Solver = Callable[..., "Solution"]
+
+
+@dataclass(frozen=True)
+class Counts:
+    """How large the estimator's state is, and what was refused so far.
+
+    Attributes:
+        keyframes, edges, pending: sizes now.
+        rejected: inputs refused, by :class:`RejectReason` value.
+    """
+
+    keyframes: int
+    edges: int
+    pending: int
+    rejected: dict[str, int]
+
+
+class OnlineEstimator:
+    """Thread-safe: inputs may come while another thread solves; they wait for microseconds only.
+
+    A tick solves from the previous answer while data flows (warm), and once more from scratch (cold) when the graph
+    has not changed since the tick before. So the last answer before silence is what ``rotavg solve`` says of the
+    same graph, and nothing is computed after it until something changes.
+    """
+
+    def __init__(self, options: EstimatorOptions | None = None, solver: Solver | None = None) -> None:
+        """Start empty.
+
+        Args:
+            options: default: the defaults.
+            solver: default: :func:`rotavg_ros.solve`.
+        """
+        self.options = options or EstimatorOptions()
+        self._solver = solver or _default_solver()
+        self._lock = threading.Lock()
+        self._tick_lock = threading.Lock()  # one tick at a time; taken before ``_lock``
+        self._paused = False
+        self._start_over(GraphBuilder(self.options), None, 0)
+
+    def _start_over(self, builder: GraphBuilder, answered: Tensor | None, version: int) -> None:
+        """Begin with this content; ``answered`` is the last answer's body_from_world ``(n, 4)``."""
+        self._builder = builder
+        self._answered = answered
+        self._answered_component: Tensor | None = None
+        self._answered_revision = 0
+        self._answer_was_cold = True
+        self._ticked_revision = 0
+        self._version = version
+        # Per robot: world_from_body = world_from_odometry ∘ odometry, as of its last corrected keyframe.
+        self._world_from_odometry: dict[str, Quaternion] = {}
+
+    def add_odometry(
+        self,
+        robot: str,
+        stamp_ns: int,
+        world_from_body: Sequence[float],
+        position: Sequence[float] | None = None,
+    ) -> RejectReason | None:
+        """Take an odometry message.
+
+        Args:
+            robot: whose.
+            stamp_ns: nanoseconds, ascending per robot.
+            world_from_body: xyzw, the body in the odometry's frame.
+            position: metres, for the keyframes' distance criterion.
+
+        Returns:
+            why it was refused and counted; None if it was taken.
+        """
+        with self._lock:
+            return self._builder.add_odometry(robot, stamp_ns, world_from_body, position)
+
+    def add_edge(self, edge: EdgeMeasurement) -> RejectReason | None:
+        """Take a measured edge; returns why it was refused and counted, None if it was taken or may wait."""
+        with self._lock:
+            return self._builder.add_edge(edge)
+
+    def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
+        """Accept or reject for good every edge with a sender's id, or hand it back; returns how many there are."""
+        with self._lock:
+            return self._builder.label_edge(source_robot, edge_id, label)
+
+    def current_orientation(self, robot: str) -> Quaternion | None:
+        """world_from_body now: the robot's last corrected keyframe, then odometry. None before its first odometry."""
+        with self._lock:
+            track = self._builder.tracks.get(robot)
+            if track is None or track.latest is None:
+                return None
+            return quaternion.normalize(quaternion.multiply(self._correction(robot), track.latest.world_from_body))
+
+    def world_from_odometry(self, robot: str) -> Quaternion | None:
+        """The correction of a robot's odometry frame (map from odom); None before its first odometry."""
+        with self._lock:
+            return self._correction(robot) if robot in self._builder.tracks else None
+
+    def counts(self) -> Counts:
+        """Sizes and refusals now."""
+        with self._lock:
+            builder = self._builder
+            return Counts(
+                builder.graph.num_keyframes, builder.graph.num_edges, len(builder.pending), dict(builder.rejected)
+            )
+
+    @property
+    def paused(self) -> bool:
+        return self._paused
+
+    def pause(self, paused: bool) -> None:
+        """While paused, inputs are taken as ever but ticks do nothing (a forced one does)."""
+        self._paused = paused
+
+    def reset(self) -> None:
+        """Forget everything, counters included. Answers go on counting up; a running tick is thrown away."""
+        with self._lock:
+            self._start_over(GraphBuilder(self.options), None, self._version)
+
+    def save(self, path: Path) -> None:
+        """Write everything into one file, whole or not at all.
+
+        Raises:
+            StateFileError: the file cannot be written.
+        """
+        with self._lock:
+            state = state_file.collect(self._builder, self._answered, self._version)
+        state_file.write(path, state)
+
+    def load(self, path: Path) -> None:
+        """Replace everything by a file's content.
+
+        Raises:
+            StateFileError: not a state file, or not a whole one. The old state is kept.
+        """
+        builder, answered, version = state_file.restore(state_file.read(path), self.options)
+        with self._lock:
+            self._start_over(builder, answered, max(version, self._version))
+            if answered is not None:
+                self._world_from_odometry = self._corrections(answered)
+
+    def tick(self, force_cold: bool = False) -> Answer | None:
+        """Solve, if there is anything new.
+
+        Args:
+            force_cold: from scratch, and even while paused.
+
+        Returns:
+            the new answer; None if the last one still stands.
+
+        Raises:
+            UserError: from the solver; the next tick tries again.
+        """
+        with self._tick_lock:
+            started = time.perf_counter()
+            with self._lock:
+                if self._paused and not force_cold:
+                    return None
+                builder, answered, answered_component = self._builder, self._answered, self._answered_component
+                idle = builder.graph.revision == self._ticked_revision
+                if idle or force_cold:
+                    builder.settle()
+                unchanged = builder.graph.revision == self._answered_revision
+                if unchanged and self._answer_was_cold:
+                    return None
+                snapshot = builder.graph.snapshot()
+                self._ticked_revision = snapshot.revision
+            cold = force_cold or idle or answered is None or not self.options.warm_start
+            warm_start = None
+            if not cold and answered is not None:
+                joined = answered_component is None or joins_components(answered_component, snapshot.graph.components())
+                warm_start = None if joined else extend_along_edges(answered, snapshot.graph)
+                cold = joined
+            solution = self._solver(
+                snapshot.graph,
+                method=self.options.method,
+                profile=self.options.profile,
+                device=self.options.device,
+                refinement_steps=self.options.refinement_steps,
+                warm_start=warm_start,
+            )
+            component = solution.component.cpu()
+            with self._lock:
+                roots = self._root_orientations(builder, component, answered)
+            body_from_world = fix_gauge(solution.body_from_world.cpu(), component, roots)
+            with self._lock:
+                if builder is not self._builder:
+                    return None  # reset or loaded meanwhile
+                self._answered, self._answered_component = body_from_world, component
+                self._answered_revision, self._answer_was_cold = snapshot.revision, cold
+                self._version += 1
+                version = self._version
+                self._world_from_odometry = self._corrections(body_from_world)
+            seconds = time.perf_counter() - started
+            return self._answer(snapshot, solution, body_from_world, component, version, cold, seconds)
+
+    def _answer(
+        self,
+        snapshot: GraphSnapshot,
+        solution: Solution,
+        body_from_world: Tensor,
+        component: Tensor,
+        version: int,
+        cold: bool,
+        seconds: float,
+    ) -> Answer:
+        graph = snapshot.graph
+        score = solution.outlier_score.cpu()
+        score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, score)
+        score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
+        return Answer(
+            version=version,
+            robots=snapshot.robots,
+            keyframe_robot=snapshot.keyframe_robot,
+            keyframe_id=snapshot.keyframe_id,
+            stamp_ns=snapshot.stamp_ns,
+            world_from_body=rotations.canonical(rotations.inverse(body_from_world)).numpy(),
+            component=component.numpy(),
+            uncertainty=solution.uncertainty.cpu().numpy(),
+            edge_id=snapshot.edge_id,
+            source=graph.source.numpy(),
+            target=graph.target.numpy(),
+            kind=graph.kind.numpy(),
+            outlier_score=score.numpy(),
+            outlier=(score > self.options.outlier_threshold).numpy(),
+            was_cold=cold,
+            seconds=seconds,
+            stage_seconds=dict(solution.stage_seconds),
+            method=solution.method,
+            profile=solution.profile,
+            device=solution.device,
+        )
+
+    def _root_orientations(self, builder: GraphBuilder, component: Tensor, answered: Tensor | None) -> Tensor:
+        """body_from_world that the first keyframe of every component keeps, ``(C, 4)``.
+
+        A keyframe that an earlier answer placed stays where it was: so a component keeps its gauge, the older of two
+        that join imposes its own, and what splits off (a rejected edge) stays put as well.
+        """
+        known = 0 if answered is None else len(answered)
+        orientations: list[Sequence[float]] = []
+        for root in component_roots(component).tolist():
+            if answered is not None and root < known:
+                orientations.append(answered[root].tolist())
+            else:
+                orientations.append(quaternion.inverse(self._initial_world_from_body(builder, root)))
+        return torch.tensor(orientations, dtype=torch.float64)
+
+    def _initial_world_from_body(self, builder: GraphBuilder, node: int) -> Quaternion:
+        """Where a component's first keyframe begins."""
+        stamp_ns = builder.graph.stamp_of(node)
+        track = builder.tracks.get(builder.graph.robot_of(node))
+        if self.options.gauge == "odometry" and track is not None and stamp_ns != UNKNOWN_STAMP_NS:
+            try:
+                return track.world_from_body_at(stamp_ns)
+            except RejectedInputError:
+                pass  # the odometry does not cover the keyframe: identity is as good as anything
+        return quaternion.IDENTITY
+
+    def _correction(self, robot: str) -> Quaternion:
+        """world_from_odometry; before the robot's first answer, what makes its first odometry fit the gauge."""
+        if robot in self._world_from_odometry:
+            return self._world_from_odometry[robot]
+        return (
+            quaternion.IDENTITY
+            if self.options.gauge == "odometry"
+            else self._builder.tracks[robot].first_body_from_world()
+        )
+
+    def _corrections(self, body_from_world: Tensor) -> dict[str, Quaternion]:
+        """world_from_odometry of every robot, from its newest keyframe that is in the answer and has odometry."""
+        corrections = {}
+        for robot, track in self._builder.tracks.items():
+            for node in self._builder.graph.nodes_newest_first(robot):
+                if node >= len(body_from_world):
+                    continue
+                try:
+                    odometry = track.world_from_body_at(self._builder.graph.stamp_of(node))
+                except RejectedInputError:
+                    continue
+                x, y, z, w = body_from_world[node].tolist()
+                corrections[robot] = quaternion.inverse(quaternion.multiply(odometry, (x, y, z, w)))
+                break
+        return corrections
+
+
+def _default_solver() -> Solver:
+    from rotavg_ros.solver import solve  # loads the networks: not before somebody solves
+
+    return solve

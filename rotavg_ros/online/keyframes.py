@@ -1,0 +1,205 @@
+"""A robot's odometry: which messages become keyframes, and its rotation at any moment in between."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rotavg_ros.online import quaternion
+from rotavg_ros.online.growing_view_graph import GrowingArray
+from rotavg_ros.online.measurements import RejectedInputError, RejectReason, checked_rotation, checked_stamp
+from rotavg_ros.online.quaternion import Quaternion
+
+Position = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class KeyframePolicy:
+    """When the odometry has moved far enough since the last keyframe.
+
+    A threshold ≤ 0 switches its criterion off; with all of them off every message is a keyframe.
+
+    Attributes:
+        angle: radians.
+        distance: metres; counts only while the odometry carries positions.
+        interval_ns: nanoseconds.
+    """
+
+    angle: float
+    distance: float
+    interval_ns: int
+
+    def reached(self, angle: float, distance: float, elapsed_ns: int) -> bool:
+        if self.angle <= 0 and self.distance <= 0 and self.interval_ns <= 0:
+            return True
+        return (0 < self.angle <= angle) or (0 < self.distance <= distance) or (0 < self.interval_ns <= elapsed_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class OdometrySample:
+    """One odometry message: the body's pose in the odometry's frame at a stamp."""
+
+    stamp_ns: int
+    world_from_body: Quaternion
+    position: Position | None
+
+
+@dataclass(frozen=True)
+class OdometryBounds:
+    """How far the odometry may be stretched when a moment between its messages is asked for.
+
+    Attributes:
+        tolerance_ns: a stamp this far before the first or after the last message takes that message's rotation.
+        max_gap_ns: between two messages farther apart than this nothing is interpolated.
+        max_samples: beyond it, the older half gives up every second message that is not a keyframe.
+    """
+
+    tolerance_ns: int
+    max_gap_ns: int
+    max_samples: int
+
+
+class OdometryTrack:
+    """The odometry messages of one robot in ascending order of their stamps."""
+
+    def __init__(self, bounds: OdometryBounds) -> None:
+        self._bounds = bounds
+        self._limit = bounds.max_samples
+        self._stamp_ns = GrowingArray(np.int64)
+        self._world_from_body = GrowingArray(np.float64, width=4)
+        self._is_keyframe = GrowingArray(np.bool_)
+        self.latest: OdometrySample | None = None
+        self.last_keyframe: OdometrySample | None = None
+        self.num_keyframes = 0
+
+    def add(self, stamp_ns: int, world_from_body: Sequence[float], position: Sequence[float] | None) -> OdometrySample:
+        """Append a message.
+
+        Args:
+            stamp_ns: its stamp.
+            world_from_body: xyzw.
+            position: metres, or None; one that is not finite counts as None.
+
+        Raises:
+            RejectedInputError: a stamp not after the last one, or a rotation that is none.
+        """
+        stamp_ns = checked_stamp(stamp_ns)
+        rotation = checked_rotation(world_from_body)
+        if self.latest is not None and stamp_ns <= self.latest.stamp_ns:
+            repeated = stamp_ns == self.latest.stamp_ns
+            raise RejectedInputError(RejectReason.REPEATED_STAMP if repeated else RejectReason.OUT_OF_ORDER_ODOMETRY)
+        if position is not None:
+            x, y, z = position
+            position = (x, y, z) if math.isfinite(x + y + z) else None
+        if len(self._stamp_ns) >= self._limit:
+            self._thin_out()
+        self.latest = OdometrySample(stamp_ns, rotation, position)
+        self._stamp_ns.append(stamp_ns)
+        self._world_from_body.append(rotation)
+        self._is_keyframe.append(False)
+        return self.latest
+
+    def reached(self, policy: KeyframePolicy) -> bool:
+        """Whether the latest message is far enough from the last keyframe to become one."""
+        sample, keyframe = self.latest, self.last_keyframe
+        if sample is None or keyframe is None:
+            return sample is not None
+        distance = 0.0
+        if sample.position is not None and keyframe.position is not None:
+            distance = math.dist(sample.position, keyframe.position)
+        angle = quaternion.angle_between(keyframe.world_from_body, sample.world_from_body)
+        return policy.reached(angle, distance, sample.stamp_ns - keyframe.stamp_ns)
+
+    def mark_keyframe(self) -> None:
+        """Make the latest message the last keyframe."""
+        self._is_keyframe.view[-1] = True
+        self.last_keyframe = self.latest
+        self.num_keyframes += 1
+
+    def reaches(self, stamp_ns: int) -> bool:
+        """Whether the odometry has come as far as the stamp."""
+        return self.latest is not None and self.latest.stamp_ns >= stamp_ns
+
+    def within_tolerance(self, stamp_ns: int) -> bool:
+        """Whether the stamp is at most the tolerance ahead of the odometry."""
+        return self.reaches(stamp_ns - self._bounds.tolerance_ns)
+
+    def world_from_body_at(self, stamp_ns: int) -> Quaternion:
+        """The odometry's rotation at a moment: interpolated between two messages, clamped just outside of them.
+
+        Raises:
+            RejectedInputError: the stamp is outside the odometry by more than the tolerance, or inside a gap.
+        """
+        stamps = self._stamp_ns.view
+        after = int(np.searchsorted(stamps, stamp_ns))
+        tolerance = self._bounds.tolerance_ns
+        if after < len(stamps) and stamps[after] == stamp_ns:
+            return self._rotation(after)
+        until_next = int(stamps[after]) - stamp_ns if after < len(stamps) else None
+        since_last = stamp_ns - int(stamps[after - 1]) if after > 0 else None
+        if until_next is None or since_last is None:
+            if until_next is not None and until_next <= tolerance:
+                return self._rotation(0)
+            if since_last is not None and since_last <= tolerance:
+                return self._rotation(after - 1)
+            raise RejectedInputError(RejectReason.STAMP_OUT_OF_RANGE)
+        gap = since_last + until_next
+        if gap > self._bounds.max_gap_ns:
+            if min(since_last, until_next) > tolerance:
+                raise RejectedInputError(RejectReason.ODOMETRY_GAP)
+            return self._rotation(after if until_next < since_last else after - 1)
+        return quaternion.slerp(self._rotation(after - 1), self._rotation(after), since_last / gap)
+
+    def first_body_from_world(self) -> Quaternion:
+        """Inverse of the first message's rotation."""
+        return quaternion.inverse(self._rotation(0))
+
+    def _rotation(self, index: int) -> Quaternion:
+        x, y, z, w = self._world_from_body.view[index].tolist()
+        return (x, y, z, w)
+
+    def _thin_out(self) -> None:
+        size = len(self._stamp_ns)
+        keep = self._is_keyframe.view | (np.arange(size) % 2 == 0) | (np.arange(size) >= size // 2)
+        for name in ("_stamp_ns", "_world_from_body", "_is_keyframe"):
+            column = getattr(self, name)
+            thinned = GrowingArray(column.view.dtype, *column.view.shape[1:])
+            thinned.extend(column.view[keep])
+            setattr(self, name, thinned)
+        # Where keyframes fill the room the limit yields; a quarter of it at least lies between two thinnings.
+        self._limit = max(self._bounds.max_samples, int(keep.sum()) + self._bounds.max_samples // 4 + 1)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The messages as arrays, for :meth:`from_arrays`."""
+        positions = [sample.position or (math.nan,) * 3 for sample in (self.latest, self.last_keyframe) if sample]
+        return {
+            "stamp_ns": self._stamp_ns.view,
+            "world_from_body": self._world_from_body.view,
+            "is_keyframe": self._is_keyframe.view.copy(),
+            "positions": np.array(positions).reshape(-1, 3),
+            "num_keyframes": np.array(self.num_keyframes),
+        }
+
+    @classmethod
+    def from_arrays(cls, bounds: OdometryBounds, arrays: dict[str, np.ndarray]) -> OdometryTrack:
+        """The track that :meth:`arrays` came from."""
+        track = cls(bounds)
+        track._stamp_ns.extend(arrays["stamp_ns"])
+        track._world_from_body.extend(arrays["world_from_body"])
+        track._is_keyframe.extend(arrays["is_keyframe"])
+        track.num_keyframes = int(arrays["num_keyframes"])
+        positions = iter(arrays["positions"].tolist())
+        keyframes = np.flatnonzero(arrays["is_keyframe"])
+        if len(track._stamp_ns):
+            track.latest = track._sample(len(track._stamp_ns) - 1, next(positions))
+        if len(keyframes):
+            track.last_keyframe = track._sample(int(keyframes[-1]), next(positions))
+        return track
+
+    def _sample(self, index: int, position: list[float]) -> OdometrySample:
+        x, y, z = position
+        known = (x, y, z) if math.isfinite(x) else None
+        return OdometrySample(int(self._stamp_ns.view[index]), self._rotation(index), known)

@@ -1,0 +1,152 @@
+"""What comes in from outside, and why it may be refused."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+from rotavg_ros.online import quaternion
+from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind
+
+MAX_ID = 2**64 - 1
+# The id of an edge that the estimator itself makes between consecutive keyframes of an odometry.
+OWN_EDGE_ID = MAX_ID
+# Stamps are signed 64-bit nanoseconds; negative ones are free to mean "unknown".
+MAX_STAMP_NS = 2**63 - 1
+UNKNOWN_STAMP_NS = -1
+
+
+class RejectReason(str, Enum):
+    """Why an input changed nothing. Every refused input is counted under exactly one of these."""
+
+    NAN_ROTATION = "nan_rotation"
+    ZERO_QUATERNION = "zero_quaternion"
+    UNNORMALIZED_QUATERNION = "unnormalized_quaternion"
+    SELF_EDGE = "self_edge"
+    UNKNOWN_KEYFRAME = "unknown_keyframe"
+    STAMP_OUT_OF_RANGE = "stamp_out_of_range"
+    ODOMETRY_GAP = "odometry_gap"
+    BAD_STAMP = "bad_stamp"
+    OUT_OF_ORDER_ODOMETRY = "out_of_order_odometry"
+    REPEATED_STAMP = "repeated_stamp"
+    ID_OUT_OF_RANGE = "id_out_of_range"
+    BAD_KIND = "bad_kind"
+    BAD_PRECISION = "bad_precision"
+    BAD_REFERENCE = "bad_reference"
+    DUPLICATE_EDGE = "duplicate_edge"
+    PENDING_OVERFLOW = "pending_overflow"
+    PENDING_TIMEOUT = "pending_timeout"
+
+
+class RejectedInputError(Exception):
+    """An input is refused; it must have changed nothing."""
+
+    def __init__(self, reason: RejectReason) -> None:
+        super().__init__(reason.value)
+        self.reason = reason
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeReference:
+    """One end of an edge: a keyframe's id, or a moment of a robot.
+
+    Attributes:
+        robot: the robot's name.
+        keyframe_id: decides when given; ``stamp_ns`` is then the keyframe's stamp, for information.
+        stamp_ns: nanoseconds in the robot's (or the bag's) clock; alone it means "the body at this moment".
+    """
+
+    robot: str
+    keyframe_id: int | None = None
+    stamp_ns: int | None = None
+
+    @property
+    def key(self) -> tuple[str, bool, int | None]:
+        """What decides which keyframe is meant: equal for equal ends."""
+        by_id = self.keyframe_id is not None
+        return (self.robot, by_id, self.keyframe_id if by_id else self.stamp_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeMeasurement:
+    """A measured relative rotation as a front end sends it.
+
+    Attributes:
+        edge_id: the sender's, echoed with the flags; 0 … 2⁶⁴-1.
+        source, target: the ends.
+        target_from_source: xyzw, ``R_target R_source⁻¹`` of the body-from-world orientations.
+        kind: an :class:`EdgeKind` value.
+        precision: rad⁻²; 0 is unknown; negative or not finite refuses the edge (a sender that gets its own
+            covariance wrong is not to be trusted with the rotation).
+    """
+
+    edge_id: int
+    source: KeyframeReference
+    target: KeyframeReference
+    target_from_source: Sequence[float]
+    kind: int = EdgeKind.LOOP_CLOSURE
+    precision: float = 0.0
+
+    def fingerprint(self) -> int:
+        """64 bits that agree for a retransmission (same id, ends and rotation) and for nothing else in practice."""
+        ends = repr((self.source.key, self.target.key)).encode("utf-8", "surrogatepass")
+        numbers = struct.pack("<Q4d", self.edge_id, *self.target_from_source)
+        return int.from_bytes(hashlib.blake2b(numbers + ends, digest_size=8).digest(), "little")
+
+
+def checked_rotation(xyzw: Sequence[float]) -> Quaternion:
+    """The unit quaternion with w ≥ 0, from one within 1e-3 of unit length.
+
+    Raises:
+        RejectedInputError: not finite, zero, or far from unit length.
+    """
+    length = quaternion.norm(xyzw)
+    if not math.isfinite(length):
+        raise RejectedInputError(RejectReason.NAN_ROTATION)
+    if abs(length - 1) > UNIT_NORM_TOLERANCE:
+        zero = length < UNIT_NORM_TOLERANCE
+        raise RejectedInputError(RejectReason.ZERO_QUATERNION if zero else RejectReason.UNNORMALIZED_QUATERNION)
+    return quaternion.normalize(xyzw)
+
+
+def checked_stamp(stamp_ns: int) -> int:
+    """The stamp, if it is one.
+
+    Raises:
+        RejectedInputError: negative or beyond 64 bits.
+    """
+    if not 0 <= stamp_ns <= MAX_STAMP_NS:
+        raise RejectedInputError(RejectReason.BAD_STAMP)
+    return stamp_ns
+
+
+def check_edge(edge: EdgeMeasurement) -> Quaternion:
+    """Everything about an edge that can be judged without knowing the graph.
+
+    Returns:
+        ``edge.target_from_source`` normalised.
+
+    Raises:
+        RejectedInputError: with the first reason that applies.
+    """
+    if edge.kind not in (EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE):
+        raise RejectedInputError(RejectReason.BAD_KIND)
+    if not (math.isfinite(edge.precision) and edge.precision >= 0):
+        raise RejectedInputError(RejectReason.BAD_PRECISION)
+    for reference in (edge.source, edge.target):
+        if reference.keyframe_id is None and reference.stamp_ns is None:
+            raise RejectedInputError(RejectReason.BAD_REFERENCE)
+        if reference.keyframe_id is not None and not 0 <= reference.keyframe_id <= MAX_ID:
+            raise RejectedInputError(RejectReason.ID_OUT_OF_RANGE)
+        if reference.stamp_ns is not None:
+            checked_stamp(reference.stamp_ns)
+    if not 0 <= edge.edge_id <= MAX_ID:
+        raise RejectedInputError(RejectReason.ID_OUT_OF_RANGE)
+    if edge.source.key == edge.target.key:
+        raise RejectedInputError(RejectReason.SELF_EDGE)
+    return checked_rotation(edge.target_from_source)

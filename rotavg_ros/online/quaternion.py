@@ -1,0 +1,67 @@
+"""Quaternion algebra on plain tuples, for the path that runs once per message.
+
+Same conventions as :mod:`rotavg_ros.rotations` (xyzw, ``multiply(a, b)`` rotates by ``b`` first), but a product costs
+about a microsecond instead of the hundred that a torch tensor of four numbers takes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+Quaternion = tuple[float, float, float, float]
+
+IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Hamilton product ``a ∘ b``."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def inverse(a: Quaternion) -> Quaternion:
+    """Inverse of a unit quaternion."""
+    x, y, z, w = a
+    return (-x, -y, -z, w)
+
+
+def norm(a: Sequence[float]) -> float:
+    """Euclidean length; NaN or infinite where a component is."""
+    x, y, z, w = a
+    return math.sqrt(x * x + y * y + z * z + w * w)
+
+
+def normalize(a: Sequence[float]) -> Quaternion:
+    """Unit quaternion with w ≥ 0. The input must not be zero."""
+    x, y, z, w = a
+    scale = math.copysign(1 / norm(a), w)
+    return (x * scale, y * scale, z * scale, w * scale)
+
+
+def angle(a: Quaternion) -> float:
+    """Rotation angle of a unit quaternion in radians, in [0, π]."""
+    x, y, z, w = a
+    return 2 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
+
+
+def angle_between(a: Quaternion, b: Quaternion) -> float:
+    """Geodesic distance of two rotations in radians, in [0, π]."""
+    return angle(multiply(inverse(a), b))
+
+
+def slerp(start: Quaternion, end: Quaternion, fraction: float) -> Quaternion:
+    """Rotation at ``fraction`` of the shortest way from ``start`` to ``end``."""
+    x, y, z, w = normalize(multiply(inverse(start), end))
+    sine = math.sqrt(x * x + y * y + z * z)
+    if sine == 0.0:
+        return start
+    half_angle = math.atan2(sine, w) * fraction
+    scale = math.sin(half_angle) / sine
+    return normalize(multiply(start, (x * scale, y * scale, z * scale, math.cos(half_angle))))
