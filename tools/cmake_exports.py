@@ -18,7 +18,7 @@ _PYTHON_INCLUDE = re.compile(_CONTAINER + r"/include/python3\.\d+t?")
 def repair_cmake_exports(prefix: Path, python_include: Path, numpy_include: Path) -> int:
     """Point the exported targets below `prefix`/share at this interpreter's include folders.
 
-    Changes only files that name the container, so that a second call changes nothing. Returns the number of files changed.
+    Only files that name the container are changed, so that a second call changes nothing. Returns their number.
     """
     changed = 0
     for export in sorted(prefix.glob("share/*/cmake/*.cmake")):

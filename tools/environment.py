@@ -88,11 +88,8 @@ def create_venv() -> None:
     if not (VENV / "bin" / "python").exists():
         say(f"creating {VENV.name} with Python {platform.python_version()}")
         run([sys.executable, "-m", "venv", VENV])
-    answer = subprocess.run(
-        [VENV / "bin" / "python", "-c", "import pip, sys; print(sys.prefix)"], capture_output=True, text=True, check=False
-    )
-    if answer.returncode != 0 or Path(answer.stdout.strip()) != VENV:
-        raise SetupError(f"{VENV} is broken or was made elsewhere (environments cannot be moved); delete it and call again")
+    if ask_venv("import pip, sys; print(sys.prefix)") != [str(VENV)]:
+        raise SetupError(f"{VENV} is broken or was moved, which environments do not survive; delete it and call again")
     STATE.mkdir(exist_ok=True)
 
 
@@ -103,9 +100,9 @@ def install_requirements() -> bool:
             say("installing the pinned requirements (some minutes and 2 GB the first time)")
             files = [argument for file in REQUIREMENTS for argument in ("--requirement", file)]
             pip("install", "--constraint", CONSTRAINTS, *files)
-            includes = "import numpy, sysconfig; print(sysconfig.get_paths()['include']); print(numpy.get_include())"
-            answer = subprocess.run([VENV / "bin" / "python", "-c", includes], capture_output=True, text=True, check=True)
-            repair_cmake_exports(VENV, *map(Path, answer.stdout.split("\n")[:2]))
+            python_include = ask_venv("import sysconfig; print(sysconfig.get_paths()['include'])")[0]
+            numpy_include = ask_venv("import numpy; print(numpy.get_include())")[0]
+            repair_cmake_exports(VENV, Path(python_include), Path(numpy_include))
     return stale
 
 
@@ -121,7 +118,7 @@ def build_workspace() -> bool:
             check_package_types()
             colcon(
                 *("build", "--base-paths", ".", "msg_defs", "--symlink-install"),
-                *("--event-handlers", "console_cohesion-", "desktop_notification-"),
+                *("--event-handlers", "desktop_notification-"),
                 *("--cmake-args", f"-DPython3_EXECUTABLE={VENV}/bin/python", "-DBUILD_TESTING=OFF"),
                 *("-DCMAKE_BUILD_TYPE=Release", "-Wno-unused-cli"),
             )
@@ -147,7 +144,7 @@ def install_package() -> bool:
             pip("install", "--no-deps", "--no-build-isolation", "--editable", ROOT)
             site_packages = next(VENV.glob("lib/python3.*/site-packages"))
             shutil.copyfile(hook, site_packages / "rotavg_workspace.py")
-            # The underscore sorts it before the ROS wheels' own hook, which restarts Python with the library path set here.
+            # The underscore sorts it before the ROS wheels' hook, which restarts Python with the library path set here.
             (site_packages / "_rotavg_workspace.pth").write_text(
                 "import rotavg_workspace; rotavg_workspace.activate_this_process()\n"
             )
@@ -157,14 +154,37 @@ def install_package() -> bool:
 # Tools
 
 
+def ask_venv(code: str) -> list[str]:
+    """The lines that a short program prints in the virtual environment; none if it fails."""
+    answer = subprocess.run([str(VENV / "bin" / "python"), "-c", code], capture_output=True, text=True, check=False)
+    return answer.stdout.splitlines()
+
+
 def pip(*arguments: str | Path) -> None:
+    """Run the environment's pip; a terminal shows in one line what it is at, an error brings all that it said."""
+    command = [VENV / "bin" / "python", "-m", "pip", "--disable-pip-version-check", *arguments]
     # No warnings: setuptools warns of every editable installation.
     environ = {**clean_environment(), "PYTHONWARNINGS": "ignore"}
-    run([VENV / "bin" / "python", "-m", "pip", "--disable-pip-version-check", *arguments, "--quiet"], environ)
+    said = []
+    process = subprocess.Popen(
+        command, cwd=ROOT, env=environ, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    assert process.stdout is not None
+    with process:
+        for line in process.stdout:
+            said.append(line)
+            if sys.stdout.isatty():
+                print(f"\r\033[K       {line.strip()[:70]}", end="", flush=True)
+    if sys.stdout.isatty():
+        print("\r\033[K", end="", flush=True)
+    if process.returncode != 0:
+        sys.stderr.writelines(said)
+        raise subprocess.CalledProcessError(process.returncode, ["pip", arguments[0]])
 
 
 def colcon(*arguments: str, output: bool = False) -> str:
-    command = [VENV / "bin" / "python", "-m", "colcon", "--log-base", "log", "--log-level", "error", *arguments]
+    command: list[str | Path] = [VENV / "bin" / "python", "-m", "colcon"]
+    command += ["--log-base", "log", "--log-level", "error", *arguments]
     return run(command, clean_environment(), output)
 
 

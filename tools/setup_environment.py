@@ -3,7 +3,8 @@
 Usage: python3 tools/setup_environment.py
 
 Every step is skipped when its inputs have not changed since it last succeeded, so a second call takes seconds and an
-interrupted one goes on where it stopped. This file stays free of new syntax, so that an old Python can still say what is wrong.
+interrupted one goes on where it stopped. This file stays free of new syntax, so that an old Python can still say what
+is wrong.
 """
 
 import sys
@@ -11,7 +12,7 @@ import sys
 SUPPORTED = ((3, 10), (3, 13))
 
 
-def main():
+def main() -> None:
     if not SUPPORTED[0] <= sys.version_info[:2] <= SUPPORTED[1]:
         sys.exit(
             "setup: error: Python {}.{} to {}.{} is needed, but {} is {}.{}; name another one with "

@@ -39,7 +39,7 @@ def activate(environment: Path, environ: MutableMapping[str, str], module_path: 
     if prepend(environ, "LD_LIBRARY_PATH", libraries):
         # The dynamic loader reads the variable once, when a process starts: have the wheels restart Python (again).
         environ.pop(_BOOTSTRAPPED, None)
-    for site_packages in install.glob(f"rotavg_msgs/lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages"):
+    for site_packages in install.glob(f"rotavg_msgs/lib/python3.{sys.version_info.minor}/site-packages"):
         if str(site_packages) not in module_path:
             module_path.append(str(site_packages))
 
