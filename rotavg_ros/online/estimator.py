@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,6 +22,7 @@ from rotavg_ros.online.growing_view_graph import GraphSnapshot
 from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS, EdgeMeasurement, RejectedInputError, RejectReason
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.online.trajectory import Trajectory, dead_reckoning
 from rotavg_ros.view_graph import EdgeLabel
 
 if TYPE_CHECKING:
@@ -106,6 +108,11 @@ class OnlineEstimator:
         with self._lock:
             return self._builder.add_edge(edge)
 
+    def reject(self, reason: RejectReason) -> None:
+        """Count an input that could not even be read as a measurement."""
+        with self._lock:
+            self._builder.rejected[reason.value] += 1
+
     def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
         """Accept or reject for good every edge with a sender's id, or hand it back; returns how many there are."""
         with self._lock:
@@ -131,6 +138,27 @@ class OnlineEstimator:
             return Counts(
                 builder.graph.num_keyframes, builder.graph.num_edges, len(builder.pending), dict(builder.rejected)
             )
+
+    def set_options(self, options: EstimatorOptions) -> None:
+        """Change the options; what was built so far stays, and the next tick solves anew."""
+        with self._lock:
+            self.options = options
+            self._builder.set_options(options)
+            self._answered_revision = -1
+
+    def trajectory(self, answer: Answer, robot: str) -> Trajectory | None:
+        """A robot's keyframes in the answer by time, positions by dead reckoning; None without odometry."""
+        with self._lock:
+            track = self._builder.tracks.get(robot)
+            if track is None or robot not in answer.robots:
+                return None
+            of_robot = answer.keyframe_robot == answer.robots.index(robot)
+            nodes = np.flatnonzero(of_robot & (answer.stamp_ns != UNKNOWN_STAMP_NS))
+            nodes = nodes[np.argsort(answer.stamp_ns[nodes], kind="stable")]
+            odometry_orientation, odometry_position = track.poses_at(answer.stamp_ns[nodes])
+        orientation = answer.world_from_body[nodes]
+        position = dead_reckoning(orientation, odometry_orientation, odometry_position)
+        return Trajectory(nodes, answer.stamp_ns[nodes], orientation, position)
 
     @property
     def paused(self) -> bool:

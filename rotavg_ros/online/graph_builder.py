@@ -60,6 +60,13 @@ class GraphBuilder:
         self.data_time_ns: int | None = None
         self._policy = options.keyframe_policy
 
+    def set_options(self, options: EstimatorOptions) -> None:
+        """Change what applies to inputs from now on: keyframe thresholds, tolerances, gaps."""
+        self.options = options
+        self._policy = options.keyframe_policy
+        for track in self.tracks.values():
+            track.bounds = options.odometry_bounds
+
     def add_odometry(
         self, robot: str, stamp_ns: int, world_from_body: Sequence[float], position: Sequence[float] | None
     ) -> RejectReason | None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.growing_view_graph import GrowingArray
@@ -14,6 +16,9 @@ from rotavg_ros.online.measurements import RejectedInputError, RejectReason, che
 from rotavg_ros.online.quaternion import Quaternion
 
 Position = tuple[float, float, float]
+
+_UNKNOWN_POSITION = (math.nan, math.nan, math.nan)
+_COLUMNS = ("stamp_ns", "world_from_body", "position", "is_keyframe")
 
 
 @dataclass(frozen=True)
@@ -66,10 +71,11 @@ class OdometryTrack:
     """The odometry messages of one robot in ascending order of their stamps."""
 
     def __init__(self, bounds: OdometryBounds) -> None:
-        self._bounds = bounds
+        self.bounds = bounds
         self._limit = bounds.max_samples
         self._stamp_ns = GrowingArray(np.int64)
         self._world_from_body = GrowingArray(np.float64, width=4)
+        self._position = GrowingArray(np.float64, width=3)
         self._is_keyframe = GrowingArray(np.bool_)
         self.latest: OdometrySample | None = None
         self.last_keyframe: OdometrySample | None = None
@@ -99,6 +105,7 @@ class OdometryTrack:
         self.latest = OdometrySample(stamp_ns, rotation, position)
         self._stamp_ns.append(stamp_ns)
         self._world_from_body.append(rotation)
+        self._position.append(_UNKNOWN_POSITION if position is None else position)
         self._is_keyframe.append(False)
         return self.latest
 
@@ -125,7 +132,7 @@ class OdometryTrack:
 
     def within_tolerance(self, stamp_ns: int) -> bool:
         """Whether the stamp is at most the tolerance ahead of the odometry."""
-        return self.reaches(stamp_ns - self._bounds.tolerance_ns)
+        return self.reaches(stamp_ns - self.bounds.tolerance_ns)
 
     def world_from_body_at(self, stamp_ns: int) -> Quaternion:
         """The odometry's rotation at a moment: interpolated between two messages, clamped just outside of them.
@@ -135,7 +142,7 @@ class OdometryTrack:
         """
         stamps = self._stamp_ns.view
         after = int(np.searchsorted(stamps, stamp_ns))
-        tolerance = self._bounds.tolerance_ns
+        tolerance = self.bounds.tolerance_ns
         if after < len(stamps) and stamps[after] == stamp_ns:
             return self._rotation(after)
         until_next = int(stamps[after]) - stamp_ns if after < len(stamps) else None
@@ -147,7 +154,7 @@ class OdometryTrack:
                 return self._rotation(after - 1)
             raise RejectedInputError(RejectReason.STAMP_OUT_OF_RANGE)
         gap = since_last + until_next
-        if gap > self._bounds.max_gap_ns:
+        if gap > self.bounds.max_gap_ns:
             if min(since_last, until_next) > tolerance:
                 raise RejectedInputError(RejectReason.ODOMETRY_GAP)
             return self._rotation(after if until_next < since_last else after - 1)
@@ -164,42 +171,43 @@ class OdometryTrack:
     def _thin_out(self) -> None:
         size = len(self._stamp_ns)
         keep = self._is_keyframe.view | (np.arange(size) % 2 == 0) | (np.arange(size) >= size // 2)
-        for name in ("_stamp_ns", "_world_from_body", "_is_keyframe"):
-            column = getattr(self, name)
+        for name in _COLUMNS:
+            column = getattr(self, f"_{name}")
             thinned = GrowingArray(column.view.dtype, *column.view.shape[1:])
             thinned.extend(column.view[keep])
-            setattr(self, name, thinned)
+            setattr(self, f"_{name}", thinned)
         # Where keyframes fill the room the limit yields; a quarter of it at least lies between two thinnings.
-        self._limit = max(self._bounds.max_samples, int(keep.sum()) + self._bounds.max_samples // 4 + 1)
+        self._limit = max(self.bounds.max_samples, int(keep.sum()) + self.bounds.max_samples // 4 + 1)
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def poses_at(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The messages at or next after the stamps ``(K,)``: world_from_body ``(K, 4)`` and position ``(K, 3)``.
+
+        Positions are NaN where the odometry carries none. There must be a message.
+        """
+        index = np.minimum(np.searchsorted(self._stamp_ns.view, stamp_ns), len(self._stamp_ns) - 1)
+        return self._world_from_body.view[index], self._position.view[index]
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
         """The messages as arrays, for :meth:`from_arrays`."""
-        positions = [sample.position or (math.nan,) * 3 for sample in (self.latest, self.last_keyframe) if sample]
-        return {
-            "stamp_ns": self._stamp_ns.view,
-            "world_from_body": self._world_from_body.view,
-            "is_keyframe": self._is_keyframe.view.copy(),
-            "positions": np.array(positions).reshape(-1, 3),
-            "num_keyframes": np.array(self.num_keyframes),
-        }
+        columns = {name: getattr(self, f"_{name}").view for name in _COLUMNS}
+        columns["is_keyframe"] = columns["is_keyframe"].copy()
+        return columns | {"num_keyframes": np.array(self.num_keyframes)}
 
     @classmethod
-    def from_arrays(cls, bounds: OdometryBounds, arrays: dict[str, np.ndarray]) -> OdometryTrack:
+    def from_arrays(cls, bounds: OdometryBounds, arrays: dict[str, NDArray[Any]]) -> OdometryTrack:
         """The track that :meth:`arrays` came from."""
         track = cls(bounds)
-        track._stamp_ns.extend(arrays["stamp_ns"])
-        track._world_from_body.extend(arrays["world_from_body"])
-        track._is_keyframe.extend(arrays["is_keyframe"])
+        for name in _COLUMNS:
+            getattr(track, f"_{name}").extend(arrays[name])
         track.num_keyframes = int(arrays["num_keyframes"])
-        positions = iter(arrays["positions"].tolist())
         keyframes = np.flatnonzero(arrays["is_keyframe"])
         if len(track._stamp_ns):
-            track.latest = track._sample(len(track._stamp_ns) - 1, next(positions))
+            track.latest = track._sample(-1)
         if len(keyframes):
-            track.last_keyframe = track._sample(int(keyframes[-1]), next(positions))
+            track.last_keyframe = track._sample(int(keyframes[-1]))
         return track
 
-    def _sample(self, index: int, position: list[float]) -> OdometrySample:
-        x, y, z = position
-        known = (x, y, z) if math.isfinite(x) else None
-        return OdometrySample(int(self._stamp_ns.view[index]), self._rotation(index), known)
+    def _sample(self, index: int) -> OdometrySample:
+        x, y, z = self._position.view[index].tolist()
+        position = (x, y, z) if math.isfinite(x) else None
+        return OdometrySample(int(self._stamp_ns.view[index]), self._rotation(index), position)
