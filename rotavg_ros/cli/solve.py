@@ -22,16 +22,15 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from rotavg_ros import Solution, ViewGraph, solve
 from rotavg_ros.cli.main import EXIT_USER_ERROR, print_error
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.csv_writer import Column, write_csv
 from rotavg_ros.datasets.graph_file import GraphFile, read_graph
 from rotavg_ros.errors import UserError
 from rotavg_ros.rotations import canonical, inverse
-from rotavg_ros.solver import METHODS
+from rotavg_ros.solver import DEVICES, METHODS, PROFILES, Solution, solve
 from rotavg_ros.version import __version__
-from rotavg_ros.view_graph import EdgeKind
+from rotavg_ros.view_graph import EdgeKind, ViewGraph
 
 OUTLIER_THRESHOLD = 0.5
 _ORIENTATIONS, _EDGES, _SUMMARY = "orientations.csv", "edges", "summary.json"
@@ -55,10 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("graphs", nargs="+", type=Path, metavar="GRAPH", help="view-graph file")
     parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for the answer")
     parser.add_argument("--method", default="neurora", metavar="NAME", help=f"{', '.join(METHODS)} (default: neurora)")
-    parser.add_argument(
-        "--profile", default="auto", choices=("auto", "slam", "sfm"), help="auto: slam if any edge is odometry"
-    )
-    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default: auto")
+    parser.add_argument("--profile", default="auto", choices=PROFILES, help="auto: slam if any edge is odometry")
+    parser.add_argument("--device", default="auto", choices=DEVICES, help="default: auto")
     parser.add_argument(
         "--refine", type=_step_count, metavar="N", help="at most N refinement steps; 0 skips (default: the method's)"
     )
@@ -67,10 +64,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve every graph; a bad one does not keep the others from being solved."""
+    jobs = plan(arguments.graphs, arguments.output)
+    solve_graph = partial(
+        solve,
+        method=arguments.method,
+        profile=arguments.profile,
+        device=arguments.device,
+        refinement_steps=arguments.refine,
+    )
+    # One-time costs (loading weights, first kernels) are not the graphs', and wrong options show before any work.
+    for has_odometry in (True, False):
+        solve_graph(_warm_up_graph(has_odometry))
     errors: list[UserError] = []
-    for job in plan(arguments.graphs, arguments.output):
+    for job in jobs:
         try:
-            summary = solve_file(job, arguments)
+            summary = solve_file(job, solve_graph, arguments.edges)
         except UserError as mistake:
             errors.append(mistake)
         else:
@@ -84,31 +92,22 @@ def run(arguments: argparse.Namespace) -> int:
     return EXIT_USER_ERROR if errors else 0
 
 
-def solve_file(job: Job, arguments: argparse.Namespace) -> dict[str, Any]:
+def solve_file(job: Job, solve_graph: Callable[[ViewGraph], Solution], edges: str) -> dict[str, Any]:
     """Read, solve and write one graph.
 
     Returns:
         The content of its ``summary.json``.
     """
-    solve_graph = partial(
-        solve,
-        method=arguments.method,
-        profile=arguments.profile,
-        device=arguments.device,
-        refinement_steps=arguments.refine,
-    )
     start = time.perf_counter()
     with working(f"reading {job.graph}"):
         graph_file = read_graph(job.graph)
     read_seconds = time.perf_counter() - start
-    # One-time costs (loading weights, first kernels) are not the graph's.
-    solve_graph(_warm_up_graph(has_odometry=bool(graph_file.graph.is_odometry.any())))
     start = time.perf_counter()
     with working(f"solving {job.graph}"):
         solution = solve_graph(graph_file.graph)
     solve_seconds = time.perf_counter() - start
     summary = summarize(job.graph, graph_file, solution, read_seconds, solve_seconds)
-    write_answer(job.output, graph_file, solution, summary, arguments.edges)
+    write_answer(job.output, graph_file, solution, summary, edges)
     return summary
 
 
@@ -119,10 +118,7 @@ def plan(graphs: list[Path], output: Path) -> list[Job]:
         SolveError: two graphs with one stem, an output folder that cannot be written, or a graph that an
             output would overwrite.
     """
-    if len(graphs) == 1:
-        jobs = [Job(graphs[0], output)]
-    else:
-        jobs = [Job(graph, output / graph.stem) for graph in graphs]
+    jobs = [Job(graph, output if len(graphs) == 1 else output / graph.stem) for graph in graphs]
     first_of: dict[Path, Path] = {}
     for job in jobs:
         other = first_of.setdefault(job.output, job.graph)
@@ -209,8 +205,8 @@ def _edge_columns(graph_file: GraphFile, solution: Solution) -> list[Column]:
     ]
 
 
-def _warm_up_graph(*, has_odometry: bool) -> ViewGraph:
-    """A constant triangle, with odometry or without, so that ``--profile auto`` chooses as for the graph to come."""
+def _warm_up_graph(has_odometry: bool) -> ViewGraph:
+    """A constant triangle that ``--profile auto`` takes for a SLAM graph or for an SfM graph."""
     kind = [EdgeKind.ODOMETRY if has_odometry else EdgeKind.LOOP_CLOSURE] * 2 + [EdgeKind.LOOP_CLOSURE]
     return ViewGraph.create([0, 1, 0], [1, 2, 2], [[0.0, 0.0, 0.0, 1.0]] * 3, kind=kind)
 

@@ -121,7 +121,7 @@ def _load(path: Path) -> tuple[dict[str, np.ndarray], bool | None]:
                 names = sorted(archive.files)
                 arrays = {name: archive[name] for name in _SHAPES if name in names}
                 planar = bool(archive["planar"]) if "planar" in names else None
-        except Exception as error:  # noqa: BLE001  a damaged archive can fail anywhere in zipfile, zlib or the array headers
+        except Exception as error:  # a damaged archive can fail anywhere in zipfile, zlib or the array headers
             reason = " ".join(str(error).split())[:120] or type(error).__name__
             raise GraphFileError.at(path, None, f"not a readable npz archive of plain arrays: {reason}") from None
     missing = [name for name in _REQUIRED if name not in arrays]

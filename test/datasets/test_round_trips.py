@@ -12,6 +12,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+
 from rotavg_ros import rotations
 from rotavg_ros.datasets import g2o
 from rotavg_ros.datasets.graph_file import MAX_NODE_ID, GraphFile, GraphFileError, not_stored, read_graph, write_graph

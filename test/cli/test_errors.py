@@ -1,0 +1,189 @@
+"""Whatever the user gets wrong: one line on stderr, exit code 2, no traceback, old outputs intact."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rotavg_ros.cli import main as main_module
+from rotavg_ros.cli.main import COMMANDS, main
+from rotavg_ros.datasets.graph_file import GraphFile, read_graph, write_graph
+from rotavg_ros.version import __version__
+
+EDGES = "".join(f"EDGE_SE2 {i} {i + 1} 1 0 0.1 1 0 0 1 0 100\n" for i in range(5))
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def graph_path(tmp_path: Path) -> Path:
+    path = tmp_path / "good.g2o"
+    path.write_text(EDGES)
+    return path
+
+
+def refused(capsys: pytest.CaptureFixture[str], *command: object) -> str:
+    """The one line that a refused command prints."""
+    assert main([str(word) for word in command]) == 2
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith("rotavg: error: ")
+    assert captured.out == ""
+    return lines[0].removeprefix("rotavg: error: ")
+
+
+def python(program: str, *words: object, stdout: int = subprocess.PIPE) -> subprocess.CompletedProcess[str]:
+    """A program in a process of its own that finds the package."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, "-B", "-c", program, *map(str, words)]
+    return subprocess.run(command, env=environment, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False)
+
+
+ROTAVG = "import sys; from rotavg_ros.cli.main import main; sys.exit(main())"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "required: COMMAND; see rotavg --help"),
+        (["frobnicate"], "invalid choice: 'frobnicate'"),
+        (["solve"], "required: GRAPH, --output; see rotavg solve --help"),
+        (["solve", "x.g2o"], "required: --output"),
+        (["solve", "x.g2o", "--output", "out", "--profile", "x"], "invalid choice: 'x'"),
+        (["solve", "x.g2o", "--output", "out", "--refine", "-1"], "must be 0 or more"),
+        (["solve", "x.g2o", "--output", "out", "--refine", "many"], "--refine"),
+        (["solve", "x.g2o", "--output", "out", "--frob"], "unrecognized arguments: --frob"),
+        (["solve", "x.g2o", "--output", "out", "--method", "magic"], "magic"),
+    ],
+)
+def test_usage(capsys: pytest.CaptureFixture[str], words: list[str], message: str) -> None:
+    assert message in refused(capsys, *words)
+
+
+@pytest.mark.parametrize("words", [["--help"], ["--version"], *([command.name, "--help"] for command in COMMANDS)])
+def test_help(capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(words)
+    assert caught.value.code == 0
+    output = capsys.readouterr().out
+    assert output == f"rotavg {__version__}\n" if words == ["--version"] else "usage: rotavg" in output
+
+
+def test_help_of_one_command_imports_no_other() -> None:
+    heavy = ["matplotlib", "rosbags", "rclpy", "pandas"]
+    for words in (["--version"], ["solve", "--help"]):
+        program = (
+            "import sys; from rotavg_ros.cli.main import main\n"
+            f"try: main({words!r})\n"
+            f"except SystemExit: print([name for name in {heavy!r} if name in sys.modules])"
+        )
+        result = python(program)
+        assert result.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "empty"),
+        (EDGES.replace("0.1", "nan", 1).encode(), ":1: a number that is not finite"),
+        (EDGES.encode()[:-10], ":5: "),
+        (b"EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 0" + b" 1" * 21, ":1: a quaternion of length 0"),
+        (b"NONSENSE 1 2 3\n", ":1: unknown tag 'NONSENSE'"),
+        (bytes(range(256)) * 20, "unknown tag"),
+        (b"PK\x03\x04" + bytes(100), "not an npz archive"),
+        (b"0 1 2\n", ":1: 3 numbers where 14 belong"),
+    ],
+)
+def test_bad_graph(capsys: pytest.CaptureFixture[str], tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "bad.g2o"
+    path.write_bytes(content)
+    line = refused(capsys, "solve", path, "--output", tmp_path / "out")
+    assert line.startswith(f"{path}:")
+    assert message in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_missing_and_directory(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert "no such file" in refused(capsys, "solve", tmp_path / "none.g2o", "--output", tmp_path / "out")
+    assert "is a directory" in refused(capsys, "solve", tmp_path, "--output", tmp_path / "out")
+
+
+def test_one_bad_graph_among_good_ones(capsys: pytest.CaptureFixture[str], tmp_path: Path, graph_path: Path) -> None:
+    bad = [tmp_path / "bad.g2o", tmp_path / "missing.g2o"]
+    bad[0].write_text("EDGE_SE2 0 1\n")
+    last = tmp_path / "last.g2o"
+    last.write_text(EDGES)
+    assert main(["solve", *map(str, [bad[0], graph_path, bad[1], last]), "--output", str(tmp_path / "out")]) == 2
+    captured = capsys.readouterr()
+    assert [line.split(":")[0] for line in captured.out.splitlines()] == [str(graph_path), str(last)]
+    assert [line.split(" ")[2].split(":")[0] for line in captured.err.splitlines()] == list(map(str, bad))
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["good", "last"]
+
+
+def test_same_stem_twice(capsys: pytest.CaptureFixture[str], tmp_path: Path, graph_path: Path) -> None:
+    twin = tmp_path / "folder" / "good.npz"
+    line = refused(capsys, "solve", graph_path, twin, "--output", tmp_path / "out")
+    assert str(graph_path) in line
+    assert str(twin) in line
+    assert not (tmp_path / "out").exists()
+    assert "would both go to" in refused(capsys, "solve", graph_path, graph_path, "--output", tmp_path / "out")
+
+
+def test_output_that_is_no_folder(capsys: pytest.CaptureFixture[str], tmp_path: Path, graph_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    for output in (tmp_path / "file", tmp_path / "file" / "below"):
+        assert "is not a folder" in refused(capsys, "solve", graph_path, "--output", output)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_graph_is_never_overwritten(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "edges.npz"
+    write_graph(path, GraphFile.from_ids(np.array([0]), np.array([1]), np.array([[0.0, 0, 0, 1]])))
+    assert "would be overwritten" in refused(capsys, "solve", path, "--output", tmp_path)
+    assert read_graph(path).graph.num_edges == 1
+
+
+def test_unwritable_folder(capsys: pytest.CaptureFixture[str], tmp_path: Path, graph_path: Path) -> None:
+    locked = tmp_path / "locked"
+    locked.mkdir(mode=0o500)
+    if os.access(locked, os.W_OK):
+        pytest.skip("this user may write everywhere, so permission cannot be denied")
+    assert "permission denied" in refused(capsys, "solve", graph_path, "--output", locked / "out")
+
+
+def test_full_disk_leaves_the_old_answer(tmp_path: Path) -> None:
+    graph, out = tmp_path / "long.g2o", tmp_path / "out"
+    graph.write_text("".join(f"EDGE_SE2 {i} {i + 1} 1 0 0.1 1 0 0 1 0 100\n" for i in range(2000)))
+    assert python(ROTAVG, "solve", graph, "--output", out).returncode == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    # orientations.csv is the larger file: with this limit the first fits, with the smaller neither does.
+    for limit in (1000, len(before["edges.csv"]) + 10):
+        set_limit = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}));"
+        result = python(f"{set_limit} {ROTAVG}", "solve", graph, "--output", out)
+        assert (result.returncode, result.stdout) == (2, "")
+        assert result.stderr.startswith(f"rotavg: error: {out}: cannot be written: ")
+        assert len(result.stderr.splitlines()) == 1
+        assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_interrupt(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(_: list[str]) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(main_module, "_run", interrupted)
+    assert main(["solve"]) == 128 + signal.SIGINT
+    assert capsys.readouterr().err == "rotavg: interrupted\n"
+
+
+def test_closed_pipe(graph_path: Path, tmp_path: Path) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    result = python(ROTAVG, "solve", graph_path, "--output", tmp_path / "out", stdout=writer)
+    os.close(writer)
+    assert (result.returncode, result.stderr) == (0, "")

@@ -1,0 +1,158 @@
+"""`rotavg solve`: what it writes, checked by reading it back with the csv and json modules."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros import rotations, solve
+from rotavg_ros.cli.main import main
+from rotavg_ros.datasets.graph_file import GraphFile, read_graph, write_graph
+from rotavg_ros.version import __version__
+
+
+def pose_graph(num_nodes: int = 30, *, seed: int = 0) -> GraphFile:
+    """A chain with closures, one of them false and one stored twice, new → old, and ids with gaps."""
+    rng = np.random.default_rng(seed)
+    body_from_world = rotations.random(num_nodes, generator=torch.Generator().manual_seed(seed))
+    chain = np.arange(num_nodes - 1)
+    source = np.concatenate((chain, rng.integers(15, num_nodes, 12)))
+    target = np.concatenate((chain + 1, rng.integers(0, 12, 12)))
+    source, target = np.append(source, source[-2:]), np.append(target, target[-2:])
+    noise = rotations.exp(0.003 * torch.randn(len(source), 3, dtype=torch.float64))
+    noise[num_nodes + 3] = rotations.exp(torch.tensor([0.0, 1.5, 0.0], dtype=torch.float64))
+    exact = rotations.multiply(body_from_world[target], rotations.inverse(body_from_world[source]))
+    ids = np.arange(num_nodes) + 100
+    ids[20:] += 50
+    measured = rotations.multiply(noise, exact).numpy()
+    return GraphFile.from_ids(ids[source], ids[target], measured, kind=(np.abs(ids[source] - ids[target]) != 1) * 1)
+
+
+@pytest.fixture
+def graph_path(tmp_path: Path) -> Path:
+    write_graph(tmp_path / "run.g2o", pose_graph())
+    return tmp_path / "run.g2o"
+
+
+def rows(path: Path) -> list[list[str]]:
+    with path.open(newline="") as file:
+        return list(csv.reader(file))
+
+
+def test_answer(graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["solve", str(graph_path), "--output", str(tmp_path / "out")]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    assert "30 nodes, 43 edges, " in captured.out
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "edges.csv",
+        "orientations.csv",
+        "summary.json",
+    ]
+
+    graph_file = read_graph(graph_path)
+    graph, ids = graph_file.graph, graph_file.node_ids
+    solution = solve(graph)
+    header, *orientations = rows(tmp_path / "out" / "orientations.csv")
+    assert header == ["id", "qx", "qy", "qz", "qw", "component"]
+    assert [int(row[0]) for row in orientations] == ids.tolist() == sorted(ids)
+    world_from_body = torch.tensor([[float(cell) for cell in row[1:5]] for row in orientations], dtype=torch.float64)
+    assert (world_from_body[:, 3] >= 0).all()
+    expected = rotations.inverse(solution.body_from_world)
+    assert rotations.angle_between(world_from_body, expected).max() < 1e-9
+    assert [int(row[5]) for row in orientations] == solution.component.tolist()
+
+    header, *edges = rows(tmp_path / "out" / "edges.csv")
+    assert header == ["source", "target", "outlier_score", "outlier"]
+    ends = [[int(row[0]), int(row[1])] for row in edges]
+    assert ends == np.stack((ids[graph.source], ids[graph.target]), axis=1).tolist()
+    scores = np.array([float(row[2]) for row in edges])
+    np.testing.assert_allclose(scores, solution.outlier_score, atol=1e-6)
+    assert [int(row[3]) for row in edges] == (solution.outlier_score > 0.5).int().tolist()
+    assert edges[33][3] == "1"
+
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert {name: summary[name] for name in ("nodes", "edges", "components", "skipped", "profile", "version")} == {
+        "nodes": 30, "edges": 43, "components": 1, "skipped": {}, "profile": "slam", "version": __version__,
+    }  # fmt: skip
+    assert summary["outliers"] == int((solution.outlier_score > 0.5).sum())
+    assert summary["method"] == "neurora"
+    assert summary["device"] in ("cpu", "cuda")
+    assert 0 < max(summary["stage_seconds"].values()) <= summary["solve_seconds"]
+    assert summary["peak_memory_bytes"] > 10_000_000
+
+
+def test_components_lone_nodes_and_skipped_lines(tmp_path: Path) -> None:
+    path = tmp_path / "two.g2o"
+    edge = "EDGE_SE2 {} {} 1 0 0.1 1 0 0 1 0 100\n"
+    path.write_text("VERTEX_SE2 7 0 0 0\nFIX 0\n" + edge.format(0, 1) + edge.format(3, 3) + edge.format(10, 11))
+    assert main(["solve", str(path), "--output", str(tmp_path / "out")]) == 0
+    orientations = rows(tmp_path / "out" / "orientations.csv")[1:]
+    assert [(int(row[0]), int(row[5])) for row in orientations] == [(0, 0), (1, 0), (3, 1), (7, 2), (10, 3), (11, 3)]
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["components"] == 4
+    assert summary["skipped"] == {"FIX": 1, "self-edge": 1}
+
+
+def test_edges_as_npz_or_not_at_all(graph_path: Path, tmp_path: Path) -> None:
+    """Another choice of --edges replaces the older answer's edges, so that a folder holds one answer."""
+    out = tmp_path / "out"
+    command = ["solve", str(graph_path), "--output", str(out)]
+    assert main(command) == 0
+    as_csv = np.loadtxt(out / "edges.csv", delimiter=",", skiprows=1)
+    assert main([*command, "--edges", "npz"]) == 0
+    with np.load(out / "edges.npz") as arrays:
+        together = np.stack([arrays[name] for name in ("source", "target", "outlier_score", "outlier")], axis=1)
+    np.testing.assert_allclose(together, as_csv, atol=1e-6)
+    assert not (out / "edges.csv").exists()
+    assert main([*command, "--edges", "none"]) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["orientations.csv", "summary.json"]
+
+
+def test_options_reach_the_solver(graph_path: Path, tmp_path: Path) -> None:
+    command = ["solve", str(graph_path), "--output", str(tmp_path / "out"), "--method", "spt", "--profile", "sfm"]
+    assert main([*command, "--refine", "0", "--device", "cpu"]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["method"], summary["profile"], summary["device"]) == ("spt", "sfm", "cpu")
+
+
+def test_several_graphs(graph_path: Path, tmp_path: Path) -> None:
+    write_graph(tmp_path / "other.npz", pose_graph(40, seed=1))
+    write_graph(tmp_path / "EGs.txt", pose_graph(20, seed=2))
+    graphs = [str(graph_path), str(tmp_path / "other.npz"), str(tmp_path / "EGs.txt")]
+    assert main(["solve", *graphs, "--output", str(tmp_path / "out")]) == 0
+    for stem, nodes, profile in (("run", 30, "slam"), ("other", 40, "slam"), ("EGs", 20, "sfm")):
+        summary = json.loads((tmp_path / "out" / stem / "summary.json").read_text())
+        assert (summary["nodes"], summary["profile"]) == (nodes, profile)
+
+
+def test_installed_command(graph_path: Path, tmp_path: Path) -> None:
+    """As a process, from another folder; nothing but the summary on stdout, nothing on stderr."""
+    command = [sys.executable, "-m", "rotavg_ros.cli.main", "solve", str(graph_path), "--output", "out"]
+    root = Path(__file__).parents[2]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}
+    result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert len(result.stdout.splitlines()) == 1
+    assert (tmp_path / "out" / "orientations.csv").exists()
+
+
+@pytest.mark.parametrize(("name", "bound_deg"), [("sphere2500", 6), ("manhattan", 6)])
+def test_clean_graphs_come_close_to_the_truth(shared_data: Path, tmp_path: Path, name: str, bound_deg: float) -> None:
+    assert main(["solve", str(shared_data / "slam" / f"{name}.g2o"), "--output", str(tmp_path)]) == 0
+    estimate, truth = (
+        torch.from_numpy(np.loadtxt(path, delimiter=",", skiprows=1, usecols=(1, 2, 3, 4)))
+        for path in (tmp_path / "orientations.csv", shared_data / "slam" / f"{name}_ground_truth.csv")
+    )
+    # Both start at the identity, up to the truth's own first orientation.
+    offset = rotations.multiply(rotations.normalize(truth[:1]), rotations.inverse(estimate[:1]))
+    error = rotations.angle_between(rotations.multiply(offset, estimate), rotations.normalize(truth))
+    assert error.rad2deg().mean() < bound_deg
