@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Any
 
 from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.interfaces import Connection
+from rosbags.interfaces import Connection, QosDurability
 from rosbags.rosbag1 import ReaderError as Rosbag1Error
 from rosbags.rosbag2 import ReaderError as Rosbag2Error
 
@@ -88,6 +88,15 @@ class BagReader:
     def num_messages(self, topics: Collection[str] | None = None) -> int:
         """Number of messages on the given topics; default: all."""
         return sum(c.msgcount for c in self._all() if topics is None or c.topic in topics)
+
+    def is_latched(self, topic: str) -> bool:
+        """Whether the topic was offered to late subscribers (transient_local) when it was recorded."""
+        return any(
+            profile.durability is QosDurability.TRANSIENT_LOCAL
+            for connection in self._all()
+            if connection.topic == topic
+            for profile in getattr(connection.ext, "offered_qos_profiles", [])
+        )
 
     def note(self, key: str) -> str | None:
         """A line of the bag's own metadata, as :meth:`BagWriter.set_note` writes it."""
