@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 MAX_THREADS = 2
@@ -34,6 +35,10 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
 os.environ.setdefault("ROS_LOG_DIR", tempfile.mkdtemp(prefix="rotavg-test-log-"))
 os.environ["MPLBACKEND"] = "Agg"
+
+# No test measures wall-clock time, hypothesis' deadline per example included.
+settings.register_profile("rotavg", deadline=None)
+settings.load_profile("rotavg")
 
 torch.set_num_threads(min(MAX_THREADS, os.cpu_count() or 1))
 
