@@ -129,6 +129,8 @@ def plan(graphs: list[Path], output: Path) -> list[Job]:
             for graph in graphs:
                 if graph.resolve() == (job.output / name).resolve():
                     raise SolveError(f"{graph} would be overwritten by the answer; choose another --output")
+            if (job.output / name).is_dir():
+                raise SolveError(f"{job.output / name} is a folder; remove it or choose another --output")
     return jobs
 
 

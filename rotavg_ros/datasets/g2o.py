@@ -7,8 +7,7 @@ An edge line stores the pose of the target in the source frame, so its rotation 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,9 @@ from rotavg_ros.datasets.text_rows import Row, parse_rows, read_blocks, shown, u
 from rotavg_ros.rotations import inverse
 from rotavg_ros.view_graph import EdgeKind
 
-Precision = Callable[[np.ndarray], np.ndarray]  # (K, 6 or 21) upper triangle, row by row → (K,) rad⁻²
+# Where the entries of a planar information matrix, in the order xx xy xθ yy yθ θθ, are in the 21 of a spatial one.
+_PLANAR_ENTRIES = (0, 1, 5, 6, 10, 20)
+_ANGULAR_DIAGONAL = (15, 18, 20)
 
 
 @dataclass(frozen=True)
@@ -31,42 +32,20 @@ class EdgeTag:
 
     translation: int  # how many numbers: x y, or x y z
     rotation: int  # θ, roll pitch yaw, or qx qy qz qw
-    precision: Precision
+    information: tuple[int, ...]  # which of the 21 entries of the upper triangle, row by row, each number is
+    is_square_root: bool = False
 
     @property
     def planar(self) -> bool:
         return self.rotation == 1
 
-    @property
-    def information(self) -> int:
-        return 6 if self.planar else 21
-
-
-def _toro_planar(information: np.ndarray) -> np.ndarray:
-    """Ixx Ixy Iyy Iθθ Ixθ Iyθ."""
-    return information[:, 3]
-
-
-def _isam_planar(root: np.ndarray) -> np.ndarray:
-    """The upper triangle of a square root of the information. Some exports use another order; it has no Rθθ there."""
-    return np.where(root[:, 5] > 0, root[:, 2] ** 2 + root[:, 4] ** 2 + root[:, 5] ** 2, np.nan)
-
-
-def _g2o_planar(information: np.ndarray) -> np.ndarray:
-    return information[:, 5]
-
-
-def _mean_angular(information: np.ndarray) -> np.ndarray:
-    """Mean of I44, I55 and I66."""
-    return np.asarray(information[:, [15, 18, 20]].mean(axis=1))
-
 
 EDGE_TAGS = {
-    b"EDGE_SE2": EdgeTag(translation=2, rotation=1, precision=_g2o_planar),
-    b"EDGE2": EdgeTag(translation=2, rotation=1, precision=_toro_planar),
-    b"ODOMETRY": EdgeTag(translation=2, rotation=1, precision=_isam_planar),
-    b"EDGE_SE3:QUAT": EdgeTag(translation=3, rotation=4, precision=_mean_angular),
-    b"EDGE3": EdgeTag(translation=3, rotation=3, precision=_mean_angular),
+    b"EDGE_SE2": EdgeTag(2, 1, _PLANAR_ENTRIES),
+    b"EDGE2": EdgeTag(2, 1, (0, 1, 6, 20, 5, 10)),  # TORO: xx xy yy θθ xθ yθ
+    b"ODOMETRY": EdgeTag(2, 1, _PLANAR_ENTRIES, is_square_root=True),  # iSAM
+    b"EDGE_SE3:QUAT": EdgeTag(3, 4, tuple(range(21))),
+    b"EDGE3": EdgeTag(3, 3, tuple(range(21))),  # TORO
 }
 # Numbers after the id. Only the id counts: poses in a file are somebody's estimate, not a measurement.
 VERTEX_TAGS = {b"VERTEX_SE2": 3, b"VERTEX2": 3, b"VERTEX_SE3:QUAT": 7, b"VERTEX3": 6}
@@ -90,6 +69,7 @@ def read(path: Path) -> GraphFile:
     skipped: Counter[str] = Counter()
     lone_ids: list[np.ndarray] = []
     edges: list[_Edges] = []
+    edge_tags: set[bytes] = set()
     for block in read_blocks(path):
         by_tag: dict[bytes, tuple[list[int], list[Row]]] = {}
         for line, (tag, *row) in block:
@@ -98,6 +78,7 @@ def read(path: Path) -> GraphFile:
             rows.append(row)
         for tag, (lines, rows) in by_tag.items():
             if tag in EDGE_TAGS:
+                edge_tags.add(tag)
                 edges.append(_parse_edges(path, EDGE_TAGS[tag], lines, rows))
             elif tag in VERTEX_TAGS:
                 lone_ids.append(_parse_vertices(path, VERTEX_TAGS[tag], lines, rows))
@@ -125,51 +106,38 @@ def read(path: Path) -> GraphFile:
         lone_ids=np.concatenate(lone_ids) if lone_ids else None,
         kind=np.where(consecutive, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE),
         precision=every.precision,
-        planar=every.planar,
+        planar=all(EDGE_TAGS[tag].planar for tag in edge_tags),
         edge_translation=every.translation,
+        edge_information=every.information,
         skipped=dict(skipped),
     )
 
 
 @dataclass(frozen=True)
 class _Edges:
-    """Parsed edge lines: ``(K,)`` line numbers, ``(K, 2)`` ids and the measurement."""
+    """Parsed edge lines, K rows each."""
 
     line: np.ndarray
     ids: np.ndarray
     source_from_target: np.ndarray
     translation: np.ndarray
+    information: np.ndarray
     precision: np.ndarray
-    planar: bool
 
     @classmethod
     def concatenate(cls, parts: list[_Edges]) -> _Edges:
         """All edges in the order of their lines."""
-        together = cls(
-            np.concatenate([part.line for part in parts]),
-            np.concatenate([part.ids for part in parts]),
-            np.concatenate([part.source_from_target for part in parts]),
-            np.concatenate([part.translation for part in parts]),
-            np.concatenate([part.precision for part in parts]),
-            planar=all(part.planar for part in parts),
-        )
+        together = cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
         return together.select(np.argsort(together.line))
 
     def select(self, rows: np.ndarray) -> _Edges:
-        return _Edges(
-            self.line[rows],
-            self.ids[rows],
-            self.source_from_target[rows],
-            self.translation[rows],
-            self.precision[rows],
-            self.planar,
-        )
+        return _Edges(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
 def _parse_edges(path: Path, tag: EdgeTag, lines: list[int], rows: list[Row]) -> _Edges:
     num_pose = tag.translation + tag.rotation
-    ids, numbers = parse_rows(path, lines, rows, 2, num_pose + tag.information)
-    translation, rotation, information = np.split(numbers, [tag.translation, num_pose], axis=1)
+    ids, numbers = parse_rows(path, lines, rows, 2, num_pose + len(tag.information))
+    translation, rotation, stated = np.split(numbers, [tag.translation, num_pose], axis=1)
     if tag.planar:
         source_from_target = quaternion_of_heading(rotation[:, 0])
         translation = np.pad(translation, ((0, 0), (0, 1)))
@@ -178,8 +146,20 @@ def _parse_edges(path: Path, tag: EdgeTag, lines: list[int], rows: list[Row]) ->
     else:
         source_from_target = Rotation.from_euler("xyz", rotation).as_quat()
     with np.errstate(over="ignore"):  # absurdly large entries become inf, which counts as unknown
-        precision = tag.precision(information)
-    return _Edges(np.array(lines), ids, source_from_target, translation, precision, tag.planar)
+        information = np.zeros((len(rows), 21))
+        information[:, tag.information] = _squared(stated) if tag.is_square_root else stated
+        precision = information[:, 20] if tag.planar else information[:, _ANGULAR_DIAGONAL].mean(axis=1)
+    return _Edges(np.array(lines), ids, source_from_target, translation, information, precision)
+
+
+def _squared(root: np.ndarray) -> np.ndarray:
+    """``RᵀR`` of upper triangular 3 × 3 matrices, both as ``(K, 6)`` upper triangles, row by row.
+
+    Zero where Rθθ is: the entries are then in some other program's order, and mean we do not know what.
+    """
+    xx, xy, xt, yy, yt, tt = root.T
+    information = (xx * xx, xx * xy, xx * xt, xy * xy + yy * yy, xy * xt + yy * yt, xt * xt + yt * yt + tt * tt)
+    return np.asarray(np.where(tt > 0, information, 0).T)
 
 
 def _parse_vertices(path: Path, num_values: int, lines: list[int], rows: list[Row]) -> np.ndarray:
@@ -206,19 +186,31 @@ def write(path: Path, graph_file: GraphFile, body_from_world: np.ndarray | None 
         translation = np.zeros((graph.num_edges, 3))
     positions, world_from_body = chain_poses(graph, translation, body_from_world)
     source_from_target = inverse(graph.target_from_source).cpu().numpy()
-    precision = np.nan_to_num(graph.precision.cpu().numpy(), nan=1.0)
+    information = _information(graph_file)
     ends = [ids[graph.source.cpu().numpy()], ids[graph.target.cpu().numpy()]]
     with writing(path) as temporary, temporary.open("w", encoding="ascii") as file:
         if graph_file.planar:
             vertices = [ids, positions[:, :2], heading_of_quaternion(world_from_body)]
             write_rows(file, f"VERTEX_SE2 %d{' %.15g' * 3}\n", vertices)
-            columns = [*ends, translation[:, :2], heading_of_quaternion(source_from_target), precision]
-            write_rows(file, f"EDGE_SE2 %d %d{' %.15g' * 3} 1 0 0 1 0 %.15g\n", columns)
+            headings = heading_of_quaternion(source_from_target)
+            columns = [*ends, translation[:, :2], headings, information[:, _PLANAR_ENTRIES]]
+            write_rows(file, f"EDGE_SE2 %d %d{' %.15g' * 9}\n", columns)
         else:
             write_rows(file, f"VERTEX_SE3:QUAT %d{' %.15g' * 7}\n", [ids, positions, world_from_body])
-            information = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 %.15g 0 0 %.15g 0 %.15g"
-            columns = [*ends, translation, source_from_target, precision, precision, precision]
-            write_rows(file, f"EDGE_SE3:QUAT %d %d{' %.15g' * 7} {information}\n", columns)
+            columns = [*ends, translation, source_from_target, information]
+            write_rows(file, f"EDGE_SE3:QUAT %d %d{' %.15g' * 28}\n", columns)
+
+
+def _information(graph_file: GraphFile) -> np.ndarray:
+    """``(M, 21)`` as stated; where nothing is, 1 for positions and the edge's precision for rotations."""
+    precision = np.nan_to_num(graph_file.graph.precision.cpu().numpy(), nan=1.0)
+    information = np.zeros((len(precision), 21))
+    information[:, [0, 6, 11]] = 1
+    information[:, _ANGULAR_DIAGONAL] = precision[:, None]
+    stated = graph_file.edge_information
+    if stated is None:
+        return information
+    return np.where(stated.any(axis=1, keepdims=True), stated, information)
 
 
 def not_stored(graph_file: GraphFile) -> list[str]:

@@ -49,6 +49,8 @@ class GraphFile:
         node_ids: ``(N,)`` int64, ascending, non-negative: index → id in the file.
         planar: every rotation is about z (an SE(2) graph).
         edge_translation: ``(M, 3)`` position of the target in the source frame, metres (SfM: of unknown scale).
+        edge_information: ``(M, 21)`` upper triangle, row by row, of the 6 × 6 information matrix of x, y, z and the
+            rotation, as stated by formats that have one. Planar edges have zeros for z, roll and pitch.
         body_from_world_gt: ``(N, 4)`` xyzw ground truth; NaN rows where unknown.
         stamps_ns: ``(N,)`` int64 nanoseconds.
         position_gt: ``(N, 3)`` ground truth in the world frame, metres; NaN rows where unknown.
@@ -63,6 +65,7 @@ class GraphFile:
     stamps_ns: np.ndarray | None = None
     position_gt: np.ndarray | None = None
     skipped: dict[str, int] = field(default_factory=dict)
+    edge_information: np.ndarray | None = None
 
     @property
     def consecutive(self) -> np.ndarray:
@@ -92,6 +95,7 @@ class GraphFile:
         precision: np.ndarray | None = None,
         planar: bool = False,
         edge_translation: np.ndarray | None = None,
+        edge_information: np.ndarray | None = None,
         skipped: dict[str, int] | None = None,
     ) -> GraphFile:
         """Build from edges between ids instead of indices.
@@ -116,7 +120,12 @@ class GraphFile:
             precision=precision,
         )
         return cls(
-            graph, node_ids.astype(np.int64), planar, edge_translation=edge_translation, skipped=dict(skipped or {})
+            graph,
+            node_ids.astype(np.int64),
+            planar,
+            edge_translation=edge_translation,
+            edge_information=edge_information,
+            skipped=dict(skipped or {}),
         )
 
 
@@ -127,6 +136,8 @@ def read_graph(path: str | Path) -> GraphFile:
         GraphFileError: anything that keeps the file from being read whole.
     """
     path = Path(path)
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise GraphFileError.at(path, None, "is not a regular file (a pipe or a device); save the graph to one first")
     with reading(path), path.open("rb") as file:
         head = file.read(4096)
     if not head:

@@ -2,9 +2,9 @@
 
 Required: ``source``, ``target`` ``(M,)`` integer ids and ``target_from_source`` ``(M, 4)`` xyzw.
 Optional: ``kind`` ``(M,)`` (0 odometry, 1 loop closure), ``precision`` ``(M,)`` rad⁻², ``edge_translation`` ``(M, 3)``,
-``node_ids`` ``(N,)`` (names nodes without an edge too), ``planar``, and per node, ascending by id:
-``body_from_world_gt`` ``(N, 4)`` with NaN where unknown, ``stamps_ns`` ``(N,)``, ``position_gt`` ``(N, 3)``.
-Other arrays are ignored.
+``edge_information`` ``(M, 21)``, ``node_ids`` ``(N,)`` (names nodes without an edge too), ``planar``; and per node,
+ascending by id: ``body_from_world_gt`` ``(N, 4)`` with NaN where unknown, ``stamps_ns`` ``(N,)``, ``position_gt``
+``(N, 3)``. Other arrays are ignored.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {  # of one row
     "kind": (),
     "precision": (),
     "edge_translation": (3,),
+    "edge_information": (21,),
     "node_ids": (),
     "body_from_world_gt": (4,),
     "stamps_ns": (),
@@ -36,6 +37,7 @@ _REQUIRED = ("source", "target", "target_from_source")
 _INTEGER = ("source", "target", "kind", "node_ids", "stamps_ns")
 # Sine of half a tilt that is rounding.
 _PLANAR_TOLERANCE = 1e-9
+_EDGE_EXTRAS = ("edge_translation", "edge_information")
 _PER_NODE = ("body_from_world_gt", "stamps_ns", "position_gt")
 
 
@@ -48,7 +50,7 @@ def read(path: Path) -> GraphFile:
     arrays, planar = _load(path)
     source, target = arrays["source"], arrays["target"]
     num_edges = len(source)
-    for name in ("target", "target_from_source", "kind", "precision", "edge_translation"):
+    for name in ("target", "target_from_source", "kind", "precision", *_EDGE_EXTRAS):
         if name in arrays and len(arrays[name]) != num_edges:
             what = f"{name} has {len(arrays[name])} rows, source has {num_edges}; they must agree"
             raise GraphFileError.at(path, None, what)
@@ -56,7 +58,6 @@ def read(path: Path) -> GraphFile:
     quaternions = unit_quaternions(path, None, arrays["target_from_source"])
     kind = arrays.get("kind", np.full(num_edges, EdgeKind.LOOP_CLOSURE, dtype=np.int64))
     refuse(path, None, ~np.isin(kind, list(EdgeKind)), "an unknown kind; 0 is odometry, 1 a loop closure")
-    translation = arrays.get("edge_translation")
     proper = source != target
     if not proper.any():
         raise GraphFileError.at(path, None, "no edges between nodes; there is nothing to solve")
@@ -71,7 +72,7 @@ def read(path: Path) -> GraphFile:
         kind=kind[proper],
         precision=arrays["precision"][proper] if "precision" in arrays else None,
         planar=turns_about_z if planar is None else planar,
-        edge_translation=translation[proper] if translation is not None else None,
+        **{name: arrays[name][proper] for name in _EDGE_EXTRAS if name in arrays},
         skipped={} if proper.all() else {"self-edge": int((~proper).sum())},
     )
     rows: dict[str, Any] = {
@@ -94,7 +95,7 @@ def write(path: Path, graph_file: GraphFile) -> None:
         "node_ids": ids,
         "planar": np.array(graph_file.planar),
     }
-    for name in ("edge_translation", *_PER_NODE):
+    for name in (*_EDGE_EXTRAS, *_PER_NODE):
         values = getattr(graph_file, name)
         if values is not None:
             arrays[name] = values

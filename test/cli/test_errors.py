@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rotavg_ros.cli import main as main_module
 from rotavg_ros.cli.main import COMMANDS, main
 from rotavg_ros.datasets.graph_file import GraphFile, read_graph, write_graph
 from rotavg_ros.version import __version__
@@ -148,6 +147,12 @@ def test_output_that_is_no_folder(capsys: pytest.CaptureFixture[str], tmp_path: 
     assert (tmp_path / "file").read_text() == "mine"
 
 
+def test_folder_in_the_way_of_an_output(capsys: pytest.CaptureFixture[str], tmp_path: Path, graph_path: Path) -> None:
+    (tmp_path / "out" / "edges.csv").mkdir(parents=True)
+    assert "edges.csv is a folder" in refused(capsys, "solve", graph_path, "--output", tmp_path / "out")
+    assert not (tmp_path / "out" / "orientations.csv").exists()
+
+
 def test_graph_is_never_overwritten(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = tmp_path / "edges.npz"
     write_graph(path, GraphFile.from_ids(np.array([0]), np.array([1]), np.array([[0.0, 0, 0, 1]])))
@@ -178,13 +183,19 @@ def test_full_disk_leaves_the_old_answer(tmp_path: Path) -> None:
         assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
-def test_interrupt(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def interrupted(_: list[str]) -> int:
-        raise KeyboardInterrupt
+def test_interrupt(graph_path: Path, tmp_path: Path) -> None:
+    """Ctrl-C while a graph is being read."""
+    stuck = "import os, signal, time; from rotavg_ros.datasets import g2o"
+    press = "g2o.read = lambda path: (os.kill(os.getpid(), signal.SIGINT), time.sleep(60))"
+    result = python(f"{stuck}; {press}; {ROTAVG}", "solve", graph_path, "--output", tmp_path / "out")
+    assert (result.returncode, result.stdout, result.stderr) == (128 + signal.SIGINT, "", "rotavg: interrupted\n")
+    assert not (tmp_path / "out").exists()
 
-    monkeypatch.setattr(main_module, "_run", interrupted)
-    assert main(["solve"]) == 128 + signal.SIGINT
-    assert capsys.readouterr().err == "rotavg: interrupted\n"
+
+def test_terminal_without_unicode(graph_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONIOENCODING", "ascii")
+    result = python(ROTAVG, "solve", graph_path, "--output", tmp_path / "out")
+    assert (result.returncode, result.stderr) == (0, "")
 
 
 def test_closed_pipe(graph_path: Path, tmp_path: Path) -> None:

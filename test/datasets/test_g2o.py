@@ -163,6 +163,9 @@ def test_what_is_no_file(tmp_path: Path) -> None:
         read_graph(tmp_path / "missing.g2o")
     with pytest.raises(GraphFileError, match="is a directory"):
         read_graph(tmp_path)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(GraphFileError, match="not a regular file"):
+        read_graph(tmp_path / "pipe")
     secret = tmp_path / "secret.g2o"
     secret.write_text(GOOD)
     secret.chmod(0)

@@ -97,13 +97,14 @@ def test_npz_keeps_everything(graph_file: GraphFile, seed: int) -> None:
         body_from_world_gt=truth,
         stamps_ns=rng.integers(0, 2**62, num_nodes),
         position_gt=rng.normal(size=(num_nodes, 3)),
+        edge_information=rng.normal(size=(graph_file.graph.num_edges, 21)),
     )
     read = through(".npz", full)
     assert_same_edges(read, full)
     assert read.planar == full.planar
     assert torch.equal(read.graph.kind, full.graph.kind)
     assert torch.equal(read.graph.precision, full.graph.precision)
-    for name in ("node_ids", "stamps_ns", "position_gt", "edge_translation"):
+    for name in ("node_ids", "stamps_ns", "position_gt", "edge_translation", "edge_information"):
         np.testing.assert_array_equal(getattr(read, name), getattr(full, name))
     np.testing.assert_allclose(read.body_from_world_gt, full.body_from_world_gt, atol=1e-12)
     assert not_stored("x.npz", full) == []
@@ -146,7 +147,12 @@ def test_directions_against_gtsam(shared_data: Path, tmp_path: Path, name: str) 
     assert_gtsam_agrees(gtsam.readG2o(str(path), not planar)[0], graph_file, planar)
     copy = tmp_path / "copy.g2o"
     write_graph(copy, graph_file)
-    assert_gtsam_agrees(gtsam.readG2o(str(copy), not planar)[0], graph_file, planar)
+    rewritten = gtsam.readG2o(str(copy), not planar)[0]
+    assert_gtsam_agrees(rewritten, graph_file, planar)
+    original = gtsam.readG2o(str(path), not planar)[0]
+    for edge in range(0, graph_file.graph.num_edges, 7):
+        information, expected = (factors.at(edge).noiseModel().information() for factors in (rewritten, original))
+        np.testing.assert_allclose(information, expected, rtol=1e-9, atol=1e-6)
 
 
 @given(st.integers(2, 30), st.integers(0, 2**32))
@@ -186,6 +192,15 @@ def test_madrid_metropolis(shared_data: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(rotations.to_matrix(graph_file.graph.target_from_source[0]).numpy(), first.T, atol=1e-5)
     write_graph(tmp_path / "EGs.txt", graph_file)
     assert_same_edges(read_graph(tmp_path / "EGs.txt"), graph_file)
+
+
+def test_toro_information_is_reordered(shared_data: Path, tmp_path: Path) -> None:
+    graph_file = read_graph(shared_data / "slam" / "FR079.g2o")
+    write_graph(tmp_path / "copy.g2o", graph_file)
+    assert (
+        "EDGE_SE2 0 1 0.52736 -0.06069 -0.06826 62.41751 156.175245 0 1401.514426 0 8762.863892\n"
+        in (tmp_path / "copy.g2o").read_text()
+    )
 
 
 @given(graph_files())
