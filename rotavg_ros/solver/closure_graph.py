@@ -6,8 +6,8 @@ orientations are written as a correction of the odometry's,
 
     R_v = R_v⁰ C_v        (R⁰: composed along the spanning forest; C: a rotation of the world frame),
 
-so a segment says C_b ≈ C_a, and any other edge says C_v ≈ e⁰_uv C_u with e⁰_uv its residual under R⁰. Inside a segment the
-least-squares solution turns in proportion to the variance passed, which makes the contraction exact.
+so a segment says C_b ≈ C_a, and any other edge says C_v ≈ e⁰_uv C_u with e⁰_uv its residual under R⁰. Inside a segment
+the least-squares solution turns in proportion to the variance passed, which makes the contraction exact.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ class ClosureGraph:
 
     Attributes:
         nodes: ``(K,)`` view-graph nodes, ascending.
+        position: ``(K,)`` odometry steps from the root of the node's chain; chains lie far apart from each other.
         roots: ``(components,)`` key nodes whose correction stays the identity.
         source, target: ``(E,)`` key nodes.
         residual: ``(E, 4)`` float64 e⁰; the identity on segments.
@@ -42,6 +43,7 @@ class ClosureGraph:
     """
 
     nodes: np.ndarray
+    position: np.ndarray
     roots: np.ndarray
     source: np.ndarray
     target: np.ndarray
@@ -134,8 +136,10 @@ def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
         np.inf,
     )
     segment_steps = depth[segment_end] - depth[segment_start]
+    _, chain_number = np.unique(chain, return_inverse=True)
     return ClosureGraph(
         nodes=nodes,
+        position=(depth + 4.0 * num_nodes * chain_number)[nodes],
         roots=key_of_node[forest.roots],
         source=key_of_node[np.concatenate((segment_start, source[other]))],
         target=key_of_node[np.concatenate((segment_end, target[other]))],

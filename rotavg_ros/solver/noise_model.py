@@ -13,13 +13,21 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import expit
 
-# Priors, each worth one observation: they only matter where data are too few to tell.
-_PRIOR_STEP_VARIANCE = np.radians(0.1) ** 2
-_PRIOR_CLOSURE_VARIANCE = np.radians(1.0) ** 2
+from rotavg_ros.solver.agreement import AgreementPairs
+
+# What is assumed where there is nothing to estimate from.
+_PRIOR_STEP_VARIANCE = np.radians(0.3) ** 2
+_PRIOR_CLOSURE_VARIANCE = np.radians(2.0) ** 2
+# One pseudo-observation each, in rad²: they keep variances off zero.
+_PRIOR_STEP_SQUARE = np.radians(0.02) ** 2
+_PRIOR_CLOSURE_SQUARE = np.radians(0.3) ** 2
 _PRIOR_OUTLIER_COUNTS = (1.0, 3.0)
 _EM_STARTS_STEP_DEG = (0.02, 0.1, 0.5, 2.0)
-_EM_ITERATIONS = 100
-_EM_TOLERANCE = 1e-4
+_EM_STARTS_CLOSURE_DEG = (0.3, 2.0)
+# Rows used to choose among the starts, and to converge.
+_EM_THINNED = (1000, 8000)
+_EM_ITERATIONS = 60
+_EM_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -69,53 +77,98 @@ def outlier_share(inlier_probability: np.ndarray) -> float:
     return float(((1 - inlier_probability).sum() + false_count) / (len(inlier_probability) + total_count))
 
 
-def estimate_noise(
-    squared_angle: np.ndarray, path_steps: np.ndarray, components: int, closure_prior_log_odds: np.ndarray | None = None
-) -> tuple[NoiseModel, np.ndarray]:
-    """Two variances and an outlier share from closures alone, by EM from several starts; the likeliest is kept.
+@dataclass(frozen=True)
+class Discrepancies:
+    """Differences that would be small if the closures in them were good.
 
-    Args:
-        squared_angle: ``(C,)`` rad², discrepancy of each closure against odometry.
-        path_steps: ``(C,)`` odometry steps that the discrepancy passes, at least 1; closures with inf are left out.
-        closure_prior_log_odds: ``(C,)`` what is known of each closure beforehand, added to the common prior.
-
-    Returns:
-        The model and the probability ``(C,)`` of each closure to be good.
+    Attributes:
+        squared_angle: ``(D,)`` rad².
+        steps: ``(D,)`` odometry steps that each passes.
+        closures: ``(D,)`` number of closures in each.
+        weight: ``(D,)``.
+        kind: ``(D,)`` 0 or 1; each kind has its own share of outliers.
     """
-    usable = np.isfinite(path_steps)
-    angle2, steps = squared_angle[usable], np.maximum(path_steps[usable], 1.0)
-    extra = np.zeros(len(angle2)) if closure_prior_log_odds is None else closure_prior_log_odds[usable]
-    best_likelihood, best = -np.inf, None
-    for start_deg in _EM_STARTS_STEP_DEG:
-        model = NoiseModel(components, np.radians(start_deg) ** 2, _PRIOR_CLOSURE_VARIANCE, 0.3)
-        likelihood = -np.inf
-        for _ in range(_EM_ITERATIONS):
-            variance = steps * model.step_variance + model.closure_variance
-            log_odds = model.inlier_log_odds(angle2, variance) + model.prior_log_odds + extra
-            good = expit(log_odds)
-            previous, likelihood = likelihood, float(np.logaddexp(0, log_odds).sum() + _log_false(model, angle2).sum())
-            if likelihood - previous < _EM_TOLERANCE:
-                break
-            # Expected squares of the two parts of each discrepancy, given their sum.
-            from_steps = steps * model.step_variance / variance
-            step_square = from_steps**2 * angle2 + components * steps * model.step_variance * (1 - from_steps)
-            closure_square = (1 - from_steps) ** 2 * angle2 + components * model.closure_variance * from_steps
-            observations = components * good.sum() + 1
-            model = NoiseModel(
-                components,
-                float((good * step_square / steps).sum() + _PRIOR_STEP_VARIANCE) / observations,
-                float((good * closure_square).sum() + _PRIOR_CLOSURE_VARIANCE) / observations,
-                outlier_share(good),
-            )
-        if best is None or likelihood > best_likelihood:
-            best_likelihood, best = likelihood, model
-    assert best is not None
-    variance = np.where(usable, np.maximum(path_steps, 1.0), 0.0) * best.step_variance + best.closure_variance
-    log_odds = best.inlier_log_odds(squared_angle, variance) + best.prior_log_odds
-    if closure_prior_log_odds is not None:
-        log_odds = log_odds + closure_prior_log_odds
-    return best, np.where(usable, expit(log_odds), expit(best.prior_log_odds))
+
+    squared_angle: np.ndarray
+    steps: np.ndarray
+    closures: np.ndarray
+    weight: np.ndarray
+    kind: np.ndarray
+
+    def thinned(self, size: int) -> Discrepancies:
+        """Evenly spread rows, about ``size`` of them."""
+        rows = slice(None, None, max(1, len(self.steps) // size))
+        return Discrepancies(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
-def _log_false(model: NoiseModel, squared_angle: np.ndarray) -> np.ndarray:
-    return log_uniform_density(np.sqrt(squared_angle), model.components) + np.log(model.outlier_share)
+def discrepancies(squared_angle: np.ndarray, path_steps: np.ndarray, pairs: AgreementPairs) -> Discrepancies:
+    """Of every closure with the odometry (``(C,)`` each; infinite steps tell nothing), and of agreeing closures."""
+    on_chain = np.flatnonzero(np.isfinite(path_steps))
+    num_chain, num_pairs = len(on_chain), len(pairs.first)
+    per_closure = num_pairs / max(len(path_steps), 1)
+    return Discrepancies(
+        np.concatenate((squared_angle[on_chain], pairs.squared_angle)),
+        np.concatenate((np.maximum(path_steps[on_chain], 1.0), np.maximum(pairs.steps, 0.5))),
+        np.concatenate((np.ones(num_chain), np.full(num_pairs, 2.0))),
+        np.concatenate((np.ones(num_chain), np.full(num_pairs, 1 / max(per_closure, 1.0)))),
+        np.concatenate((np.zeros(num_chain, dtype=np.int64), np.ones(num_pairs, dtype=np.int64))),
+    )
+
+
+def estimate_noise(data: Discrepancies, components: int) -> NoiseModel:
+    """Two variances and an outlier share by expectation–maximisation from several starts; the likeliest is kept.
+
+    A discrepancy is Gaussian with variance ``steps · step_variance + closures · closure_variance`` or uniform. The
+    closures' own agreement holds the estimate up where odometry has drifted past recognition or most closures are
+    false; their discrepancy with the chain separates the two variances.
+    """
+    if len(data.steps) == 0:
+        return NoiseModel(components, _PRIOR_STEP_VARIANCE, _PRIOR_CLOSURE_VARIANCE, 0.25)
+    few = data.thinned(_EM_THINNED[0])
+    starts = [
+        _maximise(few, NoiseModel(components, np.radians(step) ** 2, np.radians(closure) ** 2, 0.5), 12)
+        for step in _EM_STARTS_STEP_DEG
+        for closure in _EM_STARTS_CLOSURE_DEG
+    ]
+    best = max(starts, key=lambda start: start[0])[1]
+    return _maximise(data.thinned(_EM_THINNED[1]), best, _EM_ITERATIONS)[1]
+
+
+def _maximise(data: Discrepancies, model: NoiseModel, iterations: int) -> tuple[float, NoiseModel]:
+    """EM from ``model``; returns the log-likelihood and the last model."""
+    uniform = log_uniform_density(np.sqrt(data.squared_angle), model.components)
+    k = model.components
+    shares = np.array([model.outlier_share, 0.7])
+    likelihood = -np.inf
+    for _ in range(iterations):
+        from_steps = data.steps * model.step_variance
+        variance = from_steps + data.closures * model.closure_variance
+        share = shares[data.kind]
+        log_odds = model.inlier_log_odds(data.squared_angle, variance) + np.log1p(-share) - np.log(share)
+        previous = likelihood
+        likelihood = float((data.weight * (np.logaddexp(0, log_odds) + np.log(share) + uniform)).sum())
+        if likelihood - previous < _EM_TOLERANCE:
+            break
+        good = data.weight * expit(log_odds)
+        # Expected squares of the two parts of each discrepancy, given their sum.
+        part = from_steps / variance
+        step_square = part**2 * data.squared_angle + k * from_steps * (1 - part)
+        closure_square = (1 - part) ** 2 * data.squared_angle + k * data.closures * model.closure_variance * part
+        observations = k * good.sum() + 1
+        bad = np.bincount(data.kind, data.weight - good, 2)
+        total = np.bincount(data.kind, data.weight, 2)
+        shares = np.clip((bad + 1) / (total + 2), 0.005, 0.995)
+        model = NoiseModel(
+            k,
+            float((good * step_square / data.steps).sum() + _PRIOR_STEP_SQUARE) / observations,
+            float((good * closure_square / data.closures).sum() + _PRIOR_CLOSURE_SQUARE) / observations,
+            float(shares[0]),
+        )
+    return likelihood, model
+
+
+def judge_by_chain(model: NoiseModel, squared_angle: np.ndarray, path_steps: np.ndarray) -> np.ndarray:
+    """Log-odds of each closure to be good from its discrepancy with the odometry alone, without a prior."""
+    finite = np.isfinite(path_steps)
+    variance = np.where(finite, path_steps, 0.0) * model.step_variance + model.closure_variance
+    return np.where(finite, model.inlier_log_odds(squared_angle, variance), 0.0)

@@ -9,13 +9,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from scipy.special import expit
 from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.errors import UserError
 from rotavg_ros.solver import refinement, slam_refinement
+from rotavg_ros.solver.agreement import agreement_pairs
 from rotavg_ros.solver.closure_graph import contract
-from rotavg_ros.solver.noise_model import estimate_noise
+from rotavg_ros.solver.noise_model import discrepancies, estimate_noise, judge_by_chain
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.solver.spanning_tree import compose_orientations, minimum_spanning_forest, shortest_path_forest
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
@@ -93,9 +95,11 @@ def _solve_slam(
     with watch.stage("clean"):
         closure = closure_graph.is_closure
         square = (rotations.log(closure_graph.residual) ** 2).sum(dim=1).numpy()
-        noise, good = estimate_noise(square[closure], closure_graph.path_steps[closure], _components(graph))
+        path_steps = closure_graph.path_steps[closure]
+        pairs = agreement_pairs(closure_graph)
+        noise = estimate_noise(discrepancies(square[closure], path_steps, pairs), _components(graph))
         inlier_probability = np.ones(len(square))
-        inlier_probability[closure] = good
+        inlier_probability[closure] = expit(judge_by_chain(noise, square[closure], path_steps) + noise.prior_log_odds)
     with watch.stage("refine"):
         steps = slam_refinement.MAX_PASSES if refinement_steps is None else refinement_steps
         correction = rotations.identity(closure_graph.num_nodes)

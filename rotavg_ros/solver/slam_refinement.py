@@ -27,18 +27,24 @@ _CONVERGED_STEP = np.radians(0.002)
 _CONVERGED_PROBABILITY = 2e-3
 # An edge that alone holds two parts of the graph together has leverage 1; it cannot be judged by the others.
 _MAX_LEVERAGE = 0.999
-# Redundancy below this many edges' worth says little about the odometry's variance; the prior estimate is worth it.
+# Redundancy below this many edges' worth says little about a variance; the estimate so far is worth as much.
 _PRIOR_ODOMETRY_REDUNDANCY = 5.0
+_PRIOR_CLOSURE_SQUARE = np.radians(0.08) ** 2
+# Neighbouring closures of a real front end err together, which in the fit looks like odometry noise. How odometry drifts over
+# long ways tells otherwise, so the fit may not raise that estimate beyond this factor.
+_MAX_STEP_VARIANCE_GAIN = 2.0
 
 
 @dataclass(frozen=True)
 class SlamEstimate:
-    """Attributes (K key nodes, E edges of the closure graph):
-    correction: ``(K, 4)`` C.
-    inlier_probability: ``(E,)``.
-    noise: the estimated noise model.
-    variance: ``(K,)`` of one component of the orientation error relative to the root, rad².
-    passes: number of sparse solves.
+    """The refined closure graph (K key nodes, E edges).
+
+    Attributes:
+        correction: ``(K, 4)`` C.
+        inlier_probability: ``(E,)``.
+        noise: the estimated noise model.
+        variance: ``(K,)`` of one component of the orientation error relative to the root, rad².
+        passes: number of sparse solves.
     """
 
     correction: Tensor
@@ -70,6 +76,7 @@ def refine(
     probes = probe_signs(graph.nodes[graph.source], graph.nodes[graph.target], _NUM_PROBES)
     components = noise.components
     odometry, closure = graph.is_odometry, graph.is_closure
+    max_step_variance = _MAX_STEP_VARIANCE_GAIN * noise.step_variance
     passes = 0
     while True:
         variance = graph.steps * np.where(odometry, noise.step_variance, noise.closure_variance)
@@ -94,7 +101,7 @@ def refine(
         redundancy = inlier_probability * (1 - leverage)
         noise = NoiseModel(
             components,
-            _step_variance(square[odometry] / graph.steps[odometry], redundancy[odometry], noise),
+            min(_step_variance(square[odometry] / graph.steps[odometry], redundancy[odometry], noise), max_step_variance),
             _closure_variance(square[closure], inlier_probability[closure], redundancy[closure], components),
             outlier_share(inlier_probability[closure]),
         )
@@ -118,5 +125,4 @@ def _step_variance(square_per_step: np.ndarray, redundancy: np.ndarray, noise: N
 
 
 def _closure_variance(square: np.ndarray, probability: np.ndarray, redundancy: np.ndarray, components: int) -> float:
-    prior_square = np.radians(0.08) ** 2
-    return (float((probability * square).sum()) + prior_square) / (float(redundancy.sum()) * components + 1)
+    return (float((probability * square).sum()) + _PRIOR_CLOSURE_SQUARE) / (float(redundancy.sum()) * components + 1)

@@ -1,0 +1,174 @@
+"""Synthetic SfM view-graphs: the recipe of the paper's text, and the one of the authors' released scripts.
+
+Both draw true orientations, choose pairs, measure them with noise about mostly vertical-plane axes, and replace or disturb
+a share of the measurements. A measurement's noise is right-multiplied: ``R̃_uv = R_uv · noise``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from rotavg_ros.view_graph import ViewGraph
+
+# The paper calls an edge an outlier beyond this noise.
+SFM_OUTLIER_ANGLE = np.radians(20.0)
+
+
+@dataclass(frozen=True)
+class SyntheticGraph:
+    """A view-graph with its truth.
+
+    Attributes:
+        graph: the measurements.
+        body_from_world: ``(N, 4)`` float64, true orientations.
+        noise_angle: ``(M,)`` rad, angle between measured and true relative rotation.
+    """
+
+    graph: ViewGraph
+    body_from_world: Tensor
+    noise_angle: Tensor
+
+    @property
+    def is_outlier(self) -> Tensor:
+        """``(M,)`` bool, the paper's label: noise beyond 20°."""
+        return self.noise_angle > SFM_OUTLIER_ANGLE
+
+
+@dataclass(frozen=True)
+class ReleasedRecipe:
+    """The generator of the authors' released scripts. Pairs are ranges of uniform draws.
+
+    Attributes:
+        cameras: number of cameras.
+        turn_deg: standard deviation of the cameras' turn.
+        tilt_deg: largest additional tilt about a random axis.
+        kept_share: share of the candidate pairs kept.
+        overlap_deg: pairs beyond this relative angle are not kept.
+        noise_deg: standard deviation of the noise's angle, per graph, before division by √3.
+        outlier_share: share of the edges disturbed further, by a wide normal rotation.
+        planar: turn and noise axes lie in a vertical plane; otherwise anywhere.
+    """
+
+    cameras: tuple[int, int] = (400, 1000)
+    turn_deg: float = 45.0
+    tilt_deg: float = 10.0
+    kept_share: tuple[float, float] = (0.25, 0.5)
+    overlap_deg: tuple[float, float] = (45.0, 60.0)
+    noise_deg: tuple[float, float] = (15.0, 30.0)
+    outlier_share: tuple[float, float] = (0.1, 0.2)
+    planar: bool = True
+
+    def sample(self, rng: np.random.Generator) -> SyntheticGraph:
+        """Draw one graph."""
+        n = int(rng.integers(self.cameras[0], self.cameras[1] + 1))
+        turn = _axes(n, self.planar, rng) * np.radians(self.turn_deg) * rng.standard_normal((n, 1))
+        turn = turn[np.argsort(turn[:, 1])]
+        tilt = _axes(n, False, rng) * np.radians(rng.uniform(0, self.tilt_deg, (n, 1)))
+        orientation = Rotation.from_rotvec(turn) * Rotation.from_rotvec(tilt)
+
+        # Candidates: 1-based i < j ≤ 2 (i + 2).
+        first, second = np.triu_indices(n, k=1)
+        candidate = second + 1 <= 2 * (first + 3)
+        first, second = first[candidate], second[candidate]
+        angle = _relative_angle(orientation.as_quat(), first, second)
+        wanted = min(
+            int(rng.uniform(*self.kept_share) * len(first)),
+            int((angle < np.radians(rng.uniform(*self.overlap_deg))).sum()),
+        )
+        kept = np.zeros(len(first), dtype=bool)
+        kept[np.argpartition(angle, min(wanted, len(angle) - 1))[:wanted]] = True
+        kept[_spanning_tree_edges(n, first, second, angle)] = True
+        source, target = first[kept], second[kept]
+
+        m = len(source)
+        sigma = np.radians(rng.uniform(*self.noise_deg)) / np.sqrt(3)
+        noise = Rotation.from_rotvec(_axes(m, self.planar, rng) * sigma * rng.standard_normal((m, 1)))
+        noise = noise * Rotation.from_rotvec(_axes(m, False, rng) * sigma / 10 * rng.standard_normal((m, 1)))
+        disturbed = rng.choice(m, int(rng.uniform(*self.outlier_share) * m), replace=False)
+        wide = np.zeros((m, 3))
+        wide[disturbed] = (
+            np.radians(90) / np.sqrt(3) * rng.standard_normal((len(disturbed), 1))
+            * rng.standard_normal((len(disturbed), 3))
+        )
+        return _measured(orientation, source, target, noise * Rotation.from_rotvec(wide))
+
+
+@dataclass(frozen=True)
+class PaperRecipe:
+    """The generator as the paper's text describes it (§5.1). Pairs are ranges of uniform draws.
+
+    Attributes:
+        cameras: number of cameras, all turned about the vertical alone.
+        pair_share: share of all pairs that are measured.
+        noise_deg: standard deviation of the noise's angle, drawn once per graph, about axes in a vertical plane.
+        outlier_share: share of the edges replaced by random rotations.
+    """
+
+    cameras: tuple[int, int] = (250, 1000)
+    pair_share: tuple[float, float] = (0.1, 0.3)
+    noise_deg: tuple[float, float] = (5.0, 30.0)
+    outlier_share: tuple[float, float] = (0.0, 0.3)
+
+    def sample(self, rng: np.random.Generator) -> SyntheticGraph:
+        """Draw one graph; pairs that leave cameras unconnected are joined by a random chain."""
+        n = int(rng.integers(self.cameras[0], self.cameras[1] + 1))
+        yaw = np.zeros((n, 3))
+        yaw[:, 1] = rng.uniform(-np.pi, np.pi, n)
+        orientation = Rotation.from_rotvec(yaw)
+        first, second = np.triu_indices(n, k=1)
+        kept = rng.random(len(first)) < rng.uniform(*self.pair_share)
+        source, target = first[kept], second[kept]
+        chain = rng.permutation(n)
+        present = np.zeros((n, n), dtype=bool)
+        present[source, target] = True
+        low, high = np.minimum(chain[:-1], chain[1:]), np.maximum(chain[:-1], chain[1:])
+        missing = ~present[low, high]
+        source, target = np.concatenate((source, low[missing])), np.concatenate((target, high[missing]))
+        m = len(source)
+        sigma = np.radians(rng.uniform(*self.noise_deg))
+        rotvec = _axes(m, True, rng) * sigma * rng.standard_normal((m, 1))
+        noise = Rotation.from_rotvec(rotvec).as_quat()
+        replaced = rng.choice(m, int(rng.uniform(*self.outlier_share) * m), replace=False)
+        noise[replaced] = _random_quaternions(len(replaced), rng)
+        return _measured(orientation, source, target, Rotation.from_quat(noise))
+
+
+def _axes(count: int, in_vertical_plane: bool, rng: np.random.Generator) -> np.ndarray:
+    """Unit axes: ``[y, √(1 − y²), 0]`` with uniform y, or anywhere on the sphere."""
+    if in_vertical_plane:
+        y = rng.uniform(-1, 1, count)
+        return np.stack((y, np.sqrt(1 - y * y), np.zeros(count)), axis=1)
+    axes = rng.standard_normal((count, 3))
+    return axes / np.linalg.norm(axes, axis=1, keepdims=True)
+
+
+def _random_quaternions(count: int, rng: np.random.Generator) -> np.ndarray:
+    quaternions = rng.standard_normal((count, 4))
+    return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+
+
+def _relative_angle(quaternion: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    cosine = np.abs((quaternion @ quaternion.T)[first, second])
+    return 2 * np.arccos(np.clip(cosine, 0, 1))
+
+
+def _spanning_tree_edges(n: int, first: np.ndarray, second: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Indices of the pairs in the minimum spanning tree by relative angle."""
+    graph = coo_array((np.maximum(angle, 1e-12), (first, second)), shape=(n, n)).tocsr()
+    tree = minimum_spanning_tree(graph).tocoo()
+    position = coo_array((np.arange(1, len(first) + 1), (first, second)), shape=(n, n)).tocsr()
+    return np.asarray(position[tree.row, tree.col]).ravel() - 1
+
+
+def _measured(orientation: Rotation, source: np.ndarray, target: np.ndarray, noise: Rotation) -> SyntheticGraph:
+    """The graph that measures ``orientation`` (body_from_world) with right-multiplied ``noise``."""
+    measured = orientation[target] * orientation[source].inv() * noise
+    graph = ViewGraph.create(source, target, measured.as_quat(), num_nodes=len(orientation))
+    return SyntheticGraph(graph, torch.from_numpy(orientation.as_quat()), torch.from_numpy(noise.magnitude()))

@@ -1,0 +1,57 @@
+"""Which loop closures agree with each other.
+
+Two good closures whose ends lie near each other along the odometry measure nearly the same drift, so their residuals
+differ by the noise of the few steps between them and their own. A false closure agrees with nobody, or with its group.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.closure_graph import ClosureGraph
+
+NUM_NEIGHBOURS = 16
+
+
+@dataclass(frozen=True)
+class AgreementPairs:
+    """Every closure with those nearest to it (C closures, P = C · k pairs, k ≤ 16, grouped by ``first``).
+
+    Attributes:
+        first, second: ``(P,)`` closures, as positions among the closures.
+        steps: ``(P,)`` odometry steps between their ends, both ends summed.
+        squared_angle: ``(P,)`` rad², by how much their residuals differ.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    steps: np.ndarray
+    squared_angle: np.ndarray
+
+
+def agreement_pairs(graph: ClosureGraph, num_neighbours: int = NUM_NEIGHBOURS) -> AgreementPairs:
+    """The nearest closures of every closure, by steps along the odometry."""
+    closure = np.flatnonzero(graph.is_closure)
+    count = min(num_neighbours, len(closure) - 1)
+    if count < 1:
+        empty = np.empty(0, dtype=np.int64)
+        return AgreementPairs(empty, empty, np.empty(0), np.empty(0))
+    start, end = graph.position[graph.source[closure]], graph.position[graph.target[closure]]
+    residual = graph.residual[torch.from_numpy(closure)]
+    # Closures run old → new and new → old; residuals compare in one direction only.
+    turned = torch.from_numpy(start > end)[:, None]
+    residual = torch.where(turned, rotations.inverse(residual), residual)
+    ends = np.stack((np.minimum(start, end), np.maximum(start, end)), axis=1)
+    steps, neighbour = KDTree(ends).query(ends, k=count + 1, p=1)
+    # Each closure finds itself, but not always first where others share its ends.
+    itself = neighbour == np.arange(len(closure))[:, None]
+    itself[~itself.any(axis=1), -1] = True
+    first = np.repeat(np.arange(len(closure)), count)
+    second = neighbour[~itself]
+    difference = rotations.multiply(rotations.inverse(residual[first]), residual[second])
+    return AgreementPairs(first, second, steps[~itself], (rotations.log(difference) ** 2).sum(dim=1).numpy())

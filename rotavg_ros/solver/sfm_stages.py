@@ -1,0 +1,58 @@
+"""The paper's stages on an SfM view-graph, as the pipeline runs them and as training sees them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rotavg_ros.solver.clean_net import CleanNet
+from rotavg_ros.solver.fine_net import FineNet, edge_residual
+from rotavg_ros.solver.message_passing import DirectedEdges
+from rotavg_ros.solver.spanning_tree import SpanningForest, compose_orientations, shortest_path_forest
+from rotavg_ros.view_graph import ViewGraph
+
+# An edge whose outlier probability exceeds this is no inlier (ε of the paper; uncritical in 0.35–0.8).
+OUTLIER_THRESHOLD = 0.75
+# Cost of an edge in the tree (the authors' released code).
+_INLIER_COST, _OUTLIER_COST = 0.1, 1.1
+
+
+@dataclass(frozen=True)
+class Cleaned:
+    """A view-graph after CleanNet.
+
+    Attributes:
+        graph: the rectified measurements.
+        outlier_probability: ``(M,)`` float32.
+        is_inlier: ``(M,)`` bool.
+    """
+
+    graph: ViewGraph
+    outlier_probability: Tensor
+    is_inlier: Tensor
+
+
+def clean(network: CleanNet, graph: ViewGraph, edges: DirectedEdges | None = None) -> Cleaned:
+    """CleanNet: rectify every measurement and score it."""
+    edges = DirectedEdges.of(graph.source, graph.target, graph.num_nodes) if edges is None else edges
+    result = network(graph.target_from_source.float(), edges)
+    probability = torch.sigmoid(result.outlier_logit)
+    rectified = replace(graph, target_from_source=result.target_from_source.double())
+    return Cleaned(rectified, probability, probability < OUTLIER_THRESHOLD)
+
+
+def bootstrap(cleaned: Cleaned) -> tuple[Tensor, SpanningForest]:
+    """Orientations along a shortest-path tree that avoids outliers, ``(N, 4)`` float64."""
+    cost = torch.where(cleaned.is_inlier, _INLIER_COST, _OUTLIER_COST)
+    forest = shortest_path_forest(cleaned.graph, cost)
+    return compose_orientations(forest, cleaned.graph), forest
+
+
+def fine_tune(network: FineNet, cleaned: Cleaned, body_from_world: Tensor) -> Tensor:
+    """FineNet over the inlier edges, ``(N, 4)`` float64."""
+    inliers = cleaned.graph.select_edges(cleaned.is_inlier)
+    edges = DirectedEdges.of(inliers.source, inliers.target, inliers.num_nodes)
+    residual = edge_residual(body_from_world, inliers.target_from_source, inliers.source, inliers.target)
+    return network(body_from_world.float(), residual.float(), edges).double()

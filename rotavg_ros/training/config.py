@@ -1,0 +1,104 @@
+"""What a training run is told: a YAML file whose keys are the fields of :class:`TrainingConfig`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from rotavg_ros.errors import UserError
+
+
+class TrainingConfigError(UserError):
+    """A training configuration that cannot be used; the message names the file and the key."""
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """Everything that decides the outcome of a training run, the machine aside.
+
+    Attributes:
+        family: "sfm" or "slam", the networks' profile.
+        recipe: SfM: "released", "released-spatial" (axes anywhere), "paper" or "mixture"; SLAM: "wide".
+        nodes: cameras or keyframes of the training graphs, drawn uniformly (SLAM: in the logarithm).
+        graphs: number of training graphs; each epoch sees all of them once.
+        validation_nodes, validation_graphs: the same for the graphs that decide which weights are kept.
+        epochs: passes over the training graphs.
+        batch_graphs: graphs per step, joined into one disjoint graph.
+        learning_rate, weight_decay: of Adam; the rate falls to zero along a cosine.
+        edge_dropout: share of each graph's edges left out anew in every epoch.
+        seed: of data, initial weights and order.
+    """
+
+    family: str = "sfm"
+    recipe: str = "released"
+    nodes: tuple[int, int] = (60, 200)
+    graphs: int = 1000
+    validation_nodes: tuple[int, int] = (400, 400)
+    validation_graphs: int = 8
+    epochs: int = 250
+    batch_graphs: int = 8
+    learning_rate: float = 5e-5
+    weight_decay: float = 1e-4
+    edge_dropout: float = 0.25
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        recipes = {"sfm": ("released", "released-spatial", "paper", "mixture"), "slam": ("wide",)}
+        if self.family not in recipes:
+            raise TrainingConfigError(f"family is {self.family!r}; choose from {', '.join(recipes)}")
+        if self.recipe not in recipes[self.family]:
+            raise TrainingConfigError(
+                f"recipe is {self.recipe!r}; the family {self.family} has {', '.join(recipes[self.family])}"
+            )
+        for name in ("graphs", "validation_graphs", "epochs", "batch_graphs"):
+            if getattr(self, name) < 1:
+                raise TrainingConfigError(f"{name} is {getattr(self, name)}; it must be at least 1")
+        for name in ("nodes", "validation_nodes"):
+            low, high = getattr(self, name)
+            if not 10 <= low <= high:
+                raise TrainingConfigError(f"{name} is [{low}, {high}]; use an ascending pair of at least 10")
+        if not 0 <= self.edge_dropout < 1:
+            raise TrainingConfigError(f"edge_dropout is {self.edge_dropout}; a share in [0, 1)")
+
+    @classmethod
+    def load(cls, path: Path) -> TrainingConfig:
+        """Read a YAML file.
+
+        Raises:
+            TrainingConfigError: unreadable, unknown key, or a value of the wrong type or range.
+        """
+        try:
+            content = yaml.safe_load(path.read_text())
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            reason = str(error).splitlines()[0]
+            raise TrainingConfigError(f"{path}: not a readable YAML file ({reason})") from None
+        if not isinstance(content, dict):
+            raise TrainingConfigError(f"{path}: expected `key: value` lines, found {type(content).__name__}")
+        return cls.from_dict(content, str(path))
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any], origin: str = "configuration") -> TrainingConfig:
+        """Build from plain values; ``origin`` names them in errors."""
+        defaults = {field.name: field.default for field in fields(cls)}
+        values: dict[str, Any] = {}
+        for key, value in content.items():
+            if key not in defaults:
+                raise TrainingConfigError(f"{origin}: unknown key {key!r}; known are {', '.join(defaults)}")
+            kind = type(defaults[key])
+            try:
+                values[key] = tuple(int(item) for item in value) if kind is tuple else kind(value)
+            except (TypeError, ValueError):
+                raise TrainingConfigError(f"{origin}: {key} is {value!r}, expected like {defaults[key]!r}") from None
+            if kind is tuple and len(values[key]) != 2:
+                raise TrainingConfigError(f"{origin}: {key} is {value!r}, expected a pair")
+        try:
+            return cls(**values)
+        except TrainingConfigError as error:
+            raise TrainingConfigError(f"{origin}: {error}") from None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, as :meth:`from_dict` takes them."""
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
