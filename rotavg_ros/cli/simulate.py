@@ -43,7 +43,14 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--odometry-bias-deg-per-min", type=float, default=1.0, metavar="DEG", help="gyroscope bias (default: 1)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="same seed, same run (default: 0)")
+    parser.add_argument("--seed", type=_seed, default=0, help="same seed, same run (default: 0)")
+
+
+def _seed(text: str) -> int:
+    seed = int(text)
+    if seed < 0:
+        raise argparse.ArgumentTypeError("must be 0 or more")
+    return seed
 
 
 def simulate(arguments: argparse.Namespace) -> SimulatedRun:

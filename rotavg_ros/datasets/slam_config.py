@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum
 
 import numpy as np
@@ -90,6 +90,10 @@ class SlamSimulationConfig:
     closure_precision_factor: float = 1.0
 
     def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, float) and not 0 <= value < float("inf"):
+                raise SlamSimulationError(f"{field.name} is {value}; it must be finite and must not be negative")
         if self.dimensions not in (2, 3):
             raise SlamSimulationError(f"dimensions is {self.dimensions}; use 2 or 3")
         if self.dimensions == 2 and self.world not in PLANAR_WORLDS:
@@ -101,14 +105,11 @@ class SlamSimulationConfig:
         for name in ("slip_share", "short_range_share", "backward_share", "false_share", "in_place_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise SlamSimulationError(f"{name} is {getattr(self, name)}; a share lies in [0, 1]")
-        if min(self.grouped_share, self.near_miss_share) < 0 or self.grouped_share + self.near_miss_share > 1 + 1e-12:
+        if self.grouped_share + self.near_miss_share > 1 + 1e-12:
             raise SlamSimulationError("grouped_share and near_miss_share are parts of the false closures: at most 1")
         for name in ("laps", "keyframe_distance_m", "keyframe_period_s", "closure_radius_m"):
             if getattr(self, name) <= 0:
                 raise SlamSimulationError(f"{name} is {getattr(self, name)}; it must be positive")
-        for name in ("odometry_noise_deg", "closure_noise_deg", "closures_per_keyframe"):
-            if getattr(self, name) < 0:
-                raise SlamSimulationError(f"{name} is {getattr(self, name)}; it must not be negative")
 
 
 def random_slam_config(rng: np.random.Generator, num_keyframes: int | None = None) -> SlamSimulationConfig:

@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.bags.graph_from_bag import read_graph_bag
+from rotavg_ros.bags.graph_to_bag import write_graph_bag
+from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION
+from rotavg_ros.bags.reader import BagReader
+from rotavg_ros.bags.run_bag import write_run_bag
+from rotavg_ros.bags.topics import EDGE_TOPIC, ODOM_TOPIC, TRANSLATION_TOPIC, TRUTH_TOPIC
+from rotavg_ros.datasets.graph_file import GraphFile, read_graph
+from rotavg_ros.datasets.ground_truth import attach_stamps, attach_truth
+from rotavg_ros.datasets.robot_run import robot_run_config
+from rotavg_ros.datasets.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.trajectories import World
+
+
+def simulated(seed: int = 0, **changes: object) -> SimulatedRun:
+    config = replace(SlamSimulationConfig(num_keyframes=300, false_share=0.3), **changes)
+    return simulate_slam_graph(config, np.random.default_rng(seed))
+
+
+def assert_same(read: GraphFile, written: GraphFile) -> None:
+    """Equal in everything a bag carries."""
+    for name in ("source", "target", "kind"):
+        assert torch.equal(getattr(read.graph, name), getattr(written.graph, name)), name
+    assert read.graph.num_nodes == written.graph.num_nodes
+    difference = (read.graph.target_from_source - written.graph.target_from_source).abs().max()
+    assert float(difference) < 1e-9
+    np.testing.assert_array_equal(read.graph.precision.numpy(), written.graph.precision.numpy())
+    np.testing.assert_array_equal(read.node_ids, written.node_ids)
+    assert read.planar == written.planar
+    for name in ("edge_translation", "stamps_ns", "body_from_world_gt", "position_gt"):
+        expected, got = getattr(written, name), getattr(read, name)
+        if expected is None:
+            assert got is None, name
+        else:
+            np.testing.assert_allclose(got, expected, rtol=0, atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("world", [World.BUILDING, World.SPHERE])
+def test_round_trip(tmp_path: Path, world: World) -> None:
+    graph_file = simulated(world=world, dimensions=2 if world is World.BUILDING else 3).to_graph_file()
+    write_graph_bag(tmp_path / "bag", graph_file)
+    assert_same(read_graph_bag(tmp_path / "bag"), graph_file)
+
+
+def test_round_trip_of_a_bare_graph(tmp_path: Path) -> None:
+    graph = simulated().graph
+    # Edges in no order, ids with gaps, unknown precisions, a node without edges, nothing else known.
+    shuffled = graph.select_edges(torch.from_numpy(np.random.default_rng(0).permutation(graph.num_edges)))
+    precision = shuffled.precision.clone()
+    precision[::3] = torch.nan
+    graph_file = GraphFile(
+        replace(shuffled, precision=precision, num_nodes=graph.num_nodes + 1),
+        np.append(np.arange(graph.num_nodes) * 7 + 3, 2**62),
+        planar=True,
+    )
+    write_graph_bag(tmp_path / "bag", graph_file)
+    assert_same(read_graph_bag(tmp_path / "bag"), graph_file)
+
+
+def test_round_trip_without_odometry(tmp_path: Path) -> None:
+    graph = simulated(dimensions=3).graph
+    graph_file = GraphFile(replace(graph, kind=torch.ones_like(graph.kind)), np.arange(graph.num_nodes))
+    write_graph_bag(tmp_path / "bag", graph_file)
+    with BagReader(tmp_path / "bag") as bag:
+        assert bag.topics == {EDGE_TOPIC: RELATIVE_ROTATION}
+    assert_same(read_graph_bag(tmp_path / "bag"), graph_file)
+
+
+def test_round_trip_of_a_real_robot(tmp_path: Path, shared_data: Path) -> None:
+    folder = shared_data / "slam" / "b25b"
+    graph_file = attach_stamps(read_graph(folder / "B25b_0.000.g2o"), folder / "B25b_timestamps.txt")
+    graph_file = attach_truth(graph_file, folder / "ground_truth.csv")
+    write_graph_bag(tmp_path / "bag", graph_file)
+    assert_same(read_graph_bag(tmp_path / "bag"), graph_file)
+    with BagReader(tmp_path / "bag") as bag:
+        assert bag.num_messages([ODOM_TOPIC]) == 8358
+        assert bag.num_messages([TRUTH_TOPIC]) == 7352
+
+
+def test_edges_are_published_when_their_later_end_exists(tmp_path: Path) -> None:
+    run = simulated()
+    write_graph_bag(tmp_path / "bag", run.to_graph_file())
+    newest_odometry, sequence = 0, 0
+    with BagReader(tmp_path / "bag") as bag:
+        for topic, time_ns, message in bag.decoded([ODOM_TOPIC, EDGE_TOPIC]):
+            stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+            assert stamp_ns == time_ns
+            if topic == ODOM_TOPIC:
+                newest_odometry = stamp_ns
+                continue
+            sequence += 1
+            assert message.sequence == sequence
+            ends = [end.stamp.sec * 1_000_000_000 + end.stamp.nanosec for end in (message.source, message.target)]
+            assert max(ends) == newest_odometry
+
+
+def test_ros_conventions_in_the_bag(tmp_path: Path) -> None:
+    """world_from_target = world_from_source ∘ rotation, for orientations of /ground_truth."""
+    run = simulated(dimensions=3, closure_noise_deg=0, odometry_noise_deg=0, false_share=0)
+    write_graph_bag(tmp_path / "bag", run.to_graph_file())
+    orientation, position = {}, {}
+    checked = 0
+    with BagReader(tmp_path / "bag") as bag:
+        for topic, _, message in bag.decoded([TRUTH_TOPIC, EDGE_TOPIC]):
+            if topic == TRUTH_TOPIC:
+                q, p = message.pose.pose.orientation, message.pose.pose.position
+                stamp = (message.header.stamp.sec, message.header.stamp.nanosec)
+                orientation[stamp] = Rotation.from_quat([q.x, q.y, q.z, q.w])
+                position[stamp] = np.array([p.x, p.y, p.z])
+                continue
+            source, target = ((end.stamp.sec, end.stamp.nanosec) for end in (message.source, message.target))
+            q = message.rotation
+            reached = orientation[source] * Rotation.from_quat([q.x, q.y, q.z, q.w])
+            assert (reached.inv() * orientation[target]).magnitude() < 1e-7
+            checked += 1
+    assert checked == run.graph.num_edges
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_a_robots_run_reads_back_as_its_graph(tmp_path: Path, dimensions: int) -> None:
+    config = robot_run_config("building", dimensions=dimensions, laps=1)
+    run = simulate_slam_graph(config, np.random.default_rng(1))
+    write_run_bag(tmp_path / "bag", run)
+    with BagReader(tmp_path / "bag") as bag:
+        assert bag.topics[ODOM_TOPIC] == bag.topics[TRUTH_TOPIC] == ODOMETRY
+        assert bag.num_messages([ODOM_TOPIC]) == config.num_keyframes
+        assert bag.duration_s == pytest.approx((config.num_keyframes - 1) * 0.1)
+        closures = int((run.graph.kind == 1).sum())
+        assert bag.num_messages([EDGE_TOPIC]) == bag.num_messages([TRANSLATION_TOPIC]) == closures
+    read = read_graph_bag(tmp_path / "bag")
+    assert torch.equal(read.graph.source, run.graph.source)
+    assert torch.equal(read.graph.target, run.graph.target)
+    assert torch.equal(read.graph.kind, run.graph.kind)
+    assert float((read.graph.target_from_source - run.graph.target_from_source).abs().max()) < 1e-12
+    np.testing.assert_allclose(read.edge_translation, run.edge_translation, atol=1e-9)
+    np.testing.assert_allclose(read.position_gt, run.position)
+    assert read.planar == (dimensions == 2)

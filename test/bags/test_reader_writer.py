@@ -1,0 +1,209 @@
+from __future__ import annotations
+
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from rotavg_ros.bags.graph_from_bag import read_graph_bag
+from rotavg_ros.bags.message_types import ODOMETRY, definitions_folder, typestore
+from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_message, read_edge, read_odometry
+from rotavg_ros.bags.reader import BagReader, BagReadError
+from rotavg_ros.bags.writer import BagWriteError, BagWriter
+
+START_NS = 1_700_000_000_123_456_789
+
+
+def write_odometry(path: Path, count: int = 5, *, overwrite: bool = False, topic: str = "/odom") -> None:
+    with BagWriter(path, overwrite=overwrite) as bag:
+        bag.add_topic(topic, ODOMETRY, latched=topic == "/latched")
+        for index in range(count):
+            stamp = START_NS + index * 100_000_000
+            bag.write(topic, stamp, odometry_message(stamp, np.arange(3.0), np.array([0, 0, 0, 1.0]), "odom"))
+
+
+def test_messages_survive_serialisation() -> None:
+    edge = Edge(
+        stamp_ns=START_NS,
+        id=2**64 - 2,
+        sequence=2**32 - 1,
+        source=Keyframe(7, START_NS - 5, "robot_a"),
+        target=Keyframe(None, START_NS),
+        source_from_target=np.array([0.1, 0.2, 0.3, 0.9]),
+        precision=1234.5,
+        kind=1,
+    )
+    name = "rotavg_msgs/msg/RelativeRotation"
+    data = typestore().serialize_cdr(edge_message(edge), name)
+    back = read_edge(typestore().deserialize_cdr(data, name))
+    np.testing.assert_array_equal(back.source_from_target, edge.source_from_target)
+    for field in ("stamp_ns", "id", "sequence", "source", "target", "precision", "kind"):
+        assert getattr(back, field) == getattr(edge, field)
+    message = odometry_message(START_NS, np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.6, 0.0, 0.8]), "map")
+    assert read_odometry(message) == (START_NS, [1.0, 2.0, 3.0], [0.0, 0.6, 0.0, 0.8])
+
+
+def test_the_definitions_are_those_of_the_interface_package() -> None:
+    assert {path.stem for path in definitions_folder().glob("*.msg")} >= {"RelativeRotation", "OutlierFlags"}
+    rotavg_msgs = pytest.importorskip("rotavg_msgs.msg")
+    for name in ("RelativeRotation", "KeyframeReference", "AbsoluteOrientations", "OutlierFlags"):
+        fields = [field for field, _ in typestore().fielddefs[f"rotavg_msgs/msg/{name}"][1]]
+        assert fields == list(getattr(rotavg_msgs, name).get_fields_and_field_types())
+
+
+def test_a_written_bag_is_an_mcap_that_others_read(tmp_path: Path) -> None:
+    write_odometry(tmp_path / "run")
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == ["metadata.yaml", "run.mcap"]
+    with (tmp_path / "run" / "run.mcap").open("rb") as file:
+        messages = list(make_reader(file).iter_messages())
+    assert [message.log_time for _, _, message in messages] == [START_NS + k * 100_000_000 for k in range(5)]
+    assert {schema.name for schema, _, _ in messages if schema} == {ODOMETRY}
+
+
+def test_an_existing_output_is_refused_unless_overwritten(tmp_path: Path) -> None:
+    write_odometry(tmp_path / "run", 5)
+    with pytest.raises(BagWriteError, match="exists already"):
+        write_odometry(tmp_path / "run", 3)
+    with BagReader(tmp_path / "run") as bag:
+        assert bag.num_messages() == 5
+    write_odometry(tmp_path / "run", 3, overwrite=True)
+    with BagReader(tmp_path / "run") as bag:
+        assert bag.num_messages() == 3
+
+
+def test_overwrite_spares_what_is_not_a_bag(tmp_path: Path) -> None:
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter1.tex").write_text("years of work")
+    with pytest.raises(BagWriteError, match="not a bag"):
+        write_odometry(tmp_path / "thesis", overwrite=True)
+    assert (tmp_path / "thesis" / "chapter1.tex").exists()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BagWriteError, match="not a bag"):
+        write_odometry(tmp_path / "file", overwrite=True)
+
+
+def test_an_interrupted_recording_leaves_nothing(tmp_path: Path) -> None:
+    write_odometry(tmp_path / "run", 5)
+
+    def interrupted() -> None:
+        with BagWriter(tmp_path / "run", overwrite=True) as bag:
+            bag.add_topic("/odom", ODOMETRY)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    with BagReader(tmp_path / "run") as bag:
+        assert bag.num_messages() == 5
+
+
+def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BagWriteError, match="cannot be written"):
+        write_odometry(tmp_path / "file" / "run")
+
+
+def test_truncated_recordings(tmp_path: Path) -> None:
+    write_odometry(tmp_path / "run", 2000)
+    recording = tmp_path / "run" / "run.mcap"
+    whole = recording.read_bytes()
+    for length in (0, 5, 100, len(whole) // 2, len(whole) - 10):
+        recording.write_bytes(whole[:length])
+        with pytest.raises(BagReadError, match="truncated") as caught, BagReader(tmp_path / "run") as bag:
+            list(bag.decoded(["/odom"]))
+        assert "\n" not in str(caught.value)
+
+
+def test_garbled_recordings_never_crash(tmp_path: Path) -> None:
+    write_odometry(tmp_path / "run", 50)
+    recording = tmp_path / "run" / "run.mcap"
+    whole = bytearray(recording.read_bytes())
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        garbled = whole.copy()
+        for position in rng.integers(0, len(whole), 20):
+            garbled[position] = rng.integers(0, 256)
+        recording.write_bytes(garbled)
+        with suppress(BagReadError), BagReader(tmp_path / "run") as bag:
+            list(bag.decoded(["/odom"]))
+
+
+@pytest.mark.parametrize("metadata", ["", "nonsense", "rosbag2_bagfile_information: {version: 99}"])
+def test_broken_metadata(tmp_path: Path, metadata: str) -> None:
+    write_odometry(tmp_path / "run")
+    (tmp_path / "run" / "metadata.yaml").write_text(metadata)
+    with pytest.raises(BagReadError, match="not a readable bag"), BagReader(tmp_path / "run"):
+        pass
+
+
+def test_paths_that_are_no_bags(tmp_path: Path) -> None:
+    with pytest.raises(BagReadError, match="no such bag"):
+        BagReader(tmp_path / "nothing")
+    with pytest.raises(BagReadError, match=r"metadata\.yaml"):
+        BagReader(tmp_path)
+    (tmp_path / "graph.g2o").write_text("")
+    with pytest.raises(BagReadError, match="suffix"):
+        BagReader(tmp_path / "graph.g2o")
+    (tmp_path / "foreign.mcap").write_text("not an mcap")
+    with pytest.raises(BagReadError, match="not a readable bag"), BagReader(tmp_path / "foreign.mcap"):
+        pass
+
+
+def test_missing_topics_name_the_candidates(tmp_path: Path) -> None:
+    write_odometry(tmp_path / "run", topic="/wheel/odom")
+    with BagReader(tmp_path / "run") as bag:
+        with pytest.raises(BagReadError, match=r"no topic /odom.*topics of that type: /wheel/odom"):
+            bag.require("/odom", ODOMETRY)
+        with pytest.raises(BagReadError, match="has type nav_msgs/msg/Odometry, not"):
+            bag.require("/wheel/odom", "sensor_msgs/msg/Imu")
+    with pytest.raises(BagReadError, match="no topic /relative_rotations"):
+        read_graph_bag(tmp_path / "run")
+
+
+def test_latched_topics_are_known(tmp_path: Path) -> None:
+    write_odometry(tmp_path / "run", topic="/latched")
+    write_odometry(tmp_path / "other")
+    with BagReader(tmp_path / "run") as bag:
+        assert bag.is_latched("/latched")
+    with BagReader(tmp_path / "other") as bag:
+        assert not bag.is_latched("/odom")
+
+
+def test_a_single_recording_is_a_bag(tmp_path: Path) -> None:
+    write_odometry(tmp_path / "run")
+    with BagReader(tmp_path / "run" / "run.mcap") as bag:
+        assert bag.num_messages() == 5
+    shutil.move(tmp_path / "run" / "run.mcap", tmp_path / "alone.mcap")
+    with BagReader(tmp_path / "alone.mcap") as bag:
+        assert len(list(bag.decoded(["/odom"]))) == 5
+        assert bag.is_ros2
+
+
+@pytest.mark.parametrize("mode", [CompressionMode.NONE, CompressionMode.MESSAGE, CompressionMode.FILE])
+def test_bags_of_others_with_types_of_their_own(tmp_path: Path, mode: CompressionMode) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg("float64 value\nstring name", "their_msgs/msg/Thing"))
+    writer = Writer(tmp_path / "theirs", version=8, storage_plugin=StoragePlugin.MCAP)
+    if mode is not CompressionMode.NONE:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/thing", "their_msgs/msg/Thing", typestore=store)
+        thing = store.types["their_msgs/msg/Thing"](value=2.5, name="x")
+        writer.write(connection, 10, store.serialize_cdr(thing, "their_msgs/msg/Thing"))
+    with BagReader(tmp_path / "theirs") as bag:
+        [(topic, time_ns, message)] = bag.decoded(["/thing"])
+    assert (topic, time_ns, message.value, message.name) == ("/thing", 10, 2.5, "x")
+
+
+def test_real_bags(shared_data: Path) -> None:
+    with BagReader(shared_data / "bags" / "husky_test1.bag") as bag:
+        assert not bag.is_ros2
+        assert len(list(bag.decoded(["/husky_velocity_controller/odom"]))) == 3952
+    with BagReader(shared_data / "bags" / "nav2_turtlebot.mcap") as bag:
+        assert bag.is_ros2
+        assert len(list(bag.decoded(["/odom"]))) == 2639

@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros.cli.main import main
+from rotavg_ros.datasets.graph_file import read_graph, write_graph
+from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.trajectories import World
+
+
+@pytest.fixture
+def graph_path(tmp_path: Path) -> Path:
+    config = SlamSimulationConfig(world=World.SPHERE, dimensions=3, num_keyframes=200)
+    run = simulate_slam_graph(config, np.random.default_rng(0))
+    write_graph(tmp_path / "graph.g2o", run.to_graph_file())
+    return tmp_path / "graph.g2o"
+
+
+def test_file_to_bag_and_back(tmp_path: Path, graph_path: Path) -> None:
+    bag = tmp_path / "bag"
+    assert main(["convert", str(graph_path), str(bag)]) == 0
+    assert (bag / "metadata.yaml").exists()
+    assert main(["convert", str(bag), str(tmp_path / "back.g2o")]) == 0
+    before, after = read_graph(graph_path), read_graph(tmp_path / "back.g2o")
+    for name in ("source", "target", "kind"):
+        assert torch.equal(getattr(before.graph, name), getattr(after.graph, name))
+    difference = before.graph.target_from_source - after.graph.target_from_source
+    assert float(difference.abs().max()) < 1e-9
+    np.testing.assert_allclose(after.graph.precision, before.graph.precision, rtol=1e-9)
+    np.testing.assert_allclose(after.edge_translation, before.edge_translation, atol=1e-9)
+
+
+def test_an_existing_output_is_kept(tmp_path: Path, graph_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = str(tmp_path / "bag")
+    assert main(["convert", str(graph_path), bag]) == 0
+    capsys.readouterr()
+    assert main(["convert", str(graph_path), bag]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert main(["convert", str(graph_path), bag, "--overwrite"]) == 0
+
+
+@pytest.mark.parametrize("name", ["nothing", "nothing.mcap", "nothing.bag"])
+def test_a_bag_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    assert main(["convert", str(tmp_path / name), str(tmp_path / "x.g2o")]) == 2
+    error = capsys.readouterr().err
+    assert "no such" in error
+    assert error.count("\n") == 1
+
+
+def test_a_bag_without_edges(tmp_path: Path, capsys: pytest.CaptureFixture[str], shared_data: Path) -> None:
+    path = shared_data / "bags" / "nav2_turtlebot.mcap"
+    assert main(["convert", str(path), str(tmp_path / "x.g2o")]) == 2
+    assert "no topic /relative_rotations" in capsys.readouterr().err

@@ -1,0 +1,139 @@
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rclpy
+from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from rotavg_msgs.msg import RelativeRotation
+
+from rotavg_ros.bags.run_bag import write_run_bag
+from rotavg_ros.datasets.robot_run import robot_run_config
+from rotavg_ros.datasets.slam_simulation import SimulatedRun, simulate_slam_graph
+
+pytestmark = pytest.mark.ros
+
+ROTAVG = [sys.executable, "-m", "rotavg_ros.cli.main"]
+
+
+@pytest.fixture(scope="module")
+def run() -> SimulatedRun:
+    return simulate_slam_graph(robot_run_config(laps=1), np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def bag(run: SimulatedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bags") / "run"
+    write_run_bag(folder, run)
+    return folder
+
+
+class Listener:
+    """Everything that arrives, best-effort for odometry as sensors have it, reliable for edges."""
+
+    def __init__(self, node: rclpy.node.Node) -> None:
+        self.odometry: list[Odometry] = []
+        self.edges: list[RelativeRotation] = []
+        self.clock: list[Clock] = []
+        sensor = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
+        node.create_subscription(Odometry, "odom", self.odometry.append, sensor)
+        node.create_subscription(RelativeRotation, "relative_rotations", self.edges.append, 5000)
+        node.create_subscription(Clock, "clock", self.clock.append, 5000)
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+
+    def spin_until(self, condition: Callable[[], bool], timeout: float = 60.0) -> None:
+        deadline = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < deadline, f"{len(self.odometry)} odometry, {len(self.edges)} edges so far"
+            self._executor.spin_once(timeout_sec=0.05)
+
+
+def test_a_burst_arrives_whole_and_unchanged(
+    run: SimulatedRun, bag: Path, probe_node: rclpy.node.Node, start_process: Callable
+) -> None:
+    listener = Listener(probe_node)
+    player = start_process(*ROTAVG, "play", bag, "--rate", "0", "--clock")
+    listener.spin_until(lambda: not player.is_running)
+    assert player.wait() == 0, player.output
+    num_closures = int((~run.graph.is_odometry).sum())
+    listener.spin_until(lambda: len(listener.odometry) == 1500 and len(listener.edges) == num_closures)
+    stamps = [message.header.stamp.sec * 10**9 + message.header.stamp.nanosec for message in listener.odometry]
+    assert stamps == run.stamps_ns.tolist()
+    assert [edge.sequence for edge in listener.edges] == list(range(1, num_closures + 1))
+    orientation = listener.odometry[-1].pose.pose.orientation
+    np.testing.assert_allclose(
+        [orientation.x, orientation.y, orientation.z, orientation.w], run.odometry_world_from_body[-1], atol=1e-15
+    )
+    clock = [message.clock.sec * 10**9 + message.clock.nanosec for message in listener.clock]
+    assert clock == sorted(clock)
+    assert clock[-1] == stamps[-1]
+    assert f"{1500} on /odom" in player.output
+
+
+def test_the_rate_is_kept(bag: Path, probe_node: rclpy.node.Node, start_process: Callable) -> None:
+    listener = Listener(probe_node)
+    player = start_process(*ROTAVG, "play", bag, "--rate", "50", "--topics", "/odom")
+    listener.spin_until(lambda: len(listener.odometry) > 0)
+    start = time.monotonic()
+    listener.spin_until(lambda: len(listener.odometry) == 1500)
+    # 149.9 s of bag at 50 times real time; a loaded machine may be later, but nothing may be early.
+    assert time.monotonic() - start > 2.8
+    assert player.wait() == 0
+    assert not listener.edges
+
+
+def test_nobody_listens(bag: Path, start_process: Callable) -> None:
+    player = start_process(*ROTAVG, "play", bag, "--wait-for-subscribers", "0.5")
+    assert player.wait() == 2
+    assert "nobody subscribed" in player.output
+    assert player.output.count("\n") == 1
+
+
+def test_plays_to_nobody_when_told_so(bag: Path, start_process: Callable) -> None:
+    player = start_process(*ROTAVG, "play", bag, "--wait-for-subscribers", "0", "--rate", "0")
+    assert player.wait() == 0
+    assert "played" in player.output
+
+
+@pytest.mark.parametrize("playing", [False, True])
+def test_interrupted(
+    bag: Path, probe_node: rclpy.node.Node, start_process: Callable, playing: bool, wait_until: Callable
+) -> None:
+    player = start_process(*ROTAVG, "play", bag, "--rate", "1", "--wait-for-subscribers", "60")
+    if playing:
+        listener = Listener(probe_node)
+        listener.spin_until(lambda: len(listener.odometry) > 0)
+    else:
+        wait_until(lambda: "rotavg_player" in probe_node.get_node_names(), player)
+    assert player.stop(signal.SIGINT) == 130
+    assert "Traceback" not in player.output
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (["--topics", "/lidar"], "no topic /lidar; the bag has /ground_truth, /odom"),
+        (["--rate", "-1"], "the rate is -1"),
+        (["--max-messages-per-second", "0"], "must be positive"),
+    ],
+)
+def test_mistakes_are_one_line(bag: Path, start_process: Callable, options: list[str], complaint: str) -> None:
+    player = start_process(*ROTAVG, "play", bag, *options)
+    assert player.wait() == 2
+    assert complaint in player.output
+    assert player.output.count("\n") == 1
+
+
+def test_a_ros1_bag(shared_data: Path, start_process: Callable) -> None:
+    player = start_process(*ROTAVG, "play", shared_data / "bags" / "husky_test1.bag")
+    assert player.wait() == 2
+    assert "is a ROS 1 bag" in player.output
