@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,3 +57,10 @@ class Answer:
     @property
     def num_components(self) -> int:
         return int(self.component.max()) + 1 if len(self.component) else 0
+
+    def without_content(self) -> Answer:
+        """The same answer about no keyframes and no edges."""
+        arrays: dict[str, Any] = {
+            name: value[:0] for name, value in vars(self).items() if isinstance(value, np.ndarray)
+        }
+        return replace(self, robots=(), **arrays)

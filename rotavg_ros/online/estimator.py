@@ -161,6 +161,18 @@ class OnlineEstimator:
         return Trajectory(nodes, answer.stamp_ns[nodes], orientation, position)
 
     @property
+    def revision(self) -> int:
+        """Counts the graph's changes."""
+        with self._lock:
+            return self._builder.graph.revision
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether the graph has changed since the last answer."""
+        with self._lock:
+            return self._builder.graph.revision != self._answered_revision
+
+    @property
     def paused(self) -> bool:
         return self._paused
 

@@ -1,0 +1,90 @@
+"""Counting what never arrived, and how long it took what did."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+# A larger step is a sender that restarted or sends nonsense, not that many lost messages.
+_LARGEST_GAP = 1_000_000
+
+
+class SequenceGaps:
+    """Lost messages of senders that number theirs consecutively.
+
+    Attributes:
+        lost: numbers that were left out.
+        before_first: numbers below the first that was seen: sent before we listened, or lost while we connected.
+    """
+
+    def __init__(self) -> None:
+        self.lost = 0
+        self.before_first = 0
+        self._last: dict[str, int] = {}
+
+    def observe(self, sender: str, number: int, first: int = 1) -> None:
+        """Note a number; one that is not ahead of the last means that the sender started anew.
+
+        Args:
+            sender: whose count it is.
+            number: 0 if the sender does not count.
+            first: the number that the sender starts from.
+        """
+        if number <= 0:
+            return
+        last = self._last.get(sender)
+        if last is None:
+            self.before_first += number - first if number - first < _LARGEST_GAP else 0
+        elif last < number <= last + _LARGEST_GAP:
+            self.lost += number - last - 1
+        self._last[sender] = number
+
+
+class TopicCounter:
+    """Messages of one subscription: how many came, and how many got lost by the sender's and the middleware's count."""
+
+    def __init__(self) -> None:
+        self.received = 0
+        self.by_sequence = SequenceGaps()
+        self.by_middleware = SequenceGaps()
+
+    def observe(self, info: dict[str, Any] | None, num_publishers: int) -> None:
+        """Note a message.
+
+        Args:
+            info: rclpy's message info, None where rclpy hands out none.
+            num_publishers: the middleware's numbers are per publisher and do not say whose, so they count only while
+                there is one.
+        """
+        self.received += 1
+        if info is not None and num_publishers == 1:
+            self.by_middleware.observe("", info.get("publication_sequence_number") or 0)
+
+    @property
+    def lost(self) -> int:
+        """The larger of the two counts, for both see the same losses."""
+        return max(self.by_sequence.lost, self.by_middleware.lost)
+
+    @property
+    def before_first(self) -> int:
+        return max(self.by_sequence.before_first, self.by_middleware.before_first)
+
+
+class Durations:
+    """The last durations of something, in seconds, and their percentiles."""
+
+    def __init__(self, length: int = 1000) -> None:
+        self._recent: deque[float] = deque(maxlen=length)
+        self.count = 0
+        self.longest = 0.0
+
+    def add(self, seconds: float) -> None:
+        self._recent.append(seconds)
+        self.count += 1
+        self.longest = max(self.longest, seconds)
+
+    def percentile_ms(self, percent: float) -> float:
+        """Milliseconds; NaN before the first."""
+        return 1e3 * float(np.percentile(list(self._recent), percent)) if self._recent else float("nan")

@@ -1,0 +1,223 @@
+"""The node's parameters: one frozen dataclass from which declarations, YAML and the README's table are made."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
+from typing import Any
+
+from rotavg_ros.errors import UserError
+from rotavg_ros.online import EstimatorOptions
+from rotavg_ros.solver import DEVICES, PROFILES
+from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE
+
+NODE_NAME = "rotavg"
+
+
+class ParameterError(UserError):
+    """Parameters that cannot be, alone or together."""
+
+
+def _parameter(
+    default: Any,
+    description: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+    live: bool = False,
+) -> Any:
+    metadata = {"description": description, "low": low, "high": high, "choices": choices, "live": live}
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class NodeParameters:
+    """Every parameter of the node; ``live`` ones can be changed while it runs."""
+
+    odometry_topics: tuple[str, ...] = _parameter(("odom",), "nav_msgs/msg/Odometry topics, one per robot")
+    robots: tuple[str, ...] = _parameter(
+        ("robot",), "name of the robot behind each odometry topic; an edge without a robot name belongs to the first"
+    )
+    edge_topics: tuple[str, ...] = _parameter(
+        ("relative_rotations", "relative_rotation_arrays:rotavg_msgs/msg/RelativeRotationArray"),
+        "topics of relative rotations, 'topic' (rotavg_msgs/msg/RelativeRotation) or 'topic:package/msg/Type'",
+    )
+    edge_sensor_orientations: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0, 1.0),
+        "orientation of each edge topic's sensor frame in the body frame, xyzw one after the other; one for all, "
+        "or one per edge topic",
+    )
+    world_frame: str = _parameter("map", "frame id of what is published")
+    publish_tf: bool = _parameter(False, "publish world → odometry frame (rotation only) on /tf; needs tf2_msgs")
+    odometry_queue_depth: int = _parameter(1000, "messages that may wait per odometry topic", low=1, high=1_000_000)
+    edge_queue_depth: int = _parameter(10_000, "messages that may wait per edge topic", low=1, high=1_000_000)
+
+    keyframe_source: str = _parameter(
+        "odometry",
+        "'odometry': keyframes are chosen from odometry messages; 'edges': a front end sends them as odometry edges",
+        choices=("odometry", "edges"),
+    )
+    unknown_keyframes: str = _parameter(
+        "wait", "an edge that names an unknown keyframe waits for it, or creates it", choices=("wait", "create")
+    )
+    keyframe_angle_deg: float = _parameter(
+        5.0, "turn that makes a keyframe; 0 switches the criterion off", low=0.0, high=360.0, live=True
+    )
+    keyframe_distance_m: float = _parameter(
+        0.5, "way that makes a keyframe; 0 switches the criterion off", low=0.0, high=1e6, live=True
+    )
+    keyframe_interval_s: float = _parameter(
+        0.0,
+        "time that makes a keyframe; 0 switches the criterion off; with all three off every message is one",
+        low=0.0,
+        high=1e6,
+        live=True,
+    )
+    stamp_tolerance_s: float = _parameter(
+        0.1, "how far before the first or after the last odometry an edge's stamp may be", low=0.0, high=60.0, live=True
+    )
+    max_odometry_gap_s: float = _parameter(
+        5.0, "between odometry messages farther apart no edge is placed", low=0.0, high=1e6, live=True
+    )
+    pending_capacity: int = _parameter(
+        20_000, "edges that may wait for a keyframe or for odometry; the oldest go first", low=1, high=10_000_000
+    )
+    pending_timeout_s: float = _parameter(300.0, "how long they may wait, in the data's time", low=0.0, high=1e9)
+    gauge: str = _parameter(
+        "odometry",
+        "orientation of the first keyframe of a component: the odometry's, or identity",
+        choices=("odometry", "identity"),
+    )
+
+    solve_period_s: float = _parameter(
+        0.5, "how often to look for something new to solve", low=0.01, high=3600.0, live=True
+    )
+    method: str = _parameter("neurora", "solver, as in `rotavg solve --method`", live=True)
+    profile: str = _parameter("auto", "'slam', 'sfm', or by what the edges are", choices=tuple(PROFILES), live=True)
+    device: str = _parameter("auto", "where the networks run", choices=tuple(DEVICES))
+    refinement_steps: int = _parameter(
+        -1, "refinement steps at most, 0 for none, -1 for the profile's own number", low=-1, high=1000, live=True
+    )
+    warm_start: bool = _parameter(True, "start from the last answer while data flows", live=True)
+    outlier_threshold: float = _parameter(
+        0.5, "an edge with a higher score is an outlier", low=0.0, high=1.0, live=True
+    )
+    solver_threads: int = _parameter(0, "threads of a solve; 0: all cores but one", low=0, high=1024)
+
+    state_file: str = _parameter("", "file for ~/save and ~/load, read at start if it exists; empty: none")
+    autosave_period_s: float = _parameter(0.0, "save the state this often if it changed; 0: never", low=0.0, high=1e6)
+    odometry_timeout_s: float = _parameter(
+        5.0, "diagnostics warn when no odometry has come for longer", low=0.1, high=1e6, live=True
+    )
+
+    def __post_init__(self) -> None:
+        for parameter in fields(self):
+            _check(parameter, getattr(self, parameter.name))
+        self._check_topics()
+        if self.autosave_period_s > 0 and not self.state_file:
+            raise ParameterError("autosave_period_s is set but state_file is empty; name a file")
+        self.estimator_options()
+
+    def _check_topics(self) -> None:
+        for name in ("odometry_topics", "robots", "edge_topics"):
+            values = getattr(self, name)
+            if len(set(values)) < len(values):
+                raise ParameterError(f"{name} names something twice: {', '.join(values)}")
+        if not self.robots:
+            raise ParameterError("robots is empty; name at least one")
+        if len(self.robots) != len(self.odometry_topics):
+            raise ParameterError(
+                f"robots has {len(self.robots)} entries and odometry_topics {len(self.odometry_topics)}; "
+                "give one robot per topic"
+            )
+        numbers = self.edge_sensor_orientations
+        if len(numbers) not in (4, 4 * len(self.edge_topics)):
+            raise ParameterError(
+                f"edge_sensor_orientations has {len(numbers)} numbers; give 4, or 4 per edge topic "
+                f"({4 * len(self.edge_topics)})"
+            )
+        for start in range(0, len(numbers), 4):
+            if not abs(math.hypot(*numbers[start : start + 4]) - 1) <= UNIT_NORM_TOLERANCE:
+                raise ParameterError(f"edge_sensor_orientations: quaternion {start // 4} is not of unit length")
+
+    def estimator_options(self) -> EstimatorOptions:
+        """The same as the estimator wants it."""
+        return EstimatorOptions(
+            keyframe_source=self.keyframe_source,
+            unknown_keyframes=self.unknown_keyframes,
+            keyframe_angle=math.radians(self.keyframe_angle_deg),
+            keyframe_distance=self.keyframe_distance_m,
+            keyframe_interval_s=self.keyframe_interval_s,
+            stamp_tolerance_s=self.stamp_tolerance_s,
+            max_odometry_gap_s=self.max_odometry_gap_s,
+            pending_capacity=self.pending_capacity,
+            pending_timeout_s=self.pending_timeout_s,
+            gauge=self.gauge,
+            method=self.method,
+            profile=self.profile,
+            device=self.device,
+            refinement_steps=None if self.refinement_steps < 0 else self.refinement_steps,
+            outlier_threshold=self.outlier_threshold,
+            warm_start=self.warm_start,
+        )
+
+    def changed(self, values: Mapping[str, Any]) -> NodeParameters:
+        """A copy with these values, checked as a whole; names that are not ours are ignored.
+
+        Raises:
+            ParameterError: the values do not fit, one by one or together.
+        """
+        ours = {parameter.name for parameter in fields(self)}
+        return replace(self, **{name: _python(value) for name, value in values.items() if name in ours})
+
+
+def default(parameter: Field[Any]) -> Any:
+    """A field's default, with lists for tuples, as rclpy and YAML want them."""
+    assert parameter.default is not MISSING
+    return list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
+
+
+def to_yaml(parameters: NodeParameters, node_name: str = f"/{NODE_NAME}") -> str:
+    """A parameter file for ``--params-file``, every parameter with its description."""
+    lines = [f"{node_name}:", "  ros__parameters:"]
+    for parameter in fields(parameters):
+        value = getattr(parameters, parameter.name)
+        lines.append(f"    # {parameter.metadata['description']}")
+        lines.append(f"    {parameter.name}: {_yaml(list(value) if isinstance(value, tuple) else value)}")
+    return "\n".join(lines) + "\n"
+
+
+def to_markdown() -> str:
+    """The README's table."""
+    lines = ["| parameter | default | range | live | |", "|---|---|---|---|---|"]
+    for parameter in fields(NodeParameters):
+        about = parameter.metadata
+        allowed = " ".join(f"`{choice}`" for choice in about["choices"])
+        if about["low"] is not None:
+            allowed = f"{about['low']:g} … {about['high']:g}"
+        live = "yes" if about["live"] else ""
+        name, value = parameter.name, _yaml(default(parameter))
+        lines.append(f"| `{name}` | `{value}` | {allowed} | {live} | {about['description']} |")
+    return "\n".join(lines) + "\n"
+
+
+def _check(parameter: Field[Any], value: Any) -> None:
+    about, name = parameter.metadata, parameter.name
+    if about["choices"] and value not in about["choices"]:
+        raise ParameterError(f"{name} is {value!r}; choose from {', '.join(about['choices'])}")
+    if about["low"] is not None and not about["low"] <= value <= about["high"]:
+        raise ParameterError(f"{name} is {value}; it must be between {about['low']:g} and {about['high']:g}")
+
+
+def _python(value: Any) -> Any:
+    return value if isinstance(value, (bool, int, float, str)) else tuple(value)
+
+
+def _yaml(value: Any) -> str:
+    if isinstance(value, list):
+        return "[" + ", ".join(_yaml(entry) for entry in value) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else repr(value)
