@@ -1,0 +1,113 @@
+"""Training of the SLAM family: the closure judge on simulated pose graphs of the wide family."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from rotavg_ros.datasets.slam_simulation import random_slam_config, simulate_slam_graph
+from rotavg_ros.evaluation.calibration import expected_calibration_error
+from rotavg_ros.solver.message_passing import DirectedEdges
+from rotavg_ros.solver.slam_clean_net import ClosureFeatures, SlamCleanNet, closure_features
+from rotavg_ros.solver.slam_stages import prepare
+from rotavg_ros.training.config import TrainingConfig
+
+
+@dataclass(frozen=True)
+class SlamSample:
+    """One simulated graph as the network sees it.
+
+    Attributes:
+        features: of its C closures.
+        is_false: ``(C,)`` bool, true noise beyond 10°.
+    """
+
+    features: ClosureFeatures
+    is_false: Tensor
+
+
+def sample_run(nodes: tuple[int, int], rng: np.random.Generator) -> SlamSample | None:
+    """One graph of the wide family; None if it has fewer than two closures."""
+    keyframes = round(float(np.exp(rng.uniform(*np.log(nodes)))))
+    run = simulate_slam_graph(random_slam_config(rng, keyframes), rng)
+    prepared = prepare(run.graph)
+    closures = prepared.closure_graph.view_graph_edge[prepared.closure_graph.is_closure[prepared.num_segments :]]
+    if len(closures) < 2:
+        return None
+    features = closure_features(prepared.noise, prepared.squared_angle, prepared.path_steps, prepared.pairs)
+    return SlamSample(features, torch.from_numpy(run.closure_is_false[closures]))
+
+
+def join(samples: Sequence[SlamSample]) -> SlamSample:
+    """Several graphs as one disjoint graph."""
+    offsets = np.concatenate(([0], np.cumsum([len(sample.is_false) for sample in samples])))
+    source, target = (
+        torch.cat([getattr(s.features.edges, end) + int(o) for s, o in zip(samples, offsets, strict=False)])
+        for end in ("source", "target")
+    )
+    edges = DirectedEdges(source, target, torch.cat([s.features.edges.inverse_degree for s in samples]))
+    closures = torch.cat([s.features.closures for s in samples])
+    pairs = torch.cat([s.features.pairs for s in samples])
+    return SlamSample(ClosureFeatures(closures, pairs, edges), torch.cat([s.is_false for s in samples]))
+
+
+class SlamCleanTask:
+    """SlamCleanNet: false or good, each graph weighing the same per closure up to its size's square root."""
+
+    def __init__(self, config: TrainingConfig) -> None:
+        self.config = config
+        self.samples = _draw(config.graphs, config.nodes, np.random.default_rng((config.seed, 1)))
+        self.validation = _draw(
+            config.validation_graphs, config.validation_nodes, np.random.default_rng((config.seed, 2))
+        )
+        torch.manual_seed(config.seed)
+        self.network = SlamCleanNet()
+
+    def num_batches(self) -> int:
+        return -(-len(self.samples) // self.config.batch_graphs)
+
+    def batches(self, rng: np.random.Generator) -> Iterator[dict[str, Tensor]]:
+        order = rng.permutation(len(self.samples))
+        for start in range(0, len(order), self.config.batch_graphs):
+            batch = join([self.samples[index] for index in order[start : start + self.config.batch_graphs]])
+            yield {"loss": _loss(self.network(_drop_pairs(batch.features, self.config.edge_dropout, rng)), batch)}
+
+    def validate(self) -> dict[str, float]:
+        logits, labels, losses = [], [], []
+        for sample in self.validation:
+            logit = self.network(sample.features)
+            losses.append(float(_loss(logit, sample)))
+            logits.append(logit)
+            labels.append(sample.is_false)
+        logit, label = torch.cat(logits), torch.cat(labels)
+        return {
+            "objective": float(np.mean(losses)),
+            "accuracy": float(((logit > 0) == label).float().mean()),
+            "ece": expected_calibration_error(torch.sigmoid(logit), label),
+        }
+
+
+def _draw(count: int, nodes: tuple[int, int], rng: np.random.Generator) -> list[SlamSample]:
+    samples: list[SlamSample] = []
+    while len(samples) < count:
+        sample = sample_run(nodes, rng)
+        if sample is not None:
+            samples.append(sample)
+    return samples
+
+
+def _loss(logit: Tensor, sample: SlamSample) -> Tensor:
+    return nn.functional.binary_cross_entropy_with_logits(logit, sample.is_false.to(logit))
+
+
+def _drop_pairs(features: ClosureFeatures, share: float, rng: np.random.Generator) -> ClosureFeatures:
+    """Leave out a share of the agreement pairs, so that no closure relies on one neighbour."""
+    kept = torch.from_numpy(rng.random(len(features.pairs)) >= share)
+    source, target = features.edges.source[kept], features.edges.target[kept]
+    degree = torch.bincount(target, minlength=len(features.closures))
+    inverse_degree = torch.where(degree > 0, 1 / degree.clamp(min=1).float(), 0.0)[:, None]
+    return ClosureFeatures(features.closures, features.pairs[kept], DirectedEdges(source, target, inverse_degree))
