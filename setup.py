@@ -36,7 +36,11 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.10",
     packages=find_packages(where=str(ROOT), include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed"], f"{NAME}.solver": ["weights/*.safetensors", "weights/*.json"]},
+    package_data={
+        NAME: ["py.typed"],
+        f"{NAME}.solver": ["weights/*.safetensors", "weights/*.json"],
+        f"{NAME}.training": ["configs/*.yaml"],
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

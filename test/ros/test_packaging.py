@@ -106,7 +106,7 @@ def test_message_is_importable_with_its_fields(definition: Path) -> None:
     assert all(getattr(request, name) == int(value) for name, value in constants)
 
 
-def test_wheel_contains_weights_types_and_ros_files(tmp_path: Path) -> None:
+def test_wheel_contains_every_file_of_the_package_and_the_ros_files(tmp_path: Path) -> None:
     source = tmp_path / "source"
     for name in ("rotavg_ros", "requirements", "resource"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -116,8 +116,8 @@ def test_wheel_contains_weights_types_and_ros_files(tmp_path: Path) -> None:
     subprocess.run([*command, "--wheel-dir", tmp_path, source], check=True)
     (wheel,) = tmp_path.glob("*.whl")
     contents = set(zipfile.ZipFile(wheel).namelist())
-    sources = {path.relative_to(ROOT).as_posix() for path in (ROOT / "rotavg_ros").rglob("*.py")}
-    weights = {path.relative_to(ROOT).as_posix() for path in (ROOT / "rotavg_ros" / "solver" / "weights").glob("*.*")}
-    assert sources | weights | {"rotavg_ros/py.typed"} <= contents
+    files = (path for path in (ROOT / "rotavg_ros").rglob("*.*") if path.suffix != ".pyc")
+    missing = {path.relative_to(ROOT).as_posix() for path in files} - contents
+    assert missing == set()
     installed = {name.partition(".data/data/")[2] for name in contents}
     assert {"share/ament_index/resource_index/packages/rotavg_ros", "share/rotavg_ros/package.xml"} <= installed
