@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import random
+import shutil
 import socket
 import tempfile
 from pathlib import Path
@@ -33,7 +35,8 @@ def free_domain_id() -> int:
 # Before anything imports rclpy, and for every process that a test starts: nothing leaves this machine.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
-os.environ.setdefault("ROS_LOG_DIR", tempfile.mkdtemp(prefix="rotavg-test-log-"))
+os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="rotavg-test-log-")
+atexit.register(shutil.rmtree, os.environ["ROS_LOG_DIR"], ignore_errors=True)
 os.environ["MPLBACKEND"] = "Agg"
 
 # No test measures wall-clock time, hypothesis' deadline per example included.
