@@ -8,9 +8,10 @@ BIN := .venv/bin
 setup:
 	@$(PYTHON) tools/setup_environment.py
 
-# make demo [GRAPH=path.g2o [TRUTH=truth.csv]]
+# make demo [GRAPH=path.g2o [TRUTH=truth.csv] [STAMPS=stamps.txt]]
 demo: setup
-	@$(BIN)/rotavg demo $(if $(GRAPH),--graph "$(GRAPH)") $(if $(TRUTH),--truth "$(TRUTH)")
+	@$(BIN)/rotavg demo $(if $(GRAPH),--graph "$(GRAPH)") $(if $(TRUTH),--truth "$(TRUTH)") \
+		$(if $(STAMPS),--stamps "$(STAMPS)")
 
 # make test [ARGS="-k node -x"]
 test: setup

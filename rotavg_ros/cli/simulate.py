@@ -38,10 +38,10 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--closures-per-minute", type=float, default=20, metavar="N", help="default: 20")
     parser.add_argument("--closure-noise-deg", type=float, default=1.0, metavar="DEG", help="RMS angle (default: 1)")
     parser.add_argument(
-        "--odometry-noise-deg", type=float, default=0.06, metavar="DEG", help="RMS angle every 0.1 s (default: 0.06)"
+        "--odometry-noise-deg", type=float, default=0.1, metavar="DEG", help="RMS angle every 0.1 s (default: 0.1)"
     )
     parser.add_argument(
-        "--odometry-bias-deg-per-min", type=float, default=1.0, metavar="DEG", help="gyroscope bias (default: 1)"
+        "--odometry-bias-deg-per-min", type=float, default=2.0, metavar="DEG", help="gyroscope bias (default: 2)"
     )
     parser.add_argument("--seed", type=_seed, default=0, help="same seed, same run (default: 0)")
 

@@ -37,8 +37,8 @@ def robot_run_config(
     false_share: float = 0.3,
     grouped: bool = False,
     closures_per_minute: float = 20,
-    odometry_noise_deg: float = 0.06,
-    odometry_bias_deg_per_min: float = 1.0,
+    odometry_noise_deg: float = 0.1,
+    odometry_bias_deg_per_min: float = 2.0,
     closure_noise_deg: float = 1.0,
 ) -> SlamSimulationConfig:
     """The simulation of such a run; every pose is one odometry message.
