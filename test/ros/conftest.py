@@ -5,13 +5,22 @@ from __future__ import annotations
 import contextlib
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import QuaternionStamped
+from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rotavg_msgs.msg import AbsoluteOrientations, OutlierFlags, RelativeRotation, RelativeRotationArray
+from std_srvs.srv import Trigger
 
 STARTUP_SECONDS = 30.0  # far more than needed: a loaded machine must not fail a test
 
@@ -96,3 +105,97 @@ def wait_until() -> Callable[..., None]:
             time.sleep(0.05)
 
     return wait
+
+
+class LiveNode:
+    """The node as a process of its own, a robot that feeds it, and everything it says.
+
+    Attributes:
+        process: the node's.
+        answers, flags, orientations: messages in order of arrival.
+        status: the last diagnostics' values by key, with its "level" and "message".
+    """
+
+    def __init__(self, probe: rclpy.node.Node, start: Callable[..., RunningProcess], wait: Callable[..., None]) -> None:
+        self.probe = probe
+        self.executor = SingleThreadedExecutor(context=probe.context)
+        self.executor.add_node(probe)
+        self._start, self._wait = start, wait
+        self.answers: list[AbsoluteOrientations] = []
+        self.flags: list[OutlierFlags] = []
+        self.orientations: list[QuaternionStamped] = []
+        self.status: dict[str, str] = {}
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        probe.create_subscription(AbsoluteOrientations, "/abs_orientations", self.answers.append, latched)
+        probe.create_subscription(OutlierFlags, "/outlier_flags", self.flags.append, latched)
+        probe.create_subscription(QuaternionStamped, "/orientation", self.orientations.append, 10_000)
+        probe.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        keep_all = QoSProfile(depth=20_000)
+        self.odometry = probe.create_publisher(Odometry, "/odom", keep_all)
+        self.edges = probe.create_publisher(RelativeRotation, "/relative_rotations", keep_all)
+        self.arrays = probe.create_publisher(RelativeRotationArray, "/relative_rotation_arrays", keep_all)
+
+    def start(self, *parameters: str, reliable_odometry: bool = True) -> None:
+        """Start the node and wait until both sides have found each other."""
+        if reliable_odometry:  # a test decides what gets lost
+            parameters += ("qos_overrides./odom.subscription.reliability:=reliable",)
+        words = [word for parameter in parameters for word in ("-p", parameter)]
+        self.status.clear()
+        self.process = self._start(Path(sys.executable).with_name("rotavg_node"), "--ros-args", *words)
+        publishers = (self.odometry, self.edges, self.arrays)
+        self.spin_until(lambda: all(p.get_subscription_count() for p in publishers) and bool(self.status))
+
+    def stop(self, how: signal.Signals = signal.SIGINT) -> int:
+        """End the node and wait until its endpoints have gone; returns the exit code."""
+        code = self.process.stop(how)
+        self._wait(lambda: not self.odometry.get_subscription_count())
+        return code
+
+    def spin_until(self, condition: Callable[[], bool], timeout: float = 60.0) -> None:
+        """Take messages until the condition holds; fails when the node ends or the time is over."""
+
+        def met() -> bool:
+            end = time.monotonic() + 0.2
+            while not condition():
+                if time.monotonic() > end:
+                    return False
+                self.executor.spin_once(timeout_sec=0.05)
+            return True
+
+        self._wait(met, self.process, timeout)
+
+    def spin_for(self, seconds: float) -> None:
+        """Take messages for a while."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def wait_for_silence(self) -> AbsoluteOrientations:
+        """Wait for the cold answer after which nothing more comes; returns it."""
+        self.status.clear()
+        self.spin_until(
+            lambda: self.status.get("answer cold") == "true" and float(self.status["answer age s"]) > 2,
+        )
+        return self.answers[-1]
+
+    def call(self, service: str, service_type: type = Trigger, **request: Any) -> Any:
+        """Call one of the node's services; returns the response."""
+        client = self.probe.create_client(service_type, f"/rotavg/{service}")
+        self.spin_until(client.service_is_ready)
+        future = client.call_async(service_type.Request(**request))
+        self.spin_until(future.done)
+        self.probe.destroy_client(client)
+        return future.result()
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        status = message.status[0]
+        self.status = {pair.key: pair.value for pair in status.values}
+        self.status |= {"level": str(ord(status.level)), "message": status.message, "name": status.name}
+
+
+@pytest.fixture
+def live_node(probe_node: rclpy.node.Node, start_process: Callable, wait_until: Callable) -> Iterator[LiveNode]:
+    """A :class:`LiveNode`, not yet started."""
+    live = LiveNode(probe_node, start_process, wait_until)
+    yield live
+    live.executor.shutdown()
