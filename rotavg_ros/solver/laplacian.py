@@ -6,12 +6,20 @@ Residuals are rotations of the world frame, so the three components of a correct
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 
 # How much stiffer than its own edges a root is tied to zero.
 _GROUNDING = 1e6
+# A graph with more than this share of all pairs fills in completely, and dense Cholesky is then many times faster.
+_DENSE_SHARE = 0.01
+_DENSE_MAX_NODES = 5000
 
 
 class LaplacianSystem:
@@ -38,10 +46,9 @@ class LaplacianSystem:
                 (np.concatenate((source, target, diagonal)), np.concatenate((target, source, diagonal))),
             ),
             shape=(num_nodes, num_nodes),
-        ).tocsc()
-        self._factor = splu(
-            matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
+        fills_in = len(source) > _DENSE_SHARE * num_nodes**2 / 2
+        self._solve = _factorize(matrix, dense=fills_in and num_nodes <= _DENSE_MAX_NODES)
 
     def incidence_sum(self, edge_values: np.ndarray) -> np.ndarray:
         """``Bᵀ x``: at every node the values ``(E, k)`` of edges that end there, less those that start there."""
@@ -53,7 +60,7 @@ class LaplacianSystem:
 
     def solve(self, right_hand_side: np.ndarray) -> np.ndarray:
         """``L⁻¹ b`` for ``(N, k)`` columns."""
-        return self._factor.solve(right_hand_side)
+        return self._solve(right_hand_side)
 
     def fit(self, difference: np.ndarray) -> np.ndarray:
         """Node values ``(N, k)`` whose differences target − source fit ``difference`` ``(E, k)`` best."""
@@ -66,6 +73,18 @@ class LaplacianSystem:
         variances of estimated differences, with a relative error of √(2/k).
         """
         return self.solve(self.incidence_sum(np.sqrt(self.weight)[:, None] * signs))
+
+
+def _factorize(matrix: coo_array, dense: bool) -> Callable[[np.ndarray], np.ndarray]:
+    """What solves for right-hand sides."""
+    if dense:
+        # Weights that span all of double precision can leave no positive pivot; the sparse factorisation copes.
+        with suppress(np.linalg.LinAlgError):
+            return partial(cho_solve, cho_factor(matrix.toarray(), lower=True, overwrite_a=True))
+    factor = splu(
+        matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
+    return factor.solve  # type: ignore[no-any-return]
 
 
 def probe_signs(first: np.ndarray, second: np.ndarray, num_probes: int) -> np.ndarray:

@@ -1,0 +1,39 @@
+"""Weighted least squares on graphs, against numpy's least squares."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rotavg_ros.solver import laplacian
+from rotavg_ros.solver.laplacian import LaplacianSystem
+
+
+def random_graph(num_nodes: int, num_edges: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A chain through all nodes and random edges besides."""
+    chain, random = np.arange(num_nodes - 1), rng.integers(0, num_nodes, num_edges)
+    source = np.concatenate((chain, random))
+    target = np.concatenate((chain + 1, (random + rng.integers(1, num_nodes, num_edges)) % num_nodes))
+    return source, target
+
+
+@pytest.mark.parametrize("dense_share", [0.0, np.inf], ids=["dense", "sparse"])
+def test_fit_is_the_least_squares_solution(monkeypatch: pytest.MonkeyPatch, dense_share: float) -> None:
+    monkeypatch.setattr(laplacian, "_DENSE_SHARE", dense_share)
+    rng = np.random.default_rng(0)
+    source, target = random_graph(20, 60, rng)
+    weight, difference = rng.uniform(0.1, 10, len(source)), rng.standard_normal((len(source), 3))
+    fitted = LaplacianSystem(20, source, target, weight, np.array([3])).fit(difference)
+    incidence = np.zeros((len(source), 20))
+    incidence[np.arange(len(source)), target] = 1
+    incidence[np.arange(len(source)), source] = -1
+    root_weight = np.sqrt(weight)[:, None]
+    expected, *_ = np.linalg.lstsq(root_weight * incidence, root_weight * difference)
+    np.testing.assert_allclose(fitted, expected - expected[3], atol=1e-8)
+
+
+def test_weights_over_the_whole_range_of_doubles_stay_finite() -> None:
+    source, target = np.arange(9), np.arange(1, 10)
+    weight = 10.0 ** np.array([-200, 200, -30, 30, -300, 0, 300, 5, -5])
+    fitted = LaplacianSystem(10, source, target, weight, np.array([0])).fit(np.ones((9, 1)))
+    assert np.isfinite(fitted).all()
