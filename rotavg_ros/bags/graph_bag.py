@@ -28,5 +28,6 @@ def write_graph(path: str | Path, graph_file: GraphFile) -> None:
 
 
 def not_stored(path: str | Path, graph_file: GraphFile) -> list[str]:
-    """A bag has room for everything."""
-    return []
+    """What of this graph a bag has no room for, in words."""
+    lost = graph_file.edge_information is not None
+    return ["information matrices beyond the rotation's precision"] if lost else []

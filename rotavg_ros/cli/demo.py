@@ -201,6 +201,8 @@ def _table(report: LiveReport) -> str:
         error_row = ", ".join(f"{before[name]:.2f}° → {after[name]:.2f}° {name}" for name in ("mean", "median"))
     if false is None:
         false_row = f"{summary['flagged']} flagged; how many rightly is not known"
+    elif false["total"] == 0:
+        false_row = f"there are none; {false['good_flagged']} good ones flagged"
     else:
         false_row = (
             f"{false['found']} of {false['total']} found: precision {false['precision']:.3f}, "

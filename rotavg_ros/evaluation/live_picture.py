@@ -23,7 +23,7 @@ def draw(report: LiveReport, path: Path, title: str) -> None:
     """Write a PNG (or what else the suffix says) of 2100 × 1200 pixels."""
     figure = Figure(figsize=(14, 8), dpi=150, facecolor="white")
     grid = figure.add_gridspec(
-        2, 2, width_ratios=(1.45, 1), left=0.03, right=0.97, top=0.855, bottom=0.13, wspace=0.1, hspace=0.5
+        2, 2, width_ratios=(1.45, 1), left=0.03, right=0.97, top=0.82, bottom=0.13, wspace=0.1, hspace=0.5
     )
     figure.text(0.03, 0.95, title, fontsize=17, fontweight="bold", color=_INK, va="center")
     figure.text(0.03, 0.907, _subtitle(report), fontsize=11, color=_MUTED, va="center")

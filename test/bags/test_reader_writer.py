@@ -10,12 +10,14 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from rotavg_ros.bags import message_types
 from rotavg_ros.bags.graph_from_bag import read_graph_bag
-from rotavg_ros.bags.message_types import ODOMETRY, definitions_folder, typestore
+from rotavg_ros.bags.message_types import ODOMETRY, MessageTypeError, definitions_folder, typestore
 from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_message, read_edge, read_odometry
 from rotavg_ros.bags.reader import BagReader, BagReadError
 from rotavg_ros.bags.writer import BagWriteError, BagWriter
 
+definitions_folder_of_the_sources = definitions_folder()
 START_NS = 1_700_000_000_123_456_789
 
 
@@ -54,6 +56,19 @@ def test_the_definitions_are_those_of_the_interface_package() -> None:
     for name in ("RelativeRotation", "KeyframeReference", "AbsoluteOrientations", "OutlierFlags"):
         fields = [field for field, _ in typestore().fielddefs[f"rotavg_msgs/msg/{name}"][1]]
         assert fields == list(getattr(rotavg_msgs, name).get_fields_and_field_types())
+
+
+@pytest.mark.parametrize("site", ["lib/python3.12/site-packages", "."])
+def test_the_definitions_are_found_where_an_installation_puts_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, site: str
+) -> None:
+    module = tmp_path / site / "rotavg_ros" / "bags" / "message_types.py"
+    monkeypatch.setattr(message_types, "__file__", str(module))
+    with pytest.raises(MessageTypeError, match="install rotavg_ros again"):
+        message_types.definitions_folder()
+    share = tmp_path / "share" / "rotavg_ros" / "msg"
+    shutil.copytree(definitions_folder_of_the_sources, share)
+    assert message_types.definitions_folder() == share
 
 
 def test_a_written_bag_is_an_mcap_that_others_read(tmp_path: Path) -> None:
