@@ -10,9 +10,12 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
+
+from rotavg_ros import rotations
 
 FloatArray = NDArray[np.floating]
 
@@ -94,14 +97,13 @@ def chain_rotations(steps: FloatArray) -> FloatArray:
 
     Prefix products by doubling (Hillis & Steele 1986): log₂ N vectorised multiplications instead of a loop over N.
     """
-    products = Rotation.from_quat(steps).as_quat()
+    products = rotations.normalize(torch.from_numpy(np.array(steps, dtype=np.float64)))
     shift = 1
     while shift < len(products):
-        tail = Rotation.from_quat(products[:-shift]) * Rotation.from_quat(products[shift:])
-        products = np.concatenate((products[:shift], tail.as_quat()))
+        tail = rotations.multiply(products[:-shift], products[shift:])
+        products = torch.cat((products[:shift], tail))
         shift *= 2
-    canonical: FloatArray = np.where(products[:, 3:] < 0, -products, products)
-    return canonical
+    return rotations.normalize(products).numpy()
 
 
 # --- paths in the plane, (N, 2) metres ------------------------------------------------------------
