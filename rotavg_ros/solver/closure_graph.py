@@ -26,7 +26,7 @@ from rotavg_ros.view_graph import ViewGraph
 
 @dataclass(frozen=True)
 class ClosureGraph:
-    """K key nodes and E edges: S segments first, then every other edge of the view-graph in its order.
+    """K key nodes and E edges: S segments first, then every other edge of the view-graph, sorted by its ends.
 
     Attributes:
         nodes: ``(K,)`` view-graph nodes, ascending.
@@ -77,12 +77,17 @@ class ClosureGraph:
         spread = rotations.slerp(correction[self.above], correction[self.below], fraction)
         return rotations.normalize(rotations.multiply(self.odometry_orientation, spread))
 
-    def edge_values(self, value: np.ndarray, segment_value: np.ndarray | None = None) -> np.ndarray:
+    def corrections(self, body_from_world: Tensor) -> Tensor:
+        """Orientations of all nodes ``(N, 4)`` → corrections of the key nodes ``(K, 4)`` that are nearest to them."""
+        nodes = torch.from_numpy(self.nodes)
+        relative = rotations.multiply(rotations.inverse(self.odometry_orientation[nodes]), body_from_world[nodes])
+        return rotations.normalize(relative)
+
+    def edge_values(self, value: np.ndarray) -> np.ndarray:
         """Values of this graph's edges ``(E,)`` → values of the view-graph's edges ``(M,)``."""
-        segments = value[: self.num_segments] if segment_value is None else segment_value
         out = np.empty(len(self.segment_of_edge))
         on_segment = self.segment_of_edge >= 0
-        out[on_segment] = segments[self.segment_of_edge[on_segment]]
+        out[on_segment] = value[: self.num_segments][self.segment_of_edge[on_segment]]
         out[self.view_graph_edge] = value[self.num_segments :]
         return out
 
@@ -123,7 +128,7 @@ def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
     segment_of_edge = np.full(num_edges, -1, dtype=np.int64)
     below_edge = np.flatnonzero(hangs_on_odometry)
     segment_of_edge[parent_edge[below_edge]] = segment_of_key[below_node[below_edge]]
-    other = np.flatnonzero(~tree_odometry)
+    other = _in_canonical_order(graph, np.flatnonzero(~tree_odometry))
 
     orientation = compose_orientations(forest, graph)
     residual = edge_residual(
@@ -154,6 +159,13 @@ def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
         below=key_of_node[below_node],
         fraction=fraction,
     )
+
+
+def _in_canonical_order(graph: ViewGraph, edges: np.ndarray) -> np.ndarray:
+    """Sorted by their ends, parallels by angle: the answer must not depend on the order in which edges arrived."""
+    source, target = graph.source.numpy()[edges], graph.target.numpy()[edges]
+    cosine = graph.target_from_source[:, 3].numpy()[edges]
+    return edges[np.lexsort((cosine, np.maximum(source, target), np.minimum(source, target)))]
 
 
 def _follow(pointer: np.ndarray) -> np.ndarray:

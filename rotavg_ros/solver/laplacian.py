@@ -88,7 +88,7 @@ def _factorize(matrix: coo_array, dense: bool) -> Callable[[np.ndarray], np.ndar
 
 
 def probe_signs(first: np.ndarray, second: np.ndarray, num_probes: int) -> np.ndarray:
-    """Signs ±1 ``(E, num_probes)`` that depend on the two node numbers of an edge alone.
+    """Signs ±1 ``(E, num_probes)`` that depend on an edge's two node numbers alone; reversing it negates them.
 
     Hashed (SplitMix64), not drawn: the order of the edges and edges that are added later change nothing. Parallel edges
     share their signs; their number among the parallels is mixed in to keep them independent.
@@ -105,7 +105,7 @@ def probe_signs(first: np.ndarray, second: np.ndarray, num_probes: int) -> np.nd
     bits = [_mix(key + np.uint64(word + 1)) for word in range(words)]
     shifts = np.arange(64, dtype=np.uint64)
     signs = np.concatenate([((word[:, None] >> shifts) & np.uint64(1)).astype(np.float64) for word in bits], axis=1)
-    return 2 * signs[:, :num_probes] - 1
+    return (2 * signs[:, :num_probes] - 1) * np.where(first < second, 1.0, -1.0)[:, None]
 
 
 def _mix(value: np.ndarray) -> np.ndarray:

@@ -5,9 +5,9 @@ A layer computes, for every directed edge u→v with features ``x_uv`` and for e
     a_uv ← ReLU(A h_v + B h_u + C [x_uv, a_uv] + c)     edges remember their activation from layer to layer
     h_v ← ReLU(γ(h_v, D mean over u of a_uv + d))       γ: linear, ReLU, linear
 
-so a message ``m_uv = D a_uv + d`` is linear, ReLU, linear. Node states are projected (A, B) before they are gathered, and D
-commutes with the mean, so it is applied to nodes, not to edges. That edges remember is the authors' released code rather
-than the paper's text; on equal training it lifts CleanNet's accuracy from 94.1 to 95.8 %.
+so a message ``m_uv = D a_uv + d`` is linear, ReLU, linear. Node states are projected (A, B) before they are gathered,
+and D commutes with the mean, so it is applied to nodes, not to edges. That edges remember is the authors' released code
+rather than the paper's text; on equal training it lifts CleanNet's accuracy from 94.1 to 95.8 %.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The solve: clean → bootstrap → fine-tune → refine."""
+"""The solve, as the paper has it and one stage more: clean → bootstrap → fine-tune → refine (NeuRoRA, §4)."""
 
 from __future__ import annotations
 
@@ -9,25 +9,46 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from scipy.special import expit
 from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.errors import UserError
-from rotavg_ros.solver import refinement, slam_refinement
-from rotavg_ros.solver.agreement import agreement_pairs
-from rotavg_ros.solver.closure_graph import contract
-from rotavg_ros.solver.noise_model import discrepancies, estimate_noise, judge_by_chain
+from rotavg_ros.solver import refinement, sfm_stages, slam_refinement, slam_stages
+from rotavg_ros.solver.network_store import load_network
 from rotavg_ros.solver.solution import Solution
-from rotavg_ros.solver.spanning_tree import compose_orientations, minimum_spanning_forest, shortest_path_forest
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-METHODS = ("neurora", "spt")
 PROFILES = ("auto", "slam", "sfm")
 DEVICES = ("auto", "cpu", "cuda")
 
-# Odometry first: no number of steps is worth a closure.
-_CLOSURE_COST = 1e6
+
+@dataclass(frozen=True)
+class Method:
+    """Which stages run. Every method has the bootstrap, a spanning tree."""
+
+    clean: bool = False
+    fine_tunings: int = 0
+    refine: bool = False
+
+
+_METHODS = {
+    "neurora": Method(clean=True, fine_tunings=1, refine=True),
+    "neurora-paper": Method(clean=True, fine_tunings=1),
+    "neurora-v2": Method(clean=True, fine_tunings=2),
+    "cleannet-spt": Method(clean=True),
+    "spt-finenet": Method(fine_tunings=1),
+    "spt": Method(),
+}
+METHODS = tuple(_METHODS)
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    """What a profile's solve gives: orientations in any gauge, scores, variance in rad² (NaN: unknown)."""
+
+    body_from_world: Tensor
+    outlier_score: Tensor
+    variance: Tensor
 
 
 @dataclass
@@ -41,6 +62,7 @@ class _Stopwatch:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
 
+@torch.no_grad()
 def solve(
     graph: ViewGraph,
     *,
@@ -57,7 +79,7 @@ def solve(
         profile: "slam" for odometry chains with loop closures, "sfm" for unordered view-graphs, "auto": "slam" if any
             edge is odometry.
         device: "cpu", "cuda" or "auto".
-        refinement_steps: refinement steps at most, 0 for none; default: the profile's own number.
+        refinement_steps: refinement steps at most, 0 for none; default: the method's and profile's own number.
         warm_start: ``(N, 4)`` body_from_world of an earlier solution to start from.
 
     Raises:
@@ -66,83 +88,103 @@ def solve(
     _check_choice("method", method, METHODS)
     _check_choice("profile", profile, PROFILES)
     _check_choice("device", device, DEVICES)
+    if device == "cuda" and not torch.cuda.is_available():
+        raise UserError("device 'cuda': torch finds no usable GPU; use --device cpu or auto")
     if refinement_steps is not None and refinement_steps < 0:
         raise UserError(f"refinement steps must not be negative, got {refinement_steps}")
     if warm_start is not None and tuple(warm_start.shape) != (graph.num_nodes, 4):
         raise UserError(f"the warm start has shape {tuple(warm_start.shape)}, the graph needs ({graph.num_nodes}, 4)")
     if profile == "auto":
         profile = "slam" if bool(graph.is_odometry.any()) else "sfm"
-    graph = graph.to("cpu")
+    stages = _METHODS[method]
     watch = _Stopwatch()
-    if profile == "slam":
-        result = _solve_slam(graph, method, refinement_steps, watch)
+    graph = graph.to("cpu")
+    if graph.num_edges == 0:
+        estimate = _Estimate(
+            rotations.identity(graph.num_nodes), torch.empty(0).double(), torch.full((graph.num_nodes,), torch.nan)
+        )
+    elif profile == "slam":
+        estimate = _solve_slam(graph, stages, refinement_steps, warm_start, watch)
     else:
-        result = _solve_sfm(graph, method, refinement_steps, watch)
-    orientations, score, variance = result
+        estimate = _solve_sfm(graph, stages, refinement_steps, warm_start, watch)
     component = graph.components()
-    orientations = _root_at_identity(orientations, component)
-    score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, score)
+    score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, estimate.outlier_score)
     score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
-    return Solution(orientations, score, component, variance.sqrt(), watch.seconds, method, profile, "cpu")
-
-
-def _solve_slam(
-    graph: ViewGraph, method: str, refinement_steps: int | None, watch: _Stopwatch
-) -> tuple[Tensor, Tensor, Tensor]:
-    with watch.stage("bootstrap"):
-        forest = minimum_spanning_forest(graph, torch.where(graph.is_odometry, 1.0, _CLOSURE_COST))
-        closure_graph = contract(graph, forest)
-    with watch.stage("clean"):
-        closure = closure_graph.is_closure
-        square = (rotations.log(closure_graph.residual) ** 2).sum(dim=1).numpy()
-        path_steps = closure_graph.path_steps[closure]
-        pairs = agreement_pairs(closure_graph)
-        noise = estimate_noise(discrepancies(square[closure], path_steps, pairs), _components(graph))
-        inlier_probability = np.ones(len(square))
-        inlier_probability[closure] = expit(judge_by_chain(noise, square[closure], path_steps) + noise.prior_log_odds)
-    with watch.stage("refine"):
-        steps = slam_refinement.MAX_PASSES if refinement_steps is None else refinement_steps
-        correction = rotations.identity(closure_graph.num_nodes)
-        variance = np.full(graph.num_nodes, np.nan)
-        if method != "spt" and steps > 0:
-            log_odds = np.zeros(len(square))
-            label = graph.label.numpy()[closure_graph.view_graph_edge]
-            log_odds[closure_graph.num_segments :] = np.select(
-                [label == EdgeLabel.ACCEPTED, label == EdgeLabel.REJECTED], [np.inf, -np.inf], 0.0
-            )
-            estimate = slam_refinement.refine(
-                closure_graph, correction, inlier_probability, noise, log_odds=log_odds, max_passes=steps
-            )
-            correction, inlier_probability = estimate.correction, estimate.inlier_probability
-            variance = estimate.variance[closure_graph.above]
-    score = torch.from_numpy(1 - closure_graph.edge_values(inlier_probability))
-    return closure_graph.orientations(correction), score, torch.from_numpy(variance)
+    return Solution(
+        _root_at_identity(estimate.body_from_world, component),
+        score,
+        component,
+        estimate.variance.double().sqrt(),
+        watch.seconds,
+        method,
+        profile,
+        "cpu",
+    )
 
 
 def _solve_sfm(
-    graph: ViewGraph, method: str, refinement_steps: int | None, watch: _Stopwatch
-) -> tuple[Tensor, Tensor, Tensor]:
+    graph: ViewGraph, method: Method, refinement_steps: int | None, warm_start: Tensor | None, watch: _Stopwatch
+) -> _Estimate:
+    with watch.stage("clean"):
+        if method.clean:
+            cleaned = sfm_stages.clean(load_network("sfm-clean-net"), graph)
+        else:
+            cleaned = sfm_stages.trust_all(graph)
+        cleaned = sfm_stages.apply_labels(cleaned, graph.label)
     with watch.stage("bootstrap"):
-        forest = shortest_path_forest(graph)
-        orientations = compose_orientations(forest, graph)
-    steps = (0 if method == "spt" else 20) if refinement_steps is None else refinement_steps
-    with watch.stage("refine"):
-        prior = torch.where(graph.label == EdgeLabel.REJECTED, 0.0, 1.0)
-        orientations, angle = refinement.refine(graph, orientations, prior, forest.roots, steps)
-    score = torch.sigmoid(torch.from_numpy(angle - np.radians(20)) / np.radians(3))
-    return orientations, score, torch.full((graph.num_nodes,), torch.nan, dtype=torch.float64)
+        orientations, forest = sfm_stages.bootstrap(cleaned)
+        if warm_start is not None:
+            orientations = warm_start.double()
+    for _ in range(method.fine_tunings):
+        with watch.stage("fine-tune"):
+            orientations = sfm_stages.fine_tune(load_network("sfm-fine-net"), cleaned, orientations)
+    steps = (refinement.DEFAULT_STEPS if method.refine else 0) if refinement_steps is None else refinement_steps
+    if steps > 0:
+        with watch.stage("refine"):
+            weight = 1 - cleaned.outlier_probability
+            orientations = refinement.refine(graph, orientations, weight, forest.roots, steps)
+    score = sfm_stages.outlier_score(graph, cleaned, orientations, refined=steps > 0)
+    return _Estimate(orientations, score, torch.full((graph.num_nodes,), torch.nan))
 
 
-def _components(graph: ViewGraph) -> int:
-    """1 if all measured rotations share one axis (planar motion), else 3."""
-    vectors = rotations.log(graph.target_from_source)
-    spread = torch.linalg.eigvalsh(vectors.T @ vectors)
-    return 1 if float(spread[1]) <= 1e-10 * float(spread[2]) else 3
+def _solve_slam(
+    graph: ViewGraph, method: Method, refinement_steps: int | None, warm_start: Tensor | None, watch: _Stopwatch
+) -> _Estimate:
+    with watch.stage("contract"):
+        prepared = slam_stages.prepare(graph)
+    with watch.stage("clean"):
+        network = load_network("slam-clean-net") if method.clean else None
+        cleaned = slam_stages.clean(network, prepared, graph.label)
+    with watch.stage("bootstrap"):
+        correction = slam_stages.bootstrap(prepared, cleaned)
+        if warm_start is not None:
+            correction = prepared.closure_graph.corrections(warm_start.double())
+    inlier_probability = cleaned.inlier_probability
+    variance = np.full(graph.num_nodes, np.nan)
+    steps = (slam_refinement.MAX_PASSES if method.refine else 0) if refinement_steps is None else refinement_steps
+    if steps > 0:
+        with watch.stage("refine"):
+            estimate = slam_refinement.refine(
+                prepared.closure_graph,
+                correction,
+                inlier_probability,
+                prepared.noise,
+                log_odds=cleaned.prior_log_odds,
+                max_passes=steps,
+            )
+            correction, inlier_probability = estimate.correction, estimate.inlier_probability
+            variance = estimate.variance[prepared.closure_graph.above]
+    with watch.stage("expand"):
+        score = torch.from_numpy(1 - prepared.closure_graph.edge_values(inlier_probability))
+        orientations = prepared.closure_graph.orientations(correction)
+    return _Estimate(orientations, score, torch.from_numpy(variance))
 
 
 def _root_at_identity(body_from_world: Tensor, component: Tensor) -> Tensor:
     """The same orientations in the gauge where the first node of every component is the identity."""
-    first = torch.full((int(component.max()) + 1 if len(component) else 0,), len(component))
+    if len(component) == 0:
+        return body_from_world
+    first = torch.full((int(component.max()) + 1,), len(component))
     first = first.scatter_reduce(0, component, torch.arange(len(component)), "amin")
     gauge = rotations.inverse(body_from_world[first])[component]
     return rotations.normalize(rotations.multiply(body_from_world, gauge))

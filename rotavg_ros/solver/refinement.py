@@ -23,7 +23,7 @@ _CONVERGED_STEP = np.radians(0.001)
 
 def refine(
     graph: ViewGraph, body_from_world: Tensor, prior_weight: Tensor | None, roots: np.ndarray, num_steps: int
-) -> tuple[Tensor, np.ndarray]:
+) -> Tensor:
     """At most ``num_steps`` reweighted least-squares steps.
 
     Args:
@@ -32,7 +32,7 @@ def refine(
         roots: a node of each connected component, held fixed.
 
     Returns:
-        ``(N, 4)`` orientations, and the residual angle of every edge, ``(M,)`` rad.
+        ``(N, 4)`` orientations.
     """
     source, target = graph.source.numpy(), graph.target.numpy()
     prior = np.ones(graph.num_edges) if prior_weight is None else prior_weight.double().numpy()
@@ -46,7 +46,7 @@ def refine(
         residual = _residual_vectors(graph, orientations)
         if np.abs(step).max(initial=0.0) < _CONVERGED_STEP:
             break
-    return rotations.normalize(orientations), np.linalg.norm(residual, axis=1)
+    return rotations.normalize(orientations)
 
 
 def _residual_vectors(graph: ViewGraph, body_from_world: Tensor) -> np.ndarray:

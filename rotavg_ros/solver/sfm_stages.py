@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from rotavg_ros import rotations
 from rotavg_ros.solver.clean_net import CleanNet
 from rotavg_ros.solver.fine_net import FineNet, edge_residual
 from rotavg_ros.solver.message_passing import DirectedEdges
 from rotavg_ros.solver.spanning_tree import SpanningForest, compose_orientations, shortest_path_forest
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # An edge whose outlier probability exceeds this is no inlier (ε of the paper; uncritical in 0.35–0.8).
 OUTLIER_THRESHOLD = 0.75
+# How fast the probability of noise beyond 20° rises with the residual: what remains of the orientations' own error.
+_RESIDUAL_SCALE = np.radians(1.0)
+_OUTLIER_ANGLE = np.radians(20.0)
 # Cost of an edge in the tree (the authors' released code).
 _INLIER_COST, _OUTLIER_COST = 0.1, 1.1
 
@@ -43,6 +48,18 @@ def clean(network: CleanNet, graph: ViewGraph, edges: DirectedEdges | None = Non
     return Cleaned(rectified, probability, probability < OUTLIER_THRESHOLD)
 
 
+def trust_all(graph: ViewGraph) -> Cleaned:
+    """What stands in for CleanNet in methods without it: every measurement as it is."""
+    return Cleaned(graph, torch.zeros(graph.num_edges), torch.ones(graph.num_edges, dtype=torch.bool))
+
+
+def apply_labels(cleaned: Cleaned, label: Tensor) -> Cleaned:
+    """Verdicts from outside override the network's."""
+    probability = torch.where(label == EdgeLabel.ACCEPTED, 0.0, cleaned.outlier_probability)
+    probability = torch.where(label == EdgeLabel.REJECTED, 1.0, probability)
+    return replace(cleaned, outlier_probability=probability, is_inlier=probability < OUTLIER_THRESHOLD)
+
+
 def bootstrap(cleaned: Cleaned) -> tuple[Tensor, SpanningForest]:
     """Orientations along a shortest-path tree that avoids outliers, ``(N, 4)`` float64."""
     cost = torch.where(cleaned.is_inlier, _INLIER_COST, _OUTLIER_COST)
@@ -56,3 +73,14 @@ def fine_tune(network: FineNet, cleaned: Cleaned, body_from_world: Tensor) -> Te
     edges = DirectedEdges.of(inliers.source, inliers.target, inliers.num_nodes)
     residual = edge_residual(body_from_world, inliers.target_from_source, inliers.source, inliers.target)
     return network(body_from_world.float(), residual.float(), edges).double()
+
+
+def outlier_score(graph: ViewGraph, cleaned: Cleaned, body_from_world: Tensor, refined: bool) -> Tensor:
+    """Probability that an edge's noise exceeds 20°, ``(M,)`` float64.
+
+    CleanNet's own without refinement; after it the residual, which is the noise but for the orientations' error.
+    """
+    if not refined:
+        return cleaned.outlier_probability.double()
+    residual = edge_residual(body_from_world, graph.target_from_source, graph.source, graph.target)
+    return torch.sigmoid((rotations.angle(residual) - _OUTLIER_ANGLE) / _RESIDUAL_SCALE)

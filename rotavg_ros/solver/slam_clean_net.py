@@ -1,8 +1,9 @@
 """CleanNet of the SLAM profile: judges loop closures by the company they keep.
 
-Four layers along a chain of 10⁴ keyframes see nothing of a loop. The SLAM network therefore passes its messages between
-*closures*: each one hears from the closures nearest to it along the odometry (``agreement.py``), and knows of itself how
-far it is from what odometry predicts. All inputs are in units of the estimated noise, so one network serves all scales.
+Four layers along a chain of 10⁴ keyframes see nothing of a loop. The SLAM network therefore passes its messages
+between *closures*: each one hears from the closures nearest to it along the odometry (``agreement.py``), and knows of
+itself how far it is from what odometry predicts. All inputs are in units of the estimated noise, so one network serves
+all scales.
 """
 
 from __future__ import annotations

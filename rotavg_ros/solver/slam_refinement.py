@@ -30,8 +30,8 @@ _MAX_LEVERAGE = 0.999
 # Redundancy below this many edges' worth says little about a variance; the estimate so far is worth as much.
 _PRIOR_ODOMETRY_REDUNDANCY = 5.0
 _PRIOR_CLOSURE_SQUARE = np.radians(0.08) ** 2
-# Neighbouring closures of a real front end err together, which in the fit looks like odometry noise. How odometry drifts over
-# long ways tells otherwise, so the fit may not raise that estimate beyond this factor.
+# Neighbouring closures of a real front end err together, which in the fit looks like odometry noise. How odometry
+# drifts over long ways tells otherwise, so the fit may not raise that estimate beyond this factor.
 _MAX_STEP_VARIANCE_GAIN = 2.0
 
 
@@ -99,9 +99,10 @@ def refine(
         change = float(np.abs(probability - inlier_probability).max(initial=0.0))
         inlier_probability = probability
         redundancy = inlier_probability * (1 - leverage)
+        square_per_step = square[odometry] / graph.steps[odometry]
         noise = NoiseModel(
             components,
-            min(_step_variance(square[odometry] / graph.steps[odometry], redundancy[odometry], noise), max_step_variance),
+            min(max_step_variance, _step_variance(square_per_step, redundancy[odometry], noise)),
             _closure_variance(square[closure], inlier_probability[closure], redundancy[closure], components),
             outlier_share(inlier_probability[closure]),
         )

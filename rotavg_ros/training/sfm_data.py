@@ -56,7 +56,9 @@ def sample_graph(recipe: str, nodes: tuple[int, int], rng: np.random.Generator) 
     return ReleasedRecipe(cameras=nodes, planar=recipe == "released").sample(rng)
 
 
-def join(graphs: Sequence[SyntheticGraph], edge_dropout: float = 0.0, rng: np.random.Generator | None = None) -> SfmBatch:
+def join(
+    graphs: Sequence[SyntheticGraph], edge_dropout: float = 0.0, rng: np.random.Generator | None = None
+) -> SfmBatch:
     """One disjoint graph; with ``edge_dropout`` > 0 every graph loses that share of its edges at random."""
     first_node = np.concatenate(([0], np.cumsum([g.graph.num_nodes for g in graphs])))
     source, target, measured, outlier = [], [], [], []

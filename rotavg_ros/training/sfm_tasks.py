@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from rotavg_ros import rotations
 from rotavg_ros.datasets.synthetic import SyntheticGraph
 from rotavg_ros.evaluation.metrics import gauge_alignment, orientation_errors
-from rotavg_ros import rotations
 from rotavg_ros.solver.clean_net import CleanNet
 from rotavg_ros.solver.fine_net import FineNet
 from rotavg_ros.solver.message_passing import DirectedEdges
@@ -121,6 +122,6 @@ def _align(batch: SfmBatch, start: Tensor) -> Tensor:
     offsets = batch.first_node.tolist()
     aligned = [
         rotations.multiply(truth[low:high], gauge_alignment(start[low:high].double(), truth[low:high]))
-        for low, high in zip(offsets[:-1], offsets[1:], strict=True)
+        for low, high in pairwise(offsets)
     ]
     return rotations.canonical(torch.cat(aligned)).float()

@@ -13,11 +13,13 @@ from typing import Protocol
 
 import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from tqdm import tqdm
 
 from rotavg_ros.errors import UserError
+from rotavg_ros.solver.network_store import metadata
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.version import __version__
 
@@ -68,7 +70,6 @@ class Trainer:
         self.optimizer = torch.optim.Adam(
             task.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
-        # Adam keeps its moments from the first step on; a resumed run needs them in place before it loads.
         self._state = _State(0, float("inf"), 0.0)
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / CHECKPOINT_NAME).exists():
@@ -114,7 +115,7 @@ class Trainer:
             group["lr"] = self.config.learning_rate * (0.5 * (1 + np.cos(np.pi * progress)))
 
     def _save_best(self, figures: dict[str, float]) -> None:
-        _save_atomically(self.task.network.state_dict(), self.folder / WEIGHTS_NAME)
+        _save_atomically(self.task.network.state_dict(), self.folder / WEIGHTS_NAME, metadata(self.name))
         card = {
             "network": self.name,
             "config": self.config.to_dict(),
@@ -132,18 +133,16 @@ class Trainer:
         tensors = {f"network.{key}": value for key, value in self.task.network.state_dict().items()}
         for number, state in self.optimizer.state_dict()["state"].items():
             tensors.update({f"optimizer.{number}.{key}": value for key, value in state.items()})
-        metadata = {"config": json.dumps(self.config.to_dict()), "state": json.dumps(vars(self._state))}
-        _save_atomically(tensors, self.folder / CHECKPOINT_NAME, metadata)
+        about = {"config": json.dumps(self.config.to_dict()), "state": json.dumps(vars(self._state))}
+        _save_atomically(tensors, self.folder / CHECKPOINT_NAME, about)
 
     def _resume(self) -> None:
         path = self.folder / CHECKPOINT_NAME
-        from safetensors import SafetensorError, safe_open
-
         try:
             with safe_open(path, framework="pt") as file:
-                metadata = file.metadata()
+                about = file.metadata()
             tensors = load_file(path)
-            config, state = json.loads(metadata["config"]), json.loads(metadata["state"])
+            config, state = json.loads(about["config"]), json.loads(about["state"])
         except (SafetensorError, OSError, KeyError, TypeError, json.JSONDecodeError):
             raise TrainingError(f"{path}: not a checkpoint; remove the file to start anew") from None
         if config != self.config.to_dict():
@@ -167,9 +166,9 @@ class Trainer:
             log.write(json.dumps(row) + "\n")
 
 
-def _save_atomically(tensors: dict[str, Tensor], path: Path, metadata: dict[str, str] | None = None) -> None:
+def _save_atomically(tensors: dict[str, Tensor], path: Path, about: dict[str, str]) -> None:
     temporary = path.with_suffix(".partial")
-    save_file({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, temporary, metadata)
+    save_file({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, temporary, about)
     os.replace(temporary, path)
 
 
@@ -186,8 +185,8 @@ def _hardware(network: nn.Module) -> str:
 
 def _commit() -> str:
     try:
-        return subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True, check=True
-        ).stdout.strip()
+        command = ["git", "rev-parse", "--short", "HEAD"]
+        result = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
+    return result.stdout.strip()

@@ -1,0 +1,61 @@
+"""The SLAM noise model: densities that integrate to one, variances that are found again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.solver.agreement import agreement_pairs
+from rotavg_ros.solver.noise_model import NoiseModel, discrepancies, estimate_noise, log_uniform_density
+from rotavg_ros.solver.slam_stages import prepare
+
+from .graphs import measured, random_truth, slam_edges, small_noise
+
+
+def test_uniform_densities_integrate_to_one() -> None:
+    def shell(angle: float) -> float:
+        return float(4 * np.pi * angle**2 * np.exp(log_uniform_density(np.array([angle]), 3))[0])
+
+    assert quad(shell, 0, np.pi)[0] == pytest.approx(1)
+    assert float(np.exp(log_uniform_density(np.zeros(1), 1))[0]) == pytest.approx(1 / (2 * np.pi))
+
+
+def test_log_odds_are_a_ratio_of_densities() -> None:
+    model = NoiseModel(3, 1e-4, 1e-3, 0.5)
+    square, variance = np.array([0.0, 0.01, 1.0]), np.array([0.01, 0.02, 0.3])
+    gaussian = np.exp(-square / (2 * variance)) / (2 * np.pi * variance) ** 1.5
+    expected = np.log(gaussian) - log_uniform_density(np.sqrt(square), 3)
+    np.testing.assert_allclose(model.inlier_log_odds(square, variance), expected)
+
+
+@pytest.mark.parametrize("planar", [False, True])
+@pytest.mark.parametrize(
+    ("step_deg", "closure_deg", "false_share"), [(0.2, 1.0, 0.3), (1.0, 0.5, 0.6), (0.3, 3.0, 0.0)]
+)
+def test_scales_are_found_again(planar: bool, step_deg: float, closure_deg: float, false_share: float) -> None:
+    """All closures share one random walk, so its scale is seen about once per component; factors of two are fine."""
+    source, target, kind = slam_edges(1500, 900, 7)
+    sigma = np.where(kind == 0, step_deg, closure_deg)
+    noise = small_noise(len(source), sigma, 8, planar).as_quat()
+    false = np.random.default_rng(9).random(len(source)) < false_share
+    false &= kind == 1
+    yaw = np.random.default_rng(10).uniform(-np.pi, np.pi, (int(false.sum()), 1)) * [0, 0, 1]
+    random = Rotation.from_rotvec(yaw) if planar else Rotation.random(int(false.sum()), random_state=10)
+    noise[false] = random.as_quat()
+    graph = measured(random_truth(1500, 3, planar), source, target, Rotation.from_quat(noise), kind=kind)
+    model = prepare(graph).noise
+    assert model.components == (1 if planar else 3)
+    assert 0.6 < np.degrees(np.sqrt(model.step_variance)) / step_deg < 1.5
+    assert 0.5 < np.degrees(np.sqrt(model.closure_variance)) / closure_deg < 2
+    assert model.outlier_share == pytest.approx(false_share, abs=0.06)
+
+
+def test_without_closures_the_prior_stands() -> None:
+    source, target, kind = slam_edges(20, 0, 0)
+    prepared = prepare(measured(random_truth(20, 0), source, target, kind=kind))
+    assert len(agreement_pairs(prepared.closure_graph).first) == 0
+    empty = np.empty(0)
+    model = estimate_noise(discrepancies(empty, empty, prepared.pairs), 3)
+    assert 0 < model.step_variance < 1 and 0 < model.outlier_share < 1
