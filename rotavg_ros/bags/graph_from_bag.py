@@ -15,14 +15,17 @@ from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION
 from rotavg_ros.bags.messages import Edge, Keyframe, read_edge, read_odometry
 from rotavg_ros.bags.reader import BagReader, BagReadError
 from rotavg_ros.bags.topics import EDGE_TOPIC, GRAPH_NOTE, ODOM_TOPIC, TRANSLATION_TOPIC, TRUTH_TOPIC
-from rotavg_ros.datasets.graph_file import GraphFile
-from rotavg_ros.view_graph import EdgeKind
+from rotavg_ros.datasets.graph_file import MAX_NODE_ID, GraphFile
+from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, ViewGraphError
 
 # A stamp that names a keyframe may be this far from the odometry message that is meant.
 MAX_STAMP_DISTANCE_NS = 50_000_000
 
 # Rotations in a plane have no roll and pitch beyond rounding.
 _PLANAR_TOLERANCE = 1e-9
+
+# Stamp in ns, position, world-from-body xyzw.
+_Pose = tuple[int, list[float], list[float]]
 
 _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 
@@ -33,13 +36,19 @@ class _Content:
 
     edges: list[Edge] = field(default_factory=list)
     translations: list[list[float]] = field(default_factory=list)
-    odometry: list[tuple[int, list[float], list[float]]] = field(default_factory=list)
-    truth: list[tuple[int, list[float], list[float]]] = field(default_factory=list)
+    odometry: list[_Pose] = field(default_factory=list)
+    truth: list[_Pose] = field(default_factory=list)
     note: dict[str, Any] = field(default_factory=dict)
 
     @property
     def by_id(self) -> bool:
+        """Whether every edge names its ends by id."""
         return bool(self.edges) and all(end.id is not None for edge in self.edges for end in (edge.source, edge.target))
+
+    @property
+    def has_translations(self) -> bool:
+        """Whether there is one for every edge."""
+        return len(self.translations) == len(self.edges)
 
 
 def read_graph_bag(path: str | Path) -> GraphFile:
@@ -57,9 +66,14 @@ def read_graph_bag(path: str | Path) -> GraphFile:
         content = _read(bag)
         if not content.by_id:
             bag.require(ODOM_TOPIC, ODOMETRY)
-            if not content.odometry:
-                raise BagReadError(f"{path}: {ODOM_TOPIC} has no messages, so there are no keyframes")
-    return _with_truth(_from_ids(content) if content.by_id else _from_stamps(content), content)
+            if not any(map(_is_sound, content.odometry)):
+                raise BagReadError(f"{path}: {ODOM_TOPIC} has no messages with a pose, so there are no keyframes")
+    _check(path, content)
+    try:
+        graph_file = _from_ids(content) if content.by_id else _from_stamps(content)
+    except ViewGraphError as error:
+        raise BagReadError(f"{path}: {EDGE_TOPIC}: {error}") from None
+    return _with_truth(graph_file, content)
 
 
 def _read(bag: BagReader) -> _Content:
@@ -81,11 +95,28 @@ def _read(bag: BagReader) -> _Content:
     return content
 
 
+def _check(path: str | Path, content: _Content) -> None:
+    """Refuse what a graph has no room for."""
+    ends = [end for edge in content.edges for end in (edge.source, edge.target)]
+    robots = sorted({end.robot for end in ends})
+    if len(robots) > 1:
+        names = ", ".join(repr(robot) for robot in robots)
+        raise BagReadError(f"{path}: edges of several robots ({names}); a graph has room for one")
+    if content.by_id and (largest := max(end.id or 0 for end in ends)) > MAX_NODE_ID:
+        raise BagReadError(f"{path}: keyframe id {largest} is too large; the largest possible is {MAX_NODE_ID}")
+    known = {kind.value for kind in EdgeKind}
+    for edge in content.edges:
+        if edge.kind not in known:
+            raise BagReadError(f"{path}: edge {edge.id} is of the unknown kind {edge.kind}")
+
+
 def _from_ids(content: _Content) -> GraphFile:
-    order = sorted(range(len(content.edges)), key=lambda position: content.edges[position].id)
+    proper = [position for position, edge in enumerate(content.edges) if edge.source.id != edge.target.id]
+    order = sorted(proper, key=lambda position: content.edges[position].id)
     edges = [content.edges[position] for position in order]
     ends = np.array([(edge.source.id, edge.target.id) for edge in edges], dtype=np.int64)
-    source_from_target = np.stack([edge.source_from_target for edge in edges])
+    ends = ends.reshape(-1, 2)
+    source_from_target = np.array([edge.source_from_target for edge in edges]).reshape(-1, 4)
     note = content.note
     graph_file = GraphFile.from_ids(
         ends[:, 0],
@@ -95,7 +126,8 @@ def _from_ids(content: _Content) -> GraphFile:
         kind=np.array([edge.kind for edge in edges]),
         precision=np.array([edge.precision for edge in edges]),
         planar=bool(note.get("planar", _is_planar(source_from_target))),
-        edge_translation=np.array(content.translations)[order] if len(content.translations) == len(edges) else None,
+        edge_translation=_in_order(content.translations, order) if content.has_translations else None,
+        skipped={"self-edges": len(content.edges) - len(proper)} if len(proper) < len(content.edges) else {},
     )
     stamp_of = {end.id: end.stamp_ns for edge in edges for end in (edge.source, edge.target)}
     stamp_of.update(zip(note.get("lone_ids", []), note.get("lone_stamps_ns", []), strict=False))
@@ -104,7 +136,8 @@ def _from_ids(content: _Content) -> GraphFile:
 
 
 def _from_stamps(content: _Content) -> GraphFile:
-    poses = sorted({stamp: (position, rotation) for stamp, position, rotation in content.odometry}.items())
+    sound = [message for message in content.odometry if _is_sound(message)]
+    poses = sorted({stamp: (position, rotation) for stamp, position, rotation in sound}.items())
     stamps_ns = np.array([stamp for stamp, _ in poses], dtype=np.int64)
     position = np.array([pose[0] for _, pose in poses])
     world_from_body = Rotation.from_quat([pose[1] for _, pose in poses])
@@ -122,9 +155,12 @@ def _from_stamps(content: _Content) -> GraphFile:
     target = np.concatenate((np.arange(1, num_steps + 1), ends[usable, 1]))
     order = np.argsort(np.maximum(source, target), kind="stable")
     translations = None
-    if len(content.translations) == len(content.edges):
+    if content.has_translations:
         translations = np.concatenate((steps, np.array(content.translations).reshape(-1, 3)[usable]))[order]
-    skipped = {"edges without odometry at their stamp": int((~usable).sum())} if not usable.all() else {}
+    skipped = {
+        "odometry messages without a pose": len(content.odometry) - len(sound),
+        "edges without odometry at their stamps, or with both ends at one": int((~usable).sum()),
+    }
     graph_file = GraphFile.from_ids(
         source[order],
         target[order],
@@ -134,9 +170,19 @@ def _from_stamps(content: _Content) -> GraphFile:
         precision=np.array([np.nan] * num_steps + [edge.precision for edge in closures])[order],
         planar=_is_planar(source_from_target),
         edge_translation=translations,
-        skipped=skipped,
+        skipped={what: count for what, count in skipped.items() if count},
     )
     return replace(graph_file, stamps_ns=stamps_ns)
+
+
+def _is_sound(message: _Pose) -> bool:
+    _, position, orientation = message
+    off = abs(float(np.linalg.norm(orientation)) - 1)
+    return off <= UNIT_NORM_TOLERANCE and bool(np.isfinite(position).all())
+
+
+def _in_order(rows: list[list[float]], order: list[int]) -> NDArray[np.float64]:
+    return np.array(rows)[order].reshape(-1, 3)
 
 
 def _nearest(stamps_ns: NDArray[np.int64], end: Keyframe) -> int:

@@ -11,9 +11,11 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros.bags.graph_from_bag import read_graph_bag
 from rotavg_ros.bags.graph_to_bag import write_graph_bag
 from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION
-from rotavg_ros.bags.reader import BagReader
+from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_message
+from rotavg_ros.bags.reader import BagReader, BagReadError
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.bags.topics import EDGE_TOPIC, ODOM_TOPIC, TRANSLATION_TOPIC, TRUTH_TOPIC
+from rotavg_ros.bags.writer import BagWriter
 from rotavg_ros.datasets.graph_file import GraphFile, read_graph
 from rotavg_ros.datasets.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.datasets.robot_run import robot_run_config
@@ -127,7 +129,7 @@ def test_ros_conventions_in_the_bag(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("dimensions", [2, 3])
 def test_a_robots_run_reads_back_as_its_graph(tmp_path: Path, dimensions: int) -> None:
-    config = robot_run_config("building", dimensions=dimensions, laps=1)
+    config = robot_run_config("building", dimensions=dimensions, laps=2)
     run = simulate_slam_graph(config, np.random.default_rng(1))
     write_run_bag(tmp_path / "bag", run)
     with BagReader(tmp_path / "bag") as bag:
@@ -144,3 +146,65 @@ def test_a_robots_run_reads_back_as_its_graph(tmp_path: Path, dimensions: int) -
     np.testing.assert_allclose(read.edge_translation, run.edge_translation, atol=1e-9)
     np.testing.assert_allclose(read.position_gt, run.position)
     assert read.planar == (dimensions == 2)
+
+
+def bag_of_edges(path: Path, edges: list[Edge]) -> Path:
+    with BagWriter(path) as bag:
+        bag.add_topic(EDGE_TOPIC, RELATIVE_ROTATION)
+        for edge in edges:
+            bag.write(EDGE_TOPIC, edge.stamp_ns, edge_message(edge))
+    return path
+
+
+def edge(number: int, source: Keyframe, target: Keyframe, rotation: tuple[float, ...] = (0, 0, 0, 1.0)) -> Edge:
+    return Edge(10 + number, number, number + 1, source, target, np.array(rotation), np.nan, 1)
+
+
+def test_self_edges_are_skipped_and_counted(tmp_path: Path) -> None:
+    first, second = Keyframe(3, 5), Keyframe(9, 6)
+    bag = bag_of_edges(tmp_path / "bag", [edge(0, first, second), edge(1, second, second)])
+    graph_file = read_graph_bag(bag)
+    assert graph_file.skipped == {"self-edges": 1}
+    assert graph_file.node_ids.tolist() == [3, 9]
+    assert graph_file.stamps_ns.tolist() == [5, 6]
+
+
+@pytest.mark.parametrize(
+    ("edges", "complaint"),
+    [
+        ([edge(0, Keyframe(1, 0, "a"), Keyframe(2, 0, "b"))], "several robots"),
+        ([edge(0, Keyframe(1, 0), Keyframe(2**63, 0))], "too large"),
+        ([edge(0, Keyframe(1, 0), Keyframe(2, 0), (0, 0, 0, 0.5))], "unit length"),
+        ([edge(0, Keyframe(1, 0), Keyframe(2, 0), (0, 0, 0, np.nan))], "unit length"),
+        ([replace(edge(0, Keyframe(1, 0), Keyframe(2, 0)), kind=7)], "unknown kind 7"),
+        ([edge(0, Keyframe(None, 0), Keyframe(2, 0))], "no topic /odom"),
+        ([], "no topic /odom"),
+    ],
+)
+def test_what_makes_no_graph_is_refused(tmp_path: Path, edges: list[Edge], complaint: str) -> None:
+    bag = bag_of_edges(tmp_path / "bag", edges)
+    with pytest.raises(BagReadError, match=complaint) as caught:
+        read_graph_bag(bag)
+    assert str(caught.value).startswith(str(bag))
+    assert "\n" not in str(caught.value)
+
+
+def test_what_odometry_cannot_place_is_skipped_and_counted(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic(EDGE_TOPIC, RELATIVE_ROTATION)
+        bag.add_topic(ODOM_TOPIC, ODOMETRY)
+        for index in range(3):
+            stamp = (index + 1) * 10**9
+            bag.write(ODOM_TOPIC, stamp, odometry_message(stamp, np.zeros(3), np.array([0, 0, 0, 1.0]), "odom"))
+            for bad in (0.0, np.nan):
+                garbled = odometry_message(stamp + 1, np.zeros(3), np.array([0, 0, 0, bad]), "odom")
+                bag.write(ODOM_TOPIC, stamp + 1, garbled)
+        good = edge(0, Keyframe(None, 10**9 + 10**7), Keyframe(None, 3 * 10**9 - 10**7))
+        lost = edge(1, Keyframe(None, 10**9), Keyframe(None, 9 * 10**9))
+        for message in (good, lost):
+            bag.write(EDGE_TOPIC, 4 * 10**9, edge_message(message))
+    graph_file = read_graph_bag(tmp_path / "bag")
+    assert sorted(graph_file.skipped.values()) == [1, 6]
+    assert graph_file.graph.source.tolist() == [0, 1, 0]
+    assert graph_file.graph.target.tolist() == [1, 2, 2]
+    assert graph_file.graph.kind.tolist() == [0, 0, 1]
