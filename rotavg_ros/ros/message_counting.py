@@ -24,19 +24,18 @@ class SequenceGaps:
         self.before_first = 0
         self._last: dict[str, int] = {}
 
-    def observe(self, sender: str, number: int, first: int = 1) -> None:
+    def observe(self, sender: str, number: int) -> None:
         """Note a number; one that is not ahead of the last means that the sender started anew.
 
         Args:
             sender: whose count it is.
-            number: 0 if the sender does not count.
-            first: the number that the sender starts from.
+            number: from 1; 0 if the sender does not count.
         """
         if number <= 0:
             return
         last = self._last.get(sender)
         if last is None:
-            self.before_first += number - first if number - first < _LARGEST_GAP else 0
+            self.before_first += number - 1 if number <= _LARGEST_GAP else 0
         elif last < number <= last + _LARGEST_GAP:
             self.lost += number - last - 1
         self._last[sender] = number

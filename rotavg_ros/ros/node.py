@@ -8,11 +8,6 @@ import sys
 import traceback
 from types import FrameType
 
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args, try_shutdown
-
 from rotavg_ros.errors import UserError
 
 # A wait of the executor is not interrupted by a signal, so it must be short.
@@ -28,7 +23,11 @@ Keeps a robot's orientations right: odometry and relative rotations in, absolute
 
 def main() -> int:
     """Run the node until SIGINT or SIGTERM; returns the exit code, 2 for a mistake of the user."""
-    stop = _StopSignal()
+    stop = _StopSignal()  # before the imports below, which take seconds
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+    from rclpy.utilities import remove_ros_args, try_shutdown
+
     try:
         arguments = remove_ros_args(sys.argv)[1:]
         if arguments:
@@ -55,7 +54,9 @@ class _StopSignal:
 
 
 def _run(stop: _StopSignal) -> int:
-    from rotavg_ros.ros.estimator_node import RotavgNode  # takes seconds: loads torch
+    from rclpy.executors import SingleThreadedExecutor
+
+    from rotavg_ros.ros.estimator_node import RotavgNode
 
     executor = SingleThreadedExecutor()
     try:

@@ -174,7 +174,7 @@ class LiveNode:
         """Wait for the cold answer after which nothing more comes; returns it."""
         self.status.clear()
         self.spin_until(
-            lambda: self.status.get("answer cold") == "true" and float(self.status["answer age s"]) > 2,
+            lambda: self.status.get("answer cold") == "true" and float(self.status["answer age s"]) > 1
         )
         return self.answers[-1]
 

@@ -1,0 +1,86 @@
+"""Parameters: one dataclass, and everything that is made from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import fields
+
+import pytest
+import yaml
+
+rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
+from rclpy.parameter import Parameter
+
+from rotavg_ros.ros import parameter_server
+from rotavg_ros.ros.parameters import NodeParameters, ParameterError, to_markdown, to_yaml
+
+
+@pytest.fixture
+def make_node() -> Iterator[Callable[..., rclpy.node.Node]]:
+    """A function that makes a node that was started with some parameters."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    nodes = []
+
+    def make(**overrides: object) -> rclpy.node.Node:
+        parameters = [Parameter(name, value=value) for name, value in overrides.items()]
+        nodes.append(rclpy.create_node("parameters", context=context, parameter_overrides=parameters))
+        return nodes[-1]
+
+    yield make
+    for node in nodes:
+        node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def test_the_defaults_are_good_and_declared_with_descriptions_and_ranges(make_node) -> None:
+    node = make_node()
+    assert parameter_server.declare(node) == NodeParameters()
+    for parameter in fields(NodeParameters):
+        descriptor = node.describe_parameter(parameter.name)
+        assert descriptor.description
+        assert descriptor.read_only != parameter.metadata["live"]
+    assert node.describe_parameter("outlier_threshold").floating_point_range[0].to_value == 1.0
+    assert node.describe_parameter("refinement_steps").integer_range[0].from_value == -1
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"keyframe_angle_deg": 5}, "keyframe_angle_deg has the wrong type; it must be double"),
+        ({"robots": "a"}, "robots has the wrong type; it must be string array"),
+        ({"pending_capacity": 0}, "pending_capacity must be between 1 and"),
+        ({"outlier_threshold": 1.5}, "outlier_threshold must be between 0 and 1"),
+        ({"keyframe_angle_deg": float("nan")}, "keyframe_angle_deg"),
+        ({"gauge": "up"}, "choose from odometry, identity"),
+        ({"device": "tpu"}, "choose from"),
+        ({"robots": ["a", "b"]}, "one robot per topic"),
+        ({"robots": ["a", "a"], "odometry_topics": ["x", "y"]}, "names something twice"),
+        ({"edge_sensor_orientations": [0.0, 0.0, 1.0]}, "give 4, or 4 per edge topic"),
+        ({"edge_sensor_orientations": [1.0, 1.0, 0.0, 0.0]}, "not of unit length"),
+        ({"autosave_period_s": 5.0}, "state_file is empty"),
+    ],
+)
+def test_mistakes_are_one_clear_line(make_node, overrides: dict[str, object], message: str) -> None:
+    with pytest.raises(ParameterError, match=message) as refusal:
+        parameter_server.declare(make_node(**overrides))
+    assert "\n" not in str(refusal.value)
+
+
+def test_unknown_parameters_are_named_with_a_suggestion(make_node) -> None:
+    node = make_node(keyframe_angel_deg=3.0, **{"qos_overrides./odom.subscription.depth": 5})
+    parameter_server.declare(node)
+    (line,) = parameter_server.unknown(node)
+    assert "keyframe_angel_deg" in line and "did you mean keyframe_angle_deg?" in line
+
+
+def test_the_yaml_is_what_a_node_reads(make_node) -> None:
+    parameters = NodeParameters().changed({"robots": ["a"], "gauge": "identity", "solve_period_s": 2.0})
+    loaded = yaml.safe_load(to_yaml(parameters, "/fleet/rotavg"))["/fleet/rotavg"]["ros__parameters"]
+    assert parameter_server.declare(make_node(**loaded)) == parameters
+
+
+def test_the_table_names_every_parameter() -> None:
+    table = to_markdown()
+    assert all(f"| `{parameter.name}` |" in table for parameter in fields(NodeParameters))
+    assert len(table.splitlines()) == 2 + len(fields(NodeParameters))
