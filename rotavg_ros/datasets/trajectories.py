@@ -11,13 +11,12 @@ from enum import Enum
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import rotations
-
-FloatArray = NDArray[np.floating]
+from rotavg_ros.datasets import plane_paths
+from rotavg_ros.datasets.plane_paths import FloatArray, direction, fold, smooth_noise, walk_along
 
 
 class World(str, Enum):
@@ -76,7 +75,7 @@ def drive(
     """
     if world in PLANAR_WORLDS:
         path = _PATHS[world](num_poses, rng, step_m, laps)
-        lane = np.stack([_smooth_noise(num_poses, 12, rng) for _ in range(2)], axis=1) * 0.2 * step_m
+        lane = np.stack([smooth_noise(num_poses, 12, rng) for _ in range(2)], axis=1) * 0.2 * step_m
         if world is World.GRID:
             trajectory = _on_terrain(path, np.zeros(0), 0.0, tilt_deg, rng)
         else:
@@ -85,7 +84,7 @@ def drive(
         trajectory = _SPATIAL[world](num_poses, rng, step_m, laps)
     if sway_deg == 0:
         return trajectory
-    sway = np.stack([_smooth_noise(num_poses, 6, rng) for _ in range(3)], axis=1) * np.radians(sway_deg)
+    sway = np.stack([smooth_noise(num_poses, 6, rng) for _ in range(3)], axis=1) * np.radians(sway_deg)
     if world in PLANAR_WORLDS and tilt_deg == 0:
         sway[:, :2] = 0
     swayed = Rotation.from_quat(trajectory.world_from_body) * Rotation.from_rotvec(sway)
@@ -106,93 +105,13 @@ def chain_rotations(steps: FloatArray) -> FloatArray:
     return rotations.normalize(products).numpy()
 
 
-# --- paths in the plane, (N, 2) metres ------------------------------------------------------------
-
-
-def _corridor(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> FloatArray:
-    length = num_poses * step_m / laps
-    bends = np.cumsum(rng.choice([-np.pi / 2, -np.pi / 4, 0, np.pi / 4, np.pi / 2], size=rng.integers(1, 5)))
-    legs = rng.uniform(0.5, 1.5, len(bends))
-    legs *= length / legs.sum()
-    corners = np.concatenate((np.zeros((1, 2)), np.cumsum(legs[:, None] * _direction(bends), axis=0)))
-    return _walk_along(corners, _fold(np.arange(num_poses) * step_m, length))
-
-
-def _building(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> FloatArray:
-    # Rooms add about 60 % to the length of a lap.
-    perimeter = num_poses * step_m / laps / 1.6
-    width = perimeter / 2 * rng.uniform(0.5, 0.75)
-    size = np.array([width, perimeter / 2 - width])
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * size
-    num_doors = rng.integers(4, 13)
-    door_at = np.sort(rng.uniform(0, perimeter, num_doors))
-    doors = _walk_along(corners, door_at)
-    depth = perimeter * rng.uniform(0.02, 0.09, num_doors) * rng.choice([-1, 1], num_doors)
-    inward = _walk_along(corners, np.minimum(door_at + 1e-6 * perimeter, perimeter)) - doors
-    inward = inward[:, ::-1] * [-1, 1] / np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
-    rooms = doors + depth[:, None] * inward
-
-    corner_at = np.array([0, size[0], size.sum(), size.sum() + size[0]])
-    stop_at = np.concatenate((corner_at, np.repeat(door_at, 3)))
-    stops = np.concatenate((corners[:4], np.stack((doors, rooms, doors), axis=1).reshape(-1, 2)))
-    order = np.argsort(stop_at, kind="stable")
-    num_laps = int(np.ceil(num_poses * step_m / perimeter)) + 1
-    visited = rng.random((num_laps, num_doors)) < 0.7
-    chosen = np.concatenate((np.ones((num_laps, 4), dtype=bool), np.repeat(visited, 3, axis=1)), axis=1)[:, order]
-    waypoints = np.broadcast_to(stops[order], (num_laps, len(order), 2))[chosen]
-    return _walk_along(waypoints, np.arange(num_poses) * step_m)
-
-
-def _grid(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> FloatArray:
-    turns = rng.choice([-1, 0, 0, 0, 1], size=num_poses)
-    heading = np.cumsum(turns) % 4
-    moves = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[heading]
-    side = max(3, round(np.sqrt(num_poses / laps)))
-    return step_m * _fold(np.cumsum(moves, axis=0).astype(float) + side // 2, side)
-
-
-def _city(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> FloatArray:
-    length = num_poses * step_m
-    # A rectangle of a × b blocks, a, b ≤ 3, is 8 blocks long on average; four quadrants to choose from.
-    block = length / (8 * max(laps, 1) * 4)
-    waypoints = [np.zeros(2)]
-    driven, arriving = 0.0, np.zeros(2)
-    while driven < length + block:
-        sides = rng.integers(1, 4, 2) * rng.choice([-1, 1], 2) * block
-        along_x, along_y = np.array([sides[0], 0]), np.array([0, sides[1]])
-        first, second = (along_x, along_y) if rng.random() < 0.5 else (along_y, along_x)
-        if np.dot(first, arriving) < 0:  # no U-turn at home
-            first, second = second, first
-        waypoints += [first, first + second, second, np.zeros(2)]
-        driven += 2 * np.abs(sides).sum()
-        arriving = -second
-    return _walk_along(np.stack(waypoints), np.arange(num_poses) * step_m)
-
-
-def _laps(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> FloatArray:
-    angle = np.linspace(0, 2 * np.pi, 400)
-    harmonics = np.arange(2, 6)
-    waves = rng.normal(0, 0.25, 4) / harmonics
-    radius = 1 + (waves * np.cos(harmonics * angle[:, None] + rng.uniform(0, 2 * np.pi, 4))).sum(1)
-    track = radius[:, None] * _direction(angle) * [1, rng.uniform(0.4, 1)]
-    lap_length = np.linalg.norm(np.diff(track, axis=0), axis=1).sum()
-    track *= num_poses * step_m / laps / lap_length
-    return _walk_along(track, np.arange(num_poses) * step_m % (num_poses * step_m / laps))
-
-
-def _roam(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> FloatArray:
-    heading = np.cumsum(_smooth_noise(num_poses, rng.uniform(5, 30), rng) * rng.uniform(0.05, 0.3))
-    side = 1.5 * step_m * np.sqrt(num_poses / laps)
-    return _fold(np.cumsum(step_m * _direction(heading), axis=0) + side / 2, side)
-
-
 _PATHS = {
-    World.CORRIDOR: _corridor,
-    World.BUILDING: _building,
-    World.GRID: _grid,
-    World.CITY: _city,
-    World.LAPS: _laps,
-    World.ROAM: _roam,
+    World.CORRIDOR: plane_paths.corridor,
+    World.BUILDING: plane_paths.building,
+    World.GRID: plane_paths.grid,
+    World.CITY: plane_paths.city,
+    World.LAPS: plane_paths.laps,
+    World.ROAM: plane_paths.roam,
 }
 
 
@@ -210,7 +129,7 @@ def _on_terrain(
     world_from_body = Rotation.from_rotvec(yaw)
     if tilt_deg > 0:
         extent = max(float(np.ptp(path, axis=0).max()), 1e-9)
-        waves = 2 * np.pi / extent * rng.uniform(0.5, 2.5, (6, 1)) * _direction(rng.uniform(0, 2 * np.pi, 6))
+        waves = 2 * np.pi / extent * rng.uniform(0.5, 2.5, (6, 1)) * direction(rng.uniform(0, 2 * np.pi, 6))
         phase = path @ waves.T + rng.uniform(0, 2 * np.pi, 6)
         slope_of_wave = np.tan(np.radians(tilt_deg)) / np.sqrt(6 / 2)
         position[:, 2] = (np.sin(phase) * slope_of_wave / np.linalg.norm(waves, axis=1)).sum(1)
@@ -220,9 +139,6 @@ def _on_terrain(
         axis = np.stack((slope[:, 1], -slope[:, 0], np.zeros(len(slope))), axis=1) / np.maximum(steepness, 1e-12)
         world_from_body = Rotation.from_rotvec(axis * np.arctan(steepness)) * world_from_body
     return Trajectory(position, world_from_body.as_quat(canonical=True))
-
-
-# --- trajectories in space ------------------------------------------------------------------------
 
 
 def _sphere(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> Trajectory:
@@ -257,8 +173,8 @@ def _garage(num_poses: int, rng: np.random.Generator, step_m: float, laps: float
     round_length = num_poses * step_m / (2 * floors)
     width = round_length / 2 * rng.uniform(0.5, 0.8)
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * [width, round_length / 2 - width]
-    climbed = _fold(np.arange(num_poses) * step_m, floors * round_length)
-    path = _walk_along(corners, climbed % round_length)
+    climbed = fold(np.arange(num_poses) * step_m, floors * round_length)
+    path = walk_along(corners, climbed % round_length)
     rounding = round_length / step_m / 40
     path = gaussian_filter1d(path, rounding, axis=0, mode="nearest")
     height = climbed / round_length * np.tan(np.radians(rng.uniform(1, 5))) * round_length
@@ -280,29 +196,3 @@ def _with_frames(position: FloatArray, up: FloatArray) -> Trajectory:
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     matrix = np.stack((forward, np.cross(up, forward), up), axis=2)
     return Trajectory(position, Rotation.from_matrix(matrix).as_quat(canonical=True))
-
-
-# --- helpers --------------------------------------------------------------------------------------
-
-
-def _direction(angle: FloatArray) -> FloatArray:
-    return np.stack((np.cos(angle), np.sin(angle)), axis=-1)
-
-
-def _fold(distance: FloatArray, length: float) -> FloatArray:
-    """Reflect at both ends of [0, length]: forth and back."""
-    return np.asarray(length - np.abs(distance % (2 * length) - length))
-
-
-def _walk_along(waypoints: FloatArray, distance: FloatArray) -> FloatArray:
-    """Points of a polyline at the given distances from its start."""
-    at = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1))))
-    return np.stack([np.interp(distance, at, column) for column in waypoints.T], axis=1)
-
-
-def _smooth_noise(length: int, scale: float, rng: np.random.Generator) -> FloatArray:
-    """Gaussian noise of unit variance that varies over about ``scale`` samples."""
-    padding = int(4 * scale) + 1
-    noise: FloatArray = gaussian_filter1d(rng.normal(size=length + 2 * padding), scale)[padding : padding + length]
-    noise *= np.sqrt(2 * np.sqrt(np.pi) * scale)
-    return noise
