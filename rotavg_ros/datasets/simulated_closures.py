@@ -19,7 +19,7 @@ _GOOD, _RANDOM, _NEAR_MISS, _GROUPED = range(4)
 def measure_closures(
     config: SlamSimulationConfig, position: FloatArray, world_from_body: Rotation, rng: np.random.Generator
 ) -> Measurements:
-    """Loop closures, good and false, ordered by their newer end.
+    """Loop closures, good and false.
 
     Args:
         position: ``(N, 3)`` metres, true.
