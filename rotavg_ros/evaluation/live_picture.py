@@ -128,7 +128,7 @@ def _draw_scores(axes: Axes, report: LiveReport) -> None:
     groups = [
         ("good closures", report.closure_score[report.closure_is_false == 0], _KEPT),
         ("false closures", report.closure_score[report.closure_is_false == 1], _FLAGGED),
-        ("closures of unknown truth", report.closure_score[~known], _MUTED),
+        ("truth unknown", report.closure_score[~known], _MUTED),
     ]
     groups = [group for group in groups if len(group[1])]
     if groups:
