@@ -38,6 +38,7 @@ class LaplacianSystem:
         self.num_nodes = num_nodes
         self.source, self.target, self.weight = source, target, weight
         degree = np.bincount(source, weight, num_nodes) + np.bincount(target, weight, num_nodes)
+        degree = degree.astype(np.float64)  # bincount counts in integers where there is no edge
         degree[roots] += _GROUNDING * max(float(weight.max(initial=0.0)), 1.0)
         diagonal = np.arange(num_nodes)
         matrix = coo_array(
@@ -60,7 +61,7 @@ class LaplacianSystem:
 
     def solve(self, right_hand_side: np.ndarray) -> np.ndarray:
         """``L⁻¹ b`` for ``(N, k)`` columns."""
-        return self._solve(right_hand_side)
+        return np.asarray(self._solve(right_hand_side))
 
     def fit(self, difference: np.ndarray) -> np.ndarray:
         """Node values ``(N, k)`` whose differences target − source fit ``difference`` ``(E, k)`` best."""

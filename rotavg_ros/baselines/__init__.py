@@ -1,0 +1,26 @@
+"""The methods that NeuRoRA is compared with, each written from its own paper, behind one signature."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from torch import Tensor
+
+from rotavg_ros.baselines.arrigoni import arrigoni
+from rotavg_ros.baselines.chatterjee import chatterjee
+from rotavg_ros.baselines.wang import wang
+from rotavg_ros.baselines.weiszfeld import weiszfeld
+from rotavg_ros.view_graph import ViewGraph
+
+# A graph on the CPU and, for a warm start, the body_from_world (N, 4) of another method → body_from_world (N, 4)
+# float64. Every connected component is solved by itself, in a gauge of its own. Rejected edges take no part.
+Baseline = Callable[[ViewGraph, Tensor | None], Tensor]
+
+BASELINES: dict[str, Baseline] = {
+    "chatterjee": chatterjee,
+    "weiszfeld": weiszfeld,
+    "arrigoni": arrigoni,
+    "wang": wang,
+}
+
+__all__ = ["BASELINES", "Baseline", "arrigoni", "chatterjee", "wang", "weiszfeld"]
