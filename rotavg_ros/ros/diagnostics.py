@@ -104,7 +104,8 @@ def _errors(health: Health, parameters: NodeParameters, paused: bool, now: float
 def _warnings(health: Health, parameters: NodeParameters, paused: bool, now: float) -> list[str]:
     warnings = []
     silent = now - (health.started if health.last_odometry is None else health.last_odometry)
-    if silent > parameters.odometry_timeout_s:
+    needed = parameters.keyframe_source == "odometry" and parameters.unknown_keyframes == "wait"
+    if silent > parameters.odometry_timeout_s and (needed or health.last_odometry is not None):
         warnings.append("no odometry yet" if health.last_odometry is None else f"no odometry for {silent:.0f} s")
     p95 = health.ticks.percentile_ms(95)
     if p95 > 1e3 * parameters.solve_period_s:

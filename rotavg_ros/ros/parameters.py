@@ -51,7 +51,7 @@ class NodeParameters:
     )
     world_frame: str = _parameter("map", "frame id of what is published")
     publish_tf: bool = _parameter(False, "publish world → odometry frame (rotation only) on /tf; needs tf2_msgs")
-    odometry_queue_depth: int = _parameter(1000, "messages that may wait per odometry topic", low=1, high=1_000_000)
+    odometry_queue_depth: int = _parameter(10_000, "messages that may wait per odometry topic", low=1, high=1_000_000)
     edge_queue_depth: int = _parameter(10_000, "messages that may wait per edge topic", low=1, high=1_000_000)
 
     keyframe_source: str = _parameter(
