@@ -12,6 +12,8 @@ from rotavg_ros.datasets.simulated_odometry import IndexArray, Measurements, noi
 from rotavg_ros.datasets.slam_config import SlamSimulationConfig
 
 _NEAR_MISS_DEG = (10.0, 30.0)
+# Keyframes over which a front end sees much the same.
+_STRETCH = 20
 # How a closure is false.
 _GOOD, _RANDOM, _NEAR_MISS, _GROUPED = range(4)
 
@@ -46,7 +48,10 @@ def measure_closures(
     wrong[is_grouped] = Rotation.from_rotvec(turn[group[is_grouped]] * direction).as_quat()
 
     sigma = noise_levels(config, config.closure_noise_deg, count, rng)
-    noise = Rotation.from_rotvec(rotation_vectors(planar, count, rng) * sigma[:, None])
+    own, common = np.sqrt(1 - config.closure_common_share), np.sqrt(config.closure_common_share)
+    shared = rotation_vectors(planar, count, rng)[_stretch_pairs(older, newer)] * np.where(backward, -1, 1)[:, None]
+    vectors = own * rotation_vectors(planar, count, rng) + common * shared
+    noise = Rotation.from_rotvec(vectors * sigma[:, None])
     target_from_source = noise * world_from_body[target].inv() * Rotation.from_quat(wrong) * world_from_body[source]
     translation = world_from_body[source].inv().apply(position[target] - position[source])
     spread = rng.normal(size=(count, 3)) * [1, 1, not planar]
@@ -56,6 +61,12 @@ def measure_closures(
         translation + spread * config.closure_translation_noise_m,
     )
     return Measurements((source, target), target_from_source.as_quat(), translation, sigma)
+
+
+def _stretch_pairs(older: IndexArray, newer: IndexArray) -> IndexArray:
+    """A number per closure, the same for closures that connect the same two stretches of the path."""
+    pairs = np.stack((older // _STRETCH, newer // _STRETCH), axis=1)
+    return np.asarray(np.unique(pairs, axis=0, return_inverse=True)[1]).reshape(-1)
 
 
 def _places_seen_again(

@@ -47,6 +47,8 @@ class SlamSimulationConfig:
         min_closure_gap: and at least this many keyframes apart in time …
         short_range_share: … but for this share, which connects keyframes 2–8 steps apart.
         closure_noise_deg: root mean square angle of a good closure's error.
+        closure_common_share: share of that error's variance that closures between the same two stretches of the path
+            have in common (the same view, the same bias), as in real front ends.
         closure_translation_noise_m: standard deviation per axis.
         backward_share: share of the closures that run new → old.
         noise_spread: standard deviation of the logarithm of the noise level from edge to edge.
@@ -78,6 +80,7 @@ class SlamSimulationConfig:
     min_closure_gap: int = 20
     short_range_share: float = 0.0
     closure_noise_deg: float = 1.0
+    closure_common_share: float = 0.0
     closure_translation_noise_m: float = 0.05
     backward_share: float = 0.5
     noise_spread: float = 0.0
@@ -102,7 +105,9 @@ class SlamSimulationConfig:
             raise SlamSimulationError("terrain_tilt_deg needs dimensions=3")
         if self.num_keyframes < 10:
             raise SlamSimulationError(f"num_keyframes is {self.num_keyframes}; use at least 10")
-        for name in ("slip_share", "short_range_share", "backward_share", "false_share", "in_place_share"):
+        for name in (
+            "slip_share", "short_range_share", "backward_share", "false_share", "in_place_share", "closure_common_share"
+        ):
             if not 0 <= getattr(self, name) <= 1:
                 raise SlamSimulationError(f"{name} is {getattr(self, name)}; a share lies in [0, 1]")
         if self.grouped_share + self.near_miss_share > 1 + 1e-12:
@@ -151,6 +156,7 @@ def random_slam_config(rng: np.random.Generator, num_keyframes: int | None = Non
         min_closure_gap=int(rng.integers(5, 30)),
         short_range_share=rng.uniform(0, 0.8) if rng.random() < 0.3 else 0.0,
         closure_noise_deg=_log_uniform(rng, 0.1, 10),
+        closure_common_share=rng.uniform(0.2, 0.9) if rng.random() < 0.5 else 0.0,
         closure_translation_noise_m=step_m * rng.uniform(0.02, 0.5),
         backward_share=float(rng.choice([0.0, 0.5, 1.0])),
         noise_spread=rng.uniform(0.1, 0.7) if rng.random() < 0.4 else 0.0,
