@@ -68,10 +68,7 @@ class ReleasedRecipe:
     def sample(self, rng: np.random.Generator) -> SyntheticGraph:
         """Draw one graph."""
         n = int(rng.integers(self.cameras[0], self.cameras[1] + 1))
-        turn = _axes(n, self.planar, rng) * np.radians(self.turn_deg) * rng.standard_normal((n, 1))
-        turn = turn[np.argsort(turn[:, 1])]
-        tilt = _axes(n, False, rng) * np.radians(rng.uniform(0, self.tilt_deg, (n, 1)))
-        orientation = Rotation.from_rotvec(turn) * Rotation.from_rotvec(tilt)
+        orientation = self.orientations(n, rng)
 
         # Candidates: 1-based i < j ≤ 2 (i + 2).
         first, second = np.triu_indices(n, k=1)
@@ -86,8 +83,17 @@ class ReleasedRecipe:
         kept[np.argpartition(angle, min(wanted, len(angle) - 1))[:wanted]] = True
         kept[_spanning_tree_edges(n, first, second, angle)] = True
         source, target = first[kept], second[kept]
+        return measured(orientation, source, target, self.noise(len(source), rng))
 
-        m = len(source)
+    def orientations(self, n: int, rng: np.random.Generator) -> Rotation:
+        """True body_from_world of ``n`` cameras, in the order of their turn about the vertical."""
+        turn = _axes(n, self.planar, rng) * np.radians(self.turn_deg) * rng.standard_normal((n, 1))
+        turn = turn[np.argsort(turn[:, 1])]
+        tilt = _axes(n, False, rng) * np.radians(rng.uniform(0, self.tilt_deg, (n, 1)))
+        return Rotation.from_rotvec(turn) * Rotation.from_rotvec(tilt)
+
+    def noise(self, m: int, rng: np.random.Generator) -> Rotation:
+        """Noise of the ``m`` edges of one graph, outliers included."""
         sigma = np.radians(rng.uniform(*self.noise_deg)) / np.sqrt(3)
         noise = Rotation.from_rotvec(_axes(m, self.planar, rng) * sigma * rng.standard_normal((m, 1)))
         noise = noise * Rotation.from_rotvec(_axes(m, False, rng) * sigma / 10 * rng.standard_normal((m, 1)))
@@ -97,7 +103,7 @@ class ReleasedRecipe:
             np.radians(90) / np.sqrt(3) * rng.standard_normal((len(disturbed), 1))
             * rng.standard_normal((len(disturbed), 3))
         )
-        return _measured(orientation, source, target, noise * Rotation.from_rotvec(wide))
+        return noise * Rotation.from_rotvec(wide)
 
 
 @dataclass(frozen=True)
@@ -119,9 +125,7 @@ class PaperRecipe:
     def sample(self, rng: np.random.Generator) -> SyntheticGraph:
         """Draw one graph; pairs that leave cameras unconnected are joined by a random chain."""
         n = int(rng.integers(self.cameras[0], self.cameras[1] + 1))
-        yaw = np.zeros((n, 3))
-        yaw[:, 1] = rng.uniform(-np.pi, np.pi, n)
-        orientation = Rotation.from_rotvec(yaw)
+        orientation = self.orientations(n, rng)
         first, second = np.triu_indices(n, k=1)
         kept = rng.random(len(first)) < rng.uniform(*self.pair_share)
         source, target = first[kept], second[kept]
@@ -131,13 +135,29 @@ class PaperRecipe:
         low, high = np.minimum(chain[:-1], chain[1:]), np.maximum(chain[:-1], chain[1:])
         missing = ~present[low, high]
         source, target = np.concatenate((source, low[missing])), np.concatenate((target, high[missing]))
-        m = len(source)
+        return measured(orientation, source, target, self.noise(len(source), rng))
+
+    def orientations(self, n: int, rng: np.random.Generator) -> Rotation:
+        """True body_from_world of ``n`` cameras."""
+        yaw = np.zeros((n, 3))
+        yaw[:, 1] = rng.uniform(-np.pi, np.pi, n)
+        return Rotation.from_rotvec(yaw)
+
+    def noise(self, m: int, rng: np.random.Generator) -> Rotation:
+        """Noise of the ``m`` edges of one graph, outliers included."""
         sigma = np.radians(rng.uniform(*self.noise_deg))
         rotvec = _axes(m, True, rng) * sigma * rng.standard_normal((m, 1))
         noise = Rotation.from_rotvec(rotvec).as_quat()
         replaced = rng.choice(m, int(rng.uniform(*self.outlier_share) * m), replace=False)
         noise[replaced] = _random_quaternions(len(replaced), rng)
-        return _measured(orientation, source, target, Rotation.from_quat(noise))
+        return Rotation.from_quat(noise)
+
+
+def measured(orientation: Rotation, source: np.ndarray, target: np.ndarray, noise: Rotation) -> SyntheticGraph:
+    """The graph that measures ``orientation`` (body_from_world) with right-multiplied ``noise``."""
+    relative = orientation[target] * orientation[source].inv() * noise
+    graph = ViewGraph.create(source, target, relative.as_quat(), num_nodes=len(orientation))
+    return SyntheticGraph(graph, torch.from_numpy(orientation.as_quat()), torch.from_numpy(noise.magnitude()))
 
 
 def _axes(count: int, in_vertical_plane: bool, rng: np.random.Generator) -> np.ndarray:
@@ -165,10 +185,3 @@ def _spanning_tree_edges(n: int, first: np.ndarray, second: np.ndarray, angle: n
     tree = minimum_spanning_tree(graph).tocoo()
     position = coo_array((np.arange(1, len(first) + 1), (first, second)), shape=(n, n)).tocsr()
     return np.asarray(position[tree.row, tree.col]).ravel() - 1
-
-
-def _measured(orientation: Rotation, source: np.ndarray, target: np.ndarray, noise: Rotation) -> SyntheticGraph:
-    """The graph that measures ``orientation`` (body_from_world) with right-multiplied ``noise``."""
-    measured = orientation[target] * orientation[source].inv() * noise
-    graph = ViewGraph.create(source, target, measured.as_quat(), num_nodes=len(orientation))
-    return SyntheticGraph(graph, torch.from_numpy(orientation.as_quat()), torch.from_numpy(noise.magnitude()))
