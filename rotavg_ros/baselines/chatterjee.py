@@ -7,6 +7,10 @@ start that is wrong in places; the second, started there, Σ‖r‖^½, the loss
 iteratively reweighted least squares with one weight per edge, where the paper's first stage decodes every component of
 the residual by linear programming.
 
+On SLAM graphs, residuals count in units of their stated standard deviation. A false closure can hide in a long chain,
+which bends a little at every step; ℓ½ sees that only if residuals far below one standard deviation are told apart, and
+even then it depends on the start.
+
 Warm start: in place of the spanning tree's orientations; both stages run.
 """
 
@@ -22,8 +26,10 @@ from rotavg_ros.solver.fine_net import edge_residual
 from rotavg_ros.solver.laplacian import LaplacianSystem
 from rotavg_ros.view_graph import ViewGraph
 
-# Residuals below this angle count as this, so that edges that happen to fit exactly do not freeze the solution.
+# Residuals below this count as this, so that edges that happen to fit exactly do not freeze the solution: in radians,
+# and in standard deviations on SLAM graphs.
 _SMOOTHING = np.radians(1.0)
+_SLAM_SMOOTHING = 0.003
 _MAX_L1_STEPS = 30
 _MAX_HALF_NORM_STEPS = 100
 # The mean correction that ends a stage, in radians; the first is the paper's.
@@ -54,12 +60,22 @@ def minimize_power(
         converged_step: mean correction in radians that ends it.
     """
     source, target = graph.source.numpy(), graph.target.numpy()
+    precision, smoothing = _units(graph)
     for _ in range(max_steps):
         residual = edge_residual(body_from_world, graph.target_from_source, graph.source, graph.target)
         vector = rotations.log(residual).numpy()
-        weight = ((vector**2).sum(axis=1) + _SMOOTHING**2) ** (power / 2 - 1)
+        weight = precision * (precision * (vector**2).sum(axis=1) + smoothing**2) ** (power / 2 - 1)
         step = LaplacianSystem(graph.num_nodes, source, target, weight, roots).fit(vector)
         body_from_world = rotations.multiply(body_from_world, rotations.exp(torch.from_numpy(step)))
         if float(np.linalg.norm(step, axis=1).mean()) < converged_step:
             break
     return rotations.normalize(body_from_world)
+
+
+def _units(graph: ViewGraph) -> tuple[np.ndarray, float]:
+    """One over the squared unit in which each residual counts, ``(M,)``, and the smoothing in these units."""
+    stated = graph.precision.isfinite()
+    if not bool(graph.is_odometry.any() & stated.any()):
+        return np.ones(graph.num_edges), _SMOOTHING
+    precision = torch.where(stated, graph.precision, graph.precision[stated].median())
+    return precision.numpy(), _SLAM_SMOOTHING

@@ -130,7 +130,7 @@ class GraphFile:
 
 
 def read_graph(path: str | Path) -> GraphFile:
-    """Read a view-graph in g2o or TORO dialect, 1DSfM ``EGs.txt`` or npz; the content decides.
+    """Read a view-graph in g2o or TORO dialect, 1DSfM ``EGs.txt``, npz or Lund's MATLAB form; the content decides.
 
     Raises:
         GraphFileError: anything that keeps the file from being read whole.
@@ -172,6 +172,8 @@ def _format_of_suffix(path: Path) -> str:
 def _format_of_content(path: Path, head: bytes) -> str:
     if head.startswith(b"PK") or path.suffix.lower() == ".npz":  # npz files are zip archives
         return "npz"
+    if head.startswith(b"MATLAB ") or path.suffix.lower() == ".mat":
+        return "lund"
     first_line = next((line for line in head.splitlines() if line.strip() and not line.lstrip().startswith(b"#")), b"")
     return "onedsfm" if first_line.lstrip()[:1] in _NUMBER_STARTS else "g2o"
 

@@ -1,7 +1,7 @@
 """Synthetic SfM view-graphs: the recipe of the paper's text, and the one of the authors' released scripts.
 
-Both draw true orientations, choose pairs, measure them with noise about mostly vertical-plane axes, and replace or disturb
-a share of the measurements. A measurement's noise is right-multiplied: ``R̃_uv = R_uv · noise``.
+Both draw true orientations, choose pairs, measure them with noise about mostly vertical-plane axes, and replace or
+disturb a share of the measurements. A measurement's noise is right-multiplied: ``R̃_uv = R_uv · noise``.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class SyntheticGraph:
     @property
     def is_outlier(self) -> Tensor:
         """``(M,)`` bool, the paper's label: noise beyond 20°."""
-        return self.noise_angle > SFM_OUTLIER_ANGLE
+        return torch.gt(self.noise_angle, SFM_OUTLIER_ANGLE)
 
 
 @dataclass(frozen=True)
@@ -166,17 +166,17 @@ def _axes(count: int, in_vertical_plane: bool, rng: np.random.Generator) -> np.n
         y = rng.uniform(-1, 1, count)
         return np.stack((y, np.sqrt(1 - y * y), np.zeros(count)), axis=1)
     axes = rng.standard_normal((count, 3))
-    return axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))
 
 
 def _random_quaternions(count: int, rng: np.random.Generator) -> np.ndarray:
     quaternions = rng.standard_normal((count, 4))
-    return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return np.asarray(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
 
 
 def _relative_angle(quaternion: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     cosine = np.abs((quaternion @ quaternion.T)[first, second])
-    return 2 * np.arccos(np.clip(cosine, 0, 1))
+    return np.asarray(2 * np.arccos(np.clip(cosine, 0, 1)))
 
 
 def _spanning_tree_edges(n: int, first: np.ndarray, second: np.ndarray, angle: np.ndarray) -> np.ndarray:
