@@ -28,6 +28,7 @@ COMMANDS = (
     Command("simulate", "rotavg_ros.cli.simulate", "simulate a robot's run and write it as a bag"),
     Command("convert", "rotavg_ros.cli.convert", "convert view-graphs between files and bags"),
     Command("play", "rotavg_ros.cli.play", "publish a bag's messages live"),
+    Command("train", "rotavg_ros.cli.train", "train the networks"),
 )
 
 

@@ -18,6 +18,7 @@ from rotavg_ros.solver.slam_clean_net import SlamCleanNet
 # Raised when a network's definition changes so that older weights no longer fit it.
 ARCHITECTURE_VERSION = "1"
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
+_REMEDY = "reinstall the package or train it with `rotavg train`"
 
 NETWORKS: dict[str, type[nn.Module]] = {
     "sfm-clean-net": CleanNet,
@@ -42,24 +43,32 @@ def load_network(name: str, device: str = "cpu", folder: Path = WEIGHTS_FOLDER) 
     Raises:
         WeightsError: the file is missing, damaged, of another network or of another version.
     """
-    path = folder / f"{name}.safetensors"
+    return read_network(name, folder / f"{name}.safetensors").to(device)
+
+
+def read_network(name: str, path: Path) -> nn.Module:
+    """A network with the weights in a file, in evaluation mode and without gradients.
+
+    Raises:
+        WeightsError: as :func:`load_network`.
+    """
     network = NETWORKS[name]()
     try:
         with safe_open(path, framework="pt") as file:
             stated = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
     except FileNotFoundError:
-        raise WeightsError(f"{path}: missing; reinstall the package or train it with `rotavg train`") from None
+        raise WeightsError(f"{path}: missing; {_REMEDY}") from None
     except (SafetensorError, OSError) as error:
-        raise WeightsError(f"{path}: damaged ({error}); reinstall the package") from None
+        raise WeightsError(f"{path}: damaged ({error}); {_REMEDY}") from None
     if stated != metadata(name):
-        raise WeightsError(f"{path}: holds {json.dumps(stated)}, need {json.dumps(metadata(name))}; reinstall")
+        raise WeightsError(f"{path}: holds {json.dumps(stated)}, need {json.dumps(metadata(name))}; {_REMEDY}")
     try:
         network.load_state_dict(tensors)
     except RuntimeError:
-        raise WeightsError(f"{path}: the tensors do not fit {name}; reinstall the package") from None
+        raise WeightsError(f"{path}: the tensors do not fit {name}; {_REMEDY}") from None
     if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values()):
-        raise WeightsError(f"{path}: contains values that are not finite; reinstall the package")
+        raise WeightsError(f"{path}: contains values that are not finite; {_REMEDY}")
     for parameter in network.parameters():
         parameter.requires_grad_(False)
-    return network.eval().to(device)
+    return network.eval()

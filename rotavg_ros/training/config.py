@@ -82,7 +82,7 @@ class TrainingConfig:
     @classmethod
     def from_dict(cls, content: dict[str, Any], origin: str = "configuration") -> TrainingConfig:
         """Build from plain values; ``origin`` names them in errors."""
-        defaults = {field.name: field.default for field in fields(cls)}
+        defaults: dict[str, Any] = {field.name: field.default for field in fields(cls)}
         values: dict[str, Any] = {}
         for key, value in content.items():
             if key not in defaults:

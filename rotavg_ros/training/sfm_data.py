@@ -63,7 +63,7 @@ def join(
     first_node = np.concatenate(([0], np.cumsum([g.graph.num_nodes for g in graphs])))
     source, target, measured, outlier = [], [], [], []
     for graph, offset in zip(graphs, first_node[:-1], strict=True):
-        kept = slice(None)
+        kept: Tensor | slice = slice(None)
         if edge_dropout > 0:
             assert rng is not None
             kept = torch.from_numpy(rng.random(graph.graph.num_edges) >= edge_dropout)

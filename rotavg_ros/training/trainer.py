@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-import os
+import math
 import subprocess
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from tqdm import tqdm
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.solver.network_store import metadata
+from rotavg_ros.training.checkpoint import load_checkpoint, save_checkpoint, save_tensors, save_text
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.version import __version__
 
-CHECKPOINT_NAME = "checkpoint.safetensors"
-WEIGHTS_NAME = "weights.safetensors"
-CARD_NAME = "card.json"
+_MAX_GRADIENT_NORM = 1.0
 
 
 class TrainingError(UserError):
@@ -33,9 +31,13 @@ class TrainingError(UserError):
 
 
 class TrainingTask(Protocol):
-    """What is trained on what. Losses and metrics are means; smaller ``objective`` is better."""
+    """What is trained on what. Losses and metrics are means; smaller ``objective`` is better.
 
-    network: nn.Module
+    ``batches`` draws from the given generator alone, so that a resumed run sees what an unbroken one would.
+    """
+
+    @property
+    def network(self) -> nn.Module: ...
 
     def batches(self, rng: np.random.Generator) -> Iterator[dict[str, Tensor]]:
         """One epoch: the loss terms of every batch, with the graph of ``loss`` attached."""
@@ -48,77 +50,124 @@ class TrainingTask(Protocol):
         ...
 
 
-@dataclass
+@dataclass(frozen=True)
 class _State:
-    epoch: int
-    best: float
-    seconds: float
+    epoch: int = 0
+    best: float = math.inf
+    seconds: float = 0.0
 
 
 class Trainer:
-    """Runs a task in ``folder``, which holds the checkpoint, the best weights and their model card.
+    """Runs a task in a folder.
+
+    What it keeps there for a network called NAME:
+
+    - ``NAME.safetensors``, the weights of the best validation, and ``NAME.json``, their model card;
+    - ``NAME.checkpoint.safetensors``, from which a run goes on exactly as if it had never stopped;
+    - ``NAME.log.jsonl``, a line per epoch.
 
     Args:
         task: network and data.
-        config: the run's configuration; a checkpoint of another one is refused.
-        folder: created if missing; a checkpoint there is resumed.
-        name: what is trained, for the card ("clean-net").
+        config: the run's configuration.
+        folder: created if missing; a checkpoint there is resumed, one of another run is refused.
+        name: of the network, as in :data:`rotavg_ros.solver.network_store.NETWORKS`.
+        inputs: what else decides the outcome (fingerprints of other networks), for card and checkpoint.
+        command: how to repeat it, for the card.
     """
 
-    def __init__(self, task: TrainingTask, config: TrainingConfig, folder: Path, name: str) -> None:
-        self.task, self.config, self.folder, self.name = task, config, folder, name
+    def __init__(
+        self,
+        task: TrainingTask,
+        config: TrainingConfig,
+        folder: Path,
+        name: str,
+        inputs: Mapping[str, str] | None = None,
+        command: str = "",
+    ) -> None:
+        self.task, self.config, self.name, self.command = task, config, name, command
+        self.inputs = dict(inputs or {})
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise TrainingError(f"{folder}: cannot be used as output folder ({error.strerror})") from None
+        self.weights_path = folder / f"{name}.safetensors"
+        self.card_path = folder / f"{name}.json"
+        self._checkpoint_path = folder / f"{name}.checkpoint.safetensors"
+        self._log_path = folder / f"{name}.log.jsonl"
         self.optimizer = torch.optim.Adam(
             task.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
-        self._state = _State(0, float("inf"), 0.0)
-        folder.mkdir(parents=True, exist_ok=True)
-        if (folder / CHECKPOINT_NAME).exists():
-            self._resume()
+        self._state = _State()
+        if self._checkpoint_path.exists():
+            state = load_checkpoint(self._checkpoint_path, task.network, self.optimizer, self._identity())
+            self._state = _State(**state)
+        self._drop_log_after(self._state.epoch)
+
+    @property
+    def epochs_done(self) -> int:
+        return self._state.epoch
 
     def run(self, max_epochs: int | None = None) -> dict[str, float]:
-        """Train to the end (or ``max_epochs`` more epochs); returns the last validation's figures."""
-        network = self.task.network
+        """Train to the end (or ``max_epochs`` more epochs); returns the last validation's figures.
+
+        Raises:
+            TrainingError: the loss is no number any more.
+        """
         last = self.config.epochs if max_epochs is None else min(self.config.epochs, self._state.epoch + max_epochs)
         figures: dict[str, float] = {}
-        bar = tqdm(range(self._state.epoch, last), initial=self._state.epoch, total=last, unit="epoch", delay=2)
+        first = self._state.epoch
+        # A bar only on a terminal; elsewhere the log tells.
+        bar = tqdm(range(first, last), self.name, total=last, initial=first, unit="epoch", disable=None)
         for epoch in bar:
             start = time.perf_counter()
-            self._set_learning_rate(epoch)
-            network.train()
-            # Each epoch has its own random numbers, so that a resumed run draws what an unbroken one would.
-            rng = np.random.default_rng((self.config.seed, epoch))
-            totals: dict[str, float] = {}
-            for terms in self.task.batches(rng):
-                self.optimizer.zero_grad()
-                terms["loss"].backward()
-                nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-                self.optimizer.step()
-                for key, value in terms.items():
-                    totals[key] = totals.get(key, 0.0) + float(value.detach()) / self.task.num_batches()
-            network.eval()
+            losses = self._train(epoch)
             with torch.no_grad():
                 figures = self.task.validate()
-            self._state = _State(
-                epoch + 1, self._state.best, self._state.seconds + time.perf_counter() - start
+            seconds = self._state.seconds + time.perf_counter() - start
+            best = min(self._state.best, figures["objective"])
+            is_better = best < self._state.best
+            self._state = _State(epoch + 1, best, seconds)
+            # The checkpoint comes last: whatever a kill interrupts before it is repeated by the resumed run.
+            if is_better:
+                self._save_weights(figures)
+            self._log(epoch, losses, figures)
+            save_checkpoint(
+                self._checkpoint_path, self.task.network, self.optimizer, self._identity(), asdict(self._state)
             )
-            if figures["objective"] < self._state.best:
-                self._state.best = figures["objective"]
-                self._save_best(figures)
-            self._save_checkpoint()
-            self._log(epoch, totals, figures)
-            bar.set_postfix_str(" ".join(f"{key} {value:.4g}" for key, value in {**totals, **figures}.items()))
+            bar.set_postfix_str(" ".join(f"{key} {value:.4g}" for key, value in {**losses, **figures}.items()))
         return figures
 
-    def _set_learning_rate(self, epoch: int) -> None:
-        progress = epoch / self.config.epochs
+    def _train(self, epoch: int) -> dict[str, float]:
+        """One epoch; returns the mean of every loss term."""
+        network = self.task.network
+        network.train()
+        rate = self.config.learning_rate * 0.5 * (1 + math.cos(math.pi * epoch / self.config.epochs))
         for group in self.optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * (0.5 * (1 + np.cos(np.pi * progress)))
+            group["lr"] = rate
+        # Each epoch has its own random numbers, so that a resumed run draws what an unbroken one would.
+        rng = np.random.default_rng((self.config.seed, epoch))
+        totals: dict[str, float] = {}
+        for terms in self.task.batches(rng):
+            if not bool(torch.isfinite(terms["loss"])):
+                raise TrainingError(f"the loss is no number any more in epoch {epoch}; lower learning_rate")
+            self.optimizer.zero_grad()
+            terms["loss"].backward()  # type: ignore[no-untyped-call]
+            nn.utils.clip_grad_norm_(network.parameters(), _MAX_GRADIENT_NORM)
+            self.optimizer.step()
+            for key, value in terms.items():
+                totals[key] = totals.get(key, 0.0) + float(value.detach()) / self.task.num_batches()
+        network.eval()
+        return totals
 
-    def _save_best(self, figures: dict[str, float]) -> None:
-        _save_atomically(self.task.network.state_dict(), self.folder / WEIGHTS_NAME, metadata(self.name))
+    def _identity(self) -> dict[str, Any]:
+        return {**metadata(self.name), "config": self.config.to_dict(), **self.inputs}
+
+    def _save_weights(self, figures: dict[str, float]) -> None:
         card = {
             "network": self.name,
+            "command": self.command,
             "config": self.config.to_dict(),
+            **self.inputs,
             "epoch": self._state.epoch,
             "hours": round(self._state.seconds / 3600, 3),
             "hardware": _hardware(self.task.network),
@@ -127,55 +176,27 @@ class Trainer:
             "torch": torch.__version__,
             "validation": {key: round(value, 5) for key, value in figures.items()},
         }
-        _write_atomically(json.dumps(card, indent=2) + "\n", self.folder / CARD_NAME)
+        save_tensors(self.weights_path, self.task.network.state_dict(), metadata(self.name))
+        save_text(self.card_path, json.dumps(card, indent=2) + "\n")
 
-    def _save_checkpoint(self) -> None:
-        tensors = {f"network.{key}": value for key, value in self.task.network.state_dict().items()}
-        for number, state in self.optimizer.state_dict()["state"].items():
-            tensors.update({f"optimizer.{number}.{key}": value for key, value in state.items()})
-        about = {"config": json.dumps(self.config.to_dict()), "state": json.dumps(vars(self._state))}
-        _save_atomically(tensors, self.folder / CHECKPOINT_NAME, about)
-
-    def _resume(self) -> None:
-        path = self.folder / CHECKPOINT_NAME
-        try:
-            with safe_open(path, framework="pt") as file:
-                about = file.metadata()
-            tensors = load_file(path)
-            config, state = json.loads(about["config"]), json.loads(about["state"])
-        except (SafetensorError, OSError, KeyError, TypeError, json.JSONDecodeError):
-            raise TrainingError(f"{path}: not a checkpoint; remove the file to start anew") from None
-        if config != self.config.to_dict():
-            changed = [key for key, value in self.config.to_dict().items() if config.get(key) != value]
-            raise TrainingError(f"{path}: from a run with another {', '.join(changed)}; choose another folder")
-        network = {key[8:]: value for key, value in tensors.items() if key.startswith("network.")}
-        self.task.network.load_state_dict(network)
-        moments: dict[int, dict[str, Tensor]] = {}
-        for key, value in tensors.items():
-            if key.startswith("optimizer."):
-                _, number, entry = key.split(".")
-                moments.setdefault(int(number), {})[entry] = value
-        saved = self.optimizer.state_dict()
-        saved["state"] = moments
-        self.optimizer.load_state_dict(saved)
-        self._state = _State(**state)
-
-    def _log(self, epoch: int, totals: dict[str, float], figures: dict[str, float]) -> None:
-        row = {"epoch": epoch, **totals, **{f"validation_{key}": value for key, value in figures.items()}}
-        with (self.folder / "log.jsonl").open("a") as log:
+    def _log(self, epoch: int, losses: dict[str, float], figures: dict[str, float]) -> None:
+        row = {"epoch": epoch, **losses, **{f"validation_{key}": value for key, value in figures.items()}}
+        with self._log_path.open("a") as log:
             log.write(json.dumps(row) + "\n")
 
+    def _drop_log_after(self, epoch: int) -> None:
+        """Forget lines of epochs that are going to be repeated."""
+        if self._log_path.exists():
+            lines = self._log_path.read_text().splitlines(keepends=True)
+            save_text(self._log_path, "".join(lines[:epoch]))
 
-def _save_atomically(tensors: dict[str, Tensor], path: Path, about: dict[str, str]) -> None:
-    temporary = path.with_suffix(".partial")
-    save_file({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, temporary, about)
-    os.replace(temporary, path)
 
-
-def _write_atomically(text: str, path: Path) -> None:
-    temporary = path.with_suffix(".partial")
-    temporary.write_text(text)
-    os.replace(temporary, path)
+def fingerprint(network: nn.Module) -> str:
+    """Hash of a network's parameters, to tell whether it is the same one."""
+    digest = hashlib.sha256()
+    for key, value in sorted(network.state_dict().items()):
+        digest.update(key.encode() + value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
 
 
 def _hardware(network: nn.Module) -> str:

@@ -1,0 +1,136 @@
+"""Train a network of NeuRoRA on simulated view-graphs.
+
+CONFIG is a YAML file, or the name of one that comes with the package (sfm-clean-net, sfm-fine-net, slam-clean-net).
+DIR gets, for the network NAME, the best weights (NAME.safetensors), their model card (NAME.json), a log with a line per
+epoch (NAME.log.jsonl) and a checkpoint. Run the same command again after an interruption: training goes on as if it had
+never stopped. A FineNet learns on what a CleanNet leaves, so train CleanNet first, into the same DIR.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import torch
+
+from rotavg_ros.cli.progress import working
+from rotavg_ros.errors import UserError
+from rotavg_ros.solver.clean_net import CleanNet
+from rotavg_ros.solver.network_store import WEIGHTS_FOLDER, read_network
+from rotavg_ros.training.config import TrainingConfig, TrainingConfigError
+from rotavg_ros.training.sfm_tasks import SfmCleanTask, SfmFineTask
+from rotavg_ros.training.slam_tasks import SlamCleanTask
+from rotavg_ros.training.trainer import Trainer, TrainingTask, fingerprint
+
+_CONFIGS = Path(__file__).parent.parent / "training" / "configs"
+
+
+class TrainCommandError(UserError):
+    """Options of ``rotavg train`` that do not fit together."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``rotavg train``."""
+    parser.add_argument("network", choices=("clean-net", "fine-net"))
+    parser.add_argument("config", metavar="CONFIG", help="YAML file, or the name of one of the package's")
+    parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for weights and checkpoint")
+    parser.add_argument(
+        "--clean-net",
+        type=Path,
+        metavar="WEIGHTS",
+        help="fine-net: the CleanNet before it (default: the one in DIR if there is one, else the package's)",
+    )
+    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default: auto")
+    parser.add_argument("--threads", type=_positive, metavar="N", help="CPU threads (default: torch's choice)")
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError("must be 1 or more")
+    return number
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Train to the end of the configuration's epochs."""
+    if arguments.threads is not None:
+        torch.set_num_threads(arguments.threads)
+    config = load_config(arguments.config)
+    trainer = make_trainer(
+        arguments.network, config, arguments.output, arguments.clean_net, arguments.device, arguments.config
+    )
+    if trainer.epochs_done:
+        print(f"going on after epoch {trainer.epochs_done} of {config.epochs}", flush=True)
+    trainer.run()
+    card = json.loads(trainer.card_path.read_text())
+    figures = ", ".join(f"{name} {value:.4g}" for name, value in card["validation"].items())
+    print(f"{trainer.weights_path}: epoch {card['epoch']} of {config.epochs}, {figures}")
+    return 0
+
+
+def load_config(name: str) -> TrainingConfig:
+    """A configuration by path or, without a file of that name, by the name of a shipped one.
+
+    Raises:
+        TrainingConfigError: neither, or a file that makes no configuration.
+    """
+    shipped = {path.stem: path for path in sorted(_CONFIGS.glob("*.yaml"))}
+    path = Path(name)
+    if not path.exists():
+        if name not in shipped:
+            raise TrainingConfigError(f"{name}: no such file; the package's own are {', '.join(shipped)}")
+        path = shipped[name]
+    return TrainingConfig.load(path)
+
+
+def make_trainer(
+    network: str, config: TrainingConfig, output: Path, clean_net: Path | None, device: str, origin: str
+) -> Trainer:
+    """Task and trainer for a network ("clean-net" or "fine-net") of the configuration's family.
+
+    Args:
+        clean_net: weights for the CleanNet before a FineNet.
+        device: "auto", "cpu" or "cuda".
+        origin: how the user named the configuration, for the card.
+
+    Raises:
+        UserError: options that do not fit, weights or a checkpoint that cannot be used.
+    """
+    if network == "clean-net" and clean_net is not None:
+        raise TrainCommandError("--clean-net is for fine-net; to go on with a CleanNet, give the same --output")
+    name = f"{config.family}-{network}"
+    inputs: dict[str, str] = {}
+    task: TrainingTask
+    if config.family == "slam":
+        if network == "fine-net":
+            raise TrainCommandError("the SLAM profile has no FineNet; its refinement does that work")
+        if device == "cuda":
+            raise TrainCommandError("the SLAM profile's CleanNet trains on the CPU, where its graphs live")
+        with working("simulating pose graphs"):
+            task = SlamCleanTask(config)
+    elif network == "clean-net":
+        with working("drawing view-graphs"):
+            task = SfmCleanTask(config, _torch_device(device))
+    else:
+        before = _clean_net(output, clean_net)
+        inputs["clean_net_fingerprint"] = fingerprint(before)
+        with working("drawing view-graphs"):
+            task = SfmFineTask(config, _torch_device(device), before)
+    command = f"rotavg train {network} {Path(origin).stem if Path(origin).exists() else origin}"
+    return Trainer(task, config, output, name, inputs, command)
+
+
+def _clean_net(output: Path, given: Path | None) -> CleanNet:
+    trained = output / "sfm-clean-net.safetensors"
+    path = given or (trained if trained.exists() else WEIGHTS_FOLDER / trained.name)
+    network = read_network("sfm-clean-net", path)
+    assert isinstance(network, CleanNet)
+    return network
+
+
+def _torch_device(name: str) -> torch.device:
+    if name == "cuda" and not torch.cuda.is_available():
+        raise TrainCommandError("device 'cuda': torch finds no usable GPU; use --device cpu or auto")
+    use_gpu = name == "cuda" or (name == "auto" and torch.cuda.is_available())
+    return torch.device("cuda" if use_gpu else "cpu")

@@ -1,0 +1,104 @@
+"""A training run on disk: tensors of network and optimizer with a word on what they belong to, and atomic writes.
+
+Files are written beside their place and renamed into it, so that a run that is killed at any moment leaves whole files
+behind: the old ones or the new ones.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from rotavg_ros.errors import UserError
+
+_NETWORK, _OPTIMIZER = "network.", "optimizer."
+
+
+class CheckpointError(UserError):
+    """A checkpoint that cannot be resumed; the message names the file, the reason and the remedy."""
+
+
+def save_checkpoint(
+    path: Path, network: nn.Module, optimizer: torch.optim.Optimizer, identity: dict[str, Any], state: dict[str, Any]
+) -> None:
+    """Write what :func:`load_checkpoint` needs.
+
+    Args:
+        identity: what the run is; only a run of equal identity may resume it. Plain values.
+        state: how far it has come. Plain values.
+    """
+    tensors = {_NETWORK + key: value for key, value in network.state_dict().items()}
+    for number, moments in optimizer.state_dict()["state"].items():
+        tensors.update({f"{_OPTIMIZER}{number}.{key}": value for key, value in moments.items()})
+    save_tensors(path, tensors, {"identity": json.dumps(identity), "state": json.dumps(state)})
+
+
+def load_checkpoint(
+    path: Path, network: nn.Module, optimizer: torch.optim.Optimizer, identity: dict[str, Any]
+) -> dict[str, Any]:
+    """Bring network and optimizer to where the checkpoint left them; returns the state.
+
+    Raises:
+        CheckpointError: not a checkpoint, or one of another run.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
+        saved_identity, state = json.loads(about["identity"]), json.loads(about["state"])
+    except (SafetensorError, OSError, KeyError, json.JSONDecodeError):
+        raise CheckpointError(f"{path}: not a checkpoint; remove the file to start anew") from None
+    changed = _differences(saved_identity, json.loads(json.dumps(identity)))
+    if changed:
+        raise CheckpointError(
+            f"{path}: of a run with another {', '.join(changed)}; choose another folder, or remove the file"
+        )
+    moments: dict[int, dict[str, Tensor]] = {}
+    for key, value in tensors.items():
+        if key.startswith(_OPTIMIZER):
+            number, entry = key.removeprefix(_OPTIMIZER).split(".")
+            moments.setdefault(int(number), {})[entry] = value
+    try:
+        network.load_state_dict(
+            {key.removeprefix(_NETWORK): value for key, value in tensors.items() if key.startswith(_NETWORK)}
+        )
+        optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
+    except (RuntimeError, ValueError):
+        raise CheckpointError(f"{path}: of another network; choose another folder, or remove the file") from None
+    assert isinstance(state, dict)
+    return state
+
+
+def save_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, str]) -> None:
+    """Write a safetensors file, whole or not at all."""
+    partial = path.with_name(path.name + ".partial")
+    save_file({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, partial, about)
+    os.replace(partial, path)
+
+
+def save_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text)
+    os.replace(partial, path)
+
+
+def _differences(saved: dict[str, Any], present: dict[str, Any]) -> list[str]:
+    """Keys whose values differ, those of inner dictionaries by their own names."""
+    changed = []
+    for key in present:
+        before, now = saved.get(key), present[key]
+        if before == now:
+            continue
+        if isinstance(before, dict) and isinstance(now, dict):
+            changed += _differences(before, now)
+        else:
+            changed.append(key)
+    return changed

@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from rotavg_ros.cli.main import main
+
+CPU = ("--device", "cpu", "--threads", "1")
+TINY = """
+family: sfm
+nodes: [12, 20]
+graphs: 4
+validation_nodes: [20, 20]
+validation_graphs: 2
+epochs: 2
+batch_graphs: 2
+"""
+
+
+@pytest.fixture(autouse=True)
+def _keep_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny.yaml"
+    path.write_text(TINY)
+    return path
+
+
+def test_clean_net_and_fine_net(config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "weights"
+    assert main(["train", "clean-net", str(config), "--output", str(output), *CPU]) == 0
+    assert "sfm-clean-net.safetensors: epoch" in capsys.readouterr().out
+    assert main(["train", "fine-net", str(config), "--output", str(output), *CPU]) == 0
+    card = json.loads((output / "sfm-fine-net.json").read_text())
+    assert card["command"] == "rotavg train fine-net tiny"
+    assert "mean_deg" in card["validation"]
+
+    # The FineNet learned behind the CleanNet next to it; another one would make it another run.
+    assert main(["train", "fine-net", str(config), "--output", str(output), *CPU]) == 0
+    assert "going on after epoch 2 of 2" in capsys.readouterr().out
+    (output / "sfm-clean-net.safetensors").unlink()
+    assert main(["train", "fine-net", str(config), "--output", str(output), *CPU]) == 2
+    assert "another clean_net_fingerprint" in capsys.readouterr().err
+
+
+def test_clean_net_by_path(config: Path, tmp_path: Path) -> None:
+    main(["train", "clean-net", str(config), "--output", str(tmp_path / "a"), *CPU])
+    weights = tmp_path / "a" / "sfm-clean-net.safetensors"
+    command = ["train", "fine-net", str(config), *CPU]
+    assert main([*command, "--output", str(tmp_path / "a")]) == 0
+    assert main([*command, "--output", str(tmp_path / "b"), "--clean-net", str(weights)]) == 0
+    first, second = (load_file(tmp_path / name / "sfm-fine-net.safetensors") for name in "ab")
+    assert all(torch.equal(first[key], second[key]) for key in first)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["clean-net", "nothing"], "nothing: no such file; the package's own are sfm-clean-net, sfm-fine-net"),
+        (["fine-net", "slam-clean-net"], "no FineNet"),
+        (["clean-net", "slam-clean-net", "--device", "cuda"], "on the CPU"),
+        (["clean-net", "sfm-clean-net", "--clean-net", "x"], "--clean-net is for fine-net"),
+        (["fine-net", "sfm-fine-net", "--clean-net", "x.safetensors"], "x.safetensors: missing"),
+        (["clean-net", "sfm-clean-net", "--threads", "0"], "must be 1 or more"),
+        (["big-net", "sfm-clean-net"], "big-net"),
+    ],
+)
+def test_mistakes_take_one_line(
+    words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", *words, "--output", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.startswith("rotavg: error: ")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("epochz: 3", "unknown key 'epochz'"),
+        ("nodes: 3", "nodes is 3"),
+        ("- 1", "expected `key: value` lines"),
+        ("family: cars", "family is 'cars'"),
+        ("epochs: {", "not a readable YAML file"),
+    ],
+)
+def test_bad_configurations(text: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    assert main(["train", "clean-net", str(path), "--output", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert f"{path}: " in error
+    assert message in error
+
+
+def test_output_that_is_a_file(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "clean-net", str(config), "--output", str(config), *CPU]) == 2
+    assert "cannot be used as output folder" in capsys.readouterr().err
+
+
+def test_no_gpu(
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert main(["train", "clean-net", str(config), "--output", str(tmp_path / "out"), "--device", "cuda"]) == 2
+    assert "no usable GPU" in capsys.readouterr().err

@@ -1,0 +1,196 @@
+"""A training run that is stopped and resumed is the run that was never stopped."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from rotavg_ros.errors import UserError
+from rotavg_ros.solver.clean_net import CleanNet
+from rotavg_ros.solver.network_store import read_network
+from rotavg_ros.training import checkpoint
+from rotavg_ros.training.config import TrainingConfig
+from rotavg_ros.training.sfm_tasks import SfmCleanTask, SfmFineTask
+from rotavg_ros.training.slam_tasks import SlamCleanTask
+from rotavg_ros.training.trainer import Trainer, TrainingTask, fingerprint
+
+EPOCHS = 4
+SFM = TrainingConfig(
+    nodes=(12, 20), graphs=6, validation_nodes=(20, 20), validation_graphs=2, epochs=EPOCHS, batch_graphs=2, seed=5
+)
+SLAM = TrainingConfig(
+    family="slam",
+    recipe="wide",
+    nodes=(60, 120),
+    graphs=4,
+    validation_nodes=(100, 100),
+    validation_graphs=2,
+    epochs=EPOCHS,
+    batch_graphs=2,
+)
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    """What is this small only waits for further threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def make_task(name: str) -> tuple[TrainingTask, TrainingConfig]:
+    if name == "slam-clean-net":
+        return SlamCleanTask(SLAM), SLAM
+    if name == "sfm-clean-net":
+        return SfmCleanTask(SFM, CPU), SFM
+    torch.manual_seed(0)
+    return SfmFineTask(SFM, CPU, CleanNet()), SFM
+
+
+def make_trainer(name: str, folder: Path) -> Trainer:
+    return Trainer(*make_task(name), folder, name)
+
+
+def tensors(folder: Path) -> dict[str, torch.Tensor]:
+    return {
+        f"{path.name}:{key}": value
+        for path in sorted(folder.glob("*.safetensors"))
+        for key, value in load_file(path).items()
+    }
+
+
+def log(folder: Path, name: str) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (folder / f"{name}.log.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.parametrize("name", ["sfm-clean-net", "sfm-fine-net", "slam-clean-net"])
+def test_resumed_run_equals_unbroken_run_bit_for_bit(name: str, tmp_path: Path) -> None:
+    make_trainer(name, tmp_path / "unbroken").run()
+    make_trainer(name, tmp_path / "resumed").run(max_epochs=1)
+    make_trainer(name, tmp_path / "resumed").run(max_epochs=2)
+    resumed = make_trainer(name, tmp_path / "resumed")
+    assert resumed.epochs_done == 3
+    resumed.run()
+
+    expected, actual = tensors(tmp_path / "unbroken"), tensors(tmp_path / "resumed")
+    assert expected.keys() == actual.keys()
+    assert any("exp_avg_sq" in key for key in expected)
+    for key, value in expected.items():
+        assert torch.equal(value, actual[key]), key
+    assert log(tmp_path / "unbroken", name) == log(tmp_path / "resumed", name)
+
+
+@pytest.mark.parametrize("interrupted", [".json", ".checkpoint.safetensors", ".safetensors"])
+def test_kill_while_saving_loses_nothing(
+    interrupted: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = "sfm-clean-net"
+    make_trainer(name, tmp_path / "unbroken").run()
+    trainer = make_trainer(name, tmp_path / "killed")
+    trainer.run(max_epochs=1)
+
+    class KilledError(BaseException):
+        pass
+
+    replace = checkpoint.os.replace
+
+    def killed_before(source: Path, target: Path) -> None:
+        if Path(target).name == name + interrupted:
+            raise KilledError
+        replace(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint.os, "replace", killed_before)
+        with pytest.raises(KilledError):
+            trainer.run()
+    read_network(name, tmp_path / "killed" / f"{name}.safetensors")  # still a whole file
+
+    make_trainer(name, tmp_path / "killed").run()
+    expected, actual = tensors(tmp_path / "unbroken"), tensors(tmp_path / "killed")
+    assert all(torch.equal(value, actual[key]) for key, value in expected.items())
+    assert log(tmp_path / "unbroken", name) == log(tmp_path / "killed", name)
+
+
+def test_best_weights_and_their_card_are_kept(tmp_path: Path) -> None:
+    task, config = make_task("sfm-clean-net")
+    objectives = iter([3.0, 1.0, 2.0, 1.5])
+    task.validate = lambda: {"objective": next(objectives), "accuracy": 0.5}  # type: ignore[method-assign]
+    trainer = Trainer(task, config, tmp_path, "sfm-clean-net", {"extra": "7"}, "rotavg train clean-net tiny")
+    trainer.run(max_epochs=2)
+    best = fingerprint(task.network)
+    trainer.run()
+    assert fingerprint(task.network) != best
+    assert fingerprint(read_network("sfm-clean-net", trainer.weights_path)) == best
+
+    card = json.loads(trainer.card_path.read_text())
+    assert card["epoch"] == 2
+    assert card["validation"] == {"objective": 1.0, "accuracy": 0.5}
+    assert card["config"] == config.to_dict()
+    assert card["command"] == "rotavg train clean-net tiny"
+    assert card["extra"] == "7"
+    assert {"commit", "hardware", "hours", "torch", "version"} <= card.keys()
+
+
+def test_finished_run_has_nothing_left_to_do(tmp_path: Path) -> None:
+    make_trainer("sfm-clean-net", tmp_path).run()
+    before = tensors(tmp_path)
+    assert make_trainer("sfm-clean-net", tmp_path).run() == {}
+    assert all(torch.equal(value, before[key]) for key, value in tensors(tmp_path).items())
+
+
+def test_networks_share_a_folder(tmp_path: Path) -> None:
+    for name in ("sfm-clean-net", "sfm-fine-net"):
+        make_trainer(name, tmp_path).run(max_epochs=1)
+    assert make_trainer("sfm-clean-net", tmp_path).epochs_done == 1
+    assert make_trainer("sfm-fine-net", tmp_path).epochs_done == 1
+
+
+def test_checkpoint_of_another_run_is_refused(tmp_path: Path) -> None:
+    task, config = make_task("sfm-clean-net")
+    Trainer(task, config, tmp_path, "sfm-clean-net").run(max_epochs=1)
+    other = TrainingConfig(**{**vars(config), "seed": 6, "learning_rate": 1e-3})
+    with pytest.raises(UserError, match="another learning_rate, seed"):
+        Trainer(task, other, tmp_path, "sfm-clean-net")
+    with pytest.raises(UserError, match="another clean_net_fingerprint"):
+        Trainer(task, config, tmp_path, "sfm-clean-net", {"clean_net_fingerprint": "1"})
+
+
+def test_checkpoint_of_another_network_is_refused(tmp_path: Path) -> None:
+    make_trainer("sfm-fine-net", tmp_path).run(max_epochs=1)
+    (tmp_path / "sfm-fine-net.checkpoint.safetensors").rename(tmp_path / "sfm-clean-net.checkpoint.safetensors")
+    with pytest.raises(UserError, match="another network"):
+        make_trainer("sfm-clean-net", tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"no tensors", b"\x00" * 100])
+def test_damaged_checkpoint_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "sfm-clean-net.checkpoint.safetensors").write_bytes(content)
+    with pytest.raises(UserError, match=r"sfm-clean-net\.checkpoint\.safetensors: not a checkpoint"):
+        make_trainer("sfm-clean-net", tmp_path)
+
+
+def test_loss_that_is_no_number_stops_the_run(tmp_path: Path) -> None:
+    task, config = make_task("sfm-clean-net")
+
+    def batches(rng: np.random.Generator) -> Iterator[dict[str, torch.Tensor]]:
+        yield {"loss": torch.tensor(float("nan"), requires_grad=True)}
+
+    task.batches = batches  # type: ignore[method-assign]
+    with pytest.raises(UserError, match="no number any more in epoch 0"):
+        Trainer(task, config, tmp_path, "sfm-clean-net").run()
+    assert not (tmp_path / "sfm-clean-net.safetensors").exists()
+
+
+def test_training_reduces_the_loss(tmp_path: Path) -> None:
+    config = TrainingConfig(**{**vars(SFM), "epochs": 25, "learning_rate": 5e-3})
+    Trainer(SfmCleanTask(config, CPU), config, tmp_path, "sfm-clean-net").run()
+    losses = [row["loss"] for row in log(tmp_path, "sfm-clean-net")]
+    assert losses[-1] < 0.7 * losses[0]
