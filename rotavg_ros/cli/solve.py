@@ -53,7 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``rotavg solve``."""
     parser.add_argument("graphs", nargs="+", type=Path, metavar="GRAPH", help="view-graph file")
     parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for the answer")
-    parser.add_argument("--method", default="neurora", metavar="NAME", help=f"{', '.join(METHODS)} (default: neurora)")
+    methods = f"{', '.join(METHODS)}, or A+B: B starts from A's answer (default: neurora)"
+    parser.add_argument("--method", default="neurora", metavar="NAME", help=methods)
     parser.add_argument("--profile", default="auto", choices=PROFILES, help="auto: slam if any edge is odometry")
     parser.add_argument("--device", default="auto", choices=DEVICES, help="default: auto")
     parser.add_argument(

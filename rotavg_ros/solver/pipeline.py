@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -16,10 +17,12 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.solver import refinement, sfm_stages, slam_refinement, slam_stages
 from rotavg_ros.solver.network_store import load_network
 from rotavg_ros.solver.solution import Solution
-from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
 
 PROFILES = ("auto", "slam", "sfm")
 DEVICES = ("auto", "cpu", "cuda")
+# The noise that makes an edge an outlier, in radians.
+_OUTLIER_ANGLE = {"sfm": sfm_stages.OUTLIER_ANGLE, "slam": np.radians(10.0)}
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,9 @@ _METHODS = {
     "spt-finenet": Method(fine_tunings=1),
     "spt": Method(),
 }
-METHODS = tuple(_METHODS)
+# By name only: they build on the solver, so that they are imported when one of them runs.
+_BASELINES = ("chatterjee", "weiszfeld", "arrigoni", "wang")
+METHODS = (*_METHODS, *_BASELINES)
 
 
 @dataclass(frozen=True)
@@ -75,7 +80,8 @@ def solve(
     """Absolute orientations and outlier scores of a view-graph; every connected component by itself.
 
     Args:
-        method: one of :data:`METHODS`.
+        method: one of :data:`METHODS`, or several joined by "+", of which each starts from the answer of the one
+            before.
         profile: "slam" for odometry chains with loop closures, "sfm" for unordered view-graphs, "auto": "slam" if any
             edge is odometry.
         device: "cpu", "cuda" or "auto".
@@ -85,7 +91,9 @@ def solve(
     Raises:
         UserError: an option outside its choices, or a start of the wrong shape.
     """
-    _check_choice("method", method, METHODS)
+    names = method.split("+")
+    for name in names:
+        _check_choice("method", name, METHODS)
     _check_choice("profile", profile, PROFILES)
     _check_choice("device", device, DEVICES)
     if device == "cuda" and not torch.cuda.is_available():
@@ -96,17 +104,11 @@ def solve(
         raise UserError(f"the warm start has shape {tuple(warm_start.shape)}, the graph needs ({graph.num_nodes}, 4)")
     if profile == "auto":
         profile = "slam" if bool(graph.is_odometry.any()) else "sfm"
-    stages = _METHODS[method]
     watch = _Stopwatch()
     graph = graph.to("cpu")
-    if graph.num_edges == 0:
-        estimate = _Estimate(
-            rotations.identity(graph.num_nodes), torch.empty(0).double(), torch.full((graph.num_nodes,), torch.nan)
-        )
-    elif profile == "slam":
-        estimate = _solve_slam(graph, stages, refinement_steps, warm_start, watch)
-    else:
-        estimate = _solve_sfm(graph, stages, refinement_steps, warm_start, watch)
+    for name in names[:-1]:
+        warm_start = _solve_once(graph, name, profile, None, warm_start, watch).body_from_world
+    estimate = _solve_once(graph, names[-1], profile, refinement_steps, warm_start, watch)
     component = graph.components()
     score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, estimate.outlier_score)
     score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
@@ -120,6 +122,38 @@ def solve(
         profile,
         "cpu",
     )
+
+
+def _solve_once(
+    graph: ViewGraph,
+    name: str,
+    profile: str,
+    refinement_steps: int | None,
+    warm_start: Tensor | None,
+    watch: _Stopwatch,
+) -> _Estimate:
+    """One method, or one link of a combination."""
+    if graph.num_edges == 0:
+        unknown = torch.full((graph.num_nodes,), torch.nan)
+        return _Estimate(rotations.identity(graph.num_nodes), torch.empty(0).double(), unknown)
+    if name in _BASELINES:
+        return _solve_baseline(graph, name, profile, warm_start, watch)
+    if profile == "slam":
+        return _solve_slam(graph, _METHODS[name], refinement_steps, warm_start, watch)
+    return _solve_sfm(graph, _METHODS[name], refinement_steps, warm_start, watch)
+
+
+def _solve_baseline(
+    graph: ViewGraph, name: str, profile: str, warm_start: Tensor | None, watch: _Stopwatch
+) -> _Estimate:
+    """One of the methods to compare with. It gives no scores, so the residuals it leaves must do."""
+    baseline = importlib.import_module("rotavg_ros.baselines").BASELINES[name]
+    if profile == "sfm":  # where an order of the nodes means nothing
+        graph = replace(graph, kind=torch.full_like(graph.kind, EdgeKind.LOOP_CLOSURE))
+    with watch.stage(name):
+        orientations = baseline(graph, warm_start)
+    score = sfm_stages.residual_score(graph, orientations, _OUTLIER_ANGLE[profile])
+    return _Estimate(orientations, score, torch.full((graph.num_nodes,), torch.nan))
 
 
 def _solve_sfm(

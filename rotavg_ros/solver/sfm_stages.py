@@ -19,7 +19,8 @@ from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 OUTLIER_THRESHOLD = 0.75
 # How fast the probability of noise beyond 20° rises with the residual: what remains of the orientations' own error.
 _RESIDUAL_SCALE = np.radians(1.0)
-_OUTLIER_ANGLE = np.radians(20.0)
+# The noise that makes an edge an outlier.
+OUTLIER_ANGLE = np.radians(20.0)
 # Cost of an edge in the tree (the authors' released code).
 _INLIER_COST, _OUTLIER_COST = 0.1, 1.1
 
@@ -82,5 +83,10 @@ def outlier_score(graph: ViewGraph, cleaned: Cleaned, body_from_world: Tensor, r
     """
     if not refined:
         return cleaned.outlier_probability.double()
+    return residual_score(graph, body_from_world, OUTLIER_ANGLE)
+
+
+def residual_score(graph: ViewGraph, body_from_world: Tensor, outlier_angle: float) -> Tensor:
+    """Probability that an edge's noise exceeds ``outlier_angle`` (radians) as its residual has it, ``(M,)`` float64."""
     residual = edge_residual(body_from_world, graph.target_from_source, graph.source, graph.target)
-    return torch.sigmoid((rotations.angle(residual) - _OUTLIER_ANGLE) / _RESIDUAL_SCALE)
+    return torch.sigmoid((rotations.angle(residual) - outlier_angle) / _RESIDUAL_SCALE)

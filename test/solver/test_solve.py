@@ -170,6 +170,17 @@ def test_stages_follow_the_method() -> None:
     assert list(solve(graph, profile="sfm").stage_seconds) == ["clean", "bootstrap", "fine-tune", "refine"]
 
 
+@pytest.mark.parametrize("profile", ["slam", "sfm"])
+def test_combinations_start_from_the_answer_before(profile: str) -> None:
+    graph = PaperRecipe(cameras=(30, 30)).sample(np.random.default_rng(0)).graph
+    first = solve(graph, method="chatterjee", profile=profile)
+    joined = solve(graph, method="chatterjee+weiszfeld", profile=profile)
+    by_hand = solve(graph, method="weiszfeld", profile=profile, warm_start=first.body_from_world)
+    assert list(joined.stage_seconds) == ["chatterjee", "weiszfeld"]
+    assert joined.method == "chatterjee+weiszfeld"
+    assert float(rotations.angle_between(joined.body_from_world, by_hand.body_from_world).max()) < 1e-6
+
+
 def test_a_warm_start_ends_where_the_cold_one_does() -> None:
     graph, _, _ = _slam_graph(9)
     cold = solve(graph)
@@ -198,6 +209,8 @@ def test_the_networks_beat_the_tree(recipe: ReleasedRecipe | PaperRecipe) -> Non
     ("options", "message"),
     [
         ({"method": "magic"}, "unknown method 'magic'; choose from neurora"),
+        ({"method": "spt+magic"}, "unknown method 'magic'; choose from neurora"),
+        ({"method": "spt+"}, "unknown method ''; choose from neurora"),
         ({"profile": "drone"}, "unknown profile 'drone'"),
         ({"device": "tpu"}, "unknown device 'tpu'"),
         ({"refinement_steps": -1}, "must not be negative"),
