@@ -5,24 +5,51 @@ from __future__ import annotations
 import numpy as np
 from torch import Tensor
 
+_BINS = 15
 
-def reliability(probability: Tensor, happened: Tensor, bins: int = 15) -> np.ndarray:
-    """Rows ``(count, mean probability, observed share)`` of equal-width bins that are not empty.
+
+class CalibrationBins:
+    """Scores and outcomes of any number of graphs, collected in bins of equal width.
 
     Args:
-        probability: ``(M,)`` in [0, 1].
-        happened: ``(M,)`` bool.
+        bins: number of bins on [0, 1].
     """
-    scores, truth = probability.double().cpu().numpy(), happened.double().cpu().numpy()
-    bin_of = np.minimum((scores * bins).astype(np.int64), bins - 1)
-    count = np.bincount(bin_of, minlength=bins)
-    filled = count > 0
-    mean = np.bincount(bin_of, scores, bins)[filled] / count[filled]
-    share = np.bincount(bin_of, truth, bins)[filled] / count[filled]
-    return np.stack((count[filled].astype(np.float64), mean, share), axis=1)
+
+    def __init__(self, bins: int = _BINS) -> None:
+        self._count, self._score_sum, self._happened = (np.zeros(bins) for _ in range(3))
+
+    def add(self, probability: Tensor, happened: Tensor) -> None:
+        """Count ``(M,)`` probabilities in [0, 1] and whether what they speak of happened, ``(M,)`` bool."""
+        scores, truth = probability.double().cpu().numpy(), happened.double().cpu().numpy()
+        bins = len(self._count)
+        bin_of = np.minimum((scores * bins).astype(np.int64), bins - 1)
+        self._count += np.bincount(bin_of, minlength=bins)
+        self._score_sum += np.bincount(bin_of, scores, bins)
+        self._happened += np.bincount(bin_of, truth, bins)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Rows ``(count, mean probability, observed share)`` of the bins that are not empty."""
+        filled = self._count > 0
+        count = self._count[filled]
+        return np.stack((count, self._score_sum[filled] / count, self._happened[filled] / count), axis=1)
+
+    @property
+    def error(self) -> float:
+        """Expected calibration error: mean distance of stated probability and observed share, weighted by count."""
+        rows = self.rows
+        return float((rows[:, 0] * np.abs(rows[:, 1] - rows[:, 2])).sum() / max(rows[:, 0].sum(), 1))
 
 
-def expected_calibration_error(probability: Tensor, happened: Tensor, bins: int = 15) -> float:
-    """Mean distance of stated probability and observed share over the bins, weighted by their counts."""
-    rows = reliability(probability, happened, bins)
-    return float((rows[:, 0] * np.abs(rows[:, 1] - rows[:, 2])).sum() / max(rows[:, 0].sum(), 1))
+def reliability(probability: Tensor, happened: Tensor, bins: int = _BINS) -> np.ndarray:
+    """:attr:`CalibrationBins.rows` of one set of scores."""
+    collected = CalibrationBins(bins)
+    collected.add(probability, happened)
+    return collected.rows
+
+
+def expected_calibration_error(probability: Tensor, happened: Tensor, bins: int = _BINS) -> float:
+    """:attr:`CalibrationBins.error` of one set of scores."""
+    collected = CalibrationBins(bins)
+    collected.add(probability, happened)
+    return collected.error

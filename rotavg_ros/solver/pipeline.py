@@ -7,6 +7,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,11 +29,19 @@ _OUTLIER_ANGLE = {"sfm": sfm_stages.OUTLIER_ANGLE, "slam": np.radians(10.0)}
 
 @dataclass(frozen=True)
 class Method:
-    """Which stages run. Every method has the bootstrap, a spanning tree."""
+    """Which stages run. Every method has the bootstrap, a spanning tree.
+
+    Attributes:
+        clean: CleanNet rectifies and scores the edges.
+        fine_tunings: how often FineNet corrects the orientations.
+        refine: refinement ends the solve.
+        weighted: refinement weighs the edges by CleanNet's scores.
+    """
 
     clean: bool = False
     fine_tunings: int = 0
     refine: bool = False
+    weighted: bool = True
 
 
 _METHODS = {
@@ -41,6 +51,9 @@ _METHODS = {
     "cleannet-spt": Method(clean=True),
     "spt-finenet": Method(fine_tunings=1),
     "spt": Method(),
+    # Ablations: what each network earns.
+    "neurora-unweighted": Method(clean=True, fine_tunings=1, refine=True, weighted=False),
+    "neurora-without-finenet": Method(clean=True, refine=True),
 }
 # By name only: they build on the solver, so that they are imported when one of them runs.
 _BASELINES = ("chatterjee", "weiszfeld", "arrigoni", "wang")
@@ -76,6 +89,7 @@ def solve(
     device: str = "auto",
     refinement_steps: int | None = None,
     warm_start: Tensor | None = None,
+    weights: Path | None = None,
 ) -> Solution:
     """Absolute orientations and outlier scores of a view-graph; every connected component by itself.
 
@@ -87,6 +101,7 @@ def solve(
         device: "cpu", "cuda" or "auto".
         refinement_steps: refinement steps at most, 0 for none; default: the method's and profile's own number.
         warm_start: ``(N, 4)`` body_from_world of an earlier solution to start from.
+        weights: folder of networks trained with ``rotavg train``; what it lacks comes from the package.
 
     Raises:
         UserError: an option outside its choices, or a start of the wrong shape.
@@ -107,8 +122,8 @@ def solve(
     watch = _Stopwatch()
     graph = graph.to("cpu")
     for name in names[:-1]:
-        warm_start = _solve_once(graph, name, profile, None, warm_start, watch).body_from_world
-    estimate = _solve_once(graph, names[-1], profile, refinement_steps, warm_start, watch)
+        warm_start = _solve_once(graph, name, profile, None, warm_start, weights, watch).body_from_world
+    estimate = _solve_once(graph, names[-1], profile, refinement_steps, warm_start, weights, watch)
     component = graph.components()
     score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, estimate.outlier_score)
     score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
@@ -130,6 +145,7 @@ def _solve_once(
     profile: str,
     refinement_steps: int | None,
     warm_start: Tensor | None,
+    weights: Path | None,
     watch: _Stopwatch,
 ) -> _Estimate:
     """One method, or one link of a combination."""
@@ -139,8 +155,8 @@ def _solve_once(
     if name in _BASELINES:
         return _solve_baseline(graph, name, profile, warm_start, watch)
     if profile == "slam":
-        return _solve_slam(graph, _METHODS[name], refinement_steps, warm_start, watch)
-    return _solve_sfm(graph, _METHODS[name], refinement_steps, warm_start, watch)
+        return _solve_slam(graph, _METHODS[name], refinement_steps, warm_start, weights, watch)
+    return _solve_sfm(graph, _METHODS[name], refinement_steps, warm_start, weights, watch)
 
 
 def _solve_baseline(
@@ -157,11 +173,16 @@ def _solve_baseline(
 
 
 def _solve_sfm(
-    graph: ViewGraph, method: Method, refinement_steps: int | None, warm_start: Tensor | None, watch: _Stopwatch
+    graph: ViewGraph,
+    method: Method,
+    refinement_steps: int | None,
+    warm_start: Tensor | None,
+    weights: Path | None,
+    watch: _Stopwatch,
 ) -> _Estimate:
     with watch.stage("clean"):
         if method.clean:
-            cleaned = sfm_stages.clean(load_network("sfm-clean-net"), graph)
+            cleaned = sfm_stages.clean(_network("sfm-clean-net", weights), graph)
         else:
             cleaned = sfm_stages.trust_all(graph)
         cleaned = sfm_stages.apply_labels(cleaned, graph.label)
@@ -171,23 +192,29 @@ def _solve_sfm(
             orientations = warm_start.double()
     for _ in range(method.fine_tunings):
         with watch.stage("fine-tune"):
-            orientations = sfm_stages.fine_tune(load_network("sfm-fine-net"), cleaned, orientations)
+            orientations = sfm_stages.fine_tune(_network("sfm-fine-net", weights), cleaned, orientations)
     steps = (refinement.DEFAULT_STEPS if method.refine else 0) if refinement_steps is None else refinement_steps
     if steps > 0:
         with watch.stage("refine"):
-            weight = 1 - cleaned.outlier_probability
+            verdicts = cleaned if method.weighted else sfm_stages.apply_labels(sfm_stages.trust_all(graph), graph.label)
+            weight = 1 - verdicts.outlier_probability
             orientations = refinement.refine(graph, orientations, weight, forest.roots, steps)
     score = sfm_stages.outlier_score(graph, cleaned, orientations, refined=steps > 0)
     return _Estimate(orientations, score, torch.full((graph.num_nodes,), torch.nan))
 
 
 def _solve_slam(
-    graph: ViewGraph, method: Method, refinement_steps: int | None, warm_start: Tensor | None, watch: _Stopwatch
+    graph: ViewGraph,
+    method: Method,
+    refinement_steps: int | None,
+    warm_start: Tensor | None,
+    weights: Path | None,
+    watch: _Stopwatch,
 ) -> _Estimate:
     with watch.stage("contract"):
         prepared = slam_stages.prepare(graph)
     with watch.stage("clean"):
-        network = load_network("slam-clean-net") if method.clean else None
+        network = _network("slam-clean-net", weights) if method.clean else None
         cleaned = slam_stages.clean(network, prepared, graph.label)
     with watch.stage("bootstrap"):
         correction = slam_stages.bootstrap(prepared, cleaned)
@@ -212,6 +239,12 @@ def _solve_slam(
         score = torch.from_numpy(1 - prepared.closure_graph.edge_values(inlier_probability))
         orientations = prepared.closure_graph.orientations(correction)
     return _Estimate(orientations, score, torch.from_numpy(variance))
+
+
+def _network(name: str, weights: Path | None) -> Any:
+    if weights is not None and (weights / f"{name}.safetensors").exists():
+        return load_network(name, folder=weights)
+    return load_network(name)
 
 
 def _root_at_identity(body_from_world: Tensor, component: Tensor) -> Tensor:

@@ -1,0 +1,143 @@
+"""Who is compared: the solver's methods and combinations, COLMAP, Shonan, and an oracle that knows the outliers."""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rotavg_ros.datasets.synthetic import SFM_OUTLIER_ANGLE
+from rotavg_ros.errors import UserError
+from rotavg_ros.evaluation import peers
+from rotavg_ros.evaluation.metrics import true_edge_noise
+from rotavg_ros.solver import METHODS, solve
+from rotavg_ros.solver.refinement import refine
+from rotavg_ros.solver.sfm_stages import residual_score
+from rotavg_ros.solver.spanning_tree import shortest_path_forest
+from rotavg_ros.view_graph import ViewGraph
+
+FULL_PIPELINE = "neurora"
+# Until it moves no more.
+_ORACLE_STEPS = 50
+# Shonan's matrices beyond this many edges take minutes.
+_SHONAN_MAX_EDGES = 150_000
+_PEER_PACKAGES = {"colmap": "pycolmap", "shonan": "gtsam"}
+EXTRA_CONTENDERS = ("colmap", "shonan", "oracle")
+
+
+class ContenderError(UserError):
+    """An unknown or unavailable contender; the message lists the choices or the remedy."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A view-graph to be solved and what is known of it (N nodes, M edges).
+
+    Attributes:
+        truth: body_from_world ``(N, 4)``; NaN rows where unknown.
+    """
+
+    name: str
+    graph: ViewGraph
+    truth: Tensor
+
+    @property
+    def noise_angle(self) -> Tensor:
+        """``(M,)`` rad, true noise of every edge; NaN where unknown."""
+        return true_edge_noise(self.graph.target_from_source, self.graph.source, self.graph.target, self.truth)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a contender made of a case.
+
+    Attributes:
+        body_from_world: ``(N, 4)``; every component in a gauge of its own.
+        outlier_score: ``(M,)`` probability that the edge's noise exceeds 20°.
+        seconds: wall-clock time from graph to answer.
+    """
+
+    body_from_world: Tensor
+    outlier_score: Tensor
+    seconds: float
+
+
+Contender = Callable[[Case], "Answer | None"]
+
+
+def contenders(names: Sequence[str]) -> dict[str, Contender]:
+    """Contenders by name: a method of the solver, several joined by "+", "colmap", "shonan" or "oracle".
+
+    A contender returns None for a case that is too large for it or on which it gives up.
+
+    Raises:
+        ContenderError: an unknown name, or a peer that is not installed.
+    """
+    return {name: _contender(name) for name in names}
+
+
+def is_available(name: str) -> bool:
+    """Whether what a contender needs is installed."""
+    return name not in _PEER_PACKAGES or importlib.util.find_spec(_PEER_PACKAGES[name]) is not None
+
+
+def _contender(name: str) -> Contender:
+    if not is_available(name):
+        package = _PEER_PACKAGES[name]
+        raise ContenderError(f"method {name!r} needs {package}, which is not installed; run: pip install {package}")
+    if name == "colmap":
+        return _peer(peers.colmap)
+    if name == "shonan":
+        return _peer(peers.shonan, _SHONAN_MAX_EDGES)
+    if name == "oracle":
+        return _oracle
+    unknown = [part for part in name.split("+") if part not in METHODS]
+    if unknown:
+        choices = ", ".join((*METHODS, *EXTRA_CONTENDERS))
+        raise ContenderError(f"unknown method {unknown[0]!r}; choose from {choices}, or combine: A+B")
+    return lambda case: _solve(name, case)
+
+
+def _solve(name: str, case: Case) -> Answer:
+    start = time.perf_counter()
+    solution = solve(case.graph, method=name, profile="sfm")
+    return Answer(solution.body_from_world, solution.outlier_score, time.perf_counter() - start)
+
+
+def _peer(run: Callable[[ViewGraph], peers.PeerAnswer], max_edges: int | None = None) -> Contender:
+    def solve_case(case: Case) -> Answer | None:
+        if max_edges is not None and case.graph.num_edges > max_edges:
+            return None
+        try:
+            answer = run(case.graph)
+        except peers.PeerError:
+            return None
+        return Answer(answer.body_from_world, _residual_score(case, answer.body_from_world), answer.seconds)
+
+    return solve_case
+
+
+def _oracle(case: Case) -> Answer:
+    """Our refinement from the truth, every true inlier weighing one and every outlier nothing."""
+    start = time.perf_counter()
+    is_inlier = (case.noise_angle <= SFM_OUTLIER_ANGLE).double()
+    roots = shortest_path_forest(case.graph).roots
+    orientations = refine(case.graph, case.truth, is_inlier, roots, _ORACLE_STEPS)
+    seconds = time.perf_counter() - start
+    return Answer(orientations, _residual_score(case, orientations), seconds)
+
+
+def _residual_score(case: Case, body_from_world: Tensor) -> Tensor:
+    return residual_score(case.graph, body_from_world, SFM_OUTLIER_ANGLE)
+
+
+def warm_up(chosen: Sequence[Contender]) -> None:
+    """Let every contender pay its one-time costs (imports, weights, first kernels) on a triangle."""
+    identity = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64).expand(3, 4)
+    triangle = ViewGraph.create([0, 1, 2], [1, 2, 0], identity)
+    for contender in chosen:
+        contender(Case("warm-up", triangle, identity))
