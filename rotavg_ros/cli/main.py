@@ -29,6 +29,7 @@ COMMANDS = (
     Command("convert", "rotavg_ros.cli.convert", "convert view-graphs between files and bags"),
     Command("play", "rotavg_ros.cli.play", "publish a bag's messages live"),
     Command("train", "rotavg_ros.cli.train", "train the networks"),
+    Command("evaluate", "rotavg_ros.cli.evaluate", "compare the methods in tables and pictures"),
 )
 
 

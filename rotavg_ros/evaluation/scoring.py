@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -60,25 +60,34 @@ class Scores:
         return sum(getattr(ours[case], figure) for case in both) / below if below > 0 else float("nan")
 
 
+Step = tuple[Case, str, Contender]
+
+
 def score_all(
-    cases: Iterable[Case], chosen: Mapping[str, Contender], on_step: Callable[[str], None] = lambda _: None
+    cases: Iterable[Case],
+    chosen: Mapping[str, Contender],
+    watch: Callable[[Iterable[Step]], Iterable[Step]] = lambda steps: steps,
 ) -> Scores:
     """Every contender on every case.
 
     Args:
-        on_step: told, before each solve, what is about to run.
+        watch: passes the steps through, one per solve, and may show how far they are.
     """
     scores = Scores(calibration={name: CalibrationBins() for name in chosen})
+    for case, name, contender in watch(_steps(cases, chosen)):
+        answer = contender(case)
+        if answer is not None:
+            scores.rows.append(score(case, name, answer))
+            known = torch.isfinite(case.noise_angle)
+            is_outlier = case.noise_angle[known] > SFM_OUTLIER_ANGLE
+            scores.calibration[name].add(answer.outlier_score[known], is_outlier)
+    return scores
+
+
+def _steps(cases: Iterable[Case], chosen: Mapping[str, Contender]) -> Iterator[Step]:
     for case in cases:
         for name, contender in chosen.items():
-            on_step(f"{case.name}, {name}")
-            answer = contender(case)
-            if answer is not None:
-                scores.rows.append(score(case, name, answer))
-                known = torch.isfinite(case.noise_angle)
-                is_outlier = case.noise_angle[known] > SFM_OUTLIER_ANGLE
-                scores.calibration[name].add(answer.outlier_score[known], is_outlier)
-    return scores
+            yield case, name, contender
 
 
 def score(case: Case, name: str, answer: Answer) -> Score:

@@ -8,7 +8,7 @@ import math
 import os
 import platform
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,13 +68,20 @@ class Table:
 
 
 def write_report(
-    folder: Path, name: str, title: str, introduction: str, tables: dict[str, Table], pictures: dict[str, str]
+    folder: Path,
+    name: str,
+    title: str,
+    introduction: str,
+    tables: Mapping[str, Table],
+    pictures: Mapping[str, str],
+    extra_csv: Mapping[str, Table] | None = None,
 ) -> Path:
     """Write ``name.md`` with all tables and pictures, and a CSV file per table.
 
     Args:
         tables: by the stem of their CSV file.
         pictures: caption by file name; the files are in ``folder`` already.
+        extra_csv: tables that are too long to be read, as CSV only.
 
     Returns:
         The Markdown file.
@@ -87,7 +94,7 @@ def write_report(
     parts.append(f"_{provenance()}_\n")
     report = folder / f"{name}.md"
     try:
-        for stem, table in tables.items():
+        for stem, table in {**tables, **(extra_csv or {})}.items():
             (folder / f"{stem}.csv").write_text(table.to_csv(), encoding="utf-8")
         report.write_text("\n".join(parts), encoding="utf-8")
     except OSError as error:
