@@ -227,6 +227,7 @@ def _solve_slam(
         with watch.stage("refine"):
             estimate = slam_refinement.refine(
                 prepared.closure_graph,
+                prepared.pairs,
                 correction,
                 inlier_probability,
                 prepared.noise,

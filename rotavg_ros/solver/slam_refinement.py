@@ -1,14 +1,14 @@
 """Robust refinement of a SLAM graph: Gauss–Newton on the closure graph, every closure judged by all the others.
 
 One pass solves one sparse system. It gives the corrections, and from a few more right-hand sides the effective
-resistance of every edge, that is the variance of the difference of its ends. With it each edge is judged by what
+resistance of every edge, that is the variance of the difference of its ends. With it each closure is judged by what
 the rest of the graph predicts of it (leave-one-out), which a long chain with one closure on it forgives and a dense
 neighbourhood does not, and both noise variances are re-estimated by their redundancy.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,12 +16,14 @@ from scipy.special import expit
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver.agreement import AgreementPairs
 from rotavg_ros.solver.closure_graph import ClosureGraph
+from rotavg_ros.solver.common_error import closure_runs, common_share, variance_factor
 from rotavg_ros.solver.fine_net import edge_residual
 from rotavg_ros.solver.laplacian import LaplacianSystem, probe_signs
 from rotavg_ros.solver.noise_model import NoiseModel, outlier_share
 
-MAX_PASSES = 20
+MAX_PASSES = 30
 _NUM_PROBES = 48
 _CONVERGED_STEP = np.radians(0.002)
 _CONVERGED_PROBABILITY = 2e-3
@@ -30,9 +32,10 @@ _MAX_LEVERAGE = 0.999
 # Redundancy below this many edges' worth says little about a variance; the estimate so far is worth as much.
 _PRIOR_ODOMETRY_REDUNDANCY = 5.0
 _PRIOR_CLOSURE_SQUARE = np.radians(0.08) ** 2
-# Neighbouring closures of a real front end err together, which in the fit looks like odometry noise. How odometry
-# drifts over long ways tells otherwise, so the fit may not raise that estimate beyond this factor.
-_MAX_STEP_VARIANCE_GAIN = 2.0
+# Errors that closures share look like odometry noise in the fit. How odometry drifts over long ways tells otherwise, so
+# the fit may raise that estimate by this factor at most, and not at all once closures are seen to err together.
+_MAX_STEP_VARIANCE_GAIN = 1.5
+_MIN_COMMON_SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,7 @@ class SlamEstimate:
         inlier_probability: ``(E,)``.
         noise: the estimated noise model.
         variance: ``(K,)`` of one component of the orientation error relative to the root, rad².
+        common_share: share of the closures' error variance that neighbouring closures have in common.
         passes: number of sparse solves.
     """
 
@@ -51,11 +55,13 @@ class SlamEstimate:
     inlier_probability: np.ndarray
     noise: NoiseModel
     variance: np.ndarray
+    common_share: float
     passes: int
 
 
 def refine(
     graph: ClosureGraph,
+    pairs: AgreementPairs,
     correction: Tensor,
     inlier_probability: np.ndarray,
     noise: NoiseModel,
@@ -63,9 +69,10 @@ def refine(
     log_odds: np.ndarray | None = None,
     max_passes: int = MAX_PASSES,
 ) -> SlamEstimate:
-    """Alternate solving and judging until neither moves.
+    """Alternate solving and judging until neither moves; once more if neighbouring closures err together.
 
     Args:
+        pairs: the graph's neighbouring closures.
         correction: ``(K, 4)`` start; identities for the odometry itself.
         inlier_probability: ``(E,)`` start.
         noise: start.
@@ -73,57 +80,109 @@ def refine(
         max_passes: sparse solves at most, at least 1.
     """
     prior = np.zeros(len(graph.source)) if log_odds is None else log_odds
-    probes = probe_signs(graph.nodes[graph.source], graph.nodes[graph.target], _NUM_PROBES)
-    components = noise.components
-    odometry, closure = graph.is_odometry, graph.is_closure
-    max_step_variance = _MAX_STEP_VARIANCE_GAIN * noise.step_variance
-    passes = 0
-    while True:
-        variance = graph.steps * np.where(odometry, noise.step_variance, noise.closure_variance)
-        weight = np.maximum(inlier_probability, 1e-9) / variance
-        system = LaplacianSystem(graph.num_nodes, graph.source, graph.target, weight, graph.roots)
-        step = system.fit(_residual_vectors(graph, correction))
-        samples = system.samples(probes)
-        correction = rotations.multiply(correction, rotations.exp(torch.from_numpy(step)))
-        passes += 1
+    state = _State(graph, correction, inlier_probability, noise, prior)
+    state.alternate(_MAX_STEP_VARIANCE_GAIN * noise.step_variance, (max_passes + 1) // 2)
+    share = 0.0
+    closure = np.flatnonzero(graph.is_closure)
+    if len(pairs.first) and state.passes < max_passes:
+        good = state.inlier_probability[closure]
+        run = closure_runs(pairs, good > 0.5)
+        # Closures run old → new and new → old; their errors compare in one direction only.
+        direction = np.where(graph.position[graph.source] < graph.position[graph.target], 1.0, -1.0)[closure, None]
+        residual, samples = direction * state.residual[closure], direction * state.difference(state.samples)[closure]
+        share = common_share(run, good, residual, samples, state.noise.closure_variance, noise.components)
+        if share > _MIN_COMMON_SHARE:
+            steps = graph.steps.copy()
+            steps[closure] *= variance_factor(run, good, share)
+            state.graph = replace(graph, steps=steps)
+            state.noise = replace(state.noise, step_variance=min(noise.step_variance, state.noise.step_variance))
+            state.alternate(noise.step_variance, max_passes)
+    return SlamEstimate(
+        rotations.normalize(state.correction),
+        state.inlier_probability,
+        state.noise,
+        (state.samples**2).mean(axis=1),
+        share,
+        state.passes,
+    )
 
-        residual = _residual_vectors(graph, correction)
-        square = (residual**2).sum(axis=1)
-        resistance = ((samples[graph.target] - samples[graph.source]) ** 2).mean(axis=1)
+
+class _State:
+    """The unknowns, and what the last pass saw of them."""
+
+    residual: np.ndarray  # (E, 3) rad
+    samples: np.ndarray  # (K, probes)
+
+    def __init__(
+        self,
+        graph: ClosureGraph,
+        correction: Tensor,
+        inlier_probability: np.ndarray,
+        noise: NoiseModel,
+        prior_log_odds: np.ndarray,
+    ) -> None:
+        self.graph, self.correction, self.noise = graph, correction, noise
+        self.inlier_probability, self.prior_log_odds = inlier_probability, prior_log_odds
+        self.probes = probe_signs(graph.nodes[graph.source], graph.nodes[graph.target], _NUM_PROBES)
+        self.passes = 0
+
+    def difference(self, values: np.ndarray) -> np.ndarray:
+        """Node values ``(K, k)`` → differences over the edges, target − source ``(E, k)``."""
+        return np.asarray(values[self.graph.target] - values[self.graph.source])
+
+    def alternate(self, max_step_variance: float, max_passes: int) -> None:
+        """Passes until convergence, or until there have been ``max_passes`` in all; at least one."""
+        while True:
+            moved, changed = self._one_pass(max_step_variance)
+            if self.passes >= max_passes or (moved < _CONVERGED_STEP and changed < _CONVERGED_PROBABILITY):
+                return
+
+    def _one_pass(self, max_step_variance: float) -> tuple[float, float]:
+        """Solve, judge, re-estimate the noise; returns the largest correction (rad) and change of a probability."""
+        graph, noise = self.graph, self.noise
+        variance = graph.steps * np.where(graph.is_odometry, noise.step_variance, noise.closure_variance)
+        weight = np.maximum(self.inlier_probability, 1e-9) / variance
+        system = LaplacianSystem(graph.num_nodes, graph.source, graph.target, weight, graph.roots)
+        step = system.fit(_residual_vectors(graph, self.correction))
+        self.samples = system.samples(self.probes)
+        self.correction = rotations.multiply(self.correction, rotations.exp(torch.from_numpy(step)))
+        self.residual = _residual_vectors(graph, self.correction)
+        self.passes += 1
+
+        square = (self.residual**2).sum(axis=1)
+        resistance = (self.difference(self.samples) ** 2).mean(axis=1)
         leverage = np.clip(weight * resistance, 0.0, _MAX_LEVERAGE)
         predicted_square = np.minimum(square / (1 - leverage) ** 2, np.pi**2)
         predicted_variance = variance + resistance / (1 - leverage)
-        judged = noise.inlier_log_odds(predicted_square, predicted_variance) + noise.prior_log_odds + prior
-        probability = np.where(closure, expit(judged), 1.0)
+        judged = noise.inlier_log_odds(predicted_square, predicted_variance) + noise.prior_log_odds
+        probability = np.where(graph.is_closure, expit(judged + self.prior_log_odds), 1.0)
+        changed = float(np.abs(probability - self.inlier_probability).max(initial=0.0))
+        self.inlier_probability = probability
 
-        change = float(np.abs(probability - inlier_probability).max(initial=0.0))
-        inlier_probability = probability
-        redundancy = inlier_probability * (1 - leverage)
+        odometry, closure = graph.is_odometry, graph.is_closure
+        redundancy = probability * (1 - leverage)
+        # A run's inflated variance is what its closures weigh, not what each of them errs.
         square_per_step = square[odometry] / graph.steps[odometry]
-        noise = NoiseModel(
-            components,
+        self.noise = NoiseModel(
+            noise.components,
             min(max_step_variance, _step_variance(square_per_step, redundancy[odometry], noise)),
-            _closure_variance(square[closure], inlier_probability[closure], redundancy[closure], components),
-            outlier_share(inlier_probability[closure]),
+            _closure_variance(square[closure], probability[closure], redundancy[closure], noise),
+            outlier_share(probability[closure]),
         )
-        moved = float(np.abs(step).max(initial=0.0))
-        if passes >= max_passes or (moved < _CONVERGED_STEP and change < _CONVERGED_PROBABILITY):
-            break
-    return SlamEstimate(rotations.normalize(correction), inlier_probability, noise, (samples**2).mean(axis=1), passes)
+        return float(np.abs(step).max(initial=0.0)), changed
 
 
 def _residual_vectors(graph: ClosureGraph, correction: Tensor) -> np.ndarray:
-    residual = edge_residual(
-        correction, graph.residual, torch.from_numpy(graph.source), torch.from_numpy(graph.target)
-    )
-    return rotations.log(residual).numpy()
+    residual = edge_residual(correction, graph.residual, torch.from_numpy(graph.source), torch.from_numpy(graph.target))
+    return np.asarray(rotations.log(residual).numpy())
 
 
-def _step_variance(square_per_step: np.ndarray, redundancy: np.ndarray, noise: NoiseModel) -> float:
+def _step_variance(square: np.ndarray, redundancy: np.ndarray, noise: NoiseModel) -> float:
     prior = _PRIOR_ODOMETRY_REDUNDANCY * noise.components
-    total = float(square_per_step.sum()) + prior * noise.step_variance
+    total = float(square.sum()) + prior * noise.step_variance
     return total / (float(redundancy.sum()) * noise.components + prior)
 
 
-def _closure_variance(square: np.ndarray, probability: np.ndarray, redundancy: np.ndarray, components: int) -> float:
-    return (float((probability * square).sum()) + _PRIOR_CLOSURE_SQUARE) / (float(redundancy.sum()) * components + 1)
+def _closure_variance(square: np.ndarray, probability: np.ndarray, redundancy: np.ndarray, noise: NoiseModel) -> float:
+    total = float((probability * square).sum()) + _PRIOR_CLOSURE_SQUARE
+    return total / (float(redundancy.sum()) * noise.components + 1)

@@ -22,8 +22,6 @@ _CLOSURE_COST = 1e6
 # What a closure's verdict counts for in the tree: nobody is trusted beyond this, and a false one is off by about this.
 _MIN_DISTRUST = 0.02
 _FALSE_SQUARE = np.pi**2 / 3 + 2
-# Weight of the network's log-odds as a prior for the refinement, which sees part of the same evidence again.
-_PRIOR_TEMPER = 0.5
 # Rotations whose axes spread less than this (relative) are all about one axis.
 _PLANAR_SPREAD = 1e-10
 
@@ -80,7 +78,10 @@ class CleanedClosures:
 
 
 def clean(network: SlamCleanNet | None, prepared: Prepared, label: Tensor) -> CleanedClosures:
-    """Judge every closure: by the network, or without one by its discrepancy with the odometry alone.
+    """Judge every closure by its discrepancy with the odometry and, with a network, by the company it keeps.
+
+    A closure starts as good only if both say so: a group of false closures agrees with itself, and odometry that has
+    drifted far believes anything.
 
     Args:
         label: ``(M,)`` of the view-graph's edges.
@@ -88,14 +89,11 @@ def clean(network: SlamCleanNet | None, prepared: Prepared, label: Tensor) -> Cl
     graph, noise = prepared.closure_graph, prepared.noise
     prior = np.zeros(len(graph.source))
     good = np.full(len(graph.source), np.inf)
-    if network is None:
-        good[graph.is_closure] = (
-            judge_by_chain(noise, prepared.squared_angle, prepared.path_steps) + noise.prior_log_odds
-        )
-    elif len(prepared.squared_angle):
+    by_chain = judge_by_chain(noise, prepared.squared_angle, prepared.path_steps) + noise.prior_log_odds
+    good[graph.is_closure] = by_chain
+    if network is not None and len(by_chain):
         features = closure_features(noise, prepared.squared_angle, prepared.path_steps, prepared.pairs)
-        good[graph.is_closure] = -network(features).double().numpy()
-        prior[graph.is_closure] = _PRIOR_TEMPER * good[graph.is_closure]
+        good[graph.is_closure] = np.minimum(by_chain, -network(features).double().numpy())
     edge_label = label.numpy()[graph.view_graph_edge]
     verdict = np.select([edge_label == EdgeLabel.ACCEPTED, edge_label == EdgeLabel.REJECTED], [np.inf, -np.inf], 0.0)
     good[graph.num_segments :] = np.where(verdict == 0, good[graph.num_segments :], verdict)
