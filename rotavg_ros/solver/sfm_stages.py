@@ -17,8 +17,10 @@ from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # An edge whose outlier probability exceeds this is no inlier (ε of the paper; uncritical in 0.35–0.8).
 OUTLIER_THRESHOLD = 0.75
-# How fast the probability of noise beyond 20° rises with the residual: what remains of the orientations' own error.
-_RESIDUAL_SCALE = np.radians(1.0)
+# How fast the probability of noise beyond the outlier angle rises with the residual, in units of how far off the edge's
+# ends may be; fitted by `python -m rotavg_ros.training.score_fit`.
+SCORE_SCALE = 0.41
+_MIN_UNCERTAINTY = np.radians(0.01)
 # The noise that makes an edge an outlier.
 OUTLIER_ANGLE = np.radians(20.0)
 # Cost of an edge in the tree (the authors' released code).
@@ -87,6 +89,22 @@ def outlier_score(graph: ViewGraph, cleaned: Cleaned, body_from_world: Tensor, r
 
 
 def residual_score(graph: ViewGraph, body_from_world: Tensor, outlier_angle: float) -> Tensor:
-    """Probability that an edge's noise exceeds ``outlier_angle`` (radians) as its residual has it, ``(M,)`` float64."""
+    """Probability that an edge's noise exceeds ``outlier_angle`` (radians) as its residual has it, ``(M,)`` float64.
+
+    The residual is the noise but for the error of the orientations at the edge's ends: one half at the outlier angle,
+    and the closer to certainty on either side, the better the ends are known.
+    """
+    angle, uncertainty = residual_and_uncertainty(graph, body_from_world)
+    return torch.sigmoid((angle - outlier_angle) / (SCORE_SCALE * uncertainty))
+
+
+def residual_and_uncertainty(graph: ViewGraph, body_from_world: Tensor) -> tuple[Tensor, Tensor]:
+    """Residual angle of every edge and, up to a constant, the error of the orientations at its ends; ``(M,)`` rad.
+
+    A node's error falls with the root of its number of edges d: median residual · √(1/d_source + 1/d_target).
+    """
     residual = edge_residual(body_from_world, graph.target_from_source, graph.source, graph.target)
-    return torch.sigmoid((rotations.angle(residual) - outlier_angle) / _RESIDUAL_SCALE)
+    angle = rotations.angle(residual).double()
+    degree = torch.bincount(torch.cat((graph.source, graph.target)), minlength=graph.num_nodes).double()
+    spread = (1 / degree[graph.source] + 1 / degree[graph.target]).sqrt()
+    return angle, (angle.median() * spread).clamp(min=_MIN_UNCERTAINTY)
