@@ -84,8 +84,9 @@ def angle_between(a: Tensor, b: Tensor) -> Tensor:
 
 def rotate(a: Tensor, vector: Tensor) -> Tensor:
     """Vectors ``(..., 3)`` turned by the rotations ``a``."""
-    twice_cross = 2 * torch.linalg.cross(a[..., :3], vector)
-    return vector + a[..., 3:] * twice_cross + torch.linalg.cross(a[..., :3], twice_cross)
+    twice_cross: Tensor = 2 * torch.linalg.cross(a[..., :3], vector)
+    turned: Tensor = vector + a[..., 3:] * twice_cross + torch.linalg.cross(a[..., :3], twice_cross)
+    return turned
 
 
 def to_matrix(a: Tensor) -> Tensor:

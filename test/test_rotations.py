@@ -46,9 +46,7 @@ def test_from_matrix_includes_half_turns() -> None:
 def test_exp_is_scipys_and_log_its_inverse(vectors: np.ndarray) -> None:
     quaternions = rotations.exp(torch.from_numpy(vectors))
     _assert_same(quaternions, Rotation.from_rotvec(vectors), 1e-9)
-    np.testing.assert_allclose(
-        rotations.log(quaternions).numpy(), Rotation.from_rotvec(vectors).as_rotvec(), atol=1e-9
-    )
+    np.testing.assert_allclose(rotations.log(quaternions).numpy(), Rotation.from_rotvec(vectors).as_rotvec(), atol=1e-9)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-300, 1e-12, 1e-6, 1e-4, 1e-3, 1.0, np.pi - 1e-9, np.pi])

@@ -106,7 +106,12 @@ class SlamSimulationConfig:
         if self.num_keyframes < 10:
             raise SlamSimulationError(f"num_keyframes is {self.num_keyframes}; use at least 10")
         for name in (
-            "slip_share", "short_range_share", "backward_share", "false_share", "in_place_share", "closure_common_share"
+            "slip_share",
+            "short_range_share",
+            "backward_share",
+            "false_share",
+            "in_place_share",
+            "closure_common_share",
         ):
             if not 0 <= getattr(self, name) <= 1:
                 raise SlamSimulationError(f"{name} is {getattr(self, name)}; a share lies in [0, 1]")

@@ -100,7 +100,9 @@ class ReleasedRecipe:
         disturbed = rng.choice(m, int(rng.uniform(*self.outlier_share) * m), replace=False)
         wide = np.zeros((m, 3))
         wide[disturbed] = (
-            np.radians(90) / np.sqrt(3) * rng.standard_normal((len(disturbed), 1))
+            np.radians(90)
+            / np.sqrt(3)
+            * rng.standard_normal((len(disturbed), 1))
             * rng.standard_normal((len(disturbed), 3))
         )
         return noise * Rotation.from_rotvec(wide)

@@ -131,9 +131,7 @@ def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
     other = _in_canonical_order(graph, np.flatnonzero(~tree_odometry))
 
     orientation = compose_orientations(forest, graph)
-    residual = edge_residual(
-        orientation, graph.target_from_source[other], graph.source[other], graph.target[other]
-    )
+    residual = edge_residual(orientation, graph.target_from_source[other], graph.source[other], graph.target[other])
     chain = _odometry_chain(forest, hangs_on_odometry)
     path_steps = np.where(
         chain[source[other]] == chain[target[other]],
@@ -196,4 +194,4 @@ def _path_length(forest: SpanningForest, depth: np.ndarray, a: np.ndarray, b: np
         apart = jump[low] != jump[high]
         low, high = np.where(apart, jump[low], low), np.where(apart, jump[high], high)
     ancestor = np.where(low == high, low, forest.parent[low])
-    return depth[a] + depth[b] - 2 * depth[ancestor]
+    return np.asarray(depth[a] + depth[b] - 2 * depth[ancestor])

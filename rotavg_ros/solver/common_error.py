@@ -65,4 +65,4 @@ def common_share(
 def variance_factor(run: np.ndarray, inlier_probability: np.ndarray, share: float) -> np.ndarray:
     """``(C,)`` by how much to inflate each closure's variance so that a run of n weighs what its mean is worth."""
     size = np.bincount(run, inlier_probability)[run]
-    return (1 - share) + share * np.maximum(size, 1.0)
+    return np.asarray((1 - share) + share * np.maximum(size, 1.0))

@@ -82,9 +82,7 @@ def _factorize(matrix: coo_array, dense: bool) -> Callable[[np.ndarray], np.ndar
         # Weights that span all of double precision can leave no positive pivot; the sparse factorisation copes.
         with suppress(np.linalg.LinAlgError):
             return partial(cho_solve, cho_factor(matrix.toarray(), lower=True, overwrite_a=True))
-    factor = splu(
-        matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-    )
+    factor = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     return factor.solve  # type: ignore[no-any-return]
 
 
@@ -113,4 +111,4 @@ def _mix(value: np.ndarray) -> np.ndarray:
     """The finaliser of SplitMix64 (Steele et al. 2014); unsigned arithmetic wraps around."""
     value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return value ^ (value >> np.uint64(31))
+    return np.asarray(value ^ (value >> np.uint64(31)))

@@ -13,6 +13,7 @@ rather than the paper's text; on equal training it lifts CleanNet's accuracy fro
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -110,4 +111,5 @@ class MessagePassingNetwork(nn.Module):
         nodes, activation = self.layers[0](nodes, features, edges)
         for layer in self.layers[1:]:
             nodes, activation = layer(nodes, torch.cat((features, activation), dim=1), edges)
-        return nodes, self.layers[-1].message_output(activation)
+        last = cast(MessagePassingLayer, self.layers[-1])
+        return nodes, last.message_output(activation)

@@ -8,7 +8,7 @@ the number of steps passed while the closures' own noise does not, and later fro
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import expit
@@ -24,8 +24,8 @@ _PRIOR_CLOSURE_SQUARE = np.radians(0.3) ** 2
 _PRIOR_OUTLIER_COUNTS = (1.0, 3.0)
 _EM_STARTS_STEP_DEG = (0.02, 0.1, 0.5, 2.0)
 _EM_STARTS_CLOSURE_DEG = (0.3, 2.0)
-# Rows used to choose among the starts, and to converge.
-_EM_THINNED = (1000, 8000)
+# Rows of either kind used to choose among the starts, and to converge.
+_EM_THINNED = (1000, 5000)
 _EM_ITERATIONS = 60
 _EM_TOLERANCE = 1e-3
 
@@ -54,7 +54,7 @@ class NoiseModel:
             variance: ``(E,)`` rad² per component.
         """
         gaussian = -squared_angle / (2 * variance) - self.components / 2 * np.log(2 * np.pi * variance)
-        return gaussian - log_uniform_density(np.sqrt(squared_angle), self.components)
+        return np.asarray(gaussian - log_uniform_density(np.sqrt(squared_angle), self.components))
 
     @property
     def prior_log_odds(self) -> float:
@@ -68,7 +68,7 @@ def log_uniform_density(angle: np.ndarray, components: int) -> np.ndarray:
         return np.full(len(angle), -np.log(2 * np.pi))
     # Haar measure in rotation-vector coordinates: (1 − cos θ) / (4π² θ²).
     half = np.sinc(np.minimum(angle, np.pi) / (2 * np.pi))
-    return np.log(half * half / (8 * np.pi**2))
+    return np.asarray(np.log(half * half / (8 * np.pi**2)))
 
 
 def outlier_share(inlier_probability: np.ndarray) -> float:
@@ -96,9 +96,16 @@ class Discrepancies:
     kind: np.ndarray
 
     def thinned(self, size: int) -> Discrepancies:
-        """Evenly spread rows, about ``size`` of them."""
-        rows = slice(None, None, max(1, len(self.steps) // size))
-        return Discrepancies(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+        """Evenly spread rows, about ``size`` of each kind, that weigh as much as all of them."""
+        rows, factor = [], []
+        for kind in (0, 1):
+            members = np.flatnonzero(self.kind == kind)
+            stride = max(1, len(members) // size)
+            rows.append(members[::stride])
+            factor.append(np.full(len(rows[-1]), stride))
+        chosen = np.concatenate(rows)
+        thinned = Discrepancies(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+        return replace(thinned, weight=thinned.weight * np.concatenate(factor))
 
 
 def discrepancies(squared_angle: np.ndarray, path_steps: np.ndarray, pairs: AgreementPairs) -> Discrepancies:

@@ -90,4 +90,5 @@ class SlamCleanNet(nn.Module):
     def forward(self, features: ClosureFeatures) -> Tensor:
         """``(C,)``."""
         states, _ = self.network(features.closures, features.pairs, features.edges)
-        return self.outlier_head(torch.cat((states, features.closures), dim=1)).squeeze(1)
+        log_odds: Tensor = self.outlier_head(torch.cat((states, features.closures), dim=1))
+        return log_odds.squeeze(1)

@@ -54,9 +54,7 @@ def shortest_path_forest(graph: ViewGraph, cost: Tensor | None = None, root: str
     if cost is None:
         parent = _breadth_first_parents(adjacency, roots)
     else:
-        _, parent, _ = dijkstra(
-            adjacency, directed=False, indices=roots, return_predecessors=True, min_only=True
-        )
+        _, parent, _ = dijkstra(adjacency, directed=False, indices=roots, return_predecessors=True, min_only=True)
         parent = np.where(parent < 0, np.arange(graph.num_nodes), parent).astype(np.int64)
     return _forest(parent, best, component, graph.num_nodes)
 

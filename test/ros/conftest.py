@@ -178,9 +178,7 @@ class LiveNode:
     def wait_for_silence(self) -> AbsoluteOrientations:
         """Wait for the cold answer after which nothing more comes; returns it."""
         self.status.clear()
-        self.spin_until(
-            lambda: self.status.get("answer cold") == "true" and float(self.status["answer age s"]) > 1
-        )
+        self.spin_until(lambda: self.status.get("answer cold") == "true" and float(self.status["answer age s"]) > 1)
         return self.answers[-1]
 
     def call(self, service: str, service_type: type = Trigger, **request: Any) -> Any:

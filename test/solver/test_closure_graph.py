@@ -55,9 +55,7 @@ def test_path_steps_are_networkxs(num_nodes: int, num_closures: int, seed: int) 
     graph = measured(random_truth(num_nodes, seed), np.r_[source, start], np.r_[target, end], kind=kind)
     contracted = _contract(graph)
     tree = networkx.Graph(list(zip(source.tolist(), target.tolist(), strict=True)))
-    for edge, steps in zip(
-        contracted.view_graph_edge, contracted.path_steps[contracted.num_segments :], strict=True
-    ):
+    for edge, steps in zip(contracted.view_graph_edge, contracted.path_steps[contracted.num_segments :], strict=True):
         expected = networkx.shortest_path_length(tree, int(graph.source[edge]), int(graph.target[edge]))
         assert steps == expected
 
@@ -86,9 +84,7 @@ def test_least_squares_on_the_contraction_is_least_squares_on_the_graph(seed: in
     expected = rotations.multiply(start, rotations.exp(torch.from_numpy(whole.fit(residual))))
 
     weight = 1 / (contracted.steps * np.where(contracted.is_odometry, 2.0, 5.0))
-    small = LaplacianSystem(
-        contracted.num_nodes, contracted.source, contracted.target, weight, contracted.roots
-    )
+    small = LaplacianSystem(contracted.num_nodes, contracted.source, contracted.target, weight, contracted.roots)
     step = small.fit(rotations.log(contracted.residual).numpy())
     actual = contracted.orientations(rotations.exp(torch.from_numpy(step)))
     assert float(rotations.angle_between(actual, expected).max()) < 1e-8

@@ -89,9 +89,7 @@ def test_resumed_run_equals_unbroken_run_bit_for_bit(name: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("interrupted", [".json", ".checkpoint.safetensors", ".safetensors"])
-def test_kill_while_saving_loses_nothing(
-    interrupted: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_kill_while_saving_loses_nothing(interrupted: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     name = "sfm-clean-net"
     make_trainer(name, tmp_path / "unbroken").run()
     trainer = make_trainer(name, tmp_path / "killed")
