@@ -7,6 +7,7 @@ import re
 import shlex
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -90,7 +91,9 @@ def test_the_library_example() -> None:
     section = README.partition("## The library")[2]
     example = re.search(r"(?:^(?:    .*)?\n)+", section[section.index("    from") :], re.MULTILINE)
     assert example is not None
-    names = {"quaternions": [[0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2)] for angle in (0.1, 0.2, 0.3, 0.6)]}
+    names: dict[str, Any] = {
+        "quaternions": [[0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2)] for angle in (0.1, 0.2, 0.3, 0.6)]
+    }
     exec(textwrap.dedent(example[0]), names)  # noqa: S102 - the README is ours
     solution = names["solution"]
     assert solution.body_from_world.shape == (4, 4)
