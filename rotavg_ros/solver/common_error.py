@@ -18,15 +18,30 @@ _RUN_GAP_STEPS = 30
 # Scatter worth this many observations speaks for independent errors.
 _PRIOR_OBSERVATIONS = 5.0
 _MAX_SHARE = 0.9
+# Nor over more odometry steps than this.
+_STRETCH_STEPS = 60
+# No view lasts longer than this many closures, however closely they follow each other.
+_MAX_RUN = 25.0
 
 
-def closure_runs(pairs: AgreementPairs, good: np.ndarray) -> np.ndarray:
-    """Number of the run of each closure, ``(C,)``; only good closures (``(C,)`` bool) link up."""
+def closure_runs(pairs: AgreementPairs, good: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Number of the run of each closure, ``(C,)``.
+
+    Closures link up with near ones; a chain of links is cut where it leaves a stretch of the odometry, since a robot on its
+    second lap sees another view after a while.
+
+    Args:
+        pairs: neighbouring closures.
+        good: ``(C,)`` bool; others are runs of their own.
+        position: ``(C,)`` odometry steps to the closure's older end.
+    """
     linked = (pairs.steps <= _RUN_GAP_STEPS) & good[pairs.first] & good[pairs.second]
     links = coo_array(
         (np.ones(int(linked.sum())), (pairs.first[linked], pairs.second[linked])), shape=(len(good), len(good))
     )
-    return np.asarray(connected_components(links, directed=False)[1])
+    chain = connected_components(links, directed=False)[1]
+    stretch = np.stack((chain, position // _STRETCH_STEPS), axis=1)
+    return np.asarray(np.unique(stretch, axis=0, return_inverse=True)[1]).reshape(-1)
 
 
 def common_share(
@@ -64,5 +79,5 @@ def common_share(
 
 def variance_factor(run: np.ndarray, inlier_probability: np.ndarray, share: float) -> np.ndarray:
     """``(C,)`` by how much to inflate each closure's variance so that a run of n weighs what its mean is worth."""
-    size = np.bincount(run, inlier_probability)[run]
-    return np.asarray((1 - share) + share * np.maximum(size, 1.0))
+    size = np.clip(np.bincount(run, inlier_probability)[run], 1.0, _MAX_RUN)
+    return np.asarray((1 - share) + share * size)

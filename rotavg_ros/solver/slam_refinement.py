@@ -25,6 +25,9 @@ from rotavg_ros.solver.noise_model import NoiseModel, outlier_share
 
 MAX_PASSES = 30
 _NUM_PROBES = 48
+# Residuals say nothing of noise or falsehood while the orientations still turn by more than this.
+_SETTLED_STEP = np.radians(3.0)
+_MAX_SETTLING_PASSES = 5
 _CONVERGED_STEP = np.radians(0.002)
 _CONVERGED_PROBABILITY = 2e-3
 # An edge that alone holds two parts of the graph together has leverage 1; it cannot be judged by the others.
@@ -35,7 +38,7 @@ _PRIOR_CLOSURE_SQUARE = np.radians(0.08) ** 2
 # Errors that closures share look like odometry noise in the fit. How odometry drifts over long ways tells otherwise, so
 # the fit may raise that estimate by this factor at most, and not at all once closures are seen to err together.
 _MAX_STEP_VARIANCE_GAIN = 1.5
-_MIN_COMMON_SHARE = 0.05
+_MIN_COMMON_SHARE = 0.06
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,8 @@ def refine(
     closure = np.flatnonzero(graph.is_closure)
     if len(pairs.first) and state.passes < max_passes:
         good = state.inlier_probability[closure]
-        run = closure_runs(pairs, good > 0.5)
+        older_end = np.minimum(graph.position[graph.source], graph.position[graph.target])[closure]
+        run = closure_runs(pairs, good > 0.5, older_end)
         # Closures run old → new and new → old; their errors compare in one direction only.
         direction = np.where(graph.position[graph.source] < graph.position[graph.target], 1.0, -1.0)[closure, None]
         residual, samples = direction * state.residual[closure], direction * state.difference(state.samples)[closure]
@@ -138,7 +142,7 @@ class _State:
                 return
 
     def _one_pass(self, max_step_variance: float) -> tuple[float, float]:
-        """Solve, judge, re-estimate the noise; returns the largest correction (rad) and change of a probability."""
+        """Solve, re-estimate the noise, judge; returns the largest correction (rad) and change of a probability."""
         graph, noise = self.graph, self.noise
         variance = graph.steps * np.where(graph.is_odometry, noise.step_variance, noise.closure_variance)
         weight = np.maximum(self.inlier_probability, 1e-9) / variance
@@ -148,28 +152,33 @@ class _State:
         self.correction = rotations.multiply(self.correction, rotations.exp(torch.from_numpy(step)))
         self.residual = _residual_vectors(graph, self.correction)
         self.passes += 1
+        moved = float(np.abs(step).max(initial=0.0))
+        if moved > _SETTLED_STEP and self.passes <= _MAX_SETTLING_PASSES:
+            return moved, 1.0
 
         square = (self.residual**2).sum(axis=1)
         resistance = (self.difference(self.samples) ** 2).mean(axis=1)
         leverage = np.clip(weight * resistance, 0.0, _MAX_LEVERAGE)
-        predicted_square = np.minimum(square / (1 - leverage) ** 2, np.pi**2)
-        predicted_variance = variance + resistance / (1 - leverage)
-        judged = noise.inlier_log_odds(predicted_square, predicted_variance) + noise.prior_log_odds
-        probability = np.where(graph.is_closure, expit(judged + self.prior_log_odds), 1.0)
-        changed = float(np.abs(probability - self.inlier_probability).max(initial=0.0))
-        self.inlier_probability = probability
-
         odometry, closure = graph.is_odometry, graph.is_closure
-        redundancy = probability * (1 - leverage)
+        redundancy = self.inlier_probability * (1 - leverage)
         # A run's inflated variance is what its closures weigh, not what each of them errs.
         square_per_step = square[odometry] / graph.steps[odometry]
         self.noise = NoiseModel(
             noise.components,
             min(max_step_variance, _step_variance(square_per_step, redundancy[odometry], noise)),
-            _closure_variance(square[closure], probability[closure], redundancy[closure], noise),
-            outlier_share(probability[closure]),
+            _closure_variance(square[closure], self.inlier_probability[closure], redundancy[closure], noise),
+            outlier_share(self.inlier_probability[closure]),
         )
-        return float(np.abs(step).max(initial=0.0)), changed
+
+        # What is left of the fit without the edge itself, and how far that may be off.
+        predicted_square = np.minimum(square / (1 - leverage) ** 2, np.pi**2)
+        scale = np.where(odometry, 1.0, self.noise.closure_variance / noise.closure_variance)
+        predicted_variance = scale * variance + resistance / (1 - leverage)
+        judged = self.noise.inlier_log_odds(predicted_square, predicted_variance) + self.noise.prior_log_odds
+        probability = np.where(closure, expit(judged + self.prior_log_odds), 1.0)
+        changed = float(np.abs(probability - self.inlier_probability).max(initial=0.0))
+        self.inlier_probability = probability
+        return moved, changed
 
 
 def _residual_vectors(graph: ClosureGraph, correction: Tensor) -> np.ndarray:
