@@ -1,0 +1,131 @@
+"""Options of ``rotavg evaluate slam``, and what runs it."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from rotavg_ros.cli.progress import progress
+from rotavg_ros.datasets.graph_file import read_graph
+from rotavg_ros.evaluation import slam_cases, slam_contenders, slam_incremental, slam_report, slam_uncertainty
+from rotavg_ros.evaluation.slam_scoring import REFERENCE, Step, score_all
+
+_INCREMENTAL = ("B25b_0.000",)
+_UNCERTAINTY_GRAPHS = ("CSAIL", "intel", "manhattan", "sphere2500")
+_UNCERTAINTY_DRAWS = 20
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What to solve, and by whom."""
+    parser.add_argument(
+        "--graphs",
+        nargs="+",
+        choices=slam_cases.GRAPHS,
+        default=slam_cases.GRAPHS,
+        metavar="NAME",
+        help=f"of {', '.join(slam_cases.GRAPHS)} (default: all)",
+    )
+    parser.add_argument("--seeds", nargs="+", type=_seed, default=[0, 1, 2], metavar="S", help="default: 0 1 2")
+    parser.add_argument(
+        "--shares",
+        nargs="+",
+        type=_share,
+        default=slam_cases.SHARES,
+        metavar="P",
+        help="shares of false closures, 0 to 1 (default: 0 0.1 0.3 0.5 0.8)",
+    )
+    parser.add_argument(
+        "--hard",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="false closures in groups and slipping odometry, too",
+    )
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        metavar="NAME",
+        help=f"methods of `rotavg solve`, {', '.join(slam_contenders.PEERS)}, odometry, least-squares (default: all)",
+    )
+    parser.add_argument(
+        "--peers",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="run GTSAM's and COLMAP's methods, which take seconds per graph",
+    )
+    parser.add_argument(
+        "--incremental",
+        nargs="*",
+        choices=slam_cases.GRAPHS,
+        default=_INCREMENTAL,
+        metavar="NAME",
+        help=f"graphs to be played edge by edge, 30 %% false closures where made (default: {' '.join(_INCREMENTAL)})",
+    )
+    parser.add_argument(
+        "--uncertainty",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="compare the stated uncertainty with errors under known noise",
+    )
+    parser.add_argument("--data", type=Path, metavar="DIR", help="folder of the data sets (default: $ROTAVG_DATA)")
+
+
+def run(arguments: argparse.Namespace) -> Path:
+    """Run the suite and write the report; returns the Markdown file."""
+    data = arguments.data or (Path(os.environ["ROTAVG_DATA"]) if "ROTAVG_DATA" in os.environ else None)
+    if data is None:
+        raise slam_cases.SlamSuiteError(
+            "the pose graphs are not part of the package; name the folder of the data sets with --data or $ROTAVG_DATA"
+        )
+    chosen = slam_contenders.contenders(_methods(arguments))
+    slam_contenders.warm_up(tuple(chosen.values()))
+
+    def watch(steps: Iterable[Step]) -> Iterable[Step]:
+        return progress(steps, description="solving", unit="solve")
+
+    cases = slam_cases.cases(data, arguments.graphs, arguments.shares, arguments.seeds, arguments.hard)
+    scores = score_all(cases, chosen, watch)
+    played = slam_cases.cases(data, arguments.incremental, [0.3], arguments.seeds[:1], hard=False)
+    runs = [slam_incremental.play(case, watch=_watch_ticks(case.name)) for case in played]
+    checks: list[slam_uncertainty.UncertaintyCheck] = []
+    if arguments.uncertainty:
+        for name in progress(_UNCERTAINTY_GRAPHS, description="uncertainty", total=len(_UNCERTAINTY_GRAPHS)):
+            graph_file = read_graph(data / "slam" / f"{name}.g2o")
+            checks += slam_uncertainty.check(name, graph_file, _UNCERTAINTY_DRAWS, arguments.seeds[0])
+    return slam_report.report(arguments.output, scores, runs, checks, _command(arguments))
+
+
+def _methods(arguments: argparse.Namespace) -> list[str]:
+    """Those asked for, or all that can run here; always with ours and the oracle, which ratios need."""
+    names = arguments.methods or [name for name in slam_contenders.ROWS if slam_contenders.is_available(name)]
+    if not arguments.peers:
+        names = [name for name in names if name not in slam_contenders.PEERS]
+    return list(dict.fromkeys((slam_contenders.OURS, *names, REFERENCE)))
+
+
+def _watch_ticks(description: str) -> Callable[[Iterable[int]], Iterable[int]]:
+    return lambda ticks: progress(ticks, description=description, unit="tick")
+
+
+def _command(arguments: argparse.Namespace) -> str:
+    words = ["rotavg evaluate slam --seeds", *map(str, arguments.seeds)]
+    if tuple(arguments.graphs) != slam_cases.GRAPHS:
+        words += ["--graphs", *arguments.graphs]
+    if tuple(arguments.shares) != slam_cases.SHARES:
+        words += ["--shares", *map(str, arguments.shares)]
+    return " ".join(words)
+
+
+def _share(text: str) -> float:
+    share = float(text)
+    if not 0 <= share <= 1:
+        raise argparse.ArgumentTypeError("must lie between 0 and 1")
+    return share
+
+
+def _seed(text: str) -> int:
+    seed = int(text)
+    if seed < 0:
+        raise argparse.ArgumentTypeError("must be 0 or more")
+    return seed

@@ -1,0 +1,151 @@
+"""Who is compared on pose graphs: the solver's methods, odometry alone, least squares, the peers and the oracle."""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros.baselines.start import spanning_forest
+from rotavg_ros.evaluation import peers
+from rotavg_ros.evaluation.contenders import ContenderError
+from rotavg_ros.evaluation.least_squares import least_squares
+from rotavg_ros.evaluation.metrics import true_edge_noise
+from rotavg_ros.evaluation.slam_cases import SlamCase
+from rotavg_ros.solver import METHODS, solve
+from rotavg_ros.solver.spanning_tree import compose_orientations
+from rotavg_ros.view_graph import ViewGraph
+
+OURS = "neurora"
+_OUTLIER_ANGLE = np.radians(10.0)
+
+
+@dataclass(frozen=True)
+class SlamAnswer:
+    """What a contender made of a case (N nodes, M edges).
+
+    Attributes:
+        body_from_world: ``(N, 4)``; every component in a gauge of its own.
+        is_outlier: ``(M,)`` bool, its verdicts; where it gives none, whether the residual exceeds 10°.
+        seconds: wall-clock time from graph to answer.
+    """
+
+    body_from_world: Tensor
+    is_outlier: np.ndarray
+    seconds: float
+
+
+SlamContender = Callable[[SlamCase], "SlamAnswer | None"]
+
+
+def _odometry(case: SlamCase) -> Tensor:
+    return compose_orientations(spanning_forest(case.graph), case.graph)
+
+
+def _least_squares(case: SlamCase) -> Tensor:
+    return least_squares(case.graph, np.ones(case.graph.num_edges, dtype=bool))
+
+
+def _oracle(case: SlamCase) -> Tensor:
+    return least_squares(case.graph, case.is_inlier)
+
+
+_PEERS: dict[str, Callable[[ViewGraph], peers.PeerAnswer]] = {
+    "gnc": peers.gnc,
+    "isam2": peers.isam2_huber,
+    "colmap": peers.colmap,
+}
+_REFERENCES: dict[str, Callable[[SlamCase], Tensor]] = {
+    "odometry": _odometry,
+    "least-squares": _least_squares,
+    "oracle": _oracle,
+}
+_PACKAGES = {"gnc": "gtsam", "isam2": "gtsam", "colmap": "pycolmap"}
+ROWS: dict[str, str] = {
+    OURS: "**ours** (NeuRoRA for SLAM)",
+    "neurora-without-cleannet": "· without CleanNet",
+    "cleannet-spt": "· without refinement",
+    "spt": "· tree alone",
+    "gnc": "GNC (GTSAM), told that odometry is right",
+    "isam2": "iSAM2 with Huber's loss (GTSAM), incremental",
+    "colmap": "COLMAP's rotation averaging",
+    "chatterjee": "Chatterjee & Govindu (ℓ1 → ℓ½) from odometry",
+    "least-squares": "least squares on all edges",
+    "odometry": "odometry alone",
+    "oracle": "oracle: least squares on the true inliers",
+}
+PEERS = tuple(_PEERS)
+
+
+def is_available(name: str) -> bool:
+    """Whether what a contender needs is installed."""
+    return name not in _PACKAGES or importlib.util.find_spec(_PACKAGES[name]) is not None
+
+
+def contenders(names: Sequence[str]) -> dict[str, SlamContender]:
+    """Contenders by name: a method of the solver, a peer, "odometry", "least-squares" or "oracle".
+
+    A contender returns None for a graph on which it gives up.
+
+    Raises:
+        ContenderError: an unknown name, or a peer that is not installed.
+    """
+    return {name: _contender(name) for name in names}
+
+
+def _contender(name: str) -> SlamContender:
+    if name in _PEERS:
+        if not is_available(name):
+            package = _PACKAGES[name]
+            raise ContenderError(f"method {name!r} needs {package}, which is not installed; run: pip install {package}")
+        return lambda case: _run_peer(_PEERS[name], case)
+    if name in _REFERENCES:
+        return lambda case: _run_reference(_REFERENCES[name], case)
+    if name not in METHODS:
+        choices = ", ".join((*METHODS, *_PEERS, *_REFERENCES))
+        raise ContenderError(f"unknown method {name!r}; choose from {choices}")
+    return lambda case: _run_method(name, case)
+
+
+def _run_method(name: str, case: SlamCase) -> SlamAnswer:
+    start = time.perf_counter()
+    solution = solve(case.graph, method=name, profile="slam")
+    seconds = time.perf_counter() - start
+    return SlamAnswer(solution.body_from_world, (solution.outlier_score > 0.5).numpy(), seconds)
+
+
+def _run_peer(run: Callable[[ViewGraph], peers.PeerAnswer], case: SlamCase) -> SlamAnswer | None:
+    try:
+        answer = run(case.graph)
+    except (peers.PeerError, RuntimeError):  # GTSAM's word for a linear system without a solution
+        return None
+    given = answer.is_outlier
+    verdicts = _large_residual(case, answer.body_from_world) if given is None else given.numpy()
+    return SlamAnswer(answer.body_from_world, verdicts, answer.seconds)
+
+
+def _run_reference(run: Callable[[SlamCase], Tensor], case: SlamCase) -> SlamAnswer:
+    start = time.perf_counter()
+    orientations = run(case)
+    seconds = time.perf_counter() - start
+    return SlamAnswer(orientations, _large_residual(case, orientations), seconds)
+
+
+def _large_residual(case: SlamCase, body_from_world: Tensor) -> np.ndarray:
+    graph = case.graph
+    residual = true_edge_noise(graph.target_from_source, graph.source, graph.target, body_from_world)
+    return np.asarray(residual.numpy() > _OUTLIER_ANGLE)
+
+
+def warm_up(chosen: Sequence[SlamContender]) -> None:
+    """Let every contender pay its one-time costs (imports, weights, first kernels) on a short chain."""
+    identity = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64).expand(4, 4)
+    graph = ViewGraph.create([0, 1, 2, 0], [1, 2, 3, 3], identity, kind=[0, 0, 0, 1])
+    case = SlamCase("warm-up", "clean", 0, graph, identity, 0.1, np.ones(4, dtype=bool), np.zeros(4))
+    for contender in chosen:
+        contender(case)
