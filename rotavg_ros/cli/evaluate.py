@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Sequence
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 
-from rotavg_ros.cli.progress import progress
-from rotavg_ros.evaluation import synthetic
+from rotavg_ros.cli import evaluate_slam
+from rotavg_ros.cli.progress import progress, working
+from rotavg_ros.errors import UserError
+from rotavg_ros.evaluation import real, rgbd, robustness, synthetic
 from rotavg_ros.evaluation.contenders import Case, Contender, contenders, is_available, warm_up
 from rotavg_ros.evaluation.scoring import Scores, Step, score_all
-from rotavg_ros.evaluation.tables import make_folder
+from rotavg_ros.evaluation.small_training import train_networks
+from rotavg_ros.evaluation.tables import Table, make_folder, write_report
+
+
+class EvaluateError(UserError):
+    """Options or data that an evaluation cannot work with."""
 
 
 class _Suite(NamedTuple):
@@ -68,6 +77,126 @@ def _run_synthetic(arguments: argparse.Namespace) -> Path:
     return synthetic.report(arguments.output, scores, tuple(chosen), arguments.graphs, arguments.seed)
 
 
+def _add_robustness(parser: argparse.ArgumentParser) -> None:
+    _add_drawing(parser, 10)
+    _add_methods(parser, " ".join(_ROBUSTNESS_METHODS))
+    parser.add_argument(
+        "--settings",
+        nargs="+",
+        choices=tuple(robustness.SETTINGS),
+        metavar="NAME",
+        default=list(robustness.SETTINGS),
+        help=f"rows of the table (default: {' '.join(robustness.SETTINGS)})",
+    )
+    _add_minutes(parser)
+
+
+def _run_robustness(arguments: argparse.Namespace) -> Path:
+    names = tuple(arguments.methods or _ROBUSTNESS_METHODS)
+    contenders(names)  # mistakes show before any training
+    scores = {}
+    with tempfile.TemporaryDirectory() as folder:
+        trained = {robustness.SETTINGS[setting].training for setting in arguments.settings} - {robustness.PACKAGE}
+        for training in sorted(trained):
+            graphs = robustness.training_graphs(training, arguments.seed)
+            train_networks(Path(folder) / training, graphs, 60 * arguments.minutes)
+        for setting in arguments.settings:
+            training = robustness.SETTINGS[setting].training
+            weights = None if training == robustness.PACKAGE else Path(folder) / training
+            chosen = _contenders(names, (), weights)
+            count = robustness.num_graphs(setting, arguments.graphs)
+            scores[setting] = _score(robustness.cases(setting, count, arguments.seed), chosen, count, setting)
+    command = f"rotavg evaluate robustness --graphs {arguments.graphs} --seed {arguments.seed}"
+    return robustness.report(arguments.output, scores, names, f"{command} --minutes {arguments.minutes:g}")
+
+
+def _add_real(parser: argparse.ArgumentParser) -> None:
+    _add_data(parser)
+    _add_methods(parser, " ".join(real.METHODS))
+    parser.add_argument(
+        "--seed", type=_seed, default=0, metavar="S", help="of the noise on real topologies (default: 0)"
+    )
+
+
+def _run_real(arguments: argparse.Namespace) -> Path:
+    data = _data(arguments, (real.LUND, real.MADRID, real.TOPOLOGIES))
+    chosen = _contenders(arguments.methods, real.METHODS)
+    lund, madrid = real.lund_case(data), real.madrid_case(data)
+    topologies = list(real.topology_cases(data, arguments.seed))
+    on_lund = _score([lund], chosen, 1, lund.name)
+    fast = {name: contender for name, contender in chosen.items() if name not in real.SLOW_ON_TOPOLOGIES}
+    on_topologies = _score(topologies, fast, len(topologies), "real topologies")
+    with working(madrid.name):
+        found = real.agreement(madrid, chosen)
+    names = tuple(chosen)
+    tables: Mapping[str, Table] = {
+        "real-lund": real.errors_table(lund.name, on_lund, names, "70 cameras, 1207 edges; ground truth."),
+        "real-topologies": real.errors_table(
+            "1DSfM topologies",
+            on_topologies,
+            names,
+            f"{len(topologies)} real topologies, noise of the released recipe; without what takes minutes a graph.",
+        ),
+        "real-madrid-residuals": real.residual_table(madrid.name, found),
+        "real-madrid-agreement": real.agreement_table(f"{madrid.name}: who agrees with whom", found),
+    }
+    introduction = f"`rotavg evaluate real --seed {arguments.seed}`"
+    return write_report(arguments.output, "real", "Real view-graphs", introduction, tables, {})
+
+
+def _add_rgbd(parser: argparse.ArgumentParser) -> None:
+    _add_data(parser)
+    parser.add_argument("--sets", nargs="+", choices=rgbd.SETS, default=list(rgbd.SETS), help="default: all")
+    parser.add_argument("--folds", type=_count, default=4, metavar="K", help="of the cross-validation (default: 4)")
+    parser.add_argument("--scenes", type=_count, metavar="N", help="of each set, at most (default: all)")
+    _add_minutes(parser)
+
+
+def _run_rgbd(arguments: argparse.Namespace) -> Path:
+    data = _data(arguments, [f"rgbd/{name}" for name in arguments.sets])
+    if arguments.folds < 2:
+        raise EvaluateError("--folds must be 2 or more: what is tested must not be trained on")
+    split = {name: list(rgbd.folds(data / "rgbd" / name, arguments.folds, arguments.scenes)) for name in arguments.sets}
+    tables = {}
+    for name, folds in split.items():
+        scores = Scores()
+        for fold in progress(folds, description=name, unit="fold"):
+            with tempfile.TemporaryDirectory() as folder:
+                train_networks(Path(folder), fold.training, 60 * arguments.minutes)
+                trained = contenders(rgbd.TRAINED, Path(folder))
+                scores.extend(score_all(fold.test, {**contenders(rgbd.UNTRAINED), **trained}))
+        tables[f"rgbd-{name}"] = rgbd.table(name, scores, arguments.minutes)
+    command = f"rotavg evaluate rgbd --folds {arguments.folds} --minutes {arguments.minutes:g}"
+    introduction = (
+        f"`{command}`: scans registered pairwise, most of the registrations wrong; degrees per scene, averaged."
+    )
+    return write_report(arguments.output, "rgbd", "RGB-D scans", introduction, tables, {})
+
+
+def _add_data(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--data", type=Path, metavar="DIR", help="folder of the data sets (default: $ROTAVG_DATA)")
+
+
+def _data(arguments: argparse.Namespace, needed: Sequence[str]) -> Path:
+    folder = arguments.data or (Path(os.environ["ROTAVG_DATA"]) if "ROTAVG_DATA" in os.environ else None)
+    if folder is None:
+        raise EvaluateError("real data is not part of the package; name its folder with --data or $ROTAVG_DATA")
+    missing = [name for name in needed if not (folder / name).exists()]
+    if missing:
+        raise EvaluateError(f"{folder}: lacks {', '.join(missing)}; see the documentation of the data sets")
+    return Path(folder)
+
+
+def _add_minutes(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--minutes",
+        type=_positive,
+        default=10.0,
+        metavar="M",
+        help="training time of each pair of networks (default: 10)",
+    )
+
+
 def _add_drawing(parser: argparse.ArgumentParser, graphs: int) -> None:
     parser.add_argument("--graphs", type=_count, default=graphs, metavar="N", help=f"default: {graphs}")
     parser.add_argument("--seed", type=_seed, default=0, metavar="S", help="same seed, same graphs (default: 0)")
@@ -82,9 +211,11 @@ def _add_methods(parser: argparse.ArgumentParser, default: str) -> None:
     )
 
 
-def _contenders(names: Sequence[str] | None, default: Iterable[str]) -> dict[str, Contender]:
+def _contenders(
+    names: Sequence[str] | None, default: Iterable[str], weights: Path | None = None
+) -> dict[str, Contender]:
     """Those asked for, or what can run here of the default."""
-    chosen = contenders(names if names is not None else [name for name in default if is_available(name)])
+    chosen = contenders(names if names is not None else [name for name in default if is_available(name)], weights)
     warm_up(tuple(chosen.values()))
     return chosen
 
@@ -103,6 +234,13 @@ def _count(text: str) -> int:
     return number
 
 
+def _positive(text: str) -> float:
+    number = float(text)
+    if not 0 < number < float("inf"):
+        raise argparse.ArgumentTypeError("must be positive")
+    return number
+
+
 def _seed(text: str) -> int:
     seed = int(text)
     if seed < 0:
@@ -110,6 +248,13 @@ def _seed(text: str) -> int:
     return seed
 
 
+_ROBUSTNESS_METHODS = ("chatterjee", "neurora-paper", "neurora")
 _SUITES = (
     _Suite("synthetic", "the paper's synthetic table, and how well outliers are told", _add_synthetic, _run_synthetic),
+    _Suite("robustness", "trained on one kind of graph, tested on another", _add_robustness, _run_robustness),
+    _Suite("real", "Lund with ground truth, Madrid without, real topologies", _add_real, _run_real),
+    _Suite("rgbd", "RGB-D scans, networks cross-validated over the scenes", _add_rgbd, _run_rgbd),
+    _Suite(
+        "slam", "pose graphs with false closures, in one go and edge by edge", evaluate_slam.add_arguments, evaluate_slam.run
+    ),
 )

@@ -30,6 +30,7 @@ COMMANDS = (
     Command("play", "rotavg_ros.cli.play", "publish a bag's messages live"),
     Command("train", "rotavg_ros.cli.train", "train the networks"),
     Command("evaluate", "rotavg_ros.cli.evaluate", "compare the methods in tables and pictures"),
+    Command("plot", "rotavg_ros.cli.plot", "draw the statistics of a view-graph's noise"),
 )
 
 

@@ -19,6 +19,8 @@ from rotavg_ros.view_graph import ViewGraph
 
 # The paper calls an edge an outlier beyond this noise.
 SFM_OUTLIER_ANGLE = np.radians(20.0)
+# Beyond this many cameras a list of all pairs takes gigabytes.
+_MAX_NODES_TO_LIST_PAIRS = 4000
 
 
 @dataclass(frozen=True)
@@ -128,14 +130,10 @@ class PaperRecipe:
         """Draw one graph; pairs that leave cameras unconnected are joined by a random chain."""
         n = int(rng.integers(self.cameras[0], self.cameras[1] + 1))
         orientation = self.orientations(n, rng)
-        first, second = np.triu_indices(n, k=1)
-        kept = rng.random(len(first)) < rng.uniform(*self.pair_share)
-        source, target = first[kept], second[kept]
+        source, target = _random_pairs(n, self.pair_share, rng)
         chain = rng.permutation(n)
-        present = np.zeros((n, n), dtype=bool)
-        present[source, target] = True
         low, high = np.minimum(chain[:-1], chain[1:]), np.maximum(chain[:-1], chain[1:])
-        missing = ~present[low, high]
+        missing = ~np.isin(low * n + high, source * n + target)
         source, target = np.concatenate((source, low[missing])), np.concatenate((target, high[missing]))
         return measured(orientation, source, target, self.noise(len(source), rng))
 
@@ -160,6 +158,23 @@ def measured(orientation: Rotation, source: np.ndarray, target: np.ndarray, nois
     relative = orientation[target] * orientation[source].inv() * noise
     graph = ViewGraph.create(source, target, relative.as_quat(), num_nodes=len(orientation))
     return SyntheticGraph(graph, torch.from_numpy(orientation.as_quat()), torch.from_numpy(noise.magnitude()))
+
+
+def _random_pairs(n: int, share: tuple[float, float], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Each of the pairs i < j with the same probability, itself drawn uniformly from ``share``; in row-major order."""
+    if n <= _MAX_NODES_TO_LIST_PAIRS:
+        first, second = np.triu_indices(n, k=1)
+        kept = rng.random(len(first)) < rng.uniform(*share)
+        return first[kept], second[kept]
+    # Too many pairs to toss a coin for each: the gaps between the kept ones are geometric.
+    probability, total = rng.uniform(*share), n * (n - 1) // 2
+    expected = total * probability
+    gaps = rng.geometric(probability, int(expected + 10 * np.sqrt(expected) + 10))
+    position = np.cumsum(gaps) - 1
+    position = position[position < total]
+    row_start = np.concatenate(([0], np.cumsum(np.arange(n - 1, 0, -1))))
+    row = np.searchsorted(row_start, position, side="right") - 1
+    return row, position - row_start[row] + row + 1
 
 
 def _axes(count: int, in_vertical_plane: bool, rng: np.random.Generator) -> np.ndarray:

@@ -27,6 +27,12 @@ class CalibrationBins:
         self._score_sum += np.bincount(bin_of, scores, bins)
         self._happened += np.bincount(bin_of, truth, bins)
 
+    def extend(self, other: CalibrationBins) -> None:
+        """Take in what another has counted in bins of the same number."""
+        self._count += other._count
+        self._score_sum += other._score_sum
+        self._happened += other._happened
+
     @property
     def rows(self) -> np.ndarray:
         """Rows ``(count, mean probability, observed share)`` of the bins that are not empty."""

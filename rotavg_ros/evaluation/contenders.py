@@ -6,6 +6,8 @@ import importlib.util
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -69,15 +71,18 @@ class Answer:
 Contender = Callable[[Case], "Answer | None"]
 
 
-def contenders(names: Sequence[str]) -> dict[str, Contender]:
+def contenders(names: Sequence[str], weights: Path | None = None) -> dict[str, Contender]:
     """Contenders by name: a method of the solver, several joined by "+", "colmap", "shonan" or "oracle".
 
     A contender returns None for a case that is too large for it or on which it gives up.
 
+    Args:
+        weights: folder of networks to use in place of the package's.
+
     Raises:
         ContenderError: an unknown name, or a peer that is not installed.
     """
-    return {name: _contender(name) for name in names}
+    return {name: _contender(name, weights) for name in names}
 
 
 def is_available(name: str) -> bool:
@@ -85,7 +90,7 @@ def is_available(name: str) -> bool:
     return name not in _PEER_PACKAGES or importlib.util.find_spec(_PEER_PACKAGES[name]) is not None
 
 
-def _contender(name: str) -> Contender:
+def _contender(name: str, weights: Path | None) -> Contender:
     if not is_available(name):
         package = _PEER_PACKAGES[name]
         raise ContenderError(f"method {name!r} needs {package}, which is not installed; run: pip install {package}")
@@ -99,12 +104,12 @@ def _contender(name: str) -> Contender:
     if unknown:
         choices = ", ".join((*METHODS, *EXTRA_CONTENDERS))
         raise ContenderError(f"unknown method {unknown[0]!r}; choose from {choices}, or combine: A+B")
-    return lambda case: _solve(name, case)
+    return partial(_solve, name, weights)
 
 
-def _solve(name: str, case: Case) -> Answer:
+def _solve(name: str, weights: Path | None, case: Case) -> Answer:
     start = time.perf_counter()
-    solution = solve(case.graph, method=name, profile="sfm")
+    solution = solve(case.graph, method=name, profile="sfm", weights=weights)
     return Answer(solution.body_from_world, solution.outlier_score, time.perf_counter() - start)
 
 

@@ -43,6 +43,12 @@ class Scores:
     rows: list[Score] = field(default_factory=list)
     calibration: dict[str, CalibrationBins] = field(default_factory=dict)
 
+    def extend(self, other: Scores) -> None:
+        """Take in the scores of further cases."""
+        self.rows += other.rows
+        for name, bins in other.calibration.items():
+            self.calibration.setdefault(name, CalibrationBins()).extend(bins)
+
     def of(self, contender: str) -> dict[str, Score]:
         """A contender's scores by case."""
         return {row.case: row for row in self.rows if row.contender == contender}

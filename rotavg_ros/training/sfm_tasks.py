@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,17 +23,29 @@ from rotavg_ros.training.sfm_data import SfmBatch, join, sample_graph
 from rotavg_ros.view_graph import ViewGraph
 
 
-class _SfmTask:
-    """Training and validation graphs, drawn once from the configuration's seed."""
+class GivenGraphs(NamedTuple):
+    """Graphs to train on in place of drawn ones."""
 
-    def __init__(self, config: TrainingConfig) -> None:
+    training: Sequence[SyntheticGraph]
+    validation: Sequence[SyntheticGraph]
+
+
+def _draw(config: TrainingConfig) -> GivenGraphs:
+    rng = np.random.default_rng((config.seed, 1))
+    training = [sample_graph(config.recipe, config.nodes, rng) for _ in range(config.graphs)]
+    rng = np.random.default_rng((config.seed, 2))
+    validation = [
+        sample_graph(config.recipe, config.validation_nodes, rng) for _ in range(config.validation_graphs)
+    ]
+    return GivenGraphs(training, validation)
+
+
+class _SfmTask:
+    """Training and validation graphs: drawn once from the configuration's seed, or given."""
+
+    def __init__(self, config: TrainingConfig, given: GivenGraphs | None) -> None:
         self.config = config
-        rng = np.random.default_rng((config.seed, 1))
-        self.graphs = [sample_graph(config.recipe, config.nodes, rng) for _ in range(config.graphs)]
-        rng = np.random.default_rng((config.seed, 2))
-        self.validation: list[SyntheticGraph] = [
-            sample_graph(config.recipe, config.validation_nodes, rng) for _ in range(config.validation_graphs)
-        ]
+        self.graphs, self.validation = given if given is not None else _draw(config)
 
     def num_batches(self) -> int:
         return -(-len(self.graphs) // self.config.batch_graphs)
@@ -47,8 +60,8 @@ class _SfmTask:
 class SfmCleanTask(_SfmTask):
     """CleanNet: rectify and score (loss: rotation + 10 · outlier)."""
 
-    def __init__(self, config: TrainingConfig, device: torch.device) -> None:
-        super().__init__(config)
+    def __init__(self, config: TrainingConfig, device: torch.device, given: GivenGraphs | None = None) -> None:
+        super().__init__(config, given)
         self.device = device
         torch.manual_seed(config.seed)
         self.network = CleanNet().to(device)
@@ -83,8 +96,10 @@ class SfmCleanTask(_SfmTask):
 class SfmFineTask(_SfmTask):
     """FineNet: starts from a trained CleanNet's tree (loss: edge + 0.1 · node)."""
 
-    def __init__(self, config: TrainingConfig, device: torch.device, clean_net: CleanNet) -> None:
-        super().__init__(config)
+    def __init__(
+        self, config: TrainingConfig, device: torch.device, clean_net: CleanNet, given: GivenGraphs | None = None
+    ) -> None:
+        super().__init__(config, given)
         self.device = device
         torch.manual_seed(config.seed)
         self.network = FineNet().to(device)

@@ -1,0 +1,60 @@
+"""Draw pictures (PNG) of a view-graph.
+
+statistics: histograms of the angles and axes of the edges' noise against the truth; where the truth is unknown, of
+their residuals against the solution.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from rotavg_ros.cli.progress import working
+from rotavg_ros.datasets.graph_file import read_graph
+from rotavg_ros.datasets.ground_truth import attach_truth
+from rotavg_ros.errors import UserError
+from rotavg_ros.evaluation.noise_plot import draw, edge_noise
+
+
+class PlotError(UserError):
+    """A picture that cannot be drawn or written."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``rotavg plot``."""
+    kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True)
+    statistics = kinds.add_parser("statistics", help="histograms of the noise's angles and axes")
+    statistics.add_argument("graph", type=Path, metavar="GRAPH", help="view-graph file")
+    statistics.add_argument("--truth", type=Path, metavar="FILE", help="ground truth, for graphs without their own")
+    statistics.add_argument("--output", type=Path, metavar="PNG", help="default: <graph>-statistics.png, here")
+    statistics.add_argument(
+        "--outlier-angle", type=float, metavar="DEG", help="default: 20, or 10 if the graph has odometry"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Draw."""
+    with working(f"reading {arguments.graph}"):
+        graph_file = read_graph(arguments.graph)
+        if arguments.truth is not None:
+            graph_file = attach_truth(graph_file, arguments.truth)
+    graph, truth = graph_file.graph, graph_file.body_from_world_gt
+    if graph.num_edges == 0:
+        raise PlotError(f"{arguments.graph}: has no edges, so there is nothing to draw")
+    outlier_angle_deg = arguments.outlier_angle
+    if outlier_angle_deg is None:
+        outlier_angle_deg = 10.0 if bool(graph.is_odometry.any()) else 20.0
+    knows_truth = truth is not None and bool(np.isfinite(truth).all(axis=1).any())
+    output = arguments.output or Path(f"{arguments.graph.stem}-statistics.png")
+    with working("solving and drawing"):
+        noise = edge_noise(graph, torch.from_numpy(truth) if truth is not None and knows_truth else None)
+        try:
+            draw(output, noise, arguments.graph.name, outlier_angle_deg)
+        except (OSError, ValueError) as error:  # matplotlib: an unknown suffix is a ValueError
+            reason = error.strerror if isinstance(error, OSError) else str(error)
+            raise PlotError(f"{output}: cannot be written ({reason})") from None
+    print(output)
+    return 0

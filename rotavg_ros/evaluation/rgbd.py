@@ -1,0 +1,88 @@
+"""RGB-D scans: every scene is solved by networks that were trained on other scenes of its kind (cross-validation)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from rotavg_ros.datasets.rgbd import read_scene
+from rotavg_ros.datasets.synthetic import SyntheticGraph
+from rotavg_ros.errors import UserError
+from rotavg_ros.evaluation.contenders import Case
+from rotavg_ros.evaluation.scoring import Scores
+from rotavg_ros.evaluation.tables import Cell, Column, Table
+from rotavg_ros.training.sfm_tasks import GivenGraphs
+
+SETS = ("scannet_fgr", "scannet_super4pcs", "redwood_fgr", "redwood_super4pcs")
+# Methods without networks, and those that are trained in every fold.
+UNTRAINED = ("chatterjee", "weiszfeld")
+TRAINED = ("cleannet-spt", "neurora-paper", "neurora")
+# Of a fold's training scenes, every so many-th decides which weights are kept.
+_VALIDATION_STRIDE = 6
+
+
+class RgbdEvaluationError(UserError):
+    """Scenes that cannot be cross-validated."""
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Scenes to test on and what the networks for them learn on."""
+
+    test: tuple[Case, ...]
+    training: GivenGraphs
+
+
+def folds(folder: Path, count: int, max_scenes: int | None) -> Iterator[Fold]:
+    """Split the scenes of a folder into ``count`` parts, each of which is tested once.
+
+    Raises:
+        RgbdEvaluationError: fewer scenes than two per fold.
+    """
+    cases = [_read(path) for path in sorted(folder.glob("*.npz"))[:max_scenes]]
+    if len(cases) < 2 * count:
+        raise RgbdEvaluationError(f"{folder}: {len(cases)} scenes are too few for {count} folds; need two per fold")
+    order = np.random.default_rng(0).permutation(len(cases))
+    for part in np.array_split(order, count):
+        others = [_training_graph(cases[index]) for index in order if index not in part]
+        validation = others[::_VALIDATION_STRIDE]
+        training = [graph for number, graph in enumerate(others) if number % _VALIDATION_STRIDE]
+        yield Fold(tuple(cases[index] for index in part), GivenGraphs(training, validation))
+
+
+def table(title: str, scores: Scores, minutes: float) -> Table:
+    """Errors over all scenes, each solved in the fold that had not seen it."""
+    names = (*UNTRAINED, *TRAINED)
+    rows: list[tuple[Cell, ...]] = [
+        (
+            name,
+            *(scores.mean(name, figure) for figure in ("mean_deg", "median_deg", "accuracy", "roc_area", "seconds")),
+            len(scores.of(name)),
+        )
+        for name in names
+    ]
+    columns = (
+        Column("method"),
+        Column("mean °", ".1f"),
+        Column("median °", ".1f"),
+        Column("outlier accuracy", ".3f"),
+        Column("ROC area", ".3f"),
+        Column("seconds", ".3f"),
+        Column("scenes", "d"),
+    )
+    note = f"The networks of each fold were trained for {minutes:g} minutes on one CPU core on the other scenes."
+    return Table(title, columns, tuple(rows), (note,))
+
+
+def _read(path: Path) -> Case:
+    graph_file = read_scene(path).graph_file
+    assert graph_file.body_from_world_gt is not None
+    return Case(path.stem, graph_file.graph, torch.from_numpy(graph_file.body_from_world_gt))
+
+
+def _training_graph(case: Case) -> SyntheticGraph:
+    return SyntheticGraph(case.graph, case.truth, case.noise_angle)

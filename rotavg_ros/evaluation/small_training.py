@@ -1,0 +1,49 @@
+"""Networks trained inside an evaluation, on given graphs and within a given time."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from rotavg_ros.solver.clean_net import CleanNet
+from rotavg_ros.solver.network_store import read_network
+from rotavg_ros.training.config import TrainingConfig
+from rotavg_ros.training.sfm_tasks import GivenGraphs, SfmCleanTask, SfmFineTask
+from rotavg_ros.training.trainer import Trainer, TrainingTask
+
+# CleanNet has the harder problem.
+_CLEAN_NET_SHARE = 0.6
+_CONFIG = TrainingConfig(batch_graphs=4, learning_rate=2e-3, weight_decay=0.0)
+
+
+def train_networks(folder: Path, graphs: GivenGraphs, seconds: float, seed: int = 0) -> None:
+    """Train a CleanNet and a FineNet into ``folder``, which then serves as ``weights`` of a solve.
+
+    Args:
+        seconds: about how long both may take; at least one epoch each is run.
+    """
+    config = replace(_CONFIG, seed=seed)
+    cpu = torch.device("cpu")
+    _train("sfm-clean-net", partial(SfmCleanTask, config, cpu, graphs), config, folder, seconds * _CLEAN_NET_SHARE)
+    clean_net = read_network("sfm-clean-net", folder / "sfm-clean-net.safetensors")
+    assert isinstance(clean_net, CleanNet)
+    make_fine = partial(SfmFineTask, config, cpu, clean_net, graphs)
+    _train("sfm-fine-net", make_fine, config, folder, seconds * (1 - _CLEAN_NET_SHARE))
+
+
+def _train(
+    name: str, make_task: Callable[[], TrainingTask], config: TrainingConfig, folder: Path, seconds: float
+) -> None:
+    """As many epochs as fit: the learning rate's schedule needs their number beforehand, so one is timed first."""
+    start = time.perf_counter()
+    with tempfile.TemporaryDirectory() as trial:
+        Trainer(make_task(), replace(config, epochs=1), Path(trial), name).run()
+    epoch_seconds = time.perf_counter() - start
+    epochs = max(1, int((seconds - epoch_seconds) / epoch_seconds))
+    Trainer(make_task(), replace(config, epochs=epochs), folder, name).run()

@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros.cli.main import main
+from rotavg_ros.datasets.graph_file import GraphFile, write_graph
+from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe
+from rotavg_ros.evaluation import robustness, synthetic
+
+
+@pytest.fixture(autouse=True)
+def _keep_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def test_synthetic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setitem(synthetic.RECIPES, "paper", PaperRecipe(cameras=(30, 40)))
+    monkeypatch.setitem(synthetic.RECIPES, "released-spatial", ReleasedRecipe(cameras=(30, 40), planar=False))
+    methods = ["neurora", "cleannet-spt+chatterjee", "spt", "oracle"]
+    command = ["evaluate", "synthetic", "--graphs", "2", "--output", str(tmp_path / "results"), "--threads", "1"]
+    assert main([*command, "--recipes", "paper", "released-spatial", "--methods", *methods]) == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'results' / 'synthetic.md'}\n"
+    report = (tmp_path / "results" / "synthetic.md").read_text()
+    assert "| **full pipeline** (NeuRoRA + refinement) |" in report
+    assert "CleanNet-SPT + chatterjee" in report
+    for file in tmp_path.glob("results/*.png"):
+        assert f"({file.name})" in report
+        assert file.read_bytes().startswith(b"\x89PNG")
+    with (tmp_path / "results" / "synthetic-paper-graphs.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["method"] for row in rows] == methods * 2
+    assert all(float(row["mean_deg"]) >= 0 for row in rows)
+
+
+def test_robustness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tiny = PaperRecipe(cameras=(20, 30), pair_share=(0.3, 0.5))
+    monkeypatch.setattr(robustness, "_TRAINING_GRAPHS", 2)
+    monkeypatch.setattr(robustness, "_VALIDATION_GRAPHS", 1)
+    monkeypatch.setitem(robustness.TRAINING_RECIPES, "easy", tiny)
+    for name in ("easy", "easy-easy"):
+        setting = robustness.SETTINGS[name]
+        monkeypatch.setitem(robustness.SETTINGS, name, robustness.Setting(setting.title, setting.training, tiny))
+    command = ["evaluate", "robustness", "--graphs", "1", "--minutes", "0.001", "--settings", "easy", "easy-easy"]
+    assert main([*command, "--methods", "neurora-paper", "--output", str(tmp_path), "--threads", "1"]) == 0
+    with (tmp_path / "robustness.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert rows[0]["trained on"] == "the package's networks"
+    assert rows[1]["trained on"].startswith("60–200 cameras")
+    assert rows[0]["mean °"] != rows[1]["mean °"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["synthetic", "--methods", "magic"], "unknown method 'magic'"),
+        (["synthetic", "--graphs", "0"], "must be 1 or more"),
+        (["synthetic", "--seed", "-1"], "must be 0 or more"),
+        (["robustness", "--methods", "magic"], "unknown method 'magic'"),
+        (["robustness", "--settings", "odd"], "odd"),
+        (["robustness", "--minutes", "0"], "must be positive"),
+        (["real"], "--data or $ROTAVG_DATA"),
+        (["real", "--data", "nowhere"], "nowhere: lacks sfm/lund_sphinx.mat"),
+        (["rgbd", "--data", "nowhere"], "nowhere: lacks rgbd/scannet_fgr"),
+        (["everything"], "everything"),
+    ],
+)
+def test_mistakes_take_one_line(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("ROTAVG_DATA", raising=False)
+    assert main(["evaluate", *words, "--output", str(tmp_path / "results")]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.startswith("rotavg: error: ")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("knows_truth", [True, False])
+def test_plot_statistics(knows_truth: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sample = ReleasedRecipe(cameras=(30, 30)).sample(np.random.default_rng(0))
+    truth = sample.body_from_world.numpy() if knows_truth else None
+    write_graph(tmp_path / "graph.npz", GraphFile(sample.graph, np.arange(30), body_from_world_gt=truth))
+    picture = tmp_path / "picture.png"
+    assert main(["plot", "statistics", str(tmp_path / "graph.npz"), "--output", str(picture)]) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert main(["plot", "statistics", str(tmp_path / "graph.npz"), "--output", str(tmp_path / "x.what")]) == 2
+    assert "x.what: cannot be written" in capsys.readouterr().err
+    assert main(["plot", "statistics", str(tmp_path / "none.npz")]) == 2
