@@ -18,17 +18,16 @@ _RUN_GAP_STEPS = 30
 # Scatter worth this many observations speaks for independent errors.
 _PRIOR_OBSERVATIONS = 5.0
 _MAX_SHARE = 0.9
-# Nor over more odometry steps than this.
+# No view lasts longer than this many odometry steps, or closures, however closely they follow each other.
 _STRETCH_STEPS = 60
-# No view lasts longer than this many closures, however closely they follow each other.
 _MAX_RUN = 25.0
 
 
 def closure_runs(pairs: AgreementPairs, good: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Number of the run of each closure, ``(C,)``.
 
-    Closures link up with near ones; a chain of links is cut where it leaves a stretch of the odometry, since a robot on its
-    second lap sees another view after a while.
+    Closures link up with near ones; a chain of links is cut where it leaves a stretch of the odometry, since a robot on
+    its second lap sees another view after a while.
 
     Args:
         pairs: neighbouring closures.
