@@ -54,6 +54,7 @@ _METHODS = {
     # Ablations: what each network earns.
     "neurora-unweighted": Method(clean=True, fine_tunings=1, refine=True, weighted=False),
     "neurora-without-finenet": Method(clean=True, refine=True),
+    "neurora-without-cleannet": Method(fine_tunings=1, refine=True),
 }
 # By name only: they build on the solver, so that they are imported when one of them runs.
 _BASELINES = ("chatterjee", "weiszfeld", "arrigoni", "wang")
