@@ -33,6 +33,7 @@ _SLIP_CLOSURE_SHARE = 0.3
 _STREAM = 0x51A3
 
 AS_RECORDED, GROUPED, SLIPS = "as recorded", "30 % grouped", "slips + 30 %"
+RANDOM = "% random"
 
 
 class SlamSuiteError(UserError):
@@ -128,7 +129,7 @@ SHARES = (0.0, 0.1, 0.3, 0.5, 0.8)
 
 def share_condition(share: float) -> str:
     """Name of the condition that a share of the closures is random."""
-    return f"{100 * share:g} % random"
+    return f"{100 * share:g} {RANDOM}"
 
 
 def cases(

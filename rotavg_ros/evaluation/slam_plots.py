@@ -10,11 +10,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from rotavg_ros.evaluation.plots import BLUE, INK, MUTED, ORANGE, PALETTE, style
+from rotavg_ros.evaluation.slam_cases import RANDOM
 from rotavg_ros.evaluation.slam_contenders import OURS
 from rotavg_ros.evaluation.slam_incremental import SETTLED_KEYFRAMES, IncrementalRun
 from rotavg_ros.evaluation.slam_scoring import REFERENCE, SlamScores, geometric_mean
 
 _MARKERS = "osD^vP*X<>"
+# Without refinement no closure bends a good odometry, so that these lines would lie on its own.
+_LIKE_ODOMETRY = ("cleannet-spt", "spt")
 
 
 def ratios(path: Path, scores: SlamScores, rows: dict[str, str], graphs: Sequence[str], title: str) -> None:
@@ -26,18 +29,21 @@ def ratios(path: Path, scores: SlamScores, rows: dict[str, str], graphs: Sequenc
     conditions = [c for c in scores.conditions if scores.ratios(OURS, graphs, c)]
     figure = Figure(figsize=(10, 5.6), dpi=150, facecolor="white", layout="constrained")
     axes = figure.add_subplot()
-    position = np.arange(len(conditions))
+    position = np.arange(len(conditions), dtype=np.float64)
+    by_share = np.array([condition.endswith(RANDOM) for condition in conditions])
     for x, condition in enumerate(conditions):
         cases = list(scores.ratios(OURS, graphs, condition).values())
         axes.plot(np.full(len(cases), x), cases, ".", color=BLUE, alpha=0.35, markersize=6, zorder=2)
-    others = [name for name in rows if name not in (REFERENCE, OURS)]
+    others = [name for name in rows if name not in (REFERENCE, OURS, *_LIKE_ODOMETRY)]
     colours = [colour for colour in PALETTE if colour != BLUE]
     for number, name in enumerate((*others, OURS)):
         values = [geometric_mean(scores.ratios(name, graphs, condition).values()) for condition in conditions]
         is_ours = name == OURS
+        # A line along the shares; the other conditions stand apart.
+        between = int(by_share.sum())
         axes.plot(
-            position,
-            values,
+            np.insert(position, between, np.nan),
+            np.insert(values, between, np.nan),
             marker=_MARKERS[number % len(_MARKERS)],
             color=BLUE if is_ours else colours[number % len(colours)],
             linewidth=2.2 if is_ours else 1.2,

@@ -91,7 +91,13 @@ def _ratios(title: str, scores: SlamScores, names: Sequence[str], graphs: Sequen
     columns = [Column("method")]
     for condition in conditions:
         columns += [Column(condition, ".2f"), Column("worst", ".1f")]
-    return Table(title, tuple(columns), tuple(rows), (f"Geometric mean and worst case over: {', '.join(graphs)}.",))
+    notes = [f"Geometric mean and worst case over: {', '.join(graphs)}."]
+    total = len(scores.where(OURS, graphs).rows)
+    gave_up = [f"{ROWS.get(name, name)}: {total - len(scores.where(name, graphs).rows)}" for name in names]
+    gave_up = [text for text in gave_up if not text.endswith(": 0")]
+    if gave_up:
+        notes.append(f"Of {total} cases these gave up some, which do not count against them: {'; '.join(gave_up)}.")
+    return Table(title, tuple(columns), tuple(rows), tuple(notes))
 
 
 def _recorded(title: str, scores: SlamScores, names: Sequence[str], graphs: Sequence[str]) -> Table:
