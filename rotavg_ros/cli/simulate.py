@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from rotavg_ros.bags.run_bag import write_run_bag
+from rotavg_ros.cli.arguments import whole_number
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.graph_file import write_graph
 from rotavg_ros.datasets.robot_run import ROBOT_WORLDS, robot_run_config
@@ -43,14 +44,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--odometry-bias-deg-per-min", type=float, default=2.0, metavar="DEG", help="gyroscope bias (default: 2)"
     )
-    parser.add_argument("--seed", type=_seed, default=0, help="same seed, same run (default: 0)")
-
-
-def _seed(text: str) -> int:
-    seed = int(text)
-    if seed < 0:
-        raise argparse.ArgumentTypeError("must be 0 or more")
-    return seed
+    parser.add_argument("--seed", type=whole_number, default=0, help="same seed, same run (default: 0)")
 
 
 def simulate(arguments: argparse.Namespace) -> SimulatedRun:

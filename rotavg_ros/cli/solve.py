@@ -22,6 +22,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from rotavg_ros.cli.arguments import whole_number
 from rotavg_ros.cli.main import EXIT_USER_ERROR, print_error
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.csv_writer import Column, write_csv
@@ -58,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--profile", default="auto", choices=PROFILES, help="auto: slam if any edge is odometry")
     parser.add_argument("--device", default="auto", choices=DEVICES, help="default: auto")
     parser.add_argument(
-        "--refine", type=_step_count, metavar="N", help="at most N refinement steps; 0 skips (default: the method's)"
+        "--refine", type=whole_number, metavar="N", help="at most N refinement steps; 0 skips (default: the method's)"
     )
     parser.add_argument("--edges", default="csv", choices=(*_EDGE_FORMATS, "none"), help="default: csv")
 
@@ -83,9 +84,10 @@ def run(arguments: argparse.Namespace) -> int:
         except UserError as mistake:
             errors.append(mistake)
         else:
+            components = "1 component" if summary["components"] == 1 else f"{summary['components']} components"
             print(
                 f"{job.graph}: {summary['nodes']} nodes, {summary['edges']} edges, {summary['outliers']} outliers, "
-                f"{summary['components']} components, {summary['solve_seconds']:.2f} s → {job.output}",
+                f"{components}, {summary['solve_seconds']:.2f} s → {job.output}",
                 flush=True,
             )
     for error in errors:
@@ -225,10 +227,3 @@ def _check_writable(folder: Path) -> None:
 def _peak_memory_bytes() -> int:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024  # Linux counts in KiB
-
-
-def _step_count(text: str) -> int:
-    count = int(text)
-    if count < 0:
-        raise argparse.ArgumentTypeError("must be 0 or more")
-    return count

@@ -56,7 +56,7 @@ ROTAVG = "import sys; from rotavg_ros.cli.main import main; sys.exit(main())"
         (["solve", "x.g2o"], "required: --output"),
         (["solve", "x.g2o", "--output", "out", "--profile", "x"], "invalid choice: 'x'"),
         (["solve", "x.g2o", "--output", "out", "--refine", "-1"], "must be 0 or more"),
-        (["solve", "x.g2o", "--output", "out", "--refine", "many"], "--refine"),
+        (["solve", "x.g2o", "--output", "out", "--refine", "many"], "--refine: 'many' is not a whole number"),
         (["solve", "x.g2o", "--output", "out", "--frob"], "unrecognized arguments: --frob"),
         (["solve", "x.g2o", "--output", "out", "--method", "magic"], "magic"),
     ],
