@@ -83,8 +83,8 @@ class RotavgNode(Node):
         device = warm_up(parameters.estimator_options())
         self._estimator = OnlineEstimator(parameters.estimator_options())
         self._state_file = Path(parameters.state_file) if parameters.state_file else None
-        if self._state_file is not None and self._state_file.exists():
-            self._estimator.load(self._state_file)
+        if self._state_file is not None:
+            self._resume(self._state_file)
         self._health = Health()
         self._reporter = Reporter(f"{self.get_fully_qualified_name().lstrip('/')}: estimator")
         self._worker = Worker(executor)
@@ -340,6 +340,12 @@ class RotavgNode(Node):
             raise UserError("the parameter state_file is empty; start the node with the file's name")
         self._estimator.save(self._state_file)
         return f"saved to {self._state_file}"
+
+    def _resume(self, state_file: Path) -> None:
+        if state_file.exists():
+            self._estimator.load(state_file)
+        elif not state_file.parent.is_dir():
+            raise UserError(f"state_file is {state_file}, but there is no folder {state_file.parent}; make it first")
 
     def _load(self) -> str:
         if self._state_file is None:

@@ -36,6 +36,8 @@ def declare(node: Node) -> NodeParameters:
         except InvalidParameterValueException as error:
             low, high = parameter.metadata["low"], parameter.metadata["high"]
             raise ParameterError(f"parameter {parameter.name} must be between {low:g} and {high:g}") from error
+        if declared.value is None:  # what becomes of `-p name:=[]`
+            raise ParameterError(f"parameter {parameter.name} is empty; give it a value or leave it out")
         values[parameter.name] = declared.value
     return NodeParameters().changed(values)
 

@@ -199,6 +199,8 @@ def test_a_flood_is_survived_and_every_loss_counted(live_node) -> None:
         ("keyframe_angle_deg:=fast", "keyframe_angle_deg has the wrong type; it must be double"),
         ("edge_topics:=['x:nobodys_msgs/msg/Edge']", "nobodys_msgs/msg/Edge"),
         ("qos_overrides./odom.subscription.depth:=many", "odom"),
+        ("odometry_topics:=[]", "odometry_topics is empty"),
+        ("state_file:=/no/such/folder/state", "there is no folder /no/such/folder"),
     ],
 )
 def test_a_mistake_at_the_start_is_one_line_and_exit_code_2(parameter: str, message: str) -> None:

@@ -48,6 +48,7 @@ def test_the_defaults_are_good_and_declared_with_descriptions_and_ranges(make_no
     ("overrides", "message"),
     [
         ({"keyframe_angle_deg": 5}, "keyframe_angle_deg has the wrong type; it must be double"),
+        ({"odometry_topics": None}, "odometry_topics is empty"),
         ({"robots": "a"}, "robots has the wrong type; it must be string array"),
         ({"pending_capacity": 0}, "pending_capacity must be between 1 and"),
         ({"outlier_threshold": 1.5}, "outlier_threshold must be between 0 and 1"),
