@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test bench lint clean
+.PHONY: setup demo test lint clean
 
 setup:
 	@$(PYTHON) tools/setup_environment.py
@@ -16,9 +16,6 @@ demo: setup
 # make test [ARGS="-k node -x"]
 test: setup
 	@$(BIN)/python -m pytest $(ARGS)
-
-bench: setup
-	@$(BIN)/rotavg benchmark $(ARGS)
 
 lint: setup
 	@$(BIN)/ruff check .

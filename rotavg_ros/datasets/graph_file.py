@@ -190,7 +190,9 @@ def reading(path: Path) -> Iterator[None]:
     except FileNotFoundError:
         raise GraphFileError.at(path, None, "no such file; check the path") from None
     except IsADirectoryError:
-        raise GraphFileError.at(path, None, "is a directory; give a view-graph file (`rotavg convert` makes one of a bag)") from None
+        raise GraphFileError.at(
+            path, None, "is a directory; give a view-graph file (`rotavg convert` makes one of a bag)"
+        ) from None
     except PermissionError:
         raise GraphFileError.at(path, None, "permission denied; check the file's rights") from None
     except OSError as error:
