@@ -70,6 +70,19 @@ class _Estimate:
     variance: Tensor
 
 
+@dataclass(frozen=True)
+class _Networks:
+    """Where the networks run, and the folder that has those of the user's."""
+
+    device: str
+    folder: Path | None
+
+    def load(self, name: str) -> Any:
+        if self.folder is not None and (self.folder / f"{name}.safetensors").exists():
+            return load_network(name, self.device, self.folder)
+        return load_network(name, self.device)
+
+
 @dataclass
 class _Stopwatch:
     seconds: dict[str, float] = field(default_factory=dict)
@@ -99,7 +112,8 @@ def solve(
             before.
         profile: "slam" for odometry chains with loop closures, "sfm" for unordered view-graphs, "auto": "slam" if any
             edge is odometry.
-        device: "cpu", "cuda" or "auto".
+        device: where the SfM networks run: "cpu", "cuda" or "auto" (a GPU if torch finds one). The SLAM profile's
+            network is small and sparse; it runs on the CPU.
         refinement_steps: refinement steps at most, 0 for none; default: the method's and profile's own number.
         warm_start: ``(N, 4)`` body_from_world of an earlier solution to start from.
         weights: folder of networks trained with ``rotavg train``; what it lacks comes from the package.
@@ -120,11 +134,13 @@ def solve(
         raise UserError(f"the warm start has shape {tuple(warm_start.shape)}, the graph needs ({graph.num_nodes}, 4)")
     if profile == "auto":
         profile = "slam" if bool(graph.is_odometry.any()) else "sfm"
+    on_gpu = profile == "sfm" and (device == "cuda" or (device == "auto" and torch.cuda.is_available()))
+    networks = _Networks("cuda" if on_gpu else "cpu", weights)
     watch = _Stopwatch()
     graph = graph.to("cpu")
     for name in names[:-1]:
-        warm_start = _solve_once(graph, name, profile, None, warm_start, weights, watch).body_from_world
-    estimate = _solve_once(graph, names[-1], profile, refinement_steps, warm_start, weights, watch)
+        warm_start = _solve_once(graph, name, profile, None, warm_start, networks, watch).body_from_world
+    estimate = _solve_once(graph, names[-1], profile, refinement_steps, warm_start, networks, watch)
     component = graph.components()
     score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, estimate.outlier_score)
     score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
@@ -136,7 +152,7 @@ def solve(
         watch.seconds,
         method,
         profile,
-        "cpu",
+        networks.device,
     )
 
 
@@ -146,7 +162,7 @@ def _solve_once(
     profile: str,
     refinement_steps: int | None,
     warm_start: Tensor | None,
-    weights: Path | None,
+    networks: _Networks,
     watch: _Stopwatch,
 ) -> _Estimate:
     """One method, or one link of a combination."""
@@ -156,8 +172,8 @@ def _solve_once(
     if name in _BASELINES:
         return _solve_baseline(graph, name, profile, warm_start, watch)
     if profile == "slam":
-        return _solve_slam(graph, _METHODS[name], refinement_steps, warm_start, weights, watch)
-    return _solve_sfm(graph, _METHODS[name], refinement_steps, warm_start, weights, watch)
+        return _solve_slam(graph, _METHODS[name], refinement_steps, warm_start, networks, watch)
+    return _solve_sfm(graph, _METHODS[name], refinement_steps, warm_start, networks, watch)
 
 
 def _solve_baseline(
@@ -178,12 +194,12 @@ def _solve_sfm(
     method: Method,
     refinement_steps: int | None,
     warm_start: Tensor | None,
-    weights: Path | None,
+    networks: _Networks,
     watch: _Stopwatch,
 ) -> _Estimate:
     with watch.stage("clean"):
         if method.clean:
-            cleaned = sfm_stages.clean(_network("sfm-clean-net", weights), graph)
+            cleaned = sfm_stages.clean(networks.load("sfm-clean-net"), graph)
         else:
             cleaned = sfm_stages.trust_all(graph)
         cleaned = sfm_stages.apply_labels(cleaned, graph.label)
@@ -193,7 +209,7 @@ def _solve_sfm(
             orientations = warm_start.double()
     for _ in range(method.fine_tunings):
         with watch.stage("fine-tune"):
-            orientations = sfm_stages.fine_tune(_network("sfm-fine-net", weights), cleaned, orientations)
+            orientations = sfm_stages.fine_tune(networks.load("sfm-fine-net"), cleaned, orientations)
     steps = (refinement.DEFAULT_STEPS if method.refine else 0) if refinement_steps is None else refinement_steps
     if steps > 0:
         with watch.stage("refine"):
@@ -209,13 +225,13 @@ def _solve_slam(
     method: Method,
     refinement_steps: int | None,
     warm_start: Tensor | None,
-    weights: Path | None,
+    networks: _Networks,
     watch: _Stopwatch,
 ) -> _Estimate:
     with watch.stage("contract"):
         prepared = slam_stages.prepare(graph)
     with watch.stage("clean"):
-        network = _network("slam-clean-net", weights) if method.clean else None
+        network = networks.load("slam-clean-net") if method.clean else None
         cleaned = slam_stages.clean(network, prepared, graph.label)
     with watch.stage("bootstrap"):
         correction = slam_stages.bootstrap(prepared, cleaned)
@@ -241,12 +257,6 @@ def _solve_slam(
         score = torch.from_numpy(1 - prepared.closure_graph.edge_values(inlier_probability))
         orientations = prepared.closure_graph.orientations(correction)
     return _Estimate(orientations, score, torch.from_numpy(variance))
-
-
-def _network(name: str, weights: Path | None) -> Any:
-    if weights is not None and (weights / f"{name}.safetensors").exists():
-        return load_network(name, folder=weights)
-    return load_network(name)
 
 
 def _root_at_identity(body_from_world: Tensor, component: Tensor) -> Tensor:

@@ -43,11 +43,13 @@ class Cleaned:
 
 
 def clean(network: CleanNet, graph: ViewGraph, edges: DirectedEdges | None = None) -> Cleaned:
-    """CleanNet: rectify every measurement and score it."""
-    edges = DirectedEdges.of(graph.source, graph.target, graph.num_nodes) if edges is None else edges
-    result = network(graph.target_from_source.float(), edges)
-    probability = torch.sigmoid(result.outlier_logit)
-    rectified = replace(graph, target_from_source=result.target_from_source.double())
+    """CleanNet: rectify every measurement and score it. The network may be on another device than the graph."""
+    device = next(network.parameters()).device
+    if edges is None:
+        edges = DirectedEdges.of(graph.source.to(device), graph.target.to(device), graph.num_nodes)
+    result = network(graph.target_from_source.float().to(device), edges)
+    probability = torch.sigmoid(result.outlier_logit).to(graph.device)
+    rectified = replace(graph, target_from_source=result.target_from_source.double().to(graph.device))
     return Cleaned(rectified, probability, probability < OUTLIER_THRESHOLD)
 
 
@@ -71,11 +73,13 @@ def bootstrap(cleaned: Cleaned) -> tuple[Tensor, SpanningForest]:
 
 
 def fine_tune(network: FineNet, cleaned: Cleaned, body_from_world: Tensor) -> Tensor:
-    """FineNet over the inlier edges, ``(N, 4)`` float64."""
+    """FineNet over the inlier edges, ``(N, 4)`` float64. The network may be on another device than the graph."""
+    device = next(network.parameters()).device
     inliers = cleaned.graph.select_edges(cleaned.is_inlier)
-    edges = DirectedEdges.of(inliers.source, inliers.target, inliers.num_nodes)
+    edges = DirectedEdges.of(inliers.source.to(device), inliers.target.to(device), inliers.num_nodes)
     residual = edge_residual(body_from_world, inliers.target_from_source, inliers.source, inliers.target)
-    return network(body_from_world.float(), residual.float(), edges).double()
+    fine: Tensor = network(body_from_world.float().to(device), residual.float().to(device), edges)
+    return fine.double().to(cleaned.graph.device)
 
 
 def outlier_score(graph: ViewGraph, cleaned: Cleaned, body_from_world: Tensor, refined: bool) -> Tensor:

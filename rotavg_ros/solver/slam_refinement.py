@@ -189,9 +189,9 @@ def _residual_vectors(graph: ClosureGraph, correction: Tensor) -> np.ndarray:
 def _step_variance(square: np.ndarray, redundancy: np.ndarray, noise: NoiseModel) -> float:
     prior = _PRIOR_ODOMETRY_REDUNDANCY * noise.components
     total = float(square.sum()) + prior * noise.step_variance
-    return total / (float(redundancy.sum()) * noise.components + prior)
+    return float(total / (float(redundancy.sum()) * noise.components + prior))
 
 
 def _closure_variance(square: np.ndarray, probability: np.ndarray, redundancy: np.ndarray, noise: NoiseModel) -> float:
     total = float((probability * square).sum()) + _PRIOR_CLOSURE_SQUARE
-    return total / (float(redundancy.sum()) * noise.components + 1)
+    return float(total / (float(redundancy.sum()) * noise.components + 1))
