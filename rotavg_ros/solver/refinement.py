@@ -15,9 +15,9 @@ from rotavg_ros.solver.fine_net import edge_residual
 from rotavg_ros.solver.laplacian import LaplacianSystem
 from rotavg_ros.view_graph import ViewGraph
 
-DEFAULT_STEPS = 2
+DEFAULT_STEPS = 3
 # |r|^(−3/2) is the weight of ρ = |r|^½; residuals below this angle count as this.
-_SMOOTHING = np.radians(1.0)
+_SMOOTHING = np.radians(0.5)
 _CONVERGED_STEP = np.radians(0.001)
 
 
