@@ -3,14 +3,50 @@
 from __future__ import annotations
 
 import argparse
+import math
 
 
 def whole_number(text: str) -> int:
     """A whole number, 0 or more."""
+    number = _whole(text)
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"is {text}; it must be 0 or more")
+    return number
+
+
+def positive_whole_number(text: str) -> int:
+    """A whole number, 1 or more."""
+    number = _whole(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"is {text}; it must be 1 or more")
+    return number
+
+
+def positive_number(text: str) -> float:
+    """A finite number above 0."""
+    number = _number(text)
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"is {text}; it must be positive")
+    return number
+
+
+def share(text: str) -> float:
+    """A number between 0 and 1."""
+    number = _number(text)
+    if not 0 <= number <= 1:
+        raise argparse.ArgumentTypeError(f"is {text}; it must lie between 0 and 1")
+    return number
+
+
+def _whole(text: str) -> int:
     try:
-        number = int(text)
+        return int(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
-    if number < 0:
-        raise argparse.ArgumentTypeError(f"{text} is negative; it must be 0 or more")
-    return number
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None

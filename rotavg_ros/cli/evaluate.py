@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 
 from rotavg_ros.cli import evaluate_slam
+from rotavg_ros.cli.arguments import positive_number, positive_whole_number, whole_number
 from rotavg_ros.cli.progress import progress, working
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation import real, rgbd, robustness, synthetic
@@ -42,7 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         suite_parser.add_argument(
             "--output", type=Path, default=Path("docs/results"), metavar="DIR", help="default: docs/results"
         )
-        suite_parser.add_argument("--threads", type=_count, metavar="N", help="CPU threads (default: torch's choice)")
+        suite_parser.add_argument(
+            "--threads", type=positive_whole_number, metavar="N", help="CPU threads (default: torch's choice)"
+        )
         suite.add_arguments(suite_parser)
 
 
@@ -114,7 +117,7 @@ def _add_real(parser: argparse.ArgumentParser) -> None:
     _add_data(parser)
     _add_methods(parser, " ".join(real.METHODS))
     parser.add_argument(
-        "--seed", type=_seed, default=0, metavar="S", help="of the noise on real topologies (default: 0)"
+        "--seed", type=whole_number, default=0, metavar="S", help="of the noise on real topologies (default: 0)"
     )
 
 
@@ -147,8 +150,10 @@ def _run_real(arguments: argparse.Namespace) -> Path:
 def _add_rgbd(parser: argparse.ArgumentParser) -> None:
     _add_data(parser)
     parser.add_argument("--sets", nargs="+", choices=rgbd.SETS, default=list(rgbd.SETS), help="default: all")
-    parser.add_argument("--folds", type=_count, default=4, metavar="K", help="of the cross-validation (default: 4)")
-    parser.add_argument("--scenes", type=_count, metavar="N", help="of each set, at most (default: all)")
+    parser.add_argument(
+        "--folds", type=positive_whole_number, default=4, metavar="K", help="of the cross-validation (default: 4)"
+    )
+    parser.add_argument("--scenes", type=positive_whole_number, metavar="N", help="of each set, at most (default: all)")
     _add_minutes(parser)
 
 
@@ -190,7 +195,7 @@ def _data(arguments: argparse.Namespace, needed: Sequence[str]) -> Path:
 def _add_minutes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--minutes",
-        type=_positive,
+        type=positive_number,
         default=10.0,
         metavar="M",
         help="training time of each pair of networks (default: 10)",
@@ -198,8 +203,8 @@ def _add_minutes(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_drawing(parser: argparse.ArgumentParser, graphs: int) -> None:
-    parser.add_argument("--graphs", type=_count, default=graphs, metavar="N", help=f"default: {graphs}")
-    parser.add_argument("--seed", type=_seed, default=0, metavar="S", help="same seed, same graphs (default: 0)")
+    parser.add_argument("--graphs", type=positive_whole_number, default=graphs, metavar="N", help=f"default: {graphs}")
+    parser.add_argument("--seed", type=whole_number, default=0, metavar="S", help="same seed, same graphs (default: 0)")
 
 
 def _add_methods(parser: argparse.ArgumentParser, default: str) -> None:
@@ -227,27 +232,6 @@ def _score(cases: Iterable[Case], chosen: dict[str, Contender], count: int, desc
     return score_all(cases, chosen, watch)
 
 
-def _count(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError("must be 1 or more")
-    return number
-
-
-def _positive(text: str) -> float:
-    number = float(text)
-    if not 0 < number < float("inf"):
-        raise argparse.ArgumentTypeError("must be positive")
-    return number
-
-
-def _seed(text: str) -> int:
-    seed = int(text)
-    if seed < 0:
-        raise argparse.ArgumentTypeError("must be 0 or more")
-    return seed
-
-
 _ROBUSTNESS_METHODS = ("chatterjee", "neurora-paper", "neurora")
 _SUITES = (
     _Suite("synthetic", "the paper's synthetic table, and how well outliers are told", _add_synthetic, _run_synthetic),
@@ -255,6 +239,9 @@ _SUITES = (
     _Suite("real", "Lund with ground truth, Madrid without, real topologies", _add_real, _run_real),
     _Suite("rgbd", "RGB-D scans, networks cross-validated over the scenes", _add_rgbd, _run_rgbd),
     _Suite(
-        "slam", "pose graphs with false closures, in one go and edge by edge", evaluate_slam.add_arguments, evaluate_slam.run
+        "slam",
+        "pose graphs with false closures, in one go and edge by edge",
+        evaluate_slam.add_arguments,
+        evaluate_slam.run,
     ),
 )

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from rotavg_ros.cli.arguments import share, whole_number
 from rotavg_ros.cli.progress import progress
 from rotavg_ros.datasets.graph_file import read_graph
 from rotavg_ros.evaluation import slam_cases, slam_contenders, slam_incremental, slam_report, slam_uncertainty
@@ -27,11 +28,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help=f"of {', '.join(slam_cases.GRAPHS)} (default: all)",
     )
-    parser.add_argument("--seeds", nargs="+", type=_seed, default=[0, 1, 2], metavar="S", help="default: 0 1 2")
+    parser.add_argument("--seeds", nargs="+", type=whole_number, default=[0, 1, 2], metavar="S", help="default: 0 1 2")
     parser.add_argument(
         "--shares",
         nargs="+",
-        type=_share,
+        type=share,
         default=slam_cases.SHARES,
         metavar="P",
         help="shares of false closures, 0 to 1 (default: 0 0.1 0.3 0.5 0.8)",
@@ -115,17 +116,3 @@ def _command(arguments: argparse.Namespace) -> str:
     if tuple(arguments.shares) != slam_cases.SHARES:
         words += ["--shares", *map(str, arguments.shares)]
     return " ".join(words)
-
-
-def _share(text: str) -> float:
-    share = float(text)
-    if not 0 <= share <= 1:
-        raise argparse.ArgumentTypeError("must lie between 0 and 1")
-    return share
-
-
-def _seed(text: str) -> int:
-    seed = int(text)
-    if seed < 0:
-        raise argparse.ArgumentTypeError("must be 0 or more")
-    return seed

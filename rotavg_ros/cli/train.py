@@ -14,6 +14,7 @@ from pathlib import Path
 
 import torch
 
+from rotavg_ros.cli.arguments import positive_whole_number
 from rotavg_ros.cli.progress import working
 from rotavg_ros.errors import UserError
 from rotavg_ros.solver.clean_net import CleanNet
@@ -42,14 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="fine-net: the CleanNet before it (default: the one in DIR if there is one, else the package's)",
     )
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default: auto")
-    parser.add_argument("--threads", type=_positive, metavar="N", help="CPU threads (default: torch's choice)")
-
-
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError("must be 1 or more")
-    return number
+    parser.add_argument(
+        "--threads", type=positive_whole_number, metavar="N", help="CPU threads (default: torch's choice)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

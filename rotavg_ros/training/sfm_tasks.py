@@ -34,9 +34,7 @@ def _draw(config: TrainingConfig) -> GivenGraphs:
     rng = np.random.default_rng((config.seed, 1))
     training = [sample_graph(config.recipe, config.nodes, rng) for _ in range(config.graphs)]
     rng = np.random.default_rng((config.seed, 2))
-    validation = [
-        sample_graph(config.recipe, config.validation_nodes, rng) for _ in range(config.validation_graphs)
-    ]
+    validation = [sample_graph(config.recipe, config.validation_nodes, rng) for _ in range(config.validation_graphs)]
     return GivenGraphs(training, validation)
 
 

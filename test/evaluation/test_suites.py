@@ -32,9 +32,7 @@ def test_rows_can_all_run() -> None:
 def test_settings_that_differ_in_training_alone_share_their_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
     tiny = PaperRecipe(cameras=(20, 30))
     for name in ("easy", "easy-easy"):
-        monkeypatch.setitem(
-            robustness.SETTINGS, name, robustness.Setting("", robustness.SETTINGS[name].training, tiny)
-        )
+        monkeypatch.setitem(robustness.SETTINGS, name, robustness.Setting("", robustness.SETTINGS[name].training, tiny))
     one, other = (next(robustness.cases(name, 1, 0)) for name in ("easy", "easy-easy"))
     assert torch.equal(one.graph.target_from_source, other.graph.target_from_source)
     assert robustness.num_graphs("25000", 10) == 1
