@@ -70,20 +70,21 @@ class _Clock:
 
 
 def colmap(graph: ViewGraph) -> PeerAnswer:
-    """COLMAP's rotation averaging (ℓ1 and then Geman–McClure IRLS) with its default options.
+    """COLMAP's rotation averaging (ℓ1 and then Geman–McClure IRLS) with its default options but for one.
 
-    Of parallel edges it takes the first.
+    By default it withdraws, after the estimate, the orientations of nodes that no edge agrees with to 10°; here it
+    answers for every node, as all others do. Of parallel edges it takes the first.
     """
     pycolmap = _load("pycolmap")
+    options = pycolmap.RotationEstimatorOptions()
+    options.max_rotation_error_deg = 180.0
     clock = _Clock()
 
     def solve_connected(part: ViewGraph, _: Tensor | None) -> Tensor:
         pose_graph, reconstruction = _colmap_input(pycolmap, part)
         pycolmap.logging.minloglevel = pycolmap.logging.ERROR
         with clock.running():
-            solved = pycolmap.run_rotation_averaging(
-                pycolmap.RotationEstimatorOptions(), pose_graph, reconstruction, []
-            )
+            solved = pycolmap.run_rotation_averaging(options, pose_graph, reconstruction, [])
         images = [reconstruction.image(node + 1) for node in range(part.num_nodes)]
         if not solved or not all(image.has_pose for image in images):
             raise PeerError("COLMAP's rotation averaging left nodes without an orientation")
