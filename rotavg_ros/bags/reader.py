@@ -78,10 +78,6 @@ class BagReader:
         return bool(self._open().is2)
 
     @property
-    def start_ns(self) -> int:
-        return int(self._open().start_time)
-
-    @property
     def duration_s(self) -> float:
         return max(0.0, self._open().duration / 1e9)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from rotavg_ros.errors import UserError
@@ -79,7 +79,8 @@ def load_checkpoint(
 def save_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, str]) -> None:
     """Write a safetensors file, whole or not at all."""
     partial = path.with_name(path.name + ".partial")
-    save_file({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, partial, about)
+    # Not safetensors' save_file, which makes a file that only its owner can read.
+    partial.write_bytes(save({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, about))
     os.replace(partial, path)
 
 
