@@ -1,0 +1,76 @@
+"""``rotavg evaluate slam``: options, mistakes, what is written."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros import rotations
+from rotavg_ros.cli.main import main
+from rotavg_ros.datasets.graph_file import GraphFile, write_graph
+
+
+@pytest.fixture(autouse=True)
+def _keep_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """A folder with one small planar graph: a chain, and closures across 20 keyframes."""
+    source = np.concatenate((np.arange(79), np.arange(0, 60, 2)))
+    target = np.concatenate((np.arange(1, 80), np.arange(20, 80, 2)))
+    turn = 0.1 * (target - source) + np.radians(0.1) * np.random.default_rng(0).normal(size=len(source))
+    rotation = rotations.exp(torch.from_numpy(np.stack((0 * turn, 0 * turn, turn), axis=1))).numpy()
+    (tmp_path / "slam").mkdir()
+    graph_file = GraphFile.from_ids(source, target, rotation, precision=np.full(len(source), 1e4), planar=True)
+    write_graph(tmp_path / "slam" / "CSAIL.g2o", graph_file)
+    return tmp_path
+
+
+def test_report(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["evaluate", "slam", "--data", str(data), "--output", str(data / "results"), "--threads", "1"]
+    options = ["--graphs", "CSAIL", "--seeds", "4", "--shares", "0", "0.5", "--incremental", "CSAIL"]
+    methods = ["--methods", "odometry", "chatterjee", "--no-peers", "--no-uncertainty", "--no-hard"]
+    assert main([*command, *options, *methods]) == 0
+    assert capsys.readouterr().out == f"{data / 'results' / 'slam.md'}\n"
+    with (data / "results" / "slam-cases.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    # Ratios need ours and the oracle, asked for or not.
+    assert [row["method"] for row in rows] == ["neurora", "odometry", "chatterjee", "oracle"] * 2
+    assert [row["condition"] for row in rows[::4]] == ["0 % random", "50 % random"]
+    text = (data / "results" / "slam.md").read_text(encoding="utf-8")
+    for file in (data / "results").glob("*.png"):
+        assert f"({file.name})" in text
+    assert "GNC" not in text.split("## Seconds")[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "name the folder of the data sets with --data or $ROTAVG_DATA"),
+        (["--data", "."], "lacks slam"),
+        (["--shares", "2"], "must lie between 0 and 1"),
+        (["--seeds", "-1"], "must be 0 or more"),
+        (["--graphs", "nowhere"], "invalid choice: 'nowhere'"),
+        (["--data", ".", "--methods", "magic"], "unknown method 'magic'"),
+    ],
+)
+def test_mistakes(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("ROTAVG_DATA", raising=False)
+    assert main(["evaluate", "slam", "--no-peers", "--no-uncertainty", "--output", str(tmp_path), *options]) == 2
+    assert message in capsys.readouterr().err
