@@ -30,6 +30,14 @@ def positive_number(text: str) -> float:
     return number
 
 
+def non_negative_number(text: str) -> float:
+    """A finite number, 0 or more."""
+    number = _number(text)
+    if not 0 <= number < math.inf:
+        raise argparse.ArgumentTypeError(f"is {text}; it must be 0 or more")
+    return number
+
+
 def share(text: str) -> float:
     """A number between 0 and 1."""
     number = _number(text)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from rotavg_ros.bags.graph_to_bag import write_graph_bag
 from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.bags.topics import EDGE_TOPIC, ODOM_TOPIC
+from rotavg_ros.cli.arguments import non_negative_number
 from rotavg_ros.cli.progress import working
 from rotavg_ros.cli.simulate import add_run_arguments, describe, simulate
 from rotavg_ros.datasets.dead_reckoning import chain_poses
@@ -57,7 +59,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--output", type=Path, metavar="DIR", help="new folder (default: rotavg_demo, rotavg_demo_2, …)"
     )
-    parser.add_argument("--rate", type=float, metavar="R", help="times real time (default: in about 12 s)")
+    parser.add_argument(
+        "--rate",
+        type=non_negative_number,
+        metavar="R",
+        help="times real time; 0: as fast as possible (default: in about 12 s)",
+    )
     add_run_arguments(parser)
 
 
@@ -74,8 +81,13 @@ def run(arguments: argparse.Namespace) -> int:
     installed_node()
     output = _new_folder(arguments.output)
     bag = output / "bag"
-    with working("preparing the bag"):
-        scene = _simulated(bag, arguments) if arguments.graph is None else _own_graph(bag, arguments)
+    try:
+        with working("preparing the bag"):
+            scene = _simulated(bag, arguments) if arguments.graph is None else _own_graph(bag, arguments)
+    except UserError:
+        with suppress(OSError):
+            output.rmdir()  # nobody needs an empty folder
+        raise
     print(f"{scene.title}: {scene.description}\nplaying it to the node …", flush=True)
     keep_to_this_machine()
     answer = play_to_node(

@@ -48,7 +48,9 @@ def run(arguments: argparse.Namespace) -> int:
     if outlier_angle_deg is None:
         outlier_angle_deg = 10.0 if bool(graph.is_odometry.any()) else 20.0
     knows_truth = truth is not None and bool(np.isfinite(truth).all(axis=1).any())
-    output = arguments.output or Path(f"{arguments.graph.stem}-statistics.png")
+    output = arguments.output or Path(f"{arguments.graph.stem}-statistics")
+    if not output.suffix:
+        output = output.with_name(f"{output.name}.png")
     with working("solving and drawing"):
         noise = edge_noise(graph, torch.from_numpy(truth) if truth is not None and knows_truth else None)
         try:

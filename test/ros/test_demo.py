@@ -52,6 +52,7 @@ def test_somebodys_own_graph_without_truth(tmp_path: Path, start_process: Callab
         (["--truth", "truth.csv"], "belong to --graph"),
         (["--graph", "nothing.g2o"], "no such file"),
         (["--laps", "0"], "laps is 0"),
+        (["--rate", "nan"], "--rate: is nan; it must be 0 or more"),
     ],
 )
 def test_mistakes_are_one_line(tmp_path: Path, start_process: Callable, options: list[str], complaint: str) -> None:
@@ -59,6 +60,7 @@ def test_mistakes_are_one_line(tmp_path: Path, start_process: Callable, options:
     assert demo.wait() == 2
     assert complaint in demo.output
     assert demo.output.count("\n") == 1
+    assert not (tmp_path / "demo").exists()
 
 
 def test_an_output_in_use_is_kept(tmp_path: Path, start_process: Callable) -> None:
