@@ -58,6 +58,8 @@ class ClosureGraph:
     above: np.ndarray
     below: np.ndarray
     fraction: np.ndarray
+    # Odometry steps between the two; 0 at a key node.
+    length: np.ndarray
 
     @property
     def num_nodes(self) -> int:
@@ -76,6 +78,16 @@ class ClosureGraph:
         fraction = torch.from_numpy(self.fraction)
         spread = rotations.slerp(correction[self.above], correction[self.below], fraction)
         return rotations.normalize(rotations.multiply(self.odometry_orientation, spread))
+
+    def variance(self, samples: np.ndarray, step_variance: float) -> np.ndarray:
+        """Variance of all nodes ``(N,)`` from samples of the key nodes' errors ``(K, k)``; rad².
+
+        Inside a segment the error is interpolated, plus that of a random walk that is tied down at both ends.
+        """
+        fraction = self.fraction[:, None]
+        interpolated = (1 - fraction) * samples[self.above] + fraction * samples[self.below]
+        bridge = self.fraction * (1 - self.fraction) * self.length * step_variance
+        return np.asarray((interpolated**2).mean(axis=1) + bridge)
 
     def corrections(self, body_from_world: Tensor) -> Tensor:
         """Orientations of all nodes ``(N, 4)`` → corrections of the key nodes ``(K, 4)`` that are nearest to them."""
@@ -156,6 +168,7 @@ def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
         above=key_of_node[above_node],
         below=key_of_node[below_node],
         fraction=fraction,
+        length=length,
     )
 
 

@@ -252,7 +252,7 @@ def _solve_slam(
                 max_passes=steps,
             )
             correction, inlier_probability = estimate.correction, estimate.inlier_probability
-            variance = estimate.variance[prepared.closure_graph.above]
+            variance = prepared.closure_graph.variance(estimate.samples, estimate.noise.step_variance)
     with watch.stage("expand"):
         score = torch.from_numpy(1 - prepared.closure_graph.edge_values(inlier_probability))
         orientations = prepared.closure_graph.orientations(correction)

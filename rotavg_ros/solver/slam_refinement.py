@@ -49,7 +49,7 @@ class SlamEstimate:
         correction: ``(K, 4)`` C.
         inlier_probability: ``(E,)``.
         noise: the estimated noise model.
-        variance: ``(K,)`` of one component of the orientation error relative to the root, rad².
+        samples: ``(K, k)`` errors, in rad, as they might be: their second moments are the estimate's covariance.
         common_share: share of the closures' error variance that neighbouring closures have in common.
         passes: number of sparse solves.
     """
@@ -57,7 +57,7 @@ class SlamEstimate:
     correction: Tensor
     inlier_probability: np.ndarray
     noise: NoiseModel
-    variance: np.ndarray
+    samples: np.ndarray
     common_share: float
     passes: int
 
@@ -105,7 +105,7 @@ def refine(
         rotations.normalize(state.correction),
         state.inlier_probability,
         state.noise,
-        (state.samples**2).mean(axis=1),
+        state.samples,
         share,
         state.passes,
     )

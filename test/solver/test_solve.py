@@ -234,3 +234,20 @@ def test_classic_graphs_with_thirty_percent_false_closures(shared_data: Path, na
     truth = torch.from_numpy(graph_file.body_from_world_gt)
     error = float(torch.rad2deg(orientation_errors(solution.body_from_world, truth)).mean())
     assert error < 0.15 * odometry_deg
+
+
+def test_the_stated_uncertainty_is_that_of_repeated_runs() -> None:
+    """Root mean square error over draws of the noise, against what each solve says of itself, inside segments too."""
+    source, target, kind = slam_edges(300, 60, 3)
+    truth = random_truth(300, 3)
+    squares, stated = [], []
+    for seed in range(30):
+        noise = small_noise(len(source), np.where(kind == 0, 0.5, 1.0), 1000 + seed)
+        solution = solve(measured(truth, source, target, noise, kind=kind))
+        root = rotations.multiply(as_quaternions(truth), rotations.inverse(as_quaternions(truth)[0]))
+        error = rotations.log(rotations.multiply(rotations.inverse(root), solution.body_from_world))
+        squares.append((error**2).mean(dim=1))
+        stated.append(solution.uncertainty**2)
+    ratio = (torch.stack(squares).mean(0)[1:] / torch.stack(stated).mean(0)[1:]).sqrt()
+    assert 0.8 < float(ratio.median()) < 1.2
+    assert 0.5 < float(ratio.min()) and float(ratio.max()) < 2
