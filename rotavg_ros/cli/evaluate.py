@@ -106,7 +106,8 @@ def _run_robustness(arguments: argparse.Namespace) -> Path:
         for setting in arguments.settings:
             training = robustness.SETTINGS[setting].training
             weights = None if training == robustness.PACKAGE else Path(folder) / training
-            chosen = _contenders(names, (), weights)
+            fit = [name for name in names if robustness.is_fit(setting, name)]
+            chosen = _contenders(fit, (), weights)
             count = robustness.num_graphs(setting, arguments.graphs)
             scores[setting] = _score(robustness.cases(setting, count, arguments.seed), chosen, count, setting)
     command = f"rotavg evaluate robustness --graphs {arguments.graphs} --seed {arguments.seed}"

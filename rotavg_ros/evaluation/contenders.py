@@ -23,7 +23,7 @@ from rotavg_ros.solver.spanning_tree import shortest_path_forest
 from rotavg_ros.view_graph import ViewGraph
 
 FULL_PIPELINE = "neurora"
-# Until it moves no more.
+# Until it moves no more: a few steps would remember the truth that they start from.
 _ORACLE_STEPS = 50
 # Shonan's matrices beyond this many edges take minutes.
 _SHONAN_MAX_EDGES = 150_000
@@ -127,7 +127,7 @@ def _peer(run: Callable[[ViewGraph], peers.PeerAnswer], max_edges: int | None = 
 
 
 def _oracle(case: Case) -> Answer:
-    """Our refinement from the truth, every true inlier weighing one and every outlier nothing."""
+    """Our refinement from the truth to convergence, every true inlier weighing one and every outlier nothing."""
     start = time.perf_counter()
     is_inlier = (case.noise_angle <= SFM_OUTLIER_ANGLE).double()
     roots = shortest_path_forest(case.graph).roots
