@@ -1,7 +1,7 @@
 """Figures that the NeuRoRA paper (Purkait, Chin & Reid, ECCV 2020) publishes, for the column next to ours.
 
-Degrees only, of its synthetic table. They were written down from memory, without the paper at hand: check them there
-before citing them. What is not remembered with confidence (combinations, seconds, the robustness table) is left out.
+Only what was read in the paper itself belongs here. Its synthetic table has not been at hand yet, so those cells stay
+empty.
 """
 
 from __future__ import annotations
@@ -16,12 +16,4 @@ class Published(NamedTuple):
     median_deg: float
 
 
-SYNTHETIC: dict[str, Published] = {
-    "chatterjee": Published(2.17, 1.25),
-    "weiszfeld": Published(3.35, 1.02),
-    "arrigoni": Published(2.92, 1.42),
-    "wang": Published(2.77, 1.40),
-    "cleannet-spt": Published(2.93, 1.47),
-    "neurora-paper": Published(1.45, 0.74),
-    "neurora-v2": Published(1.30, 0.68),
-}
+SYNTHETIC: dict[str, Published] = {}

@@ -116,7 +116,7 @@ def _errors(title: str, scores: Scores, names: Sequence[str], count: int) -> Tab
     short = [f"{ROWS.get(name, name)}: {len(scores.of(name))}" for name in names if len(scores.of(name)) < count]
     notes = [
         "The paper's figures are of its own graphs, drawn by a generator whose text and released scripts disagree. "
-        "They were written down from memory, not checked against the paper; empty cells are unknown."
+        "An empty cell has not been read in the paper yet."
     ]
     if short:
         notes.append(f"Graphs solved, where not all {count} (too large, or given up): {'; '.join(short)}.")
