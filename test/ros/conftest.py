@@ -114,6 +114,7 @@ class LiveNode:
         process: the node's.
         answers, flags, orientations: messages in order of arrival.
         status: the last diagnostics' values by key, with its "level" and "message".
+        reports: diagnostics so far.
     """
 
     def __init__(self, probe: rclpy.node.Node, start: Callable[..., RunningProcess], wait: Callable[..., None]) -> None:
@@ -125,6 +126,7 @@ class LiveNode:
         self.flags: list[OutlierFlags] = []
         self.orientations: list[QuaternionStamped] = []
         self.status: dict[str, str] = {}
+        self.reports = 0
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         probe.create_subscription(AbsoluteOrientations, "/abs_orientations", self.answers.append, latched)
         probe.create_subscription(OutlierFlags, "/outlier_flags", self.flags.append, latched)
@@ -176,9 +178,19 @@ class LiveNode:
             self.executor.spin_once(timeout_sec=0.05)
 
     def wait_for_silence(self) -> AbsoluteOrientations:
-        """Wait for the cold answer after which nothing more comes; returns it."""
-        self.status.clear()
-        self.spin_until(lambda: self.status.get("answer cold") == "true" and float(self.status["answer age s"]) > 1)
+        """Wait for the cold answer after which nothing more comes; returns it.
+
+        A report may be on its way that knows nothing of what was sent last, so the second one from now counts.
+        """
+        reports = self.reports
+
+        def silent() -> bool:
+            if self.reports < reports + 2 or not self.answers or self.status["answer cold"] != "true":
+                return False
+            complete = len(self.answers[-1].keyframe_ids) == int(self.status["keyframes"])
+            return complete and float(self.status["answer age s"]) > 1
+
+        self.spin_until(silent)
         return self.answers[-1]
 
     def call(self, service: str, service_type: type = Trigger, **request: Any) -> Any:
@@ -192,6 +204,7 @@ class LiveNode:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         status = message.status[0]
+        self.reports += 1
         self.status = {pair.key: pair.value for pair in status.values}
         self.status |= {"level": str(ord(status.level)), "message": status.message, "name": status.name}
 

@@ -135,6 +135,7 @@ def test_a_node_that_was_killed_goes_on_where_it_was_saved(live_node, tmp_path) 
     assert after.keyframe_ids == before.keyframe_ids and after.stamps_ns == before.stamps_ns
     np.testing.assert_allclose(after.orientations, before.orientations, atol=1e-9)
     feed(live_node, 20, 25)
+    wait_for(live_node, "keyframes", 25)  # the middleware may take seconds to serve a reader that has just come
     assert len(live_node.wait_for_silence().keyframe_ids) == 25
 
 
