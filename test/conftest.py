@@ -6,6 +6,7 @@ import atexit
 import os
 import random
 import shutil
+import signal
 import socket
 import tempfile
 from pathlib import Path
@@ -13,6 +14,9 @@ from pathlib import Path
 import pytest
 import torch
 from hypothesis import settings
+
+# A shell that runs the tests in the background lets its children ignore SIGINT, which the tests send.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ROOT = Path(__file__).resolve().parent.parent
 MAX_THREADS = 2
