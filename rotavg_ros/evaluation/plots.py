@@ -69,12 +69,12 @@ def reliability(path: Path, calibration: dict[str, CalibrationBins], title: str)
     figure.savefig(path)
 
 
-def style(axes: Axes, title: str) -> None:
+def style(axes: Axes, title: str, *, ink: str = INK, muted: str = MUTED, grid: str = GRID) -> None:
     """The look of all pictures."""
-    axes.set_title(title, loc="left", fontsize=11, color=INK, pad=8)
-    axes.grid(color=GRID, linewidth=0.7)
+    axes.set_title(title, loc="left", fontsize=11, color=ink, pad=8)
+    axes.grid(color=grid, linewidth=0.7)
     axes.set_axisbelow(True)
-    axes.tick_params(which="both", colors=MUTED, labelsize=9, length=0)
+    axes.tick_params(which="both", colors=muted, labelsize=9, length=0)
     for side in axes.spines.values():
         side.set_visible(False)
 
