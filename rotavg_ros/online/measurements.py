@@ -32,6 +32,7 @@ class RejectReason(str, Enum):
     STAMP_OUT_OF_RANGE = "stamp_out_of_range"
     ODOMETRY_GAP = "odometry_gap"
     BAD_STAMP = "bad_stamp"
+    NO_ORIENTATION = "no_orientation"
     OUT_OF_ORDER_ODOMETRY = "out_of_order_odometry"
     REPEATED_STAMP = "repeated_stamp"
     ID_OUT_OF_RANGE = "id_out_of_range"

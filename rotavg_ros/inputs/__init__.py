@@ -1,0 +1,20 @@
+"""What others' messages say, as measurements: one module per source, chosen by the type's name.
+
+Converters look at a message's fields only, so they take rclpy's messages as well as those that `rosbags` decodes, and
+import neither.
+"""
+
+from rotavg_ros.inputs.records import EdgeConverter, EdgeRecord, EdgeVerdict, OdometryConverter, OdometryRecord, Source
+from rotavg_ros.inputs.registry import BRINGS_KEYFRAMES, EDGE_CONVERTERS, ODOMETRY_CONVERTERS
+
+__all__ = [
+    "BRINGS_KEYFRAMES",
+    "EDGE_CONVERTERS",
+    "ODOMETRY_CONVERTERS",
+    "EdgeConverter",
+    "EdgeRecord",
+    "EdgeVerdict",
+    "OdometryConverter",
+    "OdometryRecord",
+    "Source",
+]

@@ -1,0 +1,76 @@
+"""What senders of pose graphs have in common: edges between keyframes of their own, sent again and again."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from typing import Any
+
+from rotavg_ros.inputs.fields import edge_id_of, target_from_source, to_tuple
+from rotavg_ros.inputs.records import EdgeRecord, Source
+from rotavg_ros.online import EdgeMeasurement, KeyframeReference
+from rotavg_ros.online.measurements import RejectedInputError
+
+# (robot, keyframe id)
+Key = tuple[str, int]
+
+
+class ForeignGraph:
+    """Edges by keyframe id; each measurement passes once, however often the sender repeats its graph.
+
+    A repeated edge with another rotation is another measurement of the same pair.
+    """
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self._seen: set[tuple[object, ...]] = set()
+        self._stamp_ns: dict[Key, int] = {}
+
+    def forget(self) -> None:
+        self._seen.clear()
+        self._stamp_ns.clear()
+
+    def _note_stamp(self, key: Key, stamp_ns: int) -> None:
+        """Remember when a keyframe was taken; 0 means that the sender does not say."""
+        if stamp_ns > 0:
+            self._stamp_ns.setdefault(key, stamp_ns)
+
+    def _edges(self, ends: tuple[Key, Key], rotation: Any, kind: int, precision: float) -> Iterator[EdgeRecord]:
+        """The edge from ``ends[0]`` to ``ends[1]``, unless it has been seen.
+
+        Args:
+            ends: source and target.
+            rotation: ``geometry_msgs/Quaternion``, orientation of the target in the source frame.
+            kind: an ``EdgeKind`` value.
+            precision: rad⁻², 0 unknown.
+        """
+        source_from_target = to_tuple(rotation)
+        measurement = (*ends, kind, source_from_target)
+        if measurement in self._seen:
+            return
+        try:
+            inside = target_from_source(source_from_target, self._source.body_from_sensor)
+        except RejectedInputError as rejection:
+            yield EdgeRecord(rejection.reason)
+            return
+        self._seen.add(measurement)
+        source, target = (KeyframeReference(*key, self._stamp_ns.get(key)) for key in ends)
+        edge_id = edge_id_of(ends[0][1], ends[1][1], kind)
+        yield EdgeRecord(EdgeMeasurement(edge_id, source, target, inside, kind, precision))
+
+
+def edges_in_order(
+    edges: Iterable[Any], kind_of: Mapping[int, int], no_edges: Collection[int]
+) -> tuple[list[Any], int]:
+    """Edges of the known types, odometry first, for it makes the keyframes that closures refer to.
+
+    Args:
+        edges: with a field ``type``.
+        kind_of: the ``EdgeKind`` of every type that joins two keyframes.
+        no_edges: types that are something else.
+
+    Returns:
+        those edges, and how many are of a type that nobody knows.
+    """
+    edges = [edge for edge in edges if edge.type not in no_edges]
+    known = sorted((edge for edge in edges if edge.type in kind_of), key=lambda edge: kind_of[edge.type])
+    return known, len(edges) - len(known)

@@ -1,0 +1,87 @@
+"""What a converter knows about its source, and what it makes of a message."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from rotavg_ros.online import EdgeMeasurement, RejectReason
+from rotavg_ros.online.keyframes import Position
+from rotavg_ros.online.quaternion import IDENTITY, Quaternion
+from rotavg_ros.view_graph import EdgeLabel
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where messages come from: what they do not say themselves.
+
+    Attributes:
+        robot: whose they are, where they name no robot.
+        robots: names of all robots, for messages that number them.
+        body_from_sensor: orientation in the body frame of the sensor frame that the messages' rotations are given in.
+    """
+
+    robot: str
+    robots: tuple[str, ...] = ()
+    body_from_sensor: Quaternion = IDENTITY
+
+    def robot_of(self, number: int) -> str:
+        """Name of the robot with a number: its place in ``robots``, unless robots there have numbers for names.
+
+        A number that means none of them becomes a name itself.
+        """
+        numbered = {int(name): name for name in self.robots if name.isdecimal()}
+        return (numbered or dict(enumerate(self.robots))).get(number, str(number))
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeRecord:
+    """One edge of a message.
+
+    Attributes:
+        edge: the measurement, or why it cannot be read.
+        sender, sequence: who counts, and the count; 0 for senders that do not.
+    """
+
+    edge: EdgeMeasurement | RejectReason
+    sender: str = ""
+    sequence: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeVerdict:
+    """A sender's changed mind about edges that it has sent, for :meth:`OnlineEstimator.label_edge`."""
+
+    source_robot: str
+    edge_id: int
+    label: EdgeLabel
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryRecord:
+    """The body's pose in its odometry's frame.
+
+    Attributes:
+        stamp_ns: nanoseconds.
+        world_from_body: xyzw, not checked.
+        position: metres, of the sensor; None where the message carries none.
+    """
+
+    stamp_ns: int
+    world_from_body: Quaternion
+    position: Position | None
+
+
+class EdgeConverter(Protocol):
+    """Turns the messages of one topic into edges. It may remember what it has seen."""
+
+    def __call__(self, message: Any) -> Iterator[EdgeRecord | EdgeVerdict]:
+        """What is new in a message."""
+
+    def forget(self) -> None:
+        """Begin anew, as the graph does: everything that is sent again is new."""
+
+
+# Message, body_from_sensor → record. Raises RejectedInputError for what cannot be read at all.
+OdometryConverter = Callable[[Any, Quaternion], OdometryRecord]

@@ -1,0 +1,42 @@
+"""Type names to converters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rotavg_ros.inputs.cslam import (
+    InterRobotLoopClosureConverter,
+    IntraRobotLoopClosureConverter,
+    KeyframeOdomConverter,
+)
+from rotavg_ros.inputs.odometry import from_imu, from_odometry, from_pose, from_pose_with_covariance
+from rotavg_ros.inputs.pose_graph_tools import PoseGraphConverter
+from rotavg_ros.inputs.records import EdgeConverter, OdometryConverter, Source
+from rotavg_ros.inputs.rotavg import RelativeRotationArrayConverter, RelativeRotationConverter
+from rotavg_ros.inputs.rtabmap import MapGraphConverter
+
+_FOREIGN: dict[str, Callable[[Source], EdgeConverter]] = {
+    "rtabmap_msgs/msg/MapGraph": MapGraphConverter,
+    "pose_graph_tools_msgs/msg/PoseGraph": PoseGraphConverter,
+    "cslam_common_interfaces/msg/KeyframeOdom": KeyframeOdomConverter,
+    "cslam_common_interfaces/msg/IntraRobotLoopClosure": IntraRobotLoopClosureConverter,
+    "cslam_common_interfaces/msg/InterRobotLoopClosure": InterRobotLoopClosureConverter,
+}
+
+# What carries edges; each topic has a converter of its own.
+EDGE_CONVERTERS: dict[str, Callable[[Source], EdgeConverter]] = {
+    "rotavg_msgs/msg/RelativeRotation": RelativeRotationConverter,
+    "rotavg_msgs/msg/RelativeRotationArray": RelativeRotationArrayConverter,
+    **_FOREIGN,
+}
+
+# Edges between keyframes that the sender itself has chosen and numbered, so that none may be made from odometry.
+BRINGS_KEYFRAMES = frozenset(_FOREIGN)
+
+# What carries the rotation of a robot's odometry.
+ODOMETRY_CONVERTERS: dict[str, OdometryConverter] = {
+    "nav_msgs/msg/Odometry": from_odometry,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": from_pose_with_covariance,
+    "geometry_msgs/msg/PoseStamped": from_pose,
+    "sensor_msgs/msg/Imu": from_imu,
+}

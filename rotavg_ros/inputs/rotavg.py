@@ -1,0 +1,65 @@
+"""The project's own messages: ``rotavg_msgs/RelativeRotation`` and ``RelativeRotationArray``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from rotavg_ros.inputs.fields import target_from_source, to_nanoseconds, to_tuple
+from rotavg_ros.inputs.records import EdgeRecord, Source
+from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason
+from rotavg_ros.online.measurements import RejectedInputError
+
+# KeyframeReference.by
+_BY_ID, _BY_STAMP = 0, 1
+
+
+class RelativeRotationConverter:
+    """Single edges; every message is taken for what it is, the estimator knows repetitions."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+
+    def __call__(self, message: Any) -> Iterator[EdgeRecord]:
+        try:
+            edge: EdgeMeasurement | RejectReason = edge_from_message(message, self._source)
+        except RejectedInputError as rejection:
+            edge = rejection.reason
+        yield EdgeRecord(edge, message.source.robot, int(message.sequence))
+
+    def forget(self) -> None:
+        """Nothing is remembered."""
+
+
+class RelativeRotationArrayConverter(RelativeRotationConverter):
+    """Many edges in a message."""
+
+    def __call__(self, message: Any) -> Iterator[EdgeRecord]:
+        for edge in message.edges:
+            yield from super().__call__(edge)
+
+
+def edge_from_message(message: Any, source: Source) -> EdgeMeasurement:
+    """An edge between bodies from one between sensors.
+
+    Raises:
+        RejectedInputError: a field that cannot be read at all.
+    """
+    return EdgeMeasurement(
+        edge_id=int(message.id),
+        source=_reference(message.source, source.robot),
+        target=_reference(message.target, source.robot),
+        target_from_source=target_from_source(to_tuple(message.rotation), source.body_from_sensor),
+        kind=int(message.kind),
+        precision=float(message.precision),
+    )
+
+
+def _reference(message: Any, default_robot: str) -> KeyframeReference:
+    robot = message.robot or default_robot
+    stamp_ns = to_nanoseconds(message.stamp)
+    if message.by == _BY_ID:
+        return KeyframeReference(robot, int(message.id), stamp_ns or None)
+    if message.by == _BY_STAMP:
+        return KeyframeReference(robot, None, stamp_ns)
+    raise RejectedInputError(RejectReason.BAD_REFERENCE)

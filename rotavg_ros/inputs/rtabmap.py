@@ -1,0 +1,48 @@
+"""RTAB-Map's graph, ``rtabmap_msgs/MapGraph``: whole in every message, with nodes left out when it is optimised.
+
+Facts from the package's message definitions and from ``rtabmap/core/Link.h``: a link's transform is the pose of
+``to_id`` in the frame of ``from_id``, its matrix is information, not covariance, and nodes carry no stamps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from rotavg_ros.inputs.fields import precision_of_information, to_nanoseconds
+from rotavg_ros.inputs.foreign_graph import ForeignGraph, edges_in_order
+from rotavg_ros.inputs.records import EdgeRecord
+from rotavg_ros.online import RejectReason
+from rotavg_ros.online.measurements import RejectedInputError
+from rotavg_ros.view_graph import EdgeKind
+
+# Link types. 0 joins neighbours in time; 1 … 5 are closures: global, in space, in time, by a user, virtual. 6 stands
+# for links through a node that was merged into another, closures among them, so it may be as wrong as one.
+_KIND = {0: EdgeKind.ODOMETRY} | dict.fromkeys(range(1, 7), EdgeKind.LOOP_CLOSURE)
+# Pose priors, landmarks and gravity do not join two keyframes.
+_NO_EDGES = (7, 8, 9)
+
+
+class MapGraphConverter(ForeignGraph):
+    """The message is about one robot."""
+
+    def __call__(self, message: Any) -> Iterator[EdgeRecord]:
+        robot = self._source.robot
+        try:
+            stamp_ns = to_nanoseconds(message.header.stamp)
+        except RejectedInputError as rejection:
+            yield EdgeRecord(rejection.reason)
+            return
+        if len(message.poses_id):
+            # The newest node is the frame that the message was published for.
+            self._note_stamp((robot, int(max(message.poses_id))), stamp_ns)
+        links, unknown = edges_in_order(message.links, _KIND, _NO_EDGES)
+        for link in links:
+            yield from self._edges(
+                ((robot, int(link.from_id)), (robot, int(link.to_id))),
+                link.transform.rotation,
+                _KIND[link.type],
+                precision_of_information(link.information),
+            )
+        for _ in range(unknown):
+            yield EdgeRecord(RejectReason.BAD_KIND)

@@ -1,0 +1,239 @@
+"""Converters on bare objects with the messages' fields: directions, precisions, stamps, repetitions, verdicts."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace as Fields
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS, EdgeRecord, EdgeVerdict, Source
+from rotavg_ros.inputs.fields import precision_of_covariance, precision_of_information, to_nanoseconds
+from rotavg_ros.online import EdgeMeasurement, RejectReason
+from rotavg_ros.online.measurements import RejectedInputError
+from rotavg_ros.view_graph import EdgeLabel
+
+SIDES = 4
+BODY_FROM_SENSOR = Rotation.from_euler("zyx", [-90, 0, -90], degrees=True)  # a camera that looks ahead
+
+
+def world_from_body(corner: int) -> Rotation:
+    """Around a square, with a roll that makes the rotations not commute."""
+    return Rotation.from_euler("zx", [90 * corner, 20 * (corner % SIDES)], degrees=True)
+
+
+def world_from_sensor(corner: int) -> Rotation:
+    return world_from_body(corner) * BODY_FROM_SENSOR
+
+
+def quaternion(rotation: Rotation) -> Fields:
+    x, y, z, w = rotation.as_quat().tolist()
+    return Fields(x=x, y=y, z=z, w=w)
+
+
+def between(source: int, target: int) -> Fields:
+    """Orientation of the target in the source frame, as gtsam's BetweenFactor has it."""
+    return quaternion(world_from_sensor(source).inv() * world_from_sensor(target))
+
+
+def stamp(corner: int) -> Fields:
+    return Fields(sec=100 + corner, nanosec=5)
+
+
+def pose(rotation: Fields) -> Fields:
+    return Fields(position=Fields(x=1.0, y=2.0, z=3.0), orientation=rotation)
+
+
+def diagonal(rotation: float) -> np.ndarray:
+    return np.diag([9.0, 9.0, 9.0, rotation, rotation, rotation]).ravel()
+
+
+def link(source: int, target: int, kind: int) -> Fields:
+    transform = Fields(rotation=between(source, target))
+    return Fields(from_id=source, to_id=target, type=kind, transform=transform, information=diagonal(25.0))
+
+
+def map_graph() -> Fields:
+    links = [link(3, 0, 1), link(0, 1, 0), link(1, 2, 0), link(2, 3, 0), link(1, 3, 7), link(0, 0, 9)]
+    return Fields(header=Fields(stamp=stamp(3)), poses_id=np.arange(4, dtype=np.int32), links=links)
+
+
+def pose_graph_edge(source: int, target: int, kind: int) -> Fields:
+    return Fields(
+        key_from=source,
+        key_to=target,
+        robot_from=1,
+        robot_to=1,
+        type=kind,
+        pose=pose(between(source, target)),
+        covariance=diagonal(0.04),
+    )
+
+
+def pose_graph(closure: int) -> Fields:
+    nodes = [Fields(robot_id=1, key=key, header=Fields(stamp=stamp(key))) for key in range(SIDES)]
+    edges = [pose_graph_edge(3, 0, closure), *(pose_graph_edge(key, key + 1, 0) for key in range(3))]
+    return Fields(nodes=nodes, edges=edges)
+
+
+def keyframe_odometry(corner: int) -> Fields:
+    odometry = Fields(header=Fields(stamp=stamp(corner)), pose=Fields(pose=pose(quaternion(world_from_sensor(corner)))))
+    return Fields(id=corner, odom=odometry)
+
+
+def intra_closure(success: bool = True) -> Fields:
+    return Fields(keyframe0_id=3, keyframe1_id=0, success=success, transform=Fields(rotation=between(3, 0)))
+
+
+def inter_closure() -> Fields:
+    ends = {"robot0_id": 1, "robot0_keyframe_id": 3, "robot1_id": 2, "robot1_keyframe_id": 0}
+    return Fields(**ends, success=True, transform=Fields(rotation=between(3, 0)))
+
+
+def converter(type_name: str):
+    return EDGE_CONVERTERS[type_name](Source("b", ("a", "b", "c"), tuple(BODY_FROM_SENSOR.as_quat().tolist())))
+
+
+def edges(records) -> list[EdgeMeasurement]:
+    return [record.edge for record in records if isinstance(record, EdgeRecord)]
+
+
+SQUARE = {
+    "rtabmap_msgs/msg/MapGraph": ([map_graph()], 25.0),
+    "pose_graph_tools_msgs/msg/PoseGraph": ([pose_graph(1)], 25.0),
+    "cslam_common_interfaces/msg/KeyframeOdom": ([keyframe_odometry(corner) for corner in range(SIDES)], 0.0),
+    "cslam_common_interfaces/msg/IntraRobotLoopClosure": ([intra_closure()], 0.0),
+    "cslam_common_interfaces/msg/InterRobotLoopClosure": ([inter_closure()], 0.0),
+}
+
+
+@pytest.mark.parametrize("type_name", SQUARE)
+def test_edges_lead_around_a_square(type_name: str) -> None:
+    """R_target = R_target_source R_source of the true body-from-world orientations, for every edge."""
+    messages, precision = SQUARE[type_name]
+    convert = converter(type_name)
+    found = edges(record for message in messages for record in convert(message))
+    assert len(found) == (1 if "Closure" in type_name else 3 if "Keyframe" in type_name else 4)
+    for edge in found:
+        source, target = edge.source.keyframe_id, edge.target.keyframe_id
+        expected = world_from_body(target).inv() * world_from_body(source)
+        assert (Rotation.from_quat(edge.target_from_source).inv() * expected).magnitude() < 1e-12
+        assert edge.kind == (target == 0)  # the closure is the edge back to the first corner
+        assert edge.precision == pytest.approx(precision)
+        assert edge.source.robot == "b"
+        assert edge.target.robot == ("c" if "Inter" in type_name else "b")
+    assert [edge.kind for edge in found] == sorted(edge.kind for edge in found)  # odometry makes the keyframes
+    assert len({edge.edge_id for edge in found}) == len(found)
+
+
+def test_graphs_that_are_sent_again_say_nothing_new() -> None:
+    convert = converter("rtabmap_msgs/msg/MapGraph")
+    assert len(list(convert(map_graph()))) == 4
+    pruned = map_graph()
+    pruned.links = [link for link in pruned.links if 2 not in (link.from_id, link.to_id)]
+    pruned.links.append(link(3, 1, 2))
+    assert [(edge.source.keyframe_id, edge.target.keyframe_id) for edge in edges(convert(pruned))] == [(3, 1)]
+    assert list(convert(map_graph())) == []
+    convert.forget()
+    assert len(list(convert(map_graph()))) == 4
+
+
+def test_stamps_of_keyframes() -> None:
+    """RTAB-Map's message is of its newest node's time; Kimera's nodes have stamps; Swarm-SLAM's closures none."""
+    times = {corner: to_nanoseconds(stamp(corner)) for corner in range(SIDES)}
+    for type_name, (messages, _) in SQUARE.items():
+        convert = converter(type_name)
+        for edge in edges(record for message in messages for record in convert(message)):
+            for end in (edge.source, edge.target):
+                known = type_name.endswith(("PoseGraph", "Odom")) or ("MapGraph" in type_name and end.keyframe_id == 3)
+                assert end.stamp_ns == (times[end.keyframe_id] if known else None)
+
+
+def test_a_senders_verdict_on_a_closure() -> None:
+    convert = converter("pose_graph_tools_msgs/msg/PoseGraph")
+    closure = edges(convert(pose_graph(1)))[-1]
+    rejected = list(convert(pose_graph(3)))
+    assert rejected == [EdgeVerdict("b", closure.edge_id, EdgeLabel.REJECTED)]
+    assert list(convert(pose_graph(3))) == []
+    assert list(convert(pose_graph(1))) == [EdgeVerdict("b", closure.edge_id, EdgeLabel.AUTOMATIC)]
+    late = converter("pose_graph_tools_msgs/msg/PoseGraph")
+    assert list(late(pose_graph(3)))[-1] == rejected[0]
+
+
+def test_what_cannot_be_read_is_a_reason() -> None:
+    def reasons(type_name: str, message: Fields) -> list[object]:
+        return [record.edge for record in converter(type_name)(message) if isinstance(record.edge, RejectReason)]
+
+    graph = map_graph()
+    graph.links[1].transform.rotation.x = float("nan")
+    graph.links[2].type = 42
+    assert reasons("rtabmap_msgs/msg/MapGraph", graph) == ["nan_rotation", "bad_kind"]
+    graph.header.stamp.sec = -1
+    assert reasons("rtabmap_msgs/msg/MapGraph", graph) == ["bad_stamp"]
+    graph = pose_graph(1)
+    graph.nodes[0].header.stamp.nanosec = 2**31
+    graph.edges[0].robot_from = -1
+    graph.edges[1].pose.orientation.w = 0.0
+    assert reasons("pose_graph_tools_msgs/msg/PoseGraph", graph)[0] == "bad_stamp"
+    assert sorted(reasons("pose_graph_tools_msgs/msg/PoseGraph", graph)[1:]) == [
+        "bad_reference",
+        "unnormalized_quaternion",
+    ]
+    assert list(converter("cslam_common_interfaces/msg/IntraRobotLoopClosure")(intra_closure(success=False))) == []
+
+
+def test_keyframes_whose_numbers_start_again_begin_a_new_chain() -> None:
+    convert = converter("cslam_common_interfaces/msg/KeyframeOdom")
+    pairs = []
+    for number in (0, 1, 3, 0, 4, 5):
+        pairs.extend(
+            edge if isinstance(edge, RejectReason) else (edge.source.keyframe_id, edge.target.keyframe_id)
+            for edge in edges(convert(Fields(id=number, odom=keyframe_odometry(number).odom)))
+        )
+    assert pairs == [(0, 1), (1, 3), RejectReason.OUT_OF_ORDER_ODOMETRY, (4, 5)]
+
+
+@pytest.mark.parametrize("type_name", ODOMETRY_CONVERTERS)
+def test_odometry_of_a_sensor_that_is_turned_in_the_body(type_name: str) -> None:
+    orientation = quaternion(world_from_sensor(2))
+    posed = {
+        "nav_msgs/msg/Odometry": Fields(pose=pose(orientation)),
+        "geometry_msgs/msg/PoseWithCovarianceStamped": Fields(pose=pose(orientation)),
+        "geometry_msgs/msg/PoseStamped": pose(orientation),
+    }
+    message = Fields(header=Fields(stamp=stamp(2)))
+    if type_name in posed:
+        message.pose = posed[type_name]
+    else:
+        message.orientation, message.orientation_covariance = orientation, np.zeros(9)
+    record = ODOMETRY_CONVERTERS[type_name](message, tuple(BODY_FROM_SENSOR.as_quat().tolist()))
+    assert record.stamp_ns == to_nanoseconds(stamp(2))
+    assert (Rotation.from_quat(record.world_from_body).inv() * world_from_body(2)).magnitude() < 1e-12
+    assert record.position == ((1.0, 2.0, 3.0) if type_name in posed else None)
+
+
+def test_an_imu_without_orientation() -> None:
+    message = Fields(header=Fields(stamp=stamp(0)), orientation=quaternion(Rotation.identity()))
+    message.orientation_covariance = np.array([-1.0] + [0.0] * 8)
+    with pytest.raises(RejectedInputError, match="no_orientation"):
+        ODOMETRY_CONVERTERS["sensor_msgs/msg/Imu"](message, (0.0, 0.0, 0.0, 1.0))
+
+
+def test_precision_agrees_with_the_spread_of_rotation_vectors() -> None:
+    rng = np.random.default_rng(0)
+    deviation = 0.05
+    vectors = rng.normal(scale=deviation, size=(20_000, 3))
+    covariance = np.zeros((6, 6))
+    covariance[3:, 3:] = np.cov(vectors.T)
+    information = np.zeros((6, 6))
+    information[3:, 3:] = np.linalg.inv(covariance[3:, 3:])
+    assert precision_of_covariance(covariance.ravel()) == pytest.approx(deviation**-2, rel=0.03)
+    assert precision_of_information(information.ravel()) == pytest.approx(deviation**-2, rel=0.03)
+    assert precision_of_covariance(np.zeros(36)) == precision_of_information(np.zeros(36)) == 0.0
+    assert precision_of_covariance(-covariance.ravel()) < 0  # refused later, as bad_precision
+
+
+def test_numbers_of_robots() -> None:
+    assert [Source("", ("red", "blue")).robot_of(number) for number in (0, 1, 2)] == ["red", "blue", "2"]
+    assert [Source("", ("7", "0")).robot_of(number) for number in (0, 1, 7)] == ["0", "1", "7"]
