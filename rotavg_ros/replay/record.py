@@ -79,7 +79,7 @@ class RobotRecord:
         odometry_position: ``(n, 3)`` metres in odometry's frame; None without positions.
         world_from_body: ``(n, 4)`` xyzw, corrected.
         position_dead_reckoned: ``(n, 3)`` metres, odometry's steps along the corrected orientations; None without.
-        position: ``(n, 3)`` metres, by least squares over odometry and the surviving closures' translations; None without.
+        position: ``(n, 3)`` metres, least squares over odometry's and surviving closures' translations; None without.
         uncertainty: ``(n,)`` one sigma of the orientation in radians, NaN unknown.
         reference: to compare with; None without.
     """
