@@ -49,15 +49,20 @@ class CleanNet(nn.Module):
             features = torch.cat((features, extra_features.repeat(2, 1)), dim=1)
         no_states = features.new_zeros(edges.num_nodes, 0)
         _, messages = self.network(no_states, features, edges)
-        logit = self.outlier_head(messages).squeeze(1)
-        noise = self.noise_head(messages)
-        forward, backward = noise[:num_edges], noise[num_edges:]
-        # R̃_uv = clean · noise holds for the edge as given; the reversed edge's noise is seen from the other end,
-        # so it is carried over by the measurement before the two opinions are averaged.
-        carried = rotations.multiply(
-            rotations.multiply(rotations.inverse(target_from_source), rotations.inverse(backward)), target_from_source
+        noise, logit = self.noise_head(messages), self.outlier_head(messages).squeeze(1)
+        return CleanEdges(
+            correct(target_from_source, noise[:num_edges], noise[num_edges:]),
+            (logit[:num_edges] + logit[num_edges:]) / 2,
         )
-        unit = rotations.identity(1, dtype=noise.dtype, device=noise.device)
-        correction = nn.functional.normalize(unit + (forward + carried) / 2, dim=1)
-        clean = rotations.canonical(rotations.multiply(target_from_source, correction))
-        return CleanEdges(clean, (logit[:num_edges] + logit[num_edges:]) / 2)
+
+
+def correct(target_from_source: Tensor, forward: Tensor, backward: Tensor) -> Tensor:
+    """Measurements ``(M, 4)`` without the noise that the messages of their two directions predict, ``(M, 4)`` each."""
+    # R̃_uv = clean · noise holds for the edge as given; the reversed edge's noise is seen from the other end,
+    # so it is carried over by the measurement before the two opinions are averaged.
+    carried = rotations.multiply(
+        rotations.multiply(rotations.inverse(target_from_source), rotations.inverse(backward)), target_from_source
+    )
+    unit = rotations.identity(1, dtype=forward.dtype, device=forward.device)
+    noise = nn.functional.normalize(unit + (forward + carried) / 2, dim=1)
+    return rotations.canonical(rotations.multiply(target_from_source, noise))

@@ -36,6 +36,10 @@ class FineNet(nn.Module):
         if extra_features is not None:
             features = torch.cat((features, extra_features.repeat(2, 1)), dim=1)
         states, _ = self.network(body_from_world, features, edges)
+        return self.correct(body_from_world, states)
+
+    def correct(self, body_from_world: Tensor, states: Tensor) -> Tensor:
+        """Orientations ``(N, 4)`` corrected by what the last node states ``(N, hidden)`` say."""
         unit = rotations.identity(1, dtype=states.dtype, device=states.device)
         # Residuals are rotations of the world frame, and so is the correction: it goes on the right.
         correction = nn.functional.normalize(unit + self.correction_head(states), dim=1)

@@ -8,6 +8,8 @@ A layer computes, for every directed edge u→v with features ``x_uv`` and for e
 so a message ``m_uv = D a_uv + d`` is linear, ReLU, linear. Node states are projected (A, B) before they are gathered,
 and D commutes with the mean, so it is applied to nodes, not to edges. That edges remember is the authors' released code
 rather than the paper's text; on equal training it lifts CleanNet's accuracy from 94.1 to 95.8 %.
+
+This is the specification, and what training differentiates; solves run the same formula through ``inference.py``.
 """
 
 from __future__ import annotations
@@ -81,10 +83,13 @@ class MessagePassingLayer(nn.Module):
         """Node states ``(N, node_width)``, edge features ``(2M, edge_width)`` → states ``(N, hidden)``, activations."""
         activation = self.activate(nodes, features, edges)
         collected = activation.new_zeros(edges.num_nodes, activation.shape[1])
-        collected = collected.index_add(0, edges.target, activation) * edges.inverse_degree
-        connected = (edges.inverse_degree > 0).to(collected)
-        message = self.message_output(collected) * connected
-        return torch.relu(self.update(torch.cat((nodes, message), dim=1))), activation
+        mean = collected.index_add(0, edges.target, activation) * edges.inverse_degree
+        return self.update_nodes(nodes, mean, edges.inverse_degree > 0), activation
+
+    def update_nodes(self, nodes: Tensor, mean: Tensor, is_connected: Tensor) -> Tensor:
+        """New states ``(N, hidden)`` from old ones and the mean activation ``(N, hidden)`` of the edges that arrive."""
+        message = self.message_output(mean) * is_connected.to(mean)
+        return torch.relu(self.update(torch.cat((nodes, message), dim=1)))
 
 
 class MessagePassingNetwork(nn.Module):
