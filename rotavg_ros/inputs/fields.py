@@ -11,7 +11,7 @@ from typing import Any
 
 from rotavg_ros.online import RejectReason, quaternion
 from rotavg_ros.online.measurements import RejectedInputError, checked_rotation
-from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.online.quaternion import Quaternion, Vector
 
 NANOSECONDS = 1_000_000_000
 
@@ -35,6 +35,11 @@ def to_nanoseconds(stamp: Any) -> int:
 def to_tuple(rotation: Any) -> Quaternion:
     """The four numbers xyzw of a ``geometry_msgs/Quaternion``, unchecked."""
     return (rotation.x, rotation.y, rotation.z, rotation.w)
+
+
+def to_vector(vector: Any) -> Vector:
+    """The three numbers of a ``geometry_msgs/Vector3`` or ``Point``."""
+    return (vector.x, vector.y, vector.z)
 
 
 def target_from_source(source_from_target: Quaternion, body_from_sensor: Quaternion) -> Quaternion:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
-from rotavg_ros.inputs.fields import edge_id_of, target_from_source, to_tuple
+from rotavg_ros.inputs.fields import edge_id_of, target_from_source, to_tuple, to_vector
 from rotavg_ros.inputs.records import EdgeRecord, Source
-from rotavg_ros.online import EdgeMeasurement, KeyframeReference
+from rotavg_ros.online import EdgeMeasurement, KeyframeReference, quaternion
 from rotavg_ros.online.measurements import RejectedInputError
 
 # (robot, keyframe id)
@@ -34,12 +34,15 @@ class ForeignGraph:
         if stamp_ns > 0:
             self._stamp_ns.setdefault(key, stamp_ns)
 
-    def _edges(self, ends: tuple[Key, Key], rotation: Any, kind: int, precision: float) -> Iterator[EdgeRecord]:
+    def _edges(
+        self, ends: tuple[Key, Key], rotation: Any, translation: Any, kind: int, precision: float
+    ) -> Iterator[EdgeRecord]:
         """The edge from ``ends[0]`` to ``ends[1]``, unless it has been seen.
 
         Args:
             ends: source and target.
             rotation: ``geometry_msgs/Quaternion``, orientation of the target in the source frame.
+            translation: ``geometry_msgs/Vector3`` or ``Point``, position of the target in the source frame, metres.
             kind: an ``EdgeKind`` value.
             precision: rad⁻², 0 unknown.
         """
@@ -55,7 +58,9 @@ class ForeignGraph:
         self._seen.add(measurement)
         source, target = (KeyframeReference(*key, self._stamp_ns.get(key)) for key in ends)
         edge_id = edge_id_of(ends[0][1], ends[1][1], kind)
-        yield EdgeRecord(EdgeMeasurement(edge_id, source, target, inside, kind, precision))
+        # Where on the body the sensor sits is not known: the way of the sensor stands for that of the body.
+        position = quaternion.rotate(self._source.body_from_sensor, to_vector(translation))
+        yield EdgeRecord(EdgeMeasurement(edge_id, source, target, inside, kind, precision, position))
 
 
 def edges_in_order(

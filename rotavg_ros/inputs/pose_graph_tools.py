@@ -56,7 +56,7 @@ class PoseGraphConverter(ForeignGraph):
             return
         ends = self._key(edge.robot_from, edge.key_from), self._key(edge.robot_to, edge.key_to)
         kind, precision = _KIND[edge.type], precision_of_covariance(edge.covariance)
-        yield from self._edges(ends, edge.pose.orientation, kind, precision)
+        yield from self._edges(ends, edge.pose.orientation, edge.pose.position, kind, precision)
         is_rejected = edge.type == _REJECTED_CLOSURE
         if kind == EdgeKind.LOOP_CLOSURE and is_rejected != (ends in self._rejected):
             (self._rejected.add if is_rejected else self._rejected.discard)(ends)

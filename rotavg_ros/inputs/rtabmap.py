@@ -41,6 +41,7 @@ class MapGraphConverter(ForeignGraph):
             yield from self._edges(
                 ((robot, int(link.from_id)), (robot, int(link.to_id))),
                 link.transform.rotation,
+                link.transform.translation,
                 _KIND[link.type],
                 precision_of_information(link.information),
             )

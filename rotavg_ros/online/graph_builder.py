@@ -21,16 +21,23 @@ from rotavg_ros.online.measurements import (
 )
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.pending import PendingEdges
-from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion, Vector
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
 
 @dataclass(frozen=True, slots=True)
 class _Attachment:
-    """Where an edge's end is tied to the graph: a keyframe, and the body's rotation since."""
+    """Where an edge's end is tied to the graph: a keyframe, and how the body has moved since.
+
+    Attributes:
+        node: the keyframe's.
+        keyframe_from_body: the body's orientation in the keyframe's frame.
+        position: of the body in the keyframe's frame, metres; NaN where the odometry carries none.
+    """
 
     node: int
-    keyframe_from_body: Quaternion
+    keyframe_from_body: Quaternion = quaternion.IDENTITY
+    position: Vector = (0.0, 0.0, 0.0)
 
 
 class GraphBuilder:
@@ -131,7 +138,16 @@ class GraphBuilder:
                     previous.world_from_body,
                 )
             )
-            self.graph.add_edge(OWN_EDGE_ID, source, node, target_from_source, EdgeKind.ODOMETRY, math.nan)
+            step = _difference(track.latest.position or UNKNOWN_VECTOR, previous.position or UNKNOWN_VECTOR)
+            self.graph.add_edge(
+                OWN_EDGE_ID,
+                source,
+                node,
+                target_from_source,
+                EdgeKind.ODOMETRY,
+                math.nan,
+                translation=quaternion.rotate(quaternion.inverse(previous.world_from_body), step),
+            )
         track.mark_keyframe()
         self._place_all(self.pending.pop_keyframe(robot, keyframe_id))
 
@@ -178,6 +194,7 @@ class GraphBuilder:
             edge.kind,
             edge.precision or math.nan,
             self.labels.get((edge.source.robot, edge.edge_id), EdgeLabel.AUTOMATIC),
+            _between_keyframes(edge, measured, source, target),
         )
 
     def _attach(self, reference: KeyframeReference, settle: bool) -> _Attachment | None:
@@ -189,11 +206,11 @@ class GraphBuilder:
         robot, stamp_ns = reference.robot, reference.stamp_ns
         if reference.keyframe_id is not None:
             node = self.graph.node(robot, reference.keyframe_id)
-            return None if node is None else _Attachment(node, quaternion.IDENTITY)
+            return None if node is None else _Attachment(node)
         assert stamp_ns is not None
         node = self.graph.keyframe_at_or_before(robot, stamp_ns)
         if node is not None and self.graph.stamp_of(node) == stamp_ns:
-            return _Attachment(node, quaternion.IDENTITY)
+            return _Attachment(node)
         track = self.tracks.get(robot)
         if track is None or not (track.reaches(stamp_ns) or (settle and track.within_tolerance(stamp_ns))):
             return None
@@ -202,8 +219,15 @@ class GraphBuilder:
             node = self.graph.first_keyframe(robot)
         if node is None:
             raise RejectedInputError(RejectReason.UNKNOWN_KEYFRAME)
-        then = track.world_from_body_at(self.graph.stamp_of(node))
-        return _Attachment(node, quaternion.multiply(quaternion.inverse(then), now))
+        keyframe_ns = self.graph.stamp_of(node)
+        keyframe_from_odometry = quaternion.inverse(track.world_from_body_at(keyframe_ns))
+        return _Attachment(
+            node,
+            quaternion.multiply(keyframe_from_odometry, now),
+            quaternion.rotate(
+                keyframe_from_odometry, _difference(track.position_at(stamp_ns), track.position_at(keyframe_ns))
+            ),
+        )
 
     def _place_all(self, edges: Iterable[EdgeMeasurement], settle: bool = False) -> None:
         for edge in edges:
@@ -220,3 +244,22 @@ class GraphBuilder:
     def _drop(self, edge: EdgeMeasurement, reason: RejectReason) -> None:
         self.rejected[reason.value] += 1
         self.fingerprints.discard(edge.fingerprint())  # a retransmission gets another chance
+
+
+def _between_keyframes(
+    edge: EdgeMeasurement, target_from_source: Quaternion, source: _Attachment, target: _Attachment
+) -> Vector:
+    """Position of the target's keyframe in the frame of the source's, metres; NaN unknown.
+
+    ``p_ks_kt = p_ks_s + R_ks_s (p_s_t + R_s_t R_t_kt (-p_kt_t))``, pose by pose along ks → s → t → kt.
+    """
+    if edge.translation is None or not all(map(math.isfinite, edge.translation)):
+        return UNKNOWN_VECTOR
+    to_keyframe = quaternion.rotate(quaternion.inverse(target.keyframe_from_body), target.position)
+    step = _difference(edge.translation, quaternion.rotate(quaternion.inverse(target_from_source), to_keyframe))
+    x, y, z = quaternion.rotate(source.keyframe_from_body, step)
+    return (x + source.position[0], y + source.position[1], z + source.position[2])
+
+
+def _difference(a: Sequence[float], b: Sequence[float]) -> Vector:
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])

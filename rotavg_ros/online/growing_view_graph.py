@@ -12,7 +12,7 @@ import torch
 from numpy.typing import DTypeLike, NDArray
 
 from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS
-from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion, Vector
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 
@@ -64,6 +64,7 @@ class GraphSnapshot:
         keyframe_id: ``(N,)`` uint64.
         stamp_ns: ``(N,)`` int64, -1 where unknown.
         edge_id: ``(M,)`` uint64, the senders' ids.
+        translation: ``(M, 3)`` position of the edge's target in its source's frame, metres; NaN unknown.
         revision: of the growing graph.
     """
 
@@ -73,6 +74,7 @@ class GraphSnapshot:
     keyframe_id: NDArray[np.uint64]
     stamp_ns: NDArray[np.int64]
     edge_id: NDArray[np.uint64]
+    translation: NDArray[np.float64]
     revision: int
 
 
@@ -99,6 +101,7 @@ class GrowingViewGraph:
         self._kind = GrowingArray(np.int64)
         self._precision = GrowingArray(np.float64)
         self._label = GrowingArray(np.int64)
+        self._translation = GrowingArray(np.float64, width=3)
 
     @property
     def num_keyframes(self) -> int:
@@ -132,6 +135,7 @@ class GrowingViewGraph:
         kind: int,
         precision: float,
         label: int = EdgeLabel.AUTOMATIC,
+        translation: Vector = UNKNOWN_VECTOR,
     ) -> None:
         """Append an edge between two nodes; the rotation must be of unit length. Precision in rad⁻², NaN unknown."""
         self._edge_id.append(edge_id)
@@ -141,6 +145,7 @@ class GrowingViewGraph:
         self._kind.append(kind)
         self._precision.append(precision)
         self._label.append(label)
+        self._translation.append(translation)
         self.revision += 1
 
     def label_edges(self, source_robot: str, edge_id: int, label: int) -> int:
@@ -196,6 +201,7 @@ class GrowingViewGraph:
             keyframe_id=self._keyframe_id.view,
             stamp_ns=self._stamp_ns.view.copy(),
             edge_id=self._edge_id.view,
+            translation=self._translation.view,
             revision=self.revision,
         )
 
@@ -211,6 +217,7 @@ class GrowingViewGraph:
         for robot_index, keyframe_id, stamp_ns in keys:
             growing.add_keyframe(snapshot.robots[robot_index], keyframe_id, stamp_ns)
         growing._edge_id.extend(snapshot.edge_id)
+        growing._translation.extend(snapshot.translation)
         for column in ("source", "target", "target_from_source", "kind", "precision", "label"):
             getattr(growing, f"_{column}").extend(getattr(snapshot.graph, column).numpy())
         growing.revision = snapshot.revision

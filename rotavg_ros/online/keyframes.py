@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.growing_view_graph import GrowingArray
 from rotavg_ros.online.measurements import RejectedInputError, RejectReason, checked_rotation, checked_stamp
-from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion
 
-Position = tuple[float, float, float]
+Position = quaternion.Vector
 
-_UNKNOWN_POSITION = (math.nan, math.nan, math.nan)
 _COLUMNS = ("stamp_ns", "world_from_body", "position", "is_keyframe")
 
 
@@ -105,7 +104,7 @@ class OdometryTrack:
         self.latest = OdometrySample(stamp_ns, rotation, position)
         self._stamp_ns.append(stamp_ns)
         self._world_from_body.append(rotation)
-        self._position.append(_UNKNOWN_POSITION if position is None else position)
+        self._position.append(UNKNOWN_VECTOR if position is None else position)
         self._is_keyframe.append(False)
         return self.latest
 
@@ -159,6 +158,18 @@ class OdometryTrack:
                 raise RejectedInputError(RejectReason.ODOMETRY_GAP)
             return self._rotation(after if until_next < since_last else after - 1)
         return quaternion.slerp(self._rotation(after - 1), self._rotation(after), since_last / gap)
+
+    def position_at(self, stamp_ns: int) -> Position:
+        """The odometry's position at a moment: interpolated, clamped at the ends, NaN without positions."""
+        stamps, positions = self._stamp_ns.view, self._position.view
+        after = min(int(np.searchsorted(stamps, stamp_ns)), len(stamps) - 1)
+        before = max(after - 1, 0)
+        gap = int(stamps[after] - stamps[before])
+        share = min(max((stamp_ns - int(stamps[before])) / gap, 0.0), 1.0) if gap else 1.0
+        x, y, z = (
+            positions[after] if share == 1 else (1 - share) * positions[before] + share * positions[after]
+        ).tolist()
+        return (x, y, z)
 
     def first_body_from_world(self) -> Quaternion:
         """Inverse of the first message's rotation."""

@@ -84,6 +84,8 @@ class EdgeMeasurement:
         kind: an :class:`EdgeKind` value.
         precision: rad⁻²; 0 is unknown; negative or not finite refuses the edge (a sender that gets its own
             covariance wrong is not to be trusted with the rotation).
+        translation: of the target's body in the source's body frame, metres; None unknown. It has no part in the
+            rotations, only in the positions along them, so one that is not finite merely counts as unknown.
     """
 
     edge_id: int
@@ -92,6 +94,7 @@ class EdgeMeasurement:
     target_from_source: Sequence[float]
     kind: int = EdgeKind.LOOP_CLOSURE
     precision: float = 0.0
+    translation: Sequence[float] | None = None
 
     def fingerprint(self) -> int:
         """64 bits that agree for a retransmission (same id, ends and rotation) and for nothing else in practice."""

@@ -10,8 +10,10 @@ import math
 from collections.abc import Sequence
 
 Quaternion = tuple[float, float, float, float]
+Vector = tuple[float, float, float]
 
 IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
+UNKNOWN_VECTOR: Vector = (math.nan, math.nan, math.nan)
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
@@ -30,6 +32,13 @@ def inverse(a: Quaternion) -> Quaternion:
     """Inverse of a unit quaternion."""
     x, y, z, w = a
     return (-x, -y, -z, w)
+
+
+def rotate(a: Quaternion, vector: Sequence[float]) -> Vector:
+    """The vector, turned by a unit quaternion."""
+    x, y, z = vector
+    x, y, z, _ = multiply(multiply(a, (x, y, z, 0.0)), inverse(a))
+    return (x, y, z)
 
 
 def norm(a: Sequence[float]) -> float:

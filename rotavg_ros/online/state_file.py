@@ -24,9 +24,9 @@ from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.view_graph import ViewGraph
 
 FORMAT = "rotavg online state"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 _GRAPH_COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label")
-_KEYFRAME_COLUMNS = ("keyframe_robot", "keyframe_id", "stamp_ns", "edge_id")
+_KEYFRAME_COLUMNS = ("keyframe_robot", "keyframe_id", "stamp_ns", "edge_id", "translation")
 
 Arrays = dict[str, NDArray[Any]]
 

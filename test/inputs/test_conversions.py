@@ -27,6 +27,15 @@ def world_from_sensor(corner: int) -> Rotation:
     return world_from_body(corner) * BODY_FROM_SENSOR
 
 
+def position(corner: int) -> np.ndarray:
+    return np.array([np.cos(np.pi / 2 * corner), np.sin(np.pi / 2 * corner), 0.1 * (corner % SIDES)])
+
+
+def vector(xyz: np.ndarray) -> Fields:
+    x, y, z = xyz.tolist()
+    return Fields(x=x, y=y, z=z)
+
+
 def quaternion(rotation: Rotation) -> Fields:
     x, y, z, w = rotation.as_quat().tolist()
     return Fields(x=x, y=y, z=z, w=w)
@@ -37,12 +46,21 @@ def between(source: int, target: int) -> Fields:
     return quaternion(world_from_sensor(source).inv() * world_from_sensor(target))
 
 
+def way(source: int, target: int) -> Fields:
+    """Position of the target in the source frame."""
+    return vector(world_from_sensor(source).inv().apply(position(target) - position(source)))
+
+
+def transform(source: int, target: int) -> Fields:
+    return Fields(rotation=between(source, target), translation=way(source, target))
+
+
 def stamp(corner: int) -> Fields:
     return Fields(sec=100 + corner, nanosec=5)
 
 
-def pose(rotation: Fields) -> Fields:
-    return Fields(position=Fields(x=1.0, y=2.0, z=3.0), orientation=rotation)
+def pose(rotation: Fields, xyz: Fields) -> Fields:
+    return Fields(position=xyz, orientation=rotation)
 
 
 def diagonal(rotation: float) -> np.ndarray:
@@ -50,8 +68,8 @@ def diagonal(rotation: float) -> np.ndarray:
 
 
 def link(source: int, target: int, kind: int) -> Fields:
-    transform = Fields(rotation=between(source, target))
-    return Fields(from_id=source, to_id=target, type=kind, transform=transform, information=diagonal(25.0))
+    pose_between = transform(source, target)
+    return Fields(from_id=source, to_id=target, type=kind, transform=pose_between, information=diagonal(25.0))
 
 
 def map_graph() -> Fields:
@@ -66,7 +84,7 @@ def pose_graph_edge(source: int, target: int, kind: int) -> Fields:
         robot_from=1,
         robot_to=1,
         type=kind,
-        pose=pose(between(source, target)),
+        pose=pose(between(source, target), way(source, target)),
         covariance=diagonal(0.04),
     )
 
@@ -78,17 +96,18 @@ def pose_graph(closure: int) -> Fields:
 
 
 def keyframe_odometry(corner: int) -> Fields:
-    odometry = Fields(header=Fields(stamp=stamp(corner)), pose=Fields(pose=pose(quaternion(world_from_sensor(corner)))))
+    here = pose(quaternion(world_from_sensor(corner)), vector(position(corner)))
+    odometry = Fields(header=Fields(stamp=stamp(corner)), pose=Fields(pose=here))
     return Fields(id=corner, odom=odometry)
 
 
 def intra_closure(success: bool = True) -> Fields:
-    return Fields(keyframe0_id=3, keyframe1_id=0, success=success, transform=Fields(rotation=between(3, 0)))
+    return Fields(keyframe0_id=3, keyframe1_id=0, success=success, transform=transform(3, 0))
 
 
 def inter_closure() -> Fields:
     ends = {"robot0_id": 1, "robot0_keyframe_id": 3, "robot1_id": 2, "robot1_keyframe_id": 0}
-    return Fields(**ends, success=True, transform=Fields(rotation=between(3, 0)))
+    return Fields(**ends, success=True, transform=transform(3, 0))
 
 
 def converter(type_name: str):
@@ -119,6 +138,8 @@ def test_edges_lead_around_a_square(type_name: str) -> None:
         source, target = edge.source.keyframe_id, edge.target.keyframe_id
         expected = world_from_body(target).inv() * world_from_body(source)
         assert (Rotation.from_quat(edge.target_from_source).inv() * expected).magnitude() < 1e-12
+        way_of_body = world_from_body(source).inv().apply(position(target) - position(source))
+        np.testing.assert_allclose(edge.translation, way_of_body, atol=1e-12)
         assert edge.kind == (target == 0)  # the closure is the edge back to the first corner
         assert edge.precision == pytest.approx(precision)
         assert edge.source.robot == "b"
@@ -197,10 +218,11 @@ def test_keyframes_whose_numbers_start_again_begin_a_new_chain() -> None:
 @pytest.mark.parametrize("type_name", ODOMETRY_CONVERTERS)
 def test_odometry_of_a_sensor_that_is_turned_in_the_body(type_name: str) -> None:
     orientation = quaternion(world_from_sensor(2))
+    here = pose(orientation, vector(position(2)))
     posed = {
-        "nav_msgs/msg/Odometry": Fields(pose=pose(orientation)),
-        "geometry_msgs/msg/PoseWithCovarianceStamped": Fields(pose=pose(orientation)),
-        "geometry_msgs/msg/PoseStamped": pose(orientation),
+        "nav_msgs/msg/Odometry": Fields(pose=here),
+        "geometry_msgs/msg/PoseWithCovarianceStamped": Fields(pose=here),
+        "geometry_msgs/msg/PoseStamped": here,
     }
     message = Fields(header=Fields(stamp=stamp(2)))
     if type_name in posed:
@@ -210,7 +232,7 @@ def test_odometry_of_a_sensor_that_is_turned_in_the_body(type_name: str) -> None
     record = ODOMETRY_CONVERTERS[type_name](message, tuple(BODY_FROM_SENSOR.as_quat().tolist()))
     assert record.stamp_ns == to_nanoseconds(stamp(2))
     assert (Rotation.from_quat(record.world_from_body).inv() * world_from_body(2)).magnitude() < 1e-12
-    assert record.position == ((1.0, 2.0, 3.0) if type_name in posed else None)
+    assert record.position == (tuple(position(2).tolist()) if type_name in posed else None)
 
 
 def test_an_imu_without_orientation() -> None:
