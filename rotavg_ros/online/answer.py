@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.online.growing_view_graph import GraphSnapshot
+from rotavg_ros.view_graph import EdgeLabel
+
+if TYPE_CHECKING:
+    from rotavg_ros.solver import Solution
 
 
 @dataclass(frozen=True)
@@ -53,6 +62,49 @@ class Answer:
     method: str
     profile: str
     device: str
+
+    @classmethod
+    def of_solution(
+        cls,
+        snapshot: GraphSnapshot,
+        solution: Solution,
+        body_from_world: Tensor,
+        component: Tensor,
+        outlier_threshold: float,
+        version: int,
+        was_cold: bool,
+        seconds: float,
+    ) -> Answer:
+        """What a solve of a snapshot says, with the orientations ``(N, 4)`` in their fixed gauge.
+
+        An edge that a user has accepted has the score 0, a rejected one 1.
+        """
+        graph = snapshot.graph
+        score = solution.outlier_score.cpu()
+        score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, score)
+        score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
+        return cls(
+            version=version,
+            robots=snapshot.robots,
+            keyframe_robot=snapshot.keyframe_robot,
+            keyframe_id=snapshot.keyframe_id,
+            stamp_ns=snapshot.stamp_ns,
+            world_from_body=rotations.canonical(rotations.inverse(body_from_world)).numpy(),
+            component=component.numpy(),
+            uncertainty=solution.uncertainty.cpu().numpy(),
+            edge_id=snapshot.edge_id,
+            source=graph.source.numpy(),
+            target=graph.target.numpy(),
+            kind=graph.kind.numpy(),
+            outlier_score=score.numpy(),
+            outlier=(score > outlier_threshold).numpy(),
+            was_cold=was_cold,
+            seconds=seconds,
+            stage_seconds=dict(solution.stage_seconds),
+            method=solution.method,
+            profile=solution.profile,
+            device=solution.device,
+        )
 
     @property
     def num_components(self) -> int:

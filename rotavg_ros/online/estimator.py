@@ -10,16 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from rotavg_ros import rotations
 from rotavg_ros.online import quaternion, state_file
+from rotavg_ros.online.anchoring import corrections, first_correction, root_orientations
 from rotavg_ros.online.answer import Answer
-from rotavg_ros.online.gauge import component_roots, extend_along_edges, fix_gauge, joins_components
+from rotavg_ros.online.gauge import extend_along_edges, fix_gauge, joins_components
 from rotavg_ros.online.graph_builder import GraphBuilder
 from rotavg_ros.online.growing_view_graph import GraphSnapshot
-from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS, EdgeMeasurement, RejectedInputError, RejectReason
+from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS, EdgeMeasurement, RejectReason
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.online.trajectory import Trajectory, dead_reckoning
@@ -160,6 +159,11 @@ class OnlineEstimator:
         position = dead_reckoning(orientation, odometry_orientation, odometry_position)
         return Trajectory(nodes, answer.stamp_ns[nodes], orientation, position)
 
+    def snapshot(self) -> GraphSnapshot:
+        """The graph now; a later one begins with the same keyframes and edges."""
+        with self._lock:
+            return self._builder.graph.snapshot()
+
     @property
     def revision(self) -> int:
         """Counts the graph's changes."""
@@ -205,7 +209,7 @@ class OnlineEstimator:
         with self._lock:
             self._start_over(builder, answered, max(version, self._version))
             if answered is not None:
-                self._world_from_odometry = self._corrections(answered)
+                self._world_from_odometry = corrections(builder, answered)
 
     def tick(self, force_cold: bool = False) -> Answer | None:
         """Solve, if there is anything new.
@@ -249,7 +253,7 @@ class OnlineEstimator:
             )
             component = solution.component.cpu()
             with self._lock:
-                roots = self._root_orientations(builder, component, answered)
+                roots = root_orientations(builder, component, answered)
             body_from_world = fix_gauge(solution.body_from_world.cpu(), component, roots)
             with self._lock:
                 if builder is not self._builder:
@@ -258,98 +262,17 @@ class OnlineEstimator:
                 self._answered_revision, self._answer_was_cold = snapshot.revision, cold
                 self._version += 1
                 version = self._version
-                self._world_from_odometry = self._corrections(body_from_world)
+                self._world_from_odometry = corrections(self._builder, body_from_world)
             seconds = time.perf_counter() - started
-            return self._answer(snapshot, solution, body_from_world, component, version, cold, seconds)
-
-    def _answer(
-        self,
-        snapshot: GraphSnapshot,
-        solution: Solution,
-        body_from_world: Tensor,
-        component: Tensor,
-        version: int,
-        cold: bool,
-        seconds: float,
-    ) -> Answer:
-        graph = snapshot.graph
-        score = solution.outlier_score.cpu()
-        score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, score)
-        score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
-        return Answer(
-            version=version,
-            robots=snapshot.robots,
-            keyframe_robot=snapshot.keyframe_robot,
-            keyframe_id=snapshot.keyframe_id,
-            stamp_ns=snapshot.stamp_ns,
-            world_from_body=rotations.canonical(rotations.inverse(body_from_world)).numpy(),
-            component=component.numpy(),
-            uncertainty=solution.uncertainty.cpu().numpy(),
-            edge_id=snapshot.edge_id,
-            source=graph.source.numpy(),
-            target=graph.target.numpy(),
-            kind=graph.kind.numpy(),
-            outlier_score=score.numpy(),
-            outlier=(score > self.options.outlier_threshold).numpy(),
-            was_cold=cold,
-            seconds=seconds,
-            stage_seconds=dict(solution.stage_seconds),
-            method=solution.method,
-            profile=solution.profile,
-            device=solution.device,
-        )
-
-    def _root_orientations(self, builder: GraphBuilder, component: Tensor, answered: Tensor | None) -> Tensor:
-        """body_from_world that the first keyframe of every component keeps, ``(C, 4)``.
-
-        A keyframe that an earlier answer placed stays where it was: so a component keeps its gauge, the older of two
-        that join imposes its own, and what splits off (a rejected edge) stays put as well.
-        """
-        known = 0 if answered is None else len(answered)
-        orientations: list[Sequence[float]] = []
-        for root in component_roots(component).tolist():
-            if answered is not None and root < known:
-                orientations.append(answered[root].tolist())
-            else:
-                orientations.append(quaternion.inverse(self._initial_world_from_body(builder, root)))
-        return torch.tensor(orientations, dtype=torch.float64)
-
-    def _initial_world_from_body(self, builder: GraphBuilder, node: int) -> Quaternion:
-        """Where a component's first keyframe begins."""
-        stamp_ns = builder.graph.stamp_of(node)
-        track = builder.tracks.get(builder.graph.robot_of(node))
-        if self.options.gauge == "odometry" and track is not None and stamp_ns != UNKNOWN_STAMP_NS:
-            try:
-                return track.world_from_body_at(stamp_ns)
-            except RejectedInputError:
-                pass  # the odometry does not cover the keyframe: identity is as good as anything
-        return quaternion.IDENTITY
+            return Answer.of_solution(
+                snapshot, solution, body_from_world, component, self.options.outlier_threshold, version, cold, seconds
+            )
 
     def _correction(self, robot: str) -> Quaternion:
         """world_from_odometry; before the robot's first answer, what makes its first odometry fit the gauge."""
         if robot in self._world_from_odometry:
             return self._world_from_odometry[robot]
-        return (
-            quaternion.IDENTITY
-            if self.options.gauge == "odometry"
-            else self._builder.tracks[robot].first_body_from_world()
-        )
-
-    def _corrections(self, body_from_world: Tensor) -> dict[str, Quaternion]:
-        """world_from_odometry of every robot, from its newest keyframe that is in the answer and has odometry."""
-        corrections = {}
-        for robot, track in self._builder.tracks.items():
-            for node in self._builder.graph.nodes_newest_first(robot):
-                if node >= len(body_from_world):
-                    continue
-                try:
-                    odometry = track.world_from_body_at(self._builder.graph.stamp_of(node))
-                except RejectedInputError:
-                    continue
-                x, y, z, w = body_from_world[node].tolist()
-                corrections[robot] = quaternion.inverse(quaternion.multiply(odometry, (x, y, z, w)))
-                break
-        return corrections
+        return first_correction(self._builder, robot)
 
 
 def _default_solver() -> Solver:

@@ -1,0 +1,89 @@
+"""What the node publishes: answers, pictures of them, and the present orientation."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from geometry_msgs.msg import QuaternionStamped, TransformStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rotavg_msgs.msg import AbsoluteOrientations, OutlierFlags
+from visualization_msgs.msg import MarkerArray
+
+from rotavg_ros.errors import UserError
+from rotavg_ros.online import Answer, OnlineEstimator
+from rotavg_ros.ros.conversions import flags_message, orientations_message, to_quaternion_message
+from rotavg_ros.ros.parameters import NodeParameters
+from rotavg_ros.ros.topics import LATCHED, publisher
+from rotavg_ros.ros.visualization import markers_message, path_message
+
+
+class Outputs:
+    """All publishers but that of the diagnostics.
+
+    Raises:
+        UserError: a topic's ``qos_overrides`` cannot be, or ``publish_tf`` without tf2_msgs.
+    """
+
+    def __init__(self, node: Node, parameters: NodeParameters, estimator: OnlineEstimator) -> None:
+        self._estimator = estimator
+        self._robots, self._frame_id = parameters.robots, parameters.world_frame
+        self._drawn_version = 0
+        latched = partial(publisher, node, qos=LATCHED)
+        self._orientations = latched(AbsoluteOrientations, "abs_orientations")
+        self._flags = latched(OutlierFlags, "outlier_flags")
+        self._markers = latched(MarkerArray, "~/markers")
+        prefix = {robot: f"{robot}/" if len(self._robots) > 1 else "" for robot in self._robots}
+        self._paths = {robot: latched(Path, f"{prefix[robot]}corrected_path") for robot in self._robots}
+        self._orientation = {
+            robot: publisher(node, QuaternionStamped, f"{prefix[robot]}orientation", QoSProfile(depth=10))
+            for robot in self._robots
+        }
+        self._tf: Publisher | None = None
+        if parameters.publish_tf:
+            try:
+                from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
+            except ImportError as error:
+                raise UserError("publish_tf needs tf2_msgs: install that package or leave publish_tf off") from error
+            self._tf_message = TFMessage
+            self._tf = publisher(node, TFMessage, "/tf", QoSProfile(depth=100))
+
+    def publish_answer(self, answer: Answer) -> None:
+        """Latch the answer's keyframes and edges."""
+        self._orientations.publish(orientations_message(answer, self._frame_id))
+        self._flags.publish(flags_message(answer, self._frame_id))
+
+    def draw(self, answer: Answer | None) -> None:
+        """Path and markers of the last answer, for those who look; again when somebody begins to."""
+        watched = {robot: path for robot, path in self._paths.items() if path.get_subscription_count()}
+        markers = self._markers.get_subscription_count() > 0
+        if answer is None or not (watched or markers):
+            self._drawn_version = 0
+            return
+        if answer.version == self._drawn_version:
+            return
+        self._drawn_version = answer.version
+        trajectories = {robot: self._estimator.trajectory(answer, robot) for robot in self._robots}
+        for robot, path in watched.items():
+            if (trajectory := trajectories[robot]) is not None:
+                path.publish(path_message(trajectory, self._frame_id))
+        if markers:
+            known = [trajectory for trajectory in trajectories.values() if trajectory is not None]
+            self._markers.publish(markers_message(answer, known, self._frame_id))
+
+    def publish_orientation(self, robot: str, odometry: Odometry) -> None:
+        """The robot's corrected orientation at the moment of its newest odometry message."""
+        orientation = self._estimator.current_orientation(robot)
+        if orientation is None:
+            return
+        stamped = QuaternionStamped(quaternion=to_quaternion_message(orientation))
+        stamped.header.stamp = odometry.header.stamp
+        stamped.header.frame_id = self._frame_id
+        self._orientation[robot].publish(stamped)
+        correction = self._estimator.world_from_odometry(robot) if self._tf is not None else None
+        if self._tf is not None and correction is not None:
+            transform = TransformStamped(header=stamped.header, child_frame_id=odometry.header.frame_id)
+            transform.transform.rotation = to_quaternion_message(correction)
+            self._tf.publish(self._tf_message(transforms=[transform]))

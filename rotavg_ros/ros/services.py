@@ -1,0 +1,75 @@
+"""The node's services. Slow ones are done by the worker; none blocks the executor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from rclpy.node import Node
+from rotavg_msgs.srv import LabelEdge
+from std_srvs.srv import SetBool, Trigger
+
+from rotavg_ros.online import OnlineEstimator
+from rotavg_ros.ros.diagnostics import Health
+from rotavg_ros.ros.solving import Solving
+from rotavg_ros.ros.worker import Worker
+from rotavg_ros.view_graph import EdgeLabel
+
+
+class Services:
+    """``~/reset``, ``~/solve_now``, ``~/save``, ``~/load``, ``~/pause`` and ``~/label_edge``."""
+
+    def __init__(
+        self,
+        node: Node,
+        estimator: OnlineEstimator,
+        health: Health,
+        solving: Solving,
+        worker: Worker,
+        default_robot: str,
+    ) -> None:
+        self._estimator = estimator
+        self._health = health
+        self._worker = worker
+        self._default_robot = default_robot
+        for name, job in (
+            ("reset", solving.reset),
+            ("solve_now", solving.solve_now),
+            ("save", solving.save),
+            ("load", solving.load),
+        ):
+            node.create_service(Trigger, f"~/{name}", partial(self._on_trigger, job))
+        node.create_service(SetBool, "~/pause", self._on_pause)
+        node.create_service(LabelEdge, "~/label_edge", self._on_label_edge)
+
+    async def _on_trigger(
+        self, job: Callable[[], str], _request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        """Do a job on the worker, without blocking the executor meanwhile."""
+        try:
+            response.message = await self._worker.submit(job)
+            response.success = True
+        except Exception as error:
+            response.message = str(error)
+            response.success = False
+        return response
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._estimator.pause(request.data)
+        self._health.unsolved_since = None
+        response.success = True
+        response.message = "paused: inputs are kept, nothing is solved" if request.data else "running"
+        return response
+
+    def _on_label_edge(self, request: LabelEdge.Request, response: LabelEdge.Response) -> LabelEdge.Response:
+        robot = request.source_robot or self._default_robot
+        try:
+            label = EdgeLabel(request.label)
+        except ValueError:
+            response.success, response.message = False, f"label {request.label} is none of 0, 1, 2"
+            return response
+        number = self._estimator.label_edge(robot, request.edge_id, label)
+        response.success = number > 0
+        edges = f"edge {request.edge_id} of {robot}"
+        response.message = f"{edges}: {label.name.lower()} ({number} found)" if number else f"{edges} is not known"
+        return response

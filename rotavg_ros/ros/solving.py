@@ -1,0 +1,126 @@
+"""Everything slow: ticks and their answers, saving, loading, drawing. All of it runs on the worker's thread."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rclpy.node import Node
+
+from rotavg_ros.errors import UserError
+from rotavg_ros.online import Answer, OnlineEstimator
+from rotavg_ros.ros.diagnostics import Health
+from rotavg_ros.ros.outputs import Outputs
+
+_LOG_PERIOD_S = 5.0
+
+
+class Solving:
+    """Jobs for the worker. Those that a service asks for return what to tell the caller, or raise.
+
+    Raises:
+        UserError: the state file cannot be read or written.
+    """
+
+    def __init__(
+        self, node: Node, estimator: OnlineEstimator, health: Health, outputs: Outputs, state_file: Path | None
+    ) -> None:
+        self._node = node
+        self._estimator = estimator
+        self._health = health
+        self._outputs = outputs
+        self._state_file = state_file
+        if state_file is not None:
+            self._resume(state_file)
+        self._saved_revision = estimator.revision
+
+    def tick(self, force_cold: bool = False) -> Answer | None:
+        """Solve if there is anything new, and publish the answer; None if there is none."""
+        health = self._health
+        if self._estimator.is_behind and health.unsolved_since is None:
+            health.unsolved_since = time.monotonic()
+        try:
+            answer = self._estimator.tick(force_cold)
+        except Exception as error:
+            health.solve_failures += 1
+            health.failure = str(error)
+            raise
+        health.failure = None
+        if answer is not None:
+            self._publish(answer)
+        return answer
+
+    def solve_now(self) -> str:
+        answer = self.tick(force_cold=True)
+        if answer is None:
+            return "nothing has changed since the last answer"
+        return f"answer {answer.version}: {len(answer.keyframe_id)} keyframes, {int(answer.outlier.sum())} outliers"
+
+    def reset(self) -> str:
+        self._estimator.reset()
+        self._forget_answer()
+        return "reset"
+
+    def save(self) -> str:
+        state_file = self._named_state_file()
+        self._estimator.save(state_file)
+        return f"saved to {state_file}"
+
+    def load(self) -> str:
+        state_file = self._named_state_file()
+        self._estimator.load(state_file)
+        self._forget_answer()
+        self.tick()
+        return f"loaded {state_file}"
+
+    def tick_quietly(self) -> None:
+        """As :meth:`tick`; what goes wrong is logged."""
+        self._quietly("solving failed: ", self.tick)
+
+    def autosave_quietly(self) -> None:
+        """Save what has changed since it was last saved; what goes wrong is logged."""
+        self._quietly("", self._autosave)
+
+    def draw_quietly(self) -> None:
+        """Draw the last answer for those who look; what goes wrong is logged."""
+        self._quietly("drawing failed: ", lambda: self._outputs.draw(self._health.answer))
+
+    def _quietly(self, what: str, job: Callable[[], object]) -> None:
+        try:
+            job()
+        except Exception as error:  # a correction node that dies takes the robot with it
+            self._node.get_logger().error(f"{what}{error}", throttle_duration_sec=_LOG_PERIOD_S)
+
+    def _publish(self, answer: Answer) -> None:
+        health = self._health
+        if health.answer is not None and 0 < answer.num_components < health.answer.num_components:
+            self._node.get_logger().info(f"components joined: {answer.num_components} now")
+        self._outputs.publish_answer(answer)
+        health.ticks.add(answer.seconds)
+        health.answer, health.answered, health.unsolved_since = answer, time.monotonic(), None
+        self._outputs.draw(answer)
+
+    def _forget_answer(self) -> None:
+        """The published answers belong to what was forgotten: latch empty ones."""
+        health = self._health
+        if health.answer is not None:
+            self._outputs.publish_answer(health.answer.without_content())
+        health.answer, health.unsolved_since = None, None
+
+    def _autosave(self) -> None:
+        revision = self._estimator.revision
+        if revision != self._saved_revision:
+            self.save()
+            self._saved_revision = revision
+
+    def _resume(self, state_file: Path) -> None:
+        if state_file.exists():
+            self._estimator.load(state_file)
+        elif not state_file.parent.is_dir():
+            raise UserError(f"state_file is {state_file}, but there is no folder {state_file.parent}; make it first")
+
+    def _named_state_file(self) -> Path:
+        if self._state_file is None:
+            raise UserError("the parameter state_file is empty; start the node with the file's name")
+        return self._state_file
