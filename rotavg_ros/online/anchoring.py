@@ -10,7 +10,9 @@ from torch import Tensor
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.gauge import component_roots
 from rotavg_ros.online.graph_builder import GraphBuilder
+from rotavg_ros.online.keyframes import OdometryTrack
 from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS, RejectedInputError
+from rotavg_ros.online.odometry_continuity import OdometrySample
 from rotavg_ros.online.quaternion import Quaternion
 
 
@@ -39,12 +41,31 @@ def root_orientations(builder: GraphBuilder, component: Tensor, answered: Tensor
 
 
 def first_correction(builder: GraphBuilder, robot: str) -> Quaternion:
-    """world_from_odometry before the robot's first answer: what makes its first odometry fit the gauge."""
+    """world_from_odometry before the first answer about the robot's odometry chain.
+
+    The first chain's makes its first message fit the gauge; a later one has an anchor.
+    """
+    if anchors := builder.tracks[robot].anchors:
+        return anchors[-1]
     return quaternion.IDENTITY if builder.options.gauge == "odometry" else builder.tracks[robot].first_body_from_world()
 
 
+def anchor(track: OdometryTrack, last: OdometrySample, world_from_odometry: Quaternion) -> None:
+    """Let a chain that has just begun start where the robot was last: the best guess, though nothing is known.
+
+    Args:
+        track: its latest message is the chain's first.
+        last: the message before it, of the chain before.
+        world_from_odometry: of the chain before.
+    """
+    assert track.latest is not None
+    world_from_body = quaternion.multiply(world_from_odometry, last.world_from_body)
+    odometry_from_body = track.latest.world_from_body
+    track.anchors.append(quaternion.multiply(world_from_body, quaternion.inverse(odometry_from_body)))
+
+
 def corrections(builder: GraphBuilder, body_from_world: Tensor) -> dict[str, Quaternion]:
-    """world_from_odometry of every robot, from its newest keyframe that is in the answer and has odometry.
+    """world_from_odometry of every robot, from its newest keyframe in the answer that its present odometry covers.
 
     Args:
         builder: its graph may have grown since the answer.
@@ -55,6 +76,8 @@ def corrections(builder: GraphBuilder, body_from_world: Tensor) -> dict[str, Qua
         for node in builder.graph.nodes_newest_first(robot):
             if node >= len(body_from_world):
                 continue
+            if track.chain_at(builder.graph.stamp_of(node)) != track.chain:
+                break
             try:
                 odometry = track.world_from_body_at(builder.graph.stamp_of(node))
             except RejectedInputError:
@@ -69,9 +92,13 @@ def _initial_world_from_body(builder: GraphBuilder, node: int) -> Quaternion:
     """Where a component's first keyframe begins."""
     stamp_ns = builder.graph.stamp_of(node)
     track = builder.tracks.get(builder.graph.robot_of(node))
-    if builder.options.gauge == "odometry" and track is not None and stamp_ns != UNKNOWN_STAMP_NS:
-        try:
-            return track.world_from_body_at(stamp_ns)
-        except RejectedInputError:
-            pass  # the odometry does not cover the keyframe: identity is as good as anything
-    return quaternion.IDENTITY
+    if track is None or stamp_ns == UNKNOWN_STAMP_NS:
+        return quaternion.IDENTITY
+    chain = track.chain_at(stamp_ns)
+    if chain == 0 and builder.options.gauge == "identity":
+        return quaternion.IDENTITY
+    try:
+        odometry = track.world_from_body_at(stamp_ns)
+    except RejectedInputError:
+        return quaternion.IDENTITY  # the odometry does not cover the keyframe: as good as anything
+    return odometry if chain == 0 else quaternion.multiply(track.anchors[chain - 1], odometry)

@@ -13,7 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from rotavg_ros.online import quaternion, state_file
-from rotavg_ros.online.anchoring import corrections, first_correction, root_orientations
+from rotavg_ros.online.anchoring import anchor, corrections, first_correction, root_orientations
 from rotavg_ros.online.answer import Answer
 from rotavg_ros.online.gauge import extend_along_edges, fix_gauge, joins_components
 from rotavg_ros.online.graph_builder import GraphBuilder
@@ -92,15 +92,23 @@ class OnlineEstimator:
 
         Args:
             robot: whose.
-            stamp_ns: nanoseconds, ascending per robot.
+            stamp_ns: nanoseconds, ascending per robot. One far ahead is believed only when the next agrees.
             world_from_body: xyzw, the body in the odometry's frame.
             position: metres, for the keyframes' distance criterion.
+
+        Odometry that begins anew begins a new component, first where the robot was last.
 
         Returns:
             why it was refused and counted; None if it was taken.
         """
         with self._lock:
-            return self._builder.add_odometry(robot, stamp_ns, world_from_body, position)
+            track = self._builder.tracks.get(robot)
+            last = None if track is None else track.latest
+            reason = self._builder.add_odometry(robot, stamp_ns, world_from_body, position)
+            if track is not None and last is not None and track.chain > len(track.anchors):
+                anchor(track, last, self._correction(robot))
+                self._world_from_odometry.pop(robot, None)
+            return reason
 
     def add_edge(self, edge: EdgeMeasurement) -> RejectReason | None:
         """Take a measured edge; returns why it was refused and counted, None if it was taken or may wait."""
@@ -154,9 +162,9 @@ class OnlineEstimator:
             of_robot = answer.keyframe_robot == answer.robots.index(robot)
             nodes = np.flatnonzero(of_robot & (answer.stamp_ns != UNKNOWN_STAMP_NS))
             nodes = nodes[np.argsort(answer.stamp_ns[nodes], kind="stable")]
-            odometry_orientation, odometry_position = track.poses_at(answer.stamp_ns[nodes])
+            odometry_orientation, odometry_position, chain = track.poses_at(answer.stamp_ns[nodes])
         orientation = answer.world_from_body[nodes]
-        position = dead_reckoning(orientation, odometry_orientation, odometry_position)
+        position = dead_reckoning(orientation, odometry_orientation, odometry_position, chain)
         return Trajectory(nodes, answer.stamp_ns[nodes], orientation, position)
 
     def snapshot(self) -> GraphSnapshot:

@@ -66,19 +66,22 @@ class GraphBuilder:
         self.fingerprints: set[int] = set()
         self.data_time_ns: int | None = None
         self._policy = options.keyframe_policy
+        self._claimed_time_ns: int | None = None
 
     def set_options(self, options: EstimatorOptions) -> None:
         """Change what applies to inputs from now on: keyframe thresholds, tolerances, gaps."""
         self.options = options
         self._policy = options.keyframe_policy
         for track in self.tracks.values():
-            track.bounds = options.odometry_bounds
+            track.bounds, track.continuity.limits = options.odometry_bounds, options.continuity_limits
 
     def add_odometry(
         self, robot: str, stamp_ns: int, world_from_body: Sequence[float], position: Sequence[float] | None
     ) -> RejectReason | None:
         """Take an odometry message; returns why it was refused, if it was."""
-        track = self.tracks.get(robot) or OdometryTrack(self.options.odometry_bounds)
+        track = self.tracks.get(robot)
+        if track is None:
+            track = OdometryTrack(self.options.odometry_bounds, self.options.continuity_limits)
         try:
             track.add(stamp_ns, world_from_body, position)
         except RejectedInputError as rejection:
@@ -164,8 +167,8 @@ class GraphBuilder:
                 continue
             self.graph.add_keyframe(end.robot, keyframe_id, stamp_ns)
             self._place_all(self.pending.pop_keyframe(end.robot, keyframe_id))
-            if chosen_by_front_end and stamp_ns != UNKNOWN_STAMP_NS:
-                self._advance_data_time(stamp_ns)
+        if chosen_by_front_end:
+            self._advance_data_time(max(end.stamp_ns or 0 for end in (edge.source, edge.target)))
 
     def _place(self, edge: EdgeMeasurement, settle: bool = False) -> None:
         """Put an edge into the graph, or let it wait for its first end that is not there yet."""
@@ -220,6 +223,8 @@ class GraphBuilder:
         if node is None:
             raise RejectedInputError(RejectReason.UNKNOWN_KEYFRAME)
         keyframe_ns = self.graph.stamp_of(node)
+        if track.chain_at(keyframe_ns) != track.chain_at(stamp_ns):
+            raise RejectedInputError(RejectReason.ODOMETRY_GAP)
         keyframe_from_odometry = quaternion.inverse(track.world_from_body_at(keyframe_ns))
         return _Attachment(
             node,
@@ -237,6 +242,12 @@ class GraphBuilder:
                 self._drop(edge, rejection.reason)
 
     def _advance_data_time(self, stamp_ns: int) -> None:
+        """Let what has waited for too long go; a stamp far ahead counts only when a second one says so."""
+        lead_ns = self.options.continuity_limits.lead_ns
+        if self.data_time_ns is not None and stamp_ns - self.data_time_ns > lead_ns:
+            claimed_ns, self._claimed_time_ns = self._claimed_time_ns, stamp_ns
+            if claimed_ns is None or not 0 <= stamp_ns - claimed_ns <= lead_ns:
+                return
         self.data_time_ns = max(stamp_ns, self.data_time_ns or 0)
         for edge in self.pending.pop_expired(self.data_time_ns):
             self._drop(edge, RejectReason.PENDING_TIMEOUT)

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.growing_view_graph import GrowingArray
 from rotavg_ros.online.measurements import RejectedInputError, RejectReason, checked_rotation, checked_stamp
+from rotavg_ros.online.odometry_continuity import ContinuityCheck, ContinuityLimits, OdometrySample
 from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion
 
 Position = quaternion.Vector
 
-_COLUMNS = ("stamp_ns", "world_from_body", "position", "is_keyframe")
+_COLUMNS = ("stamp_ns", "world_from_body", "position", "is_keyframe", "chain")
 
 
 @dataclass(frozen=True)
@@ -42,15 +43,6 @@ class KeyframePolicy:
         return (0 < self.angle <= angle) or (0 < self.distance <= distance) or (0 < self.interval_ns <= elapsed_ns)
 
 
-@dataclass(frozen=True, slots=True)
-class OdometrySample:
-    """One odometry message: the body's pose in the odometry's frame at a stamp."""
-
-    stamp_ns: int
-    world_from_body: Quaternion
-    position: Position | None
-
-
 @dataclass(frozen=True)
 class OdometryBounds:
     """How far the odometry may be stretched when a moment between its messages is asked for.
@@ -67,15 +59,29 @@ class OdometryBounds:
 
 
 class OdometryTrack:
-    """The odometry messages of one robot in ascending order of their stamps."""
+    """The odometry messages of one robot in ascending order of their stamps.
 
-    def __init__(self, bounds: OdometryBounds) -> None:
+    Where the odometry began anew a new chain begins: between chains nothing is known of the body's rotation.
+
+    Attributes:
+        latest: the last message.
+        last_keyframe: of the latest message's chain.
+        chain: number of the latest message's chain, from 0.
+        anchors: world_from_odometry, one for every chain but the first, where whoever knows the world has set it.
+    """
+
+    def __init__(self, bounds: OdometryBounds, limits: ContinuityLimits | None = None) -> None:
         self.bounds = bounds
+        self.continuity = ContinuityCheck(limits or ContinuityLimits())
         self._limit = bounds.max_samples
         self._stamp_ns = GrowingArray(np.int64)
         self._world_from_body = GrowingArray(np.float64, width=4)
         self._position = GrowingArray(np.float64, width=3)
         self._is_keyframe = GrowingArray(np.bool_)
+        self._chain = GrowingArray(np.int32)
+        self._before_latest: OdometrySample | None = None
+        self.chain = 0
+        self.anchors: list[Quaternion] = []
         self.latest: OdometrySample | None = None
         self.last_keyframe: OdometrySample | None = None
         self.num_keyframes = 0
@@ -89,7 +95,8 @@ class OdometryTrack:
             position: metres, or None; one that is not finite counts as None.
 
         Raises:
-            RejectedInputError: a stamp not after the last one, or a rotation that is none.
+            RejectedInputError: a stamp not after the last one, a rotation that is none, or a message that does not
+                go on from the last one and that no other sides with yet.
         """
         stamp_ns = checked_stamp(stamp_ns)
         rotation = checked_rotation(world_from_body)
@@ -99,13 +106,18 @@ class OdometryTrack:
         if position is not None:
             x, y, z = position
             position = (x, y, z) if math.isfinite(x + y + z) else None
+        sample = OdometrySample(stamp_ns, rotation, position)
+        if self.latest is not None and self.continuity.admit(sample, self.latest, self._before_latest):
+            self.chain += 1
+            self.latest = self.last_keyframe = None
         if len(self._stamp_ns) >= self._limit:
             self._thin_out()
-        self.latest = OdometrySample(stamp_ns, rotation, position)
+        self._before_latest, self.latest = self.latest, sample
         self._stamp_ns.append(stamp_ns)
         self._world_from_body.append(rotation)
         self._position.append(UNKNOWN_VECTOR if position is None else position)
         self._is_keyframe.append(False)
+        self._chain.append(self.chain)
         return self.latest
 
     def reached(self, policy: KeyframePolicy) -> bool:
@@ -137,7 +149,8 @@ class OdometryTrack:
         """The odometry's rotation at a moment: interpolated between two messages, clamped just outside of them.
 
         Raises:
-            RejectedInputError: the stamp is outside the odometry by more than the tolerance, or inside a gap.
+            RejectedInputError: the stamp is outside the odometry by more than the tolerance, or inside a gap, which
+                is also where one chain ends and another begins.
         """
         stamps = self._stamp_ns.view
         after = int(np.searchsorted(stamps, stamp_ns))
@@ -152,6 +165,10 @@ class OdometryTrack:
             if since_last is not None and since_last <= tolerance:
                 return self._rotation(after - 1)
             raise RejectedInputError(RejectReason.STAMP_OUT_OF_RANGE)
+        if self._chain.view[after - 1] != self._chain.view[after]:
+            if since_last > tolerance:
+                raise RejectedInputError(RejectReason.ODOMETRY_GAP)
+            return self._rotation(after - 1)
         gap = since_last + until_next
         if gap > self.bounds.max_gap_ns:
             if min(since_last, until_next) > tolerance:
@@ -166,10 +183,16 @@ class OdometryTrack:
         before = max(after - 1, 0)
         gap = int(stamps[after] - stamps[before])
         share = min(max((stamp_ns - int(stamps[before])) / gap, 0.0), 1.0) if gap else 1.0
+        if share < 1 and self._chain.view[before] != self._chain.view[after]:
+            share = 0.0
         x, y, z = (
             positions[after] if share == 1 else (1 - share) * positions[before] + share * positions[after]
         ).tolist()
         return (x, y, z)
+
+    def chain_at(self, stamp_ns: int) -> int:
+        """Number of the chain that a moment belongs to. There must be a message."""
+        return int(self._chain.view[max(int(np.searchsorted(self._stamp_ns.view, stamp_ns, "right")) - 1, 0)])
 
     def first_body_from_world(self) -> Quaternion:
         """Inverse of the first message's rotation."""
@@ -190,30 +213,39 @@ class OdometryTrack:
         # Where keyframes fill the room the limit yields; a quarter of it at least lies between two thinnings.
         self._limit = max(self.bounds.max_samples, int(keep.sum()) + self.bounds.max_samples // 4 + 1)
 
-    def poses_at(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The messages at or next after the stamps ``(K,)``: world_from_body ``(K, 4)`` and position ``(K, 3)``.
+    def poses_at(
+        self, stamp_ns: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
+        """The messages at or next after the stamps ``(K,)``.
+
+        Returns:
+            world_from_body ``(K, 4)``, position ``(K, 3)`` and number of the chain ``(K,)``.
 
         Positions are NaN where the odometry carries none. There must be a message.
         """
         index = np.minimum(np.searchsorted(self._stamp_ns.view, stamp_ns), len(self._stamp_ns) - 1)
-        return self._world_from_body.view[index], self._position.view[index]
+        return self._world_from_body.view[index], self._position.view[index], self._chain.view[index]
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The messages as arrays, for :meth:`from_arrays`."""
         columns = {name: getattr(self, f"_{name}").view for name in _COLUMNS}
         columns["is_keyframe"] = columns["is_keyframe"].copy()
-        return columns | {"num_keyframes": np.array(self.num_keyframes)}
+        anchors = np.array(self.anchors, dtype=np.float64).reshape(-1, 4)
+        return columns | {"num_keyframes": np.array(self.num_keyframes), "anchors": anchors}
 
     @classmethod
-    def from_arrays(cls, bounds: OdometryBounds, arrays: dict[str, NDArray[Any]]) -> OdometryTrack:
+    def from_arrays(
+        cls, bounds: OdometryBounds, arrays: dict[str, NDArray[Any]], limits: ContinuityLimits | None = None
+    ) -> OdometryTrack:
         """The track that :meth:`arrays` came from."""
-        track = cls(bounds)
+        track = cls(bounds, limits)
         for name in _COLUMNS:
             getattr(track, f"_{name}").extend(arrays[name])
         track.num_keyframes = int(arrays["num_keyframes"])
-        keyframes = np.flatnonzero(arrays["is_keyframe"])
+        track.anchors = [(x, y, z, w) for x, y, z, w in arrays["anchors"].tolist()]
         if len(track._stamp_ns):
-            track.latest = track._sample(-1)
+            track.latest, track.chain = track._sample(-1), int(track._chain.view[-1])
+        keyframes = np.flatnonzero(arrays["is_keyframe"] & (arrays["chain"] == track.chain))
         if len(keyframes):
             track.last_keyframe = track._sample(int(keyframes[-1]))
         return track

@@ -35,6 +35,8 @@ class RejectReason(str, Enum):
     NO_ORIENTATION = "no_orientation"
     OUT_OF_ORDER_ODOMETRY = "out_of_order_odometry"
     REPEATED_STAMP = "repeated_stamp"
+    FUTURE_STAMP = "future_stamp"
+    ODOMETRY_JUMP = "odometry_jump"
     ID_OUT_OF_RANGE = "id_out_of_range"
     BAD_KIND = "bad_kind"
     BAD_PRECISION = "bad_precision"

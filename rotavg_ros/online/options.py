@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.online.keyframes import KeyframePolicy, OdometryBounds
+from rotavg_ros.online.odometry_continuity import ContinuityLimits
 
 NANOSECONDS = 1_000_000_000
 
@@ -28,6 +29,9 @@ class EstimatorOptions:
         keyframe_angle, keyframe_distance, keyframe_interval_s: see :class:`KeyframePolicy`; radians, metres, seconds.
         stamp_tolerance_s: how far outside the odometry the stamp of an edge may be.
         max_odometry_gap_s: odometry messages farther apart are not interpolated.
+        max_turn_rate, max_speed: odometry that moves faster has jumped; rad/s, m/s; 0: any speed, and no look-out for
+            odometry that begins anew.
+        max_stamp_lead_s: a stamp farther ahead of the last one needs a second message to be believed; 0: no limit.
         max_odometry_samples: per robot; older messages are thinned out beyond it.
         pending_capacity: edges that may wait at a time.
         pending_timeout_s: how long in data time.
@@ -44,6 +48,9 @@ class EstimatorOptions:
     keyframe_interval_s: float = 0.0
     stamp_tolerance_s: float = 0.1
     max_odometry_gap_s: float = 5.0
+    max_turn_rate: float = math.radians(360.0)
+    max_speed: float = 50.0
+    max_stamp_lead_s: float = 60.0
     max_odometry_samples: int = 200_000
     pending_capacity: int = 20_000
     pending_timeout_s: float = 300.0
@@ -63,7 +70,10 @@ class EstimatorOptions:
         ):
             if getattr(self, name) not in choices:
                 raise OptionError(f"{name} is {getattr(self, name)!r}; it must be one of {', '.join(choices)}")
-        for name in ("stamp_tolerance_s", "max_odometry_gap_s", "pending_timeout_s"):
+        for name in (
+            *("stamp_tolerance_s", "max_odometry_gap_s", "pending_timeout_s"),
+            *("max_turn_rate", "max_speed", "max_stamp_lead_s"),
+        ):
             if not 0 <= getattr(self, name) < math.inf:
                 raise OptionError(f"{name} is {getattr(self, name)}; it must be finite and not negative")
         for name in ("max_odometry_samples", "pending_capacity"):
@@ -82,6 +92,14 @@ class EstimatorOptions:
             tolerance_ns=_nanoseconds(self.stamp_tolerance_s),
             max_gap_ns=_nanoseconds(self.max_odometry_gap_s),
             max_samples=self.max_odometry_samples,
+        )
+
+    @property
+    def continuity_limits(self) -> ContinuityLimits:
+        return ContinuityLimits(
+            turn_rate=self.max_turn_rate or math.inf,
+            speed=self.max_speed or math.inf,
+            lead_ns=_nanoseconds(self.max_stamp_lead_s) or math.inf,
         )
 
     @property

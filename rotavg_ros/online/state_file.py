@@ -134,7 +134,9 @@ def _restore(arrays: Arrays, options: EstimatorOptions) -> tuple[GraphBuilder, T
     for index, robot in enumerate(header["odometry_robots"]):
         prefix = f"odometry{index}_"
         track_arrays = {name.removeprefix(prefix): arrays[name] for name in arrays if name.startswith(prefix)}
-        builder.tracks[robot] = OdometryTrack.from_arrays(options.odometry_bounds, track_arrays)
+        builder.tracks[robot] = OdometryTrack.from_arrays(
+            options.odometry_bounds, track_arrays, options.continuity_limits
+        )
     builder.data_time_ns = header["data_time_ns"]
     builder.rejected.update(header["rejected"])
     builder.labels = {(robot, edge_id): label for robot, edge_id, label in header["labels"]}

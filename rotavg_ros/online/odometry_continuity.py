@@ -1,0 +1,121 @@
+"""Whether an odometry message goes on from the one before: stamps far ahead, jumps, and odometry that begins anew."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from rotavg_ros.online import quaternion
+from rotavg_ros.online.measurements import RejectedInputError, RejectReason
+from rotavg_ros.online.quaternion import Quaternion, Vector
+
+# Within a shorter time than this, stamps and rotations are too noisy for a rate to mean anything.
+_SHORTEST_S = 0.2
+# A pose this near to zero is where odometry begins …
+_ZERO_ANGLE = math.radians(1.0)
+_ZERO_DISTANCE_M = 0.1
+# … and an odometry that has begun anew, if going on as before would have led this far from there.
+_RETURN_ANGLE = math.radians(20.0)
+_RETURN_DISTANCE_M = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class OdometrySample:
+    """One odometry message: the body's pose in the odometry's frame at a stamp."""
+
+    stamp_ns: int
+    world_from_body: Quaternion
+    position: Vector | None
+
+
+@dataclass(frozen=True)
+class ContinuityLimits:
+    """What odometry is believed to do between two messages; infinite: anything.
+
+    Attributes:
+        turn_rate: rad/s.
+        speed: m/s; counts only while the odometry carries positions.
+        lead_ns: a stamp farther ahead of the last than this has to be confirmed.
+    """
+
+    turn_rate: float = math.inf
+    speed: float = math.inf
+    lead_ns: float = math.inf
+
+
+class ContinuityCheck:
+    """Refuses a message that does not go on from the last one, until the next one sides with it.
+
+    So a single message with a stamp years ahead or a wild pose is one refusal, while a source that paused, or began
+    anew, loses one message. All decisions are made from messages alone, so that a bag is judged as the robot was.
+    """
+
+    def __init__(self, limits: ContinuityLimits) -> None:
+        self.limits = limits
+        self._refused: OdometrySample | None = None
+        self._refused_has_jumped = False
+
+    def admit(self, sample: OdometrySample, last: OdometrySample, before: OdometrySample | None) -> bool:
+        """Judge a message, stamped after the last one that was admitted.
+
+        Args:
+            sample: the message.
+            last, before: the last admitted message of the same chain, and the one before it, if any.
+
+        Returns:
+            whether the odometry has begun anew, so that nothing is known of the rotation since ``last``.
+
+        Raises:
+            RejectedInputError: the message stands alone so far.
+        """
+        refused, has_jumped = self._refused, self._refused_has_jumped
+        self._refused = None
+        is_ahead = sample.stamp_ns - last.stamp_ns > self.limits.lead_ns
+        follows = refused is not None and 0 < sample.stamp_ns - refused.stamp_ns <= self.limits.lead_ns
+        if refused is not None and follows and (is_ahead or _distance(refused, sample) < _distance(last, sample)):
+            return has_jumped
+        jumps = self._jumps(sample, last, before)
+        if is_ahead or jumps:
+            self._refused, self._refused_has_jumped = sample, jumps
+            raise RejectedInputError(RejectReason.FUTURE_STAMP if is_ahead else RejectReason.ODOMETRY_JUMP)
+        return False
+
+    def _jumps(self, sample: OdometrySample, last: OdometrySample, before: OdometrySample | None) -> bool:
+        seconds = max(1e-9 * (sample.stamp_ns - last.stamp_ns), _SHORTEST_S)
+        angle, metres = _angle_and_metres(last, sample)
+        if angle > self.limits.turn_rate * seconds or metres > self.limits.speed * seconds:
+            return True
+        if math.isinf(self.limits.turn_rate) or before is None or not _is_zero(sample):
+            return False
+        angle, metres = _angle_and_metres(_going_on(last, before, sample.stamp_ns), sample)
+        return angle > _RETURN_ANGLE or metres > _RETURN_DISTANCE_M
+
+
+def _angle_and_metres(first: OdometrySample, second: OdometrySample) -> tuple[float, float]:
+    metres = 0.0
+    if first.position is not None and second.position is not None:
+        metres = math.dist(first.position, second.position)
+    return quaternion.angle_between(first.world_from_body, second.world_from_body), metres
+
+
+def _distance(first: OdometrySample, second: OdometrySample) -> float:
+    """How far apart two poses are, in units of what tells a return to zero."""
+    angle, metres = _angle_and_metres(first, second)
+    return angle / _RETURN_ANGLE + metres / _RETURN_DISTANCE_M
+
+
+def _is_zero(sample: OdometrySample) -> bool:
+    near = sample.position is None or math.hypot(*sample.position) < _ZERO_DISTANCE_M
+    return near and quaternion.angle(sample.world_from_body) < _ZERO_ANGLE
+
+
+def _going_on(last: OdometrySample, before: OdometrySample, stamp_ns: int) -> OdometrySample:
+    """Where the last two messages lead at a stamp with constant speed, not farther than as far as they are apart."""
+    steps = min(1.0, (stamp_ns - last.stamp_ns) / (last.stamp_ns - before.stamp_ns))
+    turn = quaternion.multiply(quaternion.inverse(before.world_from_body), last.world_from_body)
+    rotation = quaternion.multiply(last.world_from_body, quaternion.slerp(quaternion.IDENTITY, turn, steps))
+    position = last.position
+    if position is not None and before.position is not None:
+        x, y, z = (now + steps * (now - then) for now, then in zip(position, before.position, strict=True))
+        position = (x, y, z)
+    return OdometrySample(stamp_ns, rotation, position)
