@@ -117,7 +117,7 @@ def _draw_errors(axes: Axes, report: LiveReport) -> None:
         axes.plot([], [], color=colour, linewidth=2, label=f"{name}, mean {np.nanmean(degrees):.2f}°")
     axes.set_ylim(bottom=0)
     axes.margins(x=0.01)
-    _style(axes, "Orientation error, degrees", _ABOVE_LEGEND)
+    _style(axes, "Orientation error after one common rotation, degrees", _ABOVE_LEGEND)
     axes.set_xlabel("minutes", fontsize=9, color=_MUTED)
     _legend_above(axes)
 

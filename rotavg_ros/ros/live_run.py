@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 
@@ -65,7 +66,7 @@ def play_to_node(
         parameters: of the node, by name.
         rate: times real time.
         topics: of the bag.
-        log: file for what the node prints.
+        log: file for what the node and the player print.
         waiting: shows that something takes its time.
 
     Raises:
@@ -79,7 +80,7 @@ def play_to_node(
         try:
             with waiting("starting the node"):
                 _spin_until(recorder, lambda: recorder.hears_node, node, log, _START_TIMEOUT_S, "did not start")
-            _play(bag, rate, topics, recorder, node, log)
+            _play(bag, rate, topics, recorder, node, log, sink)
             recorder.forget_reports()
             with waiting("waiting for the last answer"):
                 _spin_until(recorder, lambda: recorder.is_at_rest, node, log, _REST_TIMEOUT_S, "did not come to rest")
@@ -95,10 +96,17 @@ def play_to_node(
 
 
 def _play(
-    bag: Path, rate: float, topics: list[str], recorder: Recorder, node: subprocess.Popen[bytes], log: Path
+    bag: Path,
+    rate: float,
+    topics: list[str],
+    recorder: Recorder,
+    node: subprocess.Popen[bytes],
+    log: Path,
+    sink: BinaryIO,
 ) -> None:
     command = [sys.executable, "-m", "rotavg_ros.cli.main", "play", str(bag), "--rate", str(rate), "--topics", *topics]
-    player = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    # Ctrl-C reaches the player as well; what it says then is for the log.
+    player = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=sink)
     try:
         while player.poll() is None:
             recorder.spin(0.2)
@@ -106,7 +114,7 @@ def _play(
     finally:
         _stop(player)
     if player.returncode != 0:
-        raise LiveRunError(f"playing the bag failed with exit code {player.returncode}")
+        raise LiveRunError(f"playing the bag failed with exit code {player.returncode}; {_last_words(log)}")
 
 
 def _spin_until(

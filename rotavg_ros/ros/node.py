@@ -42,14 +42,17 @@ def main() -> int:
 
 
 class _StopSignal:
-    """SIGINT and SIGTERM ask for the end; whatever is being done may finish."""
+    """SIGINT and SIGTERM end the process at once while it starts; later they ask for the end."""
 
     def __init__(self) -> None:
         self.requested = False
+        self.starting = True
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._request)
 
     def _request(self, _number: int, _frame: FrameType | None) -> None:
+        if self.starting:
+            os._exit(0)  # in the middle of an import, perhaps; there is nothing to tidy up yet
         self.requested = True
 
 
@@ -64,6 +67,7 @@ def _run(stop: _StopSignal) -> int:
     except UserError as error:
         return _fail(str(error))
     executor.add_node(node)
+    stop.starting = False
     while not stop.requested:
         try:
             executor.spin_once(timeout_sec=_LONGEST_WAIT_S)

@@ -87,6 +87,9 @@ def test_interrupted(tmp_path: Path, start_process: Callable, wait_until: Callab
     demo = start_process(*ROTAVG, "demo", "--output", tmp_path / "demo", "--laps", "1")
     wait_until(lambda: len(children_of(demo.pid)) > 1, demo)
     children = children_of(demo.pid)
-    assert demo.stop(signal.SIGINT) == 130
+    for pid in (demo.pid, *children):  # as a terminal does
+        os.kill(pid, signal.SIGINT)
+    assert demo.wait() == 130
     assert "Traceback" not in demo.output
+    assert demo.output.count("interrupted") == 1
     assert not any(Path(f"/proc/{child}").exists() for child in children), "nothing is left running"
