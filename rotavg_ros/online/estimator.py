@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 from torch import Tensor
 
 from rotavg_ros.online import quaternion, state_file
@@ -18,10 +17,10 @@ from rotavg_ros.online.answer import Answer
 from rotavg_ros.online.gauge import extend_along_edges, fix_gauge, joins_components
 from rotavg_ros.online.graph_builder import GraphBuilder
 from rotavg_ros.online.growing_view_graph import GraphSnapshot
-from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS, EdgeMeasurement, RejectReason
+from rotavg_ros.online.measurements import EdgeMeasurement, RejectReason
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.quaternion import Quaternion
-from rotavg_ros.online.trajectory import Trajectory, dead_reckoning
+from rotavg_ros.online.trajectory import Trajectory, corrected_trajectories
 from rotavg_ros.view_graph import EdgeLabel
 
 if TYPE_CHECKING:
@@ -67,10 +66,12 @@ class OnlineEstimator:
         self._lock = threading.Lock()
         self._tick_lock = threading.Lock()  # one tick at a time; taken before ``_lock``
         self._paused = False
+        self._generation = 0
         self._start_over(GraphBuilder(self.options), None, 0)
 
     def _start_over(self, builder: GraphBuilder, answered: Tensor | None, version: int) -> None:
         """Begin with this content; ``answered`` is the last answer's body_from_world ``(n, 4)``."""
+        self._generation += 1
         self._builder = builder
         self._answered = answered
         self._answered_component: Tensor | None = None
@@ -153,19 +154,14 @@ class OnlineEstimator:
             self._builder.set_options(options)
             self._answered_revision = -1
 
-    def trajectory(self, answer: Answer, robot: str) -> Trajectory | None:
-        """A robot's keyframes in the answer by time, positions by dead reckoning; None without odometry."""
+    def trajectories(self, answer: Answer) -> dict[str, Trajectory]:
+        """Poses of every robot's keyframes in the answer that have a stamp, see :func:`corrected_trajectories`."""
         with self._lock:
-            track = self._builder.tracks.get(robot)
-            if track is None or robot not in answer.robots:
-                return None
-            of_robot = answer.keyframe_robot == answer.robots.index(robot)
-            nodes = np.flatnonzero(of_robot & (answer.stamp_ns != UNKNOWN_STAMP_NS))
-            nodes = nodes[np.argsort(answer.stamp_ns[nodes], kind="stable")]
-            odometry_orientation, odometry_position, chain = track.poses_at(answer.stamp_ns[nodes])
-        orientation = answer.world_from_body[nodes]
-        position = dead_reckoning(orientation, odometry_orientation, odometry_position, chain)
-        return Trajectory(nodes, answer.stamp_ns[nodes], orientation, position)
+            translation = self._builder.graph.snapshot().translation[: len(answer.source)]
+            tracks = dict(self._builder.tracks)
+        if len(translation) < len(answer.source):
+            return {}  # the answer is about a graph that was reset since
+        return corrected_trajectories(answer, translation, tracks)
 
     def snapshot(self) -> GraphSnapshot:
         """The graph now; a later one begins with the same keyframes and edges."""
@@ -177,6 +173,11 @@ class OnlineEstimator:
         """Counts the graph's changes."""
         with self._lock:
             return self._builder.graph.revision
+
+    @property
+    def generation(self) -> int:
+        """Counts how often everything was forgotten or replaced: what was sent before may be news again."""
+        return self._generation
 
     @property
     def is_behind(self) -> bool:

@@ -1,40 +1,22 @@
-"""Which messages can carry edges: type names to converters, loaded only when a topic asks for them."""
+"""Entries of the topic parameters, ``topic`` or ``topic:package/msg/Type``, to message types and converters.
+
+A package is imported only when a topic asks for one of its types.
+"""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.online import EdgeMeasurement
-from rotavg_ros.online.measurements import RejectedInputError, RejectReason
-from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS, EdgeConverter, OdometryConverter, Source
 
-DEFAULT_TYPE = "rotavg_msgs/msg/RelativeRotation"
+DEFAULT_EDGE_TYPE = "rotavg_msgs/msg/RelativeRotation"
+DEFAULT_ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 
 
 class AdapterError(UserError):
-    """An edge topic whose message type cannot be used; the message names it."""
-
-
-@dataclass(frozen=True, slots=True)
-class EdgeRecord:
-    """One edge of a message.
-
-    Attributes:
-        edge: the measurement, or why it cannot be read.
-        sender, sequence: who counts, and the count; 0 for senders that do not.
-    """
-
-    edge: EdgeMeasurement | RejectReason
-    sender: str
-    sequence: int
-
-
-# message, default robot, body_from_sensor → its edges
-Converter = Callable[[Any, str, Quaternion], Iterator[EdgeRecord]]
+    """A topic whose message type cannot be used; the message names it."""
 
 
 @dataclass(frozen=True)
@@ -42,47 +24,63 @@ class EdgeTopic:
     """An entry of the parameter ``edge_topics``, ready to subscribe to."""
 
     topic: str
-    type_name: str
     message_type: type
-    convert: Converter
+    convert: EdgeConverter
 
 
-def _single(message: Any, default_robot: str, body_from_sensor: Quaternion) -> Iterator[EdgeRecord]:
-    from rotavg_ros.ros.conversions import edge_from_message
+@dataclass(frozen=True)
+class OdometryTopic:
+    """An entry of the parameter ``odometry_topics``, ready to subscribe to."""
 
-    try:
-        edge: EdgeMeasurement | RejectReason = edge_from_message(message, default_robot, body_from_sensor)
-    except RejectedInputError as rejection:
-        edge = rejection.reason
-    yield EdgeRecord(edge, message.source.robot, message.sequence)
-
-
-def _array(message: Any, default_robot: str, body_from_sensor: Quaternion) -> Iterator[EdgeRecord]:
-    for edge in message.edges:
-        yield from _single(edge, default_robot, body_from_sensor)
+    topic: str
+    message_type: type
+    convert: OdometryConverter
 
 
-CONVERTERS: dict[str, Converter] = {
-    DEFAULT_TYPE: _single,
-    "rotavg_msgs/msg/RelativeRotationArray": _array,
-}
-
-
-def load(entry: str) -> EdgeTopic:
-    """Find the message type and the converter of 'topic' or 'topic:package/msg/Type'.
+def edge_topic(entry: str, source: Source) -> EdgeTopic:
+    """Find the message type of an entry and make a converter for its source.
 
     Raises:
         AdapterError: a type that has no converter, or whose package is not installed.
     """
+    topic, type_name = split(entry, DEFAULT_EDGE_TYPE)
+    if type_name not in EDGE_CONVERTERS:
+        raise _unknown("edge", entry, type_name, list(EDGE_CONVERTERS))
+    return EdgeTopic(topic, _message_type("edge", entry, type_name), EDGE_CONVERTERS[type_name](source))
+
+
+def odometry_topic(entry: str) -> OdometryTopic:
+    """Find the message type and the converter of an entry.
+
+    Raises:
+        AdapterError: a type that has no converter, or whose package is not installed.
+    """
+    topic, type_name = split(entry, DEFAULT_ODOMETRY_TYPE)
+    if type_name not in ODOMETRY_CONVERTERS:
+        raise _unknown("odometry", entry, type_name, list(ODOMETRY_CONVERTERS))
+    return OdometryTopic(topic, _message_type("odometry", entry, type_name), ODOMETRY_CONVERTERS[type_name])
+
+
+def split(entry: str, default_type: str) -> tuple[str, str]:
+    """Topic and type name of an entry.
+
+    Raises:
+        AdapterError: no topic.
+    """
     topic, _, type_name = entry.partition(":")
-    type_name = type_name or DEFAULT_TYPE
     if not topic:
-        raise AdapterError(f"edge topic {entry!r} names no topic; write topic or topic:package/msg/Type")
-    if type_name not in CONVERTERS:
-        raise AdapterError(f"edge topic {entry!r}: no adapter for {type_name}; known are {', '.join(CONVERTERS)}")
+        raise AdapterError(f"{entry!r} names no topic; write topic or topic:package/msg/Type")
+    return topic, type_name or default_type
+
+
+def _unknown(what: str, entry: str, type_name: str, known: list[str]) -> AdapterError:
+    return AdapterError(f"{what} topic {entry!r}: no adapter for {type_name}; known are {', '.join(known)}")
+
+
+def _message_type(what: str, entry: str, type_name: str) -> type:
     package, _, name = type_name.split("/")
     try:
-        message_type = getattr(importlib.import_module(f"{package}.msg"), name)
+        message_type: type = getattr(importlib.import_module(f"{package}.msg"), name)
     except (ImportError, AttributeError) as error:
-        raise AdapterError(f"edge topic {entry!r} needs {type_name}: install the package {package}") from error
-    return EdgeTopic(topic, type_name, message_type, CONVERTERS[type_name])
+        raise AdapterError(f"{what} topic {entry!r} needs {type_name}: install the package {package}") from error
+    return message_type

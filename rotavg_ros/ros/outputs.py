@@ -5,11 +5,12 @@ from __future__ import annotations
 from functools import partial
 
 from geometry_msgs.msg import QuaternionStamped, TransformStamped
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import Path
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rotavg_msgs.msg import AbsoluteOrientations, OutlierFlags
+from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from rotavg_ros.errors import UserError
@@ -65,25 +66,24 @@ class Outputs:
         if answer.version == self._drawn_version:
             return
         self._drawn_version = answer.version
-        trajectories = {robot: self._estimator.trajectory(answer, robot) for robot in self._robots}
+        trajectories = self._estimator.trajectories(answer)
         for robot, path in watched.items():
-            if (trajectory := trajectories[robot]) is not None:
-                path.publish(path_message(trajectory, self._frame_id))
+            if robot in trajectories:
+                path.publish(path_message(trajectories[robot], self._frame_id))
         if markers:
-            known = [trajectory for trajectory in trajectories.values() if trajectory is not None]
-            self._markers.publish(markers_message(answer, known, self._frame_id))
+            self._markers.publish(markers_message(answer, list(trajectories.values()), self._frame_id))
 
-    def publish_orientation(self, robot: str, odometry: Odometry) -> None:
-        """The robot's corrected orientation at the moment of its newest odometry message."""
+    def publish_orientation(self, robot: str, odometry: Header) -> None:
+        """The robot's corrected orientation at the moment of its newest odometry message, which has this header."""
         orientation = self._estimator.current_orientation(robot)
         if orientation is None:
             return
         stamped = QuaternionStamped(quaternion=to_quaternion_message(orientation))
-        stamped.header.stamp = odometry.header.stamp
+        stamped.header.stamp = odometry.stamp
         stamped.header.frame_id = self._frame_id
         self._orientation[robot].publish(stamped)
         correction = self._estimator.world_from_odometry(robot) if self._tf is not None else None
         if self._tf is not None and correction is not None:
-            transform = TransformStamped(header=stamped.header, child_frame_id=odometry.header.frame_id)
+            transform = TransformStamped(header=stamped.header, child_frame_id=odometry.frame_id)
             transform.transform.rotation = to_quaternion_message(correction)
             self._tf.publish(self._tf_message(transforms=[transform]))

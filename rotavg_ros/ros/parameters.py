@@ -8,7 +8,9 @@ from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from typing import Any
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.online import EstimatorOptions
+from rotavg_ros.inputs import BRINGS_KEYFRAMES, Source
+from rotavg_ros.online import EstimatorOptions, quaternion
+from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.solver import DEVICES, PROFILES
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE
 
@@ -36,13 +38,27 @@ def _parameter(
 class NodeParameters:
     """Every parameter of the node; ``live`` ones can be changed while it runs."""
 
-    odometry_topics: tuple[str, ...] = _parameter(("odom",), "nav_msgs/msg/Odometry topics, one per robot")
+    odometry_topics: tuple[str, ...] = _parameter(
+        ("odom",), "topics of odometry, one per robot, 'topic' (nav_msgs/msg/Odometry) or 'topic:package/msg/Type'"
+    )
     robots: tuple[str, ...] = _parameter(
-        ("robot",), "name of the robot behind each odometry topic; an edge without a robot name belongs to the first"
+        ("robot",),
+        "name of the robot behind each odometry topic; messages that number robots mean places in this list, counted "
+        "from 0, or the numbers themselves where these are the names",
+    )
+    odometry_sensor_orientations: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0, 1.0),
+        "orientation of each odometry topic's sensor frame in the body frame, xyzw one after the other; one for all, "
+        "or one per odometry topic",
     )
     edge_topics: tuple[str, ...] = _parameter(
         ("relative_rotations", "relative_rotation_arrays:rotavg_msgs/msg/RelativeRotationArray"),
         "topics of relative rotations, 'topic' (rotavg_msgs/msg/RelativeRotation) or 'topic:package/msg/Type'",
+    )
+    edge_robots: tuple[str, ...] = _parameter(
+        ("",),
+        "robot that an edge topic's messages are about where they name none; one for all, or one per edge topic; "
+        "empty: the first of robots",
     )
     edge_sensor_orientations: tuple[float, ...] = _parameter(
         (0.0, 0.0, 0.0, 1.0),
@@ -80,6 +96,24 @@ class NodeParameters:
     )
     max_odometry_gap_s: float = _parameter(
         5.0, "between odometry messages farther apart no edge is placed", low=0.0, high=1e6, live=True
+    )
+    max_turn_rate_deg_s: float = _parameter(
+        360.0,
+        "odometry that turns faster has jumped, and begins a new component if it goes on from there; 0: believe all, "
+        "a return to zero as well",
+        low=0.0,
+        high=1e6,
+        live=True,
+    )
+    max_speed_m_s: float = _parameter(
+        50.0, "odometry that moves faster has jumped, likewise; 0: any speed", low=0.0, high=1e6, live=True
+    )
+    max_stamp_lead_s: float = _parameter(
+        60.0,
+        "a stamp farther ahead of the last needs a second message to be believed; 0: believe all",
+        low=0.0,
+        high=1e9,
+        live=True,
     )
     pending_capacity: int = _parameter(
         20_000, "edges that may wait for a keyframe or for odometry; the oldest go first", low=1, high=10_000_000
@@ -132,15 +166,28 @@ class NodeParameters:
                 f"robots has {len(self.robots)} entries and odometry_topics {len(self.odometry_topics)}; "
                 "give one robot per topic"
             )
-        numbers = self.edge_sensor_orientations
-        if len(numbers) not in (4, 4 * len(self.edge_topics)):
+        if len(self.edge_robots) not in (1, len(self.edge_topics)):
             raise ParameterError(
-                f"edge_sensor_orientations has {len(numbers)} numbers; give 4, or 4 per edge topic "
-                f"({4 * len(self.edge_topics)})"
+                f"edge_robots has {len(self.edge_robots)} entries; give 1, or one per edge topic "
+                f"({len(self.edge_topics)})"
             )
-        for start in range(0, len(numbers), 4):
-            if not abs(math.hypot(*numbers[start : start + 4]) - 1) <= UNIT_NORM_TOLERANCE:
-                raise ParameterError(f"edge_sensor_orientations: quaternion {start // 4} is not of unit length")
+        _check_orientations("odometry", self.odometry_sensor_orientations, len(self.odometry_topics))
+        _check_orientations("edge", self.edge_sensor_orientations, len(self.edge_topics))
+        for entry in self.edge_topics:
+            if entry.partition(":")[2] in BRINGS_KEYFRAMES and self.keyframe_source != "edges":
+                raise ParameterError(f"edge topic {entry!r} brings keyframes of its own; set keyframe_source to edges")
+
+    def odometry_sensors(self) -> list[Quaternion]:
+        """body_from_sensor of every odometry topic."""
+        return _orientations(self.odometry_sensor_orientations, len(self.odometry_topics))
+
+    def edge_sources(self) -> list[Source]:
+        """What every edge topic's messages do not say themselves."""
+        number = len(self.edge_topics)
+        robots = self.edge_robots * (number // len(self.edge_robots))
+        sensors = _orientations(self.edge_sensor_orientations, number)
+        pairs = zip(robots, sensors, strict=True)
+        return [Source(robot or self.robots[0], self.robots, sensor) for robot, sensor in pairs]
 
     def estimator_options(self) -> EstimatorOptions:
         """The same as the estimator wants it."""
@@ -152,6 +199,9 @@ class NodeParameters:
             keyframe_interval_s=self.keyframe_interval_s,
             stamp_tolerance_s=self.stamp_tolerance_s,
             max_odometry_gap_s=self.max_odometry_gap_s,
+            max_turn_rate=math.radians(self.max_turn_rate_deg_s),
+            max_speed=self.max_speed_m_s,
+            max_stamp_lead_s=self.max_stamp_lead_s,
             pending_capacity=self.pending_capacity,
             pending_timeout_s=self.pending_timeout_s,
             gauge=self.gauge,
@@ -209,6 +259,21 @@ def _check(parameter: Field[Any], value: Any) -> None:
         raise ParameterError(f"{name} is {value!r}; choose from {', '.join(about['choices'])}")
     if about["low"] is not None and not about["low"] <= value <= about["high"]:
         raise ParameterError(f"{name} is {value}; it must be between {about['low']:g} and {about['high']:g}")
+
+
+def _check_orientations(what: str, numbers: tuple[float, ...], topics: int) -> None:
+    name = f"{what}_sensor_orientations"
+    if len(numbers) not in (4, 4 * topics):
+        raise ParameterError(f"{name} has {len(numbers)} numbers; give 4, or 4 per {what} topic ({4 * topics})")
+    for start in range(0, len(numbers), 4):
+        if not abs(math.hypot(*numbers[start : start + 4]) - 1) <= UNIT_NORM_TOLERANCE:
+            raise ParameterError(f"{name}: quaternion {start // 4} is not of unit length")
+
+
+def _orientations(numbers: tuple[float, ...], topics: int) -> list[Quaternion]:
+    """One per topic, from numbers for each or for all."""
+    each = [quaternion.normalize(numbers[start : start + 4]) for start in range(0, len(numbers), 4)]
+    return each * (topics // len(each))
 
 
 def _python(value: Any) -> Any:

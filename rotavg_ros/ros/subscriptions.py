@@ -7,16 +7,15 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from rotavg_ros.online import OnlineEstimator, RejectReason, quaternion
+from rotavg_ros.inputs import EdgeConverter, EdgeVerdict, OdometryConverter
+from rotavg_ros.online import OnlineEstimator, RejectReason
 from rotavg_ros.online.measurements import RejectedInputError
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.ros import adapters
-from rotavg_ros.ros.conversions import to_nanoseconds, to_tuple
 from rotavg_ros.ros.diagnostics import Health
 from rotavg_ros.ros.message_counting import TopicCounter
 from rotavg_ros.ros.outputs import Outputs
@@ -40,20 +39,22 @@ class Subscriptions:
         self._estimator = estimator
         self._health = health
         self._outputs = outputs
-        self._default_robot = parameters.robots[0]
-        sensor = QoSProfile(depth=parameters.odometry_queue_depth, reliability=ReliabilityPolicy.BEST_EFFORT)
-        for robot, topic in zip(parameters.robots, parameters.odometry_topics, strict=True):
-            counter = health.odometry.setdefault(topic, TopicCounter())
-            self._subscribe(Odometry, topic, partial(self._on_odometry, robot), counter, sensor)
+        self._generation = estimator.generation
+        self._edge_converters: list[EdgeConverter] = []
+        best_effort = QoSProfile(depth=parameters.odometry_queue_depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+        sources = zip(parameters.robots, parameters.odometry_topics, parameters.odometry_sensors(), strict=True)
+        for robot, entry, body_from_sensor in sources:
+            odometry = adapters.odometry_topic(entry)
+            counter = health.odometry.setdefault(odometry.topic, TopicCounter())
+            on_odometry = partial(self._on_odometry, robot, odometry.convert, body_from_sensor)
+            self._subscribe(odometry.message_type, odometry.topic, on_odometry, counter, best_effort)
         reliable = QoSProfile(depth=parameters.edge_queue_depth, reliability=ReliabilityPolicy.RELIABLE)
-        numbers = parameters.edge_sensor_orientations
-        sensors = [quaternion.normalize(numbers[start : start + 4]) for start in range(0, len(numbers), 4)]
-        sensors *= len(parameters.edge_topics) // len(sensors)
-        for entry, sensor_orientation in zip(parameters.edge_topics, sensors, strict=True):
-            edge_topic = adapters.load(entry)
-            counter = health.edges.setdefault(edge_topic.topic, TopicCounter())
-            on_edges = partial(self._on_edges, edge_topic.convert, sensor_orientation, counter)
-            self._subscribe(edge_topic.message_type, edge_topic.topic, on_edges, counter, reliable)
+        for entry, source in zip(parameters.edge_topics, parameters.edge_sources(), strict=True):
+            edges = adapters.edge_topic(entry, source)
+            self._edge_converters.append(edges.convert)
+            counter = health.edges.setdefault(edges.topic, TopicCounter())
+            on_edges = partial(self._on_edges, edges.convert, counter)
+            self._subscribe(edges.message_type, edges.topic, on_edges, counter, reliable)
 
     def _subscribe(
         self,
@@ -80,22 +81,25 @@ class Subscriptions:
                 message_type, topic, callback, qos, qos_overriding_options=overrides()
             )
 
-    def _on_odometry(self, robot: str, message: Odometry, info: dict[str, Any] | None) -> None:
+    def _on_odometry(
+        self,
+        robot: str,
+        convert: OdometryConverter,
+        body_from_sensor: Quaternion,
+        message: Any,
+        info: dict[str, Any] | None,
+    ) -> None:
         started = time.perf_counter()
-        position = message.pose.pose.position
         try:
-            reason = self._estimator.add_odometry(
-                robot,
-                to_nanoseconds(message.header.stamp),
-                to_tuple(message.pose.pose.orientation),
-                (position.x, position.y, position.z),
-            )
+            record = convert(message, body_from_sensor)
         except RejectedInputError as rejection:
-            reason = rejection.reason
-            self._estimator.reject(reason)
+            reason: RejectReason | None = rejection.reason
+            self._estimator.reject(rejection.reason)
+        else:
+            reason = self._estimator.add_odometry(robot, record.stamp_ns, record.world_from_body, record.position)
         if reason is None:
             self._health.last_odometry = time.monotonic()
-            self._outputs.publish_orientation(robot, message)
+            self._outputs.publish_orientation(robot, message.header)
         else:
             self._warn_of_refusal(f"odometry of {robot}", reason)
         self._health.odometry_callback.add(time.perf_counter() - started)
@@ -103,14 +107,13 @@ class Subscriptions:
             self._health.odometry_latency.add(1e-9 * (time.time_ns() - info["source_timestamp"]))
 
     def _on_edges(
-        self,
-        convert: adapters.Converter,
-        body_from_sensor: Quaternion,
-        counter: TopicCounter,
-        message: Any,
-        _info: dict[str, Any] | None,
+        self, convert: EdgeConverter, counter: TopicCounter, message: Any, _info: dict[str, Any] | None
     ) -> None:
-        for record in convert(message, self._default_robot, body_from_sensor):
+        self._forget_with_the_estimator()
+        for record in convert(message):
+            if isinstance(record, EdgeVerdict):
+                self._estimator.label_edge(record.source_robot, record.edge_id, record.label)
+                continue
             counter.by_sequence.observe(record.sender, record.sequence)
             if isinstance(record.edge, RejectReason):
                 reason: RejectReason | None = record.edge
@@ -119,6 +122,13 @@ class Subscriptions:
                 reason = self._estimator.add_edge(record.edge)
             if reason is not None and reason is not RejectReason.DUPLICATE_EDGE:
                 self._warn_of_refusal("an edge", reason)
+
+    def _forget_with_the_estimator(self) -> None:
+        """After a reset, what a sender repeats is new again."""
+        if self._generation != self._estimator.generation:
+            self._generation = self._estimator.generation
+            for convert in self._edge_converters:
+                convert.forget()
 
     def _warn_of_refusal(self, what: str, reason: RejectReason) -> None:
         self._node.get_logger().warning(

@@ -11,14 +11,20 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion
+from nav_msgs.msg import Odometry
 from rotavg_msgs.msg import KeyframeReference, RelativeRotation, RelativeRotationArray
+from sensor_msgs.msg import Imu
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.online import quaternion
+from rotavg_ros.inputs import Source
+from rotavg_ros.inputs.fields import to_nanoseconds
+from rotavg_ros.inputs.rotavg import edge_from_message
 from rotavg_ros.online.measurements import RejectedInputError
 from rotavg_ros.ros import adapters
-from rotavg_ros.ros.conversions import edge_from_message, to_nanoseconds, to_time
+from rotavg_ros.ros.conversions import to_time
 from rotavg_ros.ros.message_counting import Durations, SequenceGaps, TopicCounter
+
+DEFAULT = adapters.DEFAULT_EDGE_TYPE
 
 
 def message(source_from_target: Rotation) -> RelativeRotation:
@@ -40,7 +46,7 @@ def test_direction_agrees_with_gtsam() -> None:
     world_from_source, world_from_target = Rotation.random(2, random_state=0)
     poses = [gtsam.Rot3(rotation.as_matrix()) for rotation in (world_from_source, world_from_target)]
     carried = Rotation.from_matrix(poses[0].between(poses[1]).matrix())
-    edge = edge_from_message(message(carried), "r", quaternion.IDENTITY)
+    edge = edge_from_message(message(carried), Source("r"))
     expected = world_from_target.inv() * world_from_source
     np.testing.assert_allclose(edge.target_from_source, expected.as_quat(canonical=True), atol=1e-12)
 
@@ -49,13 +55,13 @@ def test_a_sensor_that_is_turned_in_the_body() -> None:
     body_from_sensor, world_from_source, world_from_target = Rotation.random(3, random_state=1)
     sensor_source, sensor_target = world_from_source * body_from_sensor, world_from_target * body_from_sensor
     x, y, z, w = body_from_sensor.as_quat().tolist()
-    edge = edge_from_message(message(sensor_source.inv() * sensor_target), "r", (x, y, z, w))
+    edge = edge_from_message(message(sensor_source.inv() * sensor_target), Source("r", (), (x, y, z, w)))
     between = Rotation.from_quat(edge.target_from_source).inv() * (world_from_target.inv() * world_from_source)
     assert between.magnitude() < 1e-12
 
 
 def test_fields() -> None:
-    edge = edge_from_message(message(Rotation.identity()), "default", quaternion.IDENTITY)
+    edge = edge_from_message(message(Rotation.identity()), Source("default"))
     assert (edge.edge_id, edge.kind, edge.precision) == (2**64 - 1, 1, 4.0)
     assert (edge.source.robot, edge.source.keyframe_id, edge.source.stamp_ns) == ("a", 3, 5 * 10**9)
     assert (edge.target.robot, edge.target.keyframe_id, edge.target.stamp_ns) == ("default", None, 9 * 10**9 + 1)
@@ -71,23 +77,30 @@ def test_stamps() -> None:
 
 
 def test_adapters() -> None:
-    single = adapters.load("edges")
+    single = adapters.edge_topic("edges", Source("r"))
     assert single.topic == "edges" and single.message_type is RelativeRotation
-    array = adapters.load("a/b:rotavg_msgs/msg/RelativeRotationArray")
+    array = adapters.edge_topic("a/b:rotavg_msgs/msg/RelativeRotationArray", Source("r"))
     good, bad = message(Rotation.identity()), message(Rotation.identity())
     bad.source.by = 9
-    records = list(array.convert(RelativeRotationArray(edges=[good, bad]), "r", quaternion.IDENTITY))
+    records = list(array.convert(RelativeRotationArray(edges=[good, bad])))
     assert [record.sequence for record in records] == [7, 7]
     assert records[0].edge.edge_id == 2**64 - 1 and records[1].edge == "bad_reference"
-    for entry in ("x:unheard_msgs/msg/Of", "x:y", ":rotavg_msgs/msg/RelativeRotation", ""):
-        with pytest.raises(UserError, match=r"edge topic"):
-            adapters.load(entry)
+    imu = adapters.odometry_topic("imu/data:sensor_msgs/msg/Imu")
+    assert (imu.topic, imu.message_type) == ("imu/data", Imu)
+    assert adapters.odometry_topic("odom").message_type is Odometry
+
+
+@pytest.mark.parametrize("entry", ["x:unheard_msgs/msg/Of", "x:y", ":rotavg_msgs/msg/RelativeRotation", ""])
+def test_entries_that_cannot_be(entry: str) -> None:
+    for load in (adapters.odometry_topic, lambda entry: adapters.edge_topic(entry, Source("r"))):
+        with pytest.raises(UserError, match=r"topic"):
+            load(entry)
 
 
 def test_a_package_that_is_missing_is_named(monkeypatch) -> None:
-    monkeypatch.setitem(adapters.CONVERTERS, "unheard_msgs/msg/Of", adapters.CONVERTERS[adapters.DEFAULT_TYPE])
+    monkeypatch.setitem(adapters.EDGE_CONVERTERS, "unheard_msgs/msg/Of", adapters.EDGE_CONVERTERS[DEFAULT])
     with pytest.raises(UserError, match="install the package unheard_msgs"):
-        adapters.load("x:unheard_msgs/msg/Of")
+        adapters.edge_topic("x:unheard_msgs/msg/Of", Source("r"))
 
 
 @pytest.mark.parametrize(
