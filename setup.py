@@ -38,6 +38,7 @@ setup(
     packages=find_packages(where=str(ROOT), include=[NAME, f"{NAME}.*"]),
     package_data={
         NAME: ["py.typed"],
+        f"{NAME}.reports": ["templates/*.html"],
         f"{NAME}.solver": ["weights/*.safetensors", "weights/*.json"],
         f"{NAME}.training": ["configs/*.yaml"],
     },

@@ -1,0 +1,142 @@
+"""What a report says about a run, computed once from its record."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.online.measurements import OWN_EDGE_ID
+from rotavg_ros.reports.comparison import RobotComparison, compare
+from rotavg_ros.reports.panels import Clock
+from rotavg_ros.view_graph import EdgeKind
+
+if TYPE_CHECKING:
+    from rotavg_ros.replay.record import RobotRecord, RunRecord
+
+FloatArray = NDArray[np.float64]
+
+_SURE = 0.4  # a score below 0.1 or above 0.9 is
+
+
+@dataclass(frozen=True)
+class Closure:
+    """A loop closure as the report's table names it.
+
+    Attributes:
+        edge_id: the sender's; None if it gave none.
+        source, target: robot, keyframe id and stamp of its ends.
+        score: probability that it is false.
+        outlier: the verdict.
+    """
+
+    edge_id: int | None
+    source: tuple[str, int, int]
+    target: tuple[str, int, int]
+    score: float
+    outlier: bool
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """A record and what follows from it (N keyframes and M edges in the answer, C of them loop closures)."""
+
+    record: RunRecord
+
+    @cached_property
+    def comparisons(self) -> tuple[RobotComparison | None, ...]:
+        """Per robot; None without a reference at any of its keyframes."""
+        component = self.record.answer.component
+        return tuple(compare(robot, component[robot.nodes]) for robot in self.record.robots)
+
+    @property
+    def compared(self) -> Iterator[tuple[RobotRecord, RobotComparison]]:
+        """The robots that have a reference."""
+        for robot, comparison in zip(self.record.robots, self.comparisons, strict=True):
+            if comparison is not None:
+                yield robot, comparison
+
+    @cached_property
+    def start_ns(self) -> int:
+        """The earliest stamp of a keyframe, or of a tick where keyframes have none."""
+        stamps = self.record.answer.stamp_ns
+        known = stamps[stamps >= 0]
+        if len(known):
+            return int(known.min())
+        return min((tick.stamp_ns for tick in self.record.ticks), default=0)
+
+    @cached_property
+    def clock(self) -> Clock:
+        stamps = self.record.answer.stamp_ns
+        last_s = self.seconds(stamps.max()) if len(stamps) else 0.0
+        return Clock.for_duration(max(float(last_s), self.record.duration_s))
+
+    def seconds(self, stamp_ns: NDArray[np.int64] | np.int64) -> FloatArray:
+        """Since the start; exact to a nanosecond before the division."""
+        return np.asarray((stamp_ns - self.start_ns) / 1e9)
+
+    def time(self, stamp_ns: NDArray[np.int64]) -> FloatArray:
+        """Since the start in the clock's unit."""
+        return np.asarray(self.clock(self.seconds(stamp_ns)), dtype=np.float64)
+
+    @cached_property
+    def closures(self) -> NDArray[np.intp]:
+        """``(C,)`` indices of the answer's loop closures."""
+        return np.flatnonzero(self.record.answer.kind == EdgeKind.LOOP_CLOSURE)
+
+    @cached_property
+    def num_flagged(self) -> int:
+        return int(self.record.answer.outlier[self.closures].sum())
+
+    @cached_property
+    def num_flagged_odometry(self) -> int:
+        return int(self.record.answer.outlier.sum()) - self.num_flagged
+
+    def most_suspicious(self, limit: int) -> list[Closure]:
+        """The loop closures with the highest scores, highest first; equal scores in order of arrival."""
+        score = self.record.answer.outlier_score[self.closures]
+        return self._described(self.closures[np.argsort(-score, kind="stable")[:limit]])
+
+    def closest_calls(self, limit: int) -> list[Closure]:
+        """The loop closures of which the solver was least sure, the nearest to even first."""
+        doubt = np.abs(self.record.answer.outlier_score[self.closures] - 0.5)
+        order = np.argsort(doubt, kind="stable")
+        return self._described(self.closures[order[doubt[order] < _SURE]][:limit])
+
+    def _described(self, edges: NDArray[np.intp]) -> list[Closure]:
+        answer = self.record.answer
+        return [
+            Closure(
+                edge_id=None if int(answer.edge_id[edge]) == OWN_EDGE_ID else int(answer.edge_id[edge]),
+                source=self._end(answer.source[edge]),
+                target=self._end(answer.target[edge]),
+                score=float(answer.outlier_score[edge]),
+                outlier=bool(answer.outlier[edge]),
+            )
+            for edge in edges
+        ]
+
+    def _end(self, node: np.int64) -> tuple[str, int, int]:
+        answer = self.record.answer
+        robot = answer.robots[int(answer.keyframe_robot[node])]
+        return robot, int(answer.keyframe_id[node]), int(answer.stamp_ns[node])
+
+    @cached_property
+    def correction(self) -> tuple[FloatArray, ...]:
+        """Per robot ``(n,)`` radians: how far its first keyframe's frame is turned from odometry to the answer."""
+        return tuple(_turned(robot.odometry_world_from_body, robot.world_from_body) for robot in self.record.robots)
+
+
+def _turned(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Angle of each orientation between two trajectories that are laid together at the first known one."""
+    angle = np.full(len(after), np.nan)
+    known = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
+    if known.any():
+        turn = Rotation.from_quat(after[known]) * Rotation.from_quat(before[known]).inv()
+        angle[known] = (turn[0].inv() * turn).magnitude()
+    return angle

@@ -1,0 +1,161 @@
+"""Panels that pictures are put together from; each draws plain arrays on axes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+from numpy.typing import NDArray
+
+from rotavg_ros.reports.theme import Theme
+
+FloatArray = NDArray[np.float64]
+# Values and colour by name, from back to front.
+Curves = Mapping[str, tuple[FloatArray, str]]
+
+DASHED = (0, (4, 3))
+_AXIS_NAMES = "xyz"
+_COUNT_TICKS = [0, 2, 5, *(digit * 10**power for power in range(1, 9) for digit in (1, 2, 5))]
+_FLAT = 0.02  # a run is flat if it is at most this high for its width
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Times of a run in the unit that suits its length.
+
+    Attributes:
+        unit: for the name of an axis.
+        seconds: one such unit.
+    """
+
+    unit: str
+    seconds: float
+
+    @classmethod
+    def for_duration(cls, seconds: float) -> Clock:
+        if seconds < 180:
+            return cls("seconds", 1.0)
+        return cls("minutes", 60.0) if seconds < 3 * 3600 else cls("hours", 3600.0)
+
+    def __call__(self, seconds: FloatArray) -> FloatArray:
+        return seconds / self.seconds
+
+
+@dataclass(frozen=True)
+class View:
+    """Which two of the three axes a map shows: those along which the run is longest.
+
+    Attributes:
+        across, up: indices of the axes.
+        hidden: index of the third.
+        is_flat: nothing is lost by leaving the third out.
+    """
+
+    across: int
+    up: int
+    hidden: int
+    is_flat: bool
+
+    @classmethod
+    def of(cls, positions: Sequence[FloatArray]) -> View:
+        """The view for all positions, ``(·, 3)`` each; NaN rows do not count."""
+        points = np.concatenate([np.reshape(position, (-1, 3)) for position in positions] or [np.empty((0, 3))])
+        points = points[np.isfinite(points).all(axis=1)]
+        extent = np.ptp(points, axis=0) if len(points) else np.array([1.0, 1.0, 0.0])
+        # Equal extents, as of a run that stands still, leave the vertical out.
+        hidden = 2 - int(np.argmin(extent[::-1]))
+        across, up = (axis for axis in range(3) if axis != hidden)
+        return cls(across, up, hidden, bool(extent[hidden] <= _FLAT * extent.max()))
+
+    def __call__(self, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return position[:, self.across], position[:, self.up]
+
+    def name(self, axis: int) -> str:
+        return f"{_AXIS_NAMES[axis]}, metres"
+
+
+def track(axes: Axes, view: View, position: FloatArray, **line: Any) -> None:
+    """A trajectory; gaps where positions are unknown. A single position is a dot."""
+    x, y = view(position)
+    known = np.isfinite(x) & np.isfinite(y)
+    if known.any():
+        axes.plot(x, y, marker="o" if known.sum() == 1 else "", markersize=4, solid_joinstyle="round", **line)
+
+
+def segments(axes: Axes, ends: FloatArray, **lines: Any) -> LineCollection:
+    """Straight lines between ``(·, 2, 2)`` ends."""
+    collection = LineCollection(list(ends), **lines)
+    axes.add_collection(collection)
+    return collection
+
+
+def square_map(axes: Axes) -> None:
+    """Metres are as long to the side as upwards."""
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.06)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(nbins=6, integer=False))
+
+
+def over_time(
+    axes: Axes,
+    time: FloatArray,
+    curves: Curves,
+    unit: str,
+    *,
+    from_zero: bool = True,
+) -> None:
+    """Curves over times in any order; unknown values are left out.
+
+    Args:
+        unit: goes behind the numbers on the axis.
+        from_zero: the axis begins at zero, and the ground below a curve is tinted.
+    """
+    order = np.argsort(time, kind="stable")
+    for name, (values, colour) in curves.items():
+        known = order[np.isfinite(values[order])]
+        marker = "o" if len(known) == 1 else ""
+        axes.plot(time[known], values[known], marker=marker, markersize=4, color=colour, linewidth=1.4, label=name)
+        if from_zero:
+            axes.fill_between(time[known], values[known], color=colour, alpha=0.12, linewidth=0)
+    if from_zero:
+        axes.set_ylim(bottom=0)
+    axes.margins(x=0.01)
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}{unit}"))
+
+
+def score_histogram(axes: Axes, groups: Sequence[tuple[str, FloatArray, str]]) -> None:
+    """Scores from 0 to 1 in stacked groups of name, values and colour; few and many are both seen."""
+    groups = [group for group in groups if len(group[1])]
+    if groups:
+        names, scores, colours = zip(*groups, strict=True)
+        axes.hist(
+            scores,
+            bins=np.linspace(0, 1, 26).tolist(),
+            stacked=True,
+            color=colours,
+            label=[f"{name} ({len(values)})" for name, values in zip(names, scores, strict=True)],
+            rwidth=0.9,
+        )
+        axes.set_yscale("symlog", linthresh=10)
+        most = axes.get_ylim()[1]
+        axes.set_yticks([tick for tick in _COUNT_TICKS if tick <= most])
+        axes.minorticks_off()
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.set_xlim(-0.01, 1.01)
+    axes.set_ylim(bottom=0)
+
+
+def score_bar(axes: Axes, theme: Theme, label: str = "outlier score") -> None:
+    """The colours of scores beside a panel."""
+    bar = axes.figure.colorbar(ScalarMappable(Normalize(0, 1), theme.scores), ax=axes, shrink=0.75, pad=0.02)
+    bar.set_label(label, fontsize=9, color=theme.muted)
+    bar.ax.tick_params(colors=theme.muted, labelsize=9, length=0)
+    bar.outline.set_visible(False)

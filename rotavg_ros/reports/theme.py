@@ -1,0 +1,114 @@
+"""Colours of the pictures on a light and on a dark page; colour-blind readers can tell them apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap, LinearSegmentedColormap
+from matplotlib.figure import Figure
+
+from rotavg_ros.evaluation.plots import style
+
+WIDTH = 5.6  # inches of every picture: its text can be read on a phone as well
+_PIXELS_PER_INCH = 170
+_TITLE_PAD, _LEGEND_ROW = 8, 15  # points
+
+
+@dataclass(frozen=True)
+class Theme:
+    """Colours by what they stand for.
+
+    Attributes:
+        name: ``light`` or ``dark``.
+        background, ink, muted, grid: of the picture; text in ``muted`` has a contrast of 5 : 1 and more.
+        odometry, corrected, reference: trajectories and errors before and after.
+        kept, flagged: loop closures that are believed and those that are not.
+        missed, wrongly_flagged: verdicts that the truth contradicts.
+        between: of a closure whose score is 0.5.
+        robots: one colour each, over and over.
+    """
+
+    name: str
+    background: str
+    ink: str
+    muted: str
+    grid: str
+    odometry: str
+    corrected: str
+    reference: str
+    kept: str
+    flagged: str
+    missed: str
+    wrongly_flagged: str
+    between: str
+    robots: tuple[str, ...]
+
+    @property
+    def scores(self) -> Colormap:
+        """From a score of 0 (believed) to 1 (false)."""
+        return LinearSegmentedColormap.from_list("scores", [self.kept, self.between, self.flagged])
+
+    def figure(self, width: float, height: float) -> Figure:
+        """An empty picture; the size in inches."""
+        return Figure(figsize=(width, height), dpi=_PIXELS_PER_INCH, facecolor=self.background, layout="constrained")
+
+    def dress(self, axes: Axes, title: str, x: str = "", y: str = "", *, legend_rows: int = 0) -> None:
+        """Give a panel its look, its title and the names of its axes.
+
+        Args:
+            legend_rows: of the legend above the panel, under its title; 0 for none.
+        """
+        style(axes, title, ink=self.ink, muted=self.muted, grid=self.grid)
+        pad = _TITLE_PAD + _LEGEND_ROW * legend_rows
+        axes.set_title(title, loc="left", fontsize=11, fontweight="bold", color=self.ink, pad=pad)
+        axes.set_facecolor(self.background)
+        if legend_rows:
+            names = len(axes.get_legend_handles_labels()[1])
+            axes.legend(
+                loc="lower left",
+                bbox_to_anchor=(-0.01, 0.985),
+                ncol=-(-names // legend_rows),
+                frameon=False,
+                fontsize=9,
+                labelcolor=self.ink,
+                handlelength=1.3,
+                columnspacing=1.3,
+                borderaxespad=0.2,
+            )
+        axes.set_xlabel(x, fontsize=9, color=self.muted)
+        axes.set_ylabel(y, fontsize=9, color=self.muted)
+
+
+LIGHT = Theme(
+    name="light",
+    background="#ffffff",
+    ink="#1f2933",
+    muted="#52606d",
+    grid="#e4e7eb",
+    odometry="#d9731a",
+    corrected="#1f62bd",
+    reference="#1f2933",
+    kept="#1f62bd",
+    flagged="#cf3f0a",
+    missed="#a02a91",
+    wrongly_flagged="#b58900",
+    between="#c3c9d0",
+    robots=("#1f62bd", "#00795a", "#a0468c", "#8a6d00", "#0f7f9c", "#6b4fb3"),
+)
+DARK = Theme(
+    name="dark",
+    background="#171c23",
+    ink="#e6ebf0",
+    muted="#a3b0bd",
+    grid="#2c343d",
+    odometry="#f0a04b",
+    corrected="#6aaefc",
+    reference="#e6ebf0",
+    kept="#6aaefc",
+    flagged="#ff7a45",
+    missed="#e58fd6",
+    wrongly_flagged="#e3c04b",
+    between="#66717d",
+    robots=("#6aaefc", "#3fbf99", "#dd8fca", "#d6b53c", "#57c4de", "#a992f0"),
+)

@@ -1,0 +1,200 @@
+from __future__ import annotations
+
+import base64
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.backend_bases import RendererBase
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
+from PIL import Image
+
+from rotavg_ros.replay.record import RunRecord, TopicUse
+from rotavg_ros.reports import ReportError, write_report
+from rotavg_ros.reports.facts import RunFacts
+from rotavg_ros.reports.report import PICTURES
+from rotavg_ros.reports.theme import DARK, LIGHT
+from rotavg_ros.view_graph import EdgeKind
+
+from .records import record_of, simulated_run, two_robots, without_closures, without_positions, without_reference
+
+SECTIONS = {"trajectory", "orientations", "closures", "solving", "dropped", "inputs"}
+
+
+class Page(HTMLParser):
+    """What a reader of the page gets: its text, its elements, what it refers to."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.ids: list[str] = []
+        self.references: list[str] = []
+        self.images: dict[str, str] = {}
+        self.text = ""
+        self._figure = ""
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        attributes = {name: value or "" for name, value in attrs}
+        self.references += [attributes[name] for name in ("src", "srcset", "href", "action") if name in attributes]
+        if "id" in attributes:
+            self.ids.append(attributes["id"])
+        if tag == "figure":
+            self._figure = attributes["id"].removeprefix("picture-")
+        if tag == "img":
+            self.images[self._figure] = attributes["src"]
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def record() -> RunRecord:
+    return record_of(simulated_run(400, dimensions=3))
+
+
+@pytest.fixture(scope="module")
+def folder(record: RunRecord, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("report")
+    assert write_report(record, folder) == folder / "report.html"
+    return folder
+
+
+def test_the_page_needs_nothing_else(folder: Path) -> None:
+    page = Page(folder / "report.html")
+    assert page.references
+    assert all(reference.startswith(("data:", "#")) for reference in page.references)
+    assert {reference[1:] for reference in page.references if reference.startswith("#")} <= set(page.ids)
+    source = (folder / "report.html").read_text(encoding="utf-8")
+    for outside in ("http:", "https:", "//", "@import", "url("):
+        assert outside not in source.replace("data:image/png;base64,", "").split("<style>")[1].split("</style>")[0]
+    assert "<script" not in source
+
+
+def test_every_section_and_picture_is_there(folder: Path) -> None:
+    page = Page(folder / "report.html")
+    assert set(page.ids) == SECTIONS | {f"picture-{picture.name}" for picture in PICTURES}
+    assert len(page.ids) == len(set(page.ids))
+    names = {picture.name for picture in PICTURES}
+    assert set(page.images) == names == {path.stem for path in folder.glob("*.png")}
+    for name, uri in page.images.items():
+        content = base64.b64decode(uri.removeprefix("data:image/png;base64,"))
+        assert content == (folder / f"{name}.png").read_bytes()
+    assert {path.suffix for path in folder.iterdir()} == {".html", ".png"}
+
+
+def test_pictures_hold_their_curves(folder: Path) -> None:
+    for name, colours in (
+        ("trajectory", (LIGHT.odometry, LIGHT.corrected, LIGHT.reference)),
+        ("orientation", (LIGHT.odometry, LIGHT.corrected)),
+        ("scores", (LIGHT.kept, LIGHT.flagged)),
+    ):
+        pixels = np.asarray(Image.open(folder / f"{name}.png").convert("RGB")).reshape(-1, 3).astype(int)
+        for colour in colours:
+            wanted = np.array([int(colour[start : start + 2], 16) for start in (1, 3, 5)])
+            assert (np.abs(pixels - wanted).max(axis=1) <= 3).sum() > 100, (name, colour)
+
+
+def test_numbers_of_the_page(record: RunRecord, folder: Path) -> None:
+    page = Page(folder / "report.html")
+    answer = record.answer
+    closures = answer.kind == EdgeKind.LOOP_CLOSURE
+    assert f"{answer.outlier[closures].sum()} of {closures.sum()}" in page.text
+    worst = np.flatnonzero(closures)[np.argmax(answer.outlier_score[closures])]
+    stamp = int(answer.stamp_ns[answer.source[worst]])
+    assert f"{stamp // 10**9}.{stamp % 10**9:09d}" in page.text
+    assert "the edge's stamp lies outside the odometry" in page.text
+    assert "nan_rotation" not in page.text  # counted zero times
+
+
+def test_what_a_bag_says_is_shown_and_not_obeyed(record: RunRecord, tmp_path: Path) -> None:
+    evil = "</td><script>alert(1)</script><img src=x onerror=alert(1)>\"'&amp;{{ 7*7 }}\ud800"
+    topics = (TopicUse(evil, evil, 1, "", evil),)
+    answer = replace(record.answer, robots=(evil,))
+    robots = tuple(replace(robot, robot=evil) for robot in record.robots)
+    options: dict[str, object] = {evil: evil}
+    strange = replace(record, name=evil, topics=topics, answer=answer, robots=robots, options=options)
+    page = Page(write_report(strange, tmp_path))
+    assert "script" not in page.tags
+    assert page.tags.count("img") == len(page.images)
+    assert page.text.count(evil.replace("\ud800", "?")) >= 6
+
+
+def test_a_page_says_what_is_missing(record: RunRecord, tmp_path: Path) -> None:
+    bare = without_positions(without_reference(without_closures(record)))
+    page = Page(write_report(replace(bare, ticks=(), topics=(), rejected={}, interrupted=True), tmp_path))
+    for sentence in (
+        "There are no positions",
+        "There is no reference",
+        "There are no loop closures",
+        "Nothing was solved",
+        "every message of the used topics was taken",
+        "interrupted",
+    ):
+        assert sentence in page.text
+    assert set(page.images) == {"orientation", "uncertainty"}
+
+
+def test_a_reference_at_another_time(record: RunRecord, tmp_path: Path) -> None:
+    (robot,) = record.robots
+    assert robot.reference is not None
+    late = replace(robot.reference, stamp_ns=robot.reference.stamp_ns + 10**15)
+    page = Page(write_report(replace(record, robots=(replace(robot, reference=late),)), tmp_path))
+    assert "check its clock" in page.text
+    assert "position_error" not in page.images
+
+
+def test_an_empty_run(record: RunRecord, tmp_path: Path) -> None:
+    empty = replace(record, answer=record.answer.without_content(), robots=(), ticks=(), duration_s=0.0)
+    page = Page(write_report(empty, tmp_path))
+    assert "No keyframe" in page.text
+    assert set(page.ids) == SECTIONS
+    assert page.images == {}
+
+
+def overlapping_texts(figure: Figure, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    """Pairs of texts that cover each other in the picture."""
+    boxes: list[tuple[str, Bbox]] = []
+    draw = Text.draw
+
+    def note(text: Text, renderer: RendererBase) -> None:
+        draw(text, renderer)
+        if text.get_visible() and text.get_text().strip():
+            boxes.append((text.get_text(), text.get_window_extent(renderer).padded(-1)))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Text, "draw", note)
+        figure.draw_without_rendering()
+    assert len(boxes) > 3
+    return [(a, b) for (a, box), (b, other) in itertools.combinations(boxes, 2) if box.overlaps(other)]
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: record_of(simulated_run(10)),
+        lambda: record_of(simulated_run(10_000, dimensions=3)),
+        lambda: two_robots(record_of(simulated_run(300))),
+        lambda: without_reference(record_of(simulated_run(300))),
+    ],
+    ids=["ten keyframes", "ten thousand", "two robots", "no reference"],
+)
+def test_no_label_covers_another(make: Callable[[], RunRecord], monkeypatch: pytest.MonkeyPatch) -> None:
+    facts = RunFacts(make())
+    for picture in PICTURES:
+        figure = picture.draw(facts, DARK)
+        if figure is not None:
+            assert overlapping_texts(figure, monkeypatch) == [], picture.name
+
+
+def test_a_folder_that_cannot_be_written(record: RunRecord, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ReportError, match="cannot be written"):
+        write_report(record, tmp_path / "file")
