@@ -73,7 +73,7 @@ def test_the_orientation_goes_on_and_no_edge_is_made(estimator, answered_between
     ]
     assert crossing == []
     assert set(answer.kind.tolist()) == {EdgeKind.ODOMETRY}
-    steps = np.linalg.norm(np.diff(estimator.trajectory(answer, "r").position, axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(estimator.trajectories(answer)["r"].position, axis=0), axis=1)
     assert steps.max() < 0.6
 
 
