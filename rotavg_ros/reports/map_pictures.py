@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rotavg_ros.reports.facts import RunFacts
 from rotavg_ros.reports.panels import DASHED, View, score_bar, segments, square_map, track
-from rotavg_ros.reports.theme import WIDTH, Theme
+from rotavg_ros.reports.theme import WIDTH, Theme, plain
 from rotavg_ros.reports.tracks import Tracks, node_positions, tracks_of
 
 FloatArray = NDArray[np.float64]
@@ -64,7 +64,9 @@ def _lines(robots: Sequence[Tracks], theme: Theme) -> Iterator[Line]:
         if robot.odometry is not None:
             before = {"color": own, "alpha": 0.5} if several else {"color": theme.odometry, "label": "odometry alone"}
             yield robot.time, robot.odometry, {**_BEFORE, **before}
-        after = {"color": own, "label": robot.robot} if several else {"color": theme.corrected, "label": "corrected"}
+        after = (
+            {"color": own, "label": plain(robot.robot)} if several else {"color": theme.corrected, "label": "corrected"}
+        )
         yield robot.time, robot.corrected, {**_AFTER, **after}
         if robot.reference is not None:
             name = {} if several else {"label": "reference"}

@@ -12,6 +12,7 @@ from rotavg_ros.evaluation.plots import style
 
 WIDTH = 5.6  # inches of every picture: its text can be read on a phone as well
 _PIXELS_PER_INCH = 170
+_LONGEST_LABEL = 20
 _TITLE_PAD, _LEGEND_ROW = 8, 15  # points
 
 
@@ -78,6 +79,15 @@ class Theme:
             )
         axes.set_xlabel(x, fontsize=9, color=self.muted)
         axes.set_ylabel(y, fontsize=9, color=self.muted)
+
+
+def plain(name: str) -> str:
+    """A name from outside as a label that matplotlib draws as it stands: short, neither mathematics nor private."""
+    printable = "".join(letter if letter.isprintable() else "?" for letter in name)
+    if len(printable) > _LONGEST_LABEL:
+        printable = printable[: _LONGEST_LABEL - 1] + "…"
+    label = printable.replace("$", r"\$")
+    return f"\u200a{label}" if label.startswith("_") else label
 
 
 LIGHT = Theme(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rotavg_ros.reports.facts import RunFacts
 from rotavg_ros.reports.panels import Curves, over_time
-from rotavg_ros.reports.theme import WIDTH, Theme
+from rotavg_ros.reports.theme import WIDTH, Theme, plain
 
 FloatArray = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def _leaves_the_plane(facts: RunFacts) -> bool:
 
 def _correction(facts: RunFacts, theme: Theme) -> Figure | None:
     curves: list[tuple[str, FloatArray, FloatArray]] = [
-        (robot.robot, facts.time(robot.stamp_ns), np.degrees(turned))
+        (plain(robot.robot), facts.time(robot.stamp_ns), np.degrees(turned))
         for robot, turned in zip(facts.record.robots, facts.correction, strict=True)
         if np.isfinite(turned).any()
     ]
@@ -87,7 +87,7 @@ def uncertainty(facts: RunFacts, theme: Theme) -> Figure | None:
     """One sigma of every keyframe's orientation."""
     answer = facts.record.answer
     curves = [
-        (robot.robot, facts.time(robot.stamp_ns), np.degrees(robot.uncertainty))
+        (plain(robot.robot), facts.time(robot.stamp_ns), np.degrees(robot.uncertainty))
         for robot in facts.record.robots
         if np.isfinite(robot.uncertainty).any()
     ]
@@ -166,7 +166,7 @@ def _column(facts: RunFacts, theme: Theme, count: int) -> tuple[Figure, list[Axe
 
 
 def _of_robot(what: str, robot: str, facts: RunFacts) -> str:
-    return f"{what} of {robot}" if len(facts.record.robots) > 1 else what
+    return f"{what} of {plain(robot)}" if len(facts.record.robots) > 1 else what
 
 
 def _with_mean(name: str, values: FloatArray, unit: str) -> str:

@@ -16,7 +16,7 @@ from matplotlib.transforms import Bbox
 from PIL import Image
 
 from rotavg_ros.replay.record import RunRecord, TopicUse
-from rotavg_ros.reports import ReportError, write_report
+from rotavg_ros.reports import ReportError, report, write_report
 from rotavg_ros.reports.facts import RunFacts
 from rotavg_ros.reports.report import PICTURES
 from rotavg_ros.reports.theme import DARK, LIGHT
@@ -114,11 +114,20 @@ def test_numbers_of_the_page(record: RunRecord, folder: Path) -> None:
     assert "nan_rotation" not in page.text  # counted zero times
 
 
+@pytest.fixture
+def few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes most of the time, and some tests are about the text."""
+    few = [picture for picture in PICTURES if picture.name in ("trajectory", "position_error", "matches")]
+    monkeypatch.setattr(report, "PICTURES", few)
+
+
+@pytest.mark.usefixtures("few_pictures")
 def test_what_a_bag_says_is_shown_and_not_obeyed(record: RunRecord, tmp_path: Path) -> None:
-    evil = "</td><script>alert(1)</script><img src=x onerror=alert(1)>\"'&amp;{{ 7*7 }}\ud800"
+    evil = "_$\\frac$</td><script>alert(1)</script><img src=x onerror=alert(1)>\"'&amp;{{ 7*7 }}\ud800"
     topics = (TopicUse(evil, evil, 1, "", evil),)
-    answer = replace(record.answer, robots=(evil,))
-    robots = tuple(replace(robot, robot=evil) for robot in record.robots)
+    pair = two_robots(record)
+    answer = replace(pair.answer, robots=(evil, "beta"))
+    robots = (replace(pair.robots[0], robot=evil), pair.robots[1])
     options: dict[str, object] = {evil: evil}
     strange = replace(record, name=evil, topics=topics, answer=answer, robots=robots, options=options)
     page = Page(write_report(strange, tmp_path))
@@ -142,6 +151,7 @@ def test_a_page_says_what_is_missing(record: RunRecord, tmp_path: Path) -> None:
     assert set(page.images) == {"orientation", "uncertainty"}
 
 
+@pytest.mark.usefixtures("few_pictures")
 def test_a_reference_at_another_time(record: RunRecord, tmp_path: Path) -> None:
     (robot,) = record.robots
     assert robot.reference is not None
