@@ -14,7 +14,8 @@ demo: setup
 		$(if $(STAMPS),--stamps "$(STAMPS)")
 
 # make test [ARGS="-k node -x"]
-test: setup
+test:
+	@$(PYTHON) tools/setup_environment.py --for-tests
 	@$(BIN)/python -m pytest $(ARGS)
 
 lint: setup

@@ -29,19 +29,30 @@ STATE = VENV / "rotavg-setup"  # stamps of the steps that succeeded
 REQUIREMENTS = [ROOT / "requirements" / f"{name}.txt" for name in ("runtime", "ros", "dev", "peers")]
 CONSTRAINTS = ROOT / "requirements" / "constraints.txt"
 PACKAGES = {"rotavg_msgs": "ros.ament_cmake", "rotavg_ros": "ros.ament_python"}
+TEST_INTERFACES = ROOT / "test" / "interfaces"
+TEST_BUILD = ROOT / "build" / "test_interfaces"
+
+
+COLCON_BUILD_OPTIONS = (
+    *("--event-handlers", "desktop_notification-"),
+    *("--cmake-args", f"-DPython3_EXECUTABLE={VENV}/bin/python", "-DBUILD_TESTING=OFF", "-Wno-unused-cli"),
+)
 
 
 class SetupError(Exception):
     """The set-up cannot go on; the message is one line for the user."""
 
 
-def main() -> None:
+def main(for_tests: bool = False) -> None:
+    steps = [install_requirements, build_workspace, install_package]
+    if for_tests:
+        steps.append(build_test_interfaces)
     started = time.monotonic()
     try:
         check_machine()
         create_venv()
         with only_one_setup():
-            done = [step() for step in (install_requirements, build_workspace, install_package)]
+            done = [step() for step in steps]
     except SetupError as error:
         sys.exit(f"setup: error: {error}")
     except subprocess.CalledProcessError as error:
@@ -118,9 +129,24 @@ def build_workspace() -> bool:
             check_package_types()
             colcon(
                 *("build", "--base-paths", ".", "msg_defs", "--symlink-install"),
-                *("--event-handlers", "desktop_notification-"),
-                *("--cmake-args", f"-DPython3_EXECUTABLE={VENV}/bin/python", "-DBUILD_TESTING=OFF"),
-                *("-DCMAKE_BUILD_TYPE=Release", "-Wno-unused-cli"),
+                *COLCON_BUILD_OPTIONS,
+                "-DCMAKE_BUILD_TYPE=Release",
+            )
+    return stale
+
+
+def build_test_interfaces() -> bool:
+    """Build stand-ins for others' message packages, apart from the workspace: only tests that ask for them see them."""
+    packages = sorted(folder.parent for folder in TEST_INTERFACES.glob("*/package.xml"))
+    inputs = [*files_below(TEST_INTERFACES), CONSTRAINTS, REQUIREMENTS[1]]
+    outputs = [TEST_BUILD / "install" / "share" / package.name / "package.xml" for package in packages]
+    with stamp("test_interfaces", inputs, outputs) as stale:
+        if stale:
+            say(f"building {', '.join(package.name for package in packages)} for the tests")
+            colcon(
+                *("build", "--base-paths", *map(str, packages)),
+                *("--build-base", str(TEST_BUILD), "--install-base", str(TEST_BUILD / "install"), "--merge-install"),
+                *COLCON_BUILD_OPTIONS,
             )
     return stale
 

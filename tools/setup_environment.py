@@ -1,6 +1,8 @@
 """Sets up everything that the project needs: a virtual environment with ROS 2, and both packages built into install/.
 
-Usage: python3 tools/setup_environment.py
+Usage: python3 tools/setup_environment.py [--for-tests]
+
+With --for-tests it also builds the message packages below test/interfaces/, into build/test_interfaces.
 
 Every step is skipped when its inputs have not changed since it last succeeded, so a second call takes seconds and an
 interrupted one goes on where it stopped. This file stays free of new syntax, so that an old Python can still say what
@@ -22,7 +24,7 @@ def main() -> None:
         )
     import environment
 
-    environment.main()
+    environment.main(for_tests="--for-tests" in sys.argv[1:])
 
 
 if __name__ == "__main__":
