@@ -100,7 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     report = judge(answer, scene.run, scene.is_closure)
     with working("drawing"):
-        from rotavg_ros.evaluation.live_picture import draw
+        from rotavg_ros.reports.live_picture import draw
 
         draw(report, output / "demo.png", scene.title)
     (output / "summary.json").write_text(json.dumps(_summary(report), indent=2) + "\n", encoding="utf-8")

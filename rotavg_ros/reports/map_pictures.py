@@ -16,7 +16,7 @@ from rotavg_ros.reports.panels import DASHED, View, score_bar, segments, square_
 from rotavg_ros.reports.theme import WIDTH, Theme, plain
 from rotavg_ros.reports.tracks import Tracks, node_positions, tracks_of
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 Line = tuple[FloatArray, FloatArray, dict[str, Any]]
 
 _BEFORE: dict[str, Any] = {"linewidth": 1.1, "zorder": 2}

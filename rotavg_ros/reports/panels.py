@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rotavg_ros.reports.theme import Theme
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 # Values and colour by name, from back to front.
 Curves = Mapping[str, tuple[FloatArray, str]]
 
@@ -146,7 +146,7 @@ def score_histogram(axes: Axes, groups: Sequence[tuple[str, FloatArray, str]]) -
         )
         axes.set_yscale("symlog", linthresh=10)
         most = axes.get_ylim()[1]
-        axes.set_yticks([tick for tick in _COUNT_TICKS if tick <= most])
+        axes.set_yticks([0, 1] if most < 2 else [tick for tick in _COUNT_TICKS if tick <= most])
         axes.minorticks_off()
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_xlim(-0.01, 1.01)

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros.datasets.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.datasets.trajectories import World
-from rotavg_ros.evaluation.live_picture import draw
 from rotavg_ros.evaluation.live_report import PlayedRun, edge_is_false, judge
 from rotavg_ros.evaluation.node_answer import NodeAnswer
+from rotavg_ros.reports.live_picture import draw
 
 KEYFRAMES = slice(0, None, 3)
 
