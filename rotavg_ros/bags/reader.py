@@ -69,6 +69,11 @@ class BagReader:
                 self._reader.close()
 
     @property
+    def path(self) -> Path:
+        """The bag's file or folder."""
+        return self._path
+
+    @property
     def topics(self) -> dict[str, str]:
         """Message type of every topic, in the order of their names."""
         return {connection.topic: connection.msgtype for connection in sorted(self._all(), key=lambda c: c.topic)}
@@ -80,6 +85,16 @@ class BagReader:
     @property
     def duration_s(self) -> float:
         return max(0.0, self._open().duration / 1e9)
+
+    @property
+    def start_ns(self) -> int:
+        """When the first message was recorded."""
+        return int(self._open().start_time)
+
+    @property
+    def end_ns(self) -> int:
+        """Just after the last message."""
+        return int(self._open().end_time)
 
     def num_messages(self, topics: Collection[str] | None = None) -> int:
         """Number of messages on the given topics; default: all."""
@@ -121,10 +136,20 @@ class BagReader:
         for connection, time_ns, data in self._records(topics):
             yield BagMessage(connection.topic, connection.msgtype, time_ns, data)
 
-    def decoded(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-        """Messages as (topic, time in ns, message)."""
+    def decoded(
+        self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[tuple[str, int, Any]]:
+        """Messages as (topic, time in ns, message), of those recorded from ``start_ns`` on and before ``stop_ns``.
+
+        Types of packages that are not installed are decoded by the definitions in the bag.
+        """
         reader = self._open()
-        for connection, time_ns, data in self._records(topics):
+        for connection, time_ns, data in self._records(topics, start_ns, stop_ns):
+            if connection.msgtype not in reader.typestore.fielddefs:
+                raise BagReadError(
+                    f"{self._path}: {connection.topic} has type {connection.msgtype}, which neither the bag nor rotavg "
+                    "defines; record it as MCAP, which carries definitions, or leave the topic out"
+                )
             try:
                 message = reader.deserialize(data, connection.msgtype)
             except Exception as error:  # whatever garbled bytes make the decoder stumble over
@@ -134,11 +159,13 @@ class BagReader:
                 ) from None
             yield connection.topic, time_ns, message
 
-    def _records(self, topics: Collection[str] | None) -> Iterator[tuple[Connection, int, bytes]]:
+    def _records(
+        self, topics: Collection[str] | None, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
         connections = [c for c in self._all() if topics is None or c.topic in topics]
         if not connections:
             return
-        records = self._open().messages(connections)
+        records = self._open().messages(connections, start_ns, stop_ns)
         while True:
             try:
                 record = next(records)

@@ -10,13 +10,9 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from rotavg_ros.online import Answer
+from rotavg_ros.online.drawing import EDGE_WIDTH_M, KEYFRAME_COLOR, KEYFRAME_SIZE_M, PALETTE, draw
 from rotavg_ros.online.trajectory import Trajectory
 from rotavg_ros.ros.conversions import to_quaternion_message, to_time
-
-_EDGE_WIDTH_M = 0.03
-_KEYFRAME_SIZE_M = 0.12
-_KEYFRAME_COLOR = ColorRGBA(r=0.15, g=0.35, b=0.75, a=1.0)
-_NUM_COLORS = 32
 
 
 def path_message(trajectory: Trajectory, frame_id: str) -> Path:
@@ -33,39 +29,29 @@ def path_message(trajectory: Trajectory, frame_id: str) -> Path:
 
 
 def markers_message(answer: Answer, trajectories: list[Trajectory], frame_id: str) -> MarkerArray:
-    """One sphere list of the keyframes and one line list of the edges, green (inlier) to red (outlier).
-
-    Keyframes without a known position are left out, and their edges with them.
-    """
-    position = np.full((len(answer.keyframe_id), 3), np.nan)
-    for trajectory in trajectories:
-        position[trajectory.node] = trajectory.position
-    placed = np.isfinite(position).all(axis=1)
-    points = [
-        Point(x=x, y=y, z=z) if known else None for (x, y, z), known in zip(position.tolist(), placed, strict=True)
-    ]
+    """One sphere list of the keyframes and one line list of the edges, green (inlier) to red (outlier)."""
+    drawing = draw(answer, trajectories)
     header = Header(frame_id=frame_id)
-    spheres = Marker(header=header, ns="keyframes", id=0, type=Marker.SPHERE_LIST, color=_KEYFRAME_COLOR)
-    spheres.scale = Vector3(x=_KEYFRAME_SIZE_M, y=_KEYFRAME_SIZE_M, z=_KEYFRAME_SIZE_M)
-    spheres.points = [points[node] for node in np.flatnonzero(placed).tolist()]
+    spheres = Marker(header=header, ns="keyframes", id=0, type=Marker.SPHERE_LIST, color=_color(KEYFRAME_COLOR))
+    spheres.scale = Vector3(x=KEYFRAME_SIZE_M, y=KEYFRAME_SIZE_M, z=KEYFRAME_SIZE_M)
+    spheres.points = _points(drawing.keyframes)
     lines = Marker(header=header, ns="edges", id=0, type=Marker.LINE_LIST)
-    lines.scale = Vector3(x=_EDGE_WIDTH_M)
-    shown = np.flatnonzero(placed[answer.source] & placed[answer.target])
-    colors = _colors(answer.outlier_score[shown])
-    ends = zip(answer.source[shown].tolist(), answer.target[shown].tolist(), strict=True)
-    lines.points = [points[node] for pair in ends for node in pair]
-    lines.colors = [color for color in colors for _ in range(2)]
+    lines.scale = Vector3(x=EDGE_WIDTH_M)
+    lines.points = _points(drawing.edge_ends)
+    palette = [_color(rgba) for rgba in PALETTE]
+    lines.colors = [palette[shade] for shade in drawing.edge_shades.tolist() for _ in range(2)]
     for marker in (spheres, lines):
         marker.pose.orientation.w = 1.0
     return MarkerArray(markers=[spheres, lines])
 
 
-def _colors(score: NDArray[np.float64]) -> list[ColorRGBA]:
-    palette = [
-        ColorRGBA(r=share, g=0.75 * (1 - share), b=0.1, a=0.5 + 0.5 * share)
-        for share in np.linspace(0, 1, _NUM_COLORS).tolist()
-    ]
-    return [palette[index] for index in np.rint(np.nan_to_num(score) * (_NUM_COLORS - 1)).astype(int).tolist()]
+def _points(xyz: NDArray[np.float64]) -> list[Point]:
+    return [Point(x=x, y=y, z=z) for x, y, z in xyz.tolist()]
+
+
+def _color(rgba: tuple[float, float, float, float]) -> ColorRGBA:
+    red, green, blue, opacity = rgba
+    return ColorRGBA(r=red, g=green, b=blue, a=opacity)
 
 
 def _pose(position: list[float], orientation: list[float]) -> Pose:

@@ -1,0 +1,168 @@
+"""What the node publishes, as messages for a bag: bit for bit those of :mod:`rotavg_ros.ros`, which a test checks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
+
+from rotavg_ros.bags.message_types import typestore
+from rotavg_ros.online import Answer
+from rotavg_ros.online.drawing import EDGE_WIDTH_M, KEYFRAME_COLOR, KEYFRAME_SIZE_M, PALETTE, Drawing
+from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.online.trajectory import Trajectory
+
+ORIENTATIONS = "rotavg_msgs/msg/AbsoluteOrientations"
+FLAGS = "rotavg_msgs/msg/OutlierFlags"
+ORIENTATION = "geometry_msgs/msg/QuaternionStamped"
+PATH = "nav_msgs/msg/Path"
+MARKERS = "visualization_msgs/msg/MarkerArray"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+
+_NANOSECONDS = 1_000_000_000
+
+
+def orientations_message(answer: Answer, frame_id: str) -> Any:
+    """A ``rotavg_msgs/msg/AbsoluteOrientations``."""
+    return _make(
+        ORIENTATIONS,
+        header=_header(_newest(answer), frame_id),
+        robots=list(answer.robots),
+        keyframe_robots=answer.keyframe_robot.astype(np.uint32),
+        keyframe_ids=answer.keyframe_id,
+        stamps_ns=answer.stamp_ns,
+        orientations=answer.world_from_body.ravel(),
+        components=answer.component.astype(np.uint32),
+        uncertainties_deg=np.degrees(answer.uncertainty).astype(np.float32),
+    )
+
+
+def flags_message(answer: Answer, frame_id: str) -> Any:
+    """A ``rotavg_msgs/msg/OutlierFlags``."""
+    return _make(
+        FLAGS,
+        header=_header(_newest(answer), frame_id),
+        edge_ids=answer.edge_id,
+        robots=list(answer.robots),
+        source_robots=answer.keyframe_robot[answer.source].astype(np.uint32),
+        source_ids=answer.keyframe_id[answer.source],
+        target_robots=answer.keyframe_robot[answer.target].astype(np.uint32),
+        target_ids=answer.keyframe_id[answer.target],
+        kinds=answer.kind.astype(np.uint8),
+        scores=answer.outlier_score.astype(np.float32),
+        outliers=answer.outlier,
+    )
+
+
+def orientation_message(stamp_ns: int, world_from_body: Quaternion, frame_id: str) -> Any:
+    """A ``geometry_msgs/msg/QuaternionStamped``."""
+    return _make(ORIENTATION, header=_header(stamp_ns, frame_id), quaternion=_quaternion(world_from_body))
+
+
+def path_message(trajectory: Trajectory, frame_id: str) -> Any:
+    """A ``nav_msgs/msg/Path``; the origin where positions are not known."""
+    pose_stamped, pose = _type("geometry_msgs/msg/PoseStamped"), _type("geometry_msgs/msg/Pose")
+    point = _type("geometry_msgs/msg/Point")
+    poses = [
+        pose_stamped(
+            header=_header(stamp_ns, frame_id),
+            pose=pose(position=point(*position), orientation=_quaternion(orientation)),
+        )
+        for stamp_ns, position, orientation in zip(
+            trajectory.stamp_ns.tolist(),
+            np.nan_to_num(trajectory.position).tolist(),
+            trajectory.world_from_body.tolist(),
+            strict=True,
+        )
+    ]
+    newest = int(trajectory.stamp_ns[-1]) if len(trajectory.stamp_ns) else 0
+    return _make(PATH, header=_header(newest, frame_id), poses=poses)
+
+
+def markers_message(drawing: Drawing, frame_id: str) -> Any:
+    """A ``visualization_msgs/msg/MarkerArray``: a sphere list of keyframes and a line list of edges."""
+    marker, color = _type("visualization_msgs/msg/Marker"), _type("std_msgs/msg/ColorRGBA")
+    size = {"x": KEYFRAME_SIZE_M, "y": KEYFRAME_SIZE_M, "z": KEYFRAME_SIZE_M}
+    palette = [color(*rgba) for rgba in PALETTE]
+    upright = _make("geometry_msgs/msg/Pose", orientation=_quaternion((0.0, 0.0, 0.0, 1.0)))
+    spheres = _make(
+        "visualization_msgs/msg/Marker",
+        header=_header(0, frame_id),
+        ns="keyframes",
+        type=marker.SPHERE_LIST,
+        pose=upright,
+        scale=_make("geometry_msgs/msg/Vector3", **size),
+        color=color(*KEYFRAME_COLOR),
+        points=_points(drawing.keyframes),
+    )
+    lines = _make(
+        "visualization_msgs/msg/Marker",
+        header=_header(0, frame_id),
+        ns="edges",
+        type=marker.LINE_LIST,
+        pose=upright,
+        scale=_make("geometry_msgs/msg/Vector3", x=EDGE_WIDTH_M),
+        points=_points(drawing.edge_ends),
+        colors=[palette[shade] for shade in drawing.edge_shades.tolist() for _ in range(2)],
+    )
+    return _make(MARKERS, markers=[spheres, lines])
+
+
+def diagnostics_message(stamp_ns: int, level: int, name: str, message: str, values: Mapping[str, str]) -> Any:
+    """A ``diagnostic_msgs/msg/DiagnosticArray`` of one status."""
+    pair = _type("diagnostic_msgs/msg/KeyValue")
+    status = _make(
+        "diagnostic_msgs/msg/DiagnosticStatus",
+        level=level,
+        name=name,
+        message=message,
+        hardware_id=values.get("device", ""),
+        values=[pair(key=key, value=value) for key, value in values.items()],
+    )
+    return _make(DIAGNOSTICS, header=_header(stamp_ns, ""), status=[status])
+
+
+def _newest(answer: Answer) -> int:
+    return int(answer.stamp_ns.max()) if len(answer.stamp_ns) else 0
+
+
+def _header(stamp_ns: int, frame_id: str) -> Any:
+    seconds, nanosec = divmod(stamp_ns, _NANOSECONDS)
+    time = (seconds, nanosec) if 0 <= seconds < 2**31 else (0, 0)
+    return _type("std_msgs/msg/Header")(stamp=_type("builtin_interfaces/msg/Time")(*time), frame_id=frame_id)
+
+
+def _quaternion(xyzw: Iterable[float]) -> Any:
+    return _type("geometry_msgs/msg/Quaternion")(*xyzw)
+
+
+def _points(xyz: NDArray[np.float64]) -> list[Any]:
+    point = _type("geometry_msgs/msg/Point")
+    return [point(*row) for row in xyz.tolist()]
+
+
+@cache
+def _type(name: str) -> Any:
+    return typestore().types[name]
+
+
+def _make(type_name: str, /, **values: Any) -> Any:
+    """A message with the fields that are not given at zero, or empty."""
+    _, fields = typestore().fielddefs[type_name]
+    return _type(type_name)(**{field: values[field] if field in values else _zero(node) for field, node in fields})
+
+
+def _zero(node: Any) -> Any:
+    kind, about = node
+    if kind == Nodetype.NAME:
+        return _make(about)
+    if kind == Nodetype.BASE:
+        return {"string": "", "bool": False}.get(about[0], 0.0 if about[0].startswith("float") else 0)
+    assert kind == Nodetype.SEQUENCE, "no message of ours has arrays of fixed length"
+    (element, detail), _ = about
+    numeric = element == Nodetype.BASE and detail[0] != "string"
+    return np.empty(0, dtype=np.uint8 if detail[0] == "byte" else detail[0]) if numeric else []
