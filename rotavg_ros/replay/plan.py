@@ -1,0 +1,221 @@
+"""Which topic of a bag a replay uses as what: what the user says, and a good guess for the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rotavg_ros.bags.message_types import RELATIVE_ROTATION
+from rotavg_ros.bags.reader import RECORDING_SUFFIXES, BagReader
+from rotavg_ros.errors import UserError
+from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
+from rotavg_ros.replay.record import TopicUse
+from rotavg_ros.replay.topics import Candidate, Candidates, find_candidates
+from rotavg_ros.ros.parameters import NodeParameters
+
+
+class PlanError(UserError):
+    """Topics that the bag does not have or that are good for nothing; the message names the candidates."""
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What the user wants used; None: guess. Entries are ``topic`` or ``topic:package/msg/Type``, or ``none`` alone.
+
+    Attributes:
+        odometry, edges: topics.
+        references: topics or files, one per robot in their order.
+        robots: names, one per odometry topic.
+    """
+
+    odometry: Sequence[str] | None = None
+    edges: Sequence[str] | None = None
+    references: Sequence[str] | None = None
+    robots: Sequence[str] | None = None
+
+
+class Input(NamedTuple):
+    """A topic and the type that its messages are read as."""
+
+    topic: str
+    type_name: str
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything decided.
+
+    Attributes:
+        parameters: the node's, their topics those of the bag; ``odometry_topics`` may name one that is not there.
+        odometry: one per robot, in the order of ``parameters.robots``; none where the bag has no odometry.
+        edges: in the order of ``parameters.edge_topics``.
+        translations: topic of the positions that belong to the edges, and the edges' topic.
+        references: topic or file by robot.
+        topics: every topic of the bag and its use.
+    """
+
+    parameters: NodeParameters
+    odometry: tuple[Input, ...]
+    edges: tuple[Input, ...]
+    translations: tuple[str, str] | None
+    references: dict[str, Input | Path]
+    topics: tuple[TopicUse, ...]
+
+    @property
+    def has_input(self) -> bool:
+        return bool(self.odometry or self.edges)
+
+
+def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan:
+    """Decide.
+
+    Args:
+        bag: open.
+        values: parameters that the user has set, by name; topics among them count as wishes.
+        wishes: from options, which win.
+
+    Raises:
+        PlanError: a topic that is not in the bag, or whose type nothing can be made of.
+        ParameterError: parameters that do not fit together.
+    """
+    found = find_candidates(bag)
+    odometry = _odometry(bag, found, wishes.odometry or values.get("odometry_topics"))
+    edges = _edges(bag, found, wishes.edges or values.get("edge_topics"))
+    settings = dict(values)
+    settings["robots"] = _robots(wishes.robots or values.get("robots"), odometry)
+    if odometry:
+        settings["odometry_topics"] = tuple(f"{topic}:{type_name}" for topic, type_name in odometry)
+    settings["edge_topics"] = tuple(f"{topic}:{type_name}" for topic, type_name in edges)
+    if found.brings_keyframes and edges:
+        settings.setdefault("keyframe_source", "edges")
+    elif edges and not odometry:
+        settings.setdefault("unknown_keyframes", "create")
+    parameters = NodeParameters().changed(settings)
+    references = _references(bag, found, wishes.references, parameters.robots, odometry)
+    translations = _translations(found, edges)
+    topics = _uses(bag, found, parameters, odometry, edges, translations, references)
+    return Plan(parameters, odometry, edges, translations, references, topics)
+
+
+def _odometry(bag: BagReader, found: Candidates, wanted: Sequence[str] | None) -> tuple[Input, ...]:
+    if wanted is None:
+        return tuple(Input(best.topic, best.type_name) for best in found.odometry[:1])
+    return _chosen(bag, wanted, ODOMETRY_CONVERTERS, "odometry", found.odometry)
+
+
+def _edges(bag: BagReader, found: Candidates, wanted: Sequence[str] | None) -> tuple[Input, ...]:
+    if wanted is None:
+        return tuple(Input(edge.topic, edge.type_name) for edge in found.edges)
+    return _chosen(bag, wanted, EDGE_CONVERTERS, "relative rotations", found.edges)
+
+
+def _chosen(
+    bag: BagReader,
+    wanted: Sequence[str],
+    converters: Mapping[str, object],
+    what: str,
+    candidates: Sequence[Candidate],
+) -> tuple[Input, ...]:
+    if list(wanted) == ["none"]:
+        return ()
+    recorded = bag.topics
+    inputs = []
+    for entry in wanted:
+        name, _, type_name = entry.partition(":")
+        topic = name if name in recorded else f"/{name.lstrip('/')}"
+        names = ", ".join(candidate.topic for candidate in candidates) or "none"
+        if topic not in recorded:
+            raise PlanError(f"{bag.path}: no topic {topic}; candidates for {what}: {names}")
+        type_name = type_name or recorded[topic]
+        if type_name not in converters:
+            raise PlanError(
+                f"{bag.path}: {topic} is {type_name}, of which no {what} can be made; candidates: {names}; "
+                f"types: {', '.join(converters)}"
+            )
+        inputs.append(Input(topic, type_name))
+    return tuple(inputs)
+
+
+def _robots(wanted: Sequence[str] | None, odometry: Sequence[Input]) -> tuple[str, ...]:
+    """Names for the robots behind the odometry topics: told, or their topics' namespaces, or the only one's."""
+    if wanted:
+        return tuple(wanted)
+    if len(odometry) < 2:
+        return NodeParameters().robots
+    namespaces = [source.topic.strip("/").rpartition("/")[0] for source in odometry]
+    names = namespaces if len(set(namespaces)) == len(odometry) and all(namespaces) else None
+    return tuple(names or (source.topic.strip("/") for source in odometry))
+
+
+def _references(
+    bag: BagReader,
+    found: Candidates,
+    wanted: Sequence[str] | None,
+    robots: Sequence[str],
+    odometry: Sequence[Input],
+) -> dict[str, Input | Path]:
+    if wanted is None:
+        used = {source.topic for source in odometry}
+        best = next((candidate for candidate in found.references if candidate.topic not in used), None)
+        return {robots[0]: Input(best.topic, best.type_name)} if best and len(robots) == 1 else {}
+    if list(wanted) == ["none"]:
+        return {}
+    if len(wanted) > len(robots):
+        raise PlanError(f"{len(wanted)} references for {len(robots)} robots; give at most one per robot")
+    references: dict[str, Input | Path] = {}
+    for robot, entry in zip(robots, wanted, strict=False):
+        if (
+            entry.partition(":")[0] not in bag.topics
+            and Path(entry).exists()
+            and Path(entry).suffix not in RECORDING_SUFFIXES
+        ):
+            references[robot] = Path(entry)
+        else:
+            (references[robot],) = _chosen(bag, [entry], ODOMETRY_CONVERTERS, "a reference", found.references)
+    return references
+
+
+def _translations(found: Candidates, edges: Sequence[Input]) -> tuple[str, str] | None:
+    """Only messages of single edges come one by one with their translations."""
+    single = [source.topic for source in edges if source.type_name == RELATIVE_ROTATION]
+    if len(found.translations) == 1 and len(single) == 1:
+        return found.translations[0].topic, single[0]
+    return None
+
+
+def _uses(
+    bag: BagReader,
+    found: Candidates,
+    parameters: NodeParameters,
+    odometry: Sequence[Input],
+    edges: Sequence[Input],
+    translations: tuple[str, str] | None,
+    references: Mapping[str, Input | Path],
+) -> tuple[TopicUse, ...]:
+    roles: dict[str, list[str]] = {}
+    for robot, source in zip(parameters.robots, odometry, strict=False):
+        roles.setdefault(source.topic, []).append(f"odometry of {robot}")
+    for source in edges:
+        brings = parameters.keyframe_source == "edges"
+        roles.setdefault(source.topic, []).append("keyframes and loop closures" if brings else "loop closures")
+    if translations:
+        roles.setdefault(translations[0], []).append(f"translations of {translations[1]}")
+    for robot, reference in references.items():
+        if isinstance(reference, Input):
+            roles.setdefault(reference.topic, []).append(f"reference for {robot}")
+    could_be = {candidate.topic: "could be a reference: --reference" for candidate in found.references}
+    could_be |= {candidate.topic: "could be odometry: --odometry" for candidate in found.odometry}
+    could_be |= {candidate.topic: "could be loop closures: --edges" for candidate in found.edges}
+    nothing = "neither odometry nor relative rotations"
+    return tuple(
+        TopicUse(
+            topic,
+            type_name,
+            bag.num_messages([topic]),
+            ", ".join(roles.get(topic, [])),
+            "" if topic in roles else found.why_not.get(topic) or could_be.get(topic, nothing),
+        )
+        for topic, type_name in bag.topics.items()
+    )

@@ -1,0 +1,122 @@
+"""What each topic of a bag is good for, by the type of its messages, its name and a first look into them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from itertools import islice
+
+from rotavg_ros.bags.message_types import VECTOR
+from rotavg_ros.bags.reader import BagReader
+from rotavg_ros.bags.topics import TRANSLATION_TOPIC
+from rotavg_ros.inputs import BRINGS_KEYFRAMES, EDGE_CONVERTERS, ODOMETRY_CONVERTERS, EdgeRecord, Source
+from rotavg_ros.online import EdgeMeasurement
+from rotavg_ros.online.measurements import RejectedInputError, checked_rotation
+from rotavg_ros.online.quaternion import IDENTITY
+from rotavg_ros.view_graph import EdgeKind
+
+_ODOMETRY, _IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu"
+_TRUTH_NAME = re.compile(r"ground.?truth|(^|[/_])(gt|truth|mocap|vicon|optitrack)([/_]|$)", re.IGNORECASE)
+# Into so many messages of edges is looked for the kind of graph they make.
+_FIRST_EDGES = 100
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A topic that messages could be taken from, and how many it has."""
+
+    topic: str
+    type_name: str
+    messages: int
+
+    @property
+    def is_truth(self) -> bool:
+        """Whether its name says that it is ground truth."""
+        return bool(_TRUTH_NAME.search(self.topic))
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The topics of a bag that are good for something, the best of each kind first.
+
+    Attributes:
+        odometry: could carry a robot on from moment to moment.
+        references: could be compared with; ground truth, then poses, then IMUs.
+        edges: relative rotations.
+        translations: topics with the positions that belong to the edges of a simulated or converted bag.
+        brings_keyframes: the edges' sender chooses the keyframes.
+        why_not: by topic, why one that looks useful is not.
+    """
+
+    odometry: tuple[Candidate, ...]
+    references: tuple[Candidate, ...]
+    edges: tuple[Candidate, ...]
+    translations: tuple[Candidate, ...]
+    brings_keyframes: bool
+    why_not: dict[str, str] = field(default_factory=dict)
+
+
+def find_candidates(bag: BagReader) -> Candidates:
+    """Look at every topic of the bag, and into the first messages of some.
+
+    Raises:
+        BagReadError: a damaged bag.
+    """
+    why_not: dict[str, str] = {}
+    poses, edges, translations = [], [], []
+    for topic, type_name in bag.topics.items():
+        messages = bag.num_messages([topic])
+        candidate = Candidate(topic, type_name, messages)
+        if type_name in ODOMETRY_CONVERTERS:
+            if messages and not _states_orientation(bag, candidate):
+                why_not[topic] = "its first message states no orientation"
+            elif messages:
+                poses.append(candidate)
+        elif type_name in EDGE_CONVERTERS and messages:
+            edges.append(candidate)
+        elif type_name == VECTOR and topic.endswith(TRANSLATION_TOPIC) and messages:
+            translations.append(candidate)
+        if not messages:
+            why_not[topic] = "no messages"
+    return Candidates(
+        odometry=tuple(sorted((pose for pose in poses if not pose.is_truth), key=_as_odometry)),
+        references=tuple(
+            sorted((pose for pose in poses if pose.is_truth or pose.type_name != _ODOMETRY), key=_as_reference)
+        ),
+        edges=tuple(edges),
+        translations=tuple(translations),
+        brings_keyframes=any(edge.type_name in BRINGS_KEYFRAMES or _has_odometry_edges(bag, edge) for edge in edges),
+        why_not=why_not,
+    )
+
+
+def _as_odometry(candidate: Candidate) -> tuple[int, int, int, str]:
+    """Odometry proper, then IMUs, then poses, which may jump as a localisation's do; a good name; many messages."""
+    by_type = {_ODOMETRY: 0, _IMU: 1}.get(candidate.type_name, 2)
+    name = candidate.topic.rsplit("/", 1)[-1]
+    by_name = 0 if candidate.topic == "/odom" else 1 if name == "odom" else 2 if "odom" in name else 3
+    return by_type, by_name, -candidate.messages, candidate.topic
+
+
+def _as_reference(candidate: Candidate) -> tuple[bool, bool, int, str]:
+    return not candidate.is_truth, candidate.type_name == _IMU, -candidate.messages, candidate.topic
+
+
+def _states_orientation(bag: BagReader, candidate: Candidate) -> bool:
+    for _, _, message in islice(bag.decoded([candidate.topic]), 1):
+        try:
+            checked_rotation(ODOMETRY_CONVERTERS[candidate.type_name](message, IDENTITY).world_from_body)
+        except RejectedInputError:
+            return False
+    return True
+
+
+def _has_odometry_edges(bag: BagReader, candidate: Candidate) -> bool:
+    convert = EDGE_CONVERTERS[candidate.type_name](Source("robot"))
+    for _, _, message in islice(bag.decoded([candidate.topic]), _FIRST_EDGES):
+        for record in convert(message):
+            if not isinstance(record, EdgeRecord) or not isinstance(record.edge, EdgeMeasurement):
+                continue
+            if record.edge.kind == EdgeKind.ODOMETRY:
+                return True
+    return False
