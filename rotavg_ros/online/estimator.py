@@ -20,6 +20,7 @@ from rotavg_ros.online.growing_view_graph import GraphSnapshot
 from rotavg_ros.online.measurements import EdgeMeasurement, RejectReason
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.online.time_jumps import BackwardJumps, LateMessage
 from rotavg_ros.online.trajectory import Trajectory, corrected_trajectories
 from rotavg_ros.view_graph import EdgeLabel
 
@@ -38,12 +39,16 @@ class Counts:
     Attributes:
         keyframes, edges, pending: sizes now.
         rejected: inputs refused, by :class:`RejectReason` value.
+        time_jumps: how often the data's time went back.
+        time_is_back: whether odometry is refused since such a jump, and somebody has to decide.
     """
 
     keyframes: int
     edges: int
     pending: int
     rejected: dict[str, int]
+    time_jumps: int = 0
+    time_is_back: bool = False
 
 
 class OnlineEstimator:
@@ -67,12 +72,15 @@ class OnlineEstimator:
         self._tick_lock = threading.Lock()  # one tick at a time; taken before ``_lock``
         self._paused = False
         self._generation = 0
+        self._time_jumps = 0
         self._start_over(GraphBuilder(self.options), None, 0)
 
     def _start_over(self, builder: GraphBuilder, answered: Tensor | None, version: int) -> None:
         """Begin with this content; ``answered`` is the last answer's body_from_world ``(n, 4)``."""
         self._generation += 1
+        self._first_version = version
         self._builder = builder
+        self._backward_jumps = BackwardJumps()
         self._answered = answered
         self._answered_component: Tensor | None = None
         self._answered_revision = 0
@@ -97,7 +105,8 @@ class OnlineEstimator:
             world_from_body: xyzw, the body in the odometry's frame.
             position: metres, for the keyframes' distance criterion.
 
-        Odometry that begins anew begins a new component, first where the robot was last.
+        Odometry that begins anew begins a new component, first where the robot was last. When its stamps have gone
+        back for several messages in a row, the options say what becomes of it.
 
         Returns:
             why it was refused and counted; None if it was taken.
@@ -109,7 +118,36 @@ class OnlineEstimator:
             if track is not None and last is not None and track.chain > len(track.anchors):
                 anchor(track, last, self._correction(robot))
                 self._world_from_odometry.pop(robot, None)
+            if reason is None:
+                self._backward_jumps.on_time(robot)
+            elif reason is RejectReason.OUT_OF_ORDER_ODOMETRY and last is not None:
+                message = LateMessage(robot, stamp_ns, world_from_body, position)
+                return self._consider_jump(message, last.stamp_ns, reason)
             return reason
+
+    def _consider_jump(self, message: LateMessage, latest_ns: int, reason: RejectReason) -> RejectReason | None:
+        """What becomes of an odometry message that came out of order."""
+        longest_step_ns = self.options.odometry_bounds.max_gap_ns
+        since_jump = self._backward_jumps.late(message, latest_ns, self.options.time_jump_ns, longest_step_ns)
+        if not since_jump:
+            return reason
+        self._time_jumps += 1
+        if self.options.on_time_jump != "reset":
+            return reason
+        self._start_over(GraphBuilder(self.options), None, self._version)
+        for late in since_jump:
+            self._builder.add_odometry(late.robot, late.stamp_ns, late.world_from_body, late.position)
+        return None
+
+    def clock_went_back(self, now_ns: int) -> None:
+        """The clock that stamps the data (``/clock``) went back to ``now_ns``; taken as if odometry had told it."""
+        with self._lock:
+            data_time_ns = self._builder.data_time_ns
+            if data_time_ns is None or data_time_ns - now_ns <= self.options.time_jump_ns:
+                return  # nothing of the future is known, or odometry has told it already
+            if self.options.on_time_jump == "reset":
+                self._time_jumps += 1
+                self._start_over(GraphBuilder(self.options), None, self._version)
 
     def add_edge(self, edge: EdgeMeasurement) -> RejectReason | None:
         """Take a measured edge; returns why it was refused and counted, None if it was taken or may wait."""
@@ -144,7 +182,12 @@ class OnlineEstimator:
         with self._lock:
             builder = self._builder
             return Counts(
-                builder.graph.num_keyframes, builder.graph.num_edges, len(builder.pending), dict(builder.rejected)
+                keyframes=builder.graph.num_keyframes,
+                edges=builder.graph.num_edges,
+                pending=len(builder.pending),
+                rejected=dict(builder.rejected),
+                time_jumps=self._time_jumps,
+                time_is_back=self._backward_jumps.is_back and self.options.on_time_jump == "error",
             )
 
     def set_options(self, options: EstimatorOptions) -> None:
@@ -178,6 +221,16 @@ class OnlineEstimator:
     def generation(self) -> int:
         """Counts how often everything was forgotten or replaced: what was sent before may be news again."""
         return self._generation
+
+    @property
+    def time_jumps(self) -> int:
+        """Counts how often the data's time went back."""
+        return self._time_jumps
+
+    @property
+    def first_version(self) -> int:
+        """Answers up to this version are of what was forgotten or replaced since."""
+        return self._first_version
 
     @property
     def is_behind(self) -> bool:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from rotavg_ros.errors import UserError
 from rotavg_ros.online.keyframes import KeyframePolicy, OdometryBounds
 from rotavg_ros.online.odometry_continuity import ContinuityLimits
+from rotavg_ros.online.time_jumps import POLICIES
 
 NANOSECONDS = 1_000_000_000
 
@@ -32,6 +33,10 @@ class EstimatorOptions:
         max_turn_rate, max_speed: odometry that moves faster has jumped; rad/s, m/s; 0: any speed, and no look-out for
             odometry that begins anew.
         max_stamp_lead_s: a stamp farther ahead of the last one needs a second message to be believed; 0: no limit.
+        on_time_jump: when the data's time goes back by more than ``time_jump_s`` (a bag that begins again): ``reset``
+            forgets everything and begins anew, ``ignore`` refuses odometry until it is ahead again, ``error`` does
+            too and says so.
+        time_jump_s: going back by less is no jump; such odometry is out of order.
         max_odometry_samples: per robot; older messages are thinned out beyond it.
         pending_capacity: edges that may wait at a time.
         pending_timeout_s: how long in data time.
@@ -51,6 +56,8 @@ class EstimatorOptions:
     max_turn_rate: float = math.radians(360.0)
     max_speed: float = 50.0
     max_stamp_lead_s: float = 60.0
+    on_time_jump: str = "reset"
+    time_jump_s: float = 1.0
     max_odometry_samples: int = 200_000
     pending_capacity: int = 20_000
     pending_timeout_s: float = 300.0
@@ -67,12 +74,13 @@ class EstimatorOptions:
             ("keyframe_source", ("odometry", "edges")),
             ("unknown_keyframes", ("wait", "create")),
             ("gauge", ("odometry", "identity")),
+            ("on_time_jump", POLICIES),
         ):
             if getattr(self, name) not in choices:
                 raise OptionError(f"{name} is {getattr(self, name)!r}; it must be one of {', '.join(choices)}")
         for name in (
             *("stamp_tolerance_s", "max_odometry_gap_s", "pending_timeout_s"),
-            *("max_turn_rate", "max_speed", "max_stamp_lead_s"),
+            *("max_turn_rate", "max_speed", "max_stamp_lead_s", "time_jump_s"),
         ):
             if not 0 <= getattr(self, name) < math.inf:
                 raise OptionError(f"{name} is {getattr(self, name)}; it must be finite and not negative")
@@ -101,6 +109,10 @@ class EstimatorOptions:
             speed=self.max_speed or math.inf,
             lead_ns=_nanoseconds(self.max_stamp_lead_s) or math.inf,
         )
+
+    @property
+    def time_jump_ns(self) -> int:
+        return _nanoseconds(self.time_jump_s)
 
     @property
     def pending_timeout_ns(self) -> int:

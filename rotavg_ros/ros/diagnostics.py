@@ -75,6 +75,8 @@ class Reporter:
         values["odometry rate hz"] = f"{rate:.1f}"
         dropped = sum(count for reason, count in counts.rejected.items() if reason not in _HARMLESS)
         errors = _errors(health, parameters, paused, now)
+        if counts.time_is_back:
+            errors.append("time went back and odometry is refused since; call ~/reset to begin anew")
         warnings = _warnings(health, parameters, paused, now)
         if health.lost > self._lost:
             warnings.append(f"{health.lost - self._lost} messages lost")
@@ -152,6 +154,7 @@ def _values(health: Health, counts: Counts, paused: bool, now: float) -> dict[st
         "missed before first": str(sum(counter.before_first for counter in by_topic)),
         "dropped": str(sum(counts.rejected.values())),
     }
+    values["time jumps"] = str(counts.time_jumps)
     values |= {f"dropped {reason}": str(count) for reason, count in sorted(counts.rejected.items())}
     return values | {
         "device": "none" if answer is None else answer.device,

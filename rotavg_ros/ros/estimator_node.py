@@ -7,7 +7,8 @@ from pathlib import Path
 
 import torch
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
+from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump  # type: ignore[attr-defined]
+from rclpy.duration import Duration
 from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.timer import Timer
@@ -47,7 +48,7 @@ class RotavgNode(Node):
         self._outputs = Outputs(self, parameters, self._estimator)
         state_file = Path(parameters.state_file) if parameters.state_file else None
         self._solving = Solving(self, self._estimator, self._health, self._outputs, state_file)
-        Subscriptions(self, parameters, self._estimator, self._health, self._outputs)
+        Subscriptions(self, parameters, self._estimator, self._health, self._outputs, self._on_time_jump)
         Services(self, self._estimator, self._health, self._solving, self._worker, parameters.robots[0])
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # ticks though /clock is paused or absent
@@ -57,6 +58,8 @@ class RotavgNode(Node):
             self._create_timer(
                 parameters.autosave_period_s, lambda: self._worker.submit(self._solving.autosave_quietly)
             )
+        backward = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
+        self._jump_handle = self.get_clock().create_jump_callback(backward, post_callback=self._on_clock_jump)
         parameter_server.watch(self, lambda: self._settings, self._apply)
         topics = ", ".join([*parameters.odometry_topics, *parameters.edge_topics])
         self.get_logger().info(f"rotavg {__version__} on {device}, listening to {topics}")
@@ -96,6 +99,20 @@ class RotavgNode(Node):
             self._solving.tick_quietly()
         finally:
             self._tick_queued = False
+
+    def _on_clock_jump(self, _jump: TimeJump) -> None:
+        """Simulated time went back: only ``use_sim_time`` knows of that."""
+        time_jumps = self._estimator.time_jumps
+        self._estimator.clock_went_back(self.get_clock().now().nanoseconds)
+        if self._estimator.time_jumps != time_jumps:
+            self._on_time_jump()
+
+    def _on_time_jump(self) -> None:
+        if self._settings.on_time_jump == "reset":
+            self.get_logger().warning("time went back: everything is forgotten and begins anew (on_time_jump)")
+            self._worker.submit(self._solving.forget_quietly)
+        else:
+            self.get_logger().warning("time went back: odometry is refused until it is ahead again (on_time_jump)")
 
     def _on_diagnostics_timer(self) -> None:
         status = self._reporter.report(self._health, self._estimator.counts(), self._settings, self._estimator.paused)

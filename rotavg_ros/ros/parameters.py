@@ -11,6 +11,7 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.inputs import BRINGS_KEYFRAMES, Source
 from rotavg_ros.online import EstimatorOptions, quaternion
 from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.online.time_jumps import POLICIES
 from rotavg_ros.solver import DEVICES, PROFILES
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE
 
@@ -115,6 +116,16 @@ class NodeParameters:
         high=1e9,
         live=True,
     )
+    on_time_jump: str = _parameter(
+        "reset",
+        "when the data's time goes back (a bag or a simulation that begins again): begin anew; or refuse odometry "
+        "until it is ahead again, silently or with an error in the diagnostics",
+        choices=POLICIES,
+        live=True,
+    )
+    time_jump_s: float = _parameter(
+        1.0, "going back by less is no jump; such odometry is refused as out of order", low=0.0, high=1e6, live=True
+    )
     pending_capacity: int = _parameter(
         20_000, "edges that may wait for a keyframe or for odometry; the oldest go first", low=1, high=10_000_000
     )
@@ -202,6 +213,8 @@ class NodeParameters:
             max_turn_rate=math.radians(self.max_turn_rate_deg_s),
             max_speed=self.max_speed_m_s,
             max_stamp_lead_s=self.max_stamp_lead_s,
+            on_time_jump=self.on_time_jump,
+            time_jump_s=self.time_jump_s,
             pending_capacity=self.pending_capacity,
             pending_timeout_s=self.pending_timeout_s,
             gauge=self.gauge,

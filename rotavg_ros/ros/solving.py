@@ -86,6 +86,10 @@ class Solving:
         """Draw the last answer for those who look; what goes wrong is logged."""
         self._quietly("drawing failed: ", lambda: self._outputs.draw(self._health.answer))
 
+    def forget_quietly(self) -> None:
+        """Latch empty answers in place of those that the estimator has forgotten; what goes wrong is logged."""
+        self._quietly("", self._forget_answer)
+
     def _quietly(self, what: str, job: Callable[[], object]) -> None:
         try:
             job()
@@ -103,10 +107,11 @@ class Solving:
 
     def _forget_answer(self) -> None:
         """The published answers belong to what was forgotten: latch empty ones."""
-        health = self._health
-        if health.answer is not None:
-            self._outputs.publish_answer(health.answer.without_content())
-        health.answer, health.unsolved_since = None, None
+        answer = self._health.answer
+        self._health.unsolved_since = None
+        if answer is not None and answer.version <= self._estimator.first_version:
+            self._outputs.publish_answer(answer.without_content())
+            self._health.answer = None
 
     def _autosave(self) -> None:
         revision = self._estimator.revision

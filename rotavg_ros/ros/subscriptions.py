@@ -33,9 +33,16 @@ class Subscriptions:
     """
 
     def __init__(
-        self, node: Node, parameters: NodeParameters, estimator: OnlineEstimator, health: Health, outputs: Outputs
+        self,
+        node: Node,
+        parameters: NodeParameters,
+        estimator: OnlineEstimator,
+        health: Health,
+        outputs: Outputs,
+        on_time_jump: Callable[[], None],
     ) -> None:
         self._node = node
+        self._on_time_jump = on_time_jump
         self._estimator = estimator
         self._health = health
         self._outputs = outputs
@@ -90,6 +97,7 @@ class Subscriptions:
         info: dict[str, Any] | None,
     ) -> None:
         started = time.perf_counter()
+        time_jumps = self._estimator.time_jumps
         try:
             record = convert(message, body_from_sensor)
         except RejectedInputError as rejection:
@@ -102,6 +110,8 @@ class Subscriptions:
             self._outputs.publish_orientation(robot, message.header)
         else:
             self._warn_of_refusal(f"odometry of {robot}", reason)
+        if self._estimator.time_jumps != time_jumps:
+            self._on_time_jump()
         self._health.odometry_callback.add(time.perf_counter() - started)
         if info is not None:
             self._health.odometry_latency.add(1e-9 * (time.time_ns() - info["source_timestamp"]))

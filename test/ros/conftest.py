@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped
 from nav_msgs.msg import Odometry
@@ -114,7 +115,7 @@ class LiveNode:
         process: the node's.
         answers, flags, orientations: messages in order of arrival.
         status: the last diagnostics' values by key, with its "level" and "message".
-        reports: diagnostics so far.
+        reports: diagnostics so far; ``reported_at`` is the last one's stamp.
     """
 
     def __init__(self, probe: rclpy.node.Node, start: Callable[..., RunningProcess], wait: Callable[..., None]) -> None:
@@ -127,6 +128,7 @@ class LiveNode:
         self.orientations: list[QuaternionStamped] = []
         self.status: dict[str, str] = {}
         self.reports = 0
+        self.reported_at: Time | None = None
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         probe.create_subscription(AbsoluteOrientations, "/abs_orientations", self.answers.append, latched)
         probe.create_subscription(OutlierFlags, "/outlier_flags", self.flags.append, latched)
@@ -205,6 +207,7 @@ class LiveNode:
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         status = message.status[0]
         self.reports += 1
+        self.reported_at = message.header.stamp
         self.status = {pair.key: pair.value for pair in status.values}
         self.status |= {"level": str(ord(status.level)), "message": status.message, "name": status.name}
 
