@@ -42,6 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="WEIGHTS",
         help="fine-net: the CleanNet before it (default: the one in DIR if there is one, else the package's)",
     )
+    parser.add_argument(
+        "--start", type=Path, metavar="WEIGHTS", help="weights of the same network to go on from (default: drawn)"
+    )
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default: auto")
     parser.add_argument(
         "--threads", type=positive_whole_number, metavar="N", help="CPU threads (default: torch's choice)"
@@ -54,7 +57,13 @@ def run(arguments: argparse.Namespace) -> int:
         torch.set_num_threads(arguments.threads)
     config = load_config(arguments.config)
     trainer = make_trainer(
-        arguments.network, config, arguments.output, arguments.clean_net, arguments.device, arguments.config
+        arguments.network,
+        config,
+        arguments.output,
+        arguments.clean_net,
+        arguments.device,
+        arguments.config,
+        arguments.start,
     )
     if trainer.epochs_done:
         print(f"going on after epoch {trainer.epochs_done} of {config.epochs}", flush=True)
@@ -81,7 +90,13 @@ def load_config(name: str) -> TrainingConfig:
 
 
 def make_trainer(
-    network: str, config: TrainingConfig, output: Path, clean_net: Path | None, device: str, origin: str
+    network: str,
+    config: TrainingConfig,
+    output: Path,
+    clean_net: Path | None,
+    device: str,
+    origin: str,
+    start: Path | None = None,
 ) -> Trainer:
     """Task and trainer for a network ("clean-net" or "fine-net") of the configuration's family.
 
@@ -89,6 +104,7 @@ def make_trainer(
         clean_net: weights for the CleanNet before a FineNet.
         device: "auto", "cpu" or "cuda".
         origin: how the user named the configuration, for the card.
+        start: weights to begin with.
 
     Raises:
         UserError: options that do not fit, weights or a checkpoint that cannot be used.
@@ -114,6 +130,11 @@ def make_trainer(
         with working("drawing view-graphs"):
             task = SfmFineTask(config, _torch_device(device), before)
     command = f"rotavg train {network} {Path(origin).stem if Path(origin).exists() else origin}"
+    if start is not None:
+        before_training = read_network(name, start)
+        inputs["start_fingerprint"] = fingerprint(before_training)
+        task.network.load_state_dict(before_training.state_dict())
+        command += " --start WEIGHTS"
     return Trainer(task, config, output, name, inputs, command)
 
 

@@ -94,8 +94,8 @@ def save_text(path: Path, text: str) -> None:
 def _differences(saved: dict[str, Any], present: dict[str, Any]) -> list[str]:
     """Keys whose values differ, those of inner dictionaries by their own names."""
     changed = []
-    for key in present:
-        before, now = saved.get(key), present[key]
+    for key in {**present, **saved}:
+        before, now = saved.get(key), present.get(key)
         if before == now:
             continue
         if isinstance(before, dict) and isinstance(now, dict):

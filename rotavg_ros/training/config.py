@@ -21,7 +21,9 @@ class TrainingConfig:
 
     Attributes:
         family: "sfm" or "slam", the networks' profile.
-        recipe: SfM: "released", "released-spatial" (axes anywhere), "paper" or "mixture"; SLAM: "wide".
+        recipe: SfM: "released", "released-spatial" (axes anywhere), "paper", "wide" (small and large noise, mostly on
+            topologies of dense clusters with a sparse fringe), "mixture" (the first three) or "broad" (all four); SLAM:
+            "wide".
         nodes: cameras or keyframes of the training graphs, drawn uniformly (SLAM: in the logarithm).
         graphs: number of training graphs; each epoch sees all of them once.
         validation_nodes, validation_graphs: the same for the graphs that decide which weights are kept.
@@ -46,7 +48,7 @@ class TrainingConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        recipes = {"sfm": ("released", "released-spatial", "paper", "mixture"), "slam": ("wide",)}
+        recipes = {"sfm": ("released", "released-spatial", "paper", "wide", "mixture", "broad"), "slam": ("wide",)}
         if self.family not in recipes:
             raise TrainingConfigError(f"family is {self.family!r}; choose from {', '.join(recipes)}")
         if self.recipe not in recipes[self.family]:

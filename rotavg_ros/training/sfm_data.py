@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe, SyntheticGraph
+from rotavg_ros.datasets.topology import ClusteredTopology
 from rotavg_ros.solver.message_passing import DirectedEdges
 
 
@@ -45,15 +46,45 @@ class SfmBatch:
         return SfmBatch(**moved, edges=edges)
 
 
+# What the mixtures are made of.
+_MIXTURES = {
+    "mixture": {"released": 0.5, "released-spatial": 0.25, "paper": 0.25},
+    "broad": {"released": 0.45, "released-spatial": 0.15, "paper": 0.15, "wide": 0.25},
+}
+_WIDE_NOISE_DEG = (0.2, 30.0)
+_WIDE_OUTLIER_SHARE = (0.0, 0.3)
+
+
 def sample_graph(recipe: str, nodes: tuple[int, int], rng: np.random.Generator) -> SyntheticGraph:
     """One graph of a named recipe."""
-    if recipe == "mixture":
-        recipe = str(rng.choice(["released", "released-spatial", "paper"], p=[0.5, 0.25, 0.25]))
+    if recipe in _MIXTURES:
+        parts = _MIXTURES[recipe]
+        recipe = str(rng.choice(list(parts), p=list(parts.values())))
+    if recipe == "wide":
+        return _wide_graph(nodes, rng)
     if recipe == "paper":
         # On small graphs the share of pairs grows so that a camera keeps its number of neighbours.
         denser = min(1.0, 0.3 * 500 / nodes[1])
         return PaperRecipe(cameras=nodes, pair_share=(denser / 3, denser)).sample(rng)
     return ReleasedRecipe(cameras=nodes, planar=recipe == "released").sample(rng)
+
+
+def _wide_graph(nodes: tuple[int, int], rng: np.random.Generator) -> SyntheticGraph:
+    """What real graphs are like: noise from small to large, and mostly topologies like those of photo collections."""
+    low, high = np.log(_WIDE_NOISE_DEG)
+    noise_deg = float(np.exp(rng.uniform(low, high)))
+    disturbed = ReleasedRecipe(
+        cameras=nodes,
+        noise_deg=(noise_deg, noise_deg),
+        outlier_share=_WIDE_OUTLIER_SHARE,
+        planar=bool(rng.random() < 0.5),
+    )
+    replaced = PaperRecipe(noise_deg=(noise_deg, noise_deg), outlier_share=_WIDE_OUTLIER_SHARE)
+    if rng.random() < 0.25:
+        return disturbed.sample(rng)
+    topology = ClusteredTopology().sample(int(rng.integers(nodes[0], nodes[1] + 1)), rng)
+    recipe: ReleasedRecipe | PaperRecipe = disturbed if rng.random() < 0.5 else replaced
+    return topology.sample(recipe, rng)
 
 
 def join(

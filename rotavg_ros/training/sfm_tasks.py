@@ -112,7 +112,7 @@ class SfmFineTask(_SfmTask):
     def _forward(self, batch: SfmBatch) -> tuple[Tensor, Tensor, DirectedEdges]:
         graph = ViewGraph.create(batch.source, batch.target, batch.measured.double(), num_nodes=len(batch.truth))
         with torch.no_grad():
-            cleaned = clean(self.clean_net, graph, batch.edges)
+            cleaned = clean(self.clean_net, graph)
             start, _ = bootstrap(cleaned)
         return fine_tune(self.network, cleaned, start.to(self.device)).float(), start.cpu(), batch.edges
 

@@ -9,6 +9,8 @@ import torch
 from safetensors.torch import load_file
 
 from rotavg_ros.cli.main import main
+from rotavg_ros.solver.network_store import WEIGHTS_FOLDER, load_network
+from rotavg_ros.training.trainer import fingerprint
 
 CPU = ("--device", "cpu", "--threads", "1")
 TINY = """
@@ -61,6 +63,21 @@ def test_clean_net_by_path(config: Path, tmp_path: Path) -> None:
     assert main([*command, "--output", str(tmp_path / "b"), "--clean-net", str(weights)]) == 0
     first, second = (load_file(tmp_path / name / "sfm-fine-net.safetensors") for name in "ab")
     assert all(torch.equal(first[key], second[key]) for key in first)
+
+
+def test_training_goes_on_from_given_weights(config: Path, tmp_path: Path) -> None:
+    start = WEIGHTS_FOLDER / "sfm-clean-net.safetensors"
+    still = tmp_path / "still.yaml"
+    still.write_text(TINY + "learning_rate: 1.0e-12\n")
+    command = ["train", "clean-net", str(still), *CPU]
+    assert main([*command, "--output", str(tmp_path / "out"), "--start", str(start)]) == 0
+    before, after = load_file(start), load_file(tmp_path / "out" / "sfm-clean-net.safetensors")
+    for key, value in before.items():
+        torch.testing.assert_close(after[key], value, atol=1e-9, rtol=0)
+    card = json.loads((tmp_path / "out" / "sfm-clean-net.json").read_text())
+    assert card["start_fingerprint"] == fingerprint(load_network("sfm-clean-net"))
+    # Without the start it would be another run.
+    assert main([*command, "--output", str(tmp_path / "out")]) == 2
 
 
 @pytest.mark.parametrize(

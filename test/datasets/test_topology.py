@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import networkx as nx
 import numpy as np
 import pytest
 
 from rotavg_ros.datasets.graph_file import GraphFileError
 from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe
-from rotavg_ros.datasets.topology import Topology, read_topology
+from rotavg_ros.datasets.topology import ClusteredTopology, Topology, read_topology
 from rotavg_ros.evaluation.metrics import true_edge_noise
 
 
@@ -46,3 +47,18 @@ def test_real_topology(shared_data: Path) -> None:
     drawn = topology.sample(PaperRecipe(), np.random.default_rng(0))
     assert (drawn.graph.num_nodes, drawn.graph.num_edges) == (394, 23784)
     assert int(drawn.graph.components().max()) == 0
+
+
+def test_drawn_topologies_are_like_those_of_photo_collections() -> None:
+    rng = np.random.default_rng(0)
+    clustering = []
+    for _ in range(8):
+        topology = ClusteredTopology().sample(120, rng)
+        graph = nx.Graph(zip(topology.source.tolist(), topology.target.tolist(), strict=True))
+        assert len(graph) == 120
+        assert nx.is_connected(graph)
+        assert graph.number_of_edges() == len(topology.source)  # no pair twice
+        degree = np.array([count for _, count in graph.degree()])
+        assert np.percentile(degree, 5) < 0.5 * np.median(degree)
+        clustering.append(nx.transitivity(graph))
+    assert 0.5 < np.mean(clustering) < 0.9
