@@ -59,6 +59,9 @@ def test_the_defaults_are_good_and_declared_with_descriptions_and_ranges(make_no
         ({"robots": ["a", "a"], "odometry_topics": ["x", "y"]}, "names something twice"),
         ({"edge_sensor_orientations": [0.0, 0.0, 1.0]}, "give 4, or 4 per edge topic"),
         ({"edge_sensor_orientations": [1.0, 1.0, 0.0, 0.0]}, "not of unit length"),
+        ({"odometry_sensor_orientations": [0.0, 1.0]}, "give 4, or 4 per odometry topic"),
+        ({"edge_robots": ["a", "b", "c"]}, "edge_robots has 3 entries; give 1, or one per edge topic"),
+        ({"edge_topics": ["graph:rtabmap_msgs/msg/MapGraph"]}, "set keyframe_source to edges"),
         ({"autosave_period_s": 5.0}, "state_file is empty"),
     ],
 )
