@@ -15,7 +15,7 @@ from rotavg_ros.reports.facts import Closure, RunFacts
 if TYPE_CHECKING:
     from rotavg_ros.replay.record import TopicUse
 
-_WHY_REFUSED = {
+WHY_REFUSED = {
     RejectReason.NAN_ROTATION: "the rotation holds NaN or infinity",
     RejectReason.ZERO_QUATERNION: "the quaternion is zero; often a field that the sender never filled",
     RejectReason.UNNORMALIZED_QUATERNION: "the quaternion is farther than 0.001 from unit length",
@@ -24,6 +24,9 @@ _WHY_REFUSED = {
     RejectReason.STAMP_OUT_OF_RANGE: "the edge's stamp lies outside the odometry (stamp_tolerance_s)",
     RejectReason.ODOMETRY_GAP: "the edge's stamp lies in a gap of the odometry (max_odometry_gap_s)",
     RejectReason.BAD_STAMP: "the stamp is negative or does not fit into 64 bits",
+    RejectReason.NO_ORIENTATION: "the device says that it estimates no orientation",
+    RejectReason.FUTURE_STAMP: "a stamp far ahead of the last that no second message confirmed (max_stamp_lead_s)",
+    RejectReason.ODOMETRY_JUMP: "odometry that no robot could drive or turn (max_turn_rate_deg_s, max_speed_m_s)",
     RejectReason.OUT_OF_ORDER_ODOMETRY: "an odometry message is older than the one before it",
     RejectReason.REPEATED_STAMP: "an odometry message has the stamp of the one before it",
     RejectReason.ID_OUT_OF_RANGE: "an id does not fit into 64 bits",
@@ -137,7 +140,7 @@ def _summary(values: NDArray[np.float64]) -> tuple[float, float, float, float]:
 
 def rejection_table(rejected: dict[str, int]) -> Table:
     """What was refused, by reason, most first."""
-    why = {reason.value: text for reason, text in _WHY_REFUSED.items()}
+    why = {reason.value: text for reason, text in WHY_REFUSED.items()}
     rows = [
         Row((reason, str(count), why.get(reason, "")))
         for reason, count in sorted(rejected.items(), key=lambda item: (-item[1], item[0]))

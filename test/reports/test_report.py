@@ -15,10 +15,12 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 from PIL import Image
 
+from rotavg_ros.online import RejectReason
 from rotavg_ros.replay.record import RunRecord, TopicUse
 from rotavg_ros.reports import ReportError, report, write_report
 from rotavg_ros.reports.facts import RunFacts
 from rotavg_ros.reports.report import PICTURES
+from rotavg_ros.reports.tables import WHY_REFUSED
 from rotavg_ros.reports.theme import DARK, LIGHT
 from rotavg_ros.view_graph import EdgeKind
 
@@ -202,6 +204,10 @@ def test_no_label_covers_another(make: Callable[[], RunRecord], monkeypatch: pyt
         figure = picture.draw(facts, DARK)
         if figure is not None:
             assert overlapping_texts(figure, monkeypatch) == [], picture.name
+
+
+def test_every_refusal_is_explained() -> None:
+    assert set(WHY_REFUSED) == set(RejectReason)
 
 
 def test_a_folder_that_cannot_be_written(record: RunRecord, tmp_path: Path) -> None:
