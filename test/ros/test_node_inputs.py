@@ -119,7 +119,7 @@ def test_graphs_of_other_systems(foreign_packages, live_node, start_process) -> 
 
     assert live_node.call("reset").success  # what is repeated is news again
     seen = len(live_node.answers)
-    live_node.spin_until(lambda: len(live_node.answers) > seen and len(live_node.answers[-1].keyframe_ids) == 8)
+    live_node.spin_until(lambda: len(live_node.answers) > seen and len(live_node.answers[-1].keyframe_ids) == 16)
     speaker.stop()
 
 
