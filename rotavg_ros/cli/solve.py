@@ -30,6 +30,7 @@ from rotavg_ros.datasets.graph_file import GraphFile, read_graph
 from rotavg_ros.errors import UserError
 from rotavg_ros.rotations import canonical, inverse
 from rotavg_ros.solver import DEVICES, METHODS, PROFILES, Solution, solve
+from rotavg_ros.solver.network_store import WEIGHTS_FOLDER
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
 
@@ -61,18 +62,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--refine", type=whole_number, metavar="N", help="at most N refinement steps; 0 skips (default: the method's)"
     )
+    parser.add_argument(
+        "--weights", type=Path, metavar="DIR", help="networks of `rotavg train`; what DIR lacks comes from the package"
+    )
     parser.add_argument("--edges", default="csv", choices=(*_EDGE_FORMATS, "none"), help="default: csv")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve every graph; a bad one does not keep the others from being solved."""
     jobs = plan(arguments.graphs, arguments.output)
+    _check_weights(arguments.weights)
     solve_graph = partial(
         solve,
         method=arguments.method,
         profile=arguments.profile,
         device=arguments.device,
         refinement_steps=arguments.refine,
+        weights=arguments.weights,
     )
     # One-time costs (loading weights, first kernels) are not the graphs', and wrong options show before any work.
     for has_odometry in (True, False):
@@ -135,6 +141,13 @@ def plan(graphs: list[Path], output: Path) -> list[Job]:
             if (job.output / name).is_dir():
                 raise SolveError(f"{job.output / name} is a folder; remove it or choose another --output")
     return jobs
+
+
+def _check_weights(folder: Path | None) -> None:
+    """A folder without any would pass silently, for every network may come from the package."""
+    names = sorted(path.name for path in WEIGHTS_FOLDER.glob("*.safetensors"))
+    if folder is not None and not any((folder / name).is_file() for name in names):
+        raise SolveError(f"{folder}: has no weights ({', '.join(names)}); `rotavg train` writes them into its --output")
 
 
 def summarize(

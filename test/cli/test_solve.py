@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,10 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from rotavg_ros import rotations, solve
 from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.graph_file import GraphFile, read_graph, write_graph
+from rotavg_ros.solver.network_store import WEIGHTS_FOLDER
 from rotavg_ros.version import __version__
 
 
@@ -122,6 +126,22 @@ def test_options_reach_the_solver(graph_path: Path, tmp_path: Path) -> None:
     assert main([*command, "--refine", "0", "--device", "cpu"]) == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["method"], summary["profile"], summary["device"]) == ("spt", "sfm", "cpu")
+
+
+def test_weights(graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["solve", str(graph_path), "--profile", "sfm", "--method", "cleannet-spt", "--output"]
+    trained = tmp_path / "trained"
+    trained.mkdir()
+    assert main([*command, str(tmp_path / "none"), "--weights", str(trained)]) == 2
+    assert "has no weights" in capsys.readouterr().err
+    for suffix in ("safetensors", "json"):
+        shutil.copy(WEIGHTS_FOLDER / f"sfm-clean-net.{suffix}", trained)
+    tensors = {name: 0 * value for name, value in load_file(trained / "sfm-clean-net.safetensors").items()}
+    with safe_open(trained / "sfm-clean-net.safetensors", "pt") as file:
+        save_file(tensors, trained / "sfm-clean-net.safetensors", file.metadata())
+    assert main([*command, str(tmp_path / "ours"), "--weights", str(trained)]) == 0
+    # A network of zeros gives every edge the log-odds 0.
+    assert {float(row[2]) for row in rows(tmp_path / "ours" / "edges.csv")[1:]} == {0.5}
 
 
 def test_several_graphs(graph_path: Path, tmp_path: Path) -> None:
