@@ -259,7 +259,7 @@ class OnlineEstimator:
         """
         with self._lock:
             state = state_file.collect(self._builder, self._answered, self._version)
-        state_file.write(path, state)
+        state_file.write(path, state.encoded())
 
     def load(self, path: Path) -> None:
         """Replace everything by a file's content.

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 import tempfile
 import zipfile
-from dataclasses import asdict
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,7 @@ from rotavg_ros.view_graph import ViewGraph
 
 FORMAT = "rotavg online state"
 FORMAT_VERSION = 2
+_TEMPORARY = ".tmp"
 _GRAPH_COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label")
 _KEYFRAME_COLUMNS = ("keyframe_robot", "keyframe_id", "stamp_ns", "edge_id", "translation")
 
@@ -35,8 +38,28 @@ class StateFileError(UserError):
     """A state file cannot be read or written; the message names it and says what to do."""
 
 
-def collect(builder: GraphBuilder, answered: Tensor | None, version: int) -> Arrays:
-    """The state as arrays. Mostly views: quick, so that the estimator's lock is held only briefly."""
+@dataclass(frozen=True)
+class State:
+    """Everything that a state file holds.
+
+    Attributes:
+        arrays: by name.
+        header: the rest, for JSON but for the pending edges.
+        pending: edges that wait.
+    """
+
+    arrays: Arrays
+    header: dict[str, Any]
+    pending: list[EdgeMeasurement]
+
+    def encoded(self) -> Arrays:
+        """All of it as arrays; the header is JSON's bytes."""
+        header = self.header | {"pending": [asdict(edge) for edge in self.pending]}
+        return self.arrays | {"header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
+
+
+def collect(builder: GraphBuilder, answered: Tensor | None, version: int) -> State:
+    """The state, mostly as views: quick, so that the estimator's lock is held only briefly."""
     snapshot = builder.graph.snapshot()
     arrays: Arrays = {name: getattr(snapshot, name) for name in _KEYFRAME_COLUMNS}
     arrays |= {name: getattr(snapshot.graph, name).numpy() for name in _GRAPH_COLUMNS}
@@ -53,10 +76,8 @@ def collect(builder: GraphBuilder, answered: Tensor | None, version: int) -> Arr
         "data_time_ns": builder.data_time_ns,
         "rejected": dict(builder.rejected),
         "labels": [[robot, edge_id, int(label)] for (robot, edge_id), label in builder.labels.items()],
-        "pending": [asdict(edge) for edge in builder.pending],
     }
-    arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-    return arrays
+    return State(arrays, header, list(builder.pending))
 
 
 def write(path: Path, arrays: Arrays) -> None:
@@ -67,16 +88,33 @@ def write(path: Path, arrays: Arrays) -> None:
     """
     temporary = None
     try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_TEMPORARY, dir=path.parent)
         with os.fdopen(handle, "wb") as stream:
             np.savez(stream, **arrays)  # type: ignore[arg-type]
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(temporary, path)
+        _synchronise(path.parent)
     except OSError as error:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
         raise StateFileError(f"cannot write the state file {path}: {error.strerror}") from error
+
+
+def _synchronise(folder: Path) -> None:
+    """Have the file's new name on the disk before anybody relies on it."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def remove_leftovers(path: Path) -> None:
+    """Delete what was being written beside a state file when the process was killed."""
+    for leftover in path.parent.glob(f".{glob.escape(path.name)}.*{_TEMPORARY}"):
+        with suppress(OSError):
+            leftover.unlink()
 
 
 def read(path: Path) -> Arrays:

@@ -33,6 +33,7 @@ class Health:
         answer: the last one published, and when.
         unsolved_since: since when the graph has been ahead of the answer; None if it is not.
         solve_failures: how many ticks failed in all; ``failure`` is the last one's message, None after a good tick.
+        save_failure: why the last save failed, None if it did not.
     """
 
     odometry: dict[str, TopicCounter] = field(default_factory=dict)
@@ -47,6 +48,7 @@ class Health:
     unsolved_since: float | None = None
     solve_failures: int = 0
     failure: str | None = None
+    save_failure: str | None = None
 
     @property
     def lost(self) -> int:
@@ -104,7 +106,7 @@ def _errors(health: Health, parameters: NodeParameters, paused: bool, now: float
 
 
 def _warnings(health: Health, parameters: NodeParameters, paused: bool, now: float) -> list[str]:
-    warnings = []
+    warnings = [] if health.save_failure is None else [health.save_failure]
     silent = now - (health.started if health.last_odometry is None else health.last_odometry)
     needed = parameters.keyframe_source == "odometry" and parameters.unknown_keyframes == "wait"
     if silent > parameters.odometry_timeout_s and (needed or health.last_odometry is not None):

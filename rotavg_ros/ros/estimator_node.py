@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,7 +30,7 @@ from rotavg_ros.version import __version__
 class RotavgNode(Node):
     """Subscriptions, publications, services and timers around an :class:`OnlineEstimator`.
 
-    Callbacks run on the executor's thread and stay short; solving, saving and publishing answers happen on a worker.
+    Callbacks run on the executor's thread and stay short; solving, saving and publishing answers happen on workers.
 
     Raises:
         UserError: parameters that cannot be; the message is one line for the user.
@@ -43,21 +44,20 @@ class RotavgNode(Node):
         self._estimator = OnlineEstimator(parameters.estimator_options())
         self._health = Health()
         self._reporter = Reporter(f"{self.get_fully_qualified_name().lstrip('/')}: estimator")
-        self._worker = Worker(executor)
+        self._worker = Worker(executor, "rotavg_worker")
+        self._saver = Worker(executor, "rotavg_saver")
         self._tick_queued = False
         self._outputs = Outputs(self, parameters, self._estimator)
         state_file = Path(parameters.state_file) if parameters.state_file else None
         self._solving = Solving(self, self._estimator, self._health, self._outputs, state_file)
         Subscriptions(self, parameters, self._estimator, self._health, self._outputs, self._on_time_jump)
-        Services(self, self._estimator, self._health, self._solving, self._worker, parameters.robots[0])
+        Services(self, self._estimator, self._health, self._solving, self._worker, self._saver, parameters.robots[0])
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # ticks though /clock is paused or absent
         self._solve_timer = self._create_timer(parameters.solve_period_s, self._on_solve_timer)
         self._create_timer(1.0, self._on_diagnostics_timer)
         if parameters.autosave_period_s > 0:
-            self._create_timer(
-                parameters.autosave_period_s, lambda: self._worker.submit(self._solving.autosave_quietly)
-            )
+            self._create_timer(parameters.autosave_period_s, lambda: self._saver.submit(self._solving.autosave_quietly))
         backward = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
         self._jump_handle = self.get_clock().create_jump_callback(backward, post_callback=self._on_clock_jump)
         parameter_server.watch(self, lambda: self._settings, self._apply)
@@ -67,8 +67,12 @@ class RotavgNode(Node):
             self.get_logger().warning(line)
 
     def close(self, timeout_s: float) -> bool:
-        """Stop working; False if a solve is still running after the timeout."""
-        return self._worker.stop(timeout_s)
+        """Save if that is wanted, and stop working; False if a solve or a save still runs after the timeout."""
+        deadline = time.monotonic() + timeout_s
+        if self._settings.autosave_period_s > 0:
+            self._saver.submit(self._solving.autosave_quietly)
+        is_saved = self._saver.stop(timeout_s, finish=True)
+        return self._worker.stop(deadline - time.monotonic()) and is_saved
 
     def _create_timer(self, period_s: float, callback: Callable[[], object]) -> Timer:
         return self.create_timer(period_s, callback, clock=self._steady)

@@ -26,28 +26,28 @@ class Services:
         health: Health,
         solving: Solving,
         worker: Worker,
+        saver: Worker,
         default_robot: str,
     ) -> None:
         self._estimator = estimator
         self._health = health
-        self._worker = worker
         self._default_robot = default_robot
-        for name, job in (
-            ("reset", solving.reset),
-            ("solve_now", solving.solve_now),
-            ("save", solving.save),
-            ("load", solving.load),
+        for name, job, thread in (
+            ("reset", solving.reset, worker),
+            ("solve_now", solving.solve_now, worker),
+            ("save", solving.save, saver),
+            ("load", solving.load, worker),
         ):
-            node.create_service(Trigger, f"~/{name}", partial(self._on_trigger, job))
+            node.create_service(Trigger, f"~/{name}", partial(self._on_trigger, job, thread))
         node.create_service(SetBool, "~/pause", self._on_pause)
         node.create_service(LabelEdge, "~/label_edge", self._on_label_edge)
 
     async def _on_trigger(
-        self, job: Callable[[], str], _request: Trigger.Request, response: Trigger.Response
+        self, job: Callable[[], str], worker: Worker, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        """Do a job on the worker, without blocking the executor meanwhile."""
+        """Do a job on a worker, without blocking the executor meanwhile."""
         try:
-            response.message = await self._worker.submit(job)
+            response.message = await worker.submit(job)
             response.success = True
         except Exception as error:
             response.message = str(error)

@@ -1,4 +1,7 @@
-"""Everything slow: ticks and their answers, saving, loading, drawing. All of it runs on the worker's thread."""
+"""Everything slow: ticks and their answers, loading, drawing on one worker's thread; saving on another's.
+
+A solve may take longer than the time between two autosaves, and a save must not wait for it.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from rclpy.node import Node
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import Answer, OnlineEstimator
+from rotavg_ros.online.state_file import remove_leftovers
 from rotavg_ros.ros.diagnostics import Health
 from rotavg_ros.ros.outputs import Outputs
 
@@ -17,7 +21,7 @@ _LOG_PERIOD_S = 5.0
 
 
 class Solving:
-    """Jobs for the worker. Those that a service asks for return what to tell the caller, or raise.
+    """Jobs for the workers. Those that a service asks for return what to tell the caller, or raise.
 
     Raises:
         UserError: the state file cannot be read or written.
@@ -33,7 +37,7 @@ class Solving:
         self._state_file = state_file
         if state_file is not None:
             self._resume(state_file)
-        self._saved_revision = estimator.revision
+        self._saved = self._content()
 
     def tick(self, force_cold: bool = False) -> Answer | None:
         """Solve if there is anything new, and publish the answer; None if there is none."""
@@ -65,6 +69,7 @@ class Solving:
     def save(self) -> str:
         state_file = self._named_state_file()
         self._estimator.save(state_file)
+        self._health.save_failure = None
         return f"saved to {state_file}"
 
     def load(self) -> str:
@@ -79,8 +84,17 @@ class Solving:
         self._quietly("solving failed: ", self.tick)
 
     def autosave_quietly(self) -> None:
-        """Save what has changed since it was last saved; what goes wrong is logged."""
-        self._quietly("", self._autosave)
+        """Save what has changed since it was last saved; what goes wrong is logged once, until it goes well again."""
+        content = self._content()
+        if content == self._saved and self._health.save_failure is None:
+            return
+        try:
+            self.save()
+            self._saved = content
+        except Exception as error:
+            if str(error) != self._health.save_failure:
+                self._node.get_logger().error(str(error))
+            self._health.save_failure = str(error)
 
     def draw_quietly(self) -> None:
         """Draw the last answer for those who look; what goes wrong is logged."""
@@ -113,17 +127,16 @@ class Solving:
             self._outputs.publish_answer(answer.without_content())
             self._health.answer = None
 
-    def _autosave(self) -> None:
-        revision = self._estimator.revision
-        if revision != self._saved_revision:
-            self.save()
-            self._saved_revision = revision
+    def _content(self) -> tuple[int, int]:
+        """Differs when the graph does."""
+        return self._estimator.generation, self._estimator.revision
 
     def _resume(self, state_file: Path) -> None:
         if state_file.exists():
             self._estimator.load(state_file)
         elif not state_file.parent.is_dir():
             raise UserError(f"state_file is {state_file}, but there is no folder {state_file.parent}; make it first")
+        remove_leftovers(state_file)
 
     def _named_state_file(self) -> Path:
         if self._state_file is None:

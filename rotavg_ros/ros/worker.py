@@ -1,4 +1,4 @@
-"""The one thread on which everything slow happens."""
+"""A thread on which something slow happens."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from rclpy.task import Future
 class Worker:
     """Runs jobs one after the other; a service can await the future of one."""
 
-    def __init__(self, executor: Executor) -> None:
+    def __init__(self, executor: Executor, name: str) -> None:
         self._executor = executor
         self._stopping = False
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future] | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="rotavg_worker", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     def submit(self, job: Callable[[], Any]) -> Future:
@@ -27,11 +27,11 @@ class Worker:
         self._jobs.put((job, future))
         return future
 
-    def stop(self, timeout_s: float) -> bool:
-        """Take no more jobs and wait for the running one; False if it was not done in time."""
-        self._stopping = True
+    def stop(self, timeout_s: float, finish: bool = False) -> bool:
+        """Take no more jobs and wait for the running one, or for all; False if that was not done in time."""
+        self._stopping = not finish
         self._jobs.put(None)
-        self._thread.join(timeout_s)
+        self._thread.join(max(timeout_s, 0.0))
         return not self._thread.is_alive()
 
     def _run(self) -> None:

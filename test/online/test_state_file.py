@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 import pickle
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -128,6 +130,71 @@ def test_a_failed_save_leaves_the_old_file(filled, tmp_path, monkeypatch):
     assert path.read_bytes() == content and os.listdir(tmp_path) == ["state.npz"]
     with pytest.raises(UserError, match="cannot write"):
         filled.save(Path("/nonexistent/folder/state.npz"))
+
+
+def test_what_a_killed_process_left_behind_is_removed(filled, tmp_path):
+    path = tmp_path / "state.npz"
+    filled.save(path)
+    for name in (".state.npz.x8_k.tmp", ".other.npz.x8_k.tmp", "state.npz.tmp"):
+        (tmp_path / name).write_bytes(b"half")
+    state_file.remove_leftovers(path)
+    assert sorted(os.listdir(tmp_path)) == [".other.npz.x8_k.tmp", "state.npz", "state.npz.tmp"]
+
+
+KILL = """
+import os, random, signal, sys, time, threading
+from pathlib import Path
+import numpy as np, torch
+torch.set_num_threads(1)
+from rotavg_ros.online import EstimatorOptions, OnlineEstimator
+
+path, draw = Path(sys.argv[1]), random.Random(7)
+options = EstimatorOptions(keyframe_angle=0, keyframe_distance=0)
+warm = OnlineEstimator(options)
+[warm.add_odometry("r", 10_000_000 * index, (0.0, 0.0, 0.0, 1.0)) for index in range(9)]
+assert warm.tick() is not None  # the networks are loaded before the processes part
+
+def work(pipe):
+    online = OnlineEstimator(options)
+    if path.exists():
+        online.load(path)
+    threading.Thread(target=lambda: [online.tick(force_cold=True) for _ in iter(int, 1)], daemon=True).start()
+    first = online.counts().keyframes
+    for index in range(first, first + 100_000):
+        turn = 0.001 * index
+        online.add_odometry("r", 10_000_000 * index, (0.0, 0.0, np.sin(turn), np.cos(turn)))
+        if index % 20 == 0:
+            count = online.counts().keyframes
+            online.save(path)
+            os.write(pipe, count.to_bytes(4, "little"))
+
+saved = 0
+for _ in range(50):
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        work(writer)
+    os.close(writer)
+    time.sleep(draw.uniform(0.005, 0.08))
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    told = os.read(reader, 1 << 20)
+    os.close(reader)
+    saved = int.from_bytes(told[-4:], "little") if told else saved
+    if path.exists():
+        online = OnlineEstimator(options)
+        online.load(path)
+        assert online.counts().keyframes >= saved, (online.counts().keyframes, saved)
+print(saved)
+"""
+
+
+def test_killed_at_any_moment_only_what_came_since_the_last_save_is_lost(tmp_path):
+    """Fifty processes, one after the other, that feed, solve and save, until SIGKILL at a random moment."""
+    command = [sys.executable, "-c", KILL, tmp_path / "state.npz"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert int(ended.stdout) > 100, "they got somewhere"
 
 
 def test_options_may_differ_after_the_restart(filled, solver, tmp_path):

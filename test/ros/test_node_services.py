@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import signal
 
 import numpy as np
@@ -159,12 +161,25 @@ def test_load_goes_back_and_refuses_a_broken_file(live_node, tmp_path) -> None:
     live_node.spin_until(lambda: len(live_node.answers[-1].keyframe_ids) == 10)
 
 
-def test_autosave(live_node, tmp_path) -> None:
-    path = tmp_path / "state.npz"
+def test_autosave_says_once_that_it_cannot_and_catches_up(live_node, tmp_path) -> None:
+    path = tmp_path / "states" / "state.npz"
+    path.parent.mkdir()
     live_node.start(*EVERY_MESSAGE, f"state_file:={path}", "autosave_period_s:=0.2")
     feed(live_node, 0, 10)
     live_node.spin_until(path.exists)
-    assert [entry.name for entry in tmp_path.glob("*.npz")] == ["state.npz"]
+    shutil.rmtree(path.parent)
+    feed(live_node, 10, 20)
+    live_node.spin_until(lambda: "cannot write the state file" in live_node.status["message"])
+    assert live_node.status["level"] == "1"
+    live_node.spin_for(1.0)
+    path.parent.mkdir()
+    live_node.spin_until(lambda: path.exists() and live_node.status["level"] == "0")
+    assert live_node.process.output.count("cannot write the state file") == 1
+    feed(live_node, 20, 25)
+    wait_for(live_node, "keyframes", 25)
+    assert live_node.stop() == 0  # saves once more
+    assert os.listdir(path.parent) == [path.name]
+    assert len(np.load(path)["keyframe_id"]) == 25
 
 
 def test_parameters_change_live_all_or_none(live_node) -> None:
