@@ -9,7 +9,7 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.version import __version__
 
 if TYPE_CHECKING:
-    from rotavg_ros.solver import METHODS, Solution, solve
+    from rotavg_ros.solver import METHODS, Solution, solve, solve_batch
     from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph, ViewGraphError
 
 __all__ = [
@@ -22,11 +22,12 @@ __all__ = [
     "ViewGraphError",
     "__version__",
     "solve",
+    "solve_batch",
 ]
 
 # Imported on first use, so that `rotavg --help` and mistakes on the command line need not wait for torch.
 _MODULE_OF_NAME = {
-    **dict.fromkeys(("METHODS", "Solution", "solve"), "rotavg_ros.solver"),
+    **dict.fromkeys(("METHODS", "Solution", "solve", "solve_batch"), "rotavg_ros.solver"),
     **dict.fromkeys(("EdgeKind", "EdgeLabel", "ViewGraph", "ViewGraphError"), "rotavg_ros.view_graph"),
 }
 

@@ -16,49 +16,20 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.errors import UserError
-from rotavg_ros.solver import refinement, sfm_stages, slam_refinement, slam_stages
+from rotavg_ros.solver import devices, refinement, sfm_stages, slam_refinement, slam_stages
+from rotavg_ros.solver.devices import DEVICES
+from rotavg_ros.solver.methods import BASELINES, METHODS, NETWORK_METHODS, Method
 from rotavg_ros.solver.network_store import load_network
+from rotavg_ros.solver.parallel import workers
 from rotavg_ros.solver.solution import Solution
+from rotavg_ros.solver.tuning import tune
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
 
 PROFILES = ("auto", "slam", "sfm")
-DEVICES = ("auto", "cpu", "cuda")
+# A graph of more edges is worth measuring what tiles this machine likes.
+_TUNING_PAYS = 200_000
 # The noise that makes an edge an outlier, in radians.
 _OUTLIER_ANGLE = {"sfm": sfm_stages.OUTLIER_ANGLE, "slam": np.radians(10.0)}
-
-
-@dataclass(frozen=True)
-class Method:
-    """Which stages run. Every method has the bootstrap, a spanning tree.
-
-    Attributes:
-        clean: CleanNet rectifies and scores the edges.
-        fine_tunings: how often FineNet corrects the orientations.
-        refine: refinement ends the solve.
-        weighted: refinement weighs the edges by CleanNet's scores.
-    """
-
-    clean: bool = False
-    fine_tunings: int = 0
-    refine: bool = False
-    weighted: bool = True
-
-
-_METHODS = {
-    "neurora": Method(clean=True, fine_tunings=1, refine=True),
-    "neurora-paper": Method(clean=True, fine_tunings=1),
-    "neurora-v2": Method(clean=True, fine_tunings=2),
-    "cleannet-spt": Method(clean=True),
-    "spt-finenet": Method(fine_tunings=1),
-    "spt": Method(),
-    # Ablations: what each network earns.
-    "neurora-unweighted": Method(clean=True, fine_tunings=1, refine=True, weighted=False),
-    "neurora-without-finenet": Method(clean=True, refine=True),
-    "neurora-without-cleannet": Method(fine_tunings=1, refine=True),
-}
-# By name only: they build on the solver, so that they are imported when one of them runs.
-_BASELINES = ("chatterjee", "weiszfeld", "arrigoni", "wang")
-METHODS = (*_METHODS, *_BASELINES)
 
 
 @dataclass(frozen=True)
@@ -112,8 +83,9 @@ def solve(
             before.
         profile: "slam" for odometry chains with loop closures, "sfm" for unordered view-graphs, "auto": "slam" if any
             edge is odometry.
-        device: where the SfM networks run: "cpu", "cuda" or "auto" (a GPU if torch finds one). The SLAM profile's
-            network is small and sparse; it runs on the CPU.
+        device: where the SfM profile runs, whole: "cpu", "cuda", or "auto" (a GPU if torch finds one). Where there is
+            none that works, or it has too little memory, the CPU does it, which is logged. The SLAM profile and the
+            baselines are small and sparse; they run on the CPU.
         refinement_steps: refinement steps at most, 0 for none; default: the method's and profile's own number.
         warm_start: ``(N, 4)`` body_from_world of an earlier solution to start from.
         weights: folder of networks trained with ``rotavg train``; what it lacks comes from the package.
@@ -126,38 +98,63 @@ def solve(
         _check_choice("method", name, METHODS)
     _check_choice("profile", profile, PROFILES)
     _check_choice("device", device, DEVICES)
-    if device == "cuda" and not torch.cuda.is_available():
-        raise UserError("device 'cuda': torch finds no usable GPU; use --device cpu or auto")
     if refinement_steps is not None and refinement_steps < 0:
         raise UserError(f"refinement steps must not be negative, got {refinement_steps}")
     if warm_start is not None and tuple(warm_start.shape) != (graph.num_nodes, 4):
         raise UserError(f"the warm start has shape {tuple(warm_start.shape)}, the graph needs ({graph.num_nodes}, 4)")
     if profile == "auto":
         profile = "slam" if bool(graph.is_odometry.any()) else "sfm"
-    on_gpu = profile == "sfm" and (device == "cuda" or (device == "auto" and torch.cuda.is_available()))
-    networks = _Networks("cuda" if on_gpu else "cpu", weights)
-    watch = _Stopwatch()
+    where = devices.choose(device) if profile == "sfm" and all(name in NETWORK_METHODS for name in names) else "cpu"
     graph = graph.to("cpu")
-    for name in names[:-1]:
-        warm_start = _solve_once(graph, name, profile, None, warm_start, networks, watch).body_from_world
-    estimate = _solve_once(graph, names[-1], profile, refinement_steps, warm_start, networks, watch)
-    component = graph.components()
-    score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, estimate.outlier_score)
+    job = _Job(profile, names, refinement_steps, warm_start, graph.components())
+    try:
+        estimate, seconds = _run(job, graph, _Networks(where, weights))
+    except devices.GPU_ERRORS as error:
+        if where == "cpu":
+            raise
+        devices.fall_back(error)
+        where = "cpu"
+        estimate, seconds = _run(job, graph, _Networks(where, weights))
+    score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, estimate.outlier_score.cpu())
     score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
     return Solution(
-        _root_at_identity(estimate.body_from_world, component),
+        _root_at_identity(estimate.body_from_world.cpu(), job.component),
         score,
-        component,
-        estimate.variance.double().sqrt(),
-        watch.seconds,
+        job.component,
+        estimate.variance.cpu().double().sqrt(),
+        seconds,
         method,
         profile,
-        networks.device,
+        where,
     )
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What to do with a graph, whose ``component`` ``(N,)`` of every node is known."""
+
+    profile: str
+    names: list[str]
+    refinement_steps: int | None
+    warm_start: Tensor | None
+    component: Tensor
+
+
+def _run(job: _Job, graph: ViewGraph, networks: _Networks) -> tuple[_Estimate, dict[str, float]]:
+    """Every link of the method; with the seconds of its stages."""
+    watch = _Stopwatch()
+    with workers():
+        graph, start = graph.to(networks.device), job.warm_start
+        component = job.component.to(networks.device)
+        for name in job.names[:-1]:
+            start = _solve_once(graph, component, name, job.profile, None, start, networks, watch).body_from_world
+        steps = job.refinement_steps
+        return _solve_once(graph, component, job.names[-1], job.profile, steps, start, networks, watch), watch.seconds
 
 
 def _solve_once(
     graph: ViewGraph,
+    component: Tensor,
     name: str,
     profile: str,
     refinement_steps: int | None,
@@ -169,11 +166,11 @@ def _solve_once(
     if graph.num_edges == 0:
         unknown = torch.full((graph.num_nodes,), torch.nan)
         return _Estimate(rotations.identity(graph.num_nodes), torch.empty(0).double(), unknown)
-    if name in _BASELINES:
+    if name in BASELINES:
         return _solve_baseline(graph, name, profile, warm_start, watch)
     if profile == "slam":
-        return _solve_slam(graph, _METHODS[name], refinement_steps, warm_start, networks, watch)
-    return _solve_sfm(graph, _METHODS[name], refinement_steps, warm_start, networks, watch)
+        return _solve_slam(graph, NETWORK_METHODS[name], refinement_steps, warm_start, networks, watch)
+    return _solve_sfm(graph, component, NETWORK_METHODS[name], refinement_steps, warm_start, networks, watch)
 
 
 def _solve_baseline(
@@ -191,12 +188,15 @@ def _solve_baseline(
 
 def _solve_sfm(
     graph: ViewGraph,
+    component: Tensor,
     method: Method,
     refinement_steps: int | None,
     warm_start: Tensor | None,
     networks: _Networks,
     watch: _Stopwatch,
 ) -> _Estimate:
+    if graph.num_edges > _TUNING_PAYS and graph.device.type == "cpu":
+        tune()
     with watch.stage("clean"):
         if method.clean:
             cleaned = sfm_stages.clean(networks.load("sfm-clean-net"), graph)
@@ -204,9 +204,9 @@ def _solve_sfm(
             cleaned = sfm_stages.trust_all(graph)
         cleaned = sfm_stages.apply_labels(cleaned, graph.label)
     with watch.stage("bootstrap"):
-        orientations, forest = sfm_stages.bootstrap(cleaned)
+        orientations, roots = sfm_stages.bootstrap(cleaned, component)
         if warm_start is not None:
-            orientations = warm_start.double()
+            orientations = warm_start.double().to(graph.device)
     for _ in range(method.fine_tunings):
         with watch.stage("fine-tune"):
             orientations = sfm_stages.fine_tune(networks.load("sfm-fine-net"), cleaned, orientations)
@@ -215,8 +215,10 @@ def _solve_sfm(
         with watch.stage("refine"):
             verdicts = cleaned if method.weighted else sfm_stages.apply_labels(sfm_stages.trust_all(graph), graph.label)
             weight = 1 - verdicts.outlier_probability
-            orientations = refinement.refine(graph, orientations, weight, forest.roots, steps)
-    score = sfm_stages.outlier_score(graph, cleaned, orientations, refined=steps > 0)
+            orientations = refinement.refine(
+                graph, orientations, weight, roots, steps, component=component, edges=cleaned.edges
+            )
+    score = sfm_stages.outlier_score(graph, cleaned, orientations, component, refined=steps > 0)
     return _Estimate(orientations, score, torch.full((graph.num_nodes,), torch.nan))
 
 

@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import breadth_first_order, dijkstra, minimum_spanning
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver.sorted_edges import SortedEdges
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -39,24 +40,41 @@ class SpanningForest:
         return roots[np.argsort(self.component[roots])]
 
 
-def shortest_path_forest(graph: ViewGraph, cost: Tensor | None = None, root: str = "hub") -> SpanningForest:
+def shortest_path_forest(
+    graph: ViewGraph,
+    cost: Tensor | None = None,
+    root: str = "hub",
+    *,
+    edges: SortedEdges | None = None,
+    component: Tensor | None = None,
+) -> SpanningForest:
     """Breadth-first tree from the best-connected node of each component (NeuRoRA §4.2).
 
     Args:
+        graph: on the CPU.
         cost: ``(M,)`` positive; paths of least total cost instead of fewest edges.
         root: "hub", the node of highest degree, or "first", the first node of the component.
+        edges: the graph's edges sorted; default: computed.
+        component: ``(N,)`` its connected components; default: computed.
     """
-    best = _cheapest_parallel_edges(graph, cost)
-    adjacency = _symmetric(best, np.ones_like(best.cost) if cost is None else best.cost, graph.num_nodes)
-    component = graph.components().cpu().numpy()
-    priority = -np.diff(adjacency.indptr) if root == "hub" else np.zeros(graph.num_nodes)
-    roots = _first_per_component(component, priority)
-    if cost is None:
-        parent = _breadth_first_parents(adjacency, roots)
-    else:
-        _, parent, _ = dijkstra(adjacency, directed=False, indices=roots, return_predecessors=True, min_only=True)
-        parent = np.where(parent < 0, np.arange(graph.num_nodes), parent).astype(np.int64)
-    return _forest(parent, best, component, graph.num_nodes)
+    edges = SortedEdges.of(graph) if edges is None else edges
+    labels = (graph.components() if component is None else component).numpy()
+    priority = -edges.degree.numpy() if root == "hub" else np.zeros(graph.num_nodes)
+    roots = _first_per_component(labels, priority)
+    costs = np.ones(len(edges.source)) if cost is None else cost.detach().double()[edges.edge].numpy()
+    # Rows of the matrix are symmetric, parallel edges included, which Dijkstra's algorithm does not mind.
+    adjacency = csr_array((costs, edges.source.numpy(), edges.first.numpy()), shape=(graph.num_nodes, graph.num_nodes))
+    _, parent, _ = dijkstra(adjacency, directed=True, indices=roots, return_predecessors=True, min_only=True)
+    parent = np.where(parent < 0, np.arange(graph.num_nodes), parent).astype(np.int64)
+
+    # Each node's edge to its parent: of those that arrive from there, the cheapest, and the first of equals.
+    row = np.flatnonzero(edges.source.numpy() == np.repeat(parent, edges.degree.numpy()))
+    child, edge = edges.target().numpy()[row], edges.edge.numpy()[row]
+    order = np.lexsort((edge, costs[row], child))
+    child, first = np.unique(child[order], return_index=True)
+    parent_edge = np.full(graph.num_nodes, -1, dtype=np.int64)
+    parent_edge[child] = edge[order][first]
+    return SpanningForest(parent, parent_edge, labels)
 
 
 def minimum_spanning_forest(graph: ViewGraph, cost: Tensor) -> SpanningForest:
@@ -76,15 +94,20 @@ def minimum_spanning_forest(graph: ViewGraph, cost: Tensor) -> SpanningForest:
 
 def compose_orientations(forest: SpanningForest, graph: ViewGraph) -> Tensor:
     """Orientations along the forest, body_from_world ``(N, 4)`` float64 on the CPU, roots at the identity."""
-    child = np.flatnonzero(forest.parent_edge >= 0)
-    edge = torch.from_numpy(forest.parent_edge[child])
-    measured = graph.target_from_source.cpu().double()[edge]
-    enters_child = graph.target.cpu()[edge] == torch.from_numpy(child)
+    return compose(torch.from_numpy(forest.parent), torch.from_numpy(forest.parent_edge), graph.to("cpu"))
+
+
+def compose(parent: Tensor, parent_edge: Tensor, graph: ViewGraph) -> Tensor:
+    """The same from the forest's tensors ``(N,)``, all on the graph's device."""
+    child = (parent_edge >= 0).nonzero().squeeze(1)
+    edge = parent_edge[child]
+    measured = graph.target_from_source[edge].double()
+    enters_child = graph.target[edge] == child
     child_from_parent = torch.where(enters_child[:, None], measured, rotations.inverse(measured))
     # Invariant: node_from_ancestor[v] rotates from the frame of ancestor[v]; both double their reach every round.
-    node_from_ancestor = rotations.identity(len(forest.parent))
-    node_from_ancestor[torch.from_numpy(child)] = child_from_parent
-    ancestor = torch.from_numpy(forest.parent)
+    node_from_ancestor = rotations.identity(len(parent), device=parent.device)
+    node_from_ancestor[child] = child_from_parent
+    ancestor = parent
     while True:
         farther = ancestor[ancestor]
         if torch.equal(farther, ancestor):
@@ -115,20 +138,15 @@ class _UndirectedEdges:
     index: np.ndarray
 
 
-def _cheapest_parallel_edges(graph: ViewGraph, cost: Tensor | None) -> _UndirectedEdges:
+def _cheapest_parallel_edges(graph: ViewGraph, cost: Tensor) -> _UndirectedEdges:
     source, target = graph.source.cpu().numpy(), graph.target.cpu().numpy()
     low, high = np.minimum(source, target), np.maximum(source, target)
-    costs = np.ones(len(low)) if cost is None else cost.detach().cpu().double().numpy()
+    costs = cost.detach().cpu().double().numpy()
     order = np.lexsort((costs, high, low))
     low, high = low[order], high[order]
     first = np.ones(len(low), dtype=bool)
     first[1:] = (np.diff(low) != 0) | (np.diff(high) != 0)
     return _UndirectedEdges(low[first], high[first], costs[order][first], order[first])
-
-
-def _symmetric(edges: _UndirectedEdges, weight: np.ndarray, num_nodes: int) -> csr_array:
-    ends = np.concatenate((edges.low, edges.high)), np.concatenate((edges.high, edges.low))
-    return csr_array(coo_array((np.tile(weight, 2), ends), shape=(num_nodes, num_nodes)))
 
 
 def _first_per_component(component: np.ndarray, priority: np.ndarray) -> np.ndarray:

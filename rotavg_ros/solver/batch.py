@@ -1,0 +1,88 @@
+"""Many view-graphs in one call: one pass of the networks over all of them, which is what keeps a GPU busy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from rotavg_ros.solver.methods import NETWORK_METHODS
+from rotavg_ros.solver.pipeline import solve
+from rotavg_ros.solver.solution import Solution
+from rotavg_ros.view_graph import ViewGraph
+
+
+def solve_batch(
+    graphs: Sequence[ViewGraph],
+    *,
+    method: str = "neurora",
+    profile: str = "auto",
+    device: str = "auto",
+    refinement_steps: int | None = None,
+    weights: Path | None = None,
+) -> list[Solution]:
+    """What :func:`~rotavg_ros.solver.solve` says of every graph, to 10⁻⁵ rad; the arguments are the same.
+
+    SfM graphs are solved together as one graph of that many components, and ``stage_seconds`` are those of all.
+    SLAM graphs, and methods that are not ours, go one by one.
+    """
+
+    def solve_alone(graph: ViewGraph) -> Solution:
+        return solve(
+            graph, method=method, profile=profile, device=device, refinement_steps=refinement_steps, weights=weights
+        )
+
+    is_sfm = [profile == "sfm" or (profile == "auto" and not bool(graph.is_odometry.any())) for graph in graphs]
+    if not set(method.split("+")) <= set(NETWORK_METHODS) or sum(is_sfm) < 2:
+        return [solve_alone(graph) for graph in graphs]
+    together = [graph for graph, joins in zip(graphs, is_sfm, strict=True) if joins]
+    joint = solve(
+        _union(together),
+        method=method,
+        profile="sfm",
+        device=device,
+        refinement_steps=refinement_steps,
+        weights=weights,
+    )
+    parts = iter(_split(joint, together))
+    return [next(parts) if joins else solve_alone(graph) for graph, joins in zip(graphs, is_sfm, strict=True)]
+
+
+def _union(graphs: Sequence[ViewGraph]) -> ViewGraph:
+    """All graphs side by side."""
+    columns = {f.name: [getattr(graph, f.name) for graph in graphs] for f in fields(ViewGraph) if f.name != "num_nodes"}
+    starts = _starts([graph.num_nodes for graph in graphs])
+    for end in ("source", "target"):
+        columns[end] = [column + start for column, start in zip(columns[end], starts, strict=False)]
+    joined = {name: torch.cat([column.cpu() for column in parts]) for name, parts in columns.items()}
+    return ViewGraph(num_nodes=starts[-1], **joined)
+
+
+def _split(joint: Solution, graphs: Sequence[ViewGraph]) -> list[Solution]:
+    """The answer to each graph out of the answer to their union."""
+    node = _starts([graph.num_nodes for graph in graphs])
+    edge = _starts([graph.num_edges for graph in graphs])
+    parts = []
+    for index in range(len(graphs)):
+        nodes, edges = slice(node[index], node[index + 1]), slice(edge[index], edge[index + 1])
+        component = joint.component[nodes]
+        parts.append(
+            Solution(
+                joint.body_from_world[nodes],
+                joint.outlier_score[edges],
+                component - component[:1],  # numbered by first node, so the graph's own numbers follow each other
+                joint.uncertainty[nodes],
+                joint.stage_seconds,
+                joint.method,
+                joint.profile,
+                joint.device,
+            )
+        )
+    return parts
+
+
+def _starts(sizes: list[int]) -> list[int]:
+    return [0, *np.cumsum(sizes).tolist()]

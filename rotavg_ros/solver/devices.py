@@ -1,0 +1,56 @@
+"""Where a solve runs: a GPU if there is one that works, else the CPU, which is said once."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import warnings
+
+import torch
+
+DEVICES = ("auto", "cpu", "cuda")
+# What a GPU fails with while it is at work: out of memory, or an error of the driver.
+GPU_ERRORS: tuple[type[Exception], ...] = (
+    torch.OutOfMemoryError,
+    getattr(torch, "AcceleratorError", torch.OutOfMemoryError),  # since torch 2.8
+)
+
+_log = logging.getLogger("rotavg_ros")
+_said: set[str] = set()
+
+
+def choose(device: str) -> str:
+    """What one of :data:`DEVICES` comes to, "cpu" or "cuda"; that a GPU was asked for and cannot be had is logged."""
+    if device == "cpu":
+        return "cpu"
+    problem = gpu_problem()
+    if problem is None:
+        return "cuda"
+    # With "auto" nobody has asked for a GPU where there is none.
+    if device == "cuda" or torch.version.cuda is not None:
+        fall_back(problem)
+    return "cpu"
+
+
+def fall_back(problem: object) -> None:
+    """Log that the CPU is used instead of a GPU; each problem once per process."""
+    line = str(problem).strip().partition("\n")[0]
+    if line not in _said:
+        _said.add(line)
+        _log.warning("solving on the CPU, not on a GPU: %s", line)
+
+
+@functools.cache
+def gpu_problem() -> str | None:
+    """Why there is no usable GPU; None if there is one. Tried once per process."""
+    if torch.version.cuda is None:
+        return "this build of torch has no CUDA"
+    with warnings.catch_warnings(record=True) as caught:  # torch warns of a driver that is too old
+        warnings.simplefilter("always")
+        try:
+            if not torch.cuda.is_available():
+                return str(caught[0].message) if caught else "torch finds none"
+            torch.ones(1, device="cuda").add_(1).item()
+        except RuntimeError as error:
+            return str(error)
+    return None

@@ -1,0 +1,98 @@
+"""Coarse parallelism: every worker walks its own stretch of an array, and torch's operations run on one thread each.
+
+Torch can spread each operation over the cores by itself, but then every operation of some ten microseconds ends in a
+barrier, and on a machine that does anything else besides, each barrier waits for the scheduler: measured, a solve of
+0.3 s on an idle machine took 4 s beside one busy process. Here threads meet once per layer.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TypeVar
+
+import torch
+
+Item = TypeVar("Item")
+
+_STRETCHES_PER_WORKER = 4
+
+
+class _Crew:
+    """The workers of the solves that run at the moment."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._active = 0
+        self._pool: ThreadPoolExecutor | None = None
+        self.size = 1
+
+    def enter(self) -> None:
+        with self._lock:
+            if self._active == 0:
+                self.size = torch.get_num_threads()
+            self._active += 1
+            torch.set_num_threads(1)
+
+    def leave(self) -> None:
+        with self._lock:
+            torch.set_num_threads(self.size)
+            self._active -= 1
+            if self._active == 0:
+                self.size = 1
+                if self._pool is not None:
+                    self._pool.shutdown()
+                    self._pool = None
+
+    def pool(self) -> ThreadPoolExecutor:
+        with self._lock:
+            if self._pool is None:
+                self._pool = ThreadPoolExecutor(self.size, thread_name_prefix="rotavg")
+            return self._pool
+
+
+_crew = _Crew()
+
+
+@contextmanager
+def workers() -> Iterator[None]:
+    """Inside, :func:`for_each` uses as many threads as torch was allowed, and torch's operations one each."""
+    _crew.enter()
+    try:
+        yield
+    finally:
+        _crew.leave()
+
+
+def num_workers() -> int:
+    """Threads that :func:`for_each` uses now: 1 outside of :func:`workers`."""
+    return _crew.size
+
+
+def for_each(work: Callable[[Item], None], items: Sequence[Item], threads: int | None = None) -> None:
+    """Call ``work`` for every item, on several threads; what one raises is raised here. Never nested.
+
+    Args:
+        threads: at most so many; default: all workers.
+    """
+    if min(len(items), _crew.size if threads is None else min(threads, _crew.size)) <= 1:
+        for item in items:
+            work(item)
+        return
+    # Gradients are switched off by thread, so every worker needs it said.
+    for _ in _crew.pool().map(torch.no_grad()(work), items):
+        pass
+
+
+def slices(length: int, size: int, device: torch.device) -> list[slice]:
+    """What covers ``range(length)``: slices of ``size`` on a CPU, for its caches, and one slice on an accelerator."""
+    size = size if device.type == "cpu" else max(length, 1)
+    return [slice(start, min(start + size, length)) for start in range(0, length, size)]
+
+
+def stretches(items: Sequence[Item]) -> list[Sequence[Item]]:
+    """The items in a few runs per worker: enough that one which others hold up does not hold up all."""
+    length = max(1, -(-len(items) // (_STRETCHES_PER_WORKER * num_workers())))
+    return [items[start : start + length] for start in range(0, len(items), length)]

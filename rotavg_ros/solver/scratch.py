@@ -1,0 +1,33 @@
+"""Working memory that outlives a pass: touching fresh pages costs a small graph as much as a layer of messages."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+# What is larger goes back to the system; there the share of this cost is small.
+_KEPT_BYTES = 64 << 20
+_lock = threading.Lock()
+_kept: list[Tensor] = []
+
+
+@contextmanager
+def scratch(rows: int, columns: int, like: Tensor) -> Iterator[Tensor]:
+    """An uninitialised matrix of the type and on the device of ``like``."""
+    size = rows * columns
+    if like.device.type != "cpu" or size * like.element_size() > _KEPT_BYTES:
+        yield like.new_empty(rows, columns)  # torch keeps an accelerator's memory by itself
+        return
+    with _lock:
+        buffer = _kept.pop() if _kept else like.new_empty(0)
+    if len(buffer) < size or buffer.dtype != like.dtype:
+        buffer = torch.empty(size, dtype=like.dtype)
+    try:
+        yield buffer[:size].view(rows, columns)
+    finally:
+        with _lock:
+            _kept[:] = [buffer]

@@ -1,0 +1,85 @@
+"""Both directions of a view-graph's edges, sorted by the node at which they arrive: what tiled passes walk along."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros.view_graph import ViewGraph
+
+
+class Tile(NamedTuple):
+    """Neighbouring nodes and all edges that arrive at them."""
+
+    nodes: slice
+    edges: slice
+
+
+@dataclass(frozen=True)
+class SortedEdges:
+    """Directed edges, E = 2M of M edges or both directions of some of them; all tensors on one device.
+
+    Attributes:
+        first: ``(N + 1,)`` int32: rows ``first[v] … first[v+1] - 1`` arrive at node v.
+        source: ``(E,)`` int32, the node from which each comes; in the order of the graph's edges at each node.
+        edge: ``(E,)`` int32, the graph's edge.
+        is_reversed: ``(E,)`` bool: runs against that edge's direction.
+    """
+
+    first: Tensor
+    source: Tensor
+    edge: Tensor
+    is_reversed: Tensor
+
+    @classmethod
+    def of(cls, graph: ViewGraph) -> SortedEdges:
+        num_edges = graph.num_edges
+        arrival = torch.cat((graph.target, graph.source)).int()
+        order = arrival.sort(stable=True).indices
+        source = torch.cat((graph.source, graph.target)).int()[order]
+        is_reversed = order >= num_edges
+        edge = order.sub_(is_reversed * num_edges).int()
+        return cls(_offsets(torch.bincount(arrival, minlength=graph.num_nodes)), source, edge, is_reversed)
+
+    @property
+    def num_nodes(self) -> int:
+        return len(self.first) - 1
+
+    @property
+    def degree(self) -> Tensor:
+        """``(N,)`` int32, edges that arrive; parallel ones count."""
+        return self.first.diff()
+
+    def to(self, device: torch.device | str) -> SortedEdges:
+        """The same on another device."""
+        return SortedEdges(*(getattr(self, field.name).to(device) for field in fields(self)))
+
+    def target(self) -> Tensor:
+        """``(E,)`` int32, the node at which each edge arrives."""
+        nodes = torch.arange(self.num_nodes, dtype=torch.int32, device=self.first.device)
+        return nodes.repeat_interleave(self.degree, output_size=len(self.source))
+
+    def select(self, kept: Tensor) -> SortedEdges:
+        """Those of the graph's edges that ``kept`` ``(M,)`` bool marks; edge numbers stay the whole graph's."""
+        chosen = kept.index_select(0, self.edge)
+        first = torch.cat((chosen.new_zeros(1, dtype=torch.int32), chosen.cumsum(0, dtype=torch.int32)))[self.first]
+        rows = chosen.nonzero().squeeze(1)
+        columns = (column.index_select(0, rows) for column in (self.source, self.edge, self.is_reversed))
+        return SortedEdges(first, *columns)
+
+    def tiles(self, num_edges: int) -> list[Tile]:
+        """All nodes in order, cut into tiles of about ``num_edges`` edges; a node's edges are never split."""
+        first = self.first.cpu().numpy()
+        cuts = np.searchsorted(first, np.arange(0, first[-1], num_edges), side="left")
+        nodes = np.unique(np.concatenate(([0], cuts, [self.num_nodes])))
+        edges = first[nodes]
+        bounds = zip(nodes[:-1].tolist(), nodes[1:].tolist(), edges[:-1].tolist(), edges[1:].tolist(), strict=True)
+        return [Tile(slice(low, high), slice(start, end)) for low, high, start, end in bounds]
+
+
+def _offsets(count: Tensor) -> Tensor:
+    return torch.cat((count.new_zeros(1), count.cumsum(0))).int()
