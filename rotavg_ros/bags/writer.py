@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Any
 
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from rotavg_ros.bags.message_types import typestore
 from rotavg_ros.errors import UserError
@@ -28,13 +28,15 @@ class BagWriter:
     Args:
         path: the bag's folder, which must not exist.
         overwrite: replace an existing bag (only a folder that is a bag, or an empty one).
+        compressed: chunks by zstd.
 
     Raises:
         BagWriteError: the folder exists, or its place cannot be written.
     """
 
-    def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
+    def __init__(self, path: str | Path, *, overwrite: bool = False, compressed: bool = False) -> None:
         self._path = Path(path)
+        self._compressed = compressed
         self._overwrite = overwrite
         # The bag grows inside a hidden folder beside its place, since a recording is named after its own folder.
         self._workplace = self._path.with_name(f".{self._path.name}.unfinished")
@@ -46,6 +48,8 @@ class BagWriter:
         try:
             shutil.rmtree(self._workplace, ignore_errors=True)
             self._writer = Writer(self._workplace / self._path.name, version=8, storage_plugin=StoragePlugin.MCAP)
+            if self._compressed:
+                self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             self._writer.open()
         except OSError as error:
             raise self._cannot_write(error) from None

@@ -28,6 +28,7 @@ COMMANDS = (
     Command("simulate", "rotavg_ros.cli.simulate", "simulate a robot's run and write it as a bag"),
     Command("convert", "rotavg_ros.cli.convert", "convert view-graphs between files and bags"),
     Command("play", "rotavg_ros.cli.play", "publish a bag's messages live"),
+    Command("replay", "rotavg_ros.cli.replay", "replay a recorded bag without ROS, with a report"),
     Command("train", "rotavg_ros.cli.train", "train the networks"),
     Command("evaluate", "rotavg_ros.cli.evaluate", "compare the methods in tables and pictures"),
     Command("plot", "rotavg_ros.cli.plot", "draw the statistics of a view-graph's noise"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -22,6 +22,19 @@ def progress(items: Iterable[Item], *, description: str, total: int | None = Non
     from tqdm import tqdm  # not worth its import where no bar can show
 
     yield from tqdm(items, desc=description, total=total, unit=unit, delay=_DELAY_SECONDS, leave=False)
+
+
+@contextmanager
+def seconds_bar(description: str, total: float) -> Iterator[Callable[[float], object]]:
+    """A bar over seconds of recorded time with the time that is left; yields what moves it on by so many seconds."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from tqdm import tqdm
+
+    form = "{desc}: {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} s [{elapsed}<{remaining}]"
+    with tqdm(desc=description, total=total, bar_format=form, delay=_DELAY_SECONDS, leave=False) as bar:
+        yield bar.update
 
 
 @contextmanager

@@ -171,7 +171,12 @@ def _parse_vertices(path: Path, num_values: int, lines: list[int], rows: list[Ro
     return parse_rows(path, lines, [row[:1] for row in rows], 1, 0)[0][:, 0]
 
 
-def write(path: Path, graph_file: GraphFile, body_from_world: np.ndarray | None = None) -> None:
+def write(
+    path: Path,
+    graph_file: GraphFile,
+    body_from_world: np.ndarray | None = None,
+    position: np.ndarray | None = None,
+) -> None:
     """Write EDGE_SE2 or EDGE_SE3:QUAT lines, after VERTEX lines that chain the edges' translations.
 
     The format knows no unknown precision (written as 1) and no edge kind (consecutive ids are odometry).
@@ -179,12 +184,14 @@ def write(path: Path, graph_file: GraphFile, body_from_world: np.ndarray | None 
     Args:
         body_from_world: ``(N, 4)`` xyzw orientations of the vertices; default: those a breadth-first tree of
             the edges, odometry first, gives.
+        position: ``(N, 3)`` metres, of the vertices; default: chained likewise.
     """
     graph, ids = graph_file.graph, graph_file.node_ids
     translation = graph_file.edge_translation
     if translation is None:
         translation = np.zeros((graph.num_edges, 3))
     positions, world_from_body = chain_poses(graph, translation, body_from_world)
+    positions = positions if position is None else position
     source_from_target = inverse(graph.target_from_source).cpu().numpy()
     information = _information(graph_file)
     ends = [ids[graph.source.cpu().numpy()], ids[graph.target.cpu().numpy()]]

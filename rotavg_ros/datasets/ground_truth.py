@@ -29,7 +29,7 @@ def attach_stamps(graph_file: GraphFile, path: str | Path) -> GraphFile:
     stamps: list[int] = []
     for block in read_blocks(path):
         parse_rows(path, [line for line, _ in block], [row for _, row in block], 0, 1)
-        stamps.extend(_nanoseconds(path, line, row[0]) for line, row in block)
+        stamps.extend(nanoseconds(path, line, row[0]) for line, row in block)
     if len(stamps) != len(graph_file.node_ids):
         what = f"{len(stamps)} stamps for {len(graph_file.node_ids)} nodes; give one per node, ascending by id"
         raise GraphFileError.at(path, None, what)
@@ -89,7 +89,7 @@ def _rows_by_stamp(path: Path, lines: list[int], cells: list[list[bytes]]) -> tu
     """``(K,)`` ascending stamps in nanoseconds and ``(K, 3)`` x, y, heading."""
     _, numbers = parse_rows(path, lines, cells, 0, 4)
     stamps = np.array(
-        [_nanoseconds(path, line, row[0]) for line, row in zip(lines, cells, strict=True)], dtype=np.int64
+        [nanoseconds(path, line, row[0]) for line, row in zip(lines, cells, strict=True)], dtype=np.int64
     )
     backward = np.concatenate(([False], np.diff(stamps) < 0))
     refuse(path, lines, backward, "a stamp earlier than the one before; sort the rows by time")
@@ -103,7 +103,7 @@ def _nearest(ascending: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.where(np.abs(ascending[left] - values) <= np.abs(ascending[right] - values), left, right)
 
 
-def _nanoseconds(path: Path, line: int, seconds: bytes) -> int:
+def nanoseconds(path: Path, line: int, seconds: bytes) -> int:
     """Exact, where a float of seconds since 1970 would be off by a hundred nanoseconds."""
     whole, _, fraction = seconds.partition(b".")
     if whole.isdigit() and (fraction.isdigit() or not fraction):

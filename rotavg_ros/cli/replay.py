@@ -1,0 +1,170 @@
+"""Replay a recorded bag through the node's estimator, without ROS, and write what it would have said.
+
+Topics are found by their types and names; --list shows what each would be used as. DIR gets run.mcap (opens in
+Foxglove), orientations.csv, edges.csv, trajectories (TUM, KITTI), graph.g2o, summary.json, report.html and pictures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from rotavg_ros.bags.reader import BagReader
+from rotavg_ros.cli.arguments import non_negative_number, positive_number, whole_number
+from rotavg_ros.cli.progress import seconds_bar, working
+from rotavg_ros.errors import UserError
+from rotavg_ros.replay.options import read_parameter_file, read_settings
+from rotavg_ros.replay.plan import Plan, Wishes, make_plan
+from rotavg_ros.replay.run import Window
+
+
+class ReplayUsageError(UserError):
+    """Options that do not fit together, or a bag without anything to replay."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``rotavg replay``."""
+    parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 folder, .mcap, .db3, or a ROS 1 .bag")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="folder for the answer")
+    parser.add_argument("--overwrite", action="store_true", help="replace an older replay's files in DIR")
+    parser.add_argument("--list", action="store_true", help="only list the topics and what each would be used as")
+    topics = parser.add_argument_group("topics", "each may be given several times; 'none' uses none")
+    topics.add_argument("--odometry", action="append", metavar="TOPIC[:TYPE]", help="one per robot")
+    topics.add_argument("--robots", nargs="+", metavar="NAME", help="names, one per --odometry")
+    topics.add_argument("--edges", action="append", metavar="TOPIC[:TYPE]", help="relative rotations")
+    topics.add_argument(
+        "--reference", action="append", metavar="TOPIC|FILE", help="to compare with: a topic, or TUM, KITTI, EuRoC csv"
+    )
+    window = parser.add_argument_group("window")
+    window.add_argument("--start", type=non_negative_number, default=0.0, metavar="S", help="seconds into the bag")
+    window.add_argument("--duration", type=positive_number, metavar="S", help="seconds to replay")
+    window.add_argument(
+        "--rate", type=non_negative_number, default=0.0, metavar="R", help="times real time; 0: as fast as possible"
+    )
+    node = parser.add_argument_group("the node's parameters")
+    node.add_argument("--params", type=Path, metavar="YAML", help="a file as for the node's --params-file")
+    node.add_argument("-p", action="append", default=[], metavar="NAME:=VALUE", help="one parameter")
+    parser.add_argument(
+        "--answers",
+        type=whole_number,
+        default=200,
+        metavar="N",
+        help="about so many of the answers go into run.mcap, evenly over the time; 0: all (default: 200)",
+    )
+    parser.add_argument("--no-report", action="store_true", help="leave out report.html and its pictures")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Replay and write."""
+    values = read_parameter_file(arguments.params) if arguments.params else {}
+    values |= read_settings(arguments.p)
+    wishes = Wishes(arguments.odometry, arguments.edges, arguments.reference, arguments.robots)
+    with BagReader(arguments.bag) as bag:
+        plan = make_plan(bag, values, wishes)
+        print(_described(plan))
+        if arguments.list:
+            return 0
+        if arguments.output is None:
+            raise ReplayUsageError("give a folder for the answer (--output DIR), or --list to see the topics")
+        if not plan.has_input:
+            raise ReplayUsageError(
+                f"{bag.path}: no topic is odometry or relative rotations, so there is nothing to replay; its topics: "
+                + ", ".join(f"{use.topic} ({use.type_name})" for use in plan.topics)
+            )
+        window = Window(arguments.start, arguments.duration, arguments.rate)
+        print(_replay(bag, plan, window, arguments))
+    return 0
+
+
+def _replay(bag: BagReader, plan: Plan, window: Window, arguments: argparse.Namespace) -> str:
+    # The solver and the pictures take seconds to import: not before there is something to do for them.
+    from rotavg_ros.replay.assemble import assemble
+    from rotavg_ros.replay.outputs import RECORDING, output_folder, write_summary, write_tables
+    from rotavg_ros.replay.run import replay
+    from rotavg_ros.reports import write_report
+
+    seconds = min(bag.duration_s - window.start_s, window.duration_s or bag.duration_s)
+    period_ns = round(1e9 * seconds / arguments.answers) if arguments.answers else 0
+    with output_folder(arguments.output, overwrite=arguments.overwrite) as folder:
+        with _asked_to_stop() as stop, seconds_bar("replaying", seconds) as progress:
+            outcome = replay(bag, plan, window, folder / RECORDING, period_ns, progress, stop)
+        with working("writing the report"):
+            record = assemble(bag, plan, outcome)
+            write_tables(folder, record, outcome.estimator.snapshot())
+            if not arguments.no_report:
+                write_report(record, folder)
+            summary = write_summary(folder, record, bag.path, outcome.failures)
+    return _told(summary, arguments.output)
+
+
+@contextmanager
+def _asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """The first Ctrl-C only asks for the end, so that what is done can be written; the second one ends at once."""
+    asked = False
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield lambda: asked
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _described(plan: Plan) -> str:
+    """A table of the topics."""
+    rows = [(use.topic, use.type_name, str(use.messages), use.used_as or f"— ({use.why_not})") for use in plan.topics]
+    rows += [
+        (str(path), "file", "", f"reference for {robot}")
+        for robot, path in plan.references.items()
+        if isinstance(path, Path)
+    ]
+    widths = [max((len(row[column]) for row in rows), default=0) for column in range(3)]
+    return "\n".join(
+        f"  {topic:<{widths[0]}}  {kind:<{widths[1]}}  {count:>{widths[2]}}  {use}" for topic, kind, count, use in rows
+    )
+
+
+def _told(summary: dict[str, Any], output: Path) -> str:
+    lines = []
+    if summary["interrupted"]:
+        lines.append(f"interrupted after {summary['duration_s']:.1f} s of the bag; what is done is written")
+    if not summary["loop_closures"]:
+        lines.append("no loop closures in this bag: orientations are the odometry's, and nothing could be corrected")
+    refused = ", ".join(f"{count} × {reason}" for reason, count in summary["rejected"].items())
+    if refused:
+        lines.append(f"refused: {refused}")
+    if summary["failed_ticks"]:
+        lines.append(f"{summary['failed_ticks']} solves on the way failed")
+    for robot, said in summary["robots"].items():
+        if "orientation_error_mean_deg" in said:
+            lines.append(_compared(robot, said))
+    counts = (
+        f"{summary['keyframes']} keyframes, {summary['loop_closures']} loop closures, {summary['outliers']} outliers"
+    )
+    components = "" if summary["components"] == 1 else f", {summary['components']} components"
+    times = f"{summary['duration_s']:.0f} s of the bag in {summary['wall_seconds']:.1f} s"
+    lines.append(f"{counts}{components}; {times} → {output}")
+    return "\n".join(lines)
+
+
+def _compared(robot: str, said: dict[str, Any]) -> str:
+    degrees = said["orientation_error_mean_deg"]
+    line = f"{robot} against {said['reference']}: orientation {_arrow(degrees, '°')} in the mean"
+    metres = said.get("position_error_rms_m")
+    return line if metres is None else f"{line}, position {_arrow(metres, ' m')} RMS"
+
+
+def _arrow(values: dict[str, float | None], unit: str) -> str:
+    """Odometry's error and the corrected one's."""
+    return " → ".join(
+        "?" if values[which] is None else f"{values[which]:.2f}{unit}" for which in ("odometry", "corrected")
+    )

@@ -1,0 +1,104 @@
+"""From a finished replay to its record: poses by robot, references, topics."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rotavg_ros.bags.reader import BagReader
+from rotavg_ros.datasets.graph_file import GraphFileError
+from rotavg_ros.datasets.pose_files import read_pose_file
+from rotavg_ros.online import Answer
+from rotavg_ros.online.trajectory import Trajectory
+from rotavg_ros.replay.feed import read_references
+from rotavg_ros.replay.plan import Input, Plan
+from rotavg_ros.replay.record import Reference, RobotRecord, RunRecord
+from rotavg_ros.replay.run import Outcome
+
+
+def assemble(bag: BagReader, plan: Plan, outcome: Outcome) -> RunRecord:
+    """Everything that is known about a replay.
+
+    Raises:
+        BagReadError, GraphFileError: a reference that cannot be read, or that belongs to something else.
+    """
+    answer = outcome.answer
+    trajectories = outcome.estimator.trajectories(answer)
+    references = _references(bag, plan, outcome, trajectories)
+    return RunRecord(
+        name=bag.path.stem,
+        duration_s=(outcome.end_ns - outcome.start_ns) / 1e9,
+        answer=answer,
+        robots=tuple(
+            _robot(answer, robot, trajectory, references.get(robot)) for robot, trajectory in trajectories.items()
+        ),
+        ticks=outcome.ticks,
+        topics=plan.topics,
+        rejected=outcome.estimator.counts().rejected,
+        options=dataclasses.asdict(plan.parameters),
+        wall_seconds=outcome.wall_seconds,
+        interrupted=outcome.interrupted,
+    )
+
+
+def _robot(answer: Answer, robot: str, trajectory: Trajectory, reference: Reference | None) -> RobotRecord:
+    return RobotRecord(
+        robot=robot,
+        nodes=trajectory.node,
+        stamp_ns=trajectory.stamp_ns,
+        keyframe_id=answer.keyframe_id[trajectory.node],
+        odometry_world_from_body=trajectory.odometry_world_from_body,
+        odometry_position=_known(trajectory.odometry_position),
+        world_from_body=trajectory.world_from_body,
+        position_dead_reckoned=_known(trajectory.position_dead_reckoned),
+        position=_known(trajectory.position),
+        uncertainty=answer.uncertainty[trajectory.node],
+        reference=reference,
+    )
+
+
+def _known(position: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    return position if np.isfinite(position).any() else None
+
+
+def _references(
+    bag: BagReader, plan: Plan, outcome: Outcome, trajectories: Mapping[str, Trajectory]
+) -> dict[str, Reference]:
+    inputs = {robot: source for robot, source in plan.references.items() if isinstance(source, Input)}
+    references = read_references(bag, inputs, outcome.start_ns, outcome.end_ns + 1)
+    for robot, source in plan.references.items():
+        if isinstance(source, Path) and robot in trajectories:
+            odometry_ns = outcome.odometry_stamps_ns.get(robot, np.empty(0, dtype=np.int64))
+            references[robot] = _from_file(source, trajectories[robot].stamp_ns, odometry_ns)
+    return references
+
+
+def _from_file(path: Path, keyframes_ns: NDArray[np.int64], odometry_ns: NDArray[np.int64]) -> Reference:
+    """A file's poses; those without stamps are of the odometry's messages, or of the keyframes, one by one.
+
+    Raises:
+        GraphFileError: stamps of another time, or a number of rows that fits neither.
+    """
+    poses = read_pose_file(path)
+    rows = len(poses.position)
+    if poses.stamps_ns is None:
+        stamps_ns = next((stamps for stamps in (odometry_ns, keyframes_ns) if len(stamps) == rows), None)
+        if stamps_ns is None:
+            what = (
+                f"{rows} poses without stamps, but {len(odometry_ns)} odometry messages and {len(keyframes_ns)} "
+                "keyframes were replayed; give a file with stamps (TUM), or replay the whole bag"
+            )
+            raise GraphFileError.at(path, None, what)
+    else:
+        stamps_ns = poses.stamps_ns
+        if stamps_ns[0] > keyframes_ns[-1] or stamps_ns[-1] < keyframes_ns[0]:
+            what = (
+                f"its stamps ({stamps_ns[0] / 1e9:.1f} … {stamps_ns[-1] / 1e9:.1f} s) do not overlap the bag's "
+                f"({keyframes_ns[0] / 1e9:.1f} … {keyframes_ns[-1] / 1e9:.1f} s)"
+            )
+            raise GraphFileError.at(path, None, what)
+    return Reference(path.name, stamps_ns, poses.world_from_body, poses.position)

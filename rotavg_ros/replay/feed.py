@@ -1,0 +1,139 @@
+"""A bag's messages into the estimator, by the converters that the node's subscriptions use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rotavg_ros.bags.reader import BagReader
+from rotavg_ros.inputs import (
+    EDGE_CONVERTERS,
+    ODOMETRY_CONVERTERS,
+    EdgeConverter,
+    EdgeVerdict,
+    OdometryConverter,
+    OdometryRecord,
+)
+from rotavg_ros.online import OnlineEstimator, RejectReason
+from rotavg_ros.online.measurements import RejectedInputError
+from rotavg_ros.online.quaternion import IDENTITY, Quaternion, Vector
+from rotavg_ros.replay.plan import Input, Plan
+from rotavg_ros.replay.record import Reference
+
+# Called with the robot and its odometry whenever the estimator has taken a message of it.
+OnOdometry = Callable[[str, OdometryRecord], None]
+
+
+class Feed:
+    """Hands messages on by topic.
+
+    Args:
+        estimator: gets everything.
+        plan: which topic is what.
+        translations: of the single edges in the order of their messages; empty where they have none.
+        on_odometry: is told of every odometry message that was taken.
+    """
+
+    def __init__(
+        self, estimator: OnlineEstimator, plan: Plan, translations: list[Vector], on_odometry: OnOdometry
+    ) -> None:
+        self._estimator = estimator
+        self._on_odometry = on_odometry
+        self._translations = iter(translations)
+        self._single = plan.translations[1] if plan.translations and translations else None
+        self._handlers: dict[str, list[Callable[[Any], None]]] = {}
+        parameters = plan.parameters
+        for robot, source, sensor in zip(parameters.robots, plan.odometry, parameters.odometry_sensors(), strict=False):
+            odometry = partial(self._take_odometry, robot, ODOMETRY_CONVERTERS[source.type_name], sensor)
+            self._handlers.setdefault(source.topic, []).append(odometry)
+        for source, about in zip(plan.edges, parameters.edge_sources(), strict=True):
+            convert = EDGE_CONVERTERS[source.type_name](about)
+            edges = partial(self._take_edges, convert, source.topic == self._single)
+            self._handlers.setdefault(source.topic, []).append(edges)
+
+    @property
+    def topics(self) -> list[str]:
+        """Everything that has to be read."""
+        return list(self._handlers)
+
+    def __call__(self, topic: str, message: Any) -> None:
+        """Hand one message on."""
+        for handle in self._handlers[topic]:
+            handle(message)
+
+    def _take_odometry(self, robot: str, convert: OdometryConverter, sensor: Quaternion, message: Any) -> None:
+        try:
+            record = convert(message, sensor)
+        except RejectedInputError as rejection:
+            self._estimator.reject(rejection.reason)
+            return
+        if self._estimator.add_odometry(robot, record.stamp_ns, record.world_from_body, record.position) is None:
+            self._on_odometry(robot, record)
+
+    def _take_edges(self, convert: EdgeConverter, has_translation: bool, message: Any) -> None:
+        translation = next(self._translations, None) if has_translation else None
+        for record in convert(message):
+            if isinstance(record, EdgeVerdict):
+                self._estimator.label_edge(record.source_robot, record.edge_id, record.label)
+            elif isinstance(record.edge, RejectReason):
+                self._estimator.reject(record.edge)
+            elif translation is None:
+                self._estimator.add_edge(record.edge)
+            else:
+                self._estimator.add_edge(replace(record.edge, translation=translation))
+
+
+def read_translations(bag: BagReader, plan: Plan, start_ns: int, stop_ns: int) -> list[Vector]:
+    """The positions that belong to the single edges between two moments, in the order of both their messages.
+
+    Empty where there are none, or not as many as edges.
+    """
+    if plan.translations is None:
+        return []
+    topic, edge_topic = plan.translations
+    vectors = [
+        (float(message.vector.x), float(message.vector.y), float(message.vector.z))
+        for _, _, message in bag.decoded([topic], start_ns, stop_ns)
+    ]
+    whole = start_ns <= bag.start_ns and stop_ns >= bag.end_ns
+    edges = bag.num_messages([edge_topic]) if whole else sum(1 for _ in bag.decoded([edge_topic], start_ns, stop_ns))
+    return vectors if len(vectors) == edges else []
+
+
+def read_references(bag: BagReader, inputs: Mapping[str, Input], start_ns: int, stop_ns: int) -> dict[str, Reference]:
+    """The references in the bag's topics, by robot; those without a usable pose are left out."""
+    references = {robot: _read_reference(bag, source, start_ns, stop_ns) for robot, source in inputs.items()}
+    return {robot: reference for robot, reference in references.items() if len(reference.stamp_ns)}
+
+
+def _read_reference(bag: BagReader, source: Input, start_ns: int, stop_ns: int) -> Reference:
+    records = sorted(_records(bag, source, start_ns, stop_ns), key=lambda record: record.stamp_ns)
+    stamp_ns = np.array([record.stamp_ns for record in records], dtype=np.int64)
+    orientation = _rows([record.world_from_body for record in records], 4)
+    position = _rows([record.position or (np.nan,) * 3 for record in records], 3)
+    length = np.linalg.norm(orientation, axis=1)
+    sound = np.isfinite(length) & (length > 0) & np.concatenate((np.diff(stamp_ns) > 0, [True]))[: len(records)]
+    has_position = bool(np.isfinite(position[sound]).all())
+    return Reference(
+        source.topic,
+        stamp_ns[sound],
+        orientation[sound] / length[sound, None],
+        position[sound] if has_position else None,
+    )
+
+
+def _records(bag: BagReader, source: Input, start_ns: int, stop_ns: int) -> Iterator[OdometryRecord]:
+    for _, _, message in bag.decoded([source.topic], start_ns, stop_ns):
+        try:
+            yield ODOMETRY_CONVERTERS[source.type_name](message, IDENTITY)
+        except RejectedInputError:
+            continue
+
+
+def _rows(values: list[Any], width: int) -> NDArray[np.float64]:
+    return np.array(values, dtype=np.float64).reshape(-1, width)

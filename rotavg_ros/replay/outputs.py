@@ -1,0 +1,140 @@
+"""A replay's output folder: each file appears under its name when it is complete."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rotavg_ros.datasets.csv_writer import Column, write_csv
+from rotavg_ros.datasets.pose_files import write_kitti, write_tum
+from rotavg_ros.errors import UserError
+from rotavg_ros.online import Answer
+from rotavg_ros.online.growing_view_graph import GraphSnapshot
+from rotavg_ros.replay.corrected_graph import keyframe_ids, write_corrected_graph
+from rotavg_ros.replay.record import RobotRecord, RunRecord
+from rotavg_ros.replay.summary import summarize
+
+RECORDING = "run.mcap"
+SUMMARY = "summary.json"
+
+
+class OutputError(UserError):
+    """An output folder that is there already, or cannot be written."""
+
+
+@contextmanager
+def output_folder(folder: Path, *, overwrite: bool) -> Iterator[Path]:
+    """A workplace inside the output folder; what was written there takes its place when the block ends well.
+
+    An older replay's files go then; whatever else is in the folder stays.
+
+    Raises:
+        OutputError: the folder has something in it (without ``overwrite``), or cannot be written.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder} is not a folder; choose another --output")
+    if folder.exists() and not overwrite and any(folder.iterdir()):
+        raise OutputError(f"{folder}: exists already; choose another --output or give --overwrite")
+    is_new = not folder.exists()
+    workplace = folder / f".unfinished.{os.getpid()}"
+    try:
+        workplace.mkdir(parents=True)
+        yield workplace
+        names = sorted(path.name for path in workplace.iterdir())
+        for name in set(_files_of(folder)) - set(names):
+            (folder / name).unlink(missing_ok=True)
+        for name in names:
+            os.replace(workplace / name, folder / name)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from None
+    finally:
+        shutil.rmtree(workplace, ignore_errors=True)
+        if is_new and folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+
+
+def _files_of(folder: Path) -> list[str]:
+    """The files that an older summary says it came with."""
+    try:
+        names = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["files"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    return [name for name in names if isinstance(name, str) and Path(name).name == name]
+
+
+def write_tables(folder: Path, record: RunRecord, snapshot: GraphSnapshot) -> None:
+    """Write trajectories, graph and csv files.
+
+    Args:
+        folder: where.
+        record: the run.
+        snapshot: the graph of its answer, or a later one.
+
+    Raises:
+        GraphFileError: a file cannot be written.
+        OSError: likewise.
+    """
+    answer = record.answer
+    with (folder / "orientations.csv").open("wb") as file:
+        write_csv(file, _orientation_columns(answer))
+    with (folder / "edges.csv").open("wb") as file:
+        write_csv(file, _edge_columns(answer))
+    several = len(record.robots) > 1
+    for robot in record.robots:
+        name = re.sub(r"[^\w.-]+", "_", robot.robot).strip("_") or "robot"
+        prefix = f"{name}_" if several else ""
+        _write_trajectory(folder, f"{name}" if several else "trajectory", f"{prefix}odometry", robot)
+    write_corrected_graph(folder / "graph.g2o", record, snapshot)
+
+
+def write_summary(folder: Path, record: RunRecord, bag: Path, failures: int) -> dict[str, Any]:
+    """Write ``summary.json``, last of all, and return its content."""
+    names = sorted({path.name for path in folder.iterdir()} | {SUMMARY})
+    summary = {**summarize(record, bag, failures), "files": names}
+    (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    return summary
+
+
+def _write_trajectory(folder: Path, name: str, odometry_name: str, robot: RobotRecord) -> None:
+    nothing = np.zeros((len(robot.stamp_ns), 3))
+    position = nothing if robot.position is None else np.nan_to_num(robot.position)
+    write_tum(folder / f"{name}.tum", robot.stamp_ns, position, robot.world_from_body)
+    write_kitti(folder / f"{name}.kitti", position, robot.world_from_body)
+    known = np.isfinite(robot.odometry_world_from_body).all(axis=1)
+    if known.any():
+        odometry = nothing if robot.odometry_position is None else np.nan_to_num(robot.odometry_position)
+        stamps_ns, orientation = robot.stamp_ns[known], robot.odometry_world_from_body[known]
+        write_tum(folder / f"{odometry_name}.tum", stamps_ns, odometry[known], orientation)
+
+
+def _orientation_columns(answer: Answer) -> list[Column]:
+    """As `rotavg solve` writes them; with several robots their number is the last column."""
+    order = np.lexsort((answer.keyframe_id, answer.keyframe_robot))
+    orientation = answer.world_from_body[order]
+    columns = [Column("id", keyframe_ids(answer)[order])]
+    columns += [Column(name, orientation[:, axis], decimals=12) for axis, name in enumerate(("qx", "qy", "qz", "qw"))]
+    columns.append(Column("component", answer.component[order]))
+    if len(answer.robots) > 1:
+        columns.append(Column("robot", answer.keyframe_robot[order]))
+    return columns
+
+
+def _edge_columns(answer: Answer) -> list[Column]:
+    ids, robot = keyframe_ids(answer), answer.keyframe_robot
+    columns = [
+        Column("source", ids[answer.source]),
+        Column("target", ids[answer.target]),
+        Column("outlier_score", answer.outlier_score, decimals=6),
+        Column("outlier", answer.outlier.astype(np.int64)),
+    ]
+    if len(answer.robots) > 1:
+        columns += [Column("source_robot", robot[answer.source]), Column("target_robot", robot[answer.target])]
+    return columns

@@ -1,0 +1,228 @@
+"""The replay: a bag's messages through the online estimator, ticking on the bag's clock as the node does on its own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rotavg_ros.bags.reader import BagReader, BagReadError
+from rotavg_ros.errors import UserError
+from rotavg_ros.inputs import OdometryRecord
+from rotavg_ros.online import Answer, OnlineEstimator
+from rotavg_ros.replay.feed import Feed, read_translations
+from rotavg_ros.replay.plan import Plan
+from rotavg_ros.replay.record import TickRecord
+from rotavg_ros.replay.recording import Recording
+
+_NANOSECONDS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Window:
+    """The part of a bag to replay, and how fast.
+
+    Attributes:
+        start_s: seconds after the bag's beginning.
+        duration_s: seconds; None: to the end.
+        rate: times real time; 0: as fast as possible.
+    """
+
+    start_s: float = 0.0
+    duration_s: float | None = None
+    rate: float = 0.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A replay that came to its end, or to that of the user's patience.
+
+    Attributes:
+        estimator: with everything it was told.
+        answer: the last; a cold solve.
+        ticks: one per answer.
+        odometry_stamps_ns: of the messages that were taken, by robot.
+        start_ns, end_ns: bag time of the replayed part.
+        failures: ticks whose solve failed; the last one did not.
+        interrupted: before the end.
+        wall_seconds: that it took.
+    """
+
+    estimator: OnlineEstimator
+    answer: Answer
+    ticks: tuple[TickRecord, ...]
+    odometry_stamps_ns: dict[str, NDArray[np.int64]]
+    start_ns: int
+    end_ns: int
+    failures: int
+    interrupted: bool
+    wall_seconds: float
+
+
+class ReplayError(UserError):
+    """A bag of which nothing came; the message says why."""
+
+
+def replay(
+    bag: BagReader,
+    plan: Plan,
+    window: Window,
+    recording: Path | None,
+    answer_period_ns: int,
+    progress: Callable[[float], object],
+    stop: Callable[[], bool],
+) -> Outcome:
+    """Replay.
+
+    Args:
+        bag: open.
+        plan: what its topics are used as.
+        window: which part.
+        recording: file for what the node would have published.
+        answer_period_ns: see :class:`Recording`.
+        progress: called with the seconds of bag time that have passed since the last call.
+        stop: asked between messages whether the user wants it to end.
+
+    Raises:
+        BagReadError: a damaged bag.
+        ReplayError: no message, or none from which a keyframe could be made.
+    """
+    started = time.perf_counter()
+    start_ns, stop_ns = _bounds(bag, window)
+    estimator = OnlineEstimator(plan.parameters.estimator_options())
+    with ExitStack() as stack:
+        recorder = None
+        if recording is not None:
+            recorder = stack.enter_context(Recording(recording, plan.parameters, estimator, answer_period_ns))
+        loop = _Loop(estimator, plan.parameters.solve_period_s, recorder)
+        feed = Feed(estimator, plan, read_translations(bag, plan, start_ns, stop_ns), loop.on_odometry)
+        end_ns, interrupted = start_ns, False
+        for topic, time_ns, message in bag.decoded(feed.topics, start_ns, stop_ns):
+            if interrupted := stop():
+                break
+            _wait(window.rate, (time_ns - start_ns) / _NANOSECONDS, started)
+            loop.advance(time_ns)
+            feed(topic, message)
+            progress((time_ns - end_ns) / _NANOSECONDS)
+            end_ns = time_ns
+        answer = loop.finish()
+    if answer is None:
+        raise ReplayError(f"{bag.path}: {_why_nothing(plan, estimator.counts().rejected)}")
+    return Outcome(
+        estimator,
+        answer,
+        tuple(loop.ticks),
+        {robot: np.array(stamps, dtype=np.int64) for robot, stamps in loop.odometry_stamps_ns.items()},
+        start_ns,
+        end_ns,
+        loop.failures,
+        interrupted,
+        time.perf_counter() - started,
+    )
+
+
+class _Loop:
+    """The clock, and what happens when it strikes."""
+
+    def __init__(self, estimator: OnlineEstimator, period_s: float, recorder: Recording | None) -> None:
+        self._estimator, self._recorder = estimator, recorder
+        self._period_ns = round(period_s * _NANOSECONDS)
+        self._now_ns = self._next_tick_ns = 0
+        self._last: Answer | None = None
+        self.ticks: list[TickRecord] = []
+        self.odometry_stamps_ns: dict[str, list[int]] = {}
+        self.failures = 0
+
+    def advance(self, time_ns: int) -> None:
+        """Let the time pass until a message, with all ticks on the way."""
+        if self._next_tick_ns == 0:
+            self._next_tick_ns = time_ns + self._period_ns
+        while self._next_tick_ns <= time_ns:
+            self._now_ns = self._next_tick_ns
+            self._next_tick_ns += self._period_ns
+            answered = self._tick()
+            if not answered and not self._estimator.is_behind:
+                # Nothing will change before the message: skip the strikes until then.
+                skipped = max(0, time_ns - self._next_tick_ns) // self._period_ns
+                self._next_tick_ns += skipped * self._period_ns
+        self._now_ns = time_ns
+        if self._recorder is not None:
+            self._recorder.diagnostics(time_ns)
+
+    def on_odometry(self, robot: str, record: OdometryRecord) -> None:
+        """Note an odometry message that was taken."""
+        self.odometry_stamps_ns.setdefault(robot, []).append(record.stamp_ns)
+        if self._recorder is not None:
+            self._recorder.orientation(self._now_ns, robot, record)
+
+    def finish(self) -> Answer | None:
+        """Silence: the last answer is a cold solve, as the node's; None if there is nothing to solve.
+
+        Raises:
+            UserError: from the solver.
+        """
+        if self._estimator.counts().keyframes:
+            self._note(self._estimator.tick(force_cold=True))
+        if self._recorder is not None and self._last is not None:
+            self._recorder.answer(self._now_ns, self._last, is_last=True)
+        return self._last
+
+    def _tick(self) -> bool:
+        try:
+            answer = self._estimator.tick()
+        except UserError:  # as in the node: the next tick tries again
+            self.failures += 1
+            return False
+        if answer is not None and self._recorder is not None:
+            self._recorder.answer(self._now_ns, answer)
+        return self._note(answer)
+
+    def _note(self, answer: Answer | None) -> bool:
+        if answer is None:
+            return False
+        before = np.zeros(0, dtype=bool) if self._last is None else self._last.outlier
+        shared = min(len(before), len(answer.outlier))
+        tick = TickRecord(
+            stamp_ns=self._now_ns,
+            seconds=answer.seconds,
+            was_cold=answer.was_cold,
+            keyframes=len(answer.keyframe_id),
+            edges=len(answer.outlier),
+            outliers=int(answer.outlier.sum()),
+            flips=int((before[:shared] != answer.outlier[:shared]).sum()),
+        )
+        self.ticks.append(tick)
+        self._last = answer
+        return True
+
+
+def _bounds(bag: BagReader, window: Window) -> tuple[int, int]:
+    """First moment to replay and the one after the last."""
+    if bag.num_messages() == 0:
+        raise BagReadError(f"{bag.path}: has no messages; there is nothing to replay")
+    start_ns = bag.start_ns + round(window.start_s * _NANOSECONDS)
+    if start_ns >= bag.end_ns:
+        raise ReplayError(
+            f"{bag.path}: lasts {bag.duration_s:.1f} s, so nothing is left after --start {window.start_s:g}"
+        )
+    stop_ns = bag.end_ns
+    if window.duration_s is not None:
+        stop_ns = min(stop_ns, start_ns + round(window.duration_s * _NANOSECONDS))
+    return start_ns, stop_ns
+
+
+def _wait(rate: float, bag_seconds: float, started: float) -> None:
+    if rate > 0:
+        time.sleep(max(0.0, bag_seconds / rate - (time.perf_counter() - started)))
+
+
+def _why_nothing(plan: Plan, rejected: dict[str, int]) -> str:
+    topics = ", ".join(source.topic for source in (*plan.odometry, *plan.edges))
+    refused = ", ".join(f"{count} × {reason}" for reason, count in rejected.items() if count)
+    why = f"refused: {refused}" if refused else "none of their messages lies in the replayed part"
+    return f"no keyframe could be made from {topics}; {why}"
