@@ -31,6 +31,7 @@ class Health:
         odometry, edges: counters per topic name.
         ticks, odometry_callback, odometry_latency: durations; latency from sending to ``orientation``.
         answer: the last one published, and when.
+        joins: how often components became one.
         unsolved_since: since when the graph has been ahead of the answer; None if it is not.
         solve_failures: how many ticks failed in all; ``failure`` is the last one's message, None after a good tick.
         save_failure: why the last save failed, None if it did not.
@@ -44,6 +45,7 @@ class Health:
     started: float = field(default_factory=time.monotonic)
     last_odometry: float | None = None
     answer: Answer | None = None
+    joins: int = 0
     answered: float | None = None
     unsolved_since: float | None = None
     solve_failures: int = 0
@@ -137,6 +139,7 @@ def _values(health: Health, counts: Counts, paused: bool, now: float) -> dict[st
         "loop closures": str(closures),
         "outliers": str(outliers),
         "components": str(0 if answer is None else answer.num_components),
+        "joins": str(health.joins),
         "pending": str(counts.pending),
         "answer version": str(0 if answer is None else answer.version),
         "answer age s": "nan" if health.answered is None else f"{now - health.answered:.1f}",

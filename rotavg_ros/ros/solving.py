@@ -13,6 +13,7 @@ from rclpy.node import Node
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import Answer, OnlineEstimator
+from rotavg_ros.online.joins import joins
 from rotavg_ros.online.state_file import remove_leftovers
 from rotavg_ros.ros.diagnostics import Health
 from rotavg_ros.ros.outputs import Outputs
@@ -112,8 +113,11 @@ class Solving:
 
     def _publish(self, answer: Answer) -> None:
         health = self._health
-        if health.answer is not None and 0 < answer.num_components < health.answer.num_components:
-            self._node.get_logger().info(f"components joined: {answer.num_components} now")
+        if health.answer is not None and health.answer.version > self._estimator.first_version:
+            for join in joins(health.answer, answer):
+                health.joins += 1
+                left = f"the graph is in {answer.num_components} components" if answer.num_components > 1 else "all one"
+                self._node.get_logger().info(f"{join} ({left})")
         self._outputs.publish_answer(answer)
         health.ticks.add(answer.seconds)
         health.answer, health.answered, health.unsolved_since = answer, time.monotonic(), None
