@@ -253,4 +253,4 @@ def test_several_robots_keep_apart_until_they_meet(live_node) -> None:
         np.array(apart.orientations).reshape(-1, 4)[older],
         atol=1e-9,
     )
-    assert "components joined" in live_node.process.output
+    assert "a and b are joined (all one)" in live_node.process.output
