@@ -15,9 +15,12 @@ from rotavg_ros.datasets.pose_files import read_pose_file
 from rotavg_ros.online import Answer
 from rotavg_ros.online.trajectory import Trajectory
 from rotavg_ros.replay.feed import read_references
+from rotavg_ros.replay.mounting import without_mounting
 from rotavg_ros.replay.plan import Input, Plan
 from rotavg_ros.replay.record import Reference, RobotRecord, RunRecord
 from rotavg_ros.replay.run import Outcome
+
+_IMU = "sensor_msgs/msg/Imu"
 
 
 def assemble(bag: BagReader, plan: Plan, outcome: Outcome) -> RunRecord:
@@ -70,6 +73,11 @@ def _references(
 ) -> dict[str, Reference]:
     inputs = {robot: source for robot, source in plan.references.items() if isinstance(source, Input)}
     references = read_references(bag, inputs, outcome.start_ns, outcome.end_ns + 1)
+    for robot, topic in inputs.items():
+        if topic.type_name == _IMU and robot in references and robot in trajectories:
+            trajectory = trajectories[robot]
+            orientation = trajectory.odometry_world_from_body
+            references[robot] = without_mounting(references[robot], trajectory.stamp_ns, orientation)
     for robot, source in plan.references.items():
         if isinstance(source, Path) and robot in trajectories:
             odometry_ns = outcome.odometry_stamps_ns.get(robot, np.empty(0, dtype=np.int64))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from rotavg_ros.bags.reader import BagReader, BagReadError
@@ -94,6 +95,7 @@ def replay(
     """
     started = time.perf_counter()
     start_ns, stop_ns = _bounds(bag, window)
+    torch.set_num_threads(plan.parameters.solver_threads or max(1, torch.get_num_threads() - 1))  # as in the node
     estimator = OnlineEstimator(plan.parameters.estimator_options())
     with ExitStack() as stack:
         recorder = None

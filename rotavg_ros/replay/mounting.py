@@ -1,0 +1,57 @@
+"""How a reference's sensor sits in the body, from how both turn: bags seldom say how an IMU is mounted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.replay.record import Reference
+
+_MAX_STAMP_DISTANCE_NS = 150_000_000
+# Smaller turns between keyframes are mostly noise.
+_SMALLEST_TURN = np.radians(1.0)
+
+
+def without_mounting(
+    reference: Reference, stamp_ns: NDArray[np.int64], odometry_world_from_body: NDArray[np.float64]
+) -> Reference:
+    """The reference with the sensor's mounting rotation taken out, so that it speaks of the body.
+
+    A turn of the body between two keyframes is the sensor's, seen in other axes: ``v_body = R_body_sensor v_sensor``
+    for rotation vectors, which is Wahba's problem (solved as by Kabsch 1976). A body that turns about one axis only
+    leaves open how the sensor sits about that axis, and there it makes no difference.
+
+    Args:
+        reference: orientations of a sensor.
+        stamp_ns: ``(n,)`` of the keyframes.
+        odometry_world_from_body: ``(n, 4)`` xyzw at the keyframes; NaN rows unknown.
+
+    Returns:
+        as given, where there are no turns in common.
+    """
+    nearest = np.searchsorted(reference.stamp_ns, stamp_ns).clip(0, len(reference.stamp_ns) - 1)
+    known = np.isfinite(odometry_world_from_body).all(axis=1)
+    known &= np.abs(reference.stamp_ns[nearest] - stamp_ns) <= _MAX_STAMP_DISTANCE_NS
+    if known.sum() < 2:
+        return reference
+    body = _turns(odometry_world_from_body[known])
+    sensor = _turns(reference.world_from_body[nearest[known]])
+    large = np.linalg.norm(body, axis=1) >= _SMALLEST_TURN
+    if not large.any():
+        return reference
+    u, _, vt = np.linalg.svd(body[large].T @ sensor[large])
+    body_from_sensor = Rotation.from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
+    world_from_body = Rotation.from_quat(reference.world_from_body) * body_from_sensor.inv()
+    return replace(
+        reference, name=f"{reference.name} (mounting fitted)", world_from_body=world_from_body.as_quat(canonical=True)
+    )
+
+
+def _turns(world_from_frame: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation vectors from each orientation to the next, in the frame's own axes."""
+    rotation = Rotation.from_quat(world_from_frame)
+    turns: NDArray[np.float64] = (rotation[:-1].inv() * rotation[1:]).as_rotvec()
+    return turns
