@@ -88,7 +88,8 @@ class GraphBuilder:
             self.rejected[rejection.reason.value] += 1
             return rejection.reason
         self.tracks[robot] = track
-        if self.options.keyframe_source == "odometry" and track.reached(self._policy):
+        chooses = self.options.keyframe_source == "odometry" and not self.is_full
+        if chooses and track.reached(self._policy):
             self._add_keyframe_from_odometry(robot, track)
         self._place_all(self.pending.pop_until(robot, stamp_ns))
         self._advance_data_time(stamp_ns)
@@ -101,6 +102,8 @@ class GraphBuilder:
             fingerprint = edge.fingerprint()
             if fingerprint in self.fingerprints:
                 raise RejectedInputError(RejectReason.DUPLICATE_EDGE)
+            if self.graph.num_edges >= self.options.max_edges:
+                raise RejectedInputError(RejectReason.GRAPH_FULL)
         except RejectedInputError as rejection:
             self.rejected[rejection.reason.value] += 1
             return rejection.reason
@@ -112,6 +115,11 @@ class GraphBuilder:
             self._drop(edge, rejection.reason)
             return rejection.reason
         return None
+
+    @property
+    def is_full(self) -> bool:
+        """Whether there may be no more keyframes: edges are tied to those there are, or wait in vain."""
+        return self.graph.num_keyframes >= self.options.max_keyframes
 
     def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
         """Label all edges a sender gave this id, waiting ones and later repetitions included; returns how many."""
@@ -164,6 +172,8 @@ class GraphBuilder:
             elif end.keyframe_id is None and chosen_by_front_end:
                 keyframe_id = stamp_ns
             else:
+                continue
+            if self.is_full and self.graph.node(end.robot, keyframe_id) is None:
                 continue
             self.graph.add_keyframe(end.robot, keyframe_id, stamp_ns)
             self._place_all(self.pending.pop_keyframe(end.robot, keyframe_id))

@@ -44,6 +44,7 @@ class RejectReason(str, Enum):
     DUPLICATE_EDGE = "duplicate_edge"
     PENDING_OVERFLOW = "pending_overflow"
     PENDING_TIMEOUT = "pending_timeout"
+    GRAPH_FULL = "graph_full"
 
 
 class RejectedInputError(Exception):

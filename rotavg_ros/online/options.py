@@ -38,6 +38,7 @@ class EstimatorOptions:
             too and says so.
         time_jump_s: going back by less is no jump; such odometry is out of order.
         max_odometry_samples: per robot; older messages are thinned out beyond it.
+        max_keyframes, max_edges: the graph stops growing there; what odometry still needs comes on top of the edges.
         pending_capacity: edges that may wait at a time.
         pending_timeout_s: how long in data time.
         gauge: of the first keyframe of a component: the ``odometry``'s orientation there, or ``identity``.
@@ -59,6 +60,8 @@ class EstimatorOptions:
     on_time_jump: str = "reset"
     time_jump_s: float = 1.0
     max_odometry_samples: int = 200_000
+    max_keyframes: int = 200_000
+    max_edges: int = 2_000_000
     pending_capacity: int = 20_000
     pending_timeout_s: float = 300.0
     gauge: str = "odometry"
@@ -84,7 +87,7 @@ class EstimatorOptions:
         ):
             if not 0 <= getattr(self, name) < math.inf:
                 raise OptionError(f"{name} is {getattr(self, name)}; it must be finite and not negative")
-        for name in ("max_odometry_samples", "pending_capacity"):
+        for name in ("max_odometry_samples", "max_keyframes", "max_edges", "pending_capacity"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} is {getattr(self, name)}; it must be at least 1")
         if not 0 <= self.outlier_threshold <= 1:

@@ -36,6 +36,7 @@ WHY_REFUSED = {
     RejectReason.DUPLICATE_EDGE: "the same edge came before; it counts once",
     RejectReason.PENDING_OVERFLOW: "too many edges were waiting for their keyframes (pending_capacity)",
     RejectReason.PENDING_TIMEOUT: "an edge waited too long for its keyframe (pending_timeout_s)",
+    RejectReason.GRAPH_FULL: "the graph has as many edges as it may have (max_edges)",
 }
 
 

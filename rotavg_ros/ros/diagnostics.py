@@ -82,6 +82,8 @@ class Reporter:
         if counts.time_is_back:
             errors.append("time went back and odometry is refused since; call ~/reset to begin anew")
         warnings = _warnings(health, parameters, paused, now)
+        if counts.keyframes >= parameters.max_keyframes:
+            warnings.append("the graph is full: no new keyframes (max_keyframes)")
         if health.lost > self._lost:
             warnings.append(f"{health.lost - self._lost} messages lost")
         if dropped > self._dropped:

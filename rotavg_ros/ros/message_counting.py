@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+# Beyond so many, the sender that was silent the longest is forgotten: names come from messages, and may be anything.
+_MOST_SENDERS = 1000
 # A larger step is a sender that restarted or sends nonsense, not that many lost messages.
 _LARGEST_GAP = 1_000_000
 
@@ -33,12 +35,14 @@ class SequenceGaps:
         """
         if number <= 0:
             return
-        last = self._last.get(sender)
+        last = self._last.pop(sender, None)  # and back in at the end
         if last is None:
             self.before_first += number - 1 if number <= _LARGEST_GAP else 0
         elif last < number <= last + _LARGEST_GAP:
             self.lost += number - last - 1
         self._last[sender] = number
+        if len(self._last) > _MOST_SENDERS:
+            del self._last[next(iter(self._last))]
 
 
 class TopicCounter:

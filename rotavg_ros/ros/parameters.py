@@ -126,6 +126,16 @@ class NodeParameters:
     time_jump_s: float = _parameter(
         1.0, "going back by less is no jump; such odometry is refused as out of order", low=0.0, high=1e6, live=True
     )
+    max_keyframes: int = _parameter(
+        200_000,
+        "at so many keyframes the graph stops growing, and the diagnostics warn; odometry goes on from the last one",
+        low=1,
+        high=100_000_000,
+        live=True,
+    )
+    max_edges: int = _parameter(
+        2_000_000, "at so many edges further ones are refused", low=1, high=1_000_000_000, live=True
+    )
     pending_capacity: int = _parameter(
         20_000, "edges that may wait for a keyframe or for odometry; the oldest go first", low=1, high=10_000_000
     )
@@ -215,6 +225,8 @@ class NodeParameters:
             max_stamp_lead_s=self.max_stamp_lead_s,
             on_time_jump=self.on_time_jump,
             time_jump_s=self.time_jump_s,
+            max_keyframes=self.max_keyframes,
+            max_edges=self.max_edges,
             pending_capacity=self.pending_capacity,
             pending_timeout_s=self.pending_timeout_s,
             gauge=self.gauge,
