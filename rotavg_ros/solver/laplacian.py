@@ -1,7 +1,8 @@
 """Weighted graph Laplacians: one sparse factorisation, many right-hand sides.
 
 Residuals are rotations of the world frame, so the three components of a correction share one scalar Laplacian
-``L = Bᵀ W B``, grounded at the roots (one per connected component).
+``L = Bᵀ W B``, grounded at the roots (one per connected component). A solve factorises the same pattern with ever new
+weights, so what depends on the pattern alone is done once: the order of elimination, where each weight goes, and Bᵀ.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from functools import partial
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import coo_array
+from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
 # How much stiffer than its own edges a root is tied to zero.
@@ -22,42 +23,81 @@ _DENSE_SHARE = 0.01
 _DENSE_MAX_NODES = 5000
 
 
-class LaplacianSystem:
-    """``L`` of a weighted graph, factorised.
+class LaplacianPattern:
+    """A graph whose Laplacian is factorised for one choice of weights after another.
 
     Args:
         num_nodes: N.
         source, target: ``(E,)`` ends of the edges.
-        weight: ``(E,)`` positive weights; a node reached by tiny weights alone stays solvable.
         roots: one node of each connected component; their solution is zero.
     """
 
-    def __init__(
-        self, num_nodes: int, source: np.ndarray, target: np.ndarray, weight: np.ndarray, roots: np.ndarray
-    ) -> None:
-        self.num_nodes = num_nodes
-        self.source, self.target, self.weight = source, target, weight
-        degree = np.bincount(source, weight, num_nodes) + np.bincount(target, weight, num_nodes)
-        degree = degree.astype(np.float64)  # bincount counts in integers where there is no edge
-        degree[roots] += _GROUNDING * max(float(weight.max(initial=0.0)), 1.0)
-        diagonal = np.arange(num_nodes)
-        matrix = coo_array(
-            (
-                np.concatenate((-weight, -weight, degree)),
-                (np.concatenate((source, target, diagonal)), np.concatenate((target, source, diagonal))),
-            ),
-            shape=(num_nodes, num_nodes),
+    def __init__(self, num_nodes: int, source: np.ndarray, target: np.ndarray, roots: np.ndarray) -> None:
+        self.num_nodes, self.source, self.target, self.roots = num_nodes, source, target, roots
+        edges = np.arange(len(source))
+        ends, signs = np.concatenate((target, source)), np.repeat([1.0, -1.0], len(source))
+        # Bᵀ, (N, E): parallel edges have columns of their own, so nothing coincides.
+        order = np.argsort(ends, kind="stable")
+        first = np.concatenate(([0], np.cumsum(np.bincount(ends, minlength=num_nodes))))
+        self._incidence = csr_array((signs[order], np.tile(edges, 2)[order], first), shape=(num_nodes, len(source)))
+        # Where each node stands in the order of elimination; unknown until there has been a factorisation.
+        self._rank: np.ndarray | None = None
+        self._lay_out(np.arange(num_nodes))
+
+    def _lay_out(self, rank: np.ndarray) -> None:
+        """Find where weights and degrees go in a matrix in compressed columns, rows and columns ordered by ``rank``."""
+        row, column = rank[np.concatenate((self.source, self.target))], rank[np.concatenate((self.target, self.source))]
+        keys = np.concatenate((column * self.num_nodes + row, rank * (self.num_nodes + 1)))
+        occupied, self._slot = np.unique(keys, return_inverse=True)
+        self._row = (occupied % self.num_nodes).astype(np.int32)
+        self._first = np.searchsorted(occupied, np.arange(self.num_nodes + 1) * self.num_nodes).astype(np.int32)
+
+    def factorize(self, weight: np.ndarray) -> FactorisedLaplacian:
+        """The system with positive weights ``(E,)``; a node reached by tiny weights alone stays solvable."""
+        degree = abs(self._incidence) @ weight
+        degree[self.roots] += _GROUNDING * max(float(weight.max(initial=0.0)), 1.0)
+        values = np.bincount(self._slot, np.concatenate((-weight, -weight, degree)), len(self._row))
+        matrix = csc_array((values, self._row, self._first), shape=(self.num_nodes, self.num_nodes))
+        if len(self.source) > _DENSE_SHARE * self.num_nodes**2 / 2 and self.num_nodes <= _DENSE_MAX_NODES:
+            # Weights that span all of double precision can leave no positive pivot; the sparse factorisation copes.
+            with suppress(np.linalg.LinAlgError):
+                factor = partial(cho_solve, cho_factor(matrix.toarray(), lower=True, overwrite_a=True))
+                return FactorisedLaplacian(self._incidence, weight, factor)
+        return FactorisedLaplacian(self._incidence, weight, self._factorize_sparse(matrix))
+
+    def _factorize_sparse(self, matrix: csc_array) -> Callable[[np.ndarray], np.ndarray]:
+        is_ordered = self._rank is not None
+        factor = splu(
+            matrix,
+            permc_spec="NATURAL" if is_ordered else "MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
         )
-        fills_in = len(source) > _DENSE_SHARE * num_nodes**2 / 2
-        self._solve = _factorize(matrix, dense=fills_in and num_nodes <= _DENSE_MAX_NODES)
+        if self._rank is None:
+            # This one is in the nodes' own order; from the next one on, the matrix is laid out in that of elimination.
+            self._rank = factor.perm_c.astype(np.int64)
+            self._lay_out(self._rank)
+            return factor.solve  # type: ignore[no-any-return]
+        rank = self._rank
+        node = np.argsort(rank)
+        return lambda right_hand_side: factor.solve(right_hand_side[node])[rank]
+
+
+class FactorisedLaplacian:
+    """``L`` for one choice of weights.
+
+    Args:
+        incidence: Bᵀ, ``(N, E)``.
+        weight: ``(E,)``.
+        solve: ``L⁻¹ b`` for ``(N, k)`` columns.
+    """
+
+    def __init__(self, incidence: csr_array, weight: np.ndarray, solve: Callable[[np.ndarray], np.ndarray]) -> None:
+        self._incidence, self.weight, self._solve = incidence, weight, solve
 
     def incidence_sum(self, edge_values: np.ndarray) -> np.ndarray:
         """``Bᵀ x``: at every node the values ``(E, k)`` of edges that end there, less those that start there."""
-        columns = [
-            np.bincount(self.target, column, self.num_nodes) - np.bincount(self.source, column, self.num_nodes)
-            for column in edge_values.T
-        ]
-        return np.stack(columns, axis=1)
+        return np.asarray(self._incidence @ edge_values)
 
     def solve(self, right_hand_side: np.ndarray) -> np.ndarray:
         """``L⁻¹ b`` for ``(N, k)`` columns."""
@@ -76,14 +116,14 @@ class LaplacianSystem:
         return self.solve(self.incidence_sum(np.sqrt(self.weight)[:, None] * signs))
 
 
-def _factorize(matrix: coo_array, dense: bool) -> Callable[[np.ndarray], np.ndarray]:
-    """What solves for right-hand sides."""
-    if dense:
-        # Weights that span all of double precision can leave no positive pivot; the sparse factorisation copes.
-        with suppress(np.linalg.LinAlgError):
-            return partial(cho_solve, cho_factor(matrix.toarray(), lower=True, overwrite_a=True))
-    factor = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return factor.solve  # type: ignore[no-any-return]
+class LaplacianSystem(FactorisedLaplacian):
+    """A graph that is factorised once; the arguments are those of :class:`LaplacianPattern` and the weights."""
+
+    def __init__(
+        self, num_nodes: int, source: np.ndarray, target: np.ndarray, weight: np.ndarray, roots: np.ndarray
+    ) -> None:
+        once = LaplacianPattern(num_nodes, source, target, roots).factorize(weight)
+        super().__init__(once._incidence, weight, once._solve)
 
 
 def probe_signs(first: np.ndarray, second: np.ndarray, num_probes: int) -> np.ndarray:

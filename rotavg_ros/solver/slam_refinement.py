@@ -20,7 +20,7 @@ from rotavg_ros.solver.agreement import AgreementPairs
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.common_error import closure_runs, common_share, variance_factor
 from rotavg_ros.solver.fine_net import edge_residual
-from rotavg_ros.solver.laplacian import LaplacianSystem, probe_signs
+from rotavg_ros.solver.laplacian import LaplacianPattern, probe_signs
 from rotavg_ros.solver.noise_model import NoiseModel, outlier_share
 
 MAX_PASSES = 30
@@ -127,6 +127,7 @@ class _State:
     ) -> None:
         self.graph, self.correction, self.noise = graph, correction, noise
         self.inlier_probability, self.prior_log_odds = inlier_probability, prior_log_odds
+        self.pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots)
         self.probes = probe_signs(graph.nodes[graph.source], graph.nodes[graph.target], _NUM_PROBES)
         self.passes = 0
 
@@ -146,7 +147,7 @@ class _State:
         graph, noise = self.graph, self.noise
         variance = graph.steps * np.where(graph.is_odometry, noise.step_variance, noise.closure_variance)
         weight = np.maximum(self.inlier_probability, 1e-9) / variance
-        system = LaplacianSystem(graph.num_nodes, graph.source, graph.target, weight, graph.roots)
+        system = self.pattern.factorize(weight)
         step = system.fit(_residual_vectors(graph, self.correction))
         self.samples = system.samples(self.probes)
         self.correction = rotations.multiply(self.correction, rotations.exp(torch.from_numpy(step)))
