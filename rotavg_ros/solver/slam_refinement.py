@@ -114,7 +114,6 @@ def refine(
 class _State:
     """The unknowns, and what the last pass saw of them."""
 
-    residual: np.ndarray  # (E, 3) rad
     samples: np.ndarray  # (K, probes)
 
     def __init__(
@@ -129,6 +128,7 @@ class _State:
         self.inlier_probability, self.prior_log_odds = inlier_probability, prior_log_odds
         self.pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots)
         self.probes = probe_signs(graph.nodes[graph.source], graph.nodes[graph.target], _NUM_PROBES)
+        self.residual = _residual_vectors(graph, correction)  # (E, 3) rad
         self.passes = 0
 
     def difference(self, values: np.ndarray) -> np.ndarray:
@@ -148,7 +148,7 @@ class _State:
         variance = graph.steps * np.where(graph.is_odometry, noise.step_variance, noise.closure_variance)
         weight = np.maximum(self.inlier_probability, 1e-9) / variance
         system = self.pattern.factorize(weight)
-        step = system.fit(_residual_vectors(graph, self.correction))
+        step = system.fit(self.residual)
         self.samples = system.samples(self.probes)
         self.correction = rotations.multiply(self.correction, rotations.exp(torch.from_numpy(step)))
         self.residual = _residual_vectors(graph, self.correction)
