@@ -19,6 +19,11 @@ from geometry_msgs.msg import Quaternion
 from nav_msgs.msg import Odometry
 from rotavg_msgs.msg import KeyframeReference, RelativeRotation, RelativeRotationArray
 
+from rotavg_ros.inputs import Source
+from rotavg_ros.inputs.rotavg import edge_from_message
+from rotavg_ros.online import Answer, OnlineEstimator
+from rotavg_ros.ros.parameters import NodeParameters
+
 pytestmark = pytest.mark.ros
 
 NODE = Path(sys.executable).with_name("rotavg_node")
@@ -105,28 +110,79 @@ def feed_good(live_node, start: int, stop: int) -> None:
             live_node.edges.publish(closure(index, index - 20, index))
 
 
-def test_malformed_edges_are_counted_by_reason_and_change_nothing(live_node) -> None:
-    live_node.start(*EVERY_MESSAGE)
-    feed_good(live_node, 0, LENGTH)
-    before = live_node.wait_for_silence()
-    flags = live_node.flags[-1]
+def malformed_odometry(kind: str, draw: random.Random) -> Odometry:
+    """Odometry that goes on from nothing, for one reason or another."""
+    message = odometry(draw.randrange(LENGTH))
+    quaternion = message.pose.pose.orientation
+    if kind == "nan_rotation":
+        setattr(quaternion, draw.choice("xyzw"), draw.choice((NAN, INF)))
+    elif kind == "zero_quaternion":
+        message.pose.pose.orientation = Quaternion(w=0.0)
+    elif kind == "unnormalized_quaternion":
+        quaternion.y += 2.0
+    elif kind == "bad_stamp":
+        message.header.stamp = draw.choice((Time(sec=-5), Time(sec=1010, nanosec=2**32 - 1)))
+    elif kind == "out_of_order_odometry":
+        message.header.stamp = Time(sec=draw.randrange(1, 999))
+    elif kind == "future_stamp":
+        message.header.stamp = Time(sec=draw.randrange(10**6, 2**31))
+    return message
+
+
+ODOMETRY_KINDS = (
+    *("nan_rotation", "zero_quaternion", "unnormalized_quaternion", "bad_stamp"),
+    *("out_of_order_odometry", "future_stamp"),
+)
+
+
+def answer_to_good_stream() -> Answer:
+    """What comes of :func:`feed_good` alone, in this process."""
+    every_message = NodeParameters().changed({"keyframe_angle_deg": 0.0, "keyframe_distance_m": 0.0})
+    online = OnlineEstimator(every_message.estimator_options())
+    for index in range(LENGTH):
+        online.add_odometry("robot", (1000 + index) * 10**9, rotation(index).as_quat().tolist())
+        if index >= 20:
+            assert online.add_edge(edge_from_message(closure(index, index - 20, index), Source("robot"))) is None
+    answer = online.tick(force_cold=True)
+    assert answer is not None
+    return answer
+
+
+def test_ten_thousand_malformed_messages_are_counted_by_reason_and_change_nothing(live_node) -> None:
+    """Mixed into a good stream, on every topic."""
+    live_node.start(*EVERY_MESSAGE, "pending_capacity:=1000")
     draw = random.Random(5)
-    per_kind = 100
-    kinds = [kind for kind in KINDS for _ in range(per_kind)]
-    draw.shuffle(kinds)
-    edges = [malformed(kind, draw) for kind in kinds]
-    live_node.arrays.publish(RelativeRotationArray(edges=edges[::2]))
-    for edge in edges[1::2]:
-        live_node.edges.publish(edge)
-    live_node.spin_until(lambda: live_node.status.get("dropped") == str(len(edges)))
-    assert {key: value for key, value in live_node.status.items() if key.startswith("dropped ")} == {
-        f"dropped {kind}": str(per_kind) for kind in KINDS
-    }
-    live_node.spin_for(0.5)
-    assert live_node.answers[-1] == before and live_node.flags[-1] == flags
-    # Still alive, and what is good still gets in.
-    feed_good(live_node, LENGTH, LENGTH + 5)
-    assert len(live_node.wait_for_silence().keyframe_ids) == LENGTH + 5
+    per_kind = 1000
+    edges = [malformed(kind, draw) for kind in KINDS for _ in range(per_kind)]
+    ghosts = [closure(10**9 + index, 0, 1) for index in range(500)]  # they wait for what never comes
+    for index, edge in enumerate(ghosts):
+        edge.target = KeyframeReference(robot=f"ghost {index}" if index % 2 else "", id=2**64 - 2 - index)
+    edges += ghosts
+    draw.shuffle(edges)
+    broken = [malformed_odometry(draw.choice(ODOMETRY_KINDS), draw) for _ in range(500)]
+    rounds = 100
+    for number in range(rounds):
+        if number < LENGTH:
+            feed_good(live_node, number, number + 1)
+        some = edges[number::rounds]
+        live_node.arrays.publish(RelativeRotationArray(edges=some[::2]))
+        for edge in some[1::2]:
+            live_node.edges.publish(edge)
+        for message in broken[number::rounds]:
+            live_node.odometry.publish(message)
+        live_node.spin_for(0.01)
+    live_node.spin_until(lambda: live_node.status.get("dropped") == str(len(KINDS) * per_kind + len(broken)))
+    assert live_node.status["pending"] == str(len(ghosts)) and live_node.status["time jumps"] == "0"
+    counted = {key: int(value) for key, value in live_node.status.items() if key.startswith("dropped ")}
+    assert all(counted[f"dropped {kind}"] == per_kind for kind in set(KINDS) - set(ODOMETRY_KINDS))
+    of_odometry = {kind: counted[f"dropped {kind}"] - per_kind * (kind in KINDS) for kind in ODOMETRY_KINDS}
+    assert sum(of_odometry.values()) == len(broken) and min(of_odometry.values()) > 0
+
+    answer, expected = live_node.wait_for_silence(), answer_to_good_stream()
+    assert list(answer.keyframe_ids) == expected.keyframe_id.tolist()
+    assert sorted(live_node.flags[-1].edge_ids) == sorted(expected.edge_id.tolist())
+    np.testing.assert_allclose(np.reshape(answer.orientations, (-1, 4)), expected.world_from_body, atol=1e-6)
+    assert "Traceback" not in live_node.process.output
 
 
 def test_malformed_odometry_is_counted_and_changes_nothing(live_node) -> None:
