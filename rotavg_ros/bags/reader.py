@@ -166,14 +166,22 @@ class BagReader:
         if not connections:
             return
         records = self._open().messages(connections, start_ns, stop_ns)
+        count, expected = 0, sum(connection.msgcount for connection in connections)
         while True:
             try:
                 record = next(records)
             except StopIteration:
-                return
+                break
             except Exception as error:
                 raise self._unreadable(error) from None
+            count += 1
             yield record
+        if start_ns is None and stop_ns is None and count < expected:
+            # Garbled records may pass for ones of a kind that readers have to skip.
+            raise BagReadError(
+                f"{self._path}: the bag is damaged: only {count} of {expected} messages can be read; `ros2 bag convert` "
+                "may save what is left"
+            )
 
     def _open(self) -> AnyReader:
         assert self._reader is not None, "use the reader in a with statement"

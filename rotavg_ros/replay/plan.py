@@ -80,6 +80,8 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
         PlanError: a topic that is not in the bag, or whose type nothing can be made of.
         ParameterError: parameters that do not fit together.
     """
+    if bag.num_messages() == 0:
+        raise PlanError(f"{bag.path}: has no messages; there is nothing to replay")
     found = find_candidates(bag)
     odometry = _odometry(bag, found, wishes.odometry or values.get("odometry_topics"))
     edges = _edges(bag, found, wishes.edges or values.get("edge_topics"))

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rotavg_ros.bags.reader import BagReader, BagReadError
+from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.errors import UserError
 from rotavg_ros.inputs import OdometryRecord
 from rotavg_ros.online import Answer, OnlineEstimator
@@ -22,6 +22,7 @@ from rotavg_ros.replay.record import TickRecord
 from rotavg_ros.replay.recording import Recording
 
 _NANOSECONDS = 1_000_000_000
+_NAP_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -104,10 +105,12 @@ def replay(
         loop = _Loop(estimator, plan.parameters.solve_period_s, recorder)
         feed = Feed(estimator, plan, read_translations(bag, plan, start_ns, stop_ns), loop.on_odometry)
         end_ns, interrupted = start_ns, False
-        for topic, time_ns, message in bag.decoded(feed.topics, start_ns, stop_ns):
+        is_whole = start_ns == bag.start_ns and stop_ns == bag.end_ns
+        for topic, time_ns, message in bag.decoded(feed.topics, *((None, None) if is_whole else (start_ns, stop_ns))):
+            if window.rate > 0:
+                _wait_until(started + (time_ns - start_ns) / _NANOSECONDS / window.rate, stop)
             if interrupted := stop():
                 break
-            _wait(window.rate, (time_ns - start_ns) / _NANOSECONDS, started)
             loop.advance(time_ns)
             feed(topic, message)
             progress((time_ns - end_ns) / _NANOSECONDS)
@@ -204,9 +207,7 @@ class _Loop:
 
 
 def _bounds(bag: BagReader, window: Window) -> tuple[int, int]:
-    """First moment to replay and the one after the last."""
-    if bag.num_messages() == 0:
-        raise BagReadError(f"{bag.path}: has no messages; there is nothing to replay")
+    """First moment to replay and the one after the last. The bag has messages."""
     start_ns = bag.start_ns + round(window.start_s * _NANOSECONDS)
     if start_ns >= bag.end_ns:
         raise ReplayError(
@@ -218,9 +219,10 @@ def _bounds(bag: BagReader, window: Window) -> tuple[int, int]:
     return start_ns, stop_ns
 
 
-def _wait(rate: float, bag_seconds: float, started: float) -> None:
-    if rate > 0:
-        time.sleep(max(0.0, bag_seconds / rate - (time.perf_counter() - started)))
+def _wait_until(moment: float, stop: Callable[[], bool]) -> None:
+    """Sleep until a time of ``perf_counter``, in naps after which the user may have had enough."""
+    while (left := moment - time.perf_counter()) > 0 and not stop():
+        time.sleep(min(left, _NAP_S))
 
 
 def _why_nothing(plan: Plan, rejected: dict[str, int]) -> str:

@@ -1,0 +1,204 @@
+"""What users get wrong: one line, exit code 2, and no half-written file."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rotavg_ros.bags.message_types import ODOMETRY, VECTOR
+from rotavg_ros.bags.messages import odometry_message, vector_message
+from rotavg_ros.bags.writer import BagWriter
+from rotavg_ros.cli.main import main
+
+ROTAVG = [sys.executable, "-m", "rotavg_ros.cli.main"]
+
+
+def make_bag(folder: Path, count: int = 50, topic: str = "/odom", period_ns: int = 100_000_000) -> Path:
+    """Odometry that drives straight on, and a topic of vectors."""
+    with BagWriter(folder) as bag:
+        bag.add_topic(topic, ODOMETRY)
+        bag.add_topic("/wind", VECTOR)
+        for index in range(count):
+            stamp = 10**9 + index * period_ns
+            pose = np.array([0.1 * index, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0])
+            bag.write(topic, stamp, odometry_message(stamp, *pose, "odom"))
+            bag.write("/wind", stamp, vector_message(stamp, np.ones(3), "map"))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_bag(tmp_path_factory.mktemp("small") / "small")
+
+
+def truncated(folder: Path, small: Path) -> Path:
+    content = (small / "small.mcap").read_bytes()
+    (folder / "cut.mcap").write_bytes(content[: len(content) // 2])
+    return folder / "cut.mcap"
+
+
+def corrupted(folder: Path, small: Path) -> Path:
+    content = bytearray((small / "small.mcap").read_bytes())
+    middle = len(content) // 3
+    content[middle : middle + 400] = bytes(range(200)) * 2
+    (folder / "bad.mcap").write_bytes(content)
+    return folder / "bad.mcap"
+
+
+def zero_length(folder: Path, small: Path) -> Path:
+    (folder / "zero.mcap").touch()
+    return folder / "zero.mcap"
+
+
+def without_messages(folder: Path, small: Path) -> Path:
+    return make_bag(folder / "none", count=0)
+
+
+def without_odometry(folder: Path, small: Path) -> Path:
+    with BagWriter(folder / "wind") as bag:
+        bag.add_topic("/wind", VECTOR)
+        bag.write("/wind", 10**9, vector_message(10**9, np.ones(3), "map"))
+    return folder / "wind"
+
+
+def unknown_compression(folder: Path, small: Path) -> Path:
+    content = (small / "metadata.yaml").read_text()
+    (folder / "small").mkdir()
+    (folder / "small" / "small.mcap").write_bytes((small / "small.mcap").read_bytes())
+    changed = content.replace("compression_format: ''", "compression_format: brotli")
+    changed = changed.replace("compression_mode: ''", "compression_mode: file")
+    (folder / "small" / "metadata.yaml").write_text(changed)
+    return folder / "small"
+
+
+@pytest.mark.parametrize(
+    ("broken", "says"),
+    [
+        (truncated, "not a readable bag, or a truncated one"),
+        (corrupted, "the bag is damaged: only "),
+        (zero_length, "not a readable bag, or a truncated one"),
+        (without_messages, "has no messages"),
+        (without_odometry, "its topics: /wind (geometry_msgs/msg/Vector3Stamped)"),
+        (unknown_compression, "brotli"),
+    ],
+)
+def test_a_bag_that_cannot_be_replayed(
+    tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str], broken: Callable[[Path, Path], Path], says: str
+) -> None:
+    bag = broken(tmp_path, small)
+    assert main(["replay", str(bag), "--output", str(tmp_path / "out"), "--no-report"]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.startswith("rotavg: error: ")
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--odometry", "/odometry"], "no topic /odometry; candidates for odometry: /odom"),
+        (["--odometry", "/wind"], "/wind is geometry_msgs/msg/Vector3Stamped, of which no odometry can be made"),
+        (["--edges", "/loops"], "no topic /loops; candidates for relative rotations: none"),
+        (["--reference", "truth.tum"], "no topic /truth.tum; candidates for a reference"),
+        (["--odometry", "none"], "nothing to replay"),
+        (["--start", "100"], "lasts 4.9 s"),
+        (["--start", "-1"], "must be 0 or more"),
+        (["-p", "keyframe_angel_deg:=3.0"], "did you mean keyframe_angle_deg?"),
+        (["-p", "keyframe_angle_deg:=wide"], "must be a float"),
+        (["-p", "keyframe_angle_deg"], "write name:=value"),
+        (["-p", "profile:=slow"], "profile is 'slow'"),
+        (["-p", "method:=magic"], "magic"),
+        (["--params", "nothing.yaml"], "nothing.yaml: cannot be read: No such file"),
+        (["--robots", "a", "b"], "give one robot per topic"),
+    ],
+)
+def test_options_that_cannot_be(
+    tmp_path: Path,
+    small: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    options: list[str],
+    says: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["replay", str(small), "--output", "out", "--no-report", *options]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_output_that_exists_is_refused_and_then_replaced(
+    tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["replay", str(small), "--output", str(tmp_path / "out")]
+    assert main(arguments) == 0
+    mine = tmp_path / "out" / "notes.txt"
+    mine.write_text("by hand")
+    assert main(arguments) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert main([*arguments, "--overwrite", "--no-report"]) == 0
+    names = {path.name for path in mine.parent.iterdir()}
+    assert "notes.txt" in names
+    assert "report.html" not in names  # of the older replay
+    (tmp_path / "file").touch()
+    assert main(["replay", str(small), "--output", str(tmp_path / "file"), "--overwrite"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("1 2 3\n", "3 columns; expected TUM"),
+        ("", "the file has no rows"),
+        ("900.0 0 0 0 0 0 0 1\n901.0 0 0 0 0 0 0 1\n", "do not overlap the bag's"),
+        ("1.5 0 0 0 0 0 0 9\n", "a quaternion of length 9"),
+        ("2.0 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n", ":2: a stamp that is not after the one before"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "3 poses without stamps, but 50 odometry messages"),
+    ],
+)
+def test_a_reference_of_another_kind(
+    tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str], content: str, says: str
+) -> None:
+    truth = tmp_path / "truth.txt"
+    truth.write_text(content)
+    output = ["--output", str(tmp_path / "out"), "--no-report"]
+    assert main(["replay", str(small), *output, "--reference", str(truth)]) == 2
+    error = capsys.readouterr().err
+    assert f"{truth}" in error
+    assert says in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_space_left(tmp_path: Path, small: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("rotavg_ros.replay.outputs.write_csv", full)
+    assert main(["replay", str(small), "--output", str(tmp_path / "out"), "--no-report"]) == 2
+    assert "cannot be written: No space left on device" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_ctrl_c_keeps_what_is_done(tmp_path: Path, small: Path) -> None:
+    output = tmp_path / "out"
+    command = [*ROTAVG, "replay", str(small), "--output", str(output), "--rate", "0.05", "--no-report"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while not list(output.glob(".unfinished*/.run.unfinished")):  # the recording has begun
+        assert process.poll() is None, process.stderr
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    told, complaints = process.communicate(timeout=60)
+    assert process.returncode == 0, complaints
+    assert "interrupted after" in told
+    assert {path.name for path in output.iterdir()} >= {"run.mcap", "summary.json", "trajectory.tum"}
+    assert not list(output.glob(".unfinished*"))

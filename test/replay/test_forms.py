@@ -1,0 +1,91 @@
+"""The same bag in other forms, and others' packages: the same answer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.bags.reader import BagReader
+from rotavg_ros.cli.main import main
+
+from .bag_forms import FORMS, foreign_typestore
+
+SHORT = ["--no-report", "--answers", "1", "-p", "solve_period_s:=1000.0", "--duration", "120"]
+CSV = ("orientations.csv", "edges.csv", "trajectory.tum")
+
+
+@pytest.fixture(scope="session")
+def expected(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("forms") / "expected"
+    assert main(["replay", str(bag), "--output", str(output), *SHORT]) == 0
+    return output
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_of_a_bag_gives_the_same_answer(bag: Path, expected: Path, tmp_path: Path, form: str) -> None:
+    copy = FORMS[form](bag, tmp_path)
+    assert main(["replay", str(copy), "--output", str(tmp_path / "answer"), *SHORT]) == 0
+    for name in CSV:
+        assert (tmp_path / "answer" / name).read_bytes() == (expected / name).read_bytes()
+
+
+def test_a_package_that_is_not_installed_is_decoded_by_the_bags_definitions(tmp_path: Path) -> None:
+    """Kimera's graph of a square that closes: with its translations, and a closure that its sender has rejected."""
+    package = "pose_graph_tools_msgs"
+    store = foreign_typestore(package)
+    graph = square_in_the_words_of(store)
+    with Writer(tmp_path / "kimera", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        kind = f"{package}/msg/PoseGraph"
+        connection = writer.add_connection("/kimera/pose_graph", kind, typestore=store)
+        writer.write(connection, 10**9, store.serialize_cdr(graph, kind))
+    with BagReader(tmp_path / "kimera") as reader:
+        assert reader.topics == {"/kimera/pose_graph": kind}
+    assert main(["replay", str(tmp_path / "kimera"), "--output", str(tmp_path / "out"), "--no-report"]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["keyframes"], summary["edges"], summary["outliers"]) == (4, 5, 1)
+    corners = np.loadtxt(tmp_path / "out" / "trajectory.tum")
+    np.testing.assert_allclose(corners[:, 1:4], [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], atol=1e-5)
+
+
+def square_in_the_words_of(store):
+    """A ``pose_graph_tools_msgs/PoseGraph``."""
+    types = store.types
+
+    def header(corner: int):
+        stamp = types["builtin_interfaces/msg/Time"](sec=100 + corner, nanosec=0)
+        return types["std_msgs/msg/Header"](stamp=stamp, frame_id="world")
+
+    def pose(position: list[float], heading_deg: float):
+        x, y, z, w = Rotation.from_euler("z", heading_deg, degrees=True).as_quat()
+        return types["geometry_msgs/msg/Pose"](
+            position=types["geometry_msgs/msg/Point"](*position),
+            orientation=types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w),
+        )
+
+    def edge(source: int, target: int, kind: int, heading_deg: float):
+        return types["pose_graph_tools_msgs/msg/PoseGraphEdge"](
+            header=header(target),
+            key_from=source,
+            key_to=target,
+            robot_from=0,
+            robot_to=0,
+            type=kind,
+            pose=pose([1.0, 0.0, 0.0], heading_deg),
+            covariance=np.eye(6).ravel() * 1e-4,
+        )
+
+    nodes = [
+        types["pose_graph_tools_msgs/msg/PoseGraphNode"](
+            header=header(corner), robot_id=0, key=corner, pose=pose([0.0] * 3, 0.0)
+        )
+        for corner in range(4)
+    ]
+    odometry = [edge(corner, corner + 1, 0, 90.0) for corner in range(3)]
+    return types["pose_graph_tools_msgs/msg/PoseGraph"](
+        header=header(3), nodes=nodes, edges=[*odometry, edge(3, 0, 1, 90.0), edge(0, 2, 3, 5.0)]
+    )
