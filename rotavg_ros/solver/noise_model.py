@@ -28,6 +28,12 @@ _EM_STARTS_CLOSURE_DEG = (0.3, 2.0)
 _EM_THINNED = (1000, 5000)
 _EM_ITERATIONS = 60
 _EM_TOLERANCE = 1e-3
+# The likelihood hardly knows a small graph's drift, and closures that err in the tails look like drift. Of all step
+# variances that are less likely by no more than this, down to a share of the likeliest, the least is taken: odometry
+# that is trusted too far costs a few good closures until more of them come, a false closure believed bends the map.
+_STEP_DOUBT = 5.0
+_STEP_DOUBT_SHARES = np.array([0.85, 0.7, 0.55, 0.47, 0.4]) ** 2
+_DOUBT_ITERATIONS = 8
 
 
 @dataclass(frozen=True)
@@ -125,6 +131,8 @@ def discrepancies(squared_angle: np.ndarray, path_steps: np.ndarray, pairs: Agre
 def estimate_noise(data: Discrepancies, components: int) -> NoiseModel:
     """Two variances and an outlier share by expectation–maximisation from several starts; the likeliest is kept.
 
+    Of the step variance, the lower end of what is nearly as likely.
+
     A discrepancy is Gaussian with variance ``steps · step_variance + closures · closure_variance`` or uniform. The
     closures' own agreement holds the estimate up where odometry has drifted past recognition or most closures are
     false; their discrepancy with the chain separates the two variances.
@@ -138,11 +146,25 @@ def estimate_noise(data: Discrepancies, components: int) -> NoiseModel:
         for closure in _EM_STARTS_CLOSURE_DEG
     ]
     best = max(starts, key=lambda start: start[0])[1]
-    return _maximise(data.thinned(_EM_THINNED[1]), best, _EM_ITERATIONS)[1]
+    likeliest = _maximise(data.thinned(_EM_THINNED[1]), best, _EM_ITERATIONS)[1]
+    return _least_drift(few, likeliest)
 
 
-def _maximise(data: Discrepancies, model: NoiseModel, iterations: int) -> tuple[float, NoiseModel]:
-    """EM from ``model``; returns the log-likelihood and the last model."""
+def _least_drift(data: Discrepancies, likeliest: NoiseModel) -> NoiseModel:
+    """The model of least step variance that is nearly as likely as the likeliest."""
+    profile = [_maximise(data, likeliest, _DOUBT_ITERATIONS, hold_step=True)]
+    for share in _STEP_DOUBT_SHARES:
+        start = replace(profile[-1][1], step_variance=share * likeliest.step_variance)
+        profile.append(_maximise(data, start, _DOUBT_ITERATIONS, hold_step=True))
+    bar = max(likelihood for likelihood, _ in profile) - _STEP_DOUBT
+    least = [model for likelihood, model in profile if likelihood >= bar][-1]
+    return likeliest if least is profile[0][1] else least
+
+
+def _maximise(
+    data: Discrepancies, model: NoiseModel, iterations: int, *, hold_step: bool = False
+) -> tuple[float, NoiseModel]:
+    """EM from ``model``, on request with its step variance; returns the log-likelihood and the last model."""
     uniform = log_uniform_density(np.sqrt(data.squared_angle), model.components)
     k = model.components
     shares = np.array([model.outlier_share, 0.7])
@@ -165,9 +187,10 @@ def _maximise(data: Discrepancies, model: NoiseModel, iterations: int) -> tuple[
         bad = np.bincount(data.kind, data.weight - good, 2)
         total = np.bincount(data.kind, data.weight, 2)
         shares = np.clip((bad + 1) / (total + 2), 0.005, 0.995)
+        step_variance = float((good * step_square / data.steps).sum() + _PRIOR_STEP_SQUARE) / observations
         model = NoiseModel(
             k,
-            float((good * step_square / data.steps).sum() + _PRIOR_STEP_SQUARE) / observations,
+            model.step_variance if hold_step else step_variance,
             float((good * closure_square / data.closures).sum() + _PRIOR_CLOSURE_SQUARE) / observations,
             float(shares[0]),
         )
