@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Quaternion
+from geometry_msgs.msg import Quaternion, QuaternionStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rotavg_msgs.msg import AbsoluteOrientations, KeyframeReference, RelativeRotation, RelativeRotationArray
@@ -254,3 +254,17 @@ def test_several_robots_keep_apart_until_they_meet(live_node) -> None:
         atol=1e-9,
     )
     assert "a and b are joined (all one)" in live_node.process.output
+    # What the robots steer by is in one frame from the next message on.
+    heard: dict[str, list[QuaternionStamped]] = {"a": [], "b": []}
+    for robot, messages in heard.items():
+        live_node.probe.create_subscription(QuaternionStamped, f"/{robot}/orientation", messages.append, 10)
+    live_node.spin_until(lambda: all(live_node.probe.count_publishers(f"/{robot}/orientation") for robot in heard))
+    live_node.spin_for(0.5)
+    live_node.odometry.publish(odometry(20))
+    second.publish(odometry(20, Rotation.from_euler("z", 60.0, degrees=True)))
+    live_node.spin_until(lambda: all(heard.values()))
+    a, b = (Rotation.from_quat([q.x, q.y, q.z, q.w]) for q in (messages[-1].quaternion for messages in heard.values()))
+    expected = (
+        drifting(20).inv() * drifting(5) * (truth(5).inv() * truth(6)) * Rotation.from_euler("z", 42, degrees=True)
+    )
+    assert np.degrees(((a.inv() * b).inv() * expected).magnitude()) < 0.01
