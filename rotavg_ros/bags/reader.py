@@ -179,8 +179,8 @@ class BagReader:
         if start_ns is None and stop_ns is None and count < expected:
             # Garbled records may pass for ones of a kind that readers have to skip.
             raise BagReadError(
-                f"{self._path}: the bag is damaged: only {count} of {expected} messages can be read; `ros2 bag convert` "
-                "may save what is left"
+                f"{self._path}: the bag is damaged: only {count} of {expected} messages can be read; "
+                "`ros2 bag convert` may save them"
             )
 
     def _open(self) -> AnyReader:

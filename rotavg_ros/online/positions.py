@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.solver.laplacian import LaplacianSystem
+from rotavg_ros.solver.laplacian import LaplacianPattern
 
 # A closure is worth as much as this many typical steps of odometry in a row.
 _CLOSURE_STEPS = 30.0
@@ -62,8 +62,10 @@ def fit_positions(
     typical = _typical(length[is_odometry] if is_odometry.any() else length)
     weight = np.where(is_odometry, typical / np.maximum(length, _SHORTEST_STEP * typical), trust / _CLOSURE_STEPS)
 
+    pattern = LaplacianPattern(num_nodes, source, target, roots)
+
     def solve(share: NDArray[np.float64]) -> NDArray[np.float64]:
-        return LaplacianSystem(num_nodes, source, target, weight * share, roots).fit(step)
+        return pattern.factorize(weight * share).fit(step)
 
     position = solve(np.where(is_odometry, 1.0, _NEXT_TO_NOTHING))
     if not is_odometry.all():
