@@ -4,7 +4,7 @@
 
 Eight processes on this machine: three robots that drive, their three nodes in the namespaces /a, /b and /c, the node
 /fleet, and this one, which looks on. Half-way the robots begin to recognise each other's places, a fifth of the time
-wrongly, and the fleet's three components become one. See docs/multi_robot.md for the same over several machines.
+wrongly, and the fleet's three components become one. See docs/multi-robot.md for the same over several machines.
 """
 
 from __future__ import annotations
