@@ -13,13 +13,15 @@ class Method:
         clean: CleanNet rectifies and scores the edges.
         fine_tunings: how often FineNet corrects the orientations.
         refine: refinement ends the solve.
-        weighted: refinement weighs the edges by CleanNet's scores.
+        weighted: refinement begins by weighing the edges by CleanNet's scores.
+        shaped: refinement ends in steps that know the noise's shape; otherwise it is Chatterjee & Govindu's.
     """
 
     clean: bool = False
     fine_tunings: int = 0
     refine: bool = False
     weighted: bool = True
+    shaped: bool = True
 
 
 NETWORK_METHODS = {
@@ -29,10 +31,12 @@ NETWORK_METHODS = {
     "cleannet-spt": Method(clean=True),
     "spt-finenet": Method(fine_tunings=1),
     "spt": Method(),
-    # Ablations: what each network earns.
+    # Ablations: what each network and the noise's shape earn.
     "neurora-unweighted": Method(clean=True, fine_tunings=1, refine=True, weighted=False),
     "neurora-without-finenet": Method(clean=True, refine=True),
     "neurora-without-cleannet": Method(fine_tunings=1, refine=True),
+    "neurora-without-both": Method(refine=True),
+    "neurora-round": Method(clean=True, fine_tunings=1, refine=True, shaped=False),
 }
 # By name only: they build on the solver, so that they are imported when one of them runs.
 BASELINES = ("chatterjee", "weiszfeld", "arrigoni", "wang")

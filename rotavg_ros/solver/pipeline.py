@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.errors import UserError
-from rotavg_ros.solver import devices, refinement, sfm_stages, slam_refinement, slam_stages
+from rotavg_ros.solver import devices, refinement, sfm_refinement, sfm_stages, slam_refinement, slam_stages
 from rotavg_ros.solver.devices import DEVICES
 from rotavg_ros.solver.methods import BASELINES, METHODS, NETWORK_METHODS, Method
 from rotavg_ros.solver.network_store import load_network
@@ -210,14 +210,27 @@ def _solve_sfm(
     for _ in range(method.fine_tunings):
         with watch.stage("fine-tune"):
             orientations = sfm_stages.fine_tune(networks.load("sfm-fine-net"), cleaned, orientations)
-    steps = (refinement.DEFAULT_STEPS if method.refine else 0) if refinement_steps is None else refinement_steps
+    default_steps = sfm_refinement.MAX_STEPS if method.shaped else refinement.DEFAULT_STEPS
+    steps = (default_steps if method.refine else 0) if refinement_steps is None else refinement_steps
     if steps > 0:
         with watch.stage("refine"):
-            verdicts = cleaned if method.weighted else sfm_stages.apply_labels(sfm_stages.trust_all(graph), graph.label)
-            weight = 1 - verdicts.outlier_probability
-            orientations = refinement.refine(
-                graph, orientations, weight, roots, steps, component=component, edges=cleaned.edges
-            )
+            labelled = 1 - sfm_stages.apply_labels(sfm_stages.trust_all(graph), graph.label).outlier_probability
+            weight = 1 - cleaned.outlier_probability if method.weighted else labelled
+            if method.shaped:
+                orientations = sfm_refinement.refine(
+                    graph,
+                    orientations,
+                    roots,
+                    steps,
+                    prior_weight=labelled,
+                    coarse_weight=weight,
+                    component=component,
+                    edges=cleaned.edges,
+                )
+            else:
+                orientations = refinement.refine(
+                    graph, orientations, weight, roots, steps, component=component, edges=cleaned.edges
+                )
     score = sfm_stages.outlier_score(graph, cleaned, orientations, component, refined=steps > 0)
     return _Estimate(orientations, score, torch.full((graph.num_nodes,), torch.nan))
 

@@ -26,8 +26,8 @@ SCORE_SCALE = 0.41
 _MIN_UNCERTAINTY = np.radians(0.01)
 # The noise that makes an edge an outlier.
 OUTLIER_ANGLE = np.radians(20.0)
-# Cost of an edge in the tree (the authors' released code).
-_INLIER_COST, _OUTLIER_COST = 0.1, 1.1
+# Cost of an edge in the tree, and what a certain outlier costs besides (the authors' released code, between the two).
+_EDGE_COST, _OUTLIER_COST = 0.1, 1.0
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def bootstrap(cleaned: Cleaned, component: Tensor | None = None) -> tuple[Tensor
         component: ``(N,)`` the graph's connected components; default: computed.
     """
     component = cleaned.graph.components() if component is None else component
-    cost = torch.where(cleaned.is_inlier, _INLIER_COST, _OUTLIER_COST)
+    cost = _EDGE_COST + _OUTLIER_COST * cleaned.outlier_probability
     if cleaned.graph.device.type == "cpu":
         forest = shortest_path_forest(cleaned.graph, cost, edges=cleaned.edges, component=component)
         return compose_orientations(forest, cleaned.graph), torch.from_numpy(forest.roots)

@@ -31,6 +31,7 @@ class TrainingConfig:
         batch_graphs: graphs per step, joined into one disjoint graph.
         learning_rate, weight_decay: of Adam; the rate falls to zero along a cosine.
         edge_dropout: share of each graph's edges left out anew in every epoch.
+        passes: FineNet: how often it is applied in a row, as NeuRoRA-v2 does; every pass counts in the loss.
         seed: of data, initial weights and order.
     """
 
@@ -45,6 +46,7 @@ class TrainingConfig:
     learning_rate: float = 5e-5
     weight_decay: float = 1e-4
     edge_dropout: float = 0.25
+    passes: int = 1
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -55,7 +57,7 @@ class TrainingConfig:
             raise TrainingConfigError(
                 f"recipe is {self.recipe!r}; the family {self.family} has {', '.join(recipes[self.family])}"
             )
-        for name in ("graphs", "validation_graphs", "epochs", "batch_graphs"):
+        for name in ("graphs", "validation_graphs", "epochs", "batch_graphs", "passes"):
             if getattr(self, name) < 1:
                 raise TrainingConfigError(f"{name} is {getattr(self, name)}; it must be at least 1")
         for name in ("nodes", "validation_nodes"):

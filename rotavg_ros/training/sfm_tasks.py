@@ -105,26 +105,33 @@ class SfmFineTask(_SfmTask):
 
     def batches(self, rng: np.random.Generator) -> Iterator[dict[str, Tensor]]:
         for batch in self._joined_batches(rng):
-            fine, start, edges = self._forward(batch.to(self.device))
+            passes, start, edges = self._forward(batch.to(self.device))
             truth = _align(batch, start).to(self.device)
-            yield fine_net_loss(fine, truth, batch.source.to(self.device), batch.target.to(self.device), edges)
+            source, target = batch.source.to(self.device), batch.target.to(self.device)
+            terms = [fine_net_loss(fine.float(), truth, source, target, edges) for fine in passes]
+            yield {key: torch.stack([of_pass[key] for of_pass in terms]).mean() for key in terms[0]}
 
-    def _forward(self, batch: SfmBatch) -> tuple[Tensor, Tensor, DirectedEdges]:
+    def _forward(self, batch: SfmBatch) -> tuple[list[Tensor], Tensor, DirectedEdges]:
+        """Orientations after every pass, and the tree's."""
         graph = ViewGraph.create(batch.source, batch.target, batch.measured.double(), num_nodes=len(batch.truth))
         with torch.no_grad():
             cleaned = clean(self.clean_net, graph)
             start, _ = bootstrap(cleaned)
-        return fine_tune(self.network, cleaned, start.to(self.device)).float(), start.cpu(), batch.edges
+        fine, passes = start.to(self.device), []
+        for _ in range(self.config.passes):
+            fine = fine_tune(self.network, cleaned, fine)
+            passes.append(fine)
+        return passes, start.cpu(), batch.edges
 
     def validate(self) -> dict[str, float]:
         rows = []
         for graph in self.validation:
             batch = join([graph])
-            fine, start, _ = self._forward(batch.to(self.device))
-            truth = graph.body_from_world
-            errors = [torch.rad2deg(orientation_errors(x, truth)) for x in (start, fine.cpu())]
-            distance = quaternion_distance(fine.cpu(), _align(batch, fine.cpu().double())).mean()
-            rows.append([float(distance), *(float(f(e)) for e in errors for f in (torch.mean, torch.median))])
+            passes, start, _ = self._forward(batch.to(self.device))
+            errors = [torch.rad2deg(orientation_errors(x.cpu(), graph.body_from_world)) for x in (start, passes[-1])]
+            distance = [quaternion_distance(x.cpu(), _align(batch, x.cpu().double())).mean() for x in passes]
+            objective = float(torch.stack(distance).mean())
+            rows.append([objective, *(float(f(e)) for e in errors for f in (torch.mean, torch.median))])
         names = ("objective", "tree_mean_deg", "tree_median_deg", "mean_deg", "median_deg")
         return dict(zip(names, np.mean(rows, axis=0).tolist(), strict=True))
 

@@ -1,0 +1,198 @@
+"""Refinement of an SfM view-graph: robust Gauss–Newton steps on the tangent space, coarse ones and then shaped ones.
+
+Coarse steps (ℓ1, round noise; Chatterjee & Govindu 2013) bring the orientations to within the noise, however wrong they
+were in places. Then the noise's shape in the cameras' frames is estimated from the residuals, and the last steps (ℓ½,
+Chatterjee & Govindu 2018) measure residuals by it: what an edge says about the exact axes counts for more than the
+rest. Its scale comes along, so nothing is tuned to a graph's noise.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.block_laplacian import Arrivals, BlockLaplacian, factorised
+from rotavg_ros.solver.noise_shape import NoiseShape
+from rotavg_ros.solver.parallel import for_each, slices, stretches
+from rotavg_ros.solver.residuals import SLICE_EDGES, EdgeResiduals
+from rotavg_ros.solver.sorted_edges import SortedEdges
+from rotavg_ros.view_graph import ViewGraph
+
+# Coarse steps end early where they are settled; the last ones are shaped.
+MAX_STEPS = 11
+_SHAPED_STEPS = 3
+# Coarse steps are settled once they turn nodes by less than this share of the typical residual, on average.
+_SETTLED = 0.2
+_CONVERGED_STEP = np.radians(0.001)
+_MIN_PRIOR = 1e-6
+_MIN_RESIDUAL = np.radians(0.001)
+# A graph with fewer neighbours than this is no case for conjugate gradients alone.
+_WELL_KNIT_DEGREE = 12
+# Edges of a component whose residuals tell the noise's shape and size: more would change nothing.
+_MAX_SAMPLE = 8_000
+
+
+class _Step(NamedTuple):
+    """ρ(r) = |r|^power, and how exactly a step is solved.
+
+    Attributes:
+        smoothing: residuals below it count as this: radians, or standard deviations of the noise.
+        tolerance: of conjugate gradients, radians.
+        relative_tolerance: the same as a share of the step; the next step corrects what this one lacks.
+    """
+
+    power: float
+    smoothing: float
+    tolerance: float
+    relative_tolerance: float
+
+
+_COARSE = _Step(1.0, np.radians(1.0), 1e-6, 1e-3)
+_SHAPED = _Step(0.5, 0.1, 1e-6, 1e-3)
+
+
+def refine(
+    graph: ViewGraph,
+    body_from_world: Tensor,
+    roots: Tensor,
+    max_steps: int = MAX_STEPS,
+    *,
+    prior_weight: Tensor | None = None,
+    coarse_weight: Tensor | None = None,
+    component: Tensor | None = None,
+    edges: SortedEdges | None = None,
+) -> Tensor:
+    """At most ``max_steps`` reweighted least-squares steps; every component by itself.
+
+    Of few steps, all are shaped. CleanNet's scores belong into the coarse ones alone: after these, residuals know more.
+
+    Args:
+        body_from_world: ``(N, 4)`` start.
+        roots: ``(C,)`` a node of each connected component, in the components' order; they are held fixed.
+        prior_weight: ``(M,)`` in [0, 1], multiplied to every robust weight; default 1.
+        coarse_weight: the same for the coarse steps only.
+        component: ``(N,)`` connected components; default: computed.
+        edges: the graph's edges sorted; default: computed.
+
+    Returns:
+        ``(N, 4)`` float64 orientations.
+    """
+    component = graph.components() if component is None else component
+    edges = SortedEdges.of(graph) if edges is None else edges
+    problem = _Problem(graph, roots, component, edges)
+    prior = torch.ones_like(graph.precision) if prior_weight is None else prior_weight.double()
+    coarse_prior = prior if coarse_weight is None else prior * coarse_weight
+    orientations = body_from_world.double()
+    moving = torch.ones_like(roots, dtype=torch.bool)
+    for _ in range(max_steps - _SHAPED_STEPS):
+        typical = problem.typical_residual(orientations)
+        orientations, turned = problem.step(orientations, problem.round, coarse_prior, _COARSE, moving)
+        moving = moving & (problem.mean(turned) >= _SETTLED * typical)
+        if not bool(moving.any()):
+            break
+    moving = torch.ones_like(moving)
+    for _ in range(min(max_steps, _SHAPED_STEPS)):
+        orientations, turned = problem.step(orientations, problem.shape(orientations), prior, _SHAPED, moving)
+        moving = moving & (problem.largest(turned) >= _CONVERGED_STEP)
+        if not bool(moving.any()):
+            break
+    return orientations
+
+
+class _Problem:
+    """What stays the same from step to step, of a graph of C components."""
+
+    def __init__(self, graph: ViewGraph, roots: Tensor, component: Tensor, edges: SortedEdges) -> None:
+        self.graph, self.roots, self.component = graph, roots, component
+        self.arrivals = Arrivals(edges)
+        self.round = NoiseShape.round(graph.num_nodes, graph.device)
+        self.is_well_knit = 2 * graph.num_edges >= _WELL_KNIT_DEGREE * graph.num_nodes
+        self.num_nodes = torch.bincount(component, minlength=len(roots))
+        of_edge = component[graph.source]
+        self.redundancy = torch.bincount(of_edge, minlength=len(roots)) - self.num_nodes + 1
+        self.some = graph.select_edges(_evenly_spread(of_edge, len(roots)))
+
+    def mean(self, value: Tensor) -> Tensor:
+        """Means ``(C,)`` of the nodes' values ``(N,)``."""
+        return value.new_zeros(len(self.roots)).index_add_(0, self.component, value) / self.num_nodes
+
+    def largest(self, value: Tensor) -> Tensor:
+        """Maxima ``(C,)`` of the nodes' values ``(N,)``, which are not negative."""
+        return value.new_zeros(len(self.roots)).scatter_reduce(0, self.component, value, "amax")
+
+    def typical_residual(self, orientations: Tensor) -> Tensor:
+        """Geometric mean of the residuals of each component, ``(C,)`` rad."""
+        logarithm = self._some_residuals(orientations).norm(dim=1).clamp(min=_MIN_RESIDUAL).log()
+        of_edge = self.component[self.some.source]
+        total = logarithm.new_zeros(len(self.roots)).index_add_(0, of_edge, logarithm)
+        return torch.exp(total / torch.bincount(of_edge, minlength=len(self.roots)).clamp(min=1))
+
+    def shape(self, orientations: Tensor) -> NoiseShape:
+        """The noise's shape as the residuals have it."""
+        residual = self._some_residuals(orientations)
+        return NoiseShape.estimate(
+            residual, self.some.source, self.some.target, orientations, self.component, self.redundancy
+        )
+
+    def step(
+        self, orientations: Tensor, shape: NoiseShape, prior: Tensor, settings: _Step, moving: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """One step of the components ``(C,)`` that are ``moving``; orientations, and how far each node turned, rad."""
+        weight, force = self._weights_and_forces(orientations, shape, prior, settings)
+        force = force * moving[self.component, None]
+        system = BlockLaplacian(self.arrivals, weight, shape, self.component)
+        tolerances = settings.tolerance, settings.relative_tolerance
+        step, is_solved = force, False
+        if self.is_well_knit:
+            step, is_solved = system.solve(force, system.diagonal_solve(), *tolerances)
+        if not is_solved:
+            approximate = factorised(self.graph, weight, shape, self.roots)
+            step, _ = system.solve(force, approximate, *tolerances)
+        step = step - step[self.roots[self.component]]
+        turned = rotations.normalize(rotations.multiply(orientations, rotations.exp(step)))
+        return turned, step.norm(dim=1)
+
+    def _some_residuals(self, orientations: Tensor) -> Tensor:
+        """Rotation vectors ``(K, 3)``."""
+        return EdgeResiduals(self.some, orientations).vectors(slice(0, self.some.num_edges)).t()
+
+    def _weights_and_forces(
+        self, orientations: Tensor, shape: NoiseShape, prior: Tensor, settings: _Step
+    ) -> tuple[Tensor, Tensor]:
+        """Every edge's robust weight ``(M,)``, and the weighted residuals that pull at each node, summed ``(N, 3)``."""
+        graph = self.graph
+        residuals = EdgeResiduals(graph, orientations)
+        at_source, at_target = (end.flatten(1).t().contiguous() for end in (shape.at_source, shape.at_target))
+        weight = torch.empty_like(prior)
+        parts = stretches(slices(graph.num_edges, SLICE_EDGES, graph.device))
+        forces = [orientations.new_zeros(graph.num_nodes, 3) for _ in parts]
+
+        def walk(part: int) -> None:
+            for edges in parts[part]:
+                source, target = graph.source[edges], graph.target[edges]
+                vector = residuals.vectors(edges)
+                information = at_source.index_select(1, source) + at_target.index_select(1, target)
+                pull = (information.view(3, 3, -1) * vector).sum(dim=1)
+                square = (vector * pull).sum(dim=0)
+                robust = (square + settings.smoothing**2) ** (settings.power / 2 - 1)
+                weight[edges] = prior[edges].clamp(min=_MIN_PRIOR) * robust
+                pull = (pull * weight[edges]).t()
+                forces[part].index_add_(0, target, pull)
+                forces[part].index_add_(0, source, pull, alpha=-1)
+
+        for_each(walk, range(len(parts)))
+        return weight, torch.stack(forces).sum(dim=0)
+
+
+def _evenly_spread(group: Tensor, num_groups: int) -> Tensor:
+    """Indices of members, evenly spread, at most about :data:`_MAX_SAMPLE` of each group ``(M,)``."""
+    order = group.sort(stable=True).indices
+    count = torch.bincount(group, minlength=num_groups)
+    ordered = group[order]
+    rank = torch.arange(len(group), device=group.device) - (count.cumsum(0) - count)[ordered]
+    stride = (count + _MAX_SAMPLE - 1).div(_MAX_SAMPLE, rounding_mode="floor")[ordered]
+    return order[rank % stride == 0]
