@@ -200,7 +200,7 @@ def main() -> int:
     robots = [subprocess.Popen([sys.executable, __file__, "--robot", name]) for name in ROBOTS]
     try:
         wait_until(node, lambda: all(robot.poll() is not None for robot in robots))
-        wait_until(node, lambda: len(onlooker.answers) == len(nodes) and time.monotonic() - onlooker.last_news > 3)
+        wait_until(node, lambda: len(onlooker.answers) == len(nodes) and time.monotonic() - onlooker.last_news > 5)
     finally:
         for process in (*robots, *nodes):
             process.terminate()
