@@ -123,10 +123,9 @@ def test_the_recording_is_what_a_node_would_have_published(run: SimulatedRun, ba
 
 def test_the_last_recorded_answer_is_the_one_in_the_tables(replayed: Path) -> None:
     orientations, edges = read_csv(replayed / "orientations.csv"), read_csv(replayed / "edges.csv")
-    last = {}
     with AnyReader([replayed / "run.mcap"]) as reader:
-        for connection, _, data in reader.messages():
-            last[connection.topic] = reader.deserialize(data, connection.msgtype)
+        newest = {connection.topic: (data, connection.msgtype) for connection, _, data in reader.messages()}
+        last = {topic: reader.deserialize(*serialised) for topic, serialised in newest.items()}
     table = np.stack([orientations[f"q{axis}"] for axis in "xyzw"], axis=1)
     np.testing.assert_allclose(last["/abs_orientations"].orientations.reshape(-1, 4), table, atol=1e-9)
     np.testing.assert_array_equal(last["/outlier_flags"].outliers, edges["outlier"] == 1)
