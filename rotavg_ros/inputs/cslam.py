@@ -8,6 +8,7 @@ keyframe in the frame of the first, and counts only with ``success``; robots are
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 from rotavg_ros.inputs.fields import edge_id_of, target_from_source, to_nanoseconds, to_tuple, to_vector
@@ -15,27 +16,34 @@ from rotavg_ros.inputs.foreign_graph import ForeignGraph, Key
 from rotavg_ros.inputs.records import EdgeRecord, Source
 from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason, quaternion
 from rotavg_ros.online.measurements import RejectedInputError, checked_rotation
-from rotavg_ros.online.quaternion import Quaternion, Vector
+from rotavg_ros.online.odometry_continuity import OdometrySample, has_jumped
 from rotavg_ros.view_graph import EdgeKind
 
 _UNKNOWN_PRECISION = 0.0
 
 
+@dataclass(frozen=True)
+class _Keyframe:
+    reference: KeyframeReference
+    odometry: OdometrySample  # of the sensor, not of the body
+
+
 class KeyframeOdomConverter:
     """A robot's keyframes with their odometry: an odometry edge from each to the next.
 
-    Where messages were lost the edge spans the gap, which it may, because each message carries the whole odometry. An
-    id that does not ascend is refused, and the next good one begins a new chain: who counts anew has a new odometry.
+    Where messages were lost the edge spans the gap, which it may, because each message carries the whole odometry. A
+    new chain, without an edge to the last one, begins where the odometry has jumped, and after an id that does not
+    ascend, which is refused: who counts anew has a new odometry.
     """
 
     def __init__(self, source: Source) -> None:
         self._source = source
-        self._last_id = -1
-        self._last: tuple[KeyframeReference, Quaternion, Vector] | None = None
+        self.forget()
 
     def forget(self) -> None:
         self._last_id = -1
-        self._last = None
+        self._last: _Keyframe | None = None
+        self._before: OdometrySample | None = None
 
     def __call__(self, message: Any) -> Iterator[EdgeRecord]:
         try:
@@ -47,29 +55,35 @@ class KeyframeOdomConverter:
             yield EdgeRecord(edge)
 
     def _edge_to(self, message: Any) -> EdgeMeasurement | None:
+        pose, keyframe_id = message.odom.pose.pose, int(message.id)
         stamp_ns = to_nanoseconds(message.odom.header.stamp)
-        world_from_sensor = checked_rotation(to_tuple(message.odom.pose.pose.orientation))
-        keyframe_id, last = int(message.id), self._last
+        sample = OdometrySample(stamp_ns, checked_rotation(to_tuple(pose.orientation)), to_vector(pose.position))
         if keyframe_id <= self._last_id:
-            self._last = None
+            self._last = self._before = None
             raise RejectedInputError(RejectReason.OUT_OF_ORDER_ODOMETRY)
         edge_id = edge_id_of(self._last_id, keyframe_id, EdgeKind.ODOMETRY)
-        keyframe = KeyframeReference(self._source.robot, keyframe_id, stamp_ns or None)
-        position = to_vector(message.odom.pose.pose.position)
-        self._last_id, self._last = keyframe_id, (keyframe, world_from_sensor, position)
+        last, before = self._last, self._before
+        now = _Keyframe(KeyframeReference(self._source.robot, keyframe_id, stamp_ns or None), sample)
+        self._last_id, self._last, self._before = keyframe_id, now, last.odometry if last else None
         if last is None:
             return None
-        previous, world_from_previous, previous_position = last
-        previous_from_this = quaternion.multiply(quaternion.inverse(world_from_previous), world_from_sensor)
-        step = [now - then for now, then in zip(position, previous_position, strict=True)]
-        step_from_previous = quaternion.rotate(quaternion.inverse(world_from_previous), step)
+        if has_jumped(sample, last.odometry, before, self._source.limits):
+            self._before = None
+            return None
+        return self._edge(edge_id, last, now)
+
+    def _edge(self, edge_id: int, last: _Keyframe, now: _Keyframe) -> EdgeMeasurement:
+        last_from_world = quaternion.inverse(last.odometry.world_from_body)
+        last_from_now = quaternion.multiply(last_from_world, now.odometry.world_from_body)
+        assert now.odometry.position is not None and last.odometry.position is not None
+        step = [new - old for new, old in zip(now.odometry.position, last.odometry.position, strict=True)]
         return EdgeMeasurement(
             edge_id,
-            previous,
-            keyframe,
-            target_from_source(previous_from_this, self._source.body_from_sensor),
+            last.reference,
+            now.reference,
+            target_from_source(last_from_now, self._source.body_from_sensor),
             EdgeKind.ODOMETRY,
-            translation=quaternion.rotate(self._source.body_from_sensor, step_from_previous),
+            translation=quaternion.rotate(self._source.body_from_sensor, quaternion.rotate(last_from_world, step)),
         )
 
 

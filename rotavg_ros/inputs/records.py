@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 from rotavg_ros.online import EdgeMeasurement, RejectReason
 from rotavg_ros.online.keyframes import Position
+from rotavg_ros.online.odometry_continuity import ANY_MOTION, ContinuityLimits
 from rotavg_ros.online.quaternion import IDENTITY, Quaternion
 from rotavg_ros.view_graph import EdgeLabel
 
@@ -20,11 +21,13 @@ class Source:
         robot: whose they are, where they name no robot.
         robots: names of all robots, for messages that number them.
         body_from_sensor: orientation in the body frame of the sensor frame that the messages' rotations are given in.
+        limits: what odometry is believed to do from one keyframe to the next.
     """
 
     robot: str
     robots: tuple[str, ...] = ()
     body_from_sensor: Quaternion = IDENTITY
+    limits: ContinuityLimits = ANY_MOTION
 
     def robot_of(self, number: int) -> str:
         """Name of the robot with a number: its place in ``robots``, unless robots there have numbers for names.

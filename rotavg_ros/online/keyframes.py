@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.growing_view_graph import GrowingArray
 from rotavg_ros.online.measurements import RejectedInputError, RejectReason, checked_rotation, checked_stamp
-from rotavg_ros.online.odometry_continuity import ContinuityCheck, ContinuityLimits, OdometrySample
+from rotavg_ros.online.odometry_continuity import ANY_MOTION, ContinuityCheck, ContinuityLimits, OdometrySample
 from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion
 
 Position = quaternion.Vector
@@ -70,9 +70,9 @@ class OdometryTrack:
         anchors: world_from_odometry, one for every chain but the first, where whoever knows the world has set it.
     """
 
-    def __init__(self, bounds: OdometryBounds, limits: ContinuityLimits | None = None) -> None:
+    def __init__(self, bounds: OdometryBounds, limits: ContinuityLimits = ANY_MOTION) -> None:
         self.bounds = bounds
-        self.continuity = ContinuityCheck(limits or ContinuityLimits())
+        self.continuity = ContinuityCheck(limits)
         self._limit = bounds.max_samples
         self._stamp_ns = GrowingArray(np.int64)
         self._world_from_body = GrowingArray(np.float64, width=4)
@@ -235,7 +235,7 @@ class OdometryTrack:
 
     @classmethod
     def from_arrays(
-        cls, bounds: OdometryBounds, arrays: dict[str, NDArray[Any]], limits: ContinuityLimits | None = None
+        cls, bounds: OdometryBounds, arrays: dict[str, NDArray[Any]], limits: ContinuityLimits = ANY_MOTION
     ) -> OdometryTrack:
         """The track that :meth:`arrays` came from."""
         track = cls(bounds, limits)

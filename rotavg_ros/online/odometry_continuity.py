@@ -43,6 +43,9 @@ class ContinuityLimits:
     lead_ns: float = math.inf
 
 
+ANY_MOTION = ContinuityLimits()
+
+
 class ContinuityCheck:
     """Refuses a message that does not go on from the last one, until the next one sides with it.
 
@@ -53,7 +56,7 @@ class ContinuityCheck:
     def __init__(self, limits: ContinuityLimits) -> None:
         self.limits = limits
         self._refused: OdometrySample | None = None
-        self._refused_has_jumped = False
+        self._refused_jumps = False
 
     def admit(self, sample: OdometrySample, last: OdometrySample, before: OdometrySample | None) -> bool:
         """Judge a message, stamped after the last one that was admitted.
@@ -68,27 +71,38 @@ class ContinuityCheck:
         Raises:
             RejectedInputError: the message stands alone so far.
         """
-        refused, has_jumped = self._refused, self._refused_has_jumped
+        refused, refused_jumps = self._refused, self._refused_jumps
         self._refused = None
         is_ahead = sample.stamp_ns - last.stamp_ns > self.limits.lead_ns
         follows = refused is not None and 0 < sample.stamp_ns - refused.stamp_ns <= self.limits.lead_ns
         if refused is not None and follows and (is_ahead or _distance(refused, sample) < _distance(last, sample)):
-            return has_jumped
-        jumps = self._jumps(sample, last, before)
+            return refused_jumps
+        jumps = has_jumped(sample, last, before, self.limits)
         if is_ahead or jumps:
-            self._refused, self._refused_has_jumped = sample, jumps
+            self._refused, self._refused_jumps = sample, jumps
             raise RejectedInputError(RejectReason.FUTURE_STAMP if is_ahead else RejectReason.ODOMETRY_JUMP)
         return False
 
-    def _jumps(self, sample: OdometrySample, last: OdometrySample, before: OdometrySample | None) -> bool:
-        seconds = max(1e-9 * (sample.stamp_ns - last.stamp_ns), _SHORTEST_S)
-        angle, metres = _angle_and_metres(last, sample)
-        if angle > self.limits.turn_rate * seconds or metres > self.limits.speed * seconds:
-            return True
-        if math.isinf(self.limits.turn_rate) or before is None or not _is_zero(sample):
-            return False
-        angle, metres = _angle_and_metres(_going_on(last, before, sample.stamp_ns), sample)
-        return angle > _RETURN_ANGLE or metres > _RETURN_DISTANCE_M
+
+def has_jumped(
+    sample: OdometrySample, last: OdometrySample, before: OdometrySample | None, limits: ContinuityLimits
+) -> bool:
+    """Whether no motion within the limits leads from one message to the next.
+
+    Args:
+        sample: the message.
+        last: the message before it.
+        before: the message before that, if any.
+        limits: with an infinite turn rate, odometry that begins anew is not looked out for either.
+    """
+    seconds = max(1e-9 * (sample.stamp_ns - last.stamp_ns), _SHORTEST_S)
+    angle, metres = _angle_and_metres(last, sample)
+    if angle > limits.turn_rate * seconds or metres > limits.speed * seconds:
+        return True
+    if math.isinf(limits.turn_rate) or before is None or last.stamp_ns <= before.stamp_ns or not _is_zero(sample):
+        return False
+    angle, metres = _angle_and_metres(_going_on(last, before, sample.stamp_ns), sample)
+    return angle > _RETURN_ANGLE or metres > _RETURN_DISTANCE_M
 
 
 def _angle_and_metres(first: OdometrySample, second: OdometrySample) -> tuple[float, float]:

@@ -208,7 +208,8 @@ class NodeParameters:
         robots = self.edge_robots * (number // len(self.edge_robots))
         sensors = _orientations(self.edge_sensor_orientations, number)
         pairs = zip(robots, sensors, strict=True)
-        return [Source(robot or self.robots[0], self.robots, sensor) for robot, sensor in pairs]
+        limits = self.estimator_options().continuity_limits
+        return [Source(robot or self.robots[0], self.robots, sensor, limits) for robot, sensor in pairs]
 
     def estimator_options(self) -> EstimatorOptions:
         """The same as the estimator wants it."""

@@ -217,6 +217,20 @@ def test_keyframes_whose_numbers_start_again_begin_a_new_chain() -> None:
     assert pairs == [(0, 1), (1, 3), RejectReason.OUT_OF_ORDER_ODOMETRY, (4, 5)]
 
 
+def test_keyframes_of_odometry_that_begins_anew_begin_a_new_chain() -> None:
+    limits = EstimatorOptions().continuity_limits
+    convert = EDGE_CONVERTERS["cslam_common_interfaces/msg/KeyframeOdom"](Source("b", limits=limits))
+    pairs = []
+    for number in range(8):
+        pose = Fields(position=Fields(x=20.0 + number if number < 4 else 0.0, y=0.0, z=0.0))
+        pose.orientation = quaternion(Rotation.from_euler("z", 90 + number if number < 4 else number - 4, degrees=True))
+        odom = Fields(header=Fields(stamp=stamp(number)), pose=Fields(pose=pose))
+        pairs += [
+            (edge.source.keyframe_id, edge.target.keyframe_id) for edge in edges(convert(Fields(id=number, odom=odom)))
+        ]
+    assert pairs == [(0, 1), (1, 2), (2, 3), (4, 5), (5, 6), (6, 7)]
+
+
 @pytest.mark.parametrize("type_name", ODOMETRY_CONVERTERS)
 def test_odometry_of_a_sensor_that_is_turned_in_the_body(type_name: str) -> None:
     orientation = quaternion(world_from_sensor(2))
