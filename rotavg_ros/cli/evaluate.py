@@ -69,15 +69,29 @@ def _add_synthetic(parser: argparse.ArgumentParser) -> None:
         default=["released", "paper"],
         help="generators of the graphs (default: released paper)",
     )
+    parser.add_argument(
+        "--few-graphs",
+        type=whole_number,
+        default=5,
+        metavar="N",
+        help=f"so many graphs for other rows than {' '.join(synthetic.CORE)}, unless --methods names them (default: 5)",
+    )
 
 
 def _run_synthetic(arguments: argparse.Namespace) -> Path:
-    chosen = _contenders(arguments.methods, synthetic.ROWS)
-    scores = {
-        recipe: _score(synthetic.cases(recipe, arguments.graphs, arguments.seed), chosen, arguments.graphs, recipe)
-        for recipe in arguments.recipes
-    }
-    return synthetic.report(arguments.output, scores, tuple(chosen), arguments.graphs, arguments.seed)
+    core = _contenders(arguments.methods, synthetic.CORE)
+    few = min(arguments.few_graphs, arguments.graphs)
+    is_all = arguments.methods is not None or few == 0
+    more = {} if is_all else _contenders(None, [name for name in synthetic.ROWS if name not in synthetic.CORE])
+    scores, scores_of_few = {}, {}
+    for recipe in arguments.recipes:
+        cases = synthetic.cases(recipe, arguments.graphs, arguments.seed)
+        scores[recipe] = _score(cases, core, arguments.graphs, recipe)
+        if more:
+            cases = synthetic.cases(recipe, few, arguments.seed)
+            scores_of_few[recipe] = _score(cases, more, few, f"{recipe}, more methods")
+    command = f"rotavg evaluate synthetic --graphs {arguments.graphs} --seed {arguments.seed}"
+    return synthetic.report(arguments.output, scores, tuple(core), scores_of_few, tuple(more), command)
 
 
 def _add_robustness(parser: argparse.ArgumentParser) -> None:

@@ -16,7 +16,7 @@ from rotavg_ros.datasets.synthetic import SFM_OUTLIER_ANGLE
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation import peers
 from rotavg_ros.evaluation.metrics import true_edge_noise
-from rotavg_ros.solver import METHODS, solve
+from rotavg_ros.solver import METHODS, sfm_refinement, solve
 from rotavg_ros.solver.refinement import refine
 from rotavg_ros.solver.sfm_stages import residual_score
 from rotavg_ros.solver.spanning_tree import shortest_path_forest
@@ -28,7 +28,7 @@ _ORACLE_STEPS = 50
 # Shonan's matrices beyond this many edges take minutes.
 _SHONAN_MAX_EDGES = 150_000
 _PEER_PACKAGES = {"colmap": "pycolmap", "shonan": "gtsam"}
-EXTRA_CONTENDERS = ("colmap", "shonan", "oracle")
+EXTRA_CONTENDERS = ("colmap", "shonan", "oracle", "oracle-shaped")
 
 
 class ContenderError(UserError):
@@ -98,8 +98,8 @@ def _contender(name: str, weights: Path | None) -> Contender:
         return _peer(peers.colmap)
     if name == "shonan":
         return _peer(peers.shonan, _SHONAN_MAX_EDGES)
-    if name == "oracle":
-        return _oracle
+    if name in ("oracle", "oracle-shaped"):
+        return partial(_oracle, name == "oracle-shaped")
     unknown = [part for part in name.split("+") if part not in METHODS]
     if unknown:
         choices = ", ".join((*METHODS, *EXTRA_CONTENDERS))
@@ -126,12 +126,22 @@ def _peer(run: Callable[[ViewGraph], peers.PeerAnswer], max_edges: int | None = 
     return solve_case
 
 
-def _oracle(case: Case) -> Answer:
+def _oracle(is_shaped: bool, case: Case) -> Answer:
     """Our refinement from the truth to convergence, every true inlier weighing one and every outlier nothing."""
     start = time.perf_counter()
     is_inlier = (case.noise_angle <= SFM_OUTLIER_ANGLE).double()
     roots = shortest_path_forest(case.graph).roots
-    orientations = refine(case.graph, case.truth, is_inlier, roots, _ORACLE_STEPS)
+    if is_shaped:
+        orientations = sfm_refinement.refine(
+            case.graph,
+            case.truth,
+            torch.from_numpy(roots),
+            _ORACLE_STEPS,
+            prior_weight=is_inlier,
+            shaped_steps=_ORACLE_STEPS,
+        )
+    else:
+        orientations = refine(case.graph, case.truth, is_inlier, roots, _ORACLE_STEPS)
     seconds = time.perf_counter() - start
     return Answer(orientations, _residual_score(case, orientations), seconds)
 

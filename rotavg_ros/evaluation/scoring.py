@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -49,6 +50,10 @@ class Scores:
         for name, bins in other.calibration.items():
             self.calibration.setdefault(name, CalibrationBins()).extend(bins)
 
+    def on(self, cases: Collection[str]) -> Scores:
+        """The scores of some cases alone, without calibration."""
+        return Scores([row for row in self.rows if row.case in cases])
+
     def of(self, contender: str) -> dict[str, Score]:
         """A contender's scores by case."""
         return {row.case: row for row in self.rows if row.contender == contender}
@@ -74,19 +79,24 @@ def score_all(
     chosen: Mapping[str, Contender],
     watch: Callable[[Iterable[Step]], Iterable[Step]] = lambda steps: steps,
 ) -> Scores:
-    """Every contender on every case.
+    """Every contender on every case. An interruption (Ctrl-C) ends it after the last case that all have solved.
 
     Args:
         watch: passes the steps through, one per solve, and may show how far they are.
     """
-    scores = Scores(calibration={name: CalibrationBins() for name in chosen})
-    for case, name, contender in watch(_steps(cases, chosen)):
-        answer = contender(case)
-        if answer is not None:
-            scores.rows.append(score(case, name, answer))
-            known = torch.isfinite(case.noise_angle)
-            is_outlier = case.noise_angle[known] > SFM_OUTLIER_ANGLE
-            scores.calibration[name].add(answer.outlier_score[known], is_outlier)
+    scores, of_case = Scores(calibration={name: CalibrationBins() for name in chosen}), Scores()
+    with suppress(KeyboardInterrupt):
+        for number, (case, name, contender) in enumerate(watch(_steps(cases, chosen)), 1):
+            answer = contender(case)
+            if answer is not None:
+                of_case.rows.append(score(case, name, answer))
+                known = torch.isfinite(case.noise_angle)
+                is_outlier = case.noise_angle[known] > SFM_OUTLIER_ANGLE
+                bins = of_case.calibration.setdefault(name, CalibrationBins())
+                bins.add(answer.outlier_score[known], is_outlier)
+            if number % len(chosen) == 0:
+                scores.extend(of_case)
+                of_case = Scores()
     return scores
 
 

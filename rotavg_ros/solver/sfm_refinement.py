@@ -61,6 +61,7 @@ def refine(
     roots: Tensor,
     max_steps: int = MAX_STEPS,
     *,
+    shaped_steps: int = _SHAPED_STEPS,
     prior_weight: Tensor | None = None,
     coarse_weight: Tensor | None = None,
     component: Tensor | None = None,
@@ -73,6 +74,7 @@ def refine(
     Args:
         body_from_world: ``(N, 4)`` start.
         roots: ``(C,)`` a node of each connected component, in the components' order; they are held fixed.
+        shaped_steps: how many of them are shaped at most.
         prior_weight: ``(M,)`` in [0, 1], multiplied to every robust weight; default 1.
         coarse_weight: the same for the coarse steps only.
         component: ``(N,)`` connected components; default: computed.
@@ -88,14 +90,14 @@ def refine(
     coarse_prior = prior if coarse_weight is None else prior * coarse_weight
     orientations = body_from_world.double()
     moving = torch.ones_like(roots, dtype=torch.bool)
-    for _ in range(max_steps - _SHAPED_STEPS):
+    for _ in range(max_steps - shaped_steps):
         typical = problem.typical_residual(orientations)
         orientations, turned = problem.step(orientations, problem.round, coarse_prior, _COARSE, moving)
         moving = moving & (problem.mean(turned) >= _SETTLED * typical)
         if not bool(moving.any()):
             break
     moving = torch.ones_like(moving)
-    for _ in range(min(max_steps, _SHAPED_STEPS)):
+    for _ in range(min(max_steps, shaped_steps)):
         orientations, turned = problem.step(orientations, problem.shape(orientations), prior, _SHAPED, moving)
         moving = moving & (problem.largest(turned) >= _CONVERGED_STEP)
         if not bool(moving.any()):

@@ -22,7 +22,7 @@ from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 OUTLIER_THRESHOLD = 0.75
 # How fast the probability of noise beyond the outlier angle rises with the residual, in units of how far off the edge's
 # ends may be; fitted by `python -m rotavg_ros.training.score_fit`.
-SCORE_SCALE = 0.41
+SCORE_SCALE = 0.376
 _MIN_UNCERTAINTY = np.radians(0.01)
 # The noise that makes an edge an outlier.
 OUTLIER_ANGLE = np.radians(20.0)

@@ -40,6 +40,25 @@ def test_synthetic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyte
     assert all(float(row["mean_deg"]) >= 0 for row in rows)
 
 
+def test_few_graphs_do_for_what_is_slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(synthetic.RECIPES, "paper", PaperRecipe(cameras=(30, 40)))
+    monkeypatch.setattr(synthetic, "CORE", ("neurora", "oracle"))
+    rows = {name: synthetic.ROWS[name] for name in ("neurora", "spt", "oracle", "oracle-shaped")}
+    monkeypatch.setattr(synthetic, "ROWS", rows)
+    command = ["evaluate", "synthetic", "--graphs", "3", "--few-graphs", "2", "--recipes", "paper", "--threads", "1"]
+    assert main([*command, "--output", str(tmp_path)]) == 0
+    report = (tmp_path / "synthetic-paper.md").read_text()
+    assert "3 graphs." in report
+    assert "2 graphs." in report
+    with (tmp_path / "synthetic-paper-few.csv").open() as file:
+        few = {row["method"]: float(row["mean °"]) for row in csv.DictReader(file)}
+    assert list(few) == list(rows.values())
+    with (tmp_path / "synthetic-paper-graphs.csv").open() as file:
+        graphs = [row for row in csv.DictReader(file) if row["method"] == "oracle"]
+    assert len(graphs) == 3
+    assert few[rows["oracle"]] == pytest.approx(np.mean([float(row["mean_deg"]) for row in graphs[:2]]))
+
+
 def test_robustness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny = PaperRecipe(cameras=(20, 30), pair_share=(0.3, 0.5))
     monkeypatch.setattr(robustness, "_TRAINING_GRAPHS", 2)

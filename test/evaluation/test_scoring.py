@@ -98,3 +98,18 @@ def test_bins_collect_what_is_added() -> None:
     together = reliability(torch.tensor([0.05, 0.95, 0.05, 1.0]), torch.tensor([False, True, True, True]))
     np.testing.assert_allclose(bins.rows, together)
     assert bins.rows[0, 2] == 0.5
+
+
+def test_an_interrupted_run_keeps_the_cases_that_all_have_solved(cases: list[Case]) -> None:
+    calls = []
+
+    def interrupted(case: Case) -> Answer:
+        calls.append(case.name)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return Answer(case.truth, (case.noise_angle > np.radians(20)).double(), 0.0)
+
+    chosen = {**contenders(["spt"]), "interrupted": interrupted}
+    scores = score_all(cases, chosen)
+    assert [(row.case, row.contender) for row in scores.rows] == [("0", "spt"), ("0", "interrupted")]
+    assert scores.calibration["spt"].rows[:, 0].sum() == cases[0].graph.num_edges
