@@ -18,6 +18,8 @@ from rotavg_ros.view_graph import EdgeKind
 
 # An answer that lags behind the graph by more solve periods than this is stale.
 _STALE_PERIODS = 10
+# Ticks longer ago than this say nothing about the load now.
+_RECENT_S = 60.0
 _SUSPICIOUS_OUTLIER_SHARE = 0.5
 # Refusals that a healthy system produces: a sender that repeats itself.
 _HARMLESS = {"duplicate_edge"}
@@ -115,9 +117,9 @@ def _warnings(health: Health, parameters: NodeParameters, paused: bool, now: flo
     needed = parameters.keyframe_source == "odometry" and parameters.unknown_keyframes == "wait"
     if silent > parameters.odometry_timeout_s and (needed or health.last_odometry is not None):
         warnings.append("no odometry yet" if health.last_odometry is None else f"no odometry for {silent:.0f} s")
-    p95 = health.ticks.percentile_ms(95)
-    if p95 > 1e3 * parameters.solve_period_s:
-        warnings.append(f"a solve takes longer ({p95:.0f} ms) than solve_period_s")
+    median = health.ticks.median_ms(_RECENT_S)
+    if median > 1e3 * parameters.solve_period_s:
+        warnings.append(f"a solve takes longer ({median:.0f} ms) than solve_period_s")
     answer = health.answer
     if answer is not None:
         if answer.num_components > 1:

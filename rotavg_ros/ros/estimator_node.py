@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,6 +24,8 @@ from rotavg_ros.ros.subscriptions import Subscriptions
 from rotavg_ros.ros.warm_up import warm_up
 from rotavg_ros.ros.worker import Worker
 from rotavg_ros.version import __version__
+
+_SHORT_SOLVE_S = 0.2  # a longer one need not be waited for at the end: nobody would read its answer
 
 
 class RotavgNode(Node):
@@ -67,12 +68,11 @@ class RotavgNode(Node):
             self.get_logger().warning(line)
 
     def close(self, timeout_s: float) -> bool:
-        """Save if that is wanted, and stop working; False if a solve or a save still runs after the timeout."""
-        deadline = time.monotonic() + timeout_s
+        """Save if that is wanted, and stop working; False if a save still runs after the timeout, or a solve does."""
         if self._settings.autosave_period_s > 0:
             self._saver.submit(self._solving.autosave_quietly)
         is_saved = self._saver.stop(timeout_s, finish=True)
-        return self._worker.stop(deadline - time.monotonic()) and is_saved
+        return self._worker.stop(_SHORT_SOLVE_S) and is_saved
 
     def _create_timer(self, period_s: float, callback: Callable[[], object]) -> Timer:
         return self.create_timer(period_s, callback, clock=self._steady)

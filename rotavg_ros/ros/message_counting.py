@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from typing import Any
 
@@ -79,15 +80,23 @@ class Durations:
     """The last durations of something, in seconds, and their percentiles."""
 
     def __init__(self, length: int = 1000) -> None:
-        self._recent: deque[float] = deque(maxlen=length)
+        # When, on the monotonic clock, and how long. Copied as a whole before it is read: another thread may add.
+        self._recent: deque[tuple[float, float]] = deque(maxlen=length)
         self.count = 0
         self.longest = 0.0
 
     def add(self, seconds: float) -> None:
-        self._recent.append(seconds)
+        self._recent.append((time.monotonic(), seconds))
         self.count += 1
         self.longest = max(self.longest, seconds)
 
     def percentile_ms(self, percent: float) -> float:
         """Milliseconds; NaN before the first."""
-        return 1e3 * float(np.percentile(list(self._recent), percent)) if self._recent else float("nan")
+        recent = [seconds for _, seconds in list(self._recent)]
+        return 1e3 * float(np.percentile(recent, percent)) if recent else float("nan")
+
+    def median_ms(self, window_s: float) -> float:
+        """Milliseconds, of the last so many seconds; NaN where nothing happened in them."""
+        began = time.monotonic() - window_s
+        inside = [seconds for when, seconds in list(self._recent) if when >= began]
+        return 1e3 * float(np.median(inside)) if inside else float("nan")

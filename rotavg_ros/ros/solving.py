@@ -16,6 +16,7 @@ from rotavg_ros.online import Answer, OnlineEstimator
 from rotavg_ros.online.joins import joins
 from rotavg_ros.online.state_file import remove_leftovers
 from rotavg_ros.ros.diagnostics import Health
+from rotavg_ros.ros.message_counting import Durations
 from rotavg_ros.ros.outputs import Outputs
 
 _LOG_PERIOD_S = 5.0
@@ -127,6 +128,7 @@ class Solving:
         """The published answers belong to what was forgotten: latch empty ones."""
         answer = self._health.answer
         self._health.unsolved_since = None
+        self._health.ticks = Durations()
         if answer is not None and answer.version <= self._estimator.first_version:
             self._outputs.publish_answer(answer.without_content())
             self._health.answer = None

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rotavg_msgs.msg import AbsoluteOrientations, OutlierFlags, RelativeRotation, RelativeRotationArray
 from std_srvs.srv import Trigger
 
+NODE = Path(sys.executable).with_name("rotavg_node")
 STARTUP_SECONDS = 30.0  # far more than needed: a loaded machine must not fail a test
 
 
@@ -139,14 +140,14 @@ class LiveNode:
         self.edges = probe.create_publisher(RelativeRotation, "/relative_rotations", keep_all)
         self.arrays = probe.create_publisher(RelativeRotationArray, "/relative_rotation_arrays", keep_all)
 
-    def start(self, *parameters: str, reliable_odometry: bool = True) -> None:
+    def start(self, *parameters: str, reliable_odometry: bool = True, command: Sequence[str | Path] = (NODE,)) -> None:
         """Start the node and wait until both sides have found each other."""
         if reliable_odometry:  # a test decides what gets lost
             parameters += ("qos_overrides./odom.subscription.reliability:=reliable",)
         words = [word for parameter in parameters for word in ("-p", parameter)]
         self.status.clear()
         before = self._subscriptions()  # of a node that was killed and that nobody misses yet
-        self.process = self._start(Path(sys.executable).with_name("rotavg_node"), "--ros-args", *words)
+        self.process = self._start(*command, "--ros-args", *words)
         self.spin_until(lambda: len(self._subscriptions() - before) == 3 and bool(self.status))
 
     def stop(self, how: signal.Signals = signal.SIGINT) -> int:
