@@ -1,6 +1,8 @@
 """Convert a view-graph between formats, chosen by suffix.
 
-  .g2o .graph .toro   g2o pose graph (TORO's and iSAM's tags are read, g2o's written)
+  .g2o                g2o pose graph (the tags of TORO and iSAM are read as well)
+  .toro .graph        TORO pose graph
+  .isam               iSAM pose graph, in the plane
   .txt                1DSfM EGs.txt
   .npz                arrays, see the README
   a folder            rosbag2 (MCAP): edges, chained odometry, ground truth; also read: .mcap, .db3, .bag
@@ -40,7 +42,9 @@ class Format(NamedTuple):
 # The last one also gets the suffixes that nobody knows: it can tell by content, and what it cannot it explains.
 FORMATS = (
     Format(("", ".mcap", ".db3", ".bag"), is_folder=True, module="rotavg_ros.bags.graph_bag"),
-    Format((".g2o", ".graph", ".toro", ".npz", ".txt"), is_folder=False, module="rotavg_ros.datasets.graph_file"),
+    Format(
+        (".g2o", ".graph", ".toro", ".isam", ".npz", ".txt"), is_folder=False, module="rotavg_ros.datasets.graph_file"
+    ),
 )
 
 

@@ -14,16 +14,15 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.datasets.dead_reckoning import chain_poses
 from rotavg_ros.datasets.graph_file import GraphFile, GraphFileError, writing
-from rotavg_ros.datasets.planar import heading_of_quaternion, quaternion_of_heading
+from rotavg_ros.datasets.planar import quaternion_of_heading
+from rotavg_ros.datasets.pose_graph_rows import ANGULAR_DIAGONAL, lay_out
 from rotavg_ros.datasets.text_rows import Row, parse_rows, read_blocks, shown, unit_quaternions, write_rows
 from rotavg_ros.rotations import inverse
 from rotavg_ros.view_graph import EdgeKind
 
 # Where the entries of a planar information matrix, in the order xx xy xθ yy yθ θθ, are in the 21 of a spatial one.
 _PLANAR_ENTRIES = (0, 1, 5, 6, 10, 20)
-_ANGULAR_DIAGONAL = (15, 18, 20)
 
 
 @dataclass(frozen=True)
@@ -148,7 +147,7 @@ def _parse_edges(path: Path, tag: EdgeTag, lines: list[int], rows: list[Row]) ->
     with np.errstate(over="ignore"):  # absurdly large entries become inf, which counts as unknown
         information = np.zeros((len(rows), 21))
         information[:, tag.information] = _squared(stated) if tag.is_square_root else stated
-        precision = information[:, 20] if tag.planar else information[:, _ANGULAR_DIAGONAL].mean(axis=1)
+        precision = information[:, 20] if tag.planar else information[:, ANGULAR_DIAGONAL].mean(axis=1)
     return _Edges(np.array(lines), ids, source_from_target, translation, information, precision)
 
 
@@ -186,38 +185,17 @@ def write(
             the edges, odometry first, gives.
         position: ``(N, 3)`` metres, of the vertices; default: chained likewise.
     """
-    graph, ids = graph_file.graph, graph_file.node_ids
-    translation = graph_file.edge_translation
-    if translation is None:
-        translation = np.zeros((graph.num_edges, 3))
-    positions, world_from_body = chain_poses(graph, translation, body_from_world)
-    positions = positions if position is None else position
-    source_from_target = inverse(graph.target_from_source).cpu().numpy()
-    information = _information(graph_file)
-    ends = [ids[graph.source.cpu().numpy()], ids[graph.target.cpu().numpy()]]
+    poses = lay_out(graph_file, body_from_world, position)
     with writing(path) as temporary, temporary.open("w", encoding="ascii") as file:
         if graph_file.planar:
-            vertices = [ids, positions[:, :2], heading_of_quaternion(world_from_body)]
-            write_rows(file, f"VERTEX_SE2 %d{' %.15g' * 3}\n", vertices)
-            headings = heading_of_quaternion(source_from_target)
-            columns = [*ends, translation[:, :2], headings, information[:, _PLANAR_ENTRIES]]
+            write_rows(file, f"VERTEX_SE2 %d{' %.15g' * 3}\n", [poses.ids, *poses.planar_vertices])
+            columns = [*poses.ends, *poses.planar_edges, poses.information[:, _PLANAR_ENTRIES]]
             write_rows(file, f"EDGE_SE2 %d %d{' %.15g' * 9}\n", columns)
         else:
-            write_rows(file, f"VERTEX_SE3:QUAT %d{' %.15g' * 7}\n", [ids, positions, world_from_body])
-            columns = [*ends, translation, source_from_target, information]
+            columns = [poses.ids, poses.position, poses.world_from_body]
+            write_rows(file, f"VERTEX_SE3:QUAT %d{' %.15g' * 7}\n", columns)
+            columns = [*poses.ends, poses.translation, poses.source_from_target, poses.information]
             write_rows(file, f"EDGE_SE3:QUAT %d %d{' %.15g' * 28}\n", columns)
-
-
-def _information(graph_file: GraphFile) -> np.ndarray:
-    """``(M, 21)`` as stated; where nothing is, 1 for positions and the edge's precision for rotations."""
-    precision = np.nan_to_num(graph_file.graph.precision.cpu().numpy(), nan=1.0)
-    information = np.zeros((len(precision), 21))
-    information[:, [0, 6, 11]] = 1
-    information[:, _ANGULAR_DIAGONAL] = precision[:, None]
-    stated = graph_file.edge_information
-    if stated is None:
-        return information
-    return np.where(stated.any(axis=1, keepdims=True), stated, information)
 
 
 def not_stored(graph_file: GraphFile) -> list[str]:

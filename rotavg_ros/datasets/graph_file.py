@@ -25,7 +25,14 @@ MAX_NODE_ID = np.iinfo(np.int64).max
 _NUMBER_STARTS = frozenset(bytes([character]) for character in b"0123456789+-.")
 
 # Format modules by suffix; imported when used, since they import this module.
-_FORMAT_OF_SUFFIX = {".g2o": "g2o", ".graph": "g2o", ".toro": "g2o", ".npz": "npz", ".txt": "onedsfm"}
+_FORMAT_OF_SUFFIX = {
+    ".g2o": "g2o",
+    ".graph": "toro",
+    ".toro": "toro",
+    ".isam": "isam",
+    ".npz": "npz",
+    ".txt": "onedsfm",
+}
 
 
 class GraphFileError(UserError):
@@ -146,8 +153,9 @@ def read_graph(path: str | Path) -> GraphFile:
 
 
 def write_graph(path: str | Path, graph_file: GraphFile) -> None:
-    """Write a view-graph; the suffix decides: ``.g2o``, ``.npz`` or ``.txt`` (1DSfM).
+    """Write a view-graph; the suffix decides.
 
+    ``.g2o``, ``.toro`` or ``.graph`` (TORO), ``.isam``, ``.npz``, or ``.txt`` (1DSfM).
     The file appears under its name only when it is complete.
 
     Raises:
@@ -165,7 +173,9 @@ def not_stored(path: str | Path, graph_file: GraphFile) -> list[str]:
 def _format_of_suffix(path: Path) -> str:
     name = _FORMAT_OF_SUFFIX.get(path.suffix.lower())
     if name is None:
-        raise GraphFileError.at(path, None, f"unknown suffix {path.suffix!r}; use .g2o, .npz or .txt (1DSfM EGs.txt)")
+        raise GraphFileError.at(
+            path, None, f"unknown suffix {path.suffix!r}; use .g2o, .toro, .isam, .npz or .txt (1DSfM EGs.txt)"
+        )
     return name
 
 

@@ -9,6 +9,7 @@ import torch
 
 from rotavg_ros.datasets import g2o
 from rotavg_ros.datasets.graph_file import GraphFile
+from rotavg_ros.datasets.pose_graph_rows import ANGULAR_DIAGONAL, POSITION_DIAGONAL
 from rotavg_ros.online import Answer
 from rotavg_ros.online.growing_view_graph import GraphSnapshot
 from rotavg_ros.replay.record import RunRecord
@@ -17,7 +18,6 @@ from rotavg_ros.replay.record import RunRecord
 _PLANAR_TOLERANCE = 1e-9
 # Of a position that is not known: as good as none, but the matrix can still be inverted.
 _NO_INFORMATION = 1e-9
-_POSITION_DIAGONAL, _ROTATION_DIAGONAL = [0, 6, 11], [15, 18, 20]
 
 
 def write_corrected_graph(path: Path, record: RunRecord, snapshot: GraphSnapshot) -> None:
@@ -37,9 +37,9 @@ def write_corrected_graph(path: Path, record: RunRecord, snapshot: GraphSnapshot
     translation = snapshot.translation[kept]
     precision = graph.precision.nan_to_num(1.0).numpy()
     information = np.zeros((len(kept), 21))
-    information[:, _ROTATION_DIAGONAL] = precision[:, None]
+    information[:, ANGULAR_DIAGONAL] = precision[:, None]
     known = np.isfinite(translation).all(axis=1)
-    information[:, _POSITION_DIAGONAL] = np.where(known, 1.0, _NO_INFORMATION)[:, None]
+    information[:, POSITION_DIAGONAL] = np.where(known, 1.0, _NO_INFORMATION)[:, None]
     position = np.zeros((len(answer.keyframe_id), 3))
     for robot in record.robots:
         if robot.position is not None:

@@ -79,6 +79,51 @@ def test_g2o(graph_file: GraphFile) -> None:
     assert read.skipped == {}
 
 
+@pytest.mark.parametrize("planar", [False, True])
+@given(data=st.data())
+def test_toro(planar: bool, data: st.DataObject) -> None:
+    graph_file = data.draw(graph_files(planar=planar, kinds_by_id=True))
+    read = through(".toro", graph_file)
+    assert_same_edges(read, graph_file)
+    np.testing.assert_array_equal(read.node_ids, graph_file.node_ids)
+    assert read.planar == planar
+    torch.testing.assert_close(read.graph.precision, graph_file.graph.precision, rtol=1e-12, atol=0)
+
+
+@given(graph_files(planar=True, kinds_by_id=True))
+def test_isam(graph_file: GraphFile) -> None:
+    read = through(".isam", graph_file)
+    assert_same_edges(read, graph_file)
+    torch.testing.assert_close(read.graph.precision, graph_file.graph.precision, rtol=1e-9, atol=0)
+    lost = not_stored("x.isam", graph_file)
+    assert ("nodes without an edge" in lost) == (len(read.node_ids) < len(graph_file.node_ids))
+
+
+def test_isam_is_planar(tmp_path: Path) -> None:
+    spatial = GraphFile.from_ids(np.array([0]), np.array([1]), rotations.random(1).numpy())
+    with pytest.raises(GraphFileError, match=r"write .toro or .g2o"):
+        write_graph(tmp_path / "x.isam", spatial)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", [".toro", ".isam"])
+@given(data=st.data())
+def test_gtsam_reads_our_dialects_of_the_plane(suffix: str, data: st.DataObject) -> None:
+    graph_file = data.draw(graph_files(planar=True))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"graph{suffix}"
+        write_graph(path, graph_file)
+        factors, _ = gtsam.load2D(str(path))
+    relative = [factors.at(index).measured() for index in range(factors.size())]
+    headings = [measured.theta() for measured in relative]
+    turned = rotations.angle_between(
+        torch.from_numpy(quaternion_of_heading(-np.array(headings))), graph_file.graph.target_from_source
+    )
+    assert turned.max() < 1e-9
+    steps = [measured.translation() for measured in relative]
+    np.testing.assert_allclose(steps, graph_file.edge_translation[:, :2], rtol=1e-9, atol=1e-9)
+
+
 @given(graph_files())
 def test_onedsfm(graph_file: GraphFile) -> None:
     read = through(".txt", graph_file)
