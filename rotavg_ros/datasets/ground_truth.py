@@ -88,9 +88,7 @@ def _body_from_world(world_from_body: np.ndarray) -> np.ndarray:
 def _rows_by_stamp(path: Path, lines: list[int], cells: list[list[bytes]]) -> tuple[np.ndarray, np.ndarray]:
     """``(K,)`` ascending stamps in nanoseconds and ``(K, 3)`` x, y, heading."""
     _, numbers = parse_rows(path, lines, cells, 0, 4)
-    stamps = np.array(
-        [nanoseconds(path, line, row[0]) for line, row in zip(lines, cells, strict=True)], dtype=np.int64
-    )
+    stamps = np.array([nanoseconds(path, line, row[0]) for line, row in zip(lines, cells, strict=True)], dtype=np.int64)
     backward = np.concatenate(([False], np.diff(stamps) < 0))
     refuse(path, lines, backward, "a stamp earlier than the one before; sort the rows by time")
     return stamps, numbers[:, 1:]
