@@ -1,0 +1,193 @@
+"""Every command in the README and in docs/ is run as it stands there, or is listed here with a reason."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from rotavg_ros.cli.main import COMMANDS, main
+from rotavg_ros.datasets.graph_file import write_graph
+from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.ros import diagnostics
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PROGRAMS = ("rotavg", "rotavg_node", "make", "ros2", "pip", "rosdep", "colcon", "python", "python3", "cd", ".", "git")
+
+# What is not run here, by its first words, and why.
+NOT_RUN = {
+    "make demo": "minutes; test/ros/test_demo.py runs what it calls",
+    ". .venv/bin/activate": "a shell's own",
+    ". install/setup.sh": "a shell's own, on a machine with ROS 2 from apt",
+    "cd ~/ws": "a workspace with ROS 2 from apt",
+    "rosdep install": "ROS 2 from apt",
+    "pip install": "ROS 2 from apt",
+    "colcon build": "ROS 2 from apt; `make setup` builds the same folders",
+    "ros2 run rotavg_ros": "ros2cli is not on PyPI; test/ros starts the same node with the same parameters",
+    "rotavg_node": "runs until it is stopped; test/ros starts it",
+    "rotavg play run": "ends only when a subscriber has everything; test/ros/test_play.py",
+    "rotavg play b25b": "the same",
+    "rotavg demo": "starts a node and plays for 12 s; test/ros/test_demo.py",
+    "rotavg convert B25b_0.000.g2o": "data that is no part of the repository; test/ros/test_node_b25b.py",
+    "python examples/three_robots.py": "test/ros runs it",
+}
+# What makes a command take seconds instead of minutes or hours.
+SMALLER = {"--laps 4": "--laps 1", "replay my_bag --output": "replay my_bag --duration 30 --output"}
+
+
+class Command(NamedTuple):
+    """A command on a page.
+
+    Attributes:
+        page, line: where.
+        text: without prompt and remark.
+        output: the lines below it that it must print, … standing for anything; None where the page shows none.
+    """
+
+    page: str
+    line: int
+    text: str
+    output: tuple[str, ...] | None
+
+    def __str__(self) -> str:
+        return f"{self.page}:{self.line}: {self.text}"
+
+
+def code_lines(page: Path) -> Iterator[tuple[int, str]]:
+    """Lines of indented blocks and of fenced blocks without a language, with their numbers; blocks end in ''."""
+    fence = None
+    for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
+        if line.startswith("```"):
+            fence = None if fence is not None else line[3:].strip()
+            yield number, ""
+        elif fence == "":
+            yield number, line
+        elif fence is None:
+            yield number, line[4:] if line.startswith("    ") else ""
+
+
+def commands(page: Path) -> list[Command]:
+    found: list[Command] = []
+    name, printing = str(page.relative_to(ROOT)), False
+    for number, line in code_lines(page):
+        prompted = line.startswith("$ ")
+        text = re.split(r"\s{2,}|\s#", line.removeprefix("$ ").strip())[0]
+        words = text.removeprefix(".venv/bin/").split(maxsplit=1)
+        if words and words[0] in PROGRAMS and (prompted or not printing):
+            found.append(Command(name, number, text.removeprefix(".venv/bin/"), () if prompted else None))
+            printing = prompted
+        elif printing and line:
+            last = found[-1]
+            found[-1] = last._replace(output=(*(last.output or ()), line))
+        else:
+            printing = printing and bool(line)
+    return found
+
+
+ALL = [command for page in PAGES for command in commands(page)]
+SKIPPED = {command: words for command in ALL for words in NOT_RUN if command.text.startswith(words)}
+# A command that stands on several pages is run where it comes first.
+TO_RUN = list({command.text: command for command in reversed(ALL) if command not in SKIPPED}.values())[::-1]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A user's folder with a graph and, for troubleshooting, what can be wrong with one."""
+    folder = tmp_path_factory.mktemp("user")
+    run = simulate_slam_graph(SlamSimulationConfig(num_keyframes=200), np.random.default_rng(0))
+    write_graph(folder / "my.g2o", run.to_graph_file())
+    lines = (folder / "my.g2o").read_text().splitlines(keepends=True)
+    (folder / "half.g2o").write_text("".join(lines[:268]) + " ".join(lines[268].split()[:4]))
+    (folder / "nan.g2o").write_text("".join([*lines[:299], "EDGE_SE2 0 1 nan 0 0.1 1 0 0 1 0 1\n", *lines[300:]]))
+    (folder / "foreign.g2o").write_text("".join(lines).replace("EDGE_SE2", "EDGE_FOO"))
+    tiny = (
+        "family: sfm\nrecipe: mixture\nnodes: [10, 20]\ngraphs: 6\nvalidation_nodes: [20, 20]\nvalidation_graphs: 3\n"
+    )
+    (folder / "my-robot.yaml").write_text(tiny + "epochs: 1\nbatch_graphs: 6\n")
+    return folder
+
+
+def test_pages_have_commands() -> None:
+    assert len(ALL) > 30
+    assert {command.page for command in ALL} >= {"README.md", "docs/troubleshooting.md", "docs/from-your-slam.md"}
+    unused = set(NOT_RUN) - set(SKIPPED.values())
+    assert unused == set(), "nobody needs these exceptions any more"
+
+
+@pytest.mark.parametrize("command", TO_RUN, ids=str)
+def test_command(
+    command: Command, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the order of the pages, for later ones use what earlier ones have written."""
+    monkeypatch.chdir(folder)
+    for truncated, whole in (("half.mcap", "my_bag"), ("half.mcap", "my_graph")):
+        if not Path(truncated).exists() and Path(whole).is_dir():
+            (recording,) = Path(whole).glob("*.mcap")
+            Path(truncated).write_bytes(recording.read_bytes()[:60_000])
+    text = command.text
+    for large, small in SMALLER.items():
+        text = text.replace(large, small)
+    program, *words = shlex.split(text)
+    assert program == "rotavg", f"{command}: run it here or give a reason in NOT_RUN"
+    try:
+        code = main(words)
+    except SystemExit as leaving:  # --help
+        code = int(leaving.code or 0)
+    printed = capsys.readouterr()
+    if command.output is None:
+        assert code == 0, printed.err
+    else:
+        shown = [line for line in (printed.out + printed.err).splitlines() if line.strip()]
+        assert len(shown) == len(command.output), shown
+        for line, expected in zip(shown, command.output, strict=True):
+            assert re.fullmatch(re.escape(expected).replace("…", ".*"), line), line
+
+
+@pytest.mark.parametrize("command", SKIPPED, ids=str)
+def test_command_that_is_not_run_can_be_read(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    program, *words = shlex.split(command.text.replace("<", "").replace(">", ""))
+    if program == "rotavg":
+        module = next(known.module for known in COMMANDS if known.name == words[0])
+        monkeypatch.setattr(f"{module}.run", lambda arguments: 0)
+        assert main(words) == 0
+
+
+def test_python_that_uses_trained_networks(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    page = (ROOT / "docs" / "train-on-your-noise.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    if not Path("weights").is_dir():
+        pytest.skip("the commands before it were not run")
+    names: dict[str, Any] = {}
+    exec(code, names)  # noqa: S102 - the page is ours
+    assert len(names["ours"].outlier_score) == len(names["packaged"].outlier_score) > 0
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        path, _, anchor = target.partition("#")
+        assert not target.startswith("http")
+        found = (page.parent / path) if path else page
+        assert found.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", found.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_diagnostics_that_troubleshooting_quotes() -> None:
+    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    table = page[page.index("| diagnostics say") : page.index("**Nothing at all arrives.**")]
+    source = " ".join(Path(diagnostics.__file__).read_text(encoding="utf-8").split())
+    quotes = re.findall(r"^\| `([^`]+)` \|", table, re.MULTILINE)
+    assert len(quotes) >= 5
+    for quote in quotes:
+        for part in quote.split("…"):
+            assert part.strip("() ") in source, quote
