@@ -41,6 +41,7 @@ class Counts:
         rejected: inputs refused, by :class:`RejectReason` value.
         time_jumps: how often the data's time went back.
         time_is_back: whether odometry is refused since such a jump, and somebody has to decide.
+        odometry_restarts: how often the odometry of one of the robots began anew.
     """
 
     keyframes: int
@@ -49,6 +50,7 @@ class Counts:
     rejected: dict[str, int]
     time_jumps: int = 0
     time_is_back: bool = False
+    odometry_restarts: int = 0
 
 
 class OnlineEstimator:
@@ -188,6 +190,7 @@ class OnlineEstimator:
                 rejected=dict(builder.rejected),
                 time_jumps=self._time_jumps,
                 time_is_back=self._backward_jumps.is_back and self.options.on_time_jump == "error",
+                odometry_restarts=sum(track.chain for track in builder.tracks.values()),
             )
 
     def set_options(self, options: EstimatorOptions) -> None:

@@ -70,6 +70,7 @@ class Reporter:
         self._lost = 0
         self._dropped = 0
         self._odometry_received = 0
+        self._restarts = 0
         self._reported = time.monotonic()
 
     def report(self, health: Health, counts: Counts, parameters: NodeParameters, paused: bool) -> DiagnosticStatus:
@@ -88,6 +89,9 @@ class Reporter:
             warnings.append("the graph is full: no new keyframes (max_keyframes)")
         if health.lost > self._lost:
             warnings.append(f"{health.lost - self._lost} messages lost")
+        if counts.odometry_restarts > self._restarts:
+            warnings.append("odometry began anew: a component more until a closure joins it")
+        self._restarts = counts.odometry_restarts
         if dropped > self._dropped:
             warnings.append(f"{dropped - self._dropped} inputs refused")
         self._lost, self._dropped, self._odometry_received, self._reported = health.lost, dropped, received, now
@@ -144,6 +148,7 @@ def _values(health: Health, counts: Counts, paused: bool, now: float) -> dict[st
         "outliers": str(outliers),
         "components": str(0 if answer is None else answer.num_components),
         "joins": str(health.joins),
+        "odometry restarts": str(counts.odometry_restarts),
         "pending": str(counts.pending),
         "answer version": str(0 if answer is None else answer.version),
         "answer age s": "nan" if health.answered is None else f"{now - health.answered:.1f}",

@@ -75,6 +75,7 @@ def test_faults_of_odometry_make_no_false_edge(live_node) -> None:
     live_node.spin_until(lambda: live_node.status["keyframes"] == str(RESTART + 29))
     after = live_node.wait_for_silence()
     assert live_node.status["dropped odometry_jump"] == "6" and live_node.status["components"] == "2"
+    assert live_node.status["odometry restarts"] == "1"
     ids = np.asarray(after.keyframe_ids)
     flags = live_node.flags[-1]
     edges = {(source, target) for source, target in zip(flags.source_ids, flags.target_ids, strict=True)}
