@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test lint clean
+.PHONY: setup demo test bench lint clean
 
 setup:
 	@$(PYTHON) tools/setup_environment.py
@@ -17,6 +17,11 @@ demo: setup
 test:
 	@$(PYTHON) tools/setup_environment.py --for-tests
 	@$(BIN)/python -m pytest $(ARGS)
+
+# make bench [ARGS="--minutes 5 --max-pairs 200000"]: beside COLMAP and GTSAM, and the node under load; docs/results/
+bench: setup
+	@$(BIN)/rotavg benchmark $(ARGS)
+	@$(BIN)/rotavg benchmark --soak $(SOAK)
 
 lint: setup
 	@$(BIN)/ruff check .

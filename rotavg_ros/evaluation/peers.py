@@ -47,13 +47,14 @@ class PeerAnswer:
 
     Attributes:
         body_from_world: ``(N, 4)`` float64 xyzw, every component in a gauge of its own.
-        seconds: wall-clock time of the peer's own work.
+        seconds, cpu_seconds: wall-clock and CPU time (of all threads) of the peer's own work.
         is_outlier: ``(M,)`` bool where the method judges edges.
         update_seconds: ``(N,)`` of every update where the method is incremental.
     """
 
     body_from_world: Tensor
     seconds: float
+    cpu_seconds: float
     is_outlier: Tensor | None = None
     update_seconds: np.ndarray | None = None
 
@@ -61,12 +62,14 @@ class PeerAnswer:
 @dataclass
 class _Clock:
     seconds: float = 0.0
+    cpu_seconds: float = 0.0
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        start = time.perf_counter()
+        start, cpu_start = time.perf_counter(), time.process_time()
         yield
         self.seconds += time.perf_counter() - start
+        self.cpu_seconds += time.process_time() - cpu_start
 
 
 def colmap(graph: ViewGraph) -> PeerAnswer:
@@ -90,7 +93,7 @@ def colmap(graph: ViewGraph) -> PeerAnswer:
             raise PeerError("COLMAP's rotation averaging left nodes without an orientation")
         return _from_rows([image.cam_from_world().rotation.quat for image in images])
 
-    return PeerAnswer(solve_by_component(graph, None, solve_connected), clock.seconds)
+    return PeerAnswer(solve_by_component(graph, None, solve_connected), clock.seconds, clock.cpu_seconds)
 
 
 def shonan(graph: ViewGraph) -> PeerAnswer:
@@ -109,7 +112,7 @@ def shonan(graph: ViewGraph) -> PeerAnswer:
             values, _ = averaging.run(averaging.initializeRandomly(), 3, _SHONAN_MAX_DIMENSION)
         return _body_from_world(values, part.num_nodes)
 
-    return PeerAnswer(solve_by_component(graph, None, solve_connected), clock.seconds)
+    return PeerAnswer(solve_by_component(graph, None, solve_connected), clock.seconds, clock.cpu_seconds)
 
 
 def gnc(graph: ViewGraph) -> PeerAnswer:
@@ -131,7 +134,7 @@ def gnc(graph: ViewGraph) -> PeerAnswer:
     with clock.running():
         values = optimizer.optimize()
     is_outlier = torch.from_numpy(np.asarray(optimizer.getWeights())[: graph.num_edges] < 0.5)
-    return PeerAnswer(_body_from_world(values, graph.num_nodes), clock.seconds, is_outlier)
+    return PeerAnswer(_body_from_world(values, graph.num_nodes), clock.seconds, clock.cpu_seconds, is_outlier)
 
 
 def isam2_huber(graph: ViewGraph) -> PeerAnswer:
@@ -167,7 +170,7 @@ def isam2_huber(graph: ViewGraph) -> PeerAnswer:
             isam.update(added, values)
         update_seconds[step] = clock.seconds - before
     orientations = _body_from_world(isam.calculateEstimate(), graph.num_nodes)
-    return PeerAnswer(orientations, clock.seconds, update_seconds=update_seconds)
+    return PeerAnswer(orientations, clock.seconds, clock.cpu_seconds, update_seconds=update_seconds)
 
 
 def _load(name: str) -> Any:

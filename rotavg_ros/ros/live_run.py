@@ -85,9 +85,9 @@ def play_to_node(
             with waiting("waiting for the last answer"):
                 _spin_until(recorder, lambda: recorder.is_at_rest, node, log, _REST_TIMEOUT_S, "did not come to rest")
             answer = recorder.answer()
-            exit_code = _stop(node)
+            exit_code = stop_process(node)
         finally:
-            _stop(node)
+            stop_process(node)
     if exit_code != 0:
         raise LiveRunError(f"the node ended with exit code {exit_code}; {_last_words(log)}")
     if answer is None or len(answer.keyframe_ids) == 0:
@@ -112,7 +112,7 @@ def _play(
             recorder.spin(0.2)
             _check_alive(node, log)
     finally:
-        _stop(player)
+        stop_process(player)
     if player.returncode != 0:
         raise LiveRunError(f"playing the bag failed with exit code {player.returncode}; {_last_words(log)}")
 
@@ -138,7 +138,7 @@ def _check_alive(node: subprocess.Popen[bytes], log: Path) -> None:
         raise LiveRunError(f"the node died with exit code {node.returncode}; {_last_words(log)}")
 
 
-def _stop(process: subprocess.Popen[bytes]) -> int:
+def stop_process(process: subprocess.Popen[bytes]) -> int:
     """End one process that we started, gently if it can be; returns its exit code."""
     for how in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
         if process.poll() is not None:

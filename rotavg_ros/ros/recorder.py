@@ -62,6 +62,11 @@ class Recorder:
         """Whether a node reports its diagnostics; it is ready for messages then."""
         return bool(self._reports)
 
+    @property
+    def last_report(self) -> dict[str, str]:
+        """The node's last diagnostics, name → value; empty before the first."""
+        return self._reports[-1] if self._reports else {}
+
     def forget_reports(self) -> None:
         """Judge rest by reports that come from now on."""
         self._reports.clear()
@@ -90,7 +95,7 @@ class Recorder:
             kind=np.frombuffer(bytes(flags.kinds), dtype=np.uint8).astype(np.int64),
             score=np.asarray(flags.scores, dtype=np.float64),
             is_outlier=np.asarray(flags.outliers, dtype=bool),
-            diagnostics=self._reports[-1] if self._reports else {},
+            diagnostics=self.last_report,
             answers=self._answers,
         )
 

@@ -1,0 +1,113 @@
+"""Time the solver beside COLMAP and GTSAM on the same graphs; write tables (Markdown, CSV) and scaling pictures.
+
+Every contender runs in a process of its own, after a tiny graph that pays what a process pays once. Errors count
+against the truth. Contenders that would take too long of the given minutes are left out, and the report says so.
+With --soak, a live node holds a graph of 10 000 keyframes while odometry arrives over DDS.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from rotavg_ros.cli.arguments import positive_number, positive_whole_number
+from rotavg_ros.evaluation.benchmark import report, schedule
+from rotavg_ros.evaluation.benchmark.cases import FAMILIES
+from rotavg_ros.evaluation.tables import Table, make_folder, write_report
+
+_INTRODUCTION = """\
+Medians over {repeats} solves of the same process (one, from a million edges), after a warm-up on a triangle; graph in
+memory → orientations in memory. CPU seconds are those of all threads. On a machine that does other work besides,
+wall-clock times say little and CPU times are inflated by shared caches; ratios with a peer that was measured in the
+same run are what counts. Peak memory is the whole process's, with interpreter, libraries and the graph; beside it what
+it was before the first solve. Errors are against the truth after one rotation of the world. The load average was
+{load} before the run.
+
+`{command}`
+"""
+
+
+_SOAK_INTRODUCTION = """\
+The installed node over DDS, in a process of its own. It holds a simulated city with as many loop closures as
+keyframes, four keyframes a second go on coming, and odometry arrives at the rate below. Ticks count from when the graph
+was solved, their percentiles from the node's start; latency is from the odometry's stamp to the corrected orientation.
+Milliseconds, as the node reports them; on a machine that does other work besides, they are mostly waiting, and the
+CPU time says more. The load average was {load} before the run.
+
+`{command}`
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``rotavg benchmark``."""
+    parser.add_argument(
+        "--output", type=Path, default=Path("docs/results"), metavar="DIR", help="default: docs/results"
+    )
+    parser.add_argument(
+        "--families", nargs="+", choices=tuple(FAMILIES), default=list(FAMILIES), help="default: all of them"
+    )
+    parser.add_argument("--minutes", type=positive_number, default=20.0, help="about how long in all (default: 20)")
+    parser.add_argument(
+        "--max-pairs", type=positive_whole_number, default=8_000_000, metavar="N", help="edges at most (default: 8e6)"
+    )
+    parser.add_argument("--repeats", type=positive_whole_number, default=5, metavar="N", help="default: 5")
+    parser.add_argument("--threads", type=positive_whole_number, metavar="N", help="CPU threads (default: torch's)")
+    parser.add_argument("--soak", action="store_true", help="the node under load instead of the solvers")
+    parser.add_argument(
+        "--seconds", type=positive_number, default=60.0, metavar="S", help="of a soak, for each rate (default: 60)"
+    )
+    parser.add_argument(
+        "--keyframes", type=positive_whole_number, default=10_000, metavar="N", help="of a soak (default: 10000)"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure and report."""
+    if arguments.threads is not None:
+        torch.set_num_threads(arguments.threads)
+    make_folder(arguments.output)
+    print(_soak(arguments) if arguments.soak else _benchmark(arguments))
+    return 0
+
+
+def _benchmark(arguments: argparse.Namespace) -> Path:
+    load = _load()
+    results = schedule.run(arguments.families, arguments.minutes, arguments.max_pairs, arguments.repeats)
+    tables: dict[str, Table] = {}
+    for family, of_family in results.items():
+        table = report.recipe_table(of_family) if family == "recipe" else report.time_table(family, of_family)
+        tables[f"benchmark-{family}"] = table
+    tables["benchmark-stages"] = report.stage_table(results)
+    picture = "benchmark-scaling.png"
+    report.draw_scaling(arguments.output / picture, results)
+    command = (
+        f"rotavg benchmark --families {' '.join(arguments.families)} --minutes {arguments.minutes:g} "
+        f"--max-pairs {arguments.max_pairs} --repeats {arguments.repeats}"
+    )
+    introduction = _INTRODUCTION.format(repeats=arguments.repeats, load=load, command=command)
+    pictures = {picture: "Time, error and memory over the number of edges"}
+    return write_report(arguments.output, "benchmark", "Speed and memory", introduction, tables, pictures)
+
+
+def _soak(arguments: argparse.Namespace) -> Path:
+    from rotavg_ros.ros import soak  # needs ROS 2, which the rest does not
+
+    load = _load()
+    rows = soak.run(arguments.keyframes, arguments.seconds)
+    command = f"rotavg benchmark --soak --seconds {arguments.seconds:g} --keyframes {arguments.keyframes}"
+    introduction = _SOAK_INTRODUCTION.format(load=load, command=command)
+    return write_report(
+        arguments.output,
+        "benchmark-soak",
+        "The node under load",
+        introduction,
+        {"benchmark-soak": soak.table(rows)},
+        {},
+    )
+
+
+def _load() -> str:
+    with Path("/proc/loadavg").open() as file:
+        return " ".join(file.read().split()[:3])

@@ -1,0 +1,153 @@
+"""The graphs of the benchmark, from a hundred cameras to 25 000, drawn from fixed seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.synthetic import PaperRecipe
+from rotavg_ros.datasets.trajectories import World
+from rotavg_ros.view_graph import ViewGraph
+
+_COLUMNS = ("source", "target", "target_from_source", "kind", "precision")
+
+
+class BenchmarkGraph(NamedTuple):
+    """A graph and its true orientations, body_from_world ``(N, 4)``."""
+
+    graph: ViewGraph
+    truth: Tensor
+
+
+@dataclass(frozen=True)
+class Case:
+    """A graph to be drawn.
+
+    Attributes:
+        family: of :data:`FAMILIES`.
+        nodes: cameras or keyframes.
+        expected_edges: about how many it will have.
+        seed: of its random numbers.
+    """
+
+    family: str
+    nodes: int
+    expected_edges: int
+    seed: int = 0
+
+    @property
+    def name(self) -> str:
+        return f"{self.family}-{self.nodes}-{self.seed}"
+
+    def draw(self) -> BenchmarkGraph:
+        """The graph; the same at every call."""
+        return FAMILIES[self.family].draw(self, np.random.default_rng((self.seed, self.nodes)))
+
+
+@dataclass(frozen=True)
+class Family:
+    """Graphs of one kind, growing.
+
+    Attributes:
+        title: of its table.
+        cases: in ascending size.
+        draw: draws one of them.
+        contenders: of ``contenders.py``, in the order in which they run.
+    """
+
+    title: str
+    cases: tuple[Case, ...]
+    draw: Callable[[Case, np.random.Generator], BenchmarkGraph]
+    contenders: tuple[str, ...]
+
+
+def save(path: Path, drawn: BenchmarkGraph) -> None:
+    """Write a graph for the processes that solve it."""
+    graph = drawn.graph
+    columns = {name: getattr(graph, name).numpy() for name in _COLUMNS}
+    np.savez(path, num_nodes=graph.num_nodes, truth=drawn.truth.numpy(), **columns)
+
+
+def load(path: Path) -> BenchmarkGraph:
+    """What :func:`save` wrote."""
+    with np.load(path) as file:
+        columns = {name: torch.from_numpy(file[name]) for name in _COLUMNS}
+        truth = torch.from_numpy(file["truth"])
+        label = torch.zeros(len(columns["source"]), dtype=torch.int64)
+        return BenchmarkGraph(ViewGraph(num_nodes=int(file["num_nodes"]), label=label, **columns), truth)
+
+
+def _draw_sfm(case: Case, rng: np.random.Generator) -> BenchmarkGraph:
+    """The paper's recipe with its middle noise, at the wanted share of all pairs."""
+    share = 2 * case.expected_edges / (case.nodes * (case.nodes - 1))
+    recipe = PaperRecipe((case.nodes, case.nodes), (share, share), noise_deg=(15, 15), outlier_share=(0.15, 0.15))
+    sample = recipe.sample(rng)
+    return BenchmarkGraph(sample.graph, sample.body_from_world)
+
+
+def _draw_recipe(_: Case, rng: np.random.Generator) -> BenchmarkGraph:
+    """The paper's recipe as it stands: 250–1000 cameras, everything random."""
+    sample = PaperRecipe().sample(rng)
+    return BenchmarkGraph(sample.graph, sample.body_from_world)
+
+
+def _draw_city(case: Case, rng: np.random.Generator) -> BenchmarkGraph:
+    """Drives through a city, a loop closure per keyframe, one in ten of them false."""
+    config = SlamSimulationConfig(
+        world=World.CITY,
+        num_keyframes=case.nodes,
+        laps=8,
+        keyframe_distance_m=2.0,
+        closure_radius_m=6.0,
+        closures_per_keyframe=case.expected_edges / case.nodes - 1,
+        false_share=0.1,
+    )
+    run = simulate_slam_graph(config, rng)
+    return BenchmarkGraph(run.graph, rotations.inverse(torch.from_numpy(run.world_from_body)))
+
+
+def _dense(nodes: int, share: float) -> Case:
+    return Case("sfm-dense", nodes, round(share * nodes * (nodes - 1) / 2))
+
+
+_SFM = ("neurora", "neurora-paper", "neurora-cuda", "colmap", "shonan")
+FAMILIES = {
+    "recipe": Family(
+        "The paper's recipe: 250–1000 cameras",
+        tuple(Case("recipe", 625, 39_000, seed) for seed in range(6)),
+        _draw_recipe,
+        ("neurora", "neurora-paper", "neurora-cuda", "colmap"),
+    ),
+    "sfm-dense": Family(
+        "SfM, dense: 25 % of all pairs up to 1000 cameras, then 10, 5, 2.5 %",
+        (
+            *(_dense(nodes, 0.25) for nodes in (100, 250, 500, 1000)),
+            _dense(2500, 0.1),
+            _dense(5000, 0.05),
+            *(_dense(nodes, 0.025) for nodes in (10_000, 25_000)),
+            _dense(25_000, 0.077),
+        ),
+        _draw_sfm,
+        _SFM,
+    ),
+    "sfm-sparse": Family(
+        "SfM, sparse: 20 neighbours a camera",
+        tuple(Case("sfm-sparse", nodes, 10 * nodes) for nodes in (100, 250, 1000, 2500, 10_000, 25_000)),
+        _draw_sfm,
+        _SFM,
+    ),
+    "slam": Family(
+        "SLAM: a city, one loop closure a keyframe, a tenth of them false",
+        tuple(Case("slam", nodes, 2 * nodes) for nodes in (100, 250, 1000, 2500, 10_000, 25_000)),
+        _draw_city,
+        ("neurora", "gnc", "colmap"),
+    ),
+}

@@ -1,0 +1,149 @@
+"""Tables and pictures of the benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from rotavg_ros.evaluation.benchmark.cases import FAMILIES
+from rotavg_ros.evaluation.benchmark.measure import LABELS, Measurement
+from rotavg_ros.evaluation.benchmark.schedule import NO_GPU, Result
+from rotavg_ros.evaluation.plots import MUTED, PALETTE, style
+from rotavg_ros.evaluation.tables import Cell, Column, Table
+
+_REFERENCE = "neurora"
+_COLUMNS = (
+    Column("nodes"),
+    Column("edges"),
+    Column("solver"),
+    Column("s", ".3f"),
+    Column("fastest", ".3f"),
+    Column("slowest", ".3f"),
+    Column("CPU s", ".3f"),
+    Column("CPU s ÷ rotavg's", ".1f"),
+    Column("mean error °", ".2f"),
+    Column("median °", ".2f"),
+    Column("peak MB", ".0f"),
+    Column("of it before MB", ".0f"),
+)
+
+
+def time_table(family: str, results: Sequence[Result]) -> Table:
+    """Every measurement of a family; medians over the repeats."""
+    rows = []
+    for result in results:
+        reference = result.measured.get(_REFERENCE)
+        for contender, measured in result.measured.items():
+            ratio = None if reference is None else _cpu(measured) / _cpu(reference)
+            rows.append(_row(contender, measured, ratio))
+    return Table(FAMILIES[family].title, _COLUMNS, tuple(rows), _missing(results))
+
+
+def recipe_table(results: Sequence[Result]) -> Table:
+    """Averages over the graphs of the paper's recipe that every contender has solved."""
+    title = f"{FAMILIES['recipe'].title}, averages over {len(results)} graphs"
+    names = [name for name in FAMILIES["recipe"].contenders if all(name in result.measured for result in results)]
+    columns = [
+        Column("solver"),
+        Column("s", ".3f"),
+        Column("CPU s", ".3f"),
+        Column("mean °", ".2f"),
+        Column("median °", ".2f"),
+    ]
+    rows: list[tuple[Cell, ...]] = []
+    for name in names if results else []:
+        of_name = [result.measured[name] for result in results]
+        averages = [
+            float(np.mean([value(one) for one in of_name])) for value in (_wall, _cpu, _mean_error, _median_error)
+        ]
+        rows.append((LABELS[name], *averages))
+    return Table(title, tuple(columns), tuple(rows), _missing(results))
+
+
+def stage_table(results: Mapping[str, Sequence[Result]]) -> Table:
+    """Our own stages on the largest graph of every family."""
+    rows: list[tuple[Cell, ...]] = []
+    for of_family in results.values():
+        solved = [result.measured[_REFERENCE] for result in of_family if _REFERENCE in result.measured]
+        if solved:
+            largest = max(solved, key=lambda one: one.edges)
+            size = f"{largest.nodes} nodes, {largest.edges} edges"
+            rows += [(size, stage, seconds) for stage, seconds in largest.stage_seconds.items()]
+    return Table("Our stages", (Column("graph"), Column("stage"), Column("s", ".3f")), tuple(rows))
+
+
+def draw_scaling(path: Path, results: Mapping[str, Sequence[Result]]) -> None:
+    """CPU seconds, error and memory over the number of edges, a row of pictures per family."""
+    families = [name for name in results if name != "recipe" and results[name]]
+    figure = Figure(figsize=(14, 1 + 3.6 * max(len(families), 1)), dpi=130, facecolor="white", layout="constrained")
+    if families:
+        rows = figure.subplots(len(families), 3, squeeze=False)
+        for row, family in zip(rows, families, strict=True):
+            title = FAMILIES[family].title.partition(":")[0]
+            _draw(row[0], results[family], _cpu, f"{title}: CPU seconds")
+            _draw(row[1], results[family], _mean_error, "mean error, degrees")
+            _draw(row[2], results[family], lambda one: one.peak_bytes / 1e6, "peak memory of the process, MB")
+        rows[0][0].legend(frameon=False, fontsize=8)
+    figure.savefig(path)
+
+
+def _draw(axes: Axes, results: Sequence[Result], value: object, title: str) -> None:
+    contenders = dict.fromkeys(name for result in results for name in result.measured)
+    for name in contenders:
+        points = [result.measured[name] for result in results if name in result.measured]
+        colour = PALETTE[list(LABELS).index(name) % len(PALETTE)]
+        edges = [point.edges for point in points]
+        axes.plot(edges, [value(point) for point in points], "o-", color=colour, markersize=4, label=LABELS[name])  # type: ignore[operator]
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel("edges", fontsize=9, color=MUTED)
+    style(axes, title)
+
+
+def _row(contender: str, measured: Measurement, ratio: float | None) -> tuple[Cell, ...]:
+    return (
+        measured.nodes,
+        measured.edges,
+        LABELS[contender],
+        _wall(measured),
+        min(measured.wall_seconds),
+        max(measured.wall_seconds),
+        _cpu(measured),
+        ratio,
+        measured.mean_deg,
+        measured.median_deg,
+        measured.peak_bytes / 1e6,
+        measured.graph_bytes / 1e6,
+    )
+
+
+def _missing(results: Sequence[Result]) -> tuple[str, ...]:
+    """What has no row, and why."""
+    reasons: dict[str, list[str]] = {}
+    for result in results:
+        for contender, reason in result.missing.items():
+            where = (
+                "" if reason == NO_GPU else f"{result.case.nodes} nodes and about {result.case.expected_edges} edges: "
+            )
+            reasons.setdefault(contender, []).append(where + reason)
+    return tuple(f"{LABELS[name]}: {'; '.join(dict.fromkeys(of_name))}." for name, of_name in reasons.items())
+
+
+def _wall(measured: Measurement) -> float:
+    return float(np.median(measured.wall_seconds))
+
+
+def _cpu(measured: Measurement) -> float:
+    return float(np.median(measured.cpu_seconds))
+
+
+def _mean_error(measured: Measurement) -> float:
+    return measured.mean_deg
+
+
+def _median_error(measured: Measurement) -> float:
+    return measured.median_deg
