@@ -157,8 +157,10 @@ def _trajectory(facts: RunFacts) -> Section:
     text = []
     if not tracks_of(facts):
         text.append("There are no positions: no odometry in the bag carries translations, so there is no map to draw.")
-    elif not any(True for _ in facts.compared):
-        text.append("No reference was given. Odometry and the corrected trajectory start at the same pose.")
+    elif all(errors.truth.position is None for _, errors in facts.compared):
+        text.append(
+            "There is no reference with positions. Odometry and the corrected trajectory start at the same pose."
+        )
     else:
         text.append(
             "Odometry and the corrected trajectory are each laid onto the reference as a whole, by one rotation and "
@@ -170,9 +172,11 @@ def _trajectory(facts: RunFacts) -> Section:
 def _orientations(facts: RunFacts) -> Section:
     compared = list(facts.compared)
     if compared:
+        names = ", ".join(robot.reference.name for robot, _ in compared if robot.reference is not None)
         text = [
+            f"The reference is {names}.",
             "Errors are angles to the reference after one rotation of the whole trajectory onto it (robust, per "
-            "connected part of the graph)."
+            "connected part of the graph).",
         ]
         tables = [error_table(facts)]
     elif any(robot.reference is not None for robot in facts.record.robots):
