@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +15,12 @@ from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
 from rotavg_ros.replay.record import TopicUse
 from rotavg_ros.replay.topics import Candidate, Candidates, find_candidates
 from rotavg_ros.ros.parameters import NodeParameters
+
+# Parameters that name topics, and those with so many numbers or names for each of them.
+_PER_TOPIC = {
+    "odometry_topics": {"robots": 1, "odometry_sensor_orientations": 4},
+    "edge_topics": {"edge_robots": 1, "edge_sensor_orientations": 4},
+}
 
 
 class PlanError(UserError):
@@ -73,7 +80,8 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
 
     Args:
         bag: open.
-        values: parameters that the user has set, by name; topics among them count as wishes.
+        values: parameters that the user has set, by name. Topics among them count as wishes, but need not all be there:
+            a node may listen to more than was recorded.
         wishes: from options, which win.
 
     Raises:
@@ -83,6 +91,7 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
     if bag.num_messages() == 0:
         raise PlanError(f"{bag.path}: has no messages; there is nothing to replay")
     found = find_candidates(bag)
+    values = _without_absent_topics(bag, values)
     odometry = _odometry(bag, found, wishes.odometry or values.get("odometry_topics"))
     edges = _edges(bag, found, wishes.edges or values.get("edge_topics"))
     settings = dict(values)
@@ -99,6 +108,25 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
     translations = _translations(found, edges)
     topics = _uses(bag, found, parameters, odometry, edges, translations, references)
     return Plan(parameters, odometry, edges, translations, references, topics)
+
+
+def _without_absent_topics(bag: BagReader, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters for the topics that the bag has; without any of them they are left to guessing."""
+    recorded, kept = bag.topics, dict(values)
+    for topics, lists in _PER_TOPIC.items():
+        entries = values.get(topics, ())
+        names = [entry.partition(":")[0] for entry in entries]
+        present = [index for index, name in enumerate(names) if name in recorded or f"/{name.lstrip('/')}" in recorded]
+        if len(present) == len(entries):
+            continue
+        kept[topics] = tuple(entries[index] for index in present) or None
+        for name, width in lists.items():
+            if len(values.get(name, ())) == width * len(entries) > width:
+                rows = [values[name][width * index : width * (index + 1)] for index in present]
+                kept[name] = tuple(chain.from_iterable(rows))
+            if not present:
+                kept.pop(name, None)
+    return {name: value for name, value in kept.items() if value is not None}
 
 
 def _odometry(bag: BagReader, found: Candidates, wanted: Sequence[str] | None) -> tuple[Input, ...]:
