@@ -1,0 +1,155 @@
+"""Which topic is used as what, without a word from the user and with some."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rotavg_ros.bags.answer_messages import orientation_message
+from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION, VECTOR, typestore
+from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_message, vector_message
+from rotavg_ros.bags.reader import BagReader
+from rotavg_ros.bags.writer import BagWriter
+from rotavg_ros.replay.options import ReplayOptionError, read_parameter_file
+from rotavg_ros.replay.plan import Plan, Wishes, make_plan
+from rotavg_ros.ros.parameters import NodeParameters, to_yaml
+
+IMU = "sensor_msgs/msg/Imu"
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def imu_message(orientation_is_known: bool):
+    types = typestore().types
+    zero = types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
+    stamped = orientation_message(10**9, (0.0, 0.0, 0.0, 1.0), "imu")
+    return types[IMU](
+        header=stamped.header,
+        orientation=stamped.quaternion,
+        orientation_covariance=np.full(9, 0.01 if orientation_is_known else -1.0),
+        angular_velocity=zero,
+        angular_velocity_covariance=np.zeros(9),
+        linear_acceleration=zero,
+        linear_acceleration_covariance=np.zeros(9),
+    )
+
+
+def relative_rotation(kind: int):
+    ends = Keyframe(3, 10**9), Keyframe(4, 10**9 + 5)
+    return edge_message(Edge(10**9, 1, 1, *ends, IDENTITY, 100.0, kind))
+
+
+ODOM = (ODOMETRY, lambda: odometry_message(10**9, np.zeros(3), IDENTITY, "odom"))
+CLOSURE = (RELATIVE_ROTATION, lambda: relative_rotation(1))
+STEP = (RELATIVE_ROTATION, lambda: relative_rotation(0))
+WIND = (VECTOR, lambda: vector_message(10**9, np.zeros(3), "map"))
+GOOD_IMU, BLIND_IMU = (IMU, lambda: imu_message(True)), (IMU, lambda: imu_message(False))
+
+
+@pytest.fixture
+def plan_for(tmp_path: Path) -> Callable[..., Plan]:
+    """A function that makes a bag with one message per topic and plans its replay."""
+
+    def plan(topics: dict[str, tuple], *, values: dict | None = None, **wishes: object) -> Plan:
+        with BagWriter(tmp_path / "bag", overwrite=True) as bag:
+            for topic, (kind, make) in topics.items():
+                bag.add_topic(topic, kind)
+                bag.write(topic, 10**9, make())
+        with BagReader(tmp_path / "bag") as reader:
+            return make_plan(reader, values or {}, Wishes(**wishes))
+
+    return plan
+
+
+def roles(plan: Plan) -> dict[str, str]:
+    return {use.topic: use.used_as for use in plan.topics if use.used_as}
+
+
+def test_a_usual_robot(plan_for) -> None:
+    plan = plan_for({"/odom": ODOM, "/loops": CLOSURE, "/ground_truth/pose": ODOM, "/imu": GOOD_IMU, "/wind": WIND})
+    assert roles(plan) == {
+        "/odom": "odometry of robot",
+        "/loops": "loop closures",
+        "/ground_truth/pose": "reference for robot",
+    }
+    why = {use.topic: use.why_not for use in plan.topics if not use.used_as}
+    assert why == {"/imu": "could be odometry: --odometry", "/wind": "neither odometry nor relative rotations"}
+    assert plan.parameters.keyframe_source == "odometry"
+    assert plan.parameters.odometry_topics == ("/odom:nav_msgs/msg/Odometry",)
+
+
+def test_the_better_odometry_is_taken_and_an_imu_that_knows_nothing_is_not(plan_for) -> None:
+    topics = {"/a/visual": ODOM, "/wheels/odom": ODOM, "/imu": BLIND_IMU}
+    plan = plan_for(topics)
+    assert roles(plan) == {"/wheels/odom": "odometry of robot"}
+    assert {use.topic: use.why_not for use in plan.topics}["/imu"] == "its first message states no orientation"
+    assert roles(plan_for({"/imu/data": GOOD_IMU})) == {"/imu/data": "odometry of robot"}
+
+
+def test_who_brings_the_keyframes(plan_for) -> None:
+    assert plan_for({"/odom": ODOM, "/edges": STEP}).parameters.keyframe_source == "edges"
+    assert plan_for({"/odom": ODOM, "/edges": CLOSURE}).parameters.unknown_keyframes == "wait"
+    assert plan_for({"/edges": CLOSURE}).parameters.unknown_keyframes == "create"
+    told = plan_for({"/odom": ODOM, "/edges": STEP}, values={"keyframe_source": "odometry"})
+    assert told.parameters.keyframe_source == "odometry"
+
+
+def test_several_robots(plan_for) -> None:
+    topics = {"/red/odom": ODOM, "/blue/odom": ODOM, "/truth": ODOM, "/blue/gt": ODOM}
+    plan = plan_for(topics, odometry=["/red/odom", "blue/odom"], references=["/truth", "/blue/gt"])
+    assert plan.parameters.robots == ("red", "blue")
+    assert roles(plan) == {
+        "/red/odom": "odometry of red",
+        "/blue/odom": "odometry of blue",
+        "/truth": "reference for red",
+        "/blue/gt": "reference for blue",
+    }
+    named = plan_for(topics, odometry=["/red/odom", "/blue/odom"], robots=["r", "b"])
+    assert named.parameters.robots == ("r", "b")
+
+
+def test_options_win_over_parameters_and_these_over_guesses(plan_for) -> None:
+    topics = {"/odom": ODOM, "/visual": ODOM, "/imu": GOOD_IMU}
+    values = {"odometry_topics": ("visual",)}
+    assert roles(plan_for(topics, values=values))["/visual"] == "odometry of robot"
+    assert roles(plan_for(topics, values=values, odometry=["/imu"]))["/imu"] == "odometry of robot"
+    assert "/imu" not in roles(plan_for(topics, references=["none"]))
+
+
+def test_a_node_listens_to_more_than_was_recorded(plan_for) -> None:
+    """Its parameters for topics that are not there go with them; options have to be right."""
+    everything = {parameter.name: getattr(NodeParameters(), parameter.name) for parameter in fields(NodeParameters)}
+    assert roles(plan_for({"/wheels": ODOM, "/relative_rotations": CLOSURE}, values=everything)) == {
+        "/wheels": "odometry of robot",
+        "/relative_rotations": "loop closures",
+    }
+    turned = (0.0, 0.0, 1.0, 0.0)
+    values = {
+        "edge_topics": ("laser", "camera"),
+        "edge_robots": ("red", "blue"),
+        "edge_sensor_orientations": (*IDENTITY.tolist(), *turned),
+        "robots": ("red", "blue"),
+        "odometry_topics": ("red/odom", "blue/odom"),
+    }
+    plan = plan_for({"/blue/odom": ODOM, "/camera": CLOSURE}, values=values)
+    assert plan.parameters.robots == ("blue",)
+    (source,) = plan.parameters.edge_sources()
+    assert (source.robot, source.body_from_sensor) == ("blue", turned)
+
+
+def test_the_nodes_own_parameter_file(tmp_path: Path) -> None:
+    path = tmp_path / "node.yaml"
+    path.write_text(to_yaml(NodeParameters(keyframe_angle_deg=7.0, robots=("rover",))))
+    values = read_parameter_file(path)
+    assert NodeParameters().changed(values) == NodeParameters(keyframe_angle_deg=7.0, robots=("rover",))
+    path.write_text("/**:\n  ros__parameters:\n    keyframe_angle_deg: 7\n    qos_overrides./odom.depth: 5\n")
+    assert read_parameter_file(path) == {"keyframe_angle_deg": 7.0}
+    path.write_text("/other:\n  ros__parameters:\n    keyframe_angle_deg: 7\n")
+    with pytest.raises(ReplayOptionError, match="has no parameters of the node"):
+        read_parameter_file(path)
+    path.write_text("a: [")
+    with pytest.raises(ReplayOptionError, match="is not YAML"):
+        read_parameter_file(path)
