@@ -122,3 +122,28 @@ def test_nothing_is_interpolated_between_chains():
     assert (track.chain_at(last), track.chain_at(robot.stamp)) == (0, 1)
     restored = OdometryTrack.from_arrays(BOUNDS, track.arrays(), LIMITS)
     assert restored.chain == 1 and restored.last_keyframe is None
+
+
+def test_restarts_at_any_moment_of_a_real_drive(shared_data):
+    """Visual odometry of a car in a town; every message of it is believed, every restart of it is noticed."""
+    poses = np.loadtxt(shared_data / "slam" / "kitti_mono_vo" / "05_pred.txt")[:, -12:].reshape(-1, 3, 4)
+    rotation, position = Rotation.from_matrix(poses[:, :, :3]), poses[:, :, 3]
+    stamps = START + np.arange(len(poses)) * SECOND // 10
+
+    def chains(restart: int, start: int, stop: int) -> tuple[int, int]:
+        """Chains that were begun and messages that were refused."""
+        track, refused = OdometryTrack(BOUNDS, LIMITS), 0
+        for index in range(start, stop):
+            turned, moved = rotation[index], position[index]
+            if index >= restart:
+                turned = rotation[restart].inv() * turned
+                moved = rotation[restart].inv().apply(moved - position[restart])
+            try:
+                track.add(int(stamps[index]), turned.as_quat().tolist(), moved.tolist())
+            except RejectedInputError:
+                refused += 1
+        return track.chain, refused
+
+    assert chains(len(poses), 0, len(poses)) == (0, 0)
+    for restart in np.random.default_rng(0).integers(30, len(poses) - 10, 40).tolist():
+        assert chains(restart, restart - 5, restart + 10) == (1, 1), restart
