@@ -13,6 +13,7 @@ from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.timer import Timer
 
+from rotavg_ros.errors import UserError
 from rotavg_ros.online import OnlineEstimator
 from rotavg_ros.ros import parameter_server
 from rotavg_ros.ros.diagnostics import Health, Reporter
@@ -38,7 +39,10 @@ class RotavgNode(Node):
     """
 
     def __init__(self, executor: Executor) -> None:
-        super().__init__(NODE_NAME)
+        try:
+            super().__init__(NODE_NAME)
+        except Exception as error:  # rclpy has a type of its own for each of its own parameters
+            raise UserError(" ".join(str(error).split())) from error
         self._settings = parameters = parameter_server.declare(self)
         torch.set_num_threads(parameters.solver_threads or max(1, torch.get_num_threads() - 1))
         device = warm_up(parameters.estimator_options())
@@ -64,6 +68,8 @@ class RotavgNode(Node):
         parameter_server.watch(self, lambda: self._settings, self._apply)
         topics = ", ".join([*parameters.odometry_topics, *parameters.edge_topics])
         self.get_logger().info(f"rotavg {__version__} on {device}, listening to {topics}")
+        if parameters.device == "cuda" and device == "cpu":
+            self.get_logger().warning("there is no CUDA device; the networks run on the CPU")
         for line in parameter_server.unknown(self):
             self.get_logger().warning(line)
 

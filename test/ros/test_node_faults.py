@@ -22,7 +22,7 @@ from rotavg_msgs.msg import KeyframeReference, RelativeRotation, RelativeRotatio
 from rotavg_ros.inputs import Source
 from rotavg_ros.inputs.rotavg import edge_from_message
 from rotavg_ros.online import Answer, OnlineEstimator
-from rotavg_ros.ros.parameters import NodeParameters
+from rotavg_ros.ros.parameters import NodeParameters, to_yaml
 
 pytestmark = pytest.mark.ros
 
@@ -256,6 +256,7 @@ def test_a_flood_is_survived_and_every_loss_counted(live_node) -> None:
         ("edge_topics:=['x:nobodys_msgs/msg/Edge']", "nobodys_msgs/msg/Edge"),
         ("qos_overrides./odom.subscription.depth:=many", "odom"),
         ("odometry_topics:=[]", "odometry_topics is empty"),
+        ("use_sim_time:=perhaps", "use_sim_time"),
         ("state_file:=/no/such/folder/state", "there is no folder /no/such/folder"),
     ],
 )
@@ -265,6 +266,15 @@ def test_a_mistake_at_the_start_is_one_line_and_exit_code_2(parameter: str, mess
     assert ended.returncode == 2, ended.stderr
     assert message in ended.stderr
     assert ended.stderr.startswith("rotavg_node: error: ") and ended.stderr.count("\n") == 1
+
+
+def test_a_parameter_file_speaks_to_the_node_in_its_namespace(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.yaml"
+    path.write_text(to_yaml(NodeParameters(), "/fleet/a/rotavg").replace("gauge: ", "gauge: up # "))
+    command = [NODE, "--ros-args", "-r", "__ns:=/fleet/a", "--params-file", path]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr == "rotavg_node: error: gauge is 'up'; choose from odometry, identity\n"
 
 
 def test_a_foreign_state_file_is_refused_at_the_start(tmp_path: Path) -> None:
