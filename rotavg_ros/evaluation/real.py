@@ -34,6 +34,8 @@ METHODS = (
 # Minutes a graph of 2500 cameras.
 SLOW_ON_TOPOLOGIES = ("weiszfeld", "arrigoni", "wang", "shonan")
 LUND, MADRID, TOPOLOGIES = "sfm/lund_sphinx.mat", "sfm/madrid_metropolis/EGs.txt", "sfm/topology"
+# Noise on the real topologies: the released recipe's, and as little as real measurements have.
+NOISE = {"the released recipe": ReleasedRecipe(), "σ 0.5–3°": ReleasedRecipe(noise_deg=(0.5, 3.0))}
 _STREAM = 0x70B0
 
 
@@ -44,10 +46,10 @@ def lund_case(data: Path) -> Case:
     return Case("Lund, Sphinx", graph_file.graph, torch.from_numpy(graph_file.body_from_world_gt))
 
 
-def topology_cases(data: Path, seed: int) -> Iterator[Case]:
-    """Orientations and noise of the released recipe on every real topology."""
+def topology_cases(data: Path, seed: int, recipe: ReleasedRecipe) -> Iterator[Case]:
+    """Orientations and noise of a recipe on every real topology."""
     for number, path in enumerate(sorted((data / TOPOLOGIES).glob("*.npz"))):
-        sample = read_topology(path).sample(ReleasedRecipe(), np.random.default_rng((seed, _STREAM, number)))
+        sample = read_topology(path).sample(recipe, np.random.default_rng((seed, _STREAM, number)))
         yield Case(path.stem, sample.graph, sample.body_from_world)
 
 

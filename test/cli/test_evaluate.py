@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.io import savemat
 
+from rotavg_ros import rotations
 from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.graph_file import GraphFile, write_graph
 from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe
@@ -74,6 +76,32 @@ def test_robustness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert rows[0]["trained on"] == "the package's networks"
     assert rows[1]["trained on"].startswith("60–200 cameras")
     assert rows[0]["mean °"] != rows[1]["mean °"]
+
+
+def test_real(tmp_path: Path) -> None:
+    """Every table, of graphs in the formats of the real ones."""
+    sample = ReleasedRecipe(cameras=(20, 20), noise_deg=(1, 1), outlier_share=(0, 0)).sample(np.random.default_rng(0))
+    graph = sample.graph
+    ends = graph.source.numpy(), graph.target.numpy()
+    sfm = tmp_path / "sfm"
+    (sfm / "topology").mkdir(parents=True)
+    blocks = np.zeros((20, 3, 20, 3))
+    blocks[ends[0], :, ends[1]] = rotations.to_matrix(graph.target_from_source).numpy()
+    truth = rotations.to_matrix(sample.body_from_world).numpy()
+    savemat(sfm / "lund_sphinx.mat", {"Rgt": truth.reshape(60, 3), "Rrel": blocks.reshape(60, 60)})
+    (sfm / "madrid_metropolis").mkdir()
+    write_graph(sfm / "madrid_metropolis" / "EGs.txt", GraphFile(graph, np.arange(20)))
+    np.savez(sfm / "topology" / "Square.npz", nodes=20, source=ends[0], target=ends[1])
+    command = ["evaluate", "real", "--data", str(tmp_path), "--output", str(tmp_path / "results"), "--threads", "1"]
+    assert main([*command, "--methods", "spt", "neurora"]) == 0
+    report = (tmp_path / "results" / "real.md").read_text()
+    for title in ("Lund", "released recipe", "σ 0.5–3°", "Madrid"):
+        assert title in report
+    with (tmp_path / "results" / "real-topologies-2-graphs.csv").open() as file:
+        assert [row["graph"] for row in csv.DictReader(file)] == ["Square"] * 2
+    with (tmp_path / "results" / "real-lund.csv").open() as file:
+        errors = {row["method"]: float(row["mean °"]) for row in csv.DictReader(file)}
+    assert errors["neurora"] < 0.5 < errors["spt"]
 
 
 @pytest.mark.parametrize(
