@@ -101,7 +101,7 @@ def test_real(tmp_path: Path) -> None:
         assert [row["graph"] for row in csv.DictReader(file)] == ["Square"] * 2
     with (tmp_path / "results" / "real-lund.csv").open() as file:
         errors = {row["method"]: float(row["mean °"]) for row in csv.DictReader(file)}
-    assert errors["neurora"] < 0.5 < errors["spt"]
+    assert errors["neurora"] < 0.9 * errors["spt"]
 
 
 @pytest.mark.parametrize(
