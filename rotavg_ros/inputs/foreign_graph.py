@@ -13,6 +13,10 @@ from rotavg_ros.online.measurements import RejectedInputError
 # (robot, keyframe id)
 Key = tuple[str, int]
 
+# Beyond so many, what was seen is forgotten, so that nonsense cannot fill the memory; the estimator knows repetitions
+# as well, at a higher price.
+_MOST_REMEMBERED = 1_000_000
+
 
 class ForeignGraph:
     """Edges by keyframe id; each measurement passes once, however often the sender repeats its graph.
@@ -32,6 +36,7 @@ class ForeignGraph:
     def _note_stamp(self, key: Key, stamp_ns: int) -> None:
         """Remember when a keyframe was taken; 0 means that the sender does not say."""
         if stamp_ns > 0:
+            _make_room(self._stamp_ns)
             self._stamp_ns.setdefault(key, stamp_ns)
 
     def _edges(
@@ -55,12 +60,18 @@ class ForeignGraph:
         except RejectedInputError as rejection:
             yield EdgeRecord(rejection.reason)
             return
+        _make_room(self._seen)
         self._seen.add(measurement)
         source, target = (KeyframeReference(*key, self._stamp_ns.get(key)) for key in ends)
         edge_id = edge_id_of(ends[0][1], ends[1][1], kind)
         # Where on the body the sensor sits is not known: the way of the sensor stands for that of the body.
         position = quaternion.rotate(self._source.body_from_sensor, to_vector(translation))
         yield EdgeRecord(EdgeMeasurement(edge_id, source, target, inside, kind, precision, position))
+
+
+def _make_room(memory: set[Any] | dict[Any, Any]) -> None:
+    if len(memory) >= _MOST_REMEMBERED:
+        memory.clear()
 
 
 def edges_in_order(

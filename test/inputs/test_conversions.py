@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS, EdgeRecord, EdgeVerdict, Source
+from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS, EdgeRecord, EdgeVerdict, Source, foreign_graph
 from rotavg_ros.inputs.fields import precision_of_covariance, precision_of_information, to_nanoseconds
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, OnlineEstimator, RejectReason
 from rotavg_ros.online.measurements import RejectedInputError
@@ -356,3 +356,14 @@ def test_whatever_a_message_says_what_comes_out_is_sound(type_name: str, data) -
     assert not (graph.source == graph.target).any()
     precision = graph.precision.numpy()
     assert (np.isnan(precision) | ((precision > 0) & np.isfinite(precision))).all()
+
+
+def test_what_is_remembered_is_bounded(monkeypatch) -> None:
+    monkeypatch.setattr(foreign_graph, "_MOST_REMEMBERED", 10)
+    convert = converter("rtabmap_msgs/msg/MapGraph")
+    for number in range(100):
+        graph = map_graph()
+        for each in graph.links:
+            each.from_id, each.to_id = each.from_id + 4 * number, each.to_id + 4 * number
+        assert len(list(convert(graph))) == 4
+    assert len(convert._seen) <= 10
