@@ -184,9 +184,10 @@ def _run_rgbd(arguments: argparse.Namespace) -> Path:
         scores = Scores()
         for fold in progress(folds, description=name, unit="fold"):
             with tempfile.TemporaryDirectory() as folder:
-                train_networks(Path(folder), fold.training, 60 * arguments.minutes)
+                train_networks(Path(folder), fold.training, 60 * arguments.minutes, from_package=True)
                 trained = contenders(rgbd.TRAINED, Path(folder))
-                scores.extend(score_all(fold.test, {**contenders(rgbd.UNTRAINED), **trained}))
+                own = {rgbd.PACKAGE_PREFIX + name: method for name, method in contenders(rgbd.TRAINED).items()}
+                scores.extend(score_all(fold.test, {**contenders(rgbd.UNTRAINED), **own, **trained}))
         tables[f"rgbd-{name}"] = rgbd.table(name, scores, arguments.minutes)
     command = f"rotavg evaluate rgbd --folds {arguments.folds} --minutes {arguments.minutes:g}"
     introduction = (

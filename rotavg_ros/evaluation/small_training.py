@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from rotavg_ros.solver.clean_net import CleanNet
-from rotavg_ros.solver.network_store import read_network
+from rotavg_ros.solver.network_store import load_network, read_network
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.sfm_tasks import GivenGraphs, SfmCleanTask, SfmFineTask
 from rotavg_ros.training.trainer import Trainer, TrainingTask
@@ -22,19 +22,35 @@ _CLEAN_NET_SHARE = 0.6
 _CONFIG = TrainingConfig(batch_graphs=4, learning_rate=2e-3, weight_decay=0.0)
 
 
-def train_networks(folder: Path, graphs: GivenGraphs, seconds: float, seed: int = 0) -> None:
+def train_networks(
+    folder: Path, graphs: GivenGraphs, seconds: float, seed: int = 0, from_package: bool = False
+) -> None:
     """Train a CleanNet and a FineNet into ``folder``, which then serves as ``weights`` of a solve.
 
     Args:
         seconds: about how long both may take; at least one epoch each is run.
+        from_package: go on from the package's networks instead of random ones.
     """
     config = replace(_CONFIG, seed=seed)
     cpu = torch.device("cpu")
-    _train("sfm-clean-net", partial(SfmCleanTask, config, cpu, graphs), config, folder, seconds * _CLEAN_NET_SHARE)
+    make_clean = _maker("sfm-clean-net", partial(SfmCleanTask, config, cpu, graphs), from_package)
+    _train("sfm-clean-net", make_clean, config, folder, seconds * _CLEAN_NET_SHARE)
     clean_net = read_network("sfm-clean-net", folder / "sfm-clean-net.safetensors")
     assert isinstance(clean_net, CleanNet)
-    make_fine = partial(SfmFineTask, config, cpu, clean_net, graphs)
+    make_fine = _maker("sfm-fine-net", partial(SfmFineTask, config, cpu, clean_net, graphs), from_package)
     _train("sfm-fine-net", make_fine, config, folder, seconds * (1 - _CLEAN_NET_SHARE))
+
+
+def _maker(name: str, make_task: Callable[[], TrainingTask], from_package: bool) -> Callable[[], TrainingTask]:
+    """What makes a task whose network begins as asked for."""
+
+    def make() -> TrainingTask:
+        task = make_task()
+        if from_package:
+            task.network.load_state_dict(load_network(name).state_dict())
+        return task
+
+    return make
 
 
 def _train(

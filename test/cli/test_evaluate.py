@@ -145,3 +145,27 @@ def test_plot_statistics(knows_truth: bool, tmp_path: Path, capsys: pytest.Captu
     assert main(["plot", "statistics", str(tmp_path / "graph.npz"), "--output", str(tmp_path / "x.what")]) == 2
     assert "x.what: cannot be written" in capsys.readouterr().err
     assert main(["plot", "statistics", str(tmp_path / "none.npz")]) == 2
+
+
+def test_rgbd(tmp_path: Path) -> None:
+    """Two folds of two scenes each; what is trained differs from the package's networks, which run beside it."""
+    folder = tmp_path / "rgbd" / "redwood_fgr"
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    for number in range(4):
+        sample = ReleasedRecipe(cameras=(14, 14)).sample(rng)
+        graph = sample.graph
+        np.savez(
+            folder / f"{number}.npz",
+            source=graph.source.numpy(),
+            target=graph.target.numpy(),
+            target_from_source=graph.target_from_source.numpy(),
+            registration_rms=np.ones(graph.num_edges),
+            body_from_world_gt=sample.body_from_world.numpy(),
+        )
+    command = ["evaluate", "rgbd", "--data", str(tmp_path), "--sets", "redwood_fgr", "--folds", "2"]
+    assert main([*command, "--minutes", "0.001", "--output", str(tmp_path), "--threads", "1"]) == 0
+    with (tmp_path / "rgbd-redwood_fgr.csv").open() as file:
+        rows = {row["method"]: row for row in csv.DictReader(file)}
+    assert {row["scenes"] for row in rows.values()} == {"4"}
+    assert rows["neurora-paper"]["mean °"] != rows["package: neurora-paper"]["mean °"]
