@@ -5,39 +5,24 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from rotavg_ros.online import quaternion
+from rotavg_ros.online.attachment import attach, between_keyframes
 from rotavg_ros.online.growing_view_graph import GrowingViewGraph
 from rotavg_ros.online.keyframes import OdometryTrack
 from rotavg_ros.online.measurements import (
     OWN_EDGE_ID,
     UNKNOWN_STAMP_NS,
     EdgeMeasurement,
-    KeyframeReference,
     RejectedInputError,
     RejectReason,
     check_edge,
 )
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.pending import PendingEdges
-from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion, Vector
+from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, difference
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
-
-
-@dataclass(frozen=True, slots=True)
-class _Attachment:
-    """Where an edge's end is tied to the graph: a keyframe, and how the body has moved since.
-
-    Attributes:
-        node: the keyframe's.
-        keyframe_from_body: the body's orientation in the keyframe's frame.
-        position: of the body in the keyframe's frame, metres; NaN where the odometry carries none.
-    """
-
-    node: int
-    keyframe_from_body: Quaternion = quaternion.IDENTITY
-    position: Vector = (0.0, 0.0, 0.0)
 
 
 class GraphBuilder:
@@ -149,7 +134,7 @@ class GraphBuilder:
                     previous.world_from_body,
                 )
             )
-            step = _difference(track.latest.position or UNKNOWN_VECTOR, previous.position or UNKNOWN_VECTOR)
+            step = difference(track.latest.position or UNKNOWN_VECTOR, previous.position or UNKNOWN_VECTOR)
             self.graph.add_edge(
                 OWN_EDGE_ID,
                 source,
@@ -184,7 +169,7 @@ class GraphBuilder:
         """Put an edge into the graph, or let it wait for its first end that is not there yet."""
         ends = []
         for reference in (edge.source, edge.target):
-            attachment = self._attach(reference, settle)
+            attachment = attach(reference, self.graph, self.tracks.get(reference.robot), settle)
             if attachment is None:
                 evicted = self.pending.add(edge, reference, self.data_time_ns)
                 if evicted is not None:
@@ -194,54 +179,16 @@ class GraphBuilder:
         source, target = ends
         if source.node == target.node:
             raise RejectedInputError(RejectReason.SELF_EDGE)
-        # R_kt R_ks⁻¹ = (R_kt R_t⁻¹) (R_t R_s⁻¹) (R_s R_ks⁻¹): keyframes ks and kt, moments s and t.
-        measured = quaternion.normalize(edge.target_from_source)
-        target_from_source = quaternion.multiply(
-            quaternion.multiply(target.keyframe_from_body, measured), quaternion.inverse(source.keyframe_from_body)
-        )
+        target_from_source, translation = between_keyframes(edge, source, target)
         self.graph.add_edge(
             edge.edge_id,
             source.node,
             target.node,
-            quaternion.normalize(target_from_source),
+            target_from_source,
             edge.kind,
             edge.precision or math.nan,
             self.labels.get((edge.source.robot, edge.edge_id), EdgeLabel.AUTOMATIC),
-            _between_keyframes(edge, measured, source, target),
-        )
-
-    def _attach(self, reference: KeyframeReference, settle: bool) -> _Attachment | None:
-        """Tie one end to a keyframe; None if what it needs is not there yet.
-
-        Raises:
-            RejectedInputError: a stamp before the odometry's first or inside a gap of it, or a robot without keyframes.
-        """
-        robot, stamp_ns = reference.robot, reference.stamp_ns
-        if reference.keyframe_id is not None:
-            node = self.graph.node(robot, reference.keyframe_id)
-            return None if node is None else _Attachment(node)
-        assert stamp_ns is not None
-        node = self.graph.keyframe_at_or_before(robot, stamp_ns)
-        if node is not None and self.graph.stamp_of(node) == stamp_ns:
-            return _Attachment(node)
-        track = self.tracks.get(robot)
-        if track is None or not (track.reaches(stamp_ns) or (settle and track.within_tolerance(stamp_ns))):
-            return None
-        now = track.world_from_body_at(stamp_ns)
-        if node is None:
-            node = self.graph.first_keyframe(robot)
-        if node is None:
-            raise RejectedInputError(RejectReason.UNKNOWN_KEYFRAME)
-        keyframe_ns = self.graph.stamp_of(node)
-        if track.chain_at(keyframe_ns) != track.chain_at(stamp_ns):
-            raise RejectedInputError(RejectReason.ODOMETRY_GAP)
-        keyframe_from_odometry = quaternion.inverse(track.world_from_body_at(keyframe_ns))
-        return _Attachment(
-            node,
-            quaternion.multiply(keyframe_from_odometry, now),
-            quaternion.rotate(
-                keyframe_from_odometry, _difference(track.position_at(stamp_ns), track.position_at(keyframe_ns))
-            ),
+            translation,
         )
 
     def _place_all(self, edges: Iterable[EdgeMeasurement], settle: bool = False) -> None:
@@ -265,22 +212,3 @@ class GraphBuilder:
     def _drop(self, edge: EdgeMeasurement, reason: RejectReason) -> None:
         self.rejected[reason.value] += 1
         self.fingerprints.discard(edge.fingerprint())  # a retransmission gets another chance
-
-
-def _between_keyframes(
-    edge: EdgeMeasurement, target_from_source: Quaternion, source: _Attachment, target: _Attachment
-) -> Vector:
-    """Position of the target's keyframe in the frame of the source's, metres; NaN unknown.
-
-    ``p_ks_kt = p_ks_s + R_ks_s (p_s_t + R_s_t R_t_kt (-p_kt_t))``, pose by pose along ks → s → t → kt.
-    """
-    if edge.translation is None or not all(map(math.isfinite, edge.translation)):
-        return UNKNOWN_VECTOR
-    to_keyframe = quaternion.rotate(quaternion.inverse(target.keyframe_from_body), target.position)
-    step = _difference(edge.translation, quaternion.rotate(quaternion.inverse(target_from_source), to_keyframe))
-    x, y, z = quaternion.rotate(source.keyframe_from_body, step)
-    return (x + source.position[0], y + source.position[1], z + source.position[2])
-
-
-def _difference(a: Sequence[float], b: Sequence[float]) -> Vector:
-    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])

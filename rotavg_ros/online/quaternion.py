@@ -74,3 +74,8 @@ def slerp(start: Quaternion, end: Quaternion, fraction: float) -> Quaternion:
     half_angle = math.atan2(sine, w) * fraction
     scale = math.sin(half_angle) / sine
     return normalize(multiply(start, (x * scale, y * scale, z * scale, math.cos(half_angle))))
+
+
+def difference(a: Sequence[float], b: Sequence[float]) -> Vector:
+    """``a - b``."""
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
