@@ -90,7 +90,7 @@ def _run_synthetic(arguments: argparse.Namespace) -> Path:
         if more:
             cases = synthetic.cases(recipe, few, arguments.seed)
             scores_of_few[recipe] = _score(cases, more, few, f"{recipe}, more methods")
-    command = f"rotavg evaluate synthetic --graphs {arguments.graphs} --seed {arguments.seed}"
+    command = f"rotavg evaluate synthetic --graphs {arguments.graphs} --seed {arguments.seed} --few-graphs {few}"
     return synthetic.report(arguments.output, scores, tuple(core), scores_of_few, tuple(more), command)
 
 

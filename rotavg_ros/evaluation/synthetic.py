@@ -59,9 +59,6 @@ CORE = (
     "neurora-v2",
     "colmap",
     "neurora",
-    "neurora-unweighted",
-    "neurora-without-finenet",
-    "oracle",
 )
 # Whose outlier verdicts are compared: scores of ours, residuals of the others.
 _CLASSIFIERS = {
