@@ -20,8 +20,8 @@ _CLOSURE_STEPS = 30.0
 # A step's variance grows with its length, and is that of this share of a typical one at least: wheels slip on the spot.
 _SHORTEST_STEP = 0.05
 _PASSES = 5
-# Cauchy's weight halves at this many standard deviations, and squared lengths of normal errors have this median.
-_CAUCHY_SIGMAS = 2.0
+# Geman & McClure's weight is a quarter at this many standard deviations; squared normal errors have about this median.
+_SCALE_SIGMAS = 3.0
 _MEDIAN_OF_SQUARED = 0.8
 # Keeps closures so slight that positions are odometry's, where one starts from.
 _NEXT_TO_NOTHING = 1e-9
@@ -36,10 +36,11 @@ def fit_positions(
     outlier_score: NDArray[np.float64],
     origin: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Positions that fit the translations best, closures weighted down the farther they are off (Cauchy).
+    """Positions that fit the translations best, closures weighted down the farther they are off.
 
-    A closure whose rotation is right may still be of another place that looks alike. So the passes begin at what
-    odometry alone says, and the scale on which closures are judged is their own median residual.
+    A closure whose rotation is right may still be of another place that looks alike: corridors are parallel. So the
+    passes begin at what odometry alone says, the scale on which closures are judged is their own median residual, and
+    what is far off loses all weight (Geman & McClure 1985).
 
     Args:
         world_from_body: ``(N, 4)`` xyzw.
@@ -72,7 +73,7 @@ def fit_positions(
         for _ in range(_PASSES):
             squared = ((position[target] - position[source] - step) ** 2).sum(axis=1)
             variance = np.median(squared[~is_odometry]) / _MEDIAN_OF_SQUARED
-            share = 1 / (1 + squared / max(_CAUCHY_SIGMAS**2 * variance, np.finfo(float).tiny))
+            share = 1 / (1 + squared / max(_SCALE_SIGMAS**2 * variance, np.finfo(float).tiny)) ** 2
             position = solve(np.where(is_odometry, 1.0, np.maximum(share, _NEXT_TO_NOTHING)))
     position += np.nan_to_num(origin[roots])[component]
     touched = np.zeros(num_nodes, dtype=bool)
