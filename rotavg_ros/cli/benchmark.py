@@ -19,11 +19,11 @@ from rotavg_ros.evaluation.tables import Table, make_folder, write_report
 
 _INTRODUCTION = """\
 Medians over {repeats} solves of the same process (one, from a million edges), after a warm-up on a triangle; graph in
-memory → orientations in memory. CPU seconds are those of all threads. On a machine that does other work besides,
-wall-clock times say little and CPU times are inflated by shared caches; ratios with a peer that was measured in the
-same run are what counts. Peak memory is the whole process's, with interpreter, libraries and the graph; beside it what
-it was before the first solve. Errors are against the truth after one rotation of the world. The load average was
-{load} before the run.
+memory → orientations in memory; {threads} for every solver. CPU seconds are those of all threads. On a machine that
+does other work besides, wall-clock times say little, CPU times are inflated by shared caches, and several threads by
+waiting for each other; ratios with a peer that was measured in the same run, on one thread, are what counts. Peak
+memory is the whole process's, with interpreter, libraries and the graph; beside it what it was before the first solve.
+Errors are against the truth after one rotation of the world. The load average was {load} before the run.
 
 `{command}`
 """
@@ -84,9 +84,11 @@ def _benchmark(arguments: argparse.Namespace) -> Path:
     report.draw_scaling(arguments.output / picture, results)
     command = (
         f"rotavg benchmark --families {' '.join(arguments.families)} --minutes {arguments.minutes:g} "
-        f"--max-pairs {arguments.max_pairs} --repeats {arguments.repeats}"
+        f"--max-pairs {arguments.max_pairs} --repeats {arguments.repeats} --threads {torch.get_num_threads()}"
     )
-    introduction = _INTRODUCTION.format(repeats=arguments.repeats, load=load, command=command)
+    count = torch.get_num_threads()
+    threads = "one thread" if count == 1 else f"{count} threads"
+    introduction = _INTRODUCTION.format(repeats=arguments.repeats, threads=threads, load=load, command=command)
     pictures = {picture: "Time, error and memory over the number of edges"}
     return write_report(arguments.output, "benchmark", "Speed and memory", introduction, tables, pictures)
 

@@ -26,6 +26,8 @@ _PATIENCE = 8.0
 _MIN_TIMEOUT_S = 120.0
 # What a contender may take of the time that is left.
 _SHARE_OF_REST = 0.35
+# Who spreads work over threads reads one of these.
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 # Graphs of more edges are solved once.
 _FEW_REPEATS = 1_000_000
 # What drawing the graph takes is learnt like what a contender takes.
@@ -139,7 +141,7 @@ def _measure(path: Path, contender: str, repeats: int, case: Case, budget: _Budg
     """Run one process; what went wrong in its place."""
     command = [sys.executable, "-m", "rotavg_ros.evaluation.benchmark.measure", str(path), contender, str(repeats)]
     timeout = max(_MIN_TIMEOUT_S, _PATIENCE * budget.expected(case, contender))
-    threads = {"OMP_NUM_THREADS": str(torch.get_num_threads())}
+    threads = dict.fromkeys(_THREAD_VARIABLES, str(torch.get_num_threads()))
     try:
         finished = subprocess.run(
             command, capture_output=True, text=True, timeout=timeout, check=False, env={**os.environ, **threads}
