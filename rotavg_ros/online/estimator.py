@@ -5,22 +5,22 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from rotavg_ros.online import quaternion, state_file
-from rotavg_ros.online.anchoring import anchor, corrections, first_correction, root_orientations
+from rotavg_ros.online import state_file
+from rotavg_ros.online.anchoring import root_orientations
 from rotavg_ros.online.answer import Answer
-from rotavg_ros.online.gauge import extend_along_edges, fix_gauge, joins_components
+from rotavg_ros.online.content import Content, Counts
+from rotavg_ros.online.gauge import fix_gauge
 from rotavg_ros.online.graph_builder import GraphBuilder
 from rotavg_ros.online.growing_view_graph import GraphSnapshot
 from rotavg_ros.online.measurements import EdgeMeasurement, RejectReason
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.quaternion import Quaternion
-from rotavg_ros.online.time_jumps import BackwardJumps, LateMessage
+from rotavg_ros.online.time_jumps import LateMessage
 from rotavg_ros.online.trajectory import Trajectory, corrected_trajectories
 from rotavg_ros.view_graph import EdgeLabel
 
@@ -30,27 +30,6 @@ if TYPE_CHECKING:
 
 # The signature of :func:`rotavg_ros.solve`.
 Solver = Callable[..., "Solution"]
-
-
-@dataclass(frozen=True)
-class Counts:
-    """How large the estimator's state is, and what was refused so far.
-
-    Attributes:
-        keyframes, edges, pending: sizes now.
-        rejected: inputs refused, by :class:`RejectReason` value.
-        time_jumps: how often the data's time went back.
-        time_is_back: whether odometry is refused since such a jump, and somebody has to decide.
-        odometry_restarts: how often the odometry of one of the robots began anew.
-    """
-
-    keyframes: int
-    edges: int
-    pending: int
-    rejected: dict[str, int]
-    time_jumps: int = 0
-    time_is_back: bool = False
-    odometry_restarts: int = 0
 
 
 class OnlineEstimator:
@@ -75,22 +54,12 @@ class OnlineEstimator:
         self._paused = False
         self._generation = 0
         self._time_jumps = 0
-        self._start_over(GraphBuilder(self.options), None, 0)
+        self._content = Content(GraphBuilder(self.options), None, 0)
 
     def _start_over(self, builder: GraphBuilder, answered: Tensor | None, version: int) -> None:
         """Begin with this content; ``answered`` is the last answer's body_from_world ``(n, 4)``."""
         self._generation += 1
-        self._first_version = version
-        self._builder = builder
-        self._backward_jumps = BackwardJumps()
-        self._answered = answered
-        self._answered_component: Tensor | None = None
-        self._answered_revision = 0
-        self._answer_was_cold = True
-        self._ticked_revision = 0
-        self._version = version
-        # Per robot: world_from_body = world_from_odometry ∘ odometry, as of its last corrected keyframe.
-        self._world_from_odometry: dict[str, Quaternion] = {}
+        self._content = Content(builder, answered, version)
 
     def add_odometry(
         self,
@@ -114,97 +83,69 @@ class OnlineEstimator:
             why it was refused and counted; None if it was taken.
         """
         with self._lock:
-            track = self._builder.tracks.get(robot)
-            last = None if track is None else track.latest
-            reason = self._builder.add_odometry(robot, stamp_ns, world_from_body, position)
-            if track is not None and last is not None and track.chain > len(track.anchors):
-                anchor(track, last, self._correction(robot))
-                self._world_from_odometry.pop(robot, None)
-            if reason is None:
-                self._backward_jumps.on_time(robot)
-            elif reason is RejectReason.OUT_OF_ORDER_ODOMETRY and last is not None:
-                message = LateMessage(robot, stamp_ns, world_from_body, position)
-                return self._consider_jump(message, last.stamp_ns, reason)
+            reason, since_jump = self._content.add_odometry(LateMessage(robot, stamp_ns, world_from_body, position))
+            if not since_jump:
+                return reason
+            self._time_jumps += 1
+            if self.options.on_time_jump != "reset":
+                return reason
+            self._forget()
+            for message in since_jump:
+                reason, _ = self._content.add_odometry(message)
             return reason
-
-    def _consider_jump(self, message: LateMessage, latest_ns: int, reason: RejectReason) -> RejectReason | None:
-        """What becomes of an odometry message that came out of order."""
-        longest_step_ns = self.options.odometry_bounds.max_gap_ns
-        since_jump = self._backward_jumps.late(message, latest_ns, self.options.time_jump_ns, longest_step_ns)
-        if not since_jump:
-            return reason
-        self._time_jumps += 1
-        if self.options.on_time_jump != "reset":
-            return reason
-        self._start_over(GraphBuilder(self.options), None, self._version)
-        for late in since_jump:
-            self._builder.add_odometry(late.robot, late.stamp_ns, late.world_from_body, late.position)
-        return None
 
     def clock_went_back(self, now_ns: int) -> None:
         """The clock that stamps the data (``/clock``) went back to ``now_ns``; taken as if odometry had told it."""
         with self._lock:
-            data_time_ns = self._builder.data_time_ns
+            data_time_ns = self._content.builder.data_time_ns
             if data_time_ns is None or data_time_ns - now_ns <= self.options.time_jump_ns:
                 return  # nothing of the future is known, or odometry has told it already
             if self.options.on_time_jump == "reset":
                 self._time_jumps += 1
-                self._start_over(GraphBuilder(self.options), None, self._version)
+                self._forget()
 
     def add_edge(self, edge: EdgeMeasurement) -> RejectReason | None:
         """Take a measured edge; returns why it was refused and counted, None if it was taken or may wait."""
         with self._lock:
-            return self._builder.add_edge(edge)
+            return self._content.builder.add_edge(edge)
 
     def reject(self, reason: RejectReason) -> None:
         """Count an input that could not even be read as a measurement."""
         with self._lock:
-            self._builder.rejected[reason.value] += 1
+            self._content.builder.rejected[reason.value] += 1
 
     def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
         """Accept or reject for good every edge with a sender's id, or hand it back; returns how many there are."""
         with self._lock:
-            return self._builder.label_edge(source_robot, edge_id, label)
+            return self._content.builder.label_edge(source_robot, edge_id, label)
 
     def current_orientation(self, robot: str) -> Quaternion | None:
         """world_from_body now: the robot's last corrected keyframe, then odometry. None before its first odometry."""
         with self._lock:
-            track = self._builder.tracks.get(robot)
-            if track is None or track.latest is None:
-                return None
-            return quaternion.normalize(quaternion.multiply(self._correction(robot), track.latest.world_from_body))
+            return self._content.current_orientation(robot)
 
     def world_from_odometry(self, robot: str) -> Quaternion | None:
         """The correction of a robot's odometry frame (map from odom); None before its first odometry."""
         with self._lock:
-            return self._correction(robot) if robot in self._builder.tracks else None
+            return self._content.correction(robot) if robot in self._content.builder.tracks else None
 
     def counts(self) -> Counts:
         """Sizes and refusals now."""
         with self._lock:
-            builder = self._builder
-            return Counts(
-                keyframes=builder.graph.num_keyframes,
-                edges=builder.graph.num_edges,
-                pending=len(builder.pending),
-                rejected=dict(builder.rejected),
-                time_jumps=self._time_jumps,
-                time_is_back=self._backward_jumps.is_back and self.options.on_time_jump == "error",
-                odometry_restarts=sum(track.chain for track in builder.tracks.values()),
-            )
+            return self._content.counts(self._time_jumps)
 
     def set_options(self, options: EstimatorOptions) -> None:
         """Change the options; what was built so far stays, and the next tick solves anew."""
         with self._lock:
             self.options = options
-            self._builder.set_options(options)
-            self._answered_revision = -1
+            self._content.builder.set_options(options)
+            self._content.solve_anew()
 
     def trajectories(self, answer: Answer) -> dict[str, Trajectory]:
         """Poses of every robot's keyframes in the answer that have a stamp, see :func:`corrected_trajectories`."""
         with self._lock:
-            translation = self._builder.graph.snapshot().translation[: len(answer.source)]
-            tracks = dict(self._builder.tracks)
+            translation = self._content.builder.graph.snapshot().translation[: len(answer.source)]
+            tracks = dict(self._content.builder.tracks)
         if len(translation) < len(answer.source):
             return {}  # the answer is about a graph that was reset since
         return corrected_trajectories(answer, translation, tracks)
@@ -212,13 +153,13 @@ class OnlineEstimator:
     def snapshot(self) -> GraphSnapshot:
         """The graph now; a later one begins with the same keyframes and edges."""
         with self._lock:
-            return self._builder.graph.snapshot()
+            return self._content.builder.graph.snapshot()
 
     @property
     def revision(self) -> int:
         """Counts the graph's changes."""
         with self._lock:
-            return self._builder.graph.revision
+            return self._content.builder.graph.revision
 
     @property
     def generation(self) -> int:
@@ -233,13 +174,13 @@ class OnlineEstimator:
     @property
     def first_version(self) -> int:
         """Answers up to this version are of what was forgotten or replaced since."""
-        return self._first_version
+        return self._content.first_version
 
     @property
     def is_behind(self) -> bool:
         """Whether the graph has changed since the last answer."""
         with self._lock:
-            return self._builder.graph.revision != self._answered_revision
+            return self._content.is_behind
 
     @property
     def paused(self) -> bool:
@@ -252,7 +193,10 @@ class OnlineEstimator:
     def reset(self) -> None:
         """Forget everything, counters included. Answers go on counting up; a running tick is thrown away."""
         with self._lock:
-            self._start_over(GraphBuilder(self.options), None, self._version)
+            self._forget()
+
+    def _forget(self) -> None:
+        self._start_over(GraphBuilder(self.options), None, self._content.version)
 
     def save(self, path: Path) -> None:
         """Write everything into one file, whole or not at all.
@@ -261,7 +205,8 @@ class OnlineEstimator:
             StateFileError: the file cannot be written.
         """
         with self._lock:
-            state = state_file.collect(self._builder, self._answered, self._version)
+            content = self._content
+            state = state_file.collect(content.builder, content.answered, content.version)
         state_file.write(path, state.encoded())
 
     def load(self, path: Path) -> None:
@@ -272,9 +217,7 @@ class OnlineEstimator:
         """
         builder, answered, version = state_file.restore(state_file.read(path), self.options)
         with self._lock:
-            self._start_over(builder, answered, max(version, self._version))
-            if answered is not None:
-                self._world_from_odometry = corrections(builder, answered)
+            self._start_over(builder, answered, max(version, self._content.version))
 
     def tick(self, force_cold: bool = False) -> Answer | None:
         """Solve, if there is anything new.
@@ -291,53 +234,42 @@ class OnlineEstimator:
         with self._tick_lock:
             started = time.perf_counter()
             with self._lock:
-                if self._paused and not force_cold:
-                    return None
-                builder, answered, answered_component = self._builder, self._answered, self._answered_component
-                idle = builder.graph.revision == self._ticked_revision
-                if idle or force_cold:
-                    builder.settle()
-                unchanged = builder.graph.revision == self._answered_revision
-                if unchanged and self._answer_was_cold:
-                    return None
-                snapshot = builder.graph.snapshot()
-                self._ticked_revision = snapshot.revision
-            cold = force_cold or idle or answered is None or not self.options.warm_start
-            warm_start = None
-            if not cold and answered is not None:
-                joined = answered_component is None or joins_components(answered_component, snapshot.graph.components())
-                warm_start = None if joined else extend_along_edges(answered, snapshot.graph)
-                cold = joined
+                content, options = self._content, self.options
+                problem = None if self._paused and not force_cold else content.next_problem(force_cold)
+            if problem is None:
+                return None
+            snapshot, cold = problem
+            # Between here and the next lock only this thread writes what is read of the last answer.
+            warm_start = None if cold else content.warm_start(snapshot)
             solution = self._solver(
                 snapshot.graph,
-                method=self.options.method,
-                profile=self.options.profile,
-                device=self.options.device,
-                refinement_steps=self.options.refinement_steps,
+                method=options.method,
+                profile=options.profile,
+                device=options.device,
+                refinement_steps=options.refinement_steps,
                 warm_start=warm_start,
             )
             component = solution.component.cpu()
             with self._lock:
-                roots = root_orientations(builder, component, answered)
+                roots = root_orientations(content.builder, component, content.answered)
             body_from_world = fix_gauge(solution.body_from_world.cpu(), component, roots)
             with self._lock:
-                if builder is not self._builder:
+                if content is not self._content:
                     return None  # reset or loaded meanwhile
-                self._answered, self._answered_component = body_from_world, component
-                self._answered_revision, self._answer_was_cold = snapshot.revision, cold
-                self._version += 1
-                version = self._version
-                self._world_from_odometry = corrections(self._builder, body_from_world)
-            seconds = time.perf_counter() - started
+                content.accept(body_from_world, component, snapshot.revision, was_cold=warm_start is None)
+                if options is not self.options:
+                    content.solve_anew()
+                version = content.version
             return Answer.of_solution(
-                snapshot, solution, body_from_world, component, self.options.outlier_threshold, version, cold, seconds
+                snapshot,
+                solution,
+                body_from_world,
+                component,
+                options.outlier_threshold,
+                version,
+                warm_start is None,
+                time.perf_counter() - started,
             )
-
-    def _correction(self, robot: str) -> Quaternion:
-        """world_from_odometry; before the robot's first answer, what makes its first odometry fit the gauge."""
-        if robot in self._world_from_odometry:
-            return self._world_from_odometry[robot]
-        return first_correction(self._builder, robot)
 
 
 def _default_solver() -> Solver:

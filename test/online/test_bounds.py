@@ -54,7 +54,7 @@ def test_a_full_graph_still_ties_edges_to_what_there_is() -> None:
     ends = [KeyframeReference("r", stamp_ns=index * SECOND) for index in (2, 18)]
     measured = (rotations[18].inv() * rotations[2]).as_quat()
     assert online.add_edge(EdgeMeasurement(1, *ends, measured)) is None
-    graph = online._builder.graph.snapshot().graph
+    graph = online.snapshot().graph
     assert (int(graph.source[-1]), int(graph.target[-1])) == (2, 9)
     tied = Rotation.from_quat(graph.target_from_source[-1].numpy())
     assert (tied.inv() * (rotations[9].inv() * rotations[2])).magnitude() < 1e-9

@@ -28,7 +28,7 @@ def feed(online: OnlineEstimator, indices: range, offset_ns: int = 0) -> list[Re
 
 
 def graph(online: OnlineEstimator) -> tuple[list[int], list[list[float]]]:
-    snapshot = online._builder.graph.snapshot()
+    snapshot = online.snapshot()
     return snapshot.stamp_ns.tolist(), snapshot.graph.target_from_source.tolist()
 
 

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
 
-from rotavg_ros.online.estimator import Counts
+from rotavg_ros.online.content import Counts
 from rotavg_ros.ros.diagnostics import Health, Reporter
 from rotavg_ros.ros.message_counting import TopicCounter
 from rotavg_ros.ros.parameters import NodeParameters

@@ -1,0 +1,144 @@
+"""What an estimator knows at a time: a growing graph, the last answer to it, and what ties the two to odometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from rotavg_ros.online import quaternion
+from rotavg_ros.online.anchoring import anchor, corrections, first_correction
+from rotavg_ros.online.gauge import extend_along_edges, joins_components
+from rotavg_ros.online.graph_builder import GraphBuilder
+from rotavg_ros.online.growing_view_graph import GraphSnapshot
+from rotavg_ros.online.measurements import RejectReason
+from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.online.time_jumps import BackwardJumps, LateMessage
+
+
+@dataclass(frozen=True)
+class Counts:
+    """How large the estimator's state is, and what was refused so far.
+
+    Attributes:
+        keyframes, edges, pending: sizes now.
+        rejected: inputs refused, by :class:`RejectReason` value.
+        time_jumps: how often the data's time went back.
+        time_is_back: whether odometry is refused since such a jump, and somebody has to decide.
+        odometry_restarts: how often the odometry of one of the robots began anew.
+    """
+
+    keyframes: int
+    edges: int
+    pending: int
+    rejected: dict[str, int]
+    time_jumps: int = 0
+    time_is_back: bool = False
+    odometry_restarts: int = 0
+
+
+class Content:
+    """All of it is forgotten together, by a new one in its place. Not thread-safe.
+
+    Attributes:
+        builder: the graph, and what is needed to grow it.
+        answered: body_from_world ``(n, 4)`` of the last answer, None before the first.
+        first_version, version: of the answers, before the first and of the last.
+    """
+
+    def __init__(self, builder: GraphBuilder, answered: Tensor | None, version: int) -> None:
+        self.builder = builder
+        self.answered = answered
+        self.first_version = self.version = version
+        self._answered_component: Tensor | None = None
+        self._answered_revision = 0
+        self._answer_was_cold = True
+        self._ticked_revision = 0
+        self._backward_jumps = BackwardJumps()
+        # Per robot: world_from_body = world_from_odometry ∘ odometry, as of its last corrected keyframe.
+        self._world_from_odometry: dict[str, Quaternion] = {}
+        if answered is not None:
+            self._world_from_odometry = corrections(builder, answered)
+
+    def add_odometry(self, message: LateMessage) -> tuple[RejectReason | None, list[LateMessage]]:
+        """Take an odometry message.
+
+        Returns:
+            why it was refused and counted, None if it was taken; and the messages since time went back, if this one
+            shows that it has.
+        """
+        builder, robot = self.builder, message.robot
+        track = builder.tracks.get(robot)
+        last = None if track is None else track.latest
+        reason = builder.add_odometry(robot, message.stamp_ns, message.world_from_body, message.position)
+        if track is not None and last is not None and track.chain > len(track.anchors):
+            anchor(track, last, self.correction(robot))
+            self._world_from_odometry.pop(robot, None)
+        if reason is None:
+            self._backward_jumps.on_time(robot)
+        elif reason is RejectReason.OUT_OF_ORDER_ODOMETRY and last is not None:
+            options = builder.options
+            longest_step_ns = options.odometry_bounds.max_gap_ns
+            return reason, self._backward_jumps.late(message, last.stamp_ns, options.time_jump_ns, longest_step_ns)
+        return reason, []
+
+    def correction(self, robot: str) -> Quaternion:
+        """world_from_odometry; before the robot's first answer, what makes its first odometry fit the gauge."""
+        if robot in self._world_from_odometry:
+            return self._world_from_odometry[robot]
+        return first_correction(self.builder, robot)
+
+    def current_orientation(self, robot: str) -> Quaternion | None:
+        """world_from_body now: the robot's last corrected keyframe, then odometry. None before its first odometry."""
+        track = self.builder.tracks.get(robot)
+        if track is None or track.latest is None:
+            return None
+        return quaternion.normalize(quaternion.multiply(self.correction(robot), track.latest.world_from_body))
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether the graph has changed since the last answer."""
+        return self.builder.graph.revision != self._answered_revision
+
+    def solve_anew(self) -> None:
+        """Let the next tick solve though the graph is the same."""
+        self._answered_revision = -1
+
+    def next_problem(self, force_cold: bool) -> tuple[GraphSnapshot, bool] | None:
+        """The graph that is to be solved now, and whether from scratch; None if the last answer still stands."""
+        idle = self.builder.graph.revision == self._ticked_revision
+        if idle or force_cold:
+            self.builder.settle()
+        if not self.is_behind and self._answer_was_cold:
+            return None
+        snapshot = self.builder.graph.snapshot()
+        self._ticked_revision = snapshot.revision
+        return snapshot, force_cold or idle or not self.builder.options.warm_start
+
+    def warm_start(self, snapshot: GraphSnapshot) -> Tensor | None:
+        """The last answer carried on to all keyframes ``(N, 4)``; None where it is no good start."""
+        if self.answered is None or self._answered_component is None:
+            return None
+        if joins_components(self._answered_component, snapshot.graph.components()):
+            return None
+        return extend_along_edges(self.answered, snapshot.graph)
+
+    def accept(self, body_from_world: Tensor, component: Tensor, revision: int, was_cold: bool) -> None:
+        """Make this the last answer: orientations ``(N, 4)`` and components ``(N,)`` of the graph at a revision."""
+        self.answered, self._answered_component = body_from_world, component
+        self._answered_revision, self._answer_was_cold = revision, was_cold
+        self.version += 1
+        self._world_from_odometry = corrections(self.builder, body_from_world)
+
+    def counts(self, time_jumps: int) -> Counts:
+        """Sizes and refusals now."""
+        builder = self.builder
+        return Counts(
+            keyframes=builder.graph.num_keyframes,
+            edges=builder.graph.num_edges,
+            pending=len(builder.pending),
+            rejected=dict(builder.rejected),
+            time_jumps=time_jumps,
+            time_is_back=self._backward_jumps.is_back and builder.options.on_time_jump == "error",
+            odometry_restarts=sum(track.chain for track in builder.tracks.values()),
+        )
