@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 
 from rotavg_ros.online import EdgeMeasurement, RejectReason
@@ -34,8 +35,12 @@ class Source:
 
         A number that means none of them becomes a name itself.
         """
+        return self._name_of_number.get(number, str(number))
+
+    @cached_property
+    def _name_of_number(self) -> dict[int, str]:
         numbered = {int(name): name for name in self.robots if name.isdecimal()}
-        return (numbered or dict(enumerate(self.robots))).get(number, str(number))
+        return numbered or dict(enumerate(self.robots))
 
 
 @dataclass(frozen=True, slots=True)
