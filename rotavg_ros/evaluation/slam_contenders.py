@@ -69,6 +69,9 @@ _PACKAGES = {"gnc": "gtsam", "isam2": "gtsam", "colmap": "pycolmap"}
 ROWS: dict[str, str] = {
     OURS: "**ours** (NeuRoRA for SLAM)",
     "neurora-without-cleannet": "· without CleanNet",
+    "neurora-odometry-start": "· without the weighted tree",
+    "neurora-stated-precisions": "· without scale estimation",
+    "neurora-without-slip-search": "· without the slip search",
     "cleannet-spt": "· without refinement",
     "spt": "· tree alone",
     "gnc": "GNC (GTSAM), told that odometry is right",

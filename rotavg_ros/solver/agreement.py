@@ -34,13 +34,15 @@ class AgreementPairs:
     squared_angle: np.ndarray
 
 
+NO_PAIRS = AgreementPairs(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0), np.empty(0))
+
+
 def agreement_pairs(graph: ClosureGraph, num_neighbours: int = NUM_NEIGHBOURS) -> AgreementPairs:
     """The nearest closures of every closure, by steps along the odometry."""
     closure = np.flatnonzero(graph.is_closure)
     count = min(num_neighbours, len(closure) - 1)
     if count < 1:
-        empty = np.empty(0, dtype=np.int64)
-        return AgreementPairs(empty, empty, np.empty(0), np.empty(0))
+        return NO_PAIRS
     start, end = graph.position[graph.source[closure]], graph.position[graph.target[closure]]
     residual = graph.residual[torch.from_numpy(closure)]
     # Closures run old → new and new → old; residuals compare in one direction only.

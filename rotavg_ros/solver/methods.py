@@ -15,6 +15,9 @@ class Method:
         refine: refinement ends the solve.
         weighted: refinement begins by weighing the edges by CleanNet's scores.
         shaped: refinement ends in steps that know the noise's shape; otherwise it is Chatterjee & Govindu's.
+        tree_start: SLAM starts from the tree of least expected error; otherwise from the odometry.
+        scale_estimation: SLAM estimates the noise; otherwise it believes the precisions that edges state.
+        slip_search: SLAM looks for slips in the odometry where closures speak of them.
     """
 
     clean: bool = False
@@ -22,6 +25,9 @@ class Method:
     refine: bool = False
     weighted: bool = True
     shaped: bool = True
+    tree_start: bool = True
+    scale_estimation: bool = True
+    slip_search: bool = True
 
 
 NETWORK_METHODS = {
@@ -37,6 +43,10 @@ NETWORK_METHODS = {
     "neurora-without-cleannet": Method(fine_tunings=1, refine=True),
     "neurora-without-both": Method(refine=True),
     "neurora-round": Method(clean=True, fine_tunings=1, refine=True, shaped=False),
+    # Ablations of the SLAM profile: they run as the whole does in that of SfM.
+    "neurora-odometry-start": Method(clean=True, fine_tunings=1, refine=True, tree_start=False),
+    "neurora-stated-precisions": Method(clean=True, fine_tunings=1, refine=True, scale_estimation=False),
+    "neurora-without-slip-search": Method(clean=True, fine_tunings=1, refine=True, slip_search=False),
 }
 # By name only: they build on the solver, so that they are imported when one of them runs.
 BASELINES = ("chatterjee", "weiszfeld", "arrigoni", "wang")

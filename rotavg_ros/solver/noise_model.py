@@ -22,6 +22,8 @@ _PRIOR_CLOSURE_VARIANCE = np.radians(2.0) ** 2
 _PRIOR_STEP_SQUARE = np.radians(0.02) ** 2
 _PRIOR_CLOSURE_SQUARE = np.radians(0.3) ** 2
 _PRIOR_OUTLIER_COUNTS = (1.0, 3.0)
+# Neighbours tell the noise of good closures, but not how many are false.
+_NEIGHBOURS_OUTLIER_SHARE = 0.3
 _EM_STARTS_STEP_DEG = (0.02, 0.1, 0.5, 2.0)
 _EM_STARTS_CLOSURE_DEG = (0.3, 2.0)
 # Rows of either kind used to choose among the starts, and to converge.
@@ -118,7 +120,7 @@ def discrepancies(squared_angle: np.ndarray, path_steps: np.ndarray, pairs: Agre
     """Of every closure with the odometry (``(C,)`` each; infinite steps tell nothing), and of agreeing closures."""
     on_chain = np.flatnonzero(np.isfinite(path_steps))
     num_chain, num_pairs = len(on_chain), len(pairs.first)
-    per_closure = num_pairs / max(len(path_steps), 1)
+    per_closure = num_pairs / max(len(np.unique(pairs.first)), 1)
     return Discrepancies(
         np.concatenate((squared_angle[on_chain], pairs.squared_angle)),
         np.concatenate((np.maximum(path_steps[on_chain], 1.0), np.maximum(pairs.steps, 0.5))),
@@ -137,6 +139,10 @@ def estimate_noise(data: Discrepancies, components: int) -> NoiseModel:
     closures' own agreement holds the estimate up where odometry has drifted past recognition or most closures are
     false; their discrepancy with the chain separates the two variances.
     """
+    return _least_drift(data.thinned(_EM_THINNED[0]), _likeliest(data, components))
+
+
+def _likeliest(data: Discrepancies, components: int) -> NoiseModel:
     if len(data.steps) == 0:
         return NoiseModel(components, _PRIOR_STEP_VARIANCE, _PRIOR_CLOSURE_VARIANCE, 0.25)
     few = data.thinned(_EM_THINNED[0])
@@ -146,12 +152,22 @@ def estimate_noise(data: Discrepancies, components: int) -> NoiseModel:
         for closure in _EM_STARTS_CLOSURE_DEG
     ]
     best = max(starts, key=lambda start: start[0])[1]
-    likeliest = _maximise(data.thinned(_EM_THINNED[1]), best, _EM_ITERATIONS)[1]
-    return _least_drift(few, likeliest)
+    return _maximise(data.thinned(_EM_THINNED[1]), best, _EM_ITERATIONS)[1]
+
+
+def noise_between_neighbours(pairs: AgreementPairs, components: int) -> NoiseModel:
+    """The noise as neighbouring closures see it: without the odometry that lies farther between, so immune to slips."""
+    nothing = np.empty(0)
+    model = _likeliest(discrepancies(nothing, nothing, pairs), components)
+    # Where few closures share their ends, odometry takes their noise for its own; but none is better than a step.
+    closure_variance = max(model.closure_variance, model.step_variance)
+    return replace(model, closure_variance=closure_variance, outlier_share=_NEIGHBOURS_OUTLIER_SHARE)
 
 
 def _least_drift(data: Discrepancies, likeliest: NoiseModel) -> NoiseModel:
     """The model of least step variance that is nearly as likely as the likeliest."""
+    if len(data.steps) == 0:
+        return likeliest
     profile = [_maximise(data, likeliest, _DOUBT_ITERATIONS, hold_step=True)]
     for share in _STEP_DOUBT_SHARES:
         start = replace(profile[-1][1], step_variance=share * likeliest.step_variance)

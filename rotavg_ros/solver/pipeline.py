@@ -29,7 +29,7 @@ PROFILES = ("auto", "slam", "sfm")
 # A graph of more edges is worth measuring what tiles this machine likes.
 _TUNING_PAYS = 200_000
 # The noise that makes an edge an outlier, in radians.
-_OUTLIER_ANGLE = {"sfm": sfm_stages.OUTLIER_ANGLE, "slam": np.radians(10.0)}
+_OUTLIER_ANGLE = {"sfm": sfm_stages.OUTLIER_ANGLE, "slam": slam_refinement.OUTLIER_ANGLE}
 
 
 @dataclass(frozen=True)
@@ -244,32 +244,34 @@ def _solve_slam(
     watch: _Stopwatch,
 ) -> _Estimate:
     with watch.stage("contract"):
-        prepared = slam_stages.prepare(graph)
+        prepared = slam_stages.prepare(graph, scale_estimation=method.scale_estimation)
     with watch.stage("clean"):
         network = networks.load("slam-clean-net") if method.clean else None
         cleaned = slam_stages.clean(network, prepared, graph.label)
     with watch.stage("bootstrap"):
-        correction = slam_stages.bootstrap(prepared, cleaned)
+        if method.tree_start:
+            correction = slam_stages.bootstrap(prepared, cleaned)
+        else:
+            correction = rotations.identity(prepared.closure_graph.num_nodes)
         if warm_start is not None:
             correction = prepared.closure_graph.corrections(warm_start.double())
-    inlier_probability = cleaned.inlier_probability
+    outlier_probability = 1 - cleaned.inlier_probability
     variance = np.full(graph.num_nodes, np.nan)
     steps = (slam_refinement.MAX_PASSES if method.refine else 0) if refinement_steps is None else refinement_steps
     if steps > 0:
         with watch.stage("refine"):
-            estimate = slam_refinement.refine(
-                prepared.closure_graph,
-                prepared.pairs,
+            estimate = slam_stages.refine(
+                prepared,
+                cleaned,
                 correction,
-                inlier_probability,
-                prepared.noise,
-                log_odds=cleaned.prior_log_odds,
-                max_passes=steps,
+                steps,
+                scale_estimation=method.scale_estimation,
+                slip_search=method.slip_search,
             )
-            correction, inlier_probability = estimate.correction, estimate.inlier_probability
+            correction, outlier_probability = estimate.correction, estimate.outlier_probability
             variance = prepared.closure_graph.variance(estimate.samples, estimate.noise.step_variance)
     with watch.stage("expand"):
-        score = torch.from_numpy(1 - prepared.closure_graph.edge_values(inlier_probability))
+        score = torch.from_numpy(slam_stages.outlier_scores(prepared.closure_graph, outlier_probability))
         orientations = prepared.closure_graph.orientations(correction)
     return _Estimate(orientations, score, torch.from_numpy(variance))
 

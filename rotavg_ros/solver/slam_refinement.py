@@ -19,11 +19,14 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.agreement import AgreementPairs
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.common_error import closure_runs, common_share, variance_factor
+from rotavg_ros.solver.exceedance import exceedance
 from rotavg_ros.solver.fine_net import edge_residual
 from rotavg_ros.solver.laplacian import LaplacianPattern, probe_signs
 from rotavg_ros.solver.noise_model import NoiseModel, outlier_share
 
 MAX_PASSES = 30
+# A loop closure whose true noise exceeds this is an outlier.
+OUTLIER_ANGLE = np.radians(10.0)
 _NUM_PROBES = 48
 # Residuals say nothing of noise or falsehood while the orientations still turn by more than this.
 _SETTLED_STEP = np.radians(3.0)
@@ -47,7 +50,8 @@ class SlamEstimate:
 
     Attributes:
         correction: ``(K, 4)`` C.
-        inlier_probability: ``(E,)``.
+        inlier_probability: ``(E,)`` that an edge is not a false one, which is what it weighs.
+        outlier_probability: ``(E,)`` that its true noise exceeds :data:`OUTLIER_ANGLE`, or that a segment slipped.
         noise: the estimated noise model.
         samples: ``(K, k)`` errors, in rad, as they might be: their second moments are the estimate's covariance.
         common_share: share of the closures' error variance that neighbouring closures have in common.
@@ -56,6 +60,7 @@ class SlamEstimate:
 
     correction: Tensor
     inlier_probability: np.ndarray
+    outlier_probability: np.ndarray
     noise: NoiseModel
     samples: np.ndarray
     common_share: float
@@ -71,19 +76,21 @@ def refine(
     *,
     log_odds: np.ndarray | None = None,
     max_passes: int = MAX_PASSES,
+    hold_noise: bool = False,
 ) -> SlamEstimate:
     """Alternate solving and judging until neither moves; once more if neighbouring closures err together.
 
     Args:
         pairs: the graph's neighbouring closures.
         correction: ``(K, 4)`` start; identities for the odometry itself.
-        inlier_probability: ``(E,)`` start.
+        inlier_probability: ``(E,)`` start; that of odometry is kept.
         noise: start.
         log_odds: ``(E,)`` prior log-odds of each edge to be good, beyond the common outlier share; ±inf decide it.
         max_passes: sparse solves at most, at least 1.
+        hold_noise: keep both variances as given.
     """
     prior = np.zeros(len(graph.source)) if log_odds is None else log_odds
-    state = _State(graph, correction, inlier_probability, noise, prior)
+    state = _State(graph, correction, inlier_probability, noise, prior, hold_noise)
     state.alternate(_MAX_STEP_VARIANCE_GAIN * noise.step_variance, (max_passes + 1) // 2)
     share = 0.0
     closure = np.flatnonzero(graph.is_closure)
@@ -104,6 +111,7 @@ def refine(
     return SlamEstimate(
         rotations.normalize(state.correction),
         state.inlier_probability,
+        state.outlier_probability,
         state.noise,
         state.samples,
         share,
@@ -123,12 +131,14 @@ class _State:
         inlier_probability: np.ndarray,
         noise: NoiseModel,
         prior_log_odds: np.ndarray,
+        hold_noise: bool,
     ) -> None:
-        self.graph, self.correction, self.noise = graph, correction, noise
+        self.graph, self.correction, self.noise, self.hold_noise = graph, correction, noise, hold_noise
         self.inlier_probability, self.prior_log_odds = inlier_probability, prior_log_odds
         self.pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots)
         self.probes = probe_signs(graph.nodes[graph.source], graph.nodes[graph.target], _NUM_PROBES)
         self.residual = _residual_vectors(graph, correction)  # (E, 3) rad
+        self.outlier_probability = 1 - inlier_probability
         self.passes = 0
 
     def difference(self, values: np.ndarray) -> np.ndarray:
@@ -163,23 +173,42 @@ class _State:
         odometry, closure = graph.is_odometry, graph.is_closure
         redundancy = self.inlier_probability * (1 - leverage)
         # A run's inflated variance is what its closures weigh, not what each of them errs.
-        square_per_step = square[odometry] / graph.steps[odometry]
-        self.noise = NoiseModel(
-            noise.components,
-            min(max_step_variance, _step_variance(square_per_step, redundancy[odometry], noise)),
-            _closure_variance(square[closure], self.inlier_probability[closure], redundancy[closure], noise),
-            outlier_share(self.inlier_probability[closure]),
-        )
+        square_per_step = self.inlier_probability[odometry] * square[odometry] / graph.steps[odometry]
+        step_variance, closure_variance = noise.step_variance, noise.closure_variance
+        if not self.hold_noise:
+            step_variance = min(max_step_variance, _step_variance(square_per_step, redundancy[odometry], noise))
+            closure_variance = _closure_variance(
+                square[closure], self.inlier_probability[closure], redundancy[closure], noise
+            )
+        share = outlier_share(self.inlier_probability[closure])
+        self.noise = NoiseModel(noise.components, step_variance, closure_variance, share)
 
         # What is left of the fit without the edge itself, and how far that may be off.
         predicted_square = np.minimum(square / (1 - leverage) ** 2, np.pi**2)
         scale = np.where(odometry, 1.0, self.noise.closure_variance / noise.closure_variance)
-        predicted_variance = scale * variance + resistance / (1 - leverage)
+        prediction_variance = resistance / (1 - leverage)
+        predicted_variance = scale * variance + prediction_variance
         judged = self.noise.inlier_log_odds(predicted_square, predicted_variance) + self.noise.prior_log_odds
-        probability = np.where(closure, expit(judged + self.prior_log_odds), 1.0)
+        probability = np.where(closure, expit(judged + self.prior_log_odds), self.inlier_probability)
         changed = float(np.abs(probability - self.inlier_probability).max(initial=0.0))
         self.inlier_probability = probability
+        self.outlier_probability = np.where(
+            closure, self._outlier_probability(np.sqrt(predicted_square), prediction_variance), 1 - probability
+        )
         return moved, changed
+
+    def _outlier_probability(self, discrepancy: np.ndarray, prediction_variance: np.ndarray) -> np.ndarray:
+        """Of every edge, taken for a closure: that its true noise exceeds :data:`OUTLIER_ANGLE`.
+
+        Its discrepancy is its noise and the prediction's error. Noise of a good closure is known beforehand to be
+        Gaussian; a false one's can be anything, so that the discrepancy alone says what it is.
+        """
+        noise = self.noise
+        own = noise.closure_variance / (noise.closure_variance + prediction_variance)
+        if_good = exceedance(own * discrepancy, own * prediction_variance, OUTLIER_ANGLE, noise.components)
+        if_false = exceedance(discrepancy, prediction_variance, OUTLIER_ANGLE, noise.components)
+        good = self.inlier_probability
+        return np.asarray(good * if_good + (1 - good) * if_false)
 
 
 def _residual_vectors(graph: ClosureGraph, correction: Tensor) -> np.ndarray:

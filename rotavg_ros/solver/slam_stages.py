@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,10 +10,13 @@ from scipy.special import expit
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.agreement import AgreementPairs, agreement_pairs
+from rotavg_ros.solver import slam_refinement
+from rotavg_ros.solver.agreement import NO_PAIRS, AgreementPairs, agreement_pairs
 from rotavg_ros.solver.closure_graph import ClosureGraph, contract
 from rotavg_ros.solver.noise_model import NoiseModel, discrepancies, estimate_noise, judge_by_chain
 from rotavg_ros.solver.slam_clean_net import SlamCleanNet, closure_features
+from rotavg_ros.solver.slam_refinement import SlamEstimate
+from rotavg_ros.solver.slip_search import search_for_slips
 from rotavg_ros.solver.spanning_tree import compose_orientations, minimum_spanning_forest, shortest_path_forest
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
@@ -49,8 +52,12 @@ class Prepared:
         return self.closure_graph.num_segments
 
 
-def prepare(graph: ViewGraph) -> Prepared:
-    """Contract the odometry chains and estimate the noise of steps and closures. Rejected edges take no part."""
+def prepare(graph: ViewGraph, *, scale_estimation: bool = True) -> Prepared:
+    """Contract the odometry chains and estimate the noise of steps and closures. Rejected edges take no part.
+
+    Args:
+        scale_estimation: if not, the noise is what edges of either kind state in the median.
+    """
     usable = graph.label != EdgeLabel.REJECTED
     cost = torch.where(graph.is_odometry, 1.0, _CLOSURE_COST)
     # A rejected edge may only be used where nothing else connects.
@@ -60,7 +67,11 @@ def prepare(graph: ViewGraph) -> Prepared:
     squared_angle = (rotations.log(closure_graph.residual) ** 2).sum(dim=1).numpy()[closure]
     path_steps = closure_graph.path_steps[closure]
     pairs = agreement_pairs(closure_graph)
-    noise = estimate_noise(discrepancies(squared_angle, path_steps, pairs), rotation_components(graph))
+    components = rotation_components(graph)
+    if scale_estimation:
+        noise = estimate_noise(discrepancies(squared_angle, path_steps, pairs), components)
+    else:
+        noise = _stated_noise(graph, components)
     return Prepared(closure_graph, squared_angle, path_steps, pairs, noise)
 
 
@@ -115,6 +126,57 @@ def bootstrap(prepared: Prepared, cleaned: CleanedClosures) -> Tensor:
     closure_graph = ViewGraph.create(graph.source, graph.target, graph.residual, num_nodes=graph.num_nodes)
     forest = shortest_path_forest(closure_graph, torch.from_numpy(cost), root="first")
     return compose_orientations(forest, closure_graph)
+
+
+def refine(
+    prepared: Prepared,
+    cleaned: CleanedClosures,
+    correction: Tensor,
+    max_passes: int = slam_refinement.MAX_PASSES,
+    *,
+    scale_estimation: bool = True,
+    slip_search: bool = True,
+) -> SlamEstimate:
+    """Refine from corrections ``(K, 4)``; if the outcome looks as if odometry had slipped, from a second start, too."""
+    graph, pairs, prior = prepared.closure_graph, prepared.pairs, cleaned.prior_log_odds
+
+    def run(start: Tensor, inlier_probability: np.ndarray, noise: NoiseModel) -> SlamEstimate:
+        return slam_refinement.refine(
+            graph,
+            pairs,
+            start,
+            inlier_probability,
+            noise,
+            log_odds=prior,
+            max_passes=max_passes,
+            hold_noise=not scale_estimation,
+        )
+
+    estimate = run(correction, cleaned.inlier_probability, prepared.noise)
+    second = search_for_slips(graph, pairs, estimate, prepared.noise, prior) if slip_search else None
+    return estimate if second is None else run(second.correction, second.inlier_probability, second.noise)
+
+
+def outlier_scores(graph: ClosureGraph, outlier_probability: np.ndarray) -> np.ndarray:
+    """Probability of each edge of the view-graph to be wrong, ``(M,)``, from those of the closure graph's, ``(E,)``.
+
+    A slip in a segment is as likely in any of its steps.
+    """
+    wrong = outlier_probability.copy()
+    wrong[: graph.num_segments] /= graph.steps[: graph.num_segments]
+    return graph.edge_values(wrong)
+
+
+def _stated_noise(graph: ViewGraph, components: int) -> NoiseModel:
+    """Medians of what the edges of either kind state; the prior where they state nothing."""
+    prior = estimate_noise(discrepancies(np.empty(0), np.empty(0), NO_PAIRS), components)
+    stated = {True: prior.step_variance, False: prior.closure_variance}
+    precision = graph.precision.numpy()
+    for kind in stated:
+        of_kind = precision[(graph.is_odometry.numpy() == kind) & np.isfinite(precision)]
+        if len(of_kind):
+            stated[kind] = float(1 / np.median(of_kind))
+    return replace(prior, step_variance=stated[True], closure_variance=stated[False])
 
 
 def rotation_components(graph: ViewGraph) -> int:

@@ -1,0 +1,91 @@
+"""What loop closures say of each other and of the odometry between them: verdicts that a slip elsewhere does not touch.
+
+Two neighbouring closures and the two short stretches of odometry between their ends form a cycle. It closes if all of
+them are good; if one is not, it is off by anything. Belief propagation over all such cycles (each a factor "all good →
+Gaussian, else uniform") tells which closures are good without ever trusting a long stretch of odometry.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import log_expit
+
+from rotavg_ros.solver.agreement import AgreementPairs
+from rotavg_ros.solver.closure_graph import ClosureGraph
+from rotavg_ros.solver.noise_model import NoiseModel
+
+_ROUNDS = 20
+_DAMPING = 0.5
+# Cycles that share a closure share its error; each counts this much of an independent one.
+_TEMPER = 0.5
+# A cycle through more segments than this tells nobody's fault.
+_MAX_SEGMENTS = 12
+
+
+@dataclass(frozen=True)
+class CycleVotes:
+    """Log-odds of being good, closures ``(C,)`` and segments ``(S,)``."""
+
+    closure: np.ndarray
+    segment: np.ndarray
+
+
+def count_votes(
+    graph: ClosureGraph,
+    pairs: AgreementPairs,
+    noise: NoiseModel,
+    closure_log_odds: np.ndarray,
+    segment_log_odds: np.ndarray,
+) -> CycleVotes:
+    """Belief propagation over the cycles of neighbouring closures.
+
+    Args:
+        noise: variances of steps and closures.
+        closure_log_odds: ``(C,)`` prior log-odds of each closure to be good; finite.
+        segment_log_odds: ``(S,)`` the same of each segment.
+    """
+    num_segments = graph.num_segments
+    cycle, member, square, steps = _cycles(graph, pairs)
+    num_cycles = len(square)
+    variance = np.maximum(steps, 0.5) * noise.step_variance + 2 * noise.closure_variance
+    closes = noise.inlier_log_odds(square, variance)[cycle]
+    prior = np.concatenate((segment_log_odds, closure_log_odds))
+    message = np.zeros(len(cycle))
+    for _ in range(_ROUNDS):
+        belief = prior + np.bincount(member, message, len(prior))
+        is_good = log_expit(belief[member] - message)
+        others_good = np.minimum(np.bincount(cycle, is_good, num_cycles)[cycle] - is_good, -1e-9)
+        vote = np.logaddexp(np.log(-np.expm1(others_good)), others_good + closes)
+        message = _DAMPING * message + (1 - _DAMPING) * _TEMPER * vote
+    belief = prior + np.bincount(member, message, len(prior))
+    return CycleVotes(belief[num_segments:], belief[:num_segments])
+
+
+def _cycles(graph: ClosureGraph, pairs: AgreementPairs) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Cycle and member of every incidence (segments first, then closures); squared angle and steps of every cycle."""
+    closure, num_segments = np.flatnonzero(graph.is_closure), graph.num_segments
+    first, second = np.minimum(pairs.first, pairs.second), np.maximum(pairs.first, pairs.second)
+    _, unique = np.unique(first * np.int64(len(closure)) + second, return_index=True)
+    first, second = first[unique], second[unique]
+
+    position = graph.position
+    segment_end = np.maximum(position[graph.source[:num_segments]], position[graph.target[:num_segments]])
+    order = np.argsort(segment_end, kind="stable")
+    source, target = position[graph.source[closure]], position[graph.target[closure]]
+    begins, counts = [], []
+    for end in (np.minimum(source, target), np.maximum(source, target)):
+        begin = np.searchsorted(segment_end[order], np.minimum(end[first], end[second]), side="right")
+        stop = np.searchsorted(segment_end[order], np.maximum(end[first], end[second]), side="right")
+        begins.append(begin)
+        counts.append(stop - begin)
+    kept = np.flatnonzero(counts[0] + counts[1] <= _MAX_SEGMENTS)
+    number = np.arange(len(kept))
+    cycle, member = [number, number], [num_segments + first[kept], num_segments + second[kept]]
+    for begin, count in zip(begins, counts, strict=True):
+        begin, count = begin[kept], count[kept]
+        within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        cycle.append(np.repeat(number, count))
+        member.append(order[np.repeat(begin, count) + within])
+    return np.concatenate(cycle), np.concatenate(member), pairs.squared_angle[unique][kept], pairs.steps[unique][kept]

@@ -1,0 +1,103 @@
+"""A truncated least-squares cost on a closure graph, in which odometry may slip, and its descent from a start.
+
+An edge costs half its squared residual in units of its variance, but no more than it takes to call it wrong: the
+log-odds of being good that an edge without residual has. So the cost counts, in nats, how much is wrong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.closure_graph import ClosureGraph
+from rotavg_ros.solver.fine_net import edge_residual
+from rotavg_ros.solver.laplacian import LaplacianPattern
+from rotavg_ros.solver.noise_model import NoiseModel
+
+# Estimates on the way to the optimum fit worse than the optimum: their variance counts this many times.
+_SLACK = 2.0
+_SETTLING_STEPS = 2
+_ANNEALING_FACTOR = 1.4
+_DESCENT_STEPS = 8
+# Weight of what is believed wrong: enough to keep a graph solvable that falls apart without it.
+_MIN_WEIGHT = 1e-9
+
+
+@dataclass(frozen=True)
+class TruncatedCost:
+    """The cost of the edges of ``graph`` (E edges).
+
+    Attributes:
+        graph: the closure graph.
+        variance: ``(E,)`` rad² per component.
+        cap: ``(E,)`` what a wrong edge costs, ≥ 0.
+        pattern: the graph's Laplacian.
+    """
+
+    graph: ClosureGraph
+    variance: np.ndarray
+    cap: np.ndarray
+    pattern: LaplacianPattern
+
+    @staticmethod
+    def create(graph: ClosureGraph, noise: NoiseModel, log_odds: np.ndarray) -> TruncatedCost:
+        """From the noise and each edge's prior log-odds of being good, ``(E,)``; ±inf decide it."""
+        variance = graph.steps * np.where(graph.is_odometry, noise.step_variance, noise.closure_variance)
+        cap = noise.inlier_log_odds(np.zeros(len(variance)), variance) + np.clip(log_odds, -100, 100)
+        pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots)
+        return TruncatedCost(graph, variance, np.maximum(cap, 0.0), pattern)
+
+    def residual(self, correction: Tensor) -> Tensor:
+        """``(E, 4)``."""
+        graph = self.graph
+        return edge_residual(correction, graph.residual, torch.from_numpy(graph.source), torch.from_numpy(graph.target))
+
+    def of_edges(self, residual: Tensor) -> np.ndarray:
+        """Cost of every edge with residuals ``(E, 4)``."""
+        square = (rotations.log(residual) ** 2).sum(dim=1).numpy()
+        return np.asarray(np.minimum(square / (2 * _SLACK * self.variance), self.cap))
+
+    def total(self, correction: Tensor) -> float:
+        """Cost of a solution ``(K, 4)``, in nats."""
+        return float(self.of_edges(self.residual(correction)).sum())
+
+    def log_odds(self, correction: Tensor) -> np.ndarray:
+        """``(E,)`` of each edge to be good, by its residual."""
+        square = (rotations.log(self.residual(correction)) ** 2).sum(dim=1).numpy()
+        return np.asarray(self.cap - square / (2 * _SLACK * self.variance))
+
+    def descend(self, correction: Tensor, trust: np.ndarray | None = None) -> Tensor:
+        """Gauss–Newton with Geman–McClure weights, the smooth sibling of the truncated cost; corrections ``(K, 4)``.
+
+        Args:
+            correction: ``(K, 4)`` start.
+            trust: ``(E,)`` factors on the weights; if given, the loss is annealed from least squares on (graduated
+                non-convexity, Yang et al. 2020), and the start matters only as far as angles are not linear.
+        """
+        scale = 2 * self.cap
+        if trust is None:
+            for _ in range(_DESCENT_STEPS):
+                correction = self._step(correction, (scale / (self._square(correction) + scale + 1e-12)) ** 2)
+            return rotations.normalize(correction)
+        for _ in range(_SETTLING_STEPS):
+            correction = self._step(correction, trust)
+        convexity = (
+            float((2 * self._square(correction) / np.maximum(scale, 1e-12)).max(initial=0.0, where=scale > 0)) + 1
+        )
+        while convexity > 1 / _ANNEALING_FACTOR:
+            annealed = max(convexity, 1.0) * scale + 1e-12
+            correction = self._step(correction, trust * (annealed / (self._square(correction) + annealed)) ** 2)
+            convexity /= _ANNEALING_FACTOR
+        return rotations.normalize(correction)
+
+    def _square(self, correction: Tensor) -> np.ndarray:
+        return np.asarray((rotations.log(self.residual(correction)) ** 2).sum(dim=1).numpy() / self.variance)
+
+    def _step(self, correction: Tensor, factor: np.ndarray) -> Tensor:
+        system = self.pattern.factorize(np.maximum(factor, _MIN_WEIGHT) / self.variance)
+        step = system.fit(rotations.log(self.residual(correction)).numpy())
+        return rotations.multiply(correction, rotations.exp(torch.from_numpy(step)))

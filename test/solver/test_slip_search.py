@@ -1,0 +1,137 @@
+"""Odometry that slips: votes of closures, jumps, and solves on small graphs."""
+
+from __future__ import annotations
+
+import networkx
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from scipy.stats import ncx2
+
+from rotavg_ros import EdgeKind, ViewGraph, rotations, solve
+from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.solver import slam_stages
+from rotavg_ros.solver.cycle_votes import count_votes
+from rotavg_ros.solver.exceedance import exceedance
+from rotavg_ros.solver.jumps import _best_set
+from rotavg_ros.solver.noise_model import NoiseModel, noise_between_neighbours
+from rotavg_ros.solver.truncated_cost import TruncatedCost
+from test.solver.graphs import as_quaternions, measured, random_truth, small_noise
+
+LAP, LAPS = 40, 4
+NUM_NODES = LAP * LAPS
+SLIPS = {25: 50.0, 90: -35.0}  # after these nodes, degrees
+
+
+def laps(planar: bool, false_share: float, seed: int = 0) -> tuple[ViewGraph, Rotation, np.ndarray, np.ndarray]:
+    """Laps with a closure to every earlier lap at each node; odometry slips twice. Truth, false closures, slips."""
+    rng = np.random.default_rng(seed)
+    truth = random_truth(NUM_NODES, seed, planar)
+    first, second = np.triu_indices(LAPS, 1)
+    place = np.arange(LAP)[:, None]
+    source, target = (place + LAP * first).ravel(), (place + LAP * second).ravel()
+    num_closures = len(source)
+    source = np.concatenate((np.arange(NUM_NODES - 1), source))
+    target = np.concatenate((np.arange(1, NUM_NODES), target))
+    sigma = np.repeat([0.1, 0.5], [NUM_NODES - 1, num_closures])
+    noise = small_noise(len(source), sigma, seed, planar)
+    is_false = np.zeros(len(source), dtype=bool)
+    is_false[NUM_NODES - 1 + rng.permutation(num_closures)[: round(false_share * num_closures)]] = True
+    wrong = Rotation.random(int(is_false.sum()), random_state=seed).as_rotvec()
+    vector = noise.as_rotvec()
+    vector[is_false] = [0, 0, 1] * rng.uniform(-np.pi, np.pi, (len(wrong), 1)) if planar else wrong
+    for step, angle in SLIPS.items():
+        vector[step] = np.radians(angle) * np.array([0, 0, 1.0] if planar else [0.6, 0, 0.8])
+    kind = np.repeat([EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE], [NUM_NODES - 1, num_closures])
+    graph = measured(truth, source, target, Rotation.from_rotvec(vector), kind=kind)
+    return graph, truth, is_false, np.isin(np.arange(len(source)), list(SLIPS))
+
+
+@pytest.mark.parametrize("planar", [True, False])
+@pytest.mark.parametrize("false_share", [0.0, 0.3])
+def test_slips_and_false_closures_are_told_apart(planar: bool, false_share: float) -> None:
+    graph, truth, is_false, is_slip = laps(planar, false_share)
+    solution = solve(graph, profile="slam")
+    errors = orientation_errors(solution.body_from_world, as_quaternions(truth), graph.components())
+    assert np.degrees(float(errors.mean())) < 0.5
+    flagged = (solution.outlier_score > 0.5).numpy()
+    assert (flagged[is_slip]).all()
+    assert not flagged[~is_false & ~is_slip].any()
+    without = solve(graph, profile="slam", method="neurora-without-slip-search")
+    errors = orientation_errors(without.body_from_world, as_quaternions(truth), graph.components())
+    assert np.degrees(float(errors.mean())) > 5
+
+
+def test_the_answer_depends_on_neither_order_nor_gauge() -> None:
+    graph, _, _, _ = laps(planar=False, false_share=0.3)
+    before = solve(graph, profile="slam")
+    order = torch.from_numpy(np.random.default_rng(1).permutation(graph.num_edges))
+    shuffled = ViewGraph.create(
+        graph.source[order], graph.target[order], graph.target_from_source[order], kind=graph.kind[order]
+    )
+    after = solve(shuffled, profile="slam")
+    torch.testing.assert_close(after.outlier_score, before.outlier_score[order], atol=1e-6, rtol=0)
+    torch.testing.assert_close(after.body_from_world, before.body_from_world, atol=1e-6, rtol=0)
+
+
+def test_closures_vote_without_the_odometry_between() -> None:
+    graph, _, is_false, is_slip = laps(planar=True, false_share=0.3)
+    prepared = slam_stages.prepare(graph)
+    closures = prepared.closure_graph
+    noise = noise_between_neighbours(prepared.pairs, 1)
+    assert np.degrees(np.sqrt(noise.closure_variance)) == pytest.approx(0.5, rel=0.4)
+    votes = count_votes(
+        closures,
+        prepared.pairs,
+        noise,
+        np.full(int(closures.is_closure.sum()), noise.prior_log_odds),
+        np.full(closures.num_segments, 6.0),
+    )
+    good = ~is_false[closures.view_graph_edge]
+    assert ((votes.closure > 0) == good).mean() > 0.95
+    assert (votes.segment[closures.segment_of_edge[is_slip]] < 6.0).all()
+
+
+def test_a_jump_takes_the_set_that_an_exhaustive_search_finds() -> None:
+    """Against all 2⁸ labellings of a small graph, their costs from above as in the cut."""
+    rng = np.random.default_rng(0)
+    num_nodes = 8
+    ends = np.array(list(networkx.gnm_random_graph(num_nodes, 16, seed=3).edges)).T
+    kind = np.full(ends.shape[1], EdgeKind.LOOP_CLOSURE)
+    chain = np.arange(num_nodes - 1)
+    source = np.concatenate((chain, ends[0]))
+    target = np.concatenate((chain + 1, ends[1]))
+    turned = np.where(rng.random(len(source)) < 0.4, np.radians(40.0), 0.0)
+    vector = turned[:, None] * np.array([0, 0, 1.0])
+    kind = np.concatenate((np.full(num_nodes - 1, EdgeKind.ODOMETRY), kind))
+    truth = Rotation.identity(num_nodes)
+    graph = measured(truth, source, target, Rotation.from_rotvec(vector), kind=kind)
+    closures = slam_stages.prepare(graph).closure_graph
+    noise = NoiseModel(1, np.radians(1.0) ** 2, np.radians(1.0) ** 2, 0.3)
+    cost = TruncatedCost.create(closures, noise, np.zeros(len(closures.source)))
+    residual = cost.residual(rotations.identity(closures.num_nodes))
+    costs = cost.of_edges(residual)
+    turn = rotations.exp(torch.tensor([0.0, 0.0, np.radians(40.0)]).double())
+    alone_target = cost.of_edges(rotations.multiply(rotations.inverse(turn).expand(len(residual), 4), residual))
+    alone_source = cost.of_edges(rotations.multiply(residual, turn.expand(len(residual), 4)))
+    smaller_target = alone_target < alone_source
+    source_cost = np.where(smaller_target, np.maximum(alone_source, 2 * costs - alone_target), alone_source)
+    target_cost = np.where(smaller_target, alone_target, np.maximum(alone_target, 2 * costs - alone_source))
+
+    def energy(turns: np.ndarray) -> float:
+        u, v = turns[closures.source], turns[closures.target]
+        return float(np.where(u == v, costs, np.where(u, source_cost, target_cost)).sum())
+
+    bits = (np.arange(2**closures.num_nodes)[:, None] >> np.arange(closures.num_nodes)) & 1 == 1
+    least = min(energy(turns) for turns in bits)
+    assert least < costs.sum() - 1
+    assert energy(_best_set(cost, residual, turn, costs)) == pytest.approx(least, abs=0.05)
+
+
+def test_exceedance_is_the_noncentral_chi_distribution() -> None:
+    length, sigma = np.radians([0.0, 5.0, 9.9, 30.0]), np.radians([1.0, 3.0, 8.0, 2.0])
+    angle = np.radians(10.0)
+    for components in (1, 3):
+        expected = ncx2.sf((angle / sigma) ** 2, components, (length / sigma) ** 2)
+        np.testing.assert_allclose(exceedance(length, sigma**2, angle, components), expected, atol=1e-7)
