@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
+from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.cli.main import COMMANDS, main
 from rotavg_ros.datasets.graph_file import write_graph
+from rotavg_ros.datasets.robot_run import robot_run_config
 from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.ros import diagnostics
 
@@ -38,7 +41,19 @@ NOT_RUN = {
     "python examples/three_robots.py": "test/ros runs it",
 }
 # What makes a command take seconds instead of minutes or hours.
-SMALLER = {"--laps 4": "--laps 1", "replay my_bag --output": "replay my_bag --duration 30 --output"}
+SMALLER = {"--laps 4": "--laps 1", "replay my_bag --output": "replay my_bag --duration 10 --no-report --output"}
+
+
+TINY_TRAINING = """\
+family: sfm
+recipe: mixture
+nodes: [10, 20]
+graphs: 6
+validation_nodes: [20, 20]
+validation_graphs: 3
+epochs: 1
+batch_graphs: 6
+"""
 
 
 class Command(NamedTuple):
@@ -59,6 +74,10 @@ class Command(NamedTuple):
         return f"{self.page}:{self.line}: {self.text}"
 
 
+def name_of(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
 def code_lines(page: Path) -> Iterator[tuple[int, str]]:
     """Lines of indented blocks and of fenced blocks without a language, with their numbers; blocks end in ''."""
     fence = None
@@ -74,7 +93,7 @@ def code_lines(page: Path) -> Iterator[tuple[int, str]]:
 
 def commands(page: Path) -> list[Command]:
     found: list[Command] = []
-    name, printing = str(page.relative_to(ROOT)), False
+    name, printing = name_of(page), False
     for number, line in code_lines(page):
         prompted = line.startswith("$ ")
         text = re.split(r"\s{2,}|\s#", line.removeprefix("$ ").strip())[0]
@@ -92,44 +111,52 @@ def commands(page: Path) -> list[Command]:
 
 ALL = [command for page in PAGES for command in commands(page)]
 SKIPPED = {command: words for command in ALL for words in NOT_RUN if command.text.startswith(words)}
-# A command that stands on several pages is run where it comes first.
-TO_RUN = list({command.text: command for command in reversed(ALL) if command not in SKIPPED}.values())[::-1]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A user's folder with a graph and, for troubleshooting, what can be wrong with one."""
-    folder = tmp_path_factory.mktemp("user")
+def belongings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a user has: a graph, a bag and, for troubleshooting, what can be wrong with them."""
+    folder = tmp_path_factory.mktemp("belongings")
     run = simulate_slam_graph(SlamSimulationConfig(num_keyframes=200), np.random.default_rng(0))
     write_graph(folder / "my.g2o", run.to_graph_file())
     lines = (folder / "my.g2o").read_text().splitlines(keepends=True)
     (folder / "half.g2o").write_text("".join(lines[:268]) + " ".join(lines[268].split()[:4]))
     (folder / "nan.g2o").write_text("".join([*lines[:299], "EDGE_SE2 0 1 nan 0 0.1 1 0 0 1 0 1\n", *lines[300:]]))
     (folder / "foreign.g2o").write_text("".join(lines).replace("EDGE_SE2", "EDGE_FOO"))
-    tiny = (
-        "family: sfm\nrecipe: mixture\nnodes: [10, 20]\ngraphs: 6\nvalidation_nodes: [20, 20]\nvalidation_graphs: 3\n"
-    )
-    (folder / "my-robot.yaml").write_text(tiny + "epochs: 1\nbatch_graphs: 6\n")
+    write_run_bag(folder / "my_bag", simulate_slam_graph(robot_run_config(laps=2), np.random.default_rng(0)))
+    (recording,) = (folder / "my_bag").glob("*.mcap")
+    (folder / "half.mcap").write_bytes(recording.read_bytes()[:60_000])
+    (folder / "my-robot.yaml").write_text(TINY_TRAINING)
     return folder
 
 
 def test_pages_have_commands() -> None:
     assert len(ALL) > 30
     assert {command.page for command in ALL} >= {"README.md", "docs/troubleshooting.md", "docs/from-your-slam.md"}
-    unused = set(NOT_RUN) - set(SKIPPED.values())
-    assert unused == set(), "nobody needs these exceptions any more"
+    assert set(NOT_RUN) == set(SKIPPED.values()), "an exception that no page needs"
 
 
-@pytest.mark.parametrize("command", TO_RUN, ids=str)
-def test_command(
-    command: Command, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_commands(
+    page: Path, belongings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In the order of the pages, for later ones use what earlier ones have written."""
-    monkeypatch.chdir(folder)
-    for truncated, whole in (("half.mcap", "my_bag"), ("half.mcap", "my_graph")):
-        if not Path(truncated).exists() and Path(whole).is_dir():
-            (recording,) = Path(whole).glob("*.mcap")
-            Path(truncated).write_bytes(recording.read_bytes()[:60_000])
+    """In order and in one folder, for later ones use what earlier ones have written."""
+    on_page = [command for command in ALL if command.page == name_of(page)]
+    shutil.copytree(belongings, tmp_path / "user")
+    monkeypatch.chdir(tmp_path / "user")
+    if any(command.text.startswith("rotavg simulate") and "my_bag" in command.text for command in on_page):
+        shutil.rmtree("my_bag")
+    for command in on_page:
+        if command not in SKIPPED:
+            check(command, capsys)
+    if page.name == "train-on-your-noise.md":
+        (code,) = re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+        exec(code, {})  # noqa: S102 - the page is ours
+        assert re.fullmatch(r"tensor\(\d+\) tensor\(\d+\)\n", capsys.readouterr().out)
+
+
+def check(command: Command, capsys: pytest.CaptureFixture[str]) -> None:
+    """Run one command in this process; it must succeed, or print what the page shows."""
     text = command.text
     for large, small in SMALLER.items():
         text = text.replace(large, small)
@@ -141,12 +168,12 @@ def test_command(
         code = int(leaving.code or 0)
     printed = capsys.readouterr()
     if command.output is None:
-        assert code == 0, printed.err
-    else:
-        shown = [line for line in (printed.out + printed.err).splitlines() if line.strip()]
-        assert len(shown) == len(command.output), shown
-        for line, expected in zip(shown, command.output, strict=True):
-            assert re.fullmatch(re.escape(expected).replace("…", ".*"), line), line
+        assert code == 0, f"{command}: {printed.err}"
+        return
+    shown = [line for line in (printed.out + printed.err).splitlines() if line.strip()]
+    assert len(shown) == len(command.output), f"{command}: {shown}"
+    for line, expected in zip(shown, command.output, strict=True):
+        assert re.fullmatch(re.escape(expected).replace("…", ".*"), line), f"{command}: {line}"
 
 
 @pytest.mark.parametrize("command", SKIPPED, ids=str)
@@ -158,18 +185,7 @@ def test_command_that_is_not_run_can_be_read(command: Command, monkeypatch: pyte
         assert main(words) == 0
 
 
-def test_python_that_uses_trained_networks(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    page = (ROOT / "docs" / "train-on-your-noise.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
-    if not Path("weights").is_dir():
-        pytest.skip("the commands before it were not run")
-    names: dict[str, Any] = {}
-    exec(code, names)  # noqa: S102 - the page is ours
-    assert len(names["ours"].outlier_score) == len(names["packaged"].outlier_score) > 0
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_links_lead_somewhere(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     for target in re.findall(r"\]\(([^)\s]+)\)", text):
