@@ -31,7 +31,8 @@ class WeightedAdjacency:
         """Take ``weight`` ``(M,)`` float64, of the graph's edges."""
         num_nodes = edges.num_nodes
         values = weight.index_select(0, edges.edge)
-        stretches = edges.tiles(-(-max(len(values), 1) // num_workers()))
+        threads = num_workers() if weight.device.type == "cpu" else 1
+        stretches = edges.tiles(-(-max(len(values), 1) // threads))
         self._blocks = [(tile.nodes, _block(edges, values, tile)) for tile in stretches]
         ones = weight.new_ones(num_nodes, 1)
         self.degree = self.product(ones)
