@@ -35,7 +35,7 @@ class Answer:
         source, target: ``(M,)`` int64 indices into the keyframes.
         kind: ``(M,)`` int64 :class:`~rotavg_ros.view_graph.EdgeKind`.
         outlier_score: ``(M,)`` float64 in [0, 1].
-        outlier: ``(M,)`` bool, score above the threshold; a user's label decides where there is one.
+        outlier: ``(M,)`` bool, score above the edge's threshold; a user's label decides where there is one.
         was_cold: solved from scratch, as ``rotavg solve`` would.
         seconds: of the whole tick.
         stage_seconds: of the solver's stages.
@@ -70,14 +70,15 @@ class Answer:
         solution: Solution,
         body_from_world: Tensor,
         component: Tensor,
-        outlier_threshold: float,
+        outlier_threshold: NDArray[np.float64],
         version: int,
         was_cold: bool,
         seconds: float,
     ) -> Answer:
         """What a solve of a snapshot says, with the orientations ``(N, 4)`` in their fixed gauge.
 
-        An edge that a user has accepted has the score 0, a rejected one 1.
+        An edge is an outlier if its score exceeds its threshold, ``(M,)``; what a user has accepted has the score 0,
+        what was rejected 1.
         """
         graph = snapshot.graph
         score = solution.outlier_score.cpu()
@@ -97,7 +98,7 @@ class Answer:
             target=graph.target.numpy(),
             kind=graph.kind.numpy(),
             outlier_score=score.numpy(),
-            outlier=(score > outlier_threshold).numpy(),
+            outlier=score.numpy() > outlier_threshold,
             was_cold=was_cold,
             seconds=seconds,
             stage_seconds=dict(solution.stage_seconds),

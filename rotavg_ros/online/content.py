@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rotavg_ros.online import quaternion
@@ -14,6 +16,10 @@ from rotavg_ros.online.growing_view_graph import GraphSnapshot
 from rotavg_ros.online.measurements import RejectReason
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.online.time_jumps import BackwardJumps, LateMessage
+
+# While data flows, a flag changes only if the score passes the threshold by this share of the way to 0 or 1: on a
+# real robot's graph that halves the changes, and no more flags are wrong.
+_FLAG_HYSTERESIS = 0.4
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,7 @@ class Content:
         self.answered = answered
         self.first_version = self.version = version
         self._answered_component: Tensor | None = None
+        self._answered_outlier: NDArray[np.bool_] = np.zeros(0, dtype=bool)
         self._answered_revision = 0
         self._answer_was_cold = True
         self._ticked_revision = 0
@@ -123,9 +130,27 @@ class Content:
             return None
         return extend_along_edges(self.answered, snapshot.graph)
 
-    def accept(self, body_from_world: Tensor, component: Tensor, revision: int, was_cold: bool) -> None:
-        """Make this the last answer: orientations ``(N, 4)`` and components ``(N,)`` of the graph at a revision."""
-        self.answered, self._answered_component = body_from_world, component
+    def thresholds(self, threshold: float, num_edges: int, cold: bool) -> NDArray[np.float64]:
+        """The score above which each edge is an outlier ``(M,)``; the last answer's flags are kept when in doubt.
+
+        A cold answer depends on the graph alone, so there nothing is kept.
+        """
+        thresholds = np.full(num_edges, threshold)
+        if not cold:
+            margin = _FLAG_HYSTERESIS * min(threshold, 1 - threshold)
+            thresholds[: len(self._answered_outlier)] += np.where(self._answered_outlier, -margin, margin)
+        return thresholds
+
+    def accept(
+        self,
+        body_from_world: Tensor,
+        component: Tensor,
+        outlier: NDArray[np.bool_],
+        revision: int,
+        was_cold: bool,
+    ) -> None:
+        """Make this the last answer: orientations ``(N, 4)``, components ``(N,)`` and flags of a revision."""
+        self.answered, self._answered_component, self._answered_outlier = body_from_world, component, outlier
         self._answered_revision, self._answer_was_cold = revision, was_cold
         self.version += 1
         self._world_from_odometry = corrections(self.builder, body_from_world)

@@ -253,23 +253,24 @@ class OnlineEstimator:
             with self._lock:
                 roots = root_orientations(content.builder, component, content.answered)
             body_from_world = fix_gauge(solution.body_from_world.cpu(), component, roots)
-            with self._lock:
-                if content is not self._content:
-                    return None  # reset or loaded meanwhile
-                content.accept(body_from_world, component, snapshot.revision, was_cold=warm_start is None)
-                if options is not self.options:
-                    content.solve_anew()
-                version = content.version
-            return Answer.of_solution(
+            was_cold = warm_start is None
+            answer = Answer.of_solution(
                 snapshot,
                 solution,
                 body_from_world,
                 component,
-                options.outlier_threshold,
-                version,
-                warm_start is None,
+                content.thresholds(options.outlier_threshold, snapshot.graph.num_edges, was_cold),
+                content.version + 1,
+                was_cold,
                 time.perf_counter() - started,
             )
+            with self._lock:
+                if content is not self._content:
+                    return None  # reset or loaded meanwhile
+                content.accept(body_from_world, component, answer.outlier, snapshot.revision, was_cold)
+                if options is not self.options:
+                    content.solve_anew()
+            return answer
 
 
 def _default_solver() -> Solver:
