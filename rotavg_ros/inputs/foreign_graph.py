@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 from rotavg_ros.inputs.fields import edge_id_of, target_from_source, to_tuple, to_vector
 from rotavg_ros.inputs.records import EdgeRecord, Source
-from rotavg_ros.online import EdgeMeasurement, KeyframeReference, quaternion
+from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason, quaternion
 from rotavg_ros.online.measurements import RejectedInputError
+from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.view_graph import EdgeKind
 
 # (robot, keyframe id)
 Key = tuple[str, int]
@@ -17,21 +20,27 @@ Key = tuple[str, int]
 # as well, at a higher price.
 _MOST_REMEMBERED = 1_000_000
 
+_LARGEST_REFINEMENT = math.radians(10.0)
+
 
 class ForeignGraph:
     """Edges by keyframe id; each measurement passes once, however often the sender repeats its graph.
 
-    A repeated edge with another rotation is another measurement of the same pair.
+    A repeated closure with another rotation is another measurement of the same pair. A repeated odometry edge may be
+    refined a little; with quite another rotation it is refused, because then the sender has begun anew and means other
+    places by the same ids.
     """
 
     def __init__(self, source: Source) -> None:
         self._source = source
         self._seen: set[tuple[object, ...]] = set()
         self._stamp_ns: dict[Key, int] = {}
+        self._odometry: dict[tuple[Key, Key], Quaternion] = {}
 
     def forget(self) -> None:
         self._seen.clear()
         self._stamp_ns.clear()
+        self._odometry.clear()
 
     def _note_stamp(self, key: Key, stamp_ns: int) -> None:
         """Remember when a keyframe was taken; 0 means that the sender does not say."""
@@ -60,6 +69,11 @@ class ForeignGraph:
         except RejectedInputError as rejection:
             yield EdgeRecord(rejection.reason)
             return
+        if kind == EdgeKind.ODOMETRY:
+            _make_room(self._odometry)
+            if quaternion.angle_between(self._odometry.setdefault(ends, inside), inside) > _LARGEST_REFINEMENT:
+                yield EdgeRecord(RejectReason.CONTRADICTORY_ODOMETRY)
+                return
         _make_room(self._seen)
         self._seen.add(measurement)
         source, target = (KeyframeReference(*key, self._stamp_ns.get(key)) for key in ends)

@@ -42,6 +42,7 @@ class RejectReason(str, Enum):
     BAD_PRECISION = "bad_precision"
     BAD_REFERENCE = "bad_reference"
     DUPLICATE_EDGE = "duplicate_edge"
+    CONTRADICTORY_ODOMETRY = "contradictory_odometry"
     PENDING_OVERFLOW = "pending_overflow"
     PENDING_TIMEOUT = "pending_timeout"
     GRAPH_FULL = "graph_full"

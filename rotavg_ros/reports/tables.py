@@ -34,6 +34,7 @@ WHY_REFUSED = {
     RejectReason.BAD_PRECISION: "the precision is negative or not finite",
     RejectReason.BAD_REFERENCE: "an end of the edge has neither an id nor a stamp",
     RejectReason.DUPLICATE_EDGE: "the same edge came before; it counts once",
+    RejectReason.CONTRADICTORY_ODOMETRY: "a front end says another step between the same keyframes; it began anew?",
     RejectReason.PENDING_OVERFLOW: "too many edges were waiting for their keyframes (pending_capacity)",
     RejectReason.PENDING_TIMEOUT: "an edge waited too long for its keyframe (pending_timeout_s)",
     RejectReason.GRAPH_FULL: "the graph has as many edges as it may have (max_edges)",

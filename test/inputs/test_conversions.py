@@ -162,6 +162,24 @@ def test_graphs_that_are_sent_again_say_nothing_new() -> None:
     assert len(list(convert(map_graph()))) == 4
 
 
+def test_odometry_that_contradicts_itself_is_refused() -> None:
+    """A front end that begins anew numbers other places by the same ids."""
+    convert = converter("rtabmap_msgs/msg/MapGraph")
+    list(convert(map_graph()))
+
+    def again(turned_deg: float) -> list[object]:
+        graph = map_graph()
+        turned = world_from_sensor(0).inv() * world_from_sensor(1) * Rotation.from_euler("y", turned_deg, degrees=True)
+        graph.links = [link(0, 1, 0)]
+        graph.links[0].transform.rotation = quaternion(turned)
+        return edges(convert(graph))
+
+    assert len(again(2.0)) == 1 and isinstance(again(3.0)[0], EdgeMeasurement)
+    assert again(30.0) == again(30.0) == [RejectReason.CONTRADICTORY_ODOMETRY]
+    convert.forget()
+    assert isinstance(again(30.0)[0], EdgeMeasurement)
+
+
 def test_stamps_of_keyframes() -> None:
     """RTAB-Map's message is of its newest node's time; Kimera's nodes have stamps; Swarm-SLAM's closures none."""
     times = {corner: to_nanoseconds(stamp(corner)) for corner in range(SIDES)}
