@@ -117,6 +117,7 @@ class LiveNode:
         answers, flags, orientations: messages in order of arrival.
         status: the last diagnostics' values by key, with its "level" and "message".
         reports: diagnostics so far; ``reported_at`` is the last one's stamp.
+        said: level and message of every report, until somebody takes them out.
     """
 
     def __init__(self, probe: rclpy.node.Node, start: Callable[..., RunningProcess], wait: Callable[..., None]) -> None:
@@ -129,6 +130,7 @@ class LiveNode:
         self.orientations: list[QuaternionStamped] = []
         self.status: dict[str, str] = {}
         self.reports = 0
+        self.said: list[tuple[int, str]] = []
         self.reported_at: Time | None = None
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         probe.create_subscription(AbsoluteOrientations, "/abs_orientations", self.answers.append, latched)
@@ -208,6 +210,7 @@ class LiveNode:
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         status = message.status[0]
         self.reports += 1
+        self.said.append((ord(status.level), status.message))
         self.reported_at = message.header.stamp
         self.status = {pair.key: pair.value for pair in status.values}
         self.status |= {"level": str(ord(status.level)), "message": status.message, "name": status.name}

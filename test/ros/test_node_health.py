@@ -18,7 +18,7 @@ from rotavg_msgs.msg import KeyframeReference, RelativeRotation
 pytestmark = pytest.mark.ros
 
 EVERY_MESSAGE = ("keyframe_angle_deg:=0.0", "keyframe_distance_m:=0.0", "solve_period_s:=0.1")
-OK, WARN, ERROR = "0", "1", "2"
+OK, WARN, ERROR = 0, 1, 2
 
 # The node with a solver that does what a file says: "fail", "hang", or else its work.
 SABOTAGED = """
@@ -49,11 +49,17 @@ def feed(live_node, start: int, stop: int) -> None:
         live_node.odometry.publish(message)
 
 
-def says(live_node, level: str, *words: str) -> None:
-    """Wait for a report of this level with these words in its message."""
-    live_node.spin_until(
-        lambda: live_node.status["level"] == level and all(word in live_node.status["message"] for word in words)
-    )
+def says(live_node, level: int, *words: str) -> None:
+    """Wait for the next report of this level with these words in its message."""
+
+    def heard() -> bool:
+        while live_node.said:
+            said_level, message = live_node.said.pop(0)
+            if said_level == level and all(word in message for word in words):
+                return True
+        return False
+
+    live_node.spin_until(heard)
 
 
 def test_silence_refusals_and_contradictions_are_warned_of_and_pass(live_node) -> None:
