@@ -173,8 +173,10 @@ def _orientations(facts: RunFacts) -> Section:
     compared = list(facts.compared)
     if compared:
         names = ", ".join(robot.reference.name for robot, _ in compared if robot.reference is not None)
+        known = sum(int(np.isfinite(errors.corrected.angle).sum()) for _, errors in compared)
+        total = sum(len(robot.stamp_ns) for robot, _ in compared)
         text = [
-            f"The reference is {names}.",
+            f"The reference is {names}; it is known at {known} of {total} keyframes.",
             "Errors are angles to the reference after one rotation of the whole trajectory onto it (robust, per "
             "connected part of the graph).",
         ]

@@ -23,6 +23,7 @@ Curves = Mapping[str, tuple[FloatArray, str]]
 DASHED = (0, (4, 3))
 _AXIS_NAMES = "xyz"
 _COUNT_TICKS = [0, 2, 5, *(digit * 10**power for power in range(1, 9) for digit in (1, 2, 5))]
+_FEW_POINTS = 12
 _FLAT = 0.02  # a run is flat if it is at most this high for its width
 
 
@@ -82,11 +83,15 @@ class View:
 
 
 def track(axes: Axes, view: View, position: FloatArray, **line: Any) -> None:
-    """A trajectory; gaps where positions are unknown. A single position is a dot."""
+    """A trajectory; gaps where positions are unknown. A few positions are dots, for lines between them say little."""
     x, y = view(position)
     known = np.isfinite(x) & np.isfinite(y)
     if known.any():
-        axes.plot(x, y, marker="o" if known.sum() == 1 else "", markersize=4, solid_joinstyle="round", **line)
+        axes.plot(x, y, marker=_marker(int(known.sum())), markersize=4, solid_joinstyle="round", **line)
+
+
+def _marker(count: int) -> str:
+    return "o" if count <= _FEW_POINTS else ""
 
 
 def segments(axes: Axes, ends: FloatArray, **lines: Any) -> LineCollection:
@@ -121,8 +126,8 @@ def over_time(
     order = np.argsort(time, kind="stable")
     for name, (values, colour) in curves.items():
         known = order[np.isfinite(values[order])]
-        marker = "o" if len(known) == 1 else ""
-        axes.plot(time[known], values[known], marker=marker, markersize=4, color=colour, linewidth=1.4, label=name)
+        look = {"marker": _marker(len(known)), "markersize": 4, "linewidth": 1.4}
+        axes.plot(time[known], values[known], color=colour, label=name, **look)
         if from_zero:
             axes.fill_between(time[known], values[known], color=colour, alpha=0.12, linewidth=0)
     if from_zero:
