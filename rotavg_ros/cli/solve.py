@@ -24,6 +24,7 @@ import numpy as np
 
 from rotavg_ros.cli.arguments import whole_number
 from rotavg_ros.cli.main import EXIT_USER_ERROR, print_error
+from rotavg_ros.cli.poses import POSE_FILES, write_corrected_poses
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.csv_writer import Column, write_csv
 from rotavg_ros.datasets.graph_file import GraphFile, read_graph
@@ -65,12 +66,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--weights", type=Path, metavar="DIR", help="networks of `rotavg train`; what DIR lacks comes from the package"
     )
+    parser.add_argument(
+        "--poses",
+        action="store_true",
+        help="also write the corrected graph.g2o and trajectory.kitti (.tum with stamps)",
+    )
     parser.add_argument("--edges", default="csv", choices=(*_EDGE_FORMATS, "none"), help="default: csv")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve every graph; a bad one does not keep the others from being solved."""
-    jobs = plan(arguments.graphs, arguments.output)
+    jobs = plan(arguments.graphs, arguments.output, poses=arguments.poses)
     _check_weights(arguments.weights)
     solve_graph = partial(
         solve,
@@ -86,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
     errors: list[UserError] = []
     for job in jobs:
         try:
-            summary = solve_file(job, solve_graph, arguments.edges)
+            summary = solve_file(job, solve_graph, arguments.edges, poses=arguments.poses)
         except UserError as mistake:
             errors.append(mistake)
         else:
@@ -101,8 +107,16 @@ def run(arguments: argparse.Namespace) -> int:
     return EXIT_USER_ERROR if errors else 0
 
 
-def solve_file(job: Job, solve_graph: Callable[[ViewGraph], Solution], edges: str) -> dict[str, Any]:
+def solve_file(
+    job: Job, solve_graph: Callable[[ViewGraph], Solution], edges: str, *, poses: bool = False
+) -> dict[str, Any]:
     """Read, solve and write one graph.
+
+    Args:
+        job: which, and where to.
+        solve_graph: the solver with its options.
+        edges: format of the edges' file, or ``none``.
+        poses: write positions as well.
 
     Returns:
         The content of its ``summary.json``.
@@ -117,10 +131,13 @@ def solve_file(job: Job, solve_graph: Callable[[ViewGraph], Solution], edges: st
     solve_seconds = time.perf_counter() - start
     summary = summarize(job.graph, graph_file, solution, read_seconds, solve_seconds)
     write_answer(job.output, graph_file, solution, summary, edges)
+    if poses:
+        world_from_body = canonical(inverse(solution.body_from_world)).cpu().numpy()
+        write_corrected_poses(job.output, graph_file, world_from_body, solution.outlier_score.cpu().numpy())
     return summary
 
 
-def plan(graphs: list[Path], output: Path) -> list[Job]:
+def plan(graphs: list[Path], output: Path, *, poses: bool = False) -> list[Job]:
     """Where each answer goes, after everything has been checked that can be before any work.
 
     Raises:
@@ -134,7 +151,8 @@ def plan(graphs: list[Path], output: Path) -> list[Job]:
         if other is not job.graph:
             raise SolveError(f"{other} and {job.graph} would both go to {job.output}; solve them one by one")
         _check_writable(job.output)
-        for name in (_ORIENTATIONS, _SUMMARY, *(f"{_EDGES}.{suffix}" for suffix in _EDGE_FORMATS)):
+        edge_files = (f"{_EDGES}.{suffix}" for suffix in _EDGE_FORMATS)
+        for name in (_ORIENTATIONS, _SUMMARY, *edge_files, *(POSE_FILES if poses else ())):
             for graph in graphs:
                 if graph.resolve() == (job.output / name).resolve():
                     raise SolveError(f"{graph} would be overwritten by the answer; choose another --output")

@@ -18,7 +18,7 @@ from rotavg_ros.datasets.pose_files import write_kitti, write_tum
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import Answer
 from rotavg_ros.online.growing_view_graph import GraphSnapshot
-from rotavg_ros.replay.corrected_graph import keyframe_ids, write_corrected_graph
+from rotavg_ros.replay.corrected_graph import keyframe_ids, write_graph_of_run
 from rotavg_ros.replay.record import RobotRecord, RunRecord
 from rotavg_ros.replay.summary import summarize
 
@@ -92,7 +92,7 @@ def write_tables(folder: Path, record: RunRecord, snapshot: GraphSnapshot) -> No
         name = re.sub(r"[^\w.-]+", "_", robot.robot).strip("_") or "robot"
         prefix = f"{name}_" if several else ""
         _write_trajectory(folder, f"{name}" if several else "trajectory", f"{prefix}odometry", robot)
-    write_corrected_graph(folder / "graph.g2o", record, snapshot)
+    write_graph_of_run(folder / "graph.g2o", record, snapshot)
 
 
 def write_summary(folder: Path, record: RunRecord, bag: Path, failures: int) -> dict[str, Any]:

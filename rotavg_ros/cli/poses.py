@@ -1,0 +1,47 @@
+"""Corrected poses of a solved file, for `rotavg solve --poses`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from rotavg_ros.datasets.corrected_graph import write_corrected_graph
+from rotavg_ros.datasets.graph_file import GraphFile
+from rotavg_ros.datasets.pose_files import write_kitti, write_tum
+from rotavg_ros.online.positions import fit_positions
+
+POSE_FILES = ("graph.g2o", "trajectory.kitti", "trajectory.tum")
+
+
+def write_corrected_poses(
+    folder: Path, graph_file: GraphFile, world_from_body: np.ndarray, outlier_score: np.ndarray
+) -> None:
+    """Write ``graph.g2o``, ``trajectory.kitti``, and ``trajectory.tum`` where the graph has stamps.
+
+    Args:
+        folder: where.
+        graph_file: N nodes, M edges.
+        world_from_body: ``(N, 4)`` xyzw, the answer.
+        outlier_score: ``(M,)``.
+
+    Raises:
+        GraphFileError: a file cannot be written.
+    """
+    graph = graph_file.graph
+    translation = graph_file.edge_translation
+    position = fit_positions(
+        world_from_body,
+        graph.source.cpu().numpy(),
+        graph.target.cpu().numpy(),
+        np.full((graph.num_edges, 3), np.nan) if translation is None else translation,
+        graph.is_odometry.cpu().numpy(),
+        outlier_score,
+        np.zeros((graph.num_nodes, 3)),
+    )
+    position = np.nan_to_num(position)
+    write_corrected_graph(folder / "graph.g2o", graph_file, world_from_body, position, outlier_score > 0.5)
+    write_kitti(folder / "trajectory.kitti", position, world_from_body)
+    if graph_file.stamps_ns is not None:
+        order = np.argsort(graph_file.stamps_ns, kind="stable")
+        write_tum(folder / "trajectory.tum", graph_file.stamps_ns[order], position[order], world_from_body[order])

@@ -1,0 +1,57 @@
+"""`rotavg solve --poses`: positions as well, for evo and gtsam."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from evo.core.metrics import APE, PoseRelation, StatisticsType
+from evo.core.trajectory import PosePath3D
+from evo.tools import file_interface
+
+from rotavg_ros.cli.main import main
+from rotavg_ros.datasets.graph_file import write_graph
+from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.trajectories import World
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_a_solved_file_with_positions(tmp_path: Path, dimensions: int) -> None:
+    world = World.CITY if dimensions == 2 else World.SPHERE
+    config = SlamSimulationConfig(world=world, dimensions=dimensions, num_keyframes=400, false_share=0.3)
+    run = simulate_slam_graph(config, np.random.default_rng(3))
+    write_graph(tmp_path / "run.npz", run.to_graph_file())
+    assert main(["solve", str(tmp_path / "run.npz"), "--output", str(tmp_path / "out"), "--poses"]) == 0
+
+    tum = file_interface.read_tum_trajectory_file(str(tmp_path / "out" / "trajectory.tum"))
+    kitti = file_interface.read_kitti_poses_file(str(tmp_path / "out" / "trajectory.kitti"))
+    np.testing.assert_allclose(tum.positions_xyz, kitti.positions_xyz, atol=1e-8)
+    np.testing.assert_allclose(tum.timestamps, run.stamps_ns / 1e9, atol=1e-6)
+    truth = PosePath3D(run.position, np.roll(run.world_from_body, 1, axis=1))
+    odometry = PosePath3D(run.odometry_position, np.roll(run.odometry_world_from_body, 1, axis=1))
+    assert error(kitti, truth) < 0.5 * error(odometry, truth)
+
+    factors, values = gtsam.readG2o(str(tmp_path / "out" / "graph.g2o"), dimensions == 3)
+    assert values.size() == 400
+    assert factors.size() <= run.graph.num_edges - 0.9 * run.closure_is_false.sum()  # outliers are left out
+    where = [
+        values.atPose2(k).translation() if dimensions == 2 else values.atPose3(k).translation() for k in range(400)
+    ]
+    np.testing.assert_allclose(where, kitti.positions_xyz[:, :dimensions], atol=1e-6)
+
+
+def test_a_graph_is_not_overwritten_by_its_own_answer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = simulate_slam_graph(SlamSimulationConfig(num_keyframes=100), np.random.default_rng(0))
+    write_graph(tmp_path / "graph.g2o", run.to_graph_file())
+    assert main(["solve", str(tmp_path / "graph.g2o"), "--output", str(tmp_path), "--poses"]) == 2
+    assert "would be overwritten" in capsys.readouterr().err
+
+
+def error(estimate: PosePath3D, truth: PosePath3D) -> float:
+    """Root mean square of the position error after alignment, by evo."""
+    estimate.align(truth)
+    metric = APE(PoseRelation.translation_part)
+    metric.process_data((truth, estimate))
+    return float(metric.get_statistic(StatisticsType.rmse))
