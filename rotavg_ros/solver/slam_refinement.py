@@ -21,7 +21,7 @@ from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.common_error import closure_runs, common_share, variance_factor
 from rotavg_ros.solver.exceedance import exceedance
 from rotavg_ros.solver.fine_net import edge_residual
-from rotavg_ros.solver.laplacian import LaplacianPattern, probe_signs
+from rotavg_ros.solver.laplacian import FactorisedLaplacian, LaplacianPattern, probe_signs
 from rotavg_ros.solver.noise_model import NoiseModel, outlier_share
 
 MAX_PASSES = 30
@@ -122,7 +122,8 @@ def refine(
 class _State:
     """The unknowns, and what the last pass saw of them."""
 
-    samples: np.ndarray  # (K, probes)
+    _system: FactorisedLaplacian
+    _samples: np.ndarray | None = None
 
     def __init__(
         self,
@@ -141,6 +142,13 @@ class _State:
         self.outlier_probability = 1 - inlier_probability
         self.passes = 0
 
+    @property
+    def samples(self) -> np.ndarray:
+        """Errors ``(K, probes)`` as they might be under the last pass's weights; drawn when they are asked for."""
+        if self._samples is None:
+            self._samples = self._system.samples(self.probes)
+        return self._samples
+
     def difference(self, values: np.ndarray) -> np.ndarray:
         """Node values ``(K, k)`` → differences over the edges, target − source ``(E, k)``."""
         return np.asarray(values[self.graph.target] - values[self.graph.source])
@@ -157,9 +165,10 @@ class _State:
         graph, noise = self.graph, self.noise
         variance = graph.steps * np.where(graph.is_odometry, noise.step_variance, noise.closure_variance)
         weight = np.maximum(self.inlier_probability, 1e-9) / variance
-        system = self.pattern.factorize(weight)
-        step = system.fit(self.residual)
-        self.samples = system.samples(self.probes)
+        # A pass after one that has not settled weighs as that did.
+        if self.passes == 0 or not np.array_equal(weight, self._system.weight):
+            self._system, self._samples = self.pattern.factorize(weight), None
+        step = self._system.fit(self.residual)
         self.correction = rotations.multiply(self.correction, rotations.exp(torch.from_numpy(step)))
         self.residual = _residual_vectors(graph, self.correction)
         self.passes += 1
