@@ -126,7 +126,7 @@ def over_time(
     order = np.argsort(time, kind="stable")
     for name, (values, colour) in curves.items():
         known = order[np.isfinite(values[order])]
-        look = {"marker": _marker(len(known)), "markersize": 4, "linewidth": 1.4}
+        look: dict[str, Any] = {"marker": _marker(len(known)), "markersize": 4, "linewidth": 1.4}
         axes.plot(time[known], values[known], color=colour, label=name, **look)
         if from_zero:
             axes.fill_between(time[known], values[known], color=colour, alpha=0.12, linewidth=0)
