@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 
 import gtsam
@@ -51,6 +52,7 @@ def test_a_graph_is_not_overwritten_by_its_own_answer(tmp_path: Path, capsys: py
 
 def error(estimate: PosePath3D, truth: PosePath3D) -> float:
     """Root mean square of the position error after alignment, by evo."""
+    estimate = copy.deepcopy(estimate)
     estimate.align(truth)
     metric = APE(PoseRelation.translation_part)
     metric.process_data((truth, estimate))
