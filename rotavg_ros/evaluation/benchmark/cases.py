@@ -60,13 +60,15 @@ class Family:
         title: of its table.
         cases: in ascending size.
         draw: draws one of them.
-        contenders: of ``contenders.py``, in the order in which they run.
+        contenders: of ``measure.py``, in the order in which they run.
+        share: of the time there is, relative to the other families.
     """
 
     title: str
     cases: tuple[Case, ...]
     draw: Callable[[Case, np.random.Generator], BenchmarkGraph]
     contenders: tuple[str, ...]
+    share: float = 1.0
 
 
 def save(path: Path, drawn: BenchmarkGraph) -> None:
@@ -122,7 +124,7 @@ _SFM = ("neurora", "neurora-paper", "neurora-cuda", "colmap", "shonan")
 FAMILIES = {
     "recipe": Family(
         "The paper's recipe: 250–1000 cameras",
-        tuple(Case("recipe", 625, 39_000, seed) for seed in range(6)),
+        tuple(Case("recipe", 625, 39_000, seed) for seed in range(3)),
         _draw_recipe,
         ("neurora", "neurora-paper", "neurora-cuda", "colmap"),
     ),
@@ -137,6 +139,7 @@ FAMILIES = {
         ),
         _draw_sfm,
         _SFM,
+        share=4.0,
     ),
     "sfm-sparse": Family(
         "SfM, sparse: 20 neighbours a camera",

@@ -71,7 +71,7 @@ class _Budget:
 def run(
     families: Sequence[str], minutes: float, max_pairs: int, repeats: int, say: Callable[[str], None] = print
 ) -> dict[str, list[Result]]:
-    """Measure; families get equal shares of the time.
+    """Measure; families get their shares of the time.
 
     Args:
         families: of :data:`FAMILIES`.
@@ -81,10 +81,12 @@ def run(
         say: told of every measurement.
     """
     results = {}
-    start = time.monotonic()
+    start, spent = time.monotonic(), 0.0
+    total = sum(FAMILIES[name].share for name in families)
     with tempfile.TemporaryDirectory(prefix="rotavg-benchmark-") as folder:
-        for number, name in enumerate(families, start=1):
-            budget = _Budget(start + 60 * minutes * number / len(families))
+        for name in families:
+            spent += FAMILIES[name].share
+            budget = _Budget(start + 60 * minutes * spent / total)
             results[name] = _run_family(FAMILIES[name], budget, max_pairs, repeats, Path(folder), say)
     return results
 
