@@ -22,6 +22,9 @@ from rotavg_ros.replay.options import read_parameter_file, read_settings
 from rotavg_ros.replay.plan import Plan, Wishes, make_plan
 from rotavg_ros.replay.run import Window
 
+# When it is worth saying how it would be faster.
+_MANY_TICKS, _LONG_SECONDS = 500, 60.0
+
 
 class ReplayUsageError(UserError):
     """Options that do not fit together, or a bag without anything to replay."""
@@ -98,7 +101,7 @@ def _replay(bag: BagReader, plan: Plan, window: Window, arguments: argparse.Name
             write_tables(folder, record, outcome.estimator.snapshot())
             if not arguments.no_report:
                 write_report(record, folder)
-            summary = write_summary(folder, record, bag.path, outcome.failures)
+            summary = write_summary(folder, record, bag.path, outcome)
     return _told(summary, arguments.output)
 
 
@@ -144,6 +147,10 @@ def _told(summary: dict[str, Any], output: Path) -> str:
         lines.append(f"refused: {refused}")
     if summary["failed_ticks"]:
         lines.append(f"{summary['failed_ticks']} solves on the way failed")
+    if summary["time_jumps"]:
+        lines.append(f"time went back {summary['time_jumps']} ×; see the parameter on_time_jump")
+    if summary["ticks"] > _MANY_TICKS and summary["wall_seconds"] > _LONG_SECONDS:
+        lines.append(f"most of the time went into {summary['ticks']} solves; -p solve_period_s:=5.0 makes fewer")
     for robot, said in summary["robots"].items():
         if "orientation_error_mean_deg" in said:
             lines.append(_compared(robot, said))

@@ -46,6 +46,8 @@ class Feed:
         self._on_odometry = on_odometry
         self._translations = iter(translations)
         self._single = plan.translations[1] if plan.translations and translations else None
+        self._generation = estimator.generation
+        self._edge_converters: list[EdgeConverter] = []
         self._handlers: dict[str, list[Callable[[Any], None]]] = {}
         parameters = plan.parameters
         for robot, source, sensor in zip(parameters.robots, plan.odometry, parameters.odometry_sensors(), strict=False):
@@ -53,6 +55,7 @@ class Feed:
             self._handlers.setdefault(source.topic, []).append(odometry)
         for source, about in zip(plan.edges, parameters.edge_sources(), strict=True):
             convert = EDGE_CONVERTERS[source.type_name](about)
+            self._edge_converters.append(convert)
             edges = partial(self._take_edges, convert, source.topic == self._single)
             self._handlers.setdefault(source.topic, []).append(edges)
 
@@ -76,6 +79,10 @@ class Feed:
             self._on_odometry(robot, record)
 
     def _take_edges(self, convert: EdgeConverter, has_translation: bool, message: Any) -> None:
+        if self._generation != self._estimator.generation:  # time went back: what is sent again is new
+            self._generation = self._estimator.generation
+            for converter in self._edge_converters:
+                converter.forget()
         translation = next(self._translations, None) if has_translation else None
         for record in convert(message):
             if isinstance(record, EdgeVerdict):

@@ -20,6 +20,7 @@ from rotavg_ros.online import Answer
 from rotavg_ros.online.growing_view_graph import GraphSnapshot
 from rotavg_ros.replay.corrected_graph import keyframe_ids, write_graph_of_run
 from rotavg_ros.replay.record import RobotRecord, RunRecord
+from rotavg_ros.replay.run import Outcome
 from rotavg_ros.replay.summary import summarize
 
 RECORDING = "run.mcap"
@@ -95,10 +96,10 @@ def write_tables(folder: Path, record: RunRecord, snapshot: GraphSnapshot) -> No
     write_graph_of_run(folder / "graph.g2o", record, snapshot)
 
 
-def write_summary(folder: Path, record: RunRecord, bag: Path, failures: int) -> dict[str, Any]:
+def write_summary(folder: Path, record: RunRecord, bag: Path, outcome: Outcome) -> dict[str, Any]:
     """Write ``summary.json``, last of all, and return its content."""
     names = sorted({path.name for path in folder.iterdir()} | {SUMMARY})
-    summary = {**summarize(record, bag, failures), "files": names}
+    summary = {**summarize(record, bag, outcome), "files": names}
     (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     return summary
 

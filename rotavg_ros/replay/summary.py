@@ -10,18 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rotavg_ros.replay.record import RobotRecord, RunRecord
+from rotavg_ros.replay.run import Outcome
 from rotavg_ros.reports.comparison import compare
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind
 
 
-def summarize(record: RunRecord, bag: Path, failures: int) -> dict[str, Any]:
+def summarize(record: RunRecord, bag: Path, outcome: Outcome) -> dict[str, Any]:
     """What ``summary.json`` says, but for the names of the files.
 
     Args:
         record: the run.
         bag: where it came from.
-        failures: ticks whose solve failed.
+        outcome: what the record was made of.
     """
     answer = record.answer
     closures = answer.kind == EdgeKind.LOOP_CLOSURE
@@ -40,7 +41,8 @@ def summarize(record: RunRecord, bag: Path, failures: int) -> dict[str, Any]:
         "topics": {use.topic: use.used_as for use in record.topics if use.used_as},
         "ticks": len(record.ticks),
         "tick_seconds": {f"p{percent}": float(np.percentile(seconds, percent)) for percent in (50, 95, 100)},
-        "failed_ticks": failures,
+        "failed_ticks": outcome.failures,
+        "time_jumps": outcome.estimator.time_jumps,
         "wall_seconds": record.wall_seconds,
         "device": answer.device,
         "method": answer.method,
