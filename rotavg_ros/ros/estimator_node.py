@@ -51,7 +51,6 @@ class RotavgNode(Node):
         self._reporter = Reporter(f"{self.get_fully_qualified_name().lstrip('/')}: estimator")
         self._worker = Worker(executor, "rotavg_worker")
         self._saver = Worker(executor, "rotavg_saver")
-        self._tick_queued = False
         self._outputs = Outputs(self, parameters, self._estimator)
         state_file = Path(parameters.state_file) if parameters.state_file else None
         self._solving = Solving(self, self._estimator, self._health, self._outputs, state_file)
@@ -62,7 +61,9 @@ class RotavgNode(Node):
         self._solve_timer = self._create_timer(parameters.solve_period_s, self._on_solve_timer)
         self._create_timer(1.0, self._on_diagnostics_timer)
         if parameters.autosave_period_s > 0:
-            self._create_timer(parameters.autosave_period_s, lambda: self._saver.submit(self._solving.autosave_quietly))
+            self._create_timer(
+                parameters.autosave_period_s, lambda: self._saver.submit_once(self._solving.autosave_quietly)
+            )
         backward = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
         self._jump_handle = self.get_clock().create_jump_callback(backward, post_callback=self._on_clock_jump)
         parameter_server.watch(self, lambda: self._settings, self._apply)
@@ -76,7 +77,7 @@ class RotavgNode(Node):
     def close(self, timeout_s: float) -> bool:
         """Save if that is wanted, and stop working; False if a save still runs after the timeout, or a solve does."""
         if self._settings.autosave_period_s > 0:
-            self._saver.submit(self._solving.autosave_quietly)
+            self._on_autosave_timer()
         is_saved = self._saver.stop(timeout_s, finish=True)
         return self._worker.stop(_SHORT_SOLVE_S) and is_saved
 
@@ -100,15 +101,10 @@ class RotavgNode(Node):
             self._solve_timer = self._create_timer(parameters.solve_period_s, self._on_solve_timer)
 
     def _on_solve_timer(self) -> None:
-        if not self._tick_queued:
-            self._tick_queued = True
-            self._worker.submit(self._tick)
+        self._worker.submit_once(self._solving.tick_quietly)
 
-    def _tick(self) -> None:
-        try:
-            self._solving.tick_quietly()
-        finally:
-            self._tick_queued = False
+    def _on_autosave_timer(self) -> None:
+        self._saver.submit_once(self._solving.autosave_quietly)
 
     def _on_clock_jump(self, _jump: TimeJump) -> None:
         """Simulated time went back: only ``use_sim_time`` knows of that."""
@@ -129,4 +125,4 @@ class RotavgNode(Node):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
-        self._worker.submit(self._solving.draw_quietly)
+        self._worker.submit_once(self._solving.draw_quietly)

@@ -17,6 +17,7 @@ class Worker:
     def __init__(self, executor: Executor, name: str) -> None:
         self._executor = executor
         self._stopping = False
+        self._waiting: set[Callable[[], Any]] = set()
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -26,6 +27,12 @@ class Worker:
         future = Future(executor=self._executor)
         self._jobs.put((job, future))
         return future
+
+    def submit_once(self, job: Callable[[], Any]) -> None:
+        """Queue a job unless it waits already, so that a timer cannot fill the queue."""
+        if job not in self._waiting:
+            self._waiting.add(job)
+            self.submit(job)
 
     def stop(self, timeout_s: float, finish: bool = False) -> bool:
         """Take no more jobs and wait for the running one, or for all; False if that was not done in time."""
@@ -39,6 +46,7 @@ class Worker:
             if self._stopping:
                 break
             job, future = entry
+            self._waiting.discard(job)  # before it runs: what changes from now on needs it once more
             try:
                 future.set_result(job())
             except Exception as error:
