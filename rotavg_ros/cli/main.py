@@ -31,7 +31,7 @@ COMMANDS = (
     Command("replay", "rotavg_ros.cli.replay", "replay a recorded bag without ROS, with a report"),
     Command("train", "rotavg_ros.cli.train", "train the networks"),
     Command("evaluate", "rotavg_ros.cli.evaluate", "compare the methods in tables and pictures"),
-    Command("benchmark", "rotavg_ros.cli.benchmark", "time the solver beside COLMAP and GTSAM, and the node under load"),
+    Command("benchmark", "rotavg_ros.cli.benchmark", "time the solver beside COLMAP and GTSAM, the node under load"),
     Command("plot", "rotavg_ros.cli.plot", "draw the statistics of a view-graph's noise"),
 )
 
