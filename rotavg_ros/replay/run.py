@@ -116,6 +116,8 @@ def replay(
             progress((time_ns - end_ns) / _NANOSECONDS)
             end_ns = time_ns
         answer = loop.finish()
+    if answer is None and interrupted:
+        raise ReplayError(f"{bag.path}: interrupted before the first keyframe; there is nothing to write")
     if answer is None:
         raise ReplayError(f"{bag.path}: {_why_nothing(plan, estimator.counts().rejected)}")
     return Outcome(

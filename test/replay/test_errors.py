@@ -196,6 +196,7 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path, small: Path) -> None:
         assert process.poll() is None, process.stderr
         assert time.monotonic() < deadline
         time.sleep(0.1)
+    time.sleep(3)  # the first message makes the first keyframe
     process.send_signal(signal.SIGINT)
     told, complaints = process.communicate(timeout=60)
     assert process.returncode == 0, complaints
