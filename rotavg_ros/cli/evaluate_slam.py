@@ -115,4 +115,8 @@ def _command(arguments: argparse.Namespace) -> str:
         words += ["--graphs", *arguments.graphs]
     if tuple(arguments.shares) != slam_cases.SHARES:
         words += ["--shares", *map(str, arguments.shares)]
+    if arguments.methods:
+        words += ["--methods", *arguments.methods]
+    if not arguments.peers:
+        words.append("--no-peers")
     return " ".join(words)

@@ -60,7 +60,8 @@ def _round_of_jumps(
         if len(moved) in (0, len(moves)):
             continue
         tried = correction.clone()
-        tried[moved] = rotations.multiply(correction[moved], residual[edge].expand(len(moved), 4))
+        # Norms multiply with every jump; rounding errors would, too.
+        tried[moved] = rotations.normalize(rotations.multiply(correction[moved], residual[edge].expand(len(moved), 4)))
         tried_residual = cost.residual(tried)
         tried_costs = cost.of_edges(tried_residual)
         gain = float(costs.sum() - tried_costs.sum())

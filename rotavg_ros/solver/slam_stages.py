@@ -13,11 +13,23 @@ from rotavg_ros import rotations
 from rotavg_ros.solver import slam_refinement
 from rotavg_ros.solver.agreement import NO_PAIRS, AgreementPairs, agreement_pairs
 from rotavg_ros.solver.closure_graph import ClosureGraph, contract
-from rotavg_ros.solver.noise_model import NoiseModel, discrepancies, estimate_noise, judge_by_chain
+from rotavg_ros.solver.gyro_bias import estimate_bias, without_bias
+from rotavg_ros.solver.noise_model import (
+    NoiseModel,
+    discrepancies,
+    estimate_noise,
+    judge_by_chain,
+    noise_between_neighbours,
+)
 from rotavg_ros.solver.slam_clean_net import SlamCleanNet, closure_features
 from rotavg_ros.solver.slam_refinement import SlamEstimate
 from rotavg_ros.solver.slip_search import search_for_slips
-from rotavg_ros.solver.spanning_tree import compose_orientations, minimum_spanning_forest, shortest_path_forest
+from rotavg_ros.solver.spanning_tree import (
+    SpanningForest,
+    compose_orientations,
+    minimum_spanning_forest,
+    shortest_path_forest,
+)
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # Odometry first: no number of steps is worth a closure.
@@ -25,6 +37,11 @@ _CLOSURE_COST = 1e6
 # What a closure's verdict counts for in the tree: nobody is trusted beyond this, and a false one is off by about this.
 _MIN_DISTRUST = 0.02
 _FALSE_SQUARE = np.pi**2 / 3 + 2
+# Odometry that this share of the closures disagrees with may be biased; it is if without the bias so many fewer do,
+# and with less drift.
+_BIASED_SHARE = 0.5
+_BIAS_GAIN = 0.2
+_BIAS_ROUNDS = 2
 # Rotations whose axes spread less than this (relative) are all about one axis.
 _PLANAR_SPREAD = 1e-10
 
@@ -55,9 +72,27 @@ class Prepared:
 def prepare(graph: ViewGraph, *, scale_estimation: bool = True) -> Prepared:
     """Contract the odometry chains and estimate the noise of steps and closures. Rejected edges take no part.
 
+    If most closures disagree with the odometry, a constant bias may be why; it is taken out if fewer do without it.
+
     Args:
         scale_estimation: if not, the noise is what edges of either kind state in the median.
     """
+    prepared, forest = _contract(graph, scale_estimation)
+    if scale_estimation and prepared.noise.outlier_share > _BIASED_SHARE:
+        noise = noise_between_neighbours(prepared.pairs, prepared.noise.components)
+        corrected = graph
+        for _ in range(_BIAS_ROUNDS):
+            contracted, forest = _contract(corrected, scale_estimation)
+            corrected = without_bias(corrected, estimate_bias(corrected, forest, contracted.closure_graph, noise))
+        unbiased, _ = _contract(corrected, scale_estimation)
+        fewer_disagree = unbiased.noise.outlier_share < prepared.noise.outlier_share - _BIAS_GAIN
+        if fewer_disagree and unbiased.noise.step_variance < prepared.noise.step_variance:
+            return unbiased
+    return prepared
+
+
+def _contract(graph: ViewGraph, scale_estimation: bool) -> tuple[Prepared, SpanningForest]:
+    """As :func:`prepare`, believing the odometry, and the forest along which the chains were drawn together."""
     usable = graph.label != EdgeLabel.REJECTED
     cost = torch.where(graph.is_odometry, 1.0, _CLOSURE_COST)
     # A rejected edge may only be used where nothing else connects.
@@ -72,7 +107,7 @@ def prepare(graph: ViewGraph, *, scale_estimation: bool = True) -> Prepared:
         noise = estimate_noise(discrepancies(squared_angle, path_steps, pairs), components)
     else:
         noise = _stated_noise(graph, components)
-    return Prepared(closure_graph, squared_angle, path_steps, pairs, noise)
+    return Prepared(closure_graph, squared_angle, path_steps, pairs, noise), forest
 
 
 @dataclass(frozen=True)

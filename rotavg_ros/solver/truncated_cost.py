@@ -82,7 +82,7 @@ class TruncatedCost:
         if trust is None:
             for _ in range(_DESCENT_STEPS):
                 correction = self._step(correction, (scale / (self._square(correction) + scale + 1e-12)) ** 2)
-            return rotations.normalize(correction)
+            return correction
         for _ in range(_SETTLING_STEPS):
             correction = self._step(correction, trust)
         convexity = (
@@ -92,7 +92,7 @@ class TruncatedCost:
             annealed = max(convexity, 1.0) * scale + 1e-12
             correction = self._step(correction, trust * (annealed / (self._square(correction) + annealed)) ** 2)
             convexity /= _ANNEALING_FACTOR
-        return rotations.normalize(correction)
+        return correction
 
     def _square(self, correction: Tensor) -> np.ndarray:
         return np.asarray((rotations.log(self.residual(correction)) ** 2).sum(dim=1).numpy() / self.variance)
@@ -100,4 +100,4 @@ class TruncatedCost:
     def _step(self, correction: Tensor, factor: np.ndarray) -> Tensor:
         system = self.pattern.factorize(np.maximum(factor, _MIN_WEIGHT) / self.variance)
         step = system.fit(rotations.log(self.residual(correction)).numpy())
-        return rotations.multiply(correction, rotations.exp(torch.from_numpy(step)))
+        return rotations.normalize(rotations.multiply(correction, rotations.exp(torch.from_numpy(step))))
