@@ -214,15 +214,15 @@ def _solve_sfm(
     steps = (default_steps if method.refine else 0) if refinement_steps is None else refinement_steps
     if steps > 0:
         with watch.stage("refine"):
-            labelled = 1 - sfm_stages.apply_labels(sfm_stages.trust_all(graph), graph.label).outlier_probability
-            weight = 1 - cleaned.outlier_probability if method.weighted else labelled
+            allowed = (graph.label != EdgeLabel.REJECTED).double()
+            weight = 1 - cleaned.outlier_probability if method.weighted else allowed
             if method.shaped:
                 orientations = sfm_refinement.refine(
                     graph,
                     orientations,
                     roots,
                     steps,
-                    prior_weight=labelled,
+                    prior_weight=allowed,
                     coarse_weight=weight,
                     component=component,
                     edges=cleaned.edges,
