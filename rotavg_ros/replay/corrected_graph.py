@@ -1,4 +1,4 @@
-"""The corrected pose graph of a replay as a g2o file."""
+"""A replay's corrected pose graph as a g2o file."""
 
 from __future__ import annotations
 

@@ -1,0 +1,63 @@
+"""Two robots in one bag, joined by a closure between them."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evo.tools import file_interface
+from mcap.reader import make_reader
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION
+from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_message
+from rotavg_ros.bags.writer import BagWriter
+from rotavg_ros.cli.main import main
+
+COUNT = 30
+STAMPS = 10**9 + 100_000_000 * np.arange(COUNT)
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    """Red drives along x, blue along its own x; at the end red sees blue turned by a quarter."""
+    with BagWriter(tmp_path / "two") as bag:
+        for robot in ("red", "blue"):
+            bag.add_topic(f"/{robot}/odom", ODOMETRY)
+        bag.add_topic("/between", RELATIVE_ROTATION)
+        for index, stamp in enumerate(STAMPS.tolist()):
+            pose = np.array([index, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0])
+            for robot in ("red", "blue"):
+                bag.write(f"/{robot}/odom", stamp, odometry_message(stamp, *pose, "odom"))
+        last = int(STAMPS[-1])
+        ends = Keyframe(None, last, "red"), Keyframe(None, last, "blue")
+        quarter = Rotation.from_euler("z", 90, degrees=True).as_quat()
+        bag.write("/between", last, edge_message(Edge(last, 7, 1, *ends, quarter, 1e4, 1)))
+    return tmp_path / "two"
+
+
+def test_two_robots_share_one_world(bag: Path, tmp_path: Path) -> None:
+    topics = ["--odometry", "/red/odom", "--odometry", "/blue/odom"]
+    output = tmp_path / "out"
+    assert main(["replay", str(bag), "--output", str(output), *topics]) == 0
+    summary = json.loads((output / "summary.json").read_text())
+    assert set(summary["robots"]) == {"red", "blue"}
+    assert (summary["components"], summary["keyframes"], summary["loop_closures"]) == (1, 2 * COUNT, 1)
+
+    red, blue = (file_interface.read_tum_trajectory_file(str(output / f"{robot}.tum")) for robot in ("red", "blue"))
+    turn = Rotation.from_matrix(red.poses_se3[-1][:3, :3]).inv() * Rotation.from_matrix(blue.poses_se3[-1][:3, :3])
+    assert np.degrees(turn.magnitude()) == pytest.approx(90, abs=0.1)
+    way = blue.positions_xyz[-1] - blue.positions_xyz[0]
+    along = Rotation.from_matrix(blue.poses_se3[0][:3, :3]).apply([COUNT - 1, 0, 0])
+    np.testing.assert_allclose(way, along, atol=1e-3)
+
+    with (output / "orientations.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["robot"] for row in rows] == ["0"] * COUNT + ["1"] * COUNT
+    with (output / "run.mcap").open("rb") as file:
+        topics_written = {channel.topic for _, channel, _ in make_reader(file).iter_messages()}
+    assert {"/red/orientation", "/blue/orientation", "/red/corrected_path", "/blue/corrected_path"} <= topics_written
+    assert (output / "report.html").exists()
