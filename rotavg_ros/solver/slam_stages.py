@@ -42,6 +42,10 @@ _FALSE_SQUARE = np.pi**2 / 3 + 2
 _BIASED_SHARE = 0.5
 _BIAS_GAIN = 0.2
 _BIAS_ROUNDS = 2
+# How much of the network's log-odds the refinement adds to its own: a part, since both have seen some of the same
+# evidence, and the less the more closures are false, since agreement by chance is then as common as by truth.
+_NETWORK_SHARE = 0.6
+_MAX_NETWORK_LOG_ODDS = 4.0
 # Rotations whose axes spread less than this (relative) are all about one axis.
 _PLANAR_SPREAD = 1e-10
 
@@ -127,7 +131,7 @@ def clean(network: SlamCleanNet | None, prepared: Prepared, label: Tensor) -> Cl
     """Judge every closure by its discrepancy with the odometry and, with a network, by the company it keeps.
 
     A closure starts as good only if both say so: a group of false closures agrees with itself, and odometry that has
-    drifted far believes anything.
+    drifted far believes anything. What the network says counts in the refinement's verdicts, too.
 
     Args:
         label: ``(M,)`` of the view-graph's edges.
@@ -139,7 +143,10 @@ def clean(network: SlamCleanNet | None, prepared: Prepared, label: Tensor) -> Cl
     good[graph.is_closure] = by_chain
     if network is not None and len(by_chain):
         features = closure_features(noise, prepared.squared_angle, prepared.path_steps, prepared.pairs)
-        good[graph.is_closure] = np.minimum(by_chain, -network(features).double().numpy())
+        by_company = -network(features).double().numpy()
+        good[graph.is_closure] = np.minimum(by_chain, by_company)
+        bounded = np.clip(by_company, -_MAX_NETWORK_LOG_ODDS, _MAX_NETWORK_LOG_ODDS)
+        prior[graph.is_closure] = _NETWORK_SHARE * (1 - noise.outlier_share) * bounded
     edge_label = label.numpy()[graph.view_graph_edge]
     verdict = np.select([edge_label == EdgeLabel.ACCEPTED, edge_label == EdgeLabel.REJECTED], [np.inf, -np.inf], 0.0)
     good[graph.num_segments :] = np.where(verdict == 0, good[graph.num_segments :], verdict)

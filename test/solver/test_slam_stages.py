@@ -1,0 +1,78 @@
+"""How the SLAM profile's network takes part in the verdicts, with a network whose answer is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor, nn
+
+from rotavg_ros.solver.slam_clean_net import ClosureFeatures
+from rotavg_ros.solver.slam_stages import Prepared, bootstrap, clean, prepare, refine
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+
+from .graphs import measured, random_truth, slam_edges, small_noise
+
+
+class Verdict(nn.Module):
+    """The same log-odds of being false for every closure."""
+
+    def __init__(self, log_odds: float) -> None:
+        super().__init__()
+        self.log_odds = log_odds
+
+    def forward(self, features: ClosureFeatures) -> Tensor:
+        return torch.full((len(features.closures),), self.log_odds)
+
+
+def graph_with_a_doubtful_closure() -> tuple[ViewGraph, int]:
+    """200 keyframes, 60 good closures of 1°, and one more (the last edge) that is off by 5°."""
+    source, target, kind = slam_edges(200, 61, 0)
+    noise = small_noise(len(source), np.where(kind == 0, 0.2, 1.0), 1).as_rotvec()
+    noise[-1] = np.radians([3.0, 4.0, 0.0])
+    graph = measured(random_truth(200, 2), source, target, Rotation.from_rotvec(noise), kind=kind)
+    return graph, len(source) - 1
+
+
+def probability_of(prepared: Prepared, graph: ViewGraph, edge: int, log_odds: float | None) -> float:
+    """Of being good, after the refinement."""
+    network = None if log_odds is None else Verdict(log_odds)
+    cleaned = clean(network, prepared, graph.label)  # type: ignore[arg-type]
+    estimate = refine(prepared, cleaned, bootstrap(prepared, cleaned))
+    return float(prepared.closure_graph.edge_values(estimate.inlier_probability)[edge])
+
+
+def test_the_network_sways_a_doubtful_verdict_and_not_a_clear_one() -> None:
+    graph, doubtful = graph_with_a_doubtful_closure()
+    prepared = prepare(graph)
+    suspicious, silent, trusting = (probability_of(prepared, graph, doubtful, v) for v in (9.0, None, -9.0))
+    assert suspicious < silent < trusting
+    clear = int(np.flatnonzero(graph.kind.numpy() == 1)[0])
+    assert probability_of(prepared, graph, clear, 9.0) > 0.9
+
+
+@pytest.mark.parametrize("log_odds", [100.0, -100.0])
+def test_no_network_overrules_a_label(log_odds: float) -> None:
+    graph, _ = graph_with_a_doubtful_closure()
+    closures = np.flatnonzero(graph.kind.numpy() == 1)
+    label = graph.label.clone()
+    label[closures[0]], label[closures[1]] = EdgeLabel.ACCEPTED, EdgeLabel.REJECTED
+    graph = replace(graph, label=label)
+    prepared = prepare(graph)
+    for edge, expected in ((int(closures[0]), 1.0), (int(closures[1]), 0.0)):
+        assert probability_of(prepared, graph, edge, log_odds) == expected
+
+
+def test_the_network_counts_less_the_more_is_false() -> None:
+    graph, _ = graph_with_a_doubtful_closure()
+    prepared = prepare(graph)
+    said = []
+    for share in (0.1, 0.5, 0.9):
+        noise = replace(prepared.noise, outlier_share=share)
+        prior = clean(Verdict(2.0), replace(prepared, noise=noise), graph.label).prior_log_odds  # type: ignore[arg-type]
+        assert (prior[prepared.closure_graph.is_odometry] == 0).all()
+        said.append(float(np.unique(prior[prepared.closure_graph.is_closure]).item()))
+    assert -2 < said[0] < said[1] < said[2] < 0
