@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
-from rotavg_ros.evaluation import slam_plots
+from rotavg_ros.evaluation import slam_live_tables, slam_plots
 from rotavg_ros.evaluation.slam_cases import AS_RECORDED
 from rotavg_ros.evaluation.slam_contenders import OURS, ROWS
-from rotavg_ros.evaluation.slam_incremental import SETTLED_KEYFRAMES, IncrementalRun
+from rotavg_ros.evaluation.slam_incremental import IncrementalRun
 from rotavg_ros.evaluation.slam_scoring import REFERENCE, SlamScores, geometric_mean, good_flagged
 from rotavg_ros.evaluation.slam_uncertainty import UncertaintyCheck
 from rotavg_ros.evaluation.tables import Cell, Column, Table, write_report
@@ -57,13 +55,13 @@ def report(
         tables["slam-worst"] = _worst("Where it is worst", scores, spoiled)
     tables["slam-seconds"] = _seconds("Seconds for a whole graph", scores, names)
     if incremental:
-        tables["slam-incremental"] = _incremental("Incremental", incremental)
+        tables["slam-incremental"] = slam_live_tables.incremental("Incremental", incremental)
         for run in incremental:
             picture = f"slam-incremental-{run.case.graph_name}.png"
             slam_plots.incremental(folder / picture, run)
             pictures[picture] = f"{run.case.name}: mean error of all keyframes so far, tick by tick."
     if uncertainty:
-        tables["slam-uncertainty"] = _uncertainty("Stated uncertainty", uncertainty)
+        tables["slam-uncertainty"] = slam_live_tables.uncertainty("Stated uncertainty", uncertainty)
     return write_report(
         folder,
         "slam",
@@ -206,57 +204,6 @@ def _seconds(title: str, scores: SlamScores, names: Sequence[str]) -> Table:
     return Table(title, columns, tuple(rows), (note,))
 
 
-def _incremental(title: str, runs: Sequence[IncrementalRun]) -> Table:
-    rows: list[tuple[Cell, ...]] = [
-        (
-            run.case.name,
-            run.error_deg[-1],
-            run.odometry_error_deg[-1],
-            run.worst_excess_deg,
-            float(run.flips.mean()),
-            int(run.flips.max()),
-            100 * _share(run.false_flagged[-1], run.false_seen[-1]),
-            100 * _share(run.good_flagged[-1], run.good_seen[-1]),
-            1e3 * float(np.median(run.seconds)),
-            1e3 * float(np.percentile(run.seconds, 95)),
-        )
-        for run in runs
-    ]
-    columns = (
-        Column("run"),
-        Column("final °", ".2f"),
-        Column("odometry °", ".2f"),
-        Column(f"worst excess ° after {SETTLED_KEYFRAMES}", ".2f"),
-        Column("flips per tick", ".3f"),
-        Column("most flips", "d"),
-        Column("false flagged %", ".1f"),
-        Column("good flagged %", ".1f"),
-        Column("tick p50 ms", ".0f"),
-        Column("tick p95 ms", ".0f"),
-    )
-    note = (
-        "Edges in time order, a tick every ten keyframes; errors are of all keyframes so far. Excess: how much worse "
-        "than odometry alone at the same keyframe. Flips: closures seen before whose flag a tick changes."
-    )
-    return Table(title, columns, tuple(rows), (note,))
-
-
-def _uncertainty(title: str, checks: Sequence[UncertaintyCheck]) -> Table:
-    figures = ("graph_name", "step_deg", "closure_deg", "normalized_error", "within_one", "within_two")
-    columns = (
-        Column("graph"),
-        Column("noise per step °", ".1f"),
-        Column("per closure °", ".1f"),
-        Column("error ÷ stated", ".2f"),
-        Column("within 1σ", ".3f"),
-        Column("within 2σ", ".3f"),
-    )
-    rows = tuple(tuple(getattr(check, figure) for figure in figures) for check in checks)
-    return Table(
-        title, columns, rows, ("Root mean square over nodes and draws of known noise; 1, 0.683, 0.954 if right.",)
-    )
-
-
 def _cases(title: str, scores: SlamScores) -> Table:
     rows: list[tuple[Cell, ...]] = [
         (
@@ -278,7 +225,3 @@ def _cases(title: str, scores: SlamScores) -> Table:
         "graph condition seed method error_deg false_flagged good_flagged false_kept good_kept odometry_flagged seconds"
     )
     return Table(title, tuple(Column(heading) for heading in headings.split()), tuple(rows))
-
-
-def _share(part: float, whole: float) -> float:
-    return part / whole if whole else float("nan")
