@@ -11,12 +11,13 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from rotavg_ros.inputs import EdgeConverter, EdgeVerdict, OdometryConverter
+from rotavg_ros.inputs import EdgeConverter, OdometryConverter
 from rotavg_ros.online import OnlineEstimator, RejectReason
 from rotavg_ros.online.measurements import RejectedInputError
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.ros import adapters
 from rotavg_ros.ros.diagnostics import Health
+from rotavg_ros.ros.edge_intake import EdgeIntake
 from rotavg_ros.ros.message_counting import TopicCounter
 from rotavg_ros.ros.outputs import Outputs
 from rotavg_ros.ros.parameters import NodeParameters
@@ -46,8 +47,7 @@ class Subscriptions:
         self._estimator = estimator
         self._health = health
         self._outputs = outputs
-        self._generation = estimator.generation
-        self._edge_converters: list[EdgeConverter] = []
+        self._intake = EdgeIntake(node, estimator, partial(self._warn_of_refusal, "an edge"))
         best_effort = QoSProfile(depth=parameters.odometry_queue_depth, reliability=ReliabilityPolicy.BEST_EFFORT)
         sources = zip(parameters.robots, parameters.odometry_topics, parameters.odometry_sensors(), strict=True)
         for robot, entry, body_from_sensor in sources:
@@ -58,7 +58,7 @@ class Subscriptions:
         reliable = QoSProfile(depth=parameters.edge_queue_depth, reliability=ReliabilityPolicy.RELIABLE)
         for entry, source in zip(parameters.edge_topics, parameters.edge_sources(), strict=True):
             edges = adapters.edge_topic(entry, source)
-            self._edge_converters.append(edges.convert)
+            self._intake.add_source(edges.convert)
             counter = health.edges.setdefault(edges.topic, TopicCounter())
             on_edges = partial(self._on_edges, edges.convert, counter)
             self._subscribe(edges.message_type, edges.topic, on_edges, counter, reliable)
@@ -119,26 +119,7 @@ class Subscriptions:
     def _on_edges(
         self, convert: EdgeConverter, counter: TopicCounter, message: Any, _info: dict[str, Any] | None
     ) -> None:
-        self._forget_with_the_estimator()
-        for record in convert(message):
-            if isinstance(record, EdgeVerdict):
-                self._estimator.label_edge(record.source_robot, record.edge_id, record.label)
-                continue
-            counter.by_sequence.observe(record.sender, record.sequence)
-            if isinstance(record.edge, RejectReason):
-                reason: RejectReason | None = record.edge
-                self._estimator.reject(record.edge)
-            else:
-                reason = self._estimator.add_edge(record.edge)
-            if reason is not None and reason is not RejectReason.DUPLICATE_EDGE:
-                self._warn_of_refusal("an edge", reason)
-
-    def _forget_with_the_estimator(self) -> None:
-        """After a reset, what a sender repeats is new again."""
-        if self._generation != self._estimator.generation:
-            self._generation = self._estimator.generation
-            for convert in self._edge_converters:
-                convert.forget()
+        self._intake.take(convert, counter, message)
 
     def _warn_of_refusal(self, what: str, reason: RejectReason) -> None:
         self._node.get_logger().warning(
