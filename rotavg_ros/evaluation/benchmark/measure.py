@@ -46,7 +46,7 @@ class Measurement:
         wall_seconds, cpu_seconds: of every repeat, graph in memory → answer in memory; CPU time of all threads.
         stage_seconds: wall-clock of our stages in the repeat of median wall-clock.
         mean_deg, median_deg: error of the orientations.
-        peak_bytes: the process's ru_maxrss, interpreter, libraries and graph included.
+        peak_bytes: the process's largest resident size, interpreter, libraries and graph included.
         graph_bytes: the same before the first solve.
     """
 
@@ -123,8 +123,12 @@ def _triangle(odometry: bool) -> ViewGraph:
 
 
 def _peak_bytes() -> int:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024  # Linux counts in KiB
+    """Largest resident size of this program. Linux's ru_maxrss would count what the starting process had, too."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        (line,) = (line for line in status.read_text(encoding="utf-8").splitlines() if line.startswith("VmHWM:"))
+        return 1024 * int(line.split()[1])
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from rotavg_ros.evaluation.benchmark.cases import FAMILIES
 from rotavg_ros.evaluation.benchmark.measure import LABELS, Measurement
@@ -100,6 +101,8 @@ def _draw(axes: Axes, results: Sequence[Result], value: object, title: str) -> N
         axes.plot(edges, [value(point) for point in points], "o-", color=colour, markersize=4, label=LABELS[name])  # type: ignore[operator]
     axes.set_xscale("log")
     axes.set_yscale("log")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_minor_formatter(NullFormatter())  # on less than a decade they would overlap
     axes.set_xlabel("edges", fontsize=9, color=MUTED)
     style(axes, title)
 
