@@ -123,8 +123,9 @@ def _tiles(facts: RunFacts) -> list[Tile]:
         milliseconds = [1000 * tick.seconds for tick in record.ticks]
         tiles.append(Tile(f"{np.percentile(milliseconds, 95):.0f} ms", "tick time, 95th percentile"))
     if record.wall_seconds > 0:
-        speed = f", {record.duration_s / record.wall_seconds:.0f} × real time" if record.duration_s else ""
-        tiles.append(Tile(_duration(record.wall_seconds), f"of computing{speed}"))
+        speed = record.duration_s / record.wall_seconds
+        shown = f"{speed:.0f}" if speed >= 10 else f"{speed:.1f}"
+        tiles.append(Tile(_duration(record.wall_seconds), f"of computing, {shown} × real time"))
     return tiles
 
 
