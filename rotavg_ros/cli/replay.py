@@ -155,12 +155,17 @@ def _told(summary: dict[str, Any], output: Path) -> str:
         if "orientation_error_mean_deg" in said:
             lines.append(_compared(robot, said))
     counts = (
-        f"{summary['keyframes']} keyframes, {summary['loop_closures']} loop closures, {summary['outliers']} outliers"
+        f"{_counted(summary['keyframes'], 'keyframe')}, {_counted(summary['loop_closures'], 'loop closure')}, "
+        f"{_counted(summary['outliers'], 'outlier')}"
     )
     components = "" if summary["components"] == 1 else f", {summary['components']} components"
     times = f"{summary['duration_s']:.0f} s of the bag in {summary['wall_seconds']:.1f} s"
     lines.append(f"{counts}{components}; {times} → {output}")
     return "\n".join(lines)
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _compared(robot: str, said: dict[str, Any]) -> str:

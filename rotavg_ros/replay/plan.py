@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from rotavg_ros.bags.message_types import RELATIVE_ROTATION
 from rotavg_ros.bags.reader import RECORDING_SUFFIXES, BagReader
+from rotavg_ros.datasets.pose_files import read_pose_file
 from rotavg_ros.errors import UserError
 from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
 from rotavg_ros.replay.record import TopicUse
@@ -86,6 +87,7 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
 
     Raises:
         PlanError: a topic that is not in the bag, or whose type nothing can be made of.
+        GraphFileError: a file for reference that holds no poses.
         ParameterError: parameters that do not fit together.
     """
     if bag.num_messages() == 0:
@@ -201,6 +203,7 @@ def _references(
             and Path(entry).exists()
             and Path(entry).suffix not in RECORDING_SUFFIXES
         ):
+            read_pose_file(entry)  # a mistake shows before the replay, not after it
             references[robot] = Path(entry)
         else:
             (references[robot],) = _chosen(bag, [entry], ODOMETRY_CONVERTERS, "a reference", found.references)

@@ -177,6 +177,16 @@ def test_a_reference_of_another_kind(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_file_that_is_no_reference_is_told_before_the_replay(
+    tmp_path: Path, small: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph = tmp_path / "truth.g2o"
+    graph.write_text("EDGE_SE2 0 1 1 0 0.5 1 0 0 1 0 1\n")
+    monkeypatch.setattr("rotavg_ros.replay.run.replay", lambda *_: pytest.fail("replayed first"))
+    assert main(["replay", str(small), "--output", str(tmp_path / "out"), "--reference", str(graph)]) == 2
+    assert f"{graph}:1" in capsys.readouterr().err
+
+
 def test_no_space_left(tmp_path: Path, small: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")

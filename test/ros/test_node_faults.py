@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 import random
+import shutil
 import subprocess
 import sys
 import time
@@ -11,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.torch
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
@@ -19,6 +22,7 @@ from geometry_msgs.msg import Quaternion
 from nav_msgs.msg import Odometry
 from rotavg_msgs.msg import KeyframeReference, RelativeRotation, RelativeRotationArray
 
+import rotavg_ros
 from rotavg_ros.inputs import Source
 from rotavg_ros.inputs.rotavg import edge_from_message
 from rotavg_ros.online import Answer, OnlineEstimator
@@ -305,3 +309,29 @@ def test_a_clean_end_during_a_long_solve(live_node) -> None:
     assert live_node.stop() == 0
     assert time.monotonic() - started < 30  # the promise is two seconds; a loaded machine must not fail the test
     assert "Traceback" not in live_node.process.output
+
+
+@pytest.mark.parametrize("damage", ["truncated", "another version"])
+def test_networks_that_cannot_be_used_are_told_at_the_start(tmp_path: Path, damage: str) -> None:
+    """A copy of the package with damaged weights, started as it is."""
+    package = shutil.copytree(Path(rotavg_ros.__file__).parent, tmp_path / "rotavg_ros")
+    weights = package / "solver" / "weights" / "slam-clean-net.safetensors"
+    content = weights.read_bytes()
+    if damage == "truncated":
+        weights.write_bytes(content[: len(content) // 2])
+    else:
+        stated = {"network": "slam-clean-net", "architecture_version": "0"}
+        safetensors.torch.save_file(safetensors.torch.load(content), weights, stated)
+    command = [sys.executable, "-c", "import sys; from rotavg_ros.ros.node import main; sys.exit(main())"]
+    ended = subprocess.run(
+        command,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 2, ended.stderr
+    line = next(line for line in ended.stderr.splitlines() if str(weights) in line)
+    assert "rotavg train" in line
+    assert "Traceback" not in ended.stderr
