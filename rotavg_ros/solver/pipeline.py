@@ -87,7 +87,8 @@ def solve(
             none that works, or it has too little memory, the CPU does it, which is logged. The SLAM profile and the
             baselines are small and sparse; they run on the CPU.
         refinement_steps: refinement steps at most, 0 for none; default: the method's and profile's own number.
-        warm_start: ``(N, 4)`` body_from_world of an earlier solution to start from.
+        warm_start: ``(N, 4)`` body_from_world of an earlier solution to start from; the SLAM profile then takes fewer
+            refinement steps.
         weights: folder of networks trained with ``rotavg train``; what it lacks comes from the package.
 
     Raises:
@@ -139,6 +140,15 @@ class _Job:
     warm_start: Tensor | None
     component: Tensor
 
+    @property
+    def last_steps(self) -> int | None:
+        """Refinement steps of the last link of the method; None: its own number."""
+        method = NETWORK_METHODS.get(self.names[-1])
+        refines = method is not None and method.refine
+        if self.refinement_steps is None and refines and self.profile == "slam" and self.warm_start is not None:
+            return slam_refinement.WARM_PASSES
+        return self.refinement_steps
+
 
 def _run(job: _Job, graph: ViewGraph, networks: _Networks) -> tuple[_Estimate, dict[str, float]]:
     """Every link of the method; with the seconds of its stages."""
@@ -148,8 +158,8 @@ def _run(job: _Job, graph: ViewGraph, networks: _Networks) -> tuple[_Estimate, d
         component = job.component.to(networks.device)
         for name in job.names[:-1]:
             start = _solve_once(graph, component, name, job.profile, None, start, networks, watch).body_from_world
-        steps = job.refinement_steps
-        return _solve_once(graph, component, job.names[-1], job.profile, steps, start, networks, watch), watch.seconds
+        last, steps = job.names[-1], job.last_steps
+        return _solve_once(graph, component, last, job.profile, steps, start, networks, watch), watch.seconds
 
 
 def _solve_once(
