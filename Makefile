@@ -13,10 +13,16 @@ demo: setup
 	@$(BIN)/rotavg demo $(if $(GRAPH),--graph "$(GRAPH)") $(if $(TRUTH),--truth "$(TRUTH)") \
 		$(if $(STAMPS),--stamps "$(STAMPS)")
 
-# make test [ARGS="-k node -x"]
+# make test [ARGS="-k node -x"]; without ARGS the tests over DDS, which mostly wait, run beside the others
 test:
 	@$(PYTHON) tools/setup_environment.py --for-tests
+ifeq ($(strip $(ARGS)),)
+	@mkdir -p build; $(BIN)/python -m pytest --ignore=test/ros > build/tests.log 2>&1 & others=$$!; \
+	$(BIN)/python -m pytest test/ros; ros=$$?; \
+	wait $$others; others=$$?; cat build/tests.log; exit $$((ros + others))
+else
 	@$(BIN)/python -m pytest $(ARGS)
+endif
 
 # make bench [ARGS="--minutes 5 --max-pairs 200000"]: beside COLMAP and GTSAM, and the node under load; docs/results/
 bench: setup
