@@ -52,6 +52,8 @@ class ViewGraph:
         kind: ``(M,)`` int64 :class:`EdgeKind`.
         precision: ``(M,)`` float64, 1/variance of the rotation vector's components in rad⁻²; NaN where unknown.
         label: ``(M,)`` int64 :class:`EdgeLabel`.
+        steps: ``(M,)`` float64, odometry steps that an odometry edge stands for: its variance in units of one. 1 but
+            for edges that several were drawn together into; of loop closures without meaning.
     """
 
     num_nodes: int
@@ -61,6 +63,7 @@ class ViewGraph:
     kind: Tensor
     precision: Tensor
     label: Tensor
+    steps: Tensor
 
     @classmethod
     def create(
@@ -73,6 +76,7 @@ class ViewGraph:
         kind: ArrayLike | None = None,
         precision: ArrayLike | None = None,
         label: ArrayLike | None = None,
+        steps: ArrayLike | None = None,
     ) -> ViewGraph:
         """Check the arrays and bring them into the graph's types.
 
@@ -83,10 +87,11 @@ class ViewGraph:
             kind: default: every edge is a loop closure (an SfM view-graph).
             precision: rad⁻²; default: unknown. Values that are not positive and finite count as unknown.
             label: default: automatic.
+            steps: default: 1.
 
         Raises:
-            ViewGraphError: shapes that do not fit, an index out of range, a self-edge, or a quaternion that is not
-                finite or is farther than 1e-3 from unit length.
+            ViewGraphError: shapes that do not fit, an index out of range, a self-edge, steps that are not positive and
+                finite, or a quaternion that is not finite or is farther than 1e-3 from unit length.
         """
         source = _as_tensor(source, torch.int64)
         target = _as_tensor(target, torch.int64)
@@ -95,12 +100,14 @@ class ViewGraph:
         kind = _default(kind, torch.int64, num_edges, EdgeKind.LOOP_CLOSURE)
         precision = _default(precision, torch.float64, num_edges, float("nan"))
         label = _default(label, torch.int64, num_edges, EdgeLabel.AUTOMATIC)
+        steps = _default(steps, torch.float64, num_edges, 1.0)
         for name, values in (
             ("target", target),
             ("target_from_source", quaternions),
             ("kind", kind),
             ("precision", precision),
             ("label", label),
+            ("steps", steps),
         ):
             if len(values) != num_edges:
                 raise ViewGraphError(f"{name} has {len(values)} rows, source has {num_edges}; they must agree")
@@ -109,12 +116,13 @@ class ViewGraph:
         ends = torch.stack((source, target))
         _refuse((ends < 0) | (ends >= num_nodes), f"a node index outside 0 … {num_nodes - 1}")
         _refuse((source == target)[None], "the same source and target")
+        _refuse(~(torch.isfinite(steps) & (steps > 0))[None], "steps that are not positive and finite")
         norm = quaternions.norm(dim=1)
         _refuse(~((norm - 1).abs() <= UNIT_NORM_TOLERANCE)[None], "a quaternion that is not of unit length")
         quaternions = quaternions / norm[:, None]
         quaternions = torch.where(quaternions[:, 3:] < 0, -quaternions, quaternions)
         precision = torch.where(torch.isfinite(precision) & (precision > 0), precision, torch.nan)
-        return cls(num_nodes, source, target, quaternions, kind, precision, label)
+        return cls(num_nodes, source, target, quaternions, kind, precision, label, steps)
 
     @property
     def num_edges(self) -> int:

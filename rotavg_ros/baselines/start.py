@@ -76,6 +76,7 @@ def solve_by_component(
             chosen.kind,
             chosen.precision,
             chosen.label,
+            chosen.steps,
         )
         body_from_world[members] = solve_connected(part, None if start is None else start[members])
     return body_from_world

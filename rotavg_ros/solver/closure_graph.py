@@ -35,10 +35,11 @@ class ClosureGraph:
         source, target: ``(E,)`` key nodes.
         residual: ``(E, 4)`` float64 e⁰; the identity on segments.
         is_odometry: ``(E,)`` bool; all segments, and odometry edges outside the forest.
-        steps: ``(E,)`` variance in units of one edge of its kind: odometry edges passed, 1 for a closure.
+        steps: ``(E,)`` variance in units of one edge of its kind: odometry steps passed, 1 for a closure.
         path_steps: ``(E,)`` odometry steps between the edge's ends along the forest; inf where a bridge is passed.
         view_graph_edge: ``(E - S,)`` the view-graph edge of each edge that is no segment.
         segment_of_edge: ``(M,)`` the segment that holds each view-graph edge, -1 for those above.
+        share_of_segment: ``(M,)`` how much of its segment's steps a view-graph edge is; 1 for those above.
         odometry_orientation: ``(N, 4)`` R⁰, body_from_world.
     """
 
@@ -53,6 +54,7 @@ class ClosureGraph:
     path_steps: np.ndarray
     view_graph_edge: np.ndarray
     segment_of_edge: np.ndarray
+    share_of_segment: np.ndarray
     odometry_orientation: Tensor
     # Every view-graph node lies `fraction` of the way (in variance) from key node `above` to key node `below`.
     above: np.ndarray
@@ -109,6 +111,7 @@ def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
     num_nodes, num_edges = graph.num_nodes, graph.num_edges
     source, target = graph.source.numpy(), graph.target.numpy()
     is_odometry = graph.is_odometry.numpy()
+    steps = graph.steps.numpy()
     parent, parent_edge = forest.parent, forest.parent_edge
 
     tree_odometry = np.zeros(num_edges, dtype=bool)
@@ -128,7 +131,7 @@ def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
     only_child = np.arange(num_nodes)
     only_child[parent[hangs_on_odometry]] = np.flatnonzero(hangs_on_odometry)
     below_node = _follow(np.where(is_key, np.arange(num_nodes), only_child))
-    depth = accumulate_to_root(forest, hangs_on_odometry.astype(np.float64))
+    depth = accumulate_to_root(forest, np.where(hangs_on_odometry, steps[parent_edge], 0.0))
     length = depth[below_node] - depth[above_node]
     fraction = np.divide(depth - depth[above_node], length, out=np.zeros(num_nodes), where=length > 0)
 
@@ -151,19 +154,23 @@ def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
         np.inf,
     )
     segment_steps = depth[segment_end] - depth[segment_start]
+    share_of_segment = np.ones(num_edges)
+    on_segment = segment_of_edge >= 0
+    share_of_segment[on_segment] = steps[on_segment] / segment_steps[segment_of_edge[on_segment]]
     _, chain_number = np.unique(chain, return_inverse=True)
     return ClosureGraph(
         nodes=nodes,
-        position=(depth + 4.0 * num_nodes * chain_number)[nodes],
+        position=(depth + 4.0 * max(num_nodes, depth.max(initial=0.0)) * chain_number)[nodes],
         roots=key_of_node[forest.roots],
         source=key_of_node[np.concatenate((segment_start, source[other]))],
         target=key_of_node[np.concatenate((segment_end, target[other]))],
         residual=torch.cat((rotations.identity(len(segment_end)), rotations.canonical(residual))),
         is_odometry=np.concatenate((np.ones(len(segment_end), dtype=bool), is_odometry[other])),
-        steps=np.concatenate((segment_steps, np.ones(len(other)))),
+        steps=np.concatenate((segment_steps, np.where(is_odometry, steps, 1.0)[other])),
         path_steps=np.concatenate((segment_steps, path_steps)),
         view_graph_edge=other,
         segment_of_edge=segment_of_edge,
+        share_of_segment=share_of_segment,
         odometry_orientation=orientation,
         above=key_of_node[above_node],
         below=key_of_node[below_node],

@@ -74,8 +74,11 @@ def estimate_bias(
 
 
 def without_bias(graph: ViewGraph, bias: np.ndarray) -> ViewGraph:
-    """The graph with ``bias`` ``(3,)`` rad per step taken out of its odometry, whichever way an edge runs."""
-    turn = rotations.exp(torch.from_numpy(-bias)).expand(graph.num_edges, 4)
+    """The graph with ``bias`` ``(3,)`` rad per step taken out of its odometry, whichever way an edge runs.
+
+    An edge of several steps is taken for one about the same axis throughout.
+    """
+    turn = rotations.exp(-graph.steps[:, None] * torch.from_numpy(bias))
     measured = graph.target_from_source
     forwards = rotations.multiply(measured, turn)
     backwards = rotations.multiply(rotations.inverse(turn), measured)
@@ -91,7 +94,8 @@ def _drift_per_bias(graph: ViewGraph, forest: SpanningForest, closure_graph: Clo
     source, target = graph.source.numpy()[edge], graph.target.numpy()[edge]
     # A step turns about the body of its earlier node; forwards along the tree or backwards.
     earlier = np.minimum(source, target)
-    sign = np.where(earlier == child, -1.0, 1.0) * graph.is_odometry.numpy()[edge]
+    steps = (graph.steps * graph.is_odometry).numpy()[edge]
+    sign = np.where(earlier == child, -1.0, 1.0) * steps
     world_from_body = rotations.to_matrix(rotations.inverse(closure_graph.odometry_orientation)).numpy()
     step = np.zeros((graph.num_nodes, 9))
     step[child] = (sign[:, None, None] * world_from_body[earlier]).reshape(-1, 9)

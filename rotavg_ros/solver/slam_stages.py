@@ -204,9 +204,7 @@ def outlier_scores(graph: ClosureGraph, outlier_probability: np.ndarray) -> np.n
 
     A slip in a segment is as likely in any of its steps.
     """
-    wrong = outlier_probability.copy()
-    wrong[: graph.num_segments] /= graph.steps[: graph.num_segments]
-    return graph.edge_values(wrong)
+    return graph.edge_values(outlier_probability) * graph.share_of_segment
 
 
 def _stated_noise(graph: ViewGraph, components: int) -> NoiseModel:

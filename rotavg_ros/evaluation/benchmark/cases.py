@@ -84,7 +84,8 @@ def load(path: Path) -> BenchmarkGraph:
         columns = {name: torch.from_numpy(file[name]) for name in _COLUMNS}
         truth = torch.from_numpy(file["truth"])
         label = torch.zeros(len(columns["source"]), dtype=torch.int64)
-        return BenchmarkGraph(ViewGraph(num_nodes=int(file["num_nodes"]), label=label, **columns), truth)
+        steps = torch.ones(len(columns["source"]), dtype=torch.float64)
+        return BenchmarkGraph(ViewGraph(num_nodes=int(file["num_nodes"]), label=label, steps=steps, **columns), truth)
 
 
 def _draw_sfm(case: Case, rng: np.random.Generator) -> BenchmarkGraph:
