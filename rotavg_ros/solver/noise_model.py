@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import expit
 
 from rotavg_ros.solver.agreement import AgreementPairs
 
@@ -28,6 +27,8 @@ _EM_STARTS_STEP_DEG = (0.02, 0.1, 0.5, 2.0)
 _EM_STARTS_CLOSURE_DEG = (0.3, 2.0)
 # Rows of either kind used to choose among the starts, and to converge.
 _EM_THINNED = (1000, 5000)
+# Of the starts, so many are kept after so many iterations each.
+_EM_ROUNDS = ((3, 4), (1, 8))
 _EM_ITERATIONS = 60
 _EM_TOLERANCE = 1e-3
 # The likelihood hardly knows a small graph's drift, and closures that err in the tails look like drift. Of all step
@@ -147,11 +148,14 @@ def _likeliest(data: Discrepancies, components: int) -> NoiseModel:
         return NoiseModel(components, _PRIOR_STEP_VARIANCE, _PRIOR_CLOSURE_VARIANCE, 0.25)
     few = data.thinned(_EM_THINNED[0])
     starts = [
-        _maximise(few, NoiseModel(components, np.radians(step) ** 2, np.radians(closure) ** 2, 0.5), 12)
+        NoiseModel(components, np.radians(step) ** 2, np.radians(closure) ** 2, 0.5)
         for step in _EM_STARTS_STEP_DEG
         for closure in _EM_STARTS_CLOSURE_DEG
     ]
-    best = max(starts, key=lambda start: start[0])[1]
+    for survivors, iterations in _EM_ROUNDS:
+        grown = sorted((_maximise(few, start, iterations) for start in starts), key=lambda one: -one[0])
+        starts = [model for _, model in grown[:survivors]]
+    best = starts[0]
     return _maximise(data.thinned(_EM_THINNED[1]), best, _EM_ITERATIONS)[1]
 
 
@@ -181,33 +185,40 @@ def _maximise(
     data: Discrepancies, model: NoiseModel, iterations: int, *, hold_step: bool = False
 ) -> tuple[float, NoiseModel]:
     """EM from ``model``, on request with its step variance; returns the log-likelihood and the last model."""
-    uniform = log_uniform_density(np.sqrt(data.squared_angle), model.components)
-    k = model.components
+    k, squared_angle = model.components, data.squared_angle
+    uniform = log_uniform_density(np.sqrt(squared_angle), k)
+    density_of_false = uniform + k / 2 * np.log(2 * np.pi)
+    square_per_step, square_per_closure = squared_angle / data.steps, squared_angle / data.closures
+    total = np.bincount(data.kind, data.weight, 2)
     shares = np.array([model.outlier_share, 0.7])
     likelihood = -np.inf
     for _ in range(iterations):
         from_steps = data.steps * model.step_variance
         variance = from_steps + data.closures * model.closure_variance
-        share = shares[data.kind]
-        log_odds = model.inlier_log_odds(data.squared_angle, variance) + np.log1p(-share) - np.log(share)
-        previous = likelihood
-        likelihood = float((data.weight * (np.logaddexp(0, log_odds) + np.log(share) + uniform)).sum())
+        # The arithmetic of NoiseModel.inlier_log_odds, expit and logaddexp with one logarithm and one exponential each.
+        log_share = np.log(shares)
+        prior = (np.log1p(-shares) - log_share)[data.kind]
+        log_odds = prior - squared_angle / (2 * variance) - k / 2 * np.log(variance) - density_of_false
+        rest = np.exp(-np.abs(log_odds))
+        surprise = np.maximum(log_odds, 0) + np.log1p(rest) + log_share[data.kind] + uniform
+        previous, likelihood = likelihood, float(data.weight @ surprise)
         if likelihood - previous < _EM_TOLERANCE:
             break
-        good = data.weight * expit(log_odds)
+        good = data.weight * np.where(log_odds > 0, 1.0, rest) / (1 + rest)
         # Expected squares of the two parts of each discrepancy, given their sum.
         part = from_steps / variance
-        step_square = part**2 * data.squared_angle + k * from_steps * (1 - part)
-        closure_square = (1 - part) ** 2 * data.squared_angle + k * data.closures * model.closure_variance * part
+        kept = part * good
+        rest_kept = good - kept
+        step_square = kept @ (part * square_per_step) + k * model.step_variance * rest_kept.sum()
+        closure_square = rest_kept @ ((1 - part) * square_per_closure) + k * model.closure_variance * kept.sum()
         observations = k * good.sum() + 1
-        bad = np.bincount(data.kind, data.weight - good, 2)
-        total = np.bincount(data.kind, data.weight, 2)
+        bad = total - np.bincount(data.kind, good, 2)
         shares = np.clip((bad + 1) / (total + 2), 0.005, 0.995)
-        step_variance = float((good * step_square / data.steps).sum() + _PRIOR_STEP_SQUARE) / observations
+        step_variance = float(step_square + _PRIOR_STEP_SQUARE) / observations
         model = NoiseModel(
             k,
             model.step_variance if hold_step else step_variance,
-            float((good * closure_square / data.closures).sum() + _PRIOR_CLOSURE_SQUARE) / observations,
+            float(closure_square + _PRIOR_CLOSURE_SQUARE) / observations,
             float(shares[0]),
         )
     return likelihood, model

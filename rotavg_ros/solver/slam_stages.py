@@ -22,6 +22,7 @@ from rotavg_ros.solver.noise_model import (
     noise_between_neighbours,
 )
 from rotavg_ros.solver.slam_clean_net import SlamCleanNet, closure_features
+from rotavg_ros.solver.slam_inference import false_log_odds
 from rotavg_ros.solver.slam_refinement import SlamEstimate
 from rotavg_ros.solver.slip_search import search_for_slips
 from rotavg_ros.solver.spanning_tree import (
@@ -143,7 +144,7 @@ def clean(network: SlamCleanNet | None, prepared: Prepared, label: Tensor) -> Cl
     good[graph.is_closure] = by_chain
     if network is not None and len(by_chain):
         features = closure_features(noise, prepared.squared_angle, prepared.path_steps, prepared.pairs)
-        by_company = -network(features).double().numpy()
+        by_company = -false_log_odds(network, features).double().numpy()
         good[graph.is_closure] = np.minimum(by_chain, by_company)
         bounded = np.clip(by_company, -_MAX_NETWORK_LOG_ODDS, _MAX_NETWORK_LOG_ODDS)
         prior[graph.is_closure] = _NETWORK_SHARE * (1 - noise.outlier_share) * bounded

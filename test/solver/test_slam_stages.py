@@ -15,22 +15,19 @@ from rotavg_ros import solve
 from rotavg_ros.datasets.graph_file import read_graph
 from rotavg_ros.datasets.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.evaluation.metrics import orientation_errors
-from rotavg_ros.solver.slam_clean_net import ClosureFeatures
+from rotavg_ros.solver.slam_clean_net import SlamCleanNet
 from rotavg_ros.solver.slam_stages import Prepared, bootstrap, clean, prepare, refine
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 from .graphs import measured, random_truth, slam_edges, small_noise
 
 
-class Verdict(nn.Module):
-    """The same log-odds of being false for every closure."""
-
-    def __init__(self, log_odds: float) -> None:
-        super().__init__()
-        self.log_odds = log_odds
-
-    def forward(self, features: ClosureFeatures) -> Tensor:
-        return torch.full((len(features.closures),), self.log_odds)
+def verdict(log_odds: float) -> SlamCleanNet:
+    """A network that says the same log-odds of being false of every closure."""
+    network = SlamCleanNet()
+    nn.init.zeros_(network.outlier_head.weight)
+    nn.init.constant_(network.outlier_head.bias, log_odds)
+    return network.requires_grad_(False)
 
 
 def graph_with_a_doubtful_closure() -> tuple[ViewGraph, int]:
@@ -44,8 +41,8 @@ def graph_with_a_doubtful_closure() -> tuple[ViewGraph, int]:
 
 def probability_of(prepared: Prepared, graph: ViewGraph, edge: int, log_odds: float | None) -> float:
     """Of being good, after the refinement."""
-    network = None if log_odds is None else Verdict(log_odds)
-    cleaned = clean(network, prepared, graph.label)  # type: ignore[arg-type]
+    network = None if log_odds is None else verdict(log_odds)
+    cleaned = clean(network, prepared, graph.label)
     estimate = refine(prepared, cleaned, bootstrap(prepared, cleaned))
     return float(prepared.closure_graph.edge_values(estimate.inlier_probability)[edge])
 
@@ -77,7 +74,7 @@ def test_the_network_counts_less_the_more_is_false() -> None:
     said = []
     for share in (0.1, 0.5, 0.9):
         noise = replace(prepared.noise, outlier_share=share)
-        prior = clean(Verdict(2.0), replace(prepared, noise=noise), graph.label).prior_log_odds  # type: ignore[arg-type]
+        prior = clean(verdict(2.0), replace(prepared, noise=noise), graph.label).prior_log_odds
         assert (prior[prepared.closure_graph.is_odometry] == 0).all()
         said.append(float(np.unique(prior[prepared.closure_graph.is_closure]).item()))
     assert -2 < said[0] < said[1] < said[2] < 0
