@@ -13,16 +13,10 @@ demo: setup
 	@$(BIN)/rotavg demo $(if $(GRAPH),--graph "$(GRAPH)") $(if $(TRUTH),--truth "$(TRUTH)") \
 		$(if $(STAMPS),--stamps "$(STAMPS)")
 
-# make test [ARGS="-k node -x"]; without ARGS the tests over DDS, which mostly wait, run beside the others
+# make test [ARGS="-k node -x"]; without ARGS several files at a time: those over DDS mostly wait
 test:
 	@$(PYTHON) tools/setup_environment.py --for-tests
-ifeq ($(strip $(ARGS)),)
-	@mkdir -p build; $(BIN)/python -m pytest --ignore=test/ros > build/tests.log 2>&1 & others=$$!; \
-	$(BIN)/python -m pytest test/ros; ros=$$?; \
-	wait $$others; others=$$?; cat build/tests.log; exit $$((ros + others))
-else
-	@$(BIN)/python -m pytest $(ARGS)
-endif
+	@$(BIN)/python -m pytest $(if $(strip $(ARGS)),$(ARGS),-n 4 --dist loadfile)
 
 # make bench [ARGS="--minutes 5 --max-pairs 200000"]: beside COLMAP and GTSAM, and the node under load; docs/results/
 bench: setup

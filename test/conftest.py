@@ -7,13 +7,15 @@ import os
 import random
 import shutil
 import signal
-import socket
 import tempfile
+import time
 from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import settings
+
+from rotavg_ros.ros.domain import DOMAIN_IDS, free_domain_id
 
 # A shell that runs the tests in the background lets its children ignore SIGINT, which the tests send.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -22,23 +24,17 @@ ROOT = Path(__file__).resolve().parent.parent
 MAX_THREADS = 2
 
 
-def free_domain_id() -> int:
-    """A ROS domain id on which no participant of this machine listens at the moment."""
-    # Up to 101, beyond which DDS ports would collide with the system's ephemeral ones; in random order, so that
-    # two test runs that start at the same time choose different ones.
-    for domain in random.sample(range(1, 102), 101):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind(("", 7400 + 250 * domain))  # the domain's discovery port
-            except OSError:
-                continue
-            return domain
-    raise RuntimeError("every ROS domain id from 1 to 101 is in use on this machine")
+def own_domain_id() -> int:
+    """A ROS domain id that is free at the moment; the processes of one test run (pytest-xdist) divide them up."""
+    run = os.environ.get("PYTEST_XDIST_TESTRUNUID", f"{time.time_ns()} {os.getpid()}")
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    return free_domain_id(random.Random(run).sample(DOMAIN_IDS, len(DOMAIN_IDS))[worker::workers])
 
 
 # Before anything imports rclpy, and for every process that a test starts: nothing leaves this machine.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
+os.environ["ROS_DOMAIN_ID"] = str(own_domain_id())
 os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="rotavg-test-log-")
 atexit.register(shutil.rmtree, os.environ["ROS_LOG_DIR"], ignore_errors=True)
 os.environ["MPLBACKEND"] = "Agg"
@@ -48,6 +44,12 @@ settings.register_profile("rotavg", deadline=None)
 settings.load_profile("rotavg")
 
 torch.set_num_threads(min(MAX_THREADS, os.cpu_count() or 1))
+
+
+@pytest.fixture
+def other_domain_id() -> int:
+    """A ROS domain beside the one that the tests use (while something there listens)."""
+    return own_domain_id()
 
 
 @pytest.fixture(scope="session")

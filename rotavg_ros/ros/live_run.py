@@ -16,6 +16,7 @@ from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.node_answer import NodeAnswer
+from rotavg_ros.ros.domain import free_domain_id
 from rotavg_ros.ros.recorder import Recorder
 
 _START_TIMEOUT_S = 60.0
@@ -47,7 +48,7 @@ def installed_node() -> Path:
 def keep_to_this_machine() -> None:
     """Let this process and those it starts talk among themselves only: own domain, no network."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
 
 
 def play_to_node(

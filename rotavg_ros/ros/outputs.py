@@ -31,7 +31,7 @@ class Outputs:
     def __init__(self, node: Node, parameters: NodeParameters, estimator: OnlineEstimator) -> None:
         self._estimator = estimator
         self._robots, self._frame_id = parameters.robots, parameters.world_frame
-        self._drawn_version = 0
+        self._drawn: dict[Publisher, tuple[int, int]] = {}
         latched = partial(publisher, node, qos=LATCHED)
         self._orientations = latched(AbsoluteOrientations, "abs_orientations")
         self._flags = latched(OutlierFlags, "outlier_flags")
@@ -58,20 +58,24 @@ class Outputs:
 
     def draw(self, answer: Answer | None) -> None:
         """Path and markers of the last answer, for those who look; again when somebody begins to."""
-        watched = {robot: path for robot, path in self._paths.items() if path.get_subscription_count()}
-        markers = self._markers.get_subscription_count() > 0
-        if answer is None or not (watched or markers):
-            self._drawn_version = 0
+        if answer is None:
             return
-        if answer.version == self._drawn_version:
+        missing = [p for p in (*self._paths.values(), self._markers) if self._lacks(p, answer)]
+        if not missing:
             return
-        self._drawn_version = answer.version
         trajectories = self._estimator.trajectories(answer)
-        for robot, path in watched.items():
-            if robot in trajectories:
+        for robot, path in self._paths.items():
+            if path in missing and robot in trajectories:
                 path.publish(path_message(trajectories[robot], self._frame_id))
-        if markers:
+        if self._markers in missing:
             self._markers.publish(markers_message(answer, list(trajectories.values()), self._frame_id))
+
+    def _lacks(self, picture: Publisher, answer: Answer) -> bool:
+        """Whether somebody looks who has not been sent this answer yet; from now on they have."""
+        watchers = picture.get_subscription_count()
+        version, watchers_then = self._drawn.get(picture, (0, 0))
+        self._drawn[picture] = answer.version, watchers
+        return watchers > 0 and (version != answer.version or watchers > watchers_then)
 
     def publish_orientation(self, robot: str, odometry: Header) -> None:
         """The robot's corrected orientation at the moment of its newest odometry message, which has this header."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -106,14 +105,13 @@ def test_three_robots_in_three_processes_and_a_node_that_listens_to_all(
     assert {status.name for status in statuses} == {f"{name}/rotavg: estimator" for name in ("a", "b", "c", "fleet")}
 
 
-def test_nodes_of_other_domains_hear_nothing(live_node, start_process, monkeypatch) -> None:
+def test_nodes_of_other_domains_hear_nothing(live_node, start_process, monkeypatch, other_domain_id) -> None:
     """Two nodes, same names, same topics: only the domain keeps them apart."""
     live_node.start()
-    here = int(os.environ["ROS_DOMAIN_ID"])
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(here + 1 if here < 101 else here - 1))
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(other_domain_id))
     start_process(Path(sys.executable).with_name("rotavg_node"))
     context = rclpy.Context()
-    rclpy.init(context=context, domain_id=int(os.environ["ROS_DOMAIN_ID"]))
+    rclpy.init(context=context, domain_id=other_domain_id)
     elsewhere = rclpy.create_node("elsewhere", context=context)
     said: list[DiagnosticArray] = []
     elsewhere.create_subscription(DiagnosticArray, "/diagnostics", said.append, 10)

@@ -1,0 +1,31 @@
+"""ROS domains that nobody on this machine uses."""
+
+from __future__ import annotations
+
+import random
+import socket
+from collections.abc import Iterable
+
+# Beyond 101 DDS ports would collide with the system's ephemeral ones.
+DOMAIN_IDS = range(1, 102)
+# Of the RTPS specification: where a domain's participants listen for each other.
+_BASE_PORT, _PORTS_PER_DOMAIN = 7400, 250
+
+
+def free_domain_id(candidates: Iterable[int] | None = None) -> int:
+    """The first of the candidates on which no participant of this machine listens at the moment.
+
+    Args:
+        candidates: default: all, in random order, so that two who choose at the same time choose differently.
+
+    Raises:
+        RuntimeError: all are in use.
+    """
+    for domain in random.sample(DOMAIN_IDS, len(DOMAIN_IDS)) if candidates is None else candidates:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("", _BASE_PORT + _PORTS_PER_DOMAIN * domain))
+            except OSError:
+                continue
+            return domain
+    raise RuntimeError("every ROS domain id that may be used is in use on this machine")
