@@ -35,6 +35,9 @@ _SETTLED_STEP = np.radians(3.0)
 _MAX_SETTLING_PASSES = 5
 _CONVERGED_STEP = np.radians(0.002)
 _CONVERGED_PROBABILITY = 2e-3
+# What the rest of the graph predicts of an edge changes little from pass to pass: it is estimated anew this often, and
+# before the passes end.
+_PASSES_PER_PREDICTION = 3
 # An edge that alone holds two parts of the graph together has leverage 1; it cannot be judged by the others.
 _MAX_LEVERAGE = 0.999
 # Redundancy below this many edges' worth says little about a variance; the estimate so far is worth as much.
@@ -113,7 +116,7 @@ def refine(
     return SlamEstimate(
         rotations.normalize(state.correction),
         state.inlier_probability,
-        state.outlier_probability,
+        state.outlier_probability(),
         state.noise,
         state.samples,
         share,
@@ -141,8 +144,10 @@ class _State:
         self.pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots)
         self.probes = probe_signs(graph.nodes[graph.source], graph.nodes[graph.target], _NUM_PROBES)
         self.residual = _residual_vectors(graph, correction)  # (E, 3) rad
-        self.outlier_probability = 1 - inlier_probability
         self.passes = 0
+        self.prediction_variance = np.full(len(graph.source), np.inf)
+        self._prediction_pass = -_PASSES_PER_PREDICTION
+        self._discrepancy: np.ndarray | None = None
 
     @property
     def samples(self) -> np.ndarray:
@@ -157,13 +162,21 @@ class _State:
 
     def alternate(self, max_step_variance: float, max_passes: int) -> None:
         """Passes until convergence, or until there have been ``max_passes`` in all; at least one."""
+        settled = False
         while True:
-            moved, changed = self._one_pass(max_step_variance)
-            if self.passes >= max_passes or (moved < _CONVERGED_STEP and changed < _CONVERGED_PROBABILITY):
+            is_stale = self.passes - self._prediction_pass >= _PASSES_PER_PREDICTION
+            refresh = settled or is_stale or self.passes + 1 >= max_passes
+            moved, changed = self._one_pass(max_step_variance, refresh)
+            settled = moved < _CONVERGED_STEP and changed < _CONVERGED_PROBABILITY
+            if self.passes >= max_passes or (settled and refresh):
                 return
 
-    def _one_pass(self, max_step_variance: float) -> tuple[float, float]:
-        """Solve, re-estimate the noise, judge; returns the largest correction (rad) and change of a probability."""
+    def _one_pass(self, max_step_variance: float, refresh: bool) -> tuple[float, float]:
+        """Solve, re-estimate the noise, judge; returns the largest correction (rad) and change of a probability.
+
+        Args:
+            refresh: whether to estimate anew what the rest of the graph predicts of each edge.
+        """
         graph, noise = self.graph, self.noise
         variance = graph.steps * np.where(graph.is_odometry, noise.step_variance, noise.closure_variance)
         weight = np.maximum(self.inlier_probability, 1e-9) / variance
@@ -179,8 +192,7 @@ class _State:
             return moved, 1.0
 
         square = (self.residual**2).sum(axis=1)
-        resistance = (self.difference(self.samples) ** 2).mean(axis=1)
-        leverage = np.clip(weight * resistance, 0.0, _MAX_LEVERAGE)
+        leverage = self._leverage(weight, refresh)
         odometry, closure = graph.is_odometry, graph.is_closure
         redundancy = self.inlier_probability * (1 - leverage)
         # A run's inflated variance is what its closures weigh, not what each of them errs.
@@ -197,29 +209,42 @@ class _State:
         # What is left of the fit without the edge itself, and how far that may be off.
         predicted_square = np.minimum(square / (1 - leverage) ** 2, np.pi**2)
         scale = np.where(odometry, 1.0, self.noise.closure_variance / noise.closure_variance)
-        prediction_variance = resistance / (1 - leverage)
-        predicted_variance = scale * variance + prediction_variance
+        predicted_variance = scale * variance + self.prediction_variance
         judged = self.noise.inlier_log_odds(predicted_square, predicted_variance) + self.noise.prior_log_odds
         probability = np.where(closure, expit(judged + self.prior_log_odds), self.inlier_probability)
         changed = float(np.abs(probability - self.inlier_probability).max(initial=0.0))
         self.inlier_probability = probability
-        self.outlier_probability = np.where(
-            closure, self._outlier_probability(np.sqrt(predicted_square), prediction_variance), 1 - probability
-        )
+        self._discrepancy = np.sqrt(predicted_square)
         return moved, changed
 
-    def _outlier_probability(self, discrepancy: np.ndarray, prediction_variance: np.ndarray) -> np.ndarray:
-        """Of every edge, taken for a closure: that its true noise exceeds :data:`OUTLIER_ANGLE`.
+    def _leverage(self, weight: np.ndarray, refresh: bool) -> np.ndarray:
+        """Of every edge, ``(E,)``; and the variance of what the rest of the graph predicts of it, new or as it was.
 
-        Its discrepancy is its noise and the prediction's error. Noise of a good closure is known beforehand to be
+        That variance does not depend on the edge's own weight, so it stays right where an edge's verdict is changed.
+        """
+        if not refresh:
+            gain = weight * self.prediction_variance
+            return np.asarray(np.minimum(gain / (1 + gain), _MAX_LEVERAGE))
+        resistance = (self.difference(self.samples) ** 2).mean(axis=1)
+        leverage = np.clip(weight * resistance, 0.0, _MAX_LEVERAGE)
+        self.prediction_variance, self._prediction_pass = resistance / (1 - leverage), self.passes
+        return np.asarray(leverage)
+
+    def outlier_probability(self) -> np.ndarray:
+        """That a closure's true noise exceeds :data:`OUTLIER_ANGLE`, or that a segment slipped, ``(E,)``.
+
+        A discrepancy is a closure's noise and the prediction's error. Noise of a good closure is known beforehand to be
         Gaussian; a false one's can be anything, so that the discrepancy alone says what it is.
         """
-        noise = self.noise
-        own = noise.closure_variance / (noise.closure_variance + prediction_variance)
-        if_good = exceedance(own * discrepancy, own * prediction_variance, OUTLIER_ANGLE, noise.components)
-        if_false = exceedance(discrepancy, prediction_variance, OUTLIER_ANGLE, noise.components)
-        good = self.inlier_probability
-        return np.asarray(good * if_good + (1 - good) * if_false)
+        noise, good = self.noise, self.inlier_probability
+        if self._discrepancy is None:
+            return np.asarray(1 - good)
+        own = noise.closure_variance / (noise.closure_variance + self.prediction_variance)
+        narrowed = own * self._discrepancy, own * self.prediction_variance
+        if_good = exceedance(*narrowed, OUTLIER_ANGLE, noise.components)
+        if_false = exceedance(self._discrepancy, self.prediction_variance, OUTLIER_ANGLE, noise.components)
+        wrong = good * if_good + (1 - good) * if_false
+        return np.asarray(np.where(self.graph.is_closure, wrong, 1 - good))
 
 
 def _residual_vectors(graph: ClosureGraph, correction: Tensor) -> np.ndarray:
