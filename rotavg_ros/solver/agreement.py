@@ -37,18 +37,29 @@ class AgreementPairs:
 NO_PAIRS = AgreementPairs(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0), np.empty(0))
 
 
-def agreement_pairs(graph: ClosureGraph, num_neighbours: int = NUM_NEIGHBOURS) -> AgreementPairs:
-    """The nearest closures of every closure, by steps along the odometry."""
-    closure = np.flatnonzero(graph.is_closure)
+def closure_ends(graph: ClosureGraph, closure: np.ndarray) -> np.ndarray:
+    """Both ends of closures (edges of the graph) in steps along the odometry, the earlier first, ``(C, 2)``."""
+    ends = np.stack((graph.position[graph.source[closure]], graph.position[graph.target[closure]]), axis=1)
+    return np.sort(ends, axis=1)
+
+
+def agreement_pairs(
+    graph: ClosureGraph, closure: np.ndarray | None = None, num_neighbours: int = NUM_NEIGHBOURS
+) -> AgreementPairs:
+    """The nearest closures of every closure, by steps along the odometry.
+
+    Args:
+        closure: ``(C,)`` edges of the graph to pair; default: all of its closures.
+    """
+    closure = np.flatnonzero(graph.is_closure) if closure is None else closure
     count = min(num_neighbours, len(closure) - 1)
     if count < 1:
         return NO_PAIRS
-    start, end = graph.position[graph.source[closure]], graph.position[graph.target[closure]]
     residual = graph.residual[torch.from_numpy(closure)]
     # Closures run old → new and new → old; residuals compare in one direction only.
-    turned = torch.from_numpy(start > end)[:, None]
+    turned = torch.from_numpy(graph.position[graph.source[closure]] > graph.position[graph.target[closure]])[:, None]
     residual = torch.where(turned, rotations.inverse(residual), residual)
-    ends = np.stack((np.minimum(start, end), np.maximum(start, end)), axis=1)
+    ends = closure_ends(graph, closure)
     steps, neighbour = KDTree(ends).query(ends, k=count + 1, p=1)
     # Each closure finds itself, but not always first where others share its ends.
     itself = neighbour == np.arange(len(closure))[:, None]

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from rotavg_ros.solver.agreement import AgreementPairs
 
 # Closures whose ends are at most this many odometry steps apart, both ends summed, belong to one run.
-_RUN_GAP_STEPS = 30
+RUN_GAP_STEPS = 30
 # Scatter worth this many observations speaks for independent errors.
 _PRIOR_OBSERVATIONS = 5.0
 _MAX_SHARE = 0.9
@@ -34,7 +34,7 @@ def closure_runs(pairs: AgreementPairs, good: np.ndarray, position: np.ndarray) 
         good: ``(C,)`` bool; others are runs of their own.
         position: ``(C,)`` odometry steps to the closure's older end.
     """
-    linked = (pairs.steps <= _RUN_GAP_STEPS) & good[pairs.first] & good[pairs.second]
+    linked = (pairs.steps <= RUN_GAP_STEPS) & good[pairs.first] & good[pairs.second]
     links = coo_array(
         (np.ones(int(linked.sum())), (pairs.first[linked], pairs.second[linked])), shape=(len(good), len(good))
     )

@@ -30,8 +30,9 @@ class Method:
     slip_search: bool = True
 
 
+DEFAULT_METHOD = "neurora"
 NETWORK_METHODS = {
-    "neurora": Method(clean=True, fine_tunings=1, refine=True),
+    DEFAULT_METHOD: Method(clean=True, fine_tunings=1, refine=True),
     "neurora-paper": Method(clean=True, fine_tunings=1),
     "neurora-v2": Method(clean=True, fine_tunings=2),
     "cleannet-spt": Method(clean=True),

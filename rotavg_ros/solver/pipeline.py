@@ -10,17 +10,19 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.errors import UserError
 from rotavg_ros.solver import devices, refinement, sfm_refinement, sfm_stages, slam_refinement, slam_stages
+from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.devices import DEVICES
-from rotavg_ros.solver.methods import BASELINES, METHODS, NETWORK_METHODS, Method
+from rotavg_ros.solver.methods import BASELINES, DEFAULT_METHOD, METHODS, NETWORK_METHODS, Method
 from rotavg_ros.solver.network_store import load_network
 from rotavg_ros.solver.parallel import workers
+from rotavg_ros.solver.slam_memory import SlamMemory
+from rotavg_ros.solver.slam_refinement import SlamEstimate
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.solver.tuning import tune
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
@@ -39,6 +41,7 @@ class _Estimate:
     body_from_world: Tensor
     outlier_score: Tensor
     variance: Tensor
+    memory: SlamMemory | None = None
 
 
 @dataclass(frozen=True)
@@ -69,11 +72,12 @@ class _Stopwatch:
 def solve(
     graph: ViewGraph,
     *,
-    method: str = "neurora",
+    method: str = DEFAULT_METHOD,
     profile: str = "auto",
     device: str = "auto",
     refinement_steps: int | None = None,
     warm_start: Tensor | None = None,
+    memory: SlamMemory | None = None,
     weights: Path | None = None,
 ) -> Solution:
     """Absolute orientations and outlier scores of a view-graph; every connected component by itself.
@@ -89,6 +93,9 @@ def solve(
         refinement_steps: refinement steps at most, 0 for none; default: the method's and profile's own number.
         warm_start: ``(N, 4)`` body_from_world of an earlier solution to start from; the SLAM profile then takes fewer
             refinement steps.
+        memory: that of the earlier solution by the same method, if the graph has only grown since; with it a warm start
+            of a large SLAM graph judges the new edges and goes on from all other verdicts. Now and then, and where too
+            much has changed, everything is judged anew.
         weights: folder of networks trained with ``rotavg train``; what it lacks comes from the package.
 
     Raises:
@@ -107,7 +114,7 @@ def solve(
         profile = "slam" if bool(graph.is_odometry.any()) else "sfm"
     where = devices.choose(device) if profile == "sfm" and all(name in NETWORK_METHODS for name in names) else "cpu"
     graph = graph.to("cpu")
-    job = _Job(profile, names, refinement_steps, warm_start, graph.components())
+    job = _Job(profile, names, refinement_steps, warm_start, graph.components(), memory)
     try:
         estimate, seconds = _run(job, graph, _Networks(where, weights))
     except devices.GPU_ERRORS as error:
@@ -127,6 +134,7 @@ def solve(
         method,
         profile,
         where,
+        estimate.memory,
     )
 
 
@@ -139,6 +147,12 @@ class _Job:
     refinement_steps: int | None
     warm_start: Tensor | None
     component: Tensor
+    memory: SlamMemory | None
+
+    @property
+    def may_update(self) -> bool:
+        """Whether an earlier solution's memory may be gone on from."""
+        return self.profile == "slam" and self.names == [DEFAULT_METHOD] and self.refinement_steps is None
 
     @property
     def last_steps(self) -> int | None:
@@ -159,7 +173,20 @@ def _run(job: _Job, graph: ViewGraph, networks: _Networks) -> tuple[_Estimate, d
         for name in job.names[:-1]:
             start = _solve_once(graph, component, name, job.profile, None, start, networks, watch).body_from_world
         last, steps = job.names[-1], job.last_steps
+        if job.memory is not None and start is not None and job.may_update:
+            estimate = _update_slam(graph, job.memory, start, networks, watch)
+            if estimate is not None:
+                return estimate, watch.seconds
         return _solve_once(graph, component, last, job.profile, steps, start, networks, watch), watch.seconds
+
+
+def _update_slam(
+    graph: ViewGraph, memory: SlamMemory, warm_start: Tensor, networks: _Networks, watch: _Stopwatch
+) -> _Estimate | None:
+    """The SLAM profile's solve of a graph that has grown by a few edges; None if the whole of it is due."""
+    with watch.stage("update"):
+        updated = memory.updated(graph, networks.load("slam-clean-net"), warm_start.double())
+        return None if updated is None else _slam_estimate(*updated)
 
 
 def _solve_once(
@@ -259,14 +286,12 @@ def _solve_slam(
         network = networks.load("slam-clean-net") if method.clean else None
         cleaned = slam_stages.clean(network, prepared, graph.label)
     with watch.stage("bootstrap"):
-        if method.tree_start:
+        if warm_start is not None:
+            correction = prepared.closure_graph.corrections(warm_start.double())
+        elif method.tree_start:
             correction = slam_stages.bootstrap(prepared, cleaned)
         else:
             correction = rotations.identity(prepared.closure_graph.num_nodes)
-        if warm_start is not None:
-            correction = prepared.closure_graph.corrections(warm_start.double())
-    outlier_probability = 1 - cleaned.inlier_probability
-    variance = np.full(graph.num_nodes, np.nan)
     steps = (slam_refinement.MAX_PASSES if method.refine else 0) if refinement_steps is None else refinement_steps
     if steps > 0:
         with watch.stage("refine"):
@@ -278,12 +303,24 @@ def _solve_slam(
                 scale_estimation=method.scale_estimation,
                 slip_search=method.slip_search,
             )
-            correction, outlier_probability = estimate.correction, estimate.outlier_probability
-            variance = prepared.closure_graph.variance(estimate.samples, estimate.noise.step_variance)
+        with watch.stage("expand"):
+            is_default = method is NETWORK_METHODS[DEFAULT_METHOD]
+            memory = SlamMemory.of(graph, prepared, cleaned, estimate) if is_default else None
+            return _slam_estimate(prepared.closure_graph, estimate, memory)
     with watch.stage("expand"):
-        score = torch.from_numpy(slam_stages.outlier_scores(prepared.closure_graph, outlier_probability))
+        score = slam_stages.outlier_scores(prepared.closure_graph, 1 - cleaned.inlier_probability)
         orientations = prepared.closure_graph.orientations(correction)
-    return _Estimate(orientations, score, torch.from_numpy(variance))
+    return _Estimate(orientations, torch.from_numpy(score), torch.full((graph.num_nodes,), torch.nan))
+
+
+def _slam_estimate(graph: ClosureGraph, estimate: SlamEstimate, memory: SlamMemory | None) -> _Estimate:
+    """From the closure graph's nodes and edges to the view-graph's."""
+    return _Estimate(
+        graph.orientations(estimate.correction),
+        torch.from_numpy(slam_stages.outlier_scores(graph, estimate.outlier_probability)),
+        torch.from_numpy(graph.variance(estimate.samples, estimate.noise.step_variance)),
+        memory,
+    )
 
 
 def _root_at_identity(body_from_world: Tensor, component: Tensor) -> Tensor:

@@ -43,12 +43,7 @@ class EdgeResiduals:
 
     def vectors(self, edges: slice) -> Tensor:
         """Rotation vectors ``(3, k)`` in radians, of length at most π."""
-        residual = self.quaternions(edges)
-        vector, cosine = residual[:3], residual[3]
-        sine_squared = (vector * vector).sum(dim=0)
-        sine = sine_squared.sqrt()
-        factor = 2 * torch.atan2(sine, cosine) / sine
-        return vector * torch.where(sine_squared < _SMALL_SINE_SQUARED, 2 + sine_squared / 3, factor)
+        return log_rows(self.quaternions(edges))
 
     def angles(self) -> Tensor:
         """``(M,)`` radians."""
@@ -61,6 +56,15 @@ class EdgeResiduals:
 
         for_each(write, slices(len(angles), SLICE_EDGES, angles.device))
         return angles
+
+
+def log_rows(a: Tensor) -> Tensor:
+    """Unit quaternions with w ≥ 0 whose components are rows, ``(4, k)`` → rotation vectors ``(3, k)`` in radians."""
+    vector, cosine = a[:3], a[3]
+    sine_squared = (vector * vector).sum(dim=0)
+    sine = sine_squared.sqrt()
+    factor = 2 * torch.atan2(sine, cosine) / sine
+    return vector * torch.where(sine_squared < _SMALL_SINE_SQUARED, 2 + sine_squared / 3, factor)
 
 
 def multiply_rows(a: Tensor, b: Tensor) -> Tensor:

@@ -20,9 +20,9 @@ from rotavg_ros.solver.agreement import AgreementPairs
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.common_error import closure_runs, common_share, variance_factor
 from rotavg_ros.solver.exceedance import exceedance
-from rotavg_ros.solver.fine_net import edge_residual
 from rotavg_ros.solver.laplacian import FactorisedLaplacian, LaplacianPattern, probe_signs
 from rotavg_ros.solver.noise_model import NoiseModel, outlier_share
+from rotavg_ros.solver.residuals import log_rows, multiply_rows
 
 MAX_PASSES = 30
 # From the answer of a graph that has hardly changed since: on a real robot's graph, tick by tick, as good as 30.
@@ -38,6 +38,16 @@ _CONVERGED_PROBABILITY = 2e-3
 # What the rest of the graph predicts of an edge changes little from pass to pass: it is estimated anew this often, and
 # before the passes end.
 _PASSES_PER_PREDICTION = 3
+# From so many nodes on, a system is solved from the factorisation of a few passes before.
+_ITERATING_PAYS = 4000
+# … if the last pass changed no probability by more than this.
+_NEAR = 0.2
+# Of a graph that has grown by a few edges: passes at most, and when they end; the next update goes on from there.
+_UPDATE_PASSES = 5
+_UPDATED_STEP = np.radians(0.02)
+_UPDATED_PROBABILITY = 0.02
+# A graph that turns by more than this is solved as a whole.
+_MAX_UPDATE = np.radians(20.0)
 # An edge that alone holds two parts of the graph together has leverage 1; it cannot be judged by the others.
 _MAX_LEVERAGE = 0.999
 # Redundancy below this many edges' worth says little about a variance; the estimate so far is worth as much.
@@ -61,6 +71,9 @@ class SlamEstimate:
         samples: ``(K, k)`` errors, in rad, as they might be: their second moments are the estimate's covariance.
         common_share: share of the closures' error variance that neighbouring closures have in common.
         passes: number of sparse solves.
+        steps: ``(E,)`` the graph's, more where closures err together.
+        max_step_variance: what the step variance was kept under, rad².
+        rank: ``(K,)`` where each key node stands in the order of elimination; None if there was none.
     """
 
     correction: Tensor
@@ -70,6 +83,9 @@ class SlamEstimate:
     samples: np.ndarray
     common_share: float
     passes: int
+    steps: np.ndarray
+    max_step_variance: float
+    rank: np.ndarray | None
 
 
 def refine(
@@ -96,7 +112,8 @@ def refine(
     """
     prior = np.zeros(len(graph.source)) if log_odds is None else log_odds
     state = _State(graph, correction, inlier_probability, noise, prior, hold_noise)
-    state.alternate(_MAX_STEP_VARIANCE_GAIN * noise.step_variance, (max_passes + 1) // 2)
+    max_step_variance = _MAX_STEP_VARIANCE_GAIN * noise.step_variance
+    state.alternate(max_step_variance, (max_passes + 1) // 2)
     share = 0.0
     closure = np.flatnonzero(graph.is_closure)
     if len(pairs.first) and state.passes < max_passes:
@@ -112,22 +129,45 @@ def refine(
             steps[closure] *= variance_factor(run, good, share)
             state.graph = replace(graph, steps=steps)
             state.noise = replace(state.noise, step_variance=min(noise.step_variance, state.noise.step_variance))
-            state.alternate(noise.step_variance, max_passes)
-    return SlamEstimate(
-        rotations.normalize(state.correction),
-        state.inlier_probability,
-        state.outlier_probability(),
-        state.noise,
-        state.samples,
-        share,
-        state.passes,
-    )
+            max_step_variance = noise.step_variance
+            state.alternate(max_step_variance, max_passes)
+    return state.estimate(share, max_step_variance)
+
+
+def update(
+    graph: ClosureGraph,
+    correction: Tensor,
+    inlier_probability: np.ndarray,
+    noise: NoiseModel,
+    log_odds: np.ndarray,
+    max_step_variance: float,
+    rank: np.ndarray,
+) -> SlamEstimate | None:
+    """The same for a graph that has grown a little since :func:`refine`, from the verdicts and noise it ended with.
+
+    Args:
+        graph: with steps as :class:`SlamEstimate` has them.
+        max_step_variance: as :class:`SlamEstimate` has it.
+        rank: ``(K,)`` order of elimination.
+
+    Returns:
+        None if orientations turn by so much that all has to be judged anew.
+    """
+    state = _State(graph, correction, inlier_probability, noise, log_odds, False, rank)
+    for _ in range(_UPDATE_PASSES):
+        moved, changed = state.one_pass(max_step_variance, refresh=not state.has_predictions)
+        if moved > _MAX_UPDATE:
+            return None
+        if moved < _UPDATED_STEP and changed < _UPDATED_PROBABILITY:
+            break
+    return state.estimate(0.0, max_step_variance) if state.has_predictions else None
 
 
 class _State:
     """The unknowns, and what the last pass saw of them."""
 
     _system: FactorisedLaplacian
+    _factorised: FactorisedLaplacian
     _samples: np.ndarray | None = None
 
     def __init__(
@@ -138,27 +178,60 @@ class _State:
         noise: NoiseModel,
         prior_log_odds: np.ndarray,
         hold_noise: bool,
+        rank: np.ndarray | None = None,
     ) -> None:
         self.graph, self.correction, self.noise, self.hold_noise = graph, correction, noise, hold_noise
         self.inlier_probability, self.prior_log_odds = inlier_probability, prior_log_odds
-        self.pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots)
+        self.pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots, rank)
         self.probes = probe_signs(graph.nodes[graph.source], graph.nodes[graph.target], _NUM_PROBES)
-        self.residual = _residual_vectors(graph, correction)  # (E, 3) rad
+        self._measured = graph.residual.t().contiguous()
+        self._source, self._target = torch.from_numpy(graph.source), torch.from_numpy(graph.target)
+        self.residual = self._residual_vectors()
         self.passes = 0
+        self._changed = 1.0
         self.prediction_variance = np.full(len(graph.source), np.inf)
         self._prediction_pass = -_PASSES_PER_PREDICTION
         self._discrepancy: np.ndarray | None = None
 
     @property
+    def has_predictions(self) -> bool:
+        """Whether there has been an estimate of what the rest of the graph predicts of each edge."""
+        return self._prediction_pass > 0
+
+    @property
     def samples(self) -> np.ndarray:
-        """Errors ``(K, probes)`` as they might be under the last pass's weights; drawn when they are asked for."""
+        """Errors ``(K, probes)`` as they might be under the weights last factorised; drawn when they are asked for."""
         if self._samples is None:
-            self._samples = self._system.samples(self.probes)
+            self._samples = self._factorised.samples(self.probes)
         return self._samples
+
+    def _residual_vectors(self) -> np.ndarray:
+        """Rotation vectors ``(E, 3)`` in radians, of ``fine_net.edge_residual``."""
+        rows = self.correction.t().contiguous()
+        at_target = rows.index_select(1, self._target)
+        at_target[:3].neg_()
+        residual = multiply_rows(at_target, multiply_rows(self._measured, rows.index_select(1, self._source)))
+        vectors = log_rows(residual.mul_(1 - 2 * (residual[3] < 0).to(residual)))
+        return np.asarray(vectors.t().contiguous().numpy())
 
     def difference(self, values: np.ndarray) -> np.ndarray:
         """Node values ``(K, k)`` → differences over the edges, target − source ``(E, k)``."""
         return np.asarray(values[self.graph.target] - values[self.graph.source])
+
+    def estimate(self, share: float, max_step_variance: float) -> SlamEstimate:
+        """What there is to say after the last pass."""
+        return SlamEstimate(
+            rotations.normalize(self.correction),
+            self.inlier_probability,
+            self.outlier_probability(),
+            self.noise,
+            self.samples,
+            share,
+            self.passes,
+            self.graph.steps,
+            max_step_variance,
+            self.pattern.rank,
+        )
 
     def alternate(self, max_step_variance: float, max_passes: int) -> None:
         """Passes until convergence, or until there have been ``max_passes`` in all; at least one."""
@@ -166,12 +239,12 @@ class _State:
         while True:
             is_stale = self.passes - self._prediction_pass >= _PASSES_PER_PREDICTION
             refresh = settled or is_stale or self.passes + 1 >= max_passes
-            moved, changed = self._one_pass(max_step_variance, refresh)
+            moved, changed = self.one_pass(max_step_variance, refresh)
             settled = moved < _CONVERGED_STEP and changed < _CONVERGED_PROBABILITY
             if self.passes >= max_passes or (settled and refresh):
                 return
 
-    def _one_pass(self, max_step_variance: float, refresh: bool) -> tuple[float, float]:
+    def one_pass(self, max_step_variance: float, refresh: bool) -> tuple[float, float]:
         """Solve, re-estimate the noise, judge; returns the largest correction (rad) and change of a probability.
 
         Args:
@@ -182,13 +255,19 @@ class _State:
         weight = np.maximum(self.inlier_probability, 1e-9) / variance
         # A pass after one that has not settled weighs as that did.
         if self.passes == 0 or not np.array_equal(weight, self._system.weight):
-            self._system, self._samples = self.pattern.factorize(weight), None
+            is_near = self._changed < _NEAR and graph.num_nodes >= _ITERATING_PAYS
+            if self.passes == 0 or refresh or not is_near:
+                self._system = self._factorised = self.pattern.factorize(weight)
+                self._samples = None
+            else:
+                self._system = self.pattern.near(weight, self._factorised)
         step = self._system.fit(self.residual)
         self.correction = rotations.multiply(self.correction, rotations.exp(torch.from_numpy(step)))
-        self.residual = _residual_vectors(graph, self.correction)
+        self.residual = self._residual_vectors()
         self.passes += 1
         moved = float(np.abs(step).max(initial=0.0))
         if moved > _SETTLED_STEP and self.passes <= _MAX_SETTLING_PASSES:
+            self._changed = 1.0
             return moved, 1.0
 
         square = (self.residual**2).sum(axis=1)
@@ -212,7 +291,7 @@ class _State:
         predicted_variance = scale * variance + self.prediction_variance
         judged = self.noise.inlier_log_odds(predicted_square, predicted_variance) + self.noise.prior_log_odds
         probability = np.where(closure, expit(judged + self.prior_log_odds), self.inlier_probability)
-        changed = float(np.abs(probability - self.inlier_probability).max(initial=0.0))
+        self._changed = changed = float(np.abs(probability - self.inlier_probability).max(initial=0.0))
         self.inlier_probability = probability
         self._discrepancy = np.sqrt(predicted_square)
         return moved, changed
@@ -245,11 +324,6 @@ class _State:
         if_false = exceedance(self._discrepancy, self.prediction_variance, OUTLIER_ANGLE, noise.components)
         wrong = good * if_good + (1 - good) * if_false
         return np.asarray(np.where(self.graph.is_closure, wrong, 1 - good))
-
-
-def _residual_vectors(graph: ClosureGraph, correction: Tensor) -> np.ndarray:
-    residual = edge_residual(correction, graph.residual, torch.from_numpy(graph.source), torch.from_numpy(graph.target))
-    return np.asarray(rotations.log(residual).numpy())
 
 
 def _step_variance(square: np.ndarray, redundancy: np.ndarray, noise: NoiseModel) -> float:

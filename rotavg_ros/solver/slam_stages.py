@@ -61,6 +61,7 @@ class Prepared:
         path_steps: ``(C,)`` odometry steps between its ends; inf where odometry does not connect them.
         pairs: which closures agree.
         noise: estimated scales.
+        is_unbiased: whether a gyroscope bias was taken out of the odometry beforehand.
     """
 
     closure_graph: ClosureGraph
@@ -68,6 +69,7 @@ class Prepared:
     path_steps: np.ndarray
     pairs: AgreementPairs
     noise: NoiseModel
+    is_unbiased: bool = False
 
     @property
     def num_segments(self) -> int:
@@ -92,17 +94,13 @@ def prepare(graph: ViewGraph, *, scale_estimation: bool = True) -> Prepared:
         unbiased, _ = _contract(corrected, scale_estimation)
         fewer_disagree = unbiased.noise.outlier_share < prepared.noise.outlier_share - _BIAS_GAIN
         if fewer_disagree and unbiased.noise.step_variance < prepared.noise.step_variance:
-            return unbiased
+            return replace(unbiased, is_unbiased=True)
     return prepared
 
 
 def _contract(graph: ViewGraph, scale_estimation: bool) -> tuple[Prepared, SpanningForest]:
     """As :func:`prepare`, believing the odometry, and the forest along which the chains were drawn together."""
-    usable = graph.label != EdgeLabel.REJECTED
-    cost = torch.where(graph.is_odometry, 1.0, _CLOSURE_COST)
-    # A rejected edge may only be used where nothing else connects.
-    forest = minimum_spanning_forest(graph, torch.where(usable, cost, _CLOSURE_COST**2))
-    closure_graph = contract(graph, forest)
+    closure_graph, forest = draw_together(graph)
     closure = closure_graph.is_closure
     squared_angle = (rotations.log(closure_graph.residual) ** 2).sum(dim=1).numpy()[closure]
     path_steps = closure_graph.path_steps[closure]
@@ -113,6 +111,15 @@ def _contract(graph: ViewGraph, scale_estimation: bool) -> tuple[Prepared, Spann
     else:
         noise = _stated_noise(graph, components)
     return Prepared(closure_graph, squared_angle, path_steps, pairs, noise), forest
+
+
+def draw_together(graph: ViewGraph) -> tuple[ClosureGraph, SpanningForest]:
+    """The closure graph, and the forest along which the chains were drawn together; rejected edges take no part."""
+    usable = graph.label != EdgeLabel.REJECTED
+    cost = torch.where(graph.is_odometry, 1.0, _CLOSURE_COST)
+    # A rejected edge may only be used where nothing else connects.
+    forest = minimum_spanning_forest(graph, torch.where(usable, cost, _CLOSURE_COST**2))
+    return contract(graph, forest), forest
 
 
 @dataclass(frozen=True)
@@ -140,19 +147,30 @@ def clean(network: SlamCleanNet | None, prepared: Prepared, label: Tensor) -> Cl
     graph, noise = prepared.closure_graph, prepared.noise
     prior = np.zeros(len(graph.source))
     good = np.full(len(graph.source), np.inf)
-    by_chain = judge_by_chain(noise, prepared.squared_angle, prepared.path_steps) + noise.prior_log_odds
-    good[graph.is_closure] = by_chain
-    if network is not None and len(by_chain):
-        features = closure_features(noise, prepared.squared_angle, prepared.path_steps, prepared.pairs)
-        by_company = -false_log_odds(network, features).double().numpy()
-        good[graph.is_closure] = np.minimum(by_chain, by_company)
-        bounded = np.clip(by_company, -_MAX_NETWORK_LOG_ODDS, _MAX_NETWORK_LOG_ODDS)
-        prior[graph.is_closure] = _NETWORK_SHARE * (1 - noise.outlier_share) * bounded
+    good[graph.is_closure], prior[graph.is_closure] = judge_closures(
+        network, noise, prepared.squared_angle, prepared.path_steps, prepared.pairs
+    )
     edge_label = label.numpy()[graph.view_graph_edge]
     verdict = np.select([edge_label == EdgeLabel.ACCEPTED, edge_label == EdgeLabel.REJECTED], [np.inf, -np.inf], 0.0)
     good[graph.num_segments :] = np.where(verdict == 0, good[graph.num_segments :], verdict)
     prior[graph.num_segments :] = np.where(verdict == 0, prior[graph.num_segments :], verdict)
     return CleanedClosures(expit(good), prior)
+
+
+def judge_closures(
+    network: SlamCleanNet | None,
+    noise: NoiseModel,
+    squared_angle: np.ndarray,
+    path_steps: np.ndarray,
+    pairs: AgreementPairs,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log-odds ``(C,)`` of closures to be good before the global solve, and those that the refinement is to add."""
+    by_chain = judge_by_chain(noise, squared_angle, path_steps) + noise.prior_log_odds
+    if network is None or len(by_chain) == 0:
+        return by_chain, np.zeros(len(by_chain))
+    by_company = -false_log_odds(network, closure_features(noise, squared_angle, path_steps, pairs)).double().numpy()
+    bounded = np.clip(by_company, -_MAX_NETWORK_LOG_ODDS, _MAX_NETWORK_LOG_ODDS)
+    return np.minimum(by_chain, by_company), _NETWORK_SHARE * (1 - noise.outlier_share) * bounded
 
 
 def bootstrap(prepared: Prepared, cleaned: CleanedClosures) -> Tensor:
@@ -205,7 +223,7 @@ def outlier_scores(graph: ClosureGraph, outlier_probability: np.ndarray) -> np.n
 
     A slip in a segment is as likely in any of its steps.
     """
-    return graph.edge_values(outlier_probability) * graph.share_of_segment
+    return np.asarray(graph.edge_values(outlier_probability) * graph.share_of_segment)
 
 
 def _stated_noise(graph: ViewGraph, components: int) -> NoiseModel:

@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import breadth_first_order, dijkstra, minimum_spanning
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver.residuals import multiply_rows
 from rotavg_ros.solver.sorted_edges import SortedEdges
 from rotavg_ros.view_graph import ViewGraph
 
@@ -107,12 +108,13 @@ def compose(parent: Tensor, parent_edge: Tensor, graph: ViewGraph) -> Tensor:
     # Invariant: node_from_ancestor[v] rotates from the frame of ancestor[v]; both double their reach every round.
     node_from_ancestor = rotations.identity(len(parent), device=parent.device)
     node_from_ancestor[child] = child_from_parent
+    rows = node_from_ancestor.t().contiguous()
     ancestor = parent
     while True:
         farther = ancestor[ancestor]
         if torch.equal(farther, ancestor):
-            return rotations.normalize(node_from_ancestor)
-        node_from_ancestor = rotations.multiply(node_from_ancestor, node_from_ancestor[ancestor])
+            return rotations.normalize(rows.t().contiguous())
+        rows = multiply_rows(rows, rows.index_select(1, ancestor))
         ancestor = farther
 
 

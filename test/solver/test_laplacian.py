@@ -41,3 +41,19 @@ def test_weights_over_the_whole_range_of_doubles_stay_finite() -> None:
     weight = 10.0 ** np.array([-200, 200, -30, 30, -300, 0, 300, 5, -5])
     fitted = LaplacianSystem(10, source, target, weight, np.array([0])).fit(np.ones((9, 1)))
     assert np.isfinite(fitted).all()
+
+
+def test_other_weights_and_a_known_order_give_the_same_solution() -> None:
+    rng = np.random.default_rng(1)
+    source, target = random_graph(400, 300, rng)
+    weight, difference = rng.uniform(0.1, 10, len(source)), rng.standard_normal((len(source), 3))
+    pattern = LaplacianPattern(400, source, target, np.array([0]))
+    factorised = pattern.factorize(weight)
+    again = LaplacianPattern(400, source, target, np.array([0]), pattern.rank).factorize(weight)
+    np.testing.assert_allclose(again.fit(difference), factorised.fit(difference), rtol=1e-9, atol=1e-9)
+    # A little iteration is enough for the first, and not for the second.
+    for spread in (0.1, 3.0):
+        changed = weight * np.exp(spread * rng.standard_normal(len(weight)))
+        exact = pattern.factorize(changed).fit(difference)
+        error = np.abs(pattern.near(changed, factorised).fit(difference) - exact).max()
+        assert error < 1e-3 * np.abs(exact).max()

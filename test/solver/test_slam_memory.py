@@ -1,0 +1,96 @@
+"""A graph that grows by a handful of edges: updates that go on from the verdicts so far, against whole solves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros import ViewGraph, rotations, solve
+from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.trajectories import World
+from rotavg_ros.online.gauge import extend_along_edges
+from rotavg_ros.solver import slam_memory
+from rotavg_ros.solver.solution import Solution
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel
+
+NUM_KEYFRAMES = 600
+
+
+@pytest.fixture(scope="module")
+def city() -> ViewGraph:
+    """Eight laps, a closure a keyframe, one in ten of them false; edges in the order in which a robot reports them."""
+    config = SlamSimulationConfig(
+        world=World.CITY, num_keyframes=NUM_KEYFRAMES, laps=8, closures_per_keyframe=1.0, false_share=0.1
+    )
+    return simulate_slam_graph(config, np.random.default_rng(1000)).graph
+
+
+def until(graph: ViewGraph, num_keyframes: int) -> ViewGraph:
+    """What of it a robot has reported after so many keyframes."""
+    reported = torch.maximum(graph.source, graph.target) < num_keyframes
+    return replace(graph.select_edges(reported.nonzero().squeeze(1)), num_nodes=num_keyframes)
+
+
+def grown(solution: Solution, graph: ViewGraph) -> Solution:
+    """The next tick's."""
+    start = extend_along_edges(solution.body_from_world, graph)
+    return solve(graph, warm_start=start, memory=solution.memory)
+
+
+def test_updates_end_where_a_whole_solve_does(city: ViewGraph) -> None:
+    solution = solve(until(city, 500))
+    updates = 0
+    for num_keyframes in range(508, NUM_KEYFRAMES + 1, 4):
+        solution = grown(solution, until(city, num_keyframes))
+        updates += "update" in solution.stage_seconds and "refine" not in solution.stage_seconds
+    assert updates >= 15  # of 24; the others have seen the whole graph
+    whole = solve(city)
+    difference = torch.rad2deg(rotations.angle_between(solution.body_from_world, whole.body_from_world))
+    assert float(difference.mean()) < 0.1
+    assert int(((solution.outlier_score > 0.5) != (whole.outlier_score > 0.5)).sum()) <= 3
+    torch.testing.assert_close(solution.uncertainty.mean(), whole.uncertainty.mean(), rtol=0.1, atol=0.0)
+
+
+@pytest.mark.parametrize("was_good", [True, False])
+def test_a_wrong_verdict_is_put_right_in_an_update(city: ViewGraph, was_good: bool) -> None:
+    graph = until(city, 500)
+    before = solve(graph)
+    assert before.memory is not None
+    is_closure, score = graph.kind == EdgeKind.LOOP_CLOSURE, before.outlier_score
+    edge = int(torch.where(is_closure, score if was_good else 1 - score, torch.inf).argmin())
+    mistaken = before.memory.inlier_probability.copy()
+    mistaken[edge] = 0.001 if was_good else 0.999
+    memory = replace(before.memory, inlier_probability=mistaken)
+    after = grown(replace(before, memory=memory), until(city, 502))
+    assert "refine" not in after.stage_seconds
+    assert bool(after.outlier_score[edge] < 0.5) is was_good
+
+
+@pytest.mark.parametrize("change", ["label", "rotation", "fewer edges"])
+def test_what_has_not_only_grown_is_solved_as_a_whole(city: ViewGraph, change: str) -> None:
+    before = solve(until(city, 500))
+    graph = until(city, 504)
+    if change == "label":
+        graph.label[-1] = EdgeLabel.REJECTED
+    elif change == "rotation":
+        graph.target_from_source[3] = rotations.identity(1)[0]
+    else:
+        graph = until(city, 499)
+    start = extend_along_edges(before.body_from_world[: graph.num_nodes], graph)
+    with_memory, without = solve(graph, warm_start=start, memory=before.memory), solve(graph, warm_start=start)
+    assert "refine" in with_memory.stage_seconds
+    torch.testing.assert_close(with_memory.body_from_world, without.body_from_world, rtol=0, atol=0)
+    torch.testing.assert_close(with_memory.outlier_score, without.outlier_score, rtol=0, atol=0)
+
+
+def test_the_whole_solve_comes_round(city: ViewGraph, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(slam_memory, "_MAX_UPDATES", 2)
+    solution, counts = solve(until(city, 560)), []
+    for num_keyframes in range(561, 566):
+        solution = grown(solution, until(city, num_keyframes))
+        assert solution.memory is not None
+        counts.append(solution.memory.updates)
+    assert counts == [1, 2, 0, 1, 2]
