@@ -38,6 +38,7 @@ def write_corrected_poses(
         graph.is_odometry.cpu().numpy(),
         outlier_score,
         np.zeros((graph.num_nodes, 3)),
+        graph.steps.cpu().numpy(),
     )
     position = np.nan_to_num(position)
     write_corrected_graph(folder / "graph.g2o", graph_file, world_from_body, position, outlier_score > 0.5)

@@ -98,7 +98,7 @@ def _replay(bag: BagReader, plan: Plan, window: Window, arguments: argparse.Name
             outcome = replay(bag, plan, window, folder / RECORDING, period_ns, progress, stop)
         with working("writing the report"):
             record = assemble(bag, plan, outcome)
-            write_tables(folder, record, outcome.estimator.snapshot())
+            write_tables(folder, record)
             if not arguments.no_report:
                 write_report(record, folder)
             summary = write_summary(folder, record, bag.path, outcome)

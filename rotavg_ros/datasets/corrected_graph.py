@@ -21,7 +21,8 @@ def write_corrected_graph(
 ) -> None:
     """Write corrected vertices and the edges that are not outliers, so that plain least squares can go on from there.
 
-    Unknown precisions become a typical one of those that are known, since the format has no other word for them.
+    Unknown precisions become a typical one of those that are known, since the format has no other word for them; for
+    an odometry edge that several were drawn together into, as much less.
 
     Args:
         path: of the g2o file.
@@ -43,7 +44,8 @@ def write_corrected_graph(
     defaults = np.zeros_like(information)
     precision = graph.precision.cpu().numpy()
     typical = np.nanmedian(precision) if np.isfinite(precision).any() else 1.0
-    defaults[:, ANGULAR_DIAGONAL] = np.nan_to_num(precision, nan=typical)[:, None]
+    typical = typical / graph.steps.cpu().numpy()
+    defaults[:, ANGULAR_DIAGONAL] = np.where(np.isnan(precision), typical, precision)[:, None]
     defaults[:, POSITION_DIAGONAL] = np.where(known, 1.0, _NO_INFORMATION)[:, None]
     chosen = replace(
         graph_file,

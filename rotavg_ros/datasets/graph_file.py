@@ -103,6 +103,7 @@ class GraphFile:
         planar: bool = False,
         edge_translation: np.ndarray | None = None,
         edge_information: np.ndarray | None = None,
+        steps: np.ndarray | None = None,
         skipped: dict[str, int] | None = None,
     ) -> GraphFile:
         """Build from edges between ids instead of indices.
@@ -125,6 +126,7 @@ class GraphFile:
             num_nodes=len(node_ids),
             kind=kind,
             precision=precision,
+            steps=steps,
         )
         return cls(
             graph,

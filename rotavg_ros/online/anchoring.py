@@ -10,20 +10,24 @@ from torch import Tensor
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.gauge import component_roots
 from rotavg_ros.online.graph_builder import GraphBuilder
+from rotavg_ros.online.growing_view_graph import GraphSnapshot
 from rotavg_ros.online.keyframes import OdometryTrack
 from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS, RejectedInputError
 from rotavg_ros.online.odometry_continuity import OdometrySample
 from rotavg_ros.online.quaternion import Quaternion
 
 
-def root_orientations(builder: GraphBuilder, component: Tensor, answered: Tensor | None) -> Tensor:
+def root_orientations(
+    builder: GraphBuilder, snapshot: GraphSnapshot, component: Tensor, answered: Tensor | None
+) -> Tensor:
     """body_from_world that the first keyframe of every component keeps.
 
     A keyframe that an earlier answer placed stays where it was: so a component keeps its gauge, the older of two
     that join imposes its own, and what splits off (a rejected edge) stays put as well.
 
     Args:
-        builder: its graph may have grown since.
+        builder: its graph may have changed since.
+        snapshot: the graph.
         component: ``(N,)`` numbered by first node.
         answered: body_from_world ``(n, 4)`` of the last answer.
 
@@ -36,7 +40,8 @@ def root_orientations(builder: GraphBuilder, component: Tensor, answered: Tensor
         if answered is not None and root < known:
             orientations.append(answered[root].tolist())
         else:
-            orientations.append(quaternion.inverse(_initial_world_from_body(builder, root)))
+            robot, stamp_ns = snapshot.robots[snapshot.keyframe_robot[root]], int(snapshot.stamp_ns[root])
+            orientations.append(quaternion.inverse(_initial_world_from_body(builder, robot, stamp_ns)))
     return torch.tensor(orientations, dtype=torch.float64)
 
 
@@ -88,10 +93,9 @@ def corrections(builder: GraphBuilder, body_from_world: Tensor) -> dict[str, Qua
     return found
 
 
-def _initial_world_from_body(builder: GraphBuilder, node: int) -> Quaternion:
+def _initial_world_from_body(builder: GraphBuilder, robot: str, stamp_ns: int) -> Quaternion:
     """Where a component's first keyframe begins."""
-    stamp_ns = builder.graph.stamp_of(node)
-    track = builder.tracks.get(builder.graph.robot_of(node))
+    track = builder.tracks.get(robot)
     if track is None or stamp_ns == UNKNOWN_STAMP_NS:
         return quaternion.IDENTITY
     chain = track.chain_at(stamp_ns)

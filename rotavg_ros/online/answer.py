@@ -34,6 +34,11 @@ class Answer:
         edge_id: ``(M,)`` uint64, the sender's; 2⁶⁴-1 for the estimator's own odometry edges.
         source, target: ``(M,)`` int64 indices into the keyframes.
         kind: ``(M,)`` int64 :class:`~rotavg_ros.view_graph.EdgeKind`.
+        target_from_source: ``(M, 4)`` xyzw, as measured.
+        precision: ``(M,)`` rad⁻², NaN unknown.
+        translation: ``(M, 3)`` position of the target in the source's frame, metres; NaN unknown.
+        steps: ``(M,)`` odometry steps that an odometry edge stands for, more than one where keyframes in between were
+            marginalised.
         outlier_score: ``(M,)`` float64 in [0, 1].
         outlier: ``(M,)`` bool, score above the edge's threshold; a user's label decides where there is one.
         was_cold: solved from scratch, as ``rotavg solve`` would.
@@ -54,6 +59,10 @@ class Answer:
     source: NDArray[np.int64]
     target: NDArray[np.int64]
     kind: NDArray[np.int64]
+    target_from_source: NDArray[np.float64]
+    precision: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    steps: NDArray[np.float64]
     outlier_score: NDArray[np.float64]
     outlier: NDArray[np.bool_]
     was_cold: bool
@@ -97,6 +106,10 @@ class Answer:
             source=graph.source.numpy(),
             target=graph.target.numpy(),
             kind=graph.kind.numpy(),
+            target_from_source=graph.target_from_source.numpy(),
+            precision=graph.precision.numpy(),
+            translation=snapshot.translation,
+            steps=graph.steps.numpy(),
             outlier_score=score.numpy(),
             outlier=score.numpy() > outlier_threshold,
             was_cold=was_cold,

@@ -20,11 +20,13 @@ class Attachment:
         node: the keyframe's.
         keyframe_from_body: the body's orientation in the keyframe's frame.
         position: of the body in the keyframe's frame, metres; NaN where the odometry carries none.
+        at_keyframe: whether the end is one of the graph's keyframes, or at least between two of them.
     """
 
     node: int
     keyframe_from_body: Quaternion = quaternion.IDENTITY
     position: Vector = (0.0, 0.0, 0.0)
+    at_keyframe: bool = True
 
 
 def attach(
@@ -39,16 +41,19 @@ def attach(
         settle: no more odometry is expected for now: its last message stands for moments shortly after it.
 
     Raises:
-        RejectedInputError: a stamp before the odometry's first or inside a gap of it, or a robot without keyframes.
+        RejectedInputError: a stamp before the odometry's first or inside a gap of it, a robot without keyframes, or a
+            keyframe that was marginalised too long ago.
     """
     robot, stamp_ns = reference.robot, reference.stamp_ns
     if reference.keyframe_id is not None:
         node = graph.node(robot, reference.keyframe_id)
-        return None if node is None else Attachment(node)
+        return _marginalized(reference, graph) if node is None else Attachment(node)
     assert stamp_ns is not None
     node = graph.keyframe_at_or_before(robot, stamp_ns)
     if node is not None and graph.stamp_of(node) == stamp_ns:
         return Attachment(node)
+    if (marginalized := _marginalized(reference, graph)) is not None:
+        return marginalized
     if track is None or not (track.reaches(stamp_ns) or (settle and track.within_tolerance(stamp_ns))):
         return None
     now = track.world_from_body_at(stamp_ns)
@@ -67,6 +72,17 @@ def attach(
             keyframe_from_odometry, difference(track.position_at(stamp_ns), track.position_at(keyframe_ns))
         ),
     )
+
+
+def _marginalized(reference: KeyframeReference, graph: GrowingViewGraph) -> Attachment | None:
+    """A keyframe that is no node any more, tied to the nearest one along the odometry that still is."""
+    robot, keyframe_id = reference.robot, reference.keyframe_id
+    found = graph.marginalized_keyframe(robot, keyframe_id, reference.stamp_ns)
+    if found is not None:
+        return Attachment(*found, at_keyframe=False)
+    if keyframe_id is not None and graph.was_marginalized(robot, keyframe_id):
+        raise RejectedInputError(RejectReason.MARGINALIZED_KEYFRAME)
+    return None
 
 
 def between_keyframes(edge: EdgeMeasurement, source: Attachment, target: Attachment) -> tuple[Quaternion, Vector]:

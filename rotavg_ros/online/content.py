@@ -10,16 +10,12 @@ from torch import Tensor
 
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.anchoring import anchor, corrections, first_correction
-from rotavg_ros.online.gauge import extend_along_edges, joins_components
 from rotavg_ros.online.graph_builder import GraphBuilder
-from rotavg_ros.online.growing_view_graph import GraphSnapshot
 from rotavg_ros.online.measurements import RejectReason
+from rotavg_ros.online.problem import Problem
 from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.online.renumbering import Renumbering
 from rotavg_ros.online.time_jumps import BackwardJumps, LateMessage
-
-# While data flows, a flag changes only if the score passes the threshold by this share of the way to 0 or 1: on a
-# real robot's graph that halves the changes, and no more flags are wrong.
-_FLAG_HYSTERESIS = 0.4
 
 
 @dataclass(frozen=True)
@@ -32,6 +28,8 @@ class Counts:
         time_jumps: how often the data's time went back.
         time_is_back: whether odometry is refused since such a jump, and somebody has to decide.
         odometry_restarts: how often the odometry of one of the robots began anew.
+        marginalized, dropped_closures: how many keyframes and closures a full graph has done without so far.
+        is_full: whether nothing more can be spared, and there are no new keyframes.
     """
 
     keyframes: int
@@ -41,6 +39,9 @@ class Counts:
     time_jumps: int = 0
     time_is_back: bool = False
     odometry_restarts: int = 0
+    marginalized: int = 0
+    dropped_closures: int = 0
+    is_full: bool = False
 
 
 class Content:
@@ -57,11 +58,12 @@ class Content:
         self.answered = answered
         self.first_version = self.version = version
         self._answered_component: Tensor | None = None
-        self._answered_outlier: NDArray[np.bool_] = np.zeros(0, dtype=bool)
         self._answered_revision = 0
         self._answer_was_cold = True
         self._ticked_revision = 0
         self._backward_jumps = BackwardJumps()
+        self._renumbering: Renumbering | None = None  # since the last problem
+        builder.on_compaction = self._renumber
         # Per robot: world_from_body = world_from_odometry ∘ odometry, as of its last corrected keyframe.
         self._world_from_odometry: dict[str, Quaternion] = {}
         if answered is not None:
@@ -111,8 +113,8 @@ class Content:
         """Let the next tick solve though the graph is the same."""
         self._answered_revision = -1
 
-    def next_problem(self, force_cold: bool) -> tuple[GraphSnapshot, bool] | None:
-        """The graph that is to be solved now, and whether from scratch; None if the last answer still stands."""
+    def next_problem(self, force_cold: bool) -> Problem | None:
+        """What is to be solved now; None if the last answer still stands."""
         idle = self.builder.graph.revision == self._ticked_revision
         if idle or force_cold:
             self.builder.settle()
@@ -120,26 +122,9 @@ class Content:
             return None
         snapshot = self.builder.graph.snapshot()
         self._ticked_revision = snapshot.revision
-        return snapshot, force_cold or idle or not self.builder.options.warm_start
-
-    def warm_start(self, snapshot: GraphSnapshot) -> Tensor | None:
-        """The last answer carried on to all keyframes ``(N, 4)``; None where it is no good start."""
-        if self.answered is None or self._answered_component is None:
-            return None
-        if joins_components(self._answered_component, snapshot.graph.components()):
-            return None
-        return extend_along_edges(self.answered, snapshot.graph)
-
-    def thresholds(self, threshold: float, num_edges: int, cold: bool) -> NDArray[np.float64]:
-        """The score above which each edge is an outlier ``(M,)``; the last answer's flags are kept when in doubt.
-
-        A cold answer depends on the graph alone, so there nothing is kept.
-        """
-        thresholds = np.full(num_edges, threshold)
-        if not cold:
-            margin = _FLAG_HYSTERESIS * min(threshold, 1 - threshold)
-            thresholds[: len(self._answered_outlier)] += np.where(self._answered_outlier, -margin, margin)
-        return thresholds
+        self._renumbering = None
+        cold = force_cold or idle or not self.builder.options.warm_start
+        return Problem(snapshot, cold, self.answered, self._answered_component, self.builder.outlier)
 
     def accept(
         self,
@@ -149,11 +134,35 @@ class Content:
         revision: int,
         was_cold: bool,
     ) -> None:
-        """Make this the last answer: orientations ``(N, 4)``, components ``(N,)`` and flags of a revision."""
-        self.answered, self._answered_component, self._answered_outlier = body_from_world, component, outlier
+        """Make the answer to the last problem the last answer.
+
+        Args:
+            body_from_world, component, outlier: orientations ``(N, 4)``, components ``(N,)`` and flags ``(M,)``.
+            revision: of the graph that they are about.
+            was_cold: solved from scratch.
+        """
+        self.answered, self._answered_component, self.builder.outlier = body_from_world, component, outlier
+        if self._renumbering is not None:
+            self._renumber_answer(self._renumbering)
         self._answered_revision, self._answer_was_cold = revision, was_cold
         self.version += 1
-        self._world_from_odometry = corrections(self.builder, body_from_world)
+        self._world_from_odometry = corrections(self.builder, self.answered)
+
+    def _renumber(self, renumbering: Renumbering) -> None:
+        """Follow the builder, which has renumbered its own flags."""
+        earlier = self._renumbering
+        self._renumbering = renumbering if earlier is None else earlier.then(renumbering)
+        if self.answered is not None:
+            self.answered = renumbering.nodes(self.answered)
+        if self._answered_component is not None:
+            self._answered_component = renumbering.nodes(self._answered_component)
+
+    def _renumber_answer(self, renumbering: Renumbering) -> None:
+        """Bring an answer about the graph of the last problem into the present numbers."""
+        assert self.answered is not None and self._answered_component is not None
+        self.answered = renumbering.nodes(self.answered)
+        self._answered_component = renumbering.nodes(self._answered_component)
+        self.builder.outlier = renumbering.flags(self.builder.outlier)
 
     def counts(self, time_jumps: int) -> Counts:
         """Sizes and refusals now."""
@@ -166,4 +175,7 @@ class Content:
             time_jumps=time_jumps,
             time_is_back=self._backward_jumps.is_back and builder.options.on_time_jump == "error",
             odometry_restarts=sum(track.chain for track in builder.tracks.values()),
+            marginalized=builder.marginalized,
+            dropped_closures=builder.dropped_closures,
+            is_full=builder.is_full,
         )

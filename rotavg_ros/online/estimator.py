@@ -144,14 +144,11 @@ class OnlineEstimator:
     def trajectories(self, answer: Answer) -> dict[str, Trajectory]:
         """Poses of every robot's keyframes in the answer that have a stamp, see :func:`corrected_trajectories`."""
         with self._lock:
-            translation = self._content.builder.graph.snapshot().translation[: len(answer.source)]
             tracks = dict(self._content.builder.tracks)
-        if len(translation) < len(answer.source):
-            return {}  # the answer is about a graph that was reset since
-        return corrected_trajectories(answer, translation, tracks)
+        return corrected_trajectories(answer, tracks)
 
     def snapshot(self) -> GraphSnapshot:
-        """The graph now; a later one begins with the same keyframes and edges."""
+        """The graph now. Until keyframes are marginalised a later one begins with the same keyframes and edges."""
         with self._lock:
             return self._content.builder.graph.snapshot()
 
@@ -238,9 +235,7 @@ class OnlineEstimator:
                 problem = None if self._paused and not force_cold else content.next_problem(force_cold)
             if problem is None:
                 return None
-            snapshot, cold = problem
-            # Between here and the next lock only this thread writes what is read of the last answer.
-            warm_start = None if cold else content.warm_start(snapshot)
+            snapshot, warm_start = problem.snapshot, problem.warm_start()
             solution = self._solver(
                 snapshot.graph,
                 method=options.method,
@@ -251,7 +246,7 @@ class OnlineEstimator:
             )
             component = solution.component.cpu()
             with self._lock:
-                roots = root_orientations(content.builder, component, content.answered)
+                roots = root_orientations(content.builder, snapshot, component, problem.answered)
             body_from_world = fix_gauge(solution.body_from_world.cpu(), component, roots)
             was_cold = warm_start is None
             answer = Answer.of_solution(
@@ -259,7 +254,7 @@ class OnlineEstimator:
                 solution,
                 body_from_world,
                 component,
-                content.thresholds(options.outlier_threshold, snapshot.graph.num_edges, was_cold),
+                problem.thresholds(options.outlier_threshold, was_cold),
                 content.version + 1,
                 was_cold,
                 time.perf_counter() - started,

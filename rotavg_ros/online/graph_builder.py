@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.attachment import attach, between_keyframes
+from rotavg_ros.online.fingerprints import Fingerprints
 from rotavg_ros.online.growing_view_graph import GrowingViewGraph
 from rotavg_ros.online.keyframes import OdometryTrack
 from rotavg_ros.online.measurements import (
@@ -22,7 +26,16 @@ from rotavg_ros.online.measurements import (
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.pending import PendingEdges
 from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, difference
+from rotavg_ros.online.renumbering import Renumbering
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
+
+# How full a full graph is after keyframes or closures have been taken out of it: the cost of doing so, which grows
+# with the graph, is shared by all that come until it is full again.
+_FILL = 0.9
+# If less than this share of the limit could be spared, it is not tried again before a tenth of it has come.
+_WORTHWHILE = 0.01
+# Of how many marginalised keyframes it stays known where they were, in limits of keyframes.
+_REMEMBERED = 4
 
 
 class GraphBuilder:
@@ -38,6 +51,10 @@ class GraphBuilder:
         pending: edges that wait for a keyframe or for odometry.
         rejected: how many inputs were refused, by :class:`RejectReason`.
         labels: the users' verdicts, by source robot and edge id.
+        fingerprints: of the edges in the graph and of the latest of those that were in it.
+        outlier: the last answer's flags, of the first edges.
+        marginalized, dropped_closures: how many keyframes and closures were taken out of a full graph.
+        on_compaction: called when indices have changed.
         data_time_ns: newest stamp of odometry or of keyframes, None before the first.
     """
 
@@ -48,7 +65,11 @@ class GraphBuilder:
         self.pending = PendingEdges(options.pending_capacity, options.pending_timeout_ns)
         self.rejected: Counter[str] = Counter()
         self.labels: dict[tuple[str, int], int] = {}
-        self.fingerprints: set[int] = set()
+        self.fingerprints = Fingerprints(options.max_edges)
+        self.outlier: NDArray[np.bool_] = np.zeros(0, dtype=bool)
+        self.marginalized = self.dropped_closures = 0
+        self.on_compaction: Callable[[Renumbering], None] | None = None
+        self._compact_from_revision = [0, 0]  # for keyframes, for edges
         self.data_time_ns: int | None = None
         self._policy = options.keyframe_policy
         self._claimed_time_ns: int | None = None
@@ -59,6 +80,7 @@ class GraphBuilder:
         self._policy = options.keyframe_policy
         for track in self.tracks.values():
             track.bounds, track.continuity.limits = options.odometry_bounds, options.continuity_limits
+        self._compact_from_revision = [0, 0]
 
     def add_odometry(
         self, robot: str, stamp_ns: int, world_from_body: Sequence[float], position: Sequence[float] | None
@@ -73,8 +95,8 @@ class GraphBuilder:
             self.rejected[rejection.reason.value] += 1
             return rejection.reason
         self.tracks[robot] = track
-        chooses = self.options.keyframe_source == "odometry" and not self.is_full
-        if chooses and track.reached(self._policy):
+        chooses = self.options.keyframe_source == "odometry"
+        if chooses and track.reached(self._policy) and self._has_room():
             self._add_keyframe_from_odometry(robot, track)
         self._place_all(self.pending.pop_until(robot, stamp_ns))
         self._advance_data_time(stamp_ns)
@@ -85,26 +107,26 @@ class GraphBuilder:
         try:
             edge = replace(edge, target_from_source=check_edge(edge))
             fingerprint = edge.fingerprint()
-            if fingerprint in self.fingerprints:
+            if fingerprint in self.fingerprints or fingerprint in self.pending.fingerprints:
                 raise RejectedInputError(RejectReason.DUPLICATE_EDGE)
-            if self.graph.num_edges >= self.options.max_edges:
+            if not self._has_room(keyframe=False):
                 raise RejectedInputError(RejectReason.GRAPH_FULL)
         except RejectedInputError as rejection:
             self.rejected[rejection.reason.value] += 1
             return rejection.reason
-        self.fingerprints.add(fingerprint)
         self._create_keyframes(edge)
         try:
             self._place(edge)
         except RejectedInputError as rejection:
-            self._drop(edge, rejection.reason)
+            self.rejected[rejection.reason.value] += 1
             return rejection.reason
         return None
 
     @property
     def is_full(self) -> bool:
-        """Whether there may be no more keyframes: edges are tied to those there are, or wait in vain."""
-        return self.graph.num_keyframes >= self.options.max_keyframes
+        """Whether there may be no more keyframes, though whatever can be spared has been taken out."""
+        at_limit = self.graph.num_keyframes >= self.options.max_keyframes
+        return at_limit and self.graph.revision < self._compact_from_revision[0]
 
     def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
         """Label all edges a sender gave this id, waiting ones and later repetitions included; returns how many."""
@@ -158,7 +180,8 @@ class GraphBuilder:
                 keyframe_id = stamp_ns
             else:
                 continue
-            if self.is_full and self.graph.node(end.robot, keyframe_id) is None:
+            is_new = self.graph.node(end.robot, keyframe_id) is None
+            if is_new and (self.graph.was_marginalized(end.robot, keyframe_id) or not self._has_room()):
                 continue
             self.graph.add_keyframe(end.robot, keyframe_id, stamp_ns)
             self._place_all(self.pending.pop_keyframe(end.robot, keyframe_id))
@@ -173,10 +196,12 @@ class GraphBuilder:
             if attachment is None:
                 evicted = self.pending.add(edge, reference, self.data_time_ns)
                 if evicted is not None:
-                    self._drop(evicted, RejectReason.PENDING_OVERFLOW)
+                    self.rejected[RejectReason.PENDING_OVERFLOW.value] += 1
                 return
             ends.append(attachment)
         source, target = ends
+        if edge.kind == EdgeKind.ODOMETRY and not (source.at_keyframe and target.at_keyframe):
+            raise RejectedInputError(RejectReason.MARGINALIZED_KEYFRAME)  # the graph has this odometry already
         if source.node == target.node:
             raise RejectedInputError(RejectReason.SELF_EDGE)
         target_from_source, translation = between_keyframes(edge, source, target)
@@ -190,13 +215,53 @@ class GraphBuilder:
             self.labels.get((edge.source.robot, edge.edge_id), EdgeLabel.AUTOMATIC),
             translation,
         )
+        self.fingerprints.add(edge.fingerprint())
+
+    def _has_room(self, *, keyframe: bool = True) -> bool:
+        """Whether a keyframe (or else an edge) may come, if need be after others have gone."""
+        graph, options = self.graph, self.options
+
+        def has_room() -> bool:
+            return graph.num_keyframes < options.max_keyframes if keyframe else graph.num_edges < options.max_edges
+
+        if not has_room():
+            self._make_room()
+        return has_room()
+
+    def _make_room(self) -> None:
+        """Take keyframes and closures that can be spared out of a full graph."""
+        graph = self.graph
+        sizes = graph.num_keyframes, graph.num_edges
+        limits = self.options.max_keyframes, self.options.max_edges
+        surplus_keyframes, surplus_edges = (
+            size - int(_FILL * limit) if size >= limit and graph.revision >= from_revision else 0
+            for size, limit, from_revision in zip(sizes, limits, self._compact_from_revision, strict=True)
+        )
+        if not surplus_keyframes and not surplus_edges:
+            return
+        renumbering = graph.compact(
+            surplus_keyframes, surplus_edges, self.outlier, _REMEMBERED * self.options.max_keyframes
+        )
+        gained = sizes[0] - graph.num_keyframes, sizes[1] - graph.num_edges
+        for index, limit in enumerate(limits):
+            if (surplus_keyframes, surplus_edges)[index] and gained[index] < max(1, _WORTHWHILE * limit):
+                self._compact_from_revision[index] = graph.revision + max(1, round((1 - _FILL) * limit))
+        if renumbering is None:
+            return
+        self.outlier = renumbering.flags(self.outlier)
+        self.marginalized += gained[0]
+        self.dropped_closures += renumbering.num_dropped
+        for robot, track in self.tracks.items():
+            track.release_keyframes(graph.stamps(robot))
+        if self.on_compaction is not None:
+            self.on_compaction(renumbering)
 
     def _place_all(self, edges: Iterable[EdgeMeasurement], settle: bool = False) -> None:
         for edge in edges:
             try:
                 self._place(edge, settle)
             except RejectedInputError as rejection:
-                self._drop(edge, rejection.reason)
+                self.rejected[rejection.reason.value] += 1
 
     def _advance_data_time(self, stamp_ns: int) -> None:
         """Let what has waited for too long go; a stamp far ahead counts only when a second one says so."""
@@ -206,9 +271,6 @@ class GraphBuilder:
             if claimed_ns is None or not 0 <= stamp_ns - claimed_ns <= lead_ns:
                 return
         self.data_time_ns = max(stamp_ns, self.data_time_ns or 0)
-        for edge in self.pending.pop_expired(self.data_time_ns):
-            self._drop(edge, RejectReason.PENDING_TIMEOUT)
-
-    def _drop(self, edge: EdgeMeasurement, reason: RejectReason) -> None:
-        self.rejected[reason.value] += 1
-        self.fingerprints.discard(edge.fingerprint())  # a retransmission gets another chance
+        expired = self.pending.pop_expired(self.data_time_ns)
+        if expired:
+            self.rejected[RejectReason.PENDING_TIMEOUT.value] += len(expired)

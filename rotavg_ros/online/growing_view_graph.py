@@ -1,56 +1,39 @@
-"""A view-graph that only grows: keyframes and edges are appended, indices never change."""
+"""A view-graph that grows by appending; when it is compacted, some keyframes and edges go and the others move up."""
 
 from __future__ import annotations
 
-from bisect import bisect_right, insort
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
+from rotavg_ros.online.growing_array import GrowingArray
+from rotavg_ros.online.keyframe_index import KeyframeIndex
+from rotavg_ros.online.marginalization import Columns, marginalize
+from rotavg_ros.online.marginalized_keyframes import MarginalizedIndex, MarginalizedKeyframes
 from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS
 from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion, Vector
+from rotavg_ros.online.renumbering import Renumbering
+from rotavg_ros.online.thinning import thin
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-
-class GrowingArray:
-    """Append-only numpy array; its storage doubles, so an append is O(1) on average.
-
-    A :attr:`view` keeps its length and its rows however much the array grows afterwards.
-    """
-
-    def __init__(self, dtype: DTypeLike, width: int | None = None) -> None:
-        self._data = np.empty((64,) if width is None else (64, width), dtype=dtype)
-        self._size = 0
-
-    def __len__(self) -> int:
-        return self._size
-
-    @property
-    def view(self) -> NDArray[Any]:
-        """The rows so far, not copied."""
-        return self._data[: self._size]
-
-    def append(self, row: float | Sequence[float]) -> None:
-        self._reserve(self._size + 1)
-        self._data[self._size] = row
-        self._size += 1
-
-    def extend(self, rows: NDArray[Any]) -> None:
-        self._reserve(self._size + len(rows))
-        self._data[self._size : self._size + len(rows)] = rows
-        self._size += len(rows)
-
-    def _reserve(self, size: int) -> None:
-        capacity = len(self._data)
-        if size <= capacity:
-            return
-        grown = np.empty((max(size, 2 * capacity), *self._data.shape[1:]), dtype=self._data.dtype)
-        grown[: self._size] = self.view
-        self._data = grown  # old views keep the old storage
+_KEYFRAME_COLUMNS = {"robot": np.int32, "keyframe_id": np.uint64, "stamp_ns": np.int64}
+_EDGE_COLUMNS = {
+    "edge_id": (np.uint64, None),
+    "source": (np.int64, None),
+    "target": (np.int64, None),
+    "target_from_source": (np.float64, 4),
+    "kind": (np.int64, None),
+    "precision": (np.float64, None),
+    "label": (np.int64, None),
+    "translation": (np.float64, 3),
+    "steps": (np.float64, None),
+}
+_SOLVED_COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
+# Of all keyframes, the share that are the robots' latest and stay whatever happens.
+_LATEST_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -65,6 +48,7 @@ class GraphSnapshot:
         stamp_ns: ``(N,)`` int64, -1 where unknown.
         edge_id: ``(M,)`` uint64, the senders' ids.
         translation: ``(M, 3)`` position of the edge's target in its source's frame, metres; NaN unknown.
+        marginalized: keyframes that the edges have swallowed.
         revision: of the growing graph.
     """
 
@@ -75,6 +59,7 @@ class GraphSnapshot:
     stamp_ns: NDArray[np.int64]
     edge_id: NDArray[np.uint64]
     translation: NDArray[np.float64]
+    marginalized: MarginalizedIndex
     revision: int
 
 
@@ -87,43 +72,36 @@ class GrowingViewGraph:
     def __init__(self) -> None:
         self.revision = 0
         self.robots: list[str] = []
+        self.marginalized = MarginalizedIndex.of(MarginalizedKeyframes.none(), {})
         self._robot_index: dict[str, int] = {}
-        self._node_of_key: dict[tuple[str, int], int] = {}
-        # Per robot: stamps in ascending order and the nodes in the same order.
-        self._by_stamp: dict[str, list[tuple[int, int]]] = {}
-        self._keyframe_robot = GrowingArray(np.int32)
-        self._keyframe_id = GrowingArray(np.uint64)
-        self._stamp_ns = GrowingArray(np.int64)
-        self._edge_id = GrowingArray(np.uint64)
-        self._source = GrowingArray(np.int64)
-        self._target = GrowingArray(np.int64)
-        self._target_from_source = GrowingArray(np.float64, width=4)
-        self._kind = GrowingArray(np.int64)
-        self._precision = GrowingArray(np.float64)
-        self._label = GrowingArray(np.int64)
-        self._translation = GrowingArray(np.float64, width=3)
+        self._index: list[KeyframeIndex] = []  # by robot
+        self._keyframe = {name: GrowingArray(dtype) for name, dtype in _KEYFRAME_COLUMNS.items()}
+        self._edge = {name: GrowingArray(*column) for name, column in _EDGE_COLUMNS.items()}
 
     @property
     def num_keyframes(self) -> int:
-        return len(self._keyframe_id)
+        return len(self._keyframe["robot"])
 
     @property
     def num_edges(self) -> int:
-        return len(self._edge_id)
+        return len(self._edge["edge_id"])
 
     def add_keyframe(self, robot: str, keyframe_id: int, stamp_ns: int = UNKNOWN_STAMP_NS) -> int:
         """Append a keyframe, or find it and complete its stamp; returns its node."""
-        node = self._node_of_key.get((robot, keyframe_id))
+        robot_index = self._index_of_robot(robot)
+        index = self._index[robot_index]
+        node = index.node(keyframe_id)
         if node is None:
             node = self.num_keyframes
-            self._node_of_key[robot, keyframe_id] = node
-            self._keyframe_robot.append(self._index_of_robot(robot))
-            self._keyframe_id.append(keyframe_id)
-            self._stamp_ns.append(UNKNOWN_STAMP_NS)
+            index.add(keyframe_id, node)
+            self._keyframe["robot"].append(robot_index)
+            self._keyframe["keyframe_id"].append(keyframe_id)
+            self._keyframe["stamp_ns"].append(UNKNOWN_STAMP_NS)
             self.revision += 1
-        if stamp_ns != UNKNOWN_STAMP_NS and self._stamp_ns.view[node] == UNKNOWN_STAMP_NS:
-            self._stamp_ns.view[node] = stamp_ns
-            insort(self._by_stamp.setdefault(robot, []), (stamp_ns, node))
+        stamps = self._keyframe["stamp_ns"].view
+        if stamp_ns != UNKNOWN_STAMP_NS and stamps[node] == UNKNOWN_STAMP_NS:
+            stamps[node] = stamp_ns
+            index.add_stamp(stamp_ns, node)
         return node
 
     def add_edge(
@@ -138,93 +116,201 @@ class GrowingViewGraph:
         translation: Vector = UNKNOWN_VECTOR,
     ) -> None:
         """Append an edge between two nodes; the rotation must be of unit length. Precision in rad⁻², NaN unknown."""
-        self._edge_id.append(edge_id)
-        self._source.append(source)
-        self._target.append(target)
-        self._target_from_source.append(target_from_source)
-        self._kind.append(kind)
-        self._precision.append(precision)
-        self._label.append(label)
-        self._translation.append(translation)
+        values = (edge_id, source, target, target_from_source, kind, precision, label, translation, 1.0)
+        for column, value in zip(self._edge.values(), values, strict=True):
+            column.append(value)  # type: ignore[arg-type]
         self.revision += 1
 
     def label_edges(self, source_robot: str, edge_id: int, label: int) -> int:
         """Label every edge with the sender's id and source robot; returns how many there are."""
-        robot_of_source = self._keyframe_robot.view[self._source.view]
+        robot_of_source = self._keyframe["robot"].view[self._edge["source"].view]
         robot = self._robot_index.get(source_robot, -1)
-        chosen = (self._edge_id.view == np.uint64(edge_id)) & (robot_of_source == robot)
-        if (self._label.view[chosen] != label).any():
-            self._label.view[chosen] = label
+        chosen = (self._edge["edge_id"].view == np.uint64(edge_id)) & (robot_of_source == robot)
+        labels = self._edge["label"].view
+        if (labels[chosen] != label).any():
+            labels[chosen] = label
             self.revision += 1
         return int(chosen.sum())
 
     def node(self, robot: str, keyframe_id: int) -> int | None:
-        return self._node_of_key.get((robot, keyframe_id))
+        index = self._index_of(robot)
+        return None if index is None else index.node(keyframe_id)
 
     def robot_of(self, node: int) -> str:
-        return self.robots[int(self._keyframe_robot.view[node])]
+        return self.robots[int(self._keyframe["robot"].view[node])]
 
     def stamp_of(self, node: int) -> int:
         """Nanoseconds, or -1."""
-        return int(self._stamp_ns.view[node])
+        return int(self._keyframe["stamp_ns"].view[node])
 
     def keyframe_at_or_before(self, robot: str, stamp_ns: int) -> int | None:
         """The robot's newest node that is not younger than the stamp."""
-        stamps = self._by_stamp.get(robot, [])
-        position = bisect_right(stamps, (stamp_ns, self.num_keyframes))
-        return stamps[position - 1][1] if position else None
+        index = self._index_of(robot)
+        return None if index is None else index.at_or_before(stamp_ns)
 
     def first_keyframe(self, robot: str) -> int | None:
         """The robot's node with the smallest stamp."""
-        stamps = self._by_stamp.get(robot)
-        return stamps[0][1] if stamps else None
+        index = self._index_of(robot)
+        return None if index is None else index.first()
 
     def nodes_newest_first(self, robot: str) -> Iterator[int]:
         """The robot's nodes with a stamp, in descending order of it."""
-        return (node for _, node in reversed(self._by_stamp.get(robot, [])))
+        index = self._index_of(robot)
+        return iter(()) if index is None else index.newest_first()
+
+    def stamps(self, robot: str) -> NDArray[np.int64]:
+        """Of the robot's nodes, ascending, those that are known."""
+        index = self._index_of(robot)
+        return np.empty(0, dtype=np.int64) if index is None else index.stamps
+
+    def marginalized_keyframe(
+        self, robot: str, keyframe_id: int | None, stamp_ns: int | None
+    ) -> tuple[int, Quaternion, Vector] | None:
+        """A marginalised keyframe by id, or by its exact stamp.
+
+        Returns:
+            the node of the nearer end of the odometry edge that it lies on; its orientation and its position (metres)
+            in that keyframe's frame. None if there is no such keyframe.
+        """
+        row = self._marginalized_row(robot, keyframe_id, stamp_ns)
+        if row is None:
+            return None
+        edge = int(self.marginalized.keyframes.edge[row])
+        columns = (self._edge[name].view[edge] for name in ("target_from_source", "translation", "steps"))
+        at_source, rotation, position = self.marginalized.nearest_end(row, *columns)
+        x, y, z = position.tolist()
+        qx, qy, qz, qw = rotation.tolist()
+        return int(self._edge["source" if at_source else "target"].view[edge]), (qx, qy, qz, qw), (x, y, z)
+
+    def was_marginalized(self, robot: str, keyframe_id: int) -> bool:
+        """Whether there was such a keyframe, known or forgotten."""
+        if self._marginalized_row(robot, keyframe_id, None) is not None:
+            return True
+        return self.marginalized.is_forgotten(self._robot_index.get(robot, -1), keyframe_id)
+
+    def compact(
+        self, surplus_keyframes: int, surplus_edges: int, is_false: NDArray[np.bool_], max_marginalized: int
+    ) -> Renumbering | None:
+        """Do without so many keyframes and edges, as :func:`thin` chooses them; None if nothing can be spared.
+
+        Args:
+            surplus_keyframes, surplus_edges: how many.
+            is_false: edges judged to be outliers, of the first M' ≤ M.
+            max_marginalized: keyframes beyond it that were marginalised are forgotten.
+        """
+        keyframes: Columns = {name: column.view for name, column in self._keyframe.items()}
+        edges: Columns = {name: column.view for name, column in self._edge.items()}
+        false = np.zeros(self.num_edges, dtype=bool)
+        false[: len(is_false)] = is_false
+        thinning = thin(self.num_keyframes, edges, false, self._latest(), surplus_keyframes, surplus_edges)
+        if not thinning.nodes.any() and not thinning.edges.any():
+            return None
+        stays = np.flatnonzero(~thinning.edges)
+        place = np.cumsum(~thinning.edges) - 1
+        riders = self.marginalized.keyframes
+        riders = MarginalizedKeyframes(**(riders.arrays() | {"edge": place[riders.edge]}))
+        contraction = marginalize(
+            keyframes, {name: values[stays] for name, values in edges.items()}, thinning.nodes, riders
+        )
+        for name, keyframe_column in self._keyframe.items():
+            keyframe_column.replace(keyframes[name][contraction.kept])
+        for name, edge_column in self._edge.items():
+            edge_column.replace(contraction.edges[name])
+        self._index_anew()
+        known = MarginalizedIndex.of(contraction.marginalized, self.marginalized.forgotten_up_to)
+        self.marginalized = known.limited_to(max_marginalized)
+        self.revision += 1
+        edge_of = np.full(len(place), -1)
+        edge_of[stays] = contraction.edge_of
+        return Renumbering(contraction.kept, edge_of, stays[contraction.last], int(thinning.edges.sum()))
 
     def snapshot(self) -> GraphSnapshot:
-        """The graph now. Only the labels, which alone can change later, are copied."""
-        graph = ViewGraph(
-            num_nodes=self.num_keyframes,
-            source=torch.from_numpy(self._source.view),
-            target=torch.from_numpy(self._target.view),
-            target_from_source=torch.from_numpy(self._target_from_source.view),
-            kind=torch.from_numpy(self._kind.view),
-            precision=torch.from_numpy(self._precision.view),
-            label=torch.from_numpy(self._label.view.copy()),
-        )
+        """The graph now. Only the labels and stamps, which alone can change later, are copied."""
+        columns = {name: self._edge[name].view for name in _SOLVED_COLUMNS}
+        columns["label"] = columns["label"].copy()
         return GraphSnapshot(
-            graph=graph,
+            graph=ViewGraph(self.num_keyframes, **{name: torch.from_numpy(values) for name, values in columns.items()}),
             robots=tuple(self.robots),
-            keyframe_robot=self._keyframe_robot.view,
-            keyframe_id=self._keyframe_id.view,
-            stamp_ns=self._stamp_ns.view.copy(),
-            edge_id=self._edge_id.view,
-            translation=self._translation.view,
+            keyframe_robot=self._keyframe["robot"].view,
+            keyframe_id=self._keyframe["keyframe_id"].view,
+            stamp_ns=self._keyframe["stamp_ns"].view.copy(),
+            edge_id=self._edge["edge_id"].view,
+            translation=self._edge["translation"].view,
+            marginalized=self.marginalized,
             revision=self.revision,
         )
 
     @classmethod
     def from_snapshot(cls, snapshot: GraphSnapshot) -> GrowingViewGraph:
-        """A growing graph with the same content and the same indices."""
+        """A growing graph with the same content and the same indices.
+
+        Raises:
+            ValueError: columns of different lengths, an index out of range, or a keyframe that occurs twice.
+        """
         growing = cls()
-        keys = zip(
-            snapshot.keyframe_robot.tolist(), snapshot.keyframe_id.tolist(), snapshot.stamp_ns.tolist(), strict=True
-        )
         for robot in snapshot.robots:
             growing._index_of_robot(robot)
-        for robot_index, keyframe_id, stamp_ns in keys:
-            growing.add_keyframe(snapshot.robots[robot_index], keyframe_id, stamp_ns)
-        growing._edge_id.extend(snapshot.edge_id)
-        growing._translation.extend(snapshot.translation)
-        for column in ("source", "target", "target_from_source", "kind", "precision", "label"):
-            getattr(growing, f"_{column}").extend(getattr(snapshot.graph, column).numpy())
+        for name, values in (
+            ("robot", snapshot.keyframe_robot),
+            ("keyframe_id", snapshot.keyframe_id),
+            ("stamp_ns", snapshot.stamp_ns),
+        ):
+            growing._keyframe[name].extend(values)
+        growing._edge["edge_id"].extend(snapshot.edge_id)
+        growing._edge["translation"].extend(snapshot.translation)
+        for name in _SOLVED_COLUMNS:
+            growing._edge[name].extend(getattr(snapshot.graph, name).numpy())
+        marginalized = snapshot.marginalized.keyframes
+        _check_rows(growing._keyframe, len(snapshot.robots), "robot")
+        _check_rows(growing._edge, growing.num_keyframes, "source", "target")
+        if not ((marginalized.edge >= 0) & (marginalized.edge < growing.num_edges)).all():
+            raise ValueError("a keyframe on an edge that is not there")
+        growing._index_anew()
+        growing.marginalized = snapshot.marginalized
         growing.revision = snapshot.revision
         return growing
+
+    def _latest(self) -> NDArray[np.bool_]:
+        """The latest keyframes of every robot, two at least, ``(N,)``."""
+        robot = self._keyframe["robot"].view
+        count = max(2, int(_LATEST_SHARE * len(robot) / max(len(self.robots), 1)))
+        order = np.argsort(robot, kind="stable")
+        last = np.searchsorted(robot[order], robot, "right") - 1
+        place = np.empty(len(robot), dtype=np.int64)
+        place[order] = np.arange(len(robot))
+        return np.asarray(last - place < count)
+
+    def _index_anew(self) -> None:
+        columns = {name: column.view for name, column in self._keyframe.items()}
+        for robot in range(len(self.robots)):
+            nodes = np.flatnonzero(columns["robot"] == robot)
+            self._index[robot] = KeyframeIndex.of(nodes, columns["keyframe_id"][nodes], columns["stamp_ns"][nodes])
+
+    def _marginalized_row(self, robot: str, keyframe_id: int | None, stamp_ns: int | None) -> int | None:
+        robot_index = self._robot_index.get(robot)
+        if robot_index is None or len(self.marginalized.keyframes) == 0:
+            return None
+        if keyframe_id is not None:
+            return self.marginalized.by_id(robot_index, keyframe_id)
+        return None if stamp_ns is None else self.marginalized.by_stamp(robot_index, stamp_ns)
+
+    def _index_of(self, robot: str) -> KeyframeIndex | None:
+        robot_index = self._robot_index.get(robot)
+        return None if robot_index is None else self._index[robot_index]
 
     def _index_of_robot(self, robot: str) -> int:
         index = self._robot_index.setdefault(robot, len(self.robots))
         if index == len(self.robots):
             self.robots.append(robot)
+            self._index.append(KeyframeIndex())
         return index
+
+
+def _check_rows(columns: Mapping[str, GrowingArray], limit: int, *indices: str) -> None:
+    """Equal lengths, and columns of indices below a limit."""
+    if len({len(column) for column in columns.values()}) > 1:
+        raise ValueError("columns of different lengths")
+    for name in indices:
+        view = columns[name].view
+        if ((view < 0) | (view >= limit)).any():
+            raise ValueError(f"{name} is out of range")

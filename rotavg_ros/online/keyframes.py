@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rotavg_ros.online import quaternion
-from rotavg_ros.online.growing_view_graph import GrowingArray
+from rotavg_ros.online.growing_array import GrowingArray
 from rotavg_ros.online.measurements import RejectedInputError, RejectReason, checked_rotation, checked_stamp
 from rotavg_ros.online.odometry_continuity import ANY_MOTION, ContinuityCheck, ContinuityLimits, OdometrySample
 from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion
@@ -212,6 +212,11 @@ class OdometryTrack:
             setattr(self, f"_{name}", thinned)
         # Where keyframes fill the room the limit yields; a quarter of it at least lies between two thinnings.
         self._limit = max(self.bounds.max_samples, int(keep.sum()) + self.bounds.max_samples // 4 + 1)
+
+    def release_keyframes(self, kept_stamps_ns: NDArray[np.int64]) -> None:
+        """Where keyframes take up most of the room, let those be thinned out that are no longer in the graph."""
+        if np.count_nonzero(self._is_keyframe.view) > self.bounds.max_samples // 2:
+            self._is_keyframe.view[:] &= np.isin(self._stamp_ns.view, kept_stamps_ns)
 
     def poses_at(
         self, stamp_ns: NDArray[np.int64]

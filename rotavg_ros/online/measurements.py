@@ -46,6 +46,7 @@ class RejectReason(str, Enum):
     PENDING_OVERFLOW = "pending_overflow"
     PENDING_TIMEOUT = "pending_timeout"
     GRAPH_FULL = "graph_full"
+    MARGINALIZED_KEYFRAME = "marginalized_keyframe"
 
 
 class RejectedInputError(Exception):

@@ -17,13 +17,18 @@ class _Waiting:
 
 
 class PendingEdges:
-    """Each waiting edge waits for one of its ends. When there are more than ``capacity`` the oldest has to go."""
+    """Each waiting edge waits for one of its ends. When there are more than ``capacity`` the oldest has to go.
+
+    Attributes:
+        fingerprints: of those that wait.
+    """
 
     def __init__(self, capacity: int, timeout_ns: int) -> None:
         self._capacity = capacity
         self._timeout_ns = timeout_ns
         self._serial = 0
         self._waiting: dict[int, _Waiting] = {}  # by serial number, so in order of arrival
+        self.fingerprints: set[int] = set()
         self._by_keyframe: dict[tuple[str, int], dict[int, None]] = {}
         self._by_stamp: dict[str, list[tuple[int, int]]] = {}  # per robot, ascending (stamp, serial)
 
@@ -42,6 +47,7 @@ class PendingEdges:
             evicted = self._remove(next(iter(self._waiting)))
         self._serial += 1
         self._waiting[self._serial] = _Waiting(edge, waits_for, data_time_ns)
+        self.fingerprints.add(edge.fingerprint())
         if waits_for.keyframe_id is not None:
             key = (waits_for.robot, waits_for.keyframe_id)
             self._by_keyframe.setdefault(key, {})[self._serial] = None
@@ -75,6 +81,7 @@ class PendingEdges:
 
     def _remove(self, serial: int) -> EdgeMeasurement:
         waiting = self._waiting.pop(serial)
+        self.fingerprints.discard(waiting.edge.fingerprint())
         reference = waiting.waits_for
         if reference.keyframe_id is not None:
             key = (reference.robot, reference.keyframe_id)

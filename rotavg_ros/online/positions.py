@@ -35,6 +35,7 @@ def fit_positions(
     is_odometry: NDArray[np.bool_],
     outlier_score: NDArray[np.float64],
     origin: NDArray[np.float64],
+    steps: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Positions that fit the translations best, closures weighted down the farther they are off.
 
@@ -49,6 +50,7 @@ def fit_positions(
         is_odometry: ``(M,)``.
         outlier_score: ``(M,)`` in [0, 1]; closures above 0.5 are left out, others weigh ``1 - score``.
         origin: ``(N, 3)`` metres; the first node of every component gets its own, 0 for NaN.
+        steps: ``(M,)`` odometry steps that an odometry edge stands for; default: 1.
 
     Returns:
         ``(N, 3)`` metres; NaN for nodes on which there is no translation.
@@ -56,12 +58,14 @@ def fit_positions(
     trust = np.where(is_odometry, 1.0, 1.0 - outlier_score)
     used = np.isfinite(translation).all(axis=1) & (trust >= 0.5)
     source, target, is_odometry, trust = source[used], target[used], is_odometry[used], trust[used]
+    steps = np.ones(len(source)) if steps is None else np.where(is_odometry, steps[used], 1.0)
     num_nodes = len(world_from_body)
     component, roots = _components(num_nodes, source, target)
     step = Rotation.from_quat(world_from_body[source]).apply(translation[used]) if len(source) else np.empty((0, 3))
     length = np.linalg.norm(step, axis=1)
-    typical = _typical(length[is_odometry] if is_odometry.any() else length)
-    weight = np.where(is_odometry, typical / np.maximum(length, _SHORTEST_STEP * typical), trust / _CLOSURE_STEPS)
+    typical = _typical((length / steps)[is_odometry] if is_odometry.any() else length)
+    shortest = _SHORTEST_STEP * typical * steps
+    weight = np.where(is_odometry, typical / np.maximum(length, shortest), trust / _CLOSURE_STEPS)
 
     pattern = LaplacianPattern(num_nodes, source, target, roots)
 

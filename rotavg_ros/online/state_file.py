@@ -21,14 +21,19 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.online.graph_builder import GraphBuilder
 from rotavg_ros.online.growing_view_graph import GraphSnapshot, GrowingViewGraph
 from rotavg_ros.online.keyframes import OdometryTrack
+from rotavg_ros.online.marginalized_keyframes import MarginalizedIndex, MarginalizedKeyframes
 from rotavg_ros.online.measurements import EdgeMeasurement, KeyframeReference
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.view_graph import ViewGraph
 
 FORMAT = "rotavg online state"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
+# Before it, odometry edges stood for one step each, and no keyframe was marginalised.
+_FIRST_WITH_STEPS = 3
+_READABLE = (2, FORMAT_VERSION)
 _TEMPORARY = ".tmp"
-_GRAPH_COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label")
+_MARGINALIZED = "marginalized_"
+_GRAPH_COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
 _KEYFRAME_COLUMNS = ("keyframe_robot", "keyframe_id", "stamp_ns", "edge_id", "translation")
 
 Arrays = dict[str, NDArray[Any]]
@@ -64,7 +69,9 @@ def collect(builder: GraphBuilder, answered: Tensor | None, version: int) -> Sta
     arrays: Arrays = {name: getattr(snapshot, name) for name in _KEYFRAME_COLUMNS}
     arrays |= {name: getattr(snapshot.graph, name).numpy() for name in _GRAPH_COLUMNS}
     arrays["answered"] = np.empty((0, 4)) if answered is None else answered.numpy()
-    arrays["fingerprints"] = np.fromiter(builder.fingerprints, dtype=np.uint64, count=len(builder.fingerprints))
+    arrays["fingerprints"] = builder.fingerprints.as_array()
+    marginalized = snapshot.marginalized
+    arrays |= {f"{_MARGINALIZED}{name}": values for name, values in marginalized.keyframes.arrays().items()}
     for index, track in enumerate(builder.tracks.values()):
         arrays |= {f"odometry{index}_{name}": values for name, values in track.arrays().items()}
     header = {
@@ -75,6 +82,9 @@ def collect(builder: GraphBuilder, answered: Tensor | None, version: int) -> Sta
         "odometry_robots": list(builder.tracks),
         "data_time_ns": builder.data_time_ns,
         "rejected": dict(builder.rejected),
+        "marginalized": builder.marginalized,
+        "dropped_closures": builder.dropped_closures,
+        "forgotten_up_to": list(marginalized.forgotten_up_to.items()),
         "labels": [[robot, edge_id, int(label)] for (robot, edge_id), label in builder.labels.items()],
     }
     return State(arrays, header, list(builder.pending))
@@ -136,10 +146,14 @@ def read(path: Path) -> Arrays:
         raise StateFileError(f"cannot read the state file {path}: {error.strerror or error}") from error
     except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
         raise StateFileError(f"{path} is not a whole state file of rotavg; delete it or save a new one") from error
-    if format_version != FORMAT_VERSION:
+    if format_version not in _READABLE:
         raise StateFileError(
             f"{path} has state format {format_version}, this version reads {FORMAT_VERSION}; save a new one"
         )
+    if format_version < _FIRST_WITH_STEPS:
+        nothing = MarginalizedKeyframes.none().arrays()
+        arrays["steps"] = np.ones(len(arrays["edge_id"]))
+        arrays |= {f"{_MARGINALIZED}{name}": values for name, values in nothing.items()}
     return arrays
 
 
@@ -159,16 +173,20 @@ def _restore(arrays: Arrays, options: EstimatorOptions) -> tuple[GraphBuilder, T
     header = json.loads(arrays["header"].tobytes())
     num_keyframes = len(arrays["keyframe_id"])
     columns: dict[str, Any] = {name: arrays[name] for name in _GRAPH_COLUMNS}
+    marginalized = {
+        name.removeprefix(_MARGINALIZED): values for name, values in arrays.items() if name.startswith(_MARGINALIZED)
+    }
     snapshot = GraphSnapshot(
         graph=ViewGraph.create(num_nodes=num_keyframes, **columns),
         robots=tuple(header["robots"]),
+        marginalized=MarginalizedIndex.of(
+            MarginalizedKeyframes(**marginalized), dict(header.get("forgotten_up_to", ()))
+        ),
         revision=num_keyframes + len(arrays["edge_id"]),
         **{name: arrays[name] for name in _KEYFRAME_COLUMNS},
     )
     builder = GraphBuilder(options)
     builder.graph = GrowingViewGraph.from_snapshot(snapshot)
-    if builder.graph.num_keyframes != num_keyframes:
-        raise ValueError("a keyframe occurs twice")
     for index, robot in enumerate(header["odometry_robots"]):
         prefix = f"odometry{index}_"
         track_arrays = {name.removeprefix(prefix): arrays[name] for name in arrays if name.startswith(prefix)}
@@ -177,6 +195,8 @@ def _restore(arrays: Arrays, options: EstimatorOptions) -> tuple[GraphBuilder, T
         )
     builder.data_time_ns = header["data_time_ns"]
     builder.rejected.update(header["rejected"])
+    builder.marginalized = header.get("marginalized", 0)
+    builder.dropped_closures = header.get("dropped_closures", 0)
     builder.labels = {(robot, edge_id): label for robot, edge_id, label in header["labels"]}
     for edge in header["pending"]:
         source, target = (KeyframeReference(**edge.pop(name)) for name in ("source", "target"))

@@ -38,14 +38,11 @@ class Trajectory:
     odometry_position: NDArray[np.float64]
 
 
-def corrected_trajectories(
-    answer: Answer, translation: NDArray[np.float64], tracks: Mapping[str, OdometryTrack]
-) -> dict[str, Trajectory]:
+def corrected_trajectories(answer: Answer, tracks: Mapping[str, OdometryTrack]) -> dict[str, Trajectory]:
     """Poses of every robot's keyframes that have a stamp.
 
     Args:
-        answer: with N keyframes and M edges.
-        translation: ``(M, 3)`` of the edges, metres, NaN unknown; of odometry edges the odometry's own stands in.
+        answer: with N keyframes and M edges; where an odometry edge has no translation, the odometry's own stands in.
         tracks: odometry by robot.
 
     Returns:
@@ -69,13 +66,14 @@ def corrected_trajectories(
         answer.source,
         answer.target,
         np.where(
-            np.isnan(translation) & is_odometry[:, None],
+            np.isnan(answer.translation) & is_odometry[:, None],
             _odometry_steps(answer, *odometry, chain),
-            translation,
+            answer.translation,
         ),
         is_odometry,
         np.where(answer.outlier, 1.0, answer.outlier_score),
         reckoned,
+        answer.steps,
     )
     position = np.where(np.isnan(position), reckoned, position)
     return {

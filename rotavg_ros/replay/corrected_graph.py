@@ -9,43 +9,39 @@ import numpy as np
 from rotavg_ros.datasets.corrected_graph import write_corrected_graph
 from rotavg_ros.datasets.graph_file import GraphFile
 from rotavg_ros.online import Answer
-from rotavg_ros.online.growing_view_graph import GraphSnapshot
 from rotavg_ros.replay.record import RunRecord
 
 # Rotations in a plane have no roll and pitch, and steps no height, beyond rounding.
 _PLANAR_TOLERANCE = 1e-9
 
 
-def write_graph_of_run(path: Path, record: RunRecord, snapshot: GraphSnapshot) -> None:
+def write_graph_of_run(path: Path, record: RunRecord) -> None:
     """Write corrected vertices and the edges that are not outliers.
 
     Args:
         path: of the file.
         record: the run.
-        snapshot: the graph of its answer, or a later one.
 
     Raises:
         GraphFileError: the file cannot be written.
     """
     answer = record.answer
-    count = len(answer.source)
-    graph, translation = snapshot.graph, snapshot.translation[:count]
-    target_from_source = graph.target_from_source[:count].numpy()
     position = np.zeros((len(answer.keyframe_id), 3))
     for robot in record.robots:
         if robot.position is not None:
             position[robot.nodes] = np.nan_to_num(robot.position)
-    flat = [target_from_source[:, :2], answer.world_from_body[:, :2], np.nan_to_num(translation[:, 2:])]
+    flat = [answer.target_from_source[:, :2], answer.world_from_body[:, :2], np.nan_to_num(answer.translation[:, 2:])]
     ids = keyframe_ids(answer)
     graph_file = GraphFile.from_ids(
         ids[answer.source],
         ids[answer.target],
-        target_from_source,
+        answer.target_from_source,
         lone_ids=ids,
         kind=answer.kind,
-        precision=graph.precision[:count].numpy(),
+        precision=answer.precision,
         planar=all(bool((np.abs(values) < _PLANAR_TOLERANCE).all()) for values in flat),
-        edge_translation=translation,
+        edge_translation=answer.translation,
+        steps=answer.steps,
     )
     order = np.argsort(ids)
     write_corrected_graph(path, graph_file, answer.world_from_body[order], position[order], answer.outlier)

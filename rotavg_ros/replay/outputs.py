@@ -17,7 +17,6 @@ from rotavg_ros.datasets.csv_writer import Column, write_csv
 from rotavg_ros.datasets.pose_files import write_kitti, write_tum
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import Answer
-from rotavg_ros.online.growing_view_graph import GraphSnapshot
 from rotavg_ros.replay.corrected_graph import keyframe_ids, write_graph_of_run
 from rotavg_ros.replay.record import RobotRecord, RunRecord
 from rotavg_ros.replay.run import Outcome
@@ -71,13 +70,12 @@ def _files_of(folder: Path) -> list[str]:
     return [name for name in names if isinstance(name, str) and Path(name).name == name]
 
 
-def write_tables(folder: Path, record: RunRecord, snapshot: GraphSnapshot) -> None:
+def write_tables(folder: Path, record: RunRecord) -> None:
     """Write trajectories, graph and csv files.
 
     Args:
         folder: where.
         record: the run.
-        snapshot: the graph of its answer, or a later one.
 
     Raises:
         GraphFileError: a file cannot be written.
@@ -93,7 +91,7 @@ def write_tables(folder: Path, record: RunRecord, snapshot: GraphSnapshot) -> No
         name = re.sub(r"[^\w.-]+", "_", robot.robot).strip("_") or "robot"
         prefix = f"{name}_" if several else ""
         _write_trajectory(folder, f"{name}" if several else "trajectory", f"{prefix}odometry", robot)
-    write_graph_of_run(folder / "graph.g2o", record, snapshot)
+    write_graph_of_run(folder / "graph.g2o", record)
 
 
 def write_summary(folder: Path, record: RunRecord, bag: Path, outcome: Outcome) -> dict[str, Any]:

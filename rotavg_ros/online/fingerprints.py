@@ -1,0 +1,56 @@
+"""Which edges have been taken, at eight bytes each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+# As Python objects they take ten times the room, so only the newest are.
+_NEWEST = 4096
+
+
+class Fingerprints:
+    """A set of 64-bit numbers that forgets the oldest.
+
+    It holds the newest ``capacity`` at least and twice as many at most.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._newest: set[int] = set()
+        # Ascending; when `_younger` is full it becomes `_older`, and what that held is forgotten.
+        self._younger = self._older = np.empty(0, dtype=np.uint64)
+
+    def __len__(self) -> int:
+        return len(self._newest) + len(self._younger) + len(self._older)
+
+    def __contains__(self, number: int) -> bool:
+        return number in self._newest or _contains(self._younger, number) or _contains(self._older, number)
+
+    def add(self, number: int) -> None:
+        self._newest.add(number)
+        if len(self._newest) >= min(_NEWEST, self._capacity):
+            # Two ascending runs, which a stable sort only merges.
+            runs = self._younger, np.sort(self._newest_as_array())
+            self._younger = np.sort(np.concatenate(runs), kind="stable")
+            self._newest = set()
+            if len(self._younger) >= self._capacity:
+                self._younger, self._older = self._older[:0], self._younger
+
+    def update(self, numbers: Iterable[int]) -> None:
+        for number in numbers:
+            self.add(number)
+
+    def as_array(self) -> NDArray[np.uint64]:
+        """All of them, the older ones first."""
+        return np.concatenate((self._older, self._younger, self._newest_as_array()))
+
+    def _newest_as_array(self) -> NDArray[np.uint64]:
+        return np.fromiter(self._newest, dtype=np.uint64, count=len(self._newest))
+
+
+def _contains(ascending: NDArray[np.uint64], number: int) -> bool:
+    position = int(np.searchsorted(ascending, np.uint64(number)))
+    return position < len(ascending) and int(ascending[position]) == number

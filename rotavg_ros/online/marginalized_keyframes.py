@@ -1,0 +1,141 @@
+"""Keyframes that are no nodes any more: each lies on an odometry edge, at a known pose along it."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rotavg_ros import rotations
+
+
+@dataclass(frozen=True)
+class MarginalizedKeyframes:
+    """K keyframes in the order in which they were marginalised.
+
+    Attributes:
+        robot: ``(K,)`` int32 index.
+        keyframe_id: ``(K,)`` uint64.
+        stamp_ns: ``(K,)`` int64, -1 where unknown.
+        edge: ``(K,)`` int64, the odometry edge.
+        keyframe_from_source: ``(K, 4)`` xyzw, from the frame of the edge's source.
+        position: ``(K, 3)`` in the frame of the edge's source, metres; NaN unknown.
+        steps: ``(K,)`` odometry steps from the edge's source.
+    """
+
+    robot: NDArray[np.int32]
+    keyframe_id: NDArray[np.uint64]
+    stamp_ns: NDArray[np.int64]
+    edge: NDArray[np.int64]
+    keyframe_from_source: NDArray[np.float64]
+    position: NDArray[np.float64]
+    steps: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.edge)
+
+    @classmethod
+    def none(cls) -> MarginalizedKeyframes:
+        return cls(
+            np.empty(0, dtype=np.int32),
+            np.empty(0, dtype=np.uint64),
+            np.empty(0, dtype=np.int64),
+            np.empty(0, dtype=np.int64),
+            np.empty((0, 4)),
+            np.empty((0, 3)),
+            np.empty(0),
+        )
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """By name."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def select(self, chosen: NDArray[Any]) -> MarginalizedKeyframes:
+        """Those of a mask or of indices, in that order."""
+        return MarginalizedKeyframes(**{name: values[chosen] for name, values in self.arrays().items()})
+
+    def followed_by(self, others: MarginalizedKeyframes) -> MarginalizedKeyframes:
+        """These, then the others."""
+        theirs = others.arrays()
+        return MarginalizedKeyframes(
+            **{name: np.concatenate((values, theirs[name])) for name, values in self.arrays().items()}
+        )
+
+
+@dataclass(frozen=True)
+class MarginalizedIndex:
+    """Finds marginalised keyframes by key and by stamp.
+
+    Attributes:
+        keyframes: which can be found.
+        forgotten_up_to: by robot index: keyframes up to this id were marginalised too, but where is no longer known.
+    """
+
+    keyframes: MarginalizedKeyframes
+    forgotten_up_to: Mapping[int, int]
+    _by_id: NDArray[np.int64]
+    _by_stamp: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, keyframes: MarginalizedKeyframes, forgotten_up_to: Mapping[int, int]) -> MarginalizedIndex:
+        by_id = np.lexsort((keyframes.keyframe_id, keyframes.robot))
+        by_stamp = np.lexsort((keyframes.stamp_ns, keyframes.robot))
+        return cls(keyframes, forgotten_up_to, by_id, by_stamp)
+
+    def limited_to(self, capacity: int) -> MarginalizedIndex:
+        """Of more than ``capacity`` the first are forgotten."""
+        surplus = len(self.keyframes) - capacity
+        if surplus <= 0:
+            return self
+        forgotten = self.keyframes.select(np.arange(surplus))
+        up_to = dict(self.forgotten_up_to)
+        for robot in np.unique(forgotten.robot).tolist():
+            highest = int(forgotten.keyframe_id[forgotten.robot == robot].max())
+            up_to[robot] = max(highest, up_to.get(robot, 0))
+        return MarginalizedIndex.of(self.keyframes.select(np.arange(surplus, len(self.keyframes))), up_to)
+
+    def by_id(self, robot: int, keyframe_id: int) -> int | None:
+        """Row of a keyframe."""
+        return self._find(self._by_id, self.keyframes.keyframe_id, robot, keyframe_id)
+
+    def by_stamp(self, robot: int, stamp_ns: int) -> int | None:
+        """Row of the robot's keyframe with exactly this stamp."""
+        return self._find(self._by_stamp, self.keyframes.stamp_ns, robot, stamp_ns)
+
+    def is_forgotten(self, robot: int, keyframe_id: int) -> bool:
+        return keyframe_id <= self.forgotten_up_to.get(robot, -1)
+
+    def nearest_end(
+        self, row: int, target_from_source: NDArray[np.float64], translation: NDArray[np.float64], steps: float
+    ) -> tuple[bool, NDArray[np.float64], NDArray[np.float64]]:
+        """A keyframe seen from the nearer end of its edge.
+
+        Args:
+            row: the keyframe.
+            target_from_source: ``(4,)`` of its edge.
+            translation: ``(3,)`` of the edge: position of the target in the source's frame, metres.
+            steps: of the edge.
+
+        Returns:
+            whether the nearer end is the edge's source; the keyframe's orientation ``(4,)`` and position ``(3,)`` in
+            that end's frame.
+        """
+        keyframes = self.keyframes
+        source_from_keyframe = rotations.inverse(torch.from_numpy(keyframes.keyframe_from_source[row]))
+        if keyframes.steps[row] <= steps - keyframes.steps[row]:
+            return True, source_from_keyframe.numpy(), keyframes.position[row]
+        turn = torch.from_numpy(target_from_source)
+        position = rotations.rotate(turn, torch.from_numpy(keyframes.position[row] - translation))
+        return False, rotations.multiply(turn, source_from_keyframe).numpy(), position.numpy()
+
+    def _find(self, order: NDArray[np.int64], column: NDArray[Any], robot: int, key: int) -> int | None:
+        rows = self.keyframes.robot
+        place = bisect_left(order, (robot, key), key=lambda row: (int(rows[row]), int(column[row])))
+        if place == len(order) or (rows[order[place]], column[order[place]]) != (robot, key):
+            return None
+        return int(order[place])
