@@ -9,38 +9,42 @@ from two starts, and the one of lower cost is taken.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy.special import expit
 from torch import Tensor
 
-from rotavg_ros.solver.agreement import AgreementPairs
+from rotavg_ros import rotations
+from rotavg_ros.solver.agreement import AgreementPairs, agreement_pairs
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.cycle_votes import count_votes
+from rotavg_ros.solver.fine_net import edge_residual
 from rotavg_ros.solver.jumps import jump_to_optimum
-from rotavg_ros.solver.noise_model import NoiseModel, noise_between_neighbours
+from rotavg_ros.solver.noise_model import (
+    NoiseModel,
+    discrepancies,
+    estimate_noise,
+    noise_between_neighbours,
+)
 from rotavg_ros.solver.slam_refinement import SlamEstimate
+from rotavg_ros.solver.slip_doubt import Doubt, agree, measure_doubt
 from rotavg_ros.solver.spanning_tree import compose_orientations, shortest_path_forest
 from rotavg_ros.solver.truncated_cost import TruncatedCost
 from rotavg_ros.view_graph import ViewGraph
 
-# A segment slips with this probability, however long it is: a slip that is not located cannot be acted upon.
-_SLIP_PROBABILITY = 3e-3
-_OUTLIER_SHARE = 0.3
-# The solution is doubted if this share of what at least so many neighbours agree upon is rejected by it,
-_DOUBTED_SHARE = 0.7
-_MIN_SUPPORTERS = 2
-# or if, of a map that explains most closures, so much larger a share disagrees with the odometry.
-_DOUBTED_DIFFERENCE = 0.05
-_MOST = 0.6
+# A step of odometry slips with this probability. Of a long segment only so many count: what is left of it after a slip
+# says nothing more, and neither does where in it the slip was.
+_SLIP_PROBABILITY = 0.01
+_MAX_LOCATED_STEPS = 3.0
 # In larger graphs loops are dense; there annealing alone finds the slips, and jumps take long.
 _MAX_EDGES_TO_JUMP = 3000
 # Weight of a closure that its neighbours speak against.
 _MIN_TRUST = 1e-3
-# A new solution must be better by this many nats.
+# A new solution must be better by this many nats; so much worse it may be if false closures come in groups.
 _MIN_GAIN = 10.0
+_MAX_LOSS_IF_GROUPED = 20.0
 _FALSE_SQUARE = np.pi**2 / 3 + 2
 
 
@@ -66,13 +70,13 @@ def search_for_slips(
         by_chain: the noise as it looks if odometry never slips.
         log_odds: ``(E,)`` prior log-odds of each edge to be good, beyond the common outlier share; ±inf decide it.
     """
-    good = estimate.inlier_probability[graph.is_closure]
-    if len(pairs.first) == 0 or not _is_doubtful(pairs, good, by_chain):
+    doubt = Doubt.NONE if len(pairs.first) == 0 else measure_doubt(graph, pairs, estimate, by_chain)
+    if doubt == Doubt.NONE:
         return None
     noise = noise_between_neighbours(pairs, by_chain.components)
-    is_agreed = _agree(pairs, noise)
+    is_agreed = agree(pairs, noise)
     prior = log_odds + np.where(
-        graph.is_odometry, np.log1p(-_SLIP_PROBABILITY) - np.log(_SLIP_PROBABILITY), noise.prior_log_odds
+        graph.is_odometry, _no_slip_log_odds(graph.steps, noise.components), noise.prior_log_odds
     )
     finite = np.clip(prior, -50, 50)
     votes = count_votes(graph, pairs, noise, finite[graph.is_closure], finite[: graph.num_segments])
@@ -80,32 +84,56 @@ def search_for_slips(
     trust[graph.is_closure] = np.maximum(expit(votes.closure), _MIN_TRUST)
     cost = TruncatedCost.create(graph, noise, prior)
     correction = cost.descend(_tree(cost, trust, votes.segment), trust)
-    if len(graph.source) <= _MAX_EDGES_TO_JUMP:
+    is_small = len(graph.source) <= _MAX_EDGES_TO_JUMP
+    if is_small:
         starts = (correction, estimate.correction)
         found = [jump_to_optimum(cost, start, pairs, is_agreed, votes.closure > 0) for start in starts]
         correction = min(found, key=cost.total)
-    if cost.total(correction) > cost.total(estimate.correction) - _MIN_GAIN:
+    gain = cost.total(estimate.correction) - cost.total(correction)
+    gain_if_grouped = _grouped_cost(cost, estimate.correction, pairs, is_agreed) - _grouped_cost(
+        cost, correction, pairs, is_agreed
+    )
+    if min(gain, gain_if_grouped + (_MIN_GAIN + _MAX_LOSS_IF_GROUPED if doubt == Doubt.STRONG else 0)) < _MIN_GAIN:
         return None
+    # Without the slips, the odometry tells how it drifts.
+    noise = _noise_without_slips(cost, correction, noise)
+    cost = TruncatedCost.create(graph, noise, prior)
+    if is_small:
+        everyone = np.ones(len(votes.closure), dtype=bool)
+        correction = jump_to_optimum(cost, cost.descend(correction), pairs, is_agreed, everyone)
     return SlipStart(correction, expit(cost.log_odds(correction)), noise)
 
 
-def _is_doubtful(pairs: AgreementPairs, good: np.ndarray, by_chain: NoiseModel) -> bool:
-    """Whether closures that agree are rejected, or the map explains closures that the odometry does not."""
-    supporters = np.bincount(pairs.first, _agree(pairs, by_chain), len(good))
-    # A group of false closures agrees with itself; it must not outvote the rest by its size.
-    weight = np.where(supporters >= _MIN_SUPPORTERS, 1 / (1 + supporters), 0.0)
-    rejected = good < 0.5
-    rejected_share = float((weight * rejected).sum() / max(weight.sum(), 1e-12))
-    if rejected_share > _DOUBTED_SHARE:
-        return True
-    explained = by_chain.outlier_share - float(rejected.mean())
-    return explained > _DOUBTED_DIFFERENCE and float(rejected.mean()) < _MOST
+def _no_slip_log_odds(steps: np.ndarray, components: int) -> np.ndarray:
+    """Log-odds of segments to be good beforehand, a slip being less than a right angle and as likely to be any."""
+    narrower = np.log(2.0) if components == 1 else np.log(2 / (1 - np.cos(np.pi / 4)))
+    none = np.log1p(-_SLIP_PROBABILITY) * np.minimum(steps, _MAX_LOCATED_STEPS)
+    return np.asarray(none - np.log(-np.expm1(none)) - narrower)
 
 
-def _agree(pairs: AgreementPairs, noise: NoiseModel) -> np.ndarray:
-    """``(P,)`` bool."""
-    variance = np.maximum(pairs.steps, 0.5) * noise.step_variance + 2 * noise.closure_variance
-    return noise.inlier_log_odds(pairs.squared_angle, variance) > 0
+def _grouped_cost(cost: TruncatedCost, correction: Tensor, pairs: AgreementPairs, is_agreed: np.ndarray) -> float:
+    """The cost of a solution ``(K, 4)`` if wrong closures that agree with each other have one reason to be wrong."""
+    costs, closure = cost.of_edges(cost.residual(correction)), cost.graph.is_closure
+    wrong = costs[closure] > 0.5 * cost.cap[closure]
+    company = np.bincount(pairs.first, is_agreed & wrong[pairs.second], len(wrong))
+    return float(costs[~closure].sum() + (costs[closure] / np.where(wrong, 1 + company, 1.0)).sum())
+
+
+def _noise_without_slips(cost: TruncatedCost, correction: Tensor, noise: NoiseModel) -> NoiseModel:
+    """The noise as closures and an odometry tell it whose slips are taken out as ``correction`` ``(K, 4)`` has them."""
+    graph = cost.graph
+    source, target = torch.from_numpy(graph.source), torch.from_numpy(graph.target)
+    slipped = torch.from_numpy((cost.log_odds(correction) < 0) & graph.is_odometry)[:, None]
+    turn = rotations.multiply(correction[target], rotations.inverse(correction[source]))
+    chain = torch.where(slipped, turn, graph.residual)
+    repaired = ViewGraph.create(graph.source, graph.target, chain, num_nodes=graph.num_nodes)
+    forest = shortest_path_forest(repaired, torch.where(torch.from_numpy(graph.is_odometry), 1.0, 1e6), root="first")
+    odometry = compose_orientations(forest, repaired)
+    residual = edge_residual(odometry, graph.residual, source, target)
+    closure = torch.from_numpy(graph.is_closure)
+    square = (rotations.log(residual[closure]) ** 2).sum(dim=1).numpy()
+    pairs = agreement_pairs(replace(graph, residual=residual))
+    return estimate_noise(discrepancies(square, graph.path_steps[graph.is_closure], pairs), noise.components)
 
 
 def _tree(cost: TruncatedCost, trust: np.ndarray, segment_log_odds: np.ndarray) -> Tensor:

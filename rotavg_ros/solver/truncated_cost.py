@@ -47,7 +47,9 @@ class TruncatedCost:
     def create(graph: ClosureGraph, noise: NoiseModel, log_odds: np.ndarray) -> TruncatedCost:
         """From the noise and each edge's prior log-odds of being good, ``(E,)``; ±inf decide it."""
         variance = graph.steps * np.where(graph.is_odometry, noise.step_variance, noise.closure_variance)
-        cap = noise.inlier_log_odds(np.zeros(len(variance)), variance) + np.clip(log_odds, -100, 100)
+        # Without the edge, the way round passes at least one closure more; a segment's, two.
+        around = variance + np.where(graph.is_odometry, 2.0, 1.0) * noise.closure_variance
+        cap = noise.inlier_log_odds(np.zeros(len(variance)), around) + np.clip(log_odds, -100, 100)
         pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots)
         return TruncatedCost(graph, variance, np.maximum(cap, 0.0), pattern)
 

@@ -1,0 +1,94 @@
+"""Doubt in a solution that trusts the odometry: what speaks for slips, measured cheaply.
+
+If odometry slipped, closures that their neighbours confirm are rejected; or the slip passes for drift, and the map
+explains closures that the odometry does not, or drifts farther than neighbouring closures see it drift. All of this is
+cheap to measure, and a search for slips is not.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+from scipy.special import gammainc
+
+from rotavg_ros.solver.agreement import AgreementPairs
+from rotavg_ros.solver.closure_graph import ClosureGraph
+from rotavg_ros.solver.noise_model import NoiseModel, log_uniform_density, noise_between_neighbours
+from rotavg_ros.solver.slam_refinement import SlamEstimate
+
+# The solution is in strong doubt if this share of what at least so many neighbours agree upon is rejected by it,
+_DOUBTED_SHARE = 0.53
+_MIN_SUPPORTERS = 2
+# in some if it explains most closures, but so much larger a share disagrees with the odometry,
+_MOST = 0.6
+_DOUBTED_DIFFERENCE = 0.05
+# or if more than this share is rejected and odometry drifts by so much more (in variance) than neighbours see; but they
+# see nothing of drift below the last,
+_NOTABLE_SHARE = 0.33
+_DOUBTED_DRIFT = 3.5
+_SEEN_DRIFT = np.radians(0.04) ** 2
+# or if it drifts by this much more, while closures look so much better (in variance) than neighbours find them.
+_DOUBTED_DRIFT_OF_EXACT = 2.0
+_EXACT_CLOSURES = 0.15
+
+
+class Doubt(IntEnum):
+    """How much speaks for slips."""
+
+    NONE = 0
+    SOME = 1
+    STRONG = 2
+
+
+def measure_doubt(graph: ClosureGraph, pairs: AgreementPairs, estimate: SlamEstimate, by_chain: NoiseModel) -> Doubt:
+    """Doubt in ``estimate``.
+
+    Args:
+        by_chain: the noise as it looks if odometry never slips.
+    """
+    rejected = estimate.inlier_probability[graph.is_closure] < 0.5
+    supporters = np.bincount(pairs.first, agree(pairs, by_chain), len(rejected))
+    # A group of false closures agrees with itself; it must not outvote the rest by its size.
+    weight = np.where(supporters >= _MIN_SUPPORTERS, 1 / (1 + supporters), 0.0)
+    rejected_weight = float((weight * rejected).sum())
+    if rejected_weight > _DOUBTED_SHARE * weight.sum():
+        by_chance = float(_weight_by_chance(pairs, by_chain, len(rejected))[rejected].sum())
+        if rejected_weight - by_chance > _DOUBTED_SHARE * (weight.sum() - by_chance):
+            return Doubt.STRONG
+    rejected_share = float(rejected.mean())
+    if rejected_share > _MOST:
+        return Doubt.NONE
+    explains_more = by_chain.outlier_share - rejected_share > _DOUBTED_DIFFERENCE
+    if explains_more or (rejected_share > _NOTABLE_SHARE and _drifts_farther(pairs, estimate, by_chain)):
+        return Doubt.SOME
+    return Doubt.NONE
+
+
+def agree(pairs: AgreementPairs, noise: NoiseModel) -> np.ndarray:
+    """``(P,)`` bool."""
+    return noise.inlier_log_odds(pairs.squared_angle, _pair_variance(pairs, noise)) > 0
+
+
+def _pair_variance(pairs: AgreementPairs, noise: NoiseModel) -> np.ndarray:
+    return np.asarray(np.maximum(pairs.steps, 0.5) * noise.step_variance + 2 * noise.closure_variance)
+
+
+def _weight_by_chance(pairs: AgreementPairs, noise: NoiseModel, num_closures: int) -> np.ndarray:
+    """``(C,)`` the weight that a closure has on average if it and all its neighbours are random."""
+    k, variance = noise.components, _pair_variance(pairs, noise)
+    evidence = -k / 2 * np.log(2 * np.pi * variance) - log_uniform_density(np.zeros(1), k)
+    angle = np.minimum(np.sqrt(2 * variance * np.maximum(evidence, 0)), np.pi)
+    chance = angle / np.pi if k == 1 else (angle - np.sin(angle)) / np.pi
+    expected = np.bincount(pairs.first, chance, num_closures)
+    # E[1 / (1 + n); n ≥ m] = P(n > m) / λ for n ~ Poisson(λ)
+    return np.asarray(gammainc(1.0 + _MIN_SUPPORTERS, expected) / np.maximum(expected, 1e-12))
+
+
+def _drifts_farther(pairs: AgreementPairs, estimate: SlamEstimate, by_chain: NoiseModel) -> bool:
+    between = noise_between_neighbours(pairs, by_chain.components)
+    drift = estimate.noise.step_variance / between.step_variance
+    exact = by_chain.closure_variance < _EXACT_CLOSURES * between.closure_variance
+    return (between.step_variance > _SEEN_DRIFT and drift > _DOUBTED_DRIFT) or (
+        exact and drift > _DOUBTED_DRIFT_OF_EXACT
+    )
