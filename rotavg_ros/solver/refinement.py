@@ -89,18 +89,18 @@ def _weights_and_forces(graph: ViewGraph, orientations: Tensor, prior: Tensor) -
     residuals = EdgeResiduals(graph, orientations)
     weight = torch.empty_like(prior)
     parts = stretches(slices(graph.num_edges, SLICE_EDGES, graph.device))
-    forces = [orientations.new_zeros(graph.num_nodes, 3) for _ in parts]
+    forces = [orientations.new_zeros(3, graph.num_nodes) for _ in parts]
 
     def walk(part: int) -> None:
         for edges in parts[part]:
             vector = residuals.vectors(edges)
             weight[edges] = prior[edges] * ((vector * vector).sum(dim=0) + _SMOOTHING**2) ** -0.75
-            pull = (vector * weight[edges]).t()
-            forces[part].index_add_(0, graph.target[edges], pull)
-            forces[part].index_add_(0, graph.source[edges], pull, alpha=-1)
+            pull = vector * weight[edges]
+            forces[part].index_add_(1, graph.target[edges], pull)
+            forces[part].index_add_(1, graph.source[edges], pull.neg_())
 
     for_each(walk, range(len(parts)))
-    return weight, torch.stack(forces).sum(dim=0)
+    return weight, torch.stack(forces).sum(dim=0).t().contiguous()
 
 
 def _factorise_and_solve(graph: ViewGraph, weight: Tensor, force: Tensor, root: Tensor) -> Tensor:

@@ -43,16 +43,18 @@ class _Step(NamedTuple):
         smoothing: residuals below it count as this: radians, or standard deviations of the noise.
         tolerance: of conjugate gradients, radians.
         relative_tolerance: the same as a share of the step; the next step corrects what this one lacks.
+        dtype: of residuals; single precision leaves them exact to a hundred-thousandth of a degree.
     """
 
     power: float
     smoothing: float
     tolerance: float
     relative_tolerance: float
+    dtype: torch.dtype
 
 
-_COARSE = _Step(1.0, np.radians(1.0), 1e-6, 1e-3)
-_SHAPED = _Step(0.5, 0.1, 1e-6, 1e-3)
+_COARSE = _Step(1.0, np.radians(1.0), 1e-6, 1e-3, torch.float32)
+_SHAPED = _Step(0.5, 0.1, 1e-6, 1e-3, torch.float64)
 
 
 def refine(
@@ -167,27 +169,43 @@ class _Problem:
     ) -> tuple[Tensor, Tensor]:
         """Every edge's robust weight ``(M,)``, and the weighted residuals that pull at each node, summed ``(N, 3)``."""
         graph = self.graph
-        residuals = EdgeResiduals(graph, orientations)
-        at_source, at_target = (end.flatten(1).t().contiguous() for end in (shape.at_source, shape.at_target))
+        residuals = EdgeResiduals(graph, orientations.to(settings.dtype))
+        at_source, at_target = (_distinct_entries(end).to(settings.dtype) for end in (shape.at_source, shape.at_target))
         weight = torch.empty_like(prior)
         parts = stretches(slices(graph.num_edges, SLICE_EDGES, graph.device))
-        forces = [orientations.new_zeros(graph.num_nodes, 3) for _ in parts]
+        # Components in rows: adding columns up by node is a dozen times as fast as adding up rows.
+        forces = [at_source.new_zeros(3, graph.num_nodes) for _ in parts]
 
         def walk(part: int) -> None:
             for edges in parts[part]:
                 source, target = graph.source[edges], graph.target[edges]
                 vector = residuals.vectors(edges)
-                information = at_source.index_select(1, source) + at_target.index_select(1, target)
-                pull = (information.view(3, 3, -1) * vector).sum(dim=1)
+                pull = _times(at_source.index_select(1, source).add_(at_target.index_select(1, target)), vector)
                 square = (vector * pull).sum(dim=0)
                 robust = (square + settings.smoothing**2) ** (settings.power / 2 - 1)
                 weight[edges] = prior[edges].clamp(min=_MIN_PRIOR) * robust
-                pull = (pull * weight[edges]).t()
-                forces[part].index_add_(0, target, pull)
-                forces[part].index_add_(0, source, pull, alpha=-1)
+                pull *= weight[edges].to(settings.dtype)
+                forces[part].index_add_(1, target, pull)
+                forces[part].index_add_(1, source, pull.neg_())  # with alpha = -1 it takes six times as long
 
         for_each(walk, range(len(parts)))
-        return weight, torch.stack(forces).sum(dim=0)
+        return weight, torch.stack(forces).double().sum(dim=0).t().contiguous()
+
+
+def _distinct_entries(matrices: Tensor) -> Tensor:
+    """Symmetric matrices ``(N, 3, 3)`` → their entries xx, xy, xz, yy, yz, zz in rows, ``(6, N)``."""
+    return matrices.flatten(1).t()[[0, 1, 2, 4, 5, 8]].contiguous()
+
+
+def _times(entries: Tensor, vector: Tensor) -> Tensor:
+    """Products ``(3, k)`` of symmetric matrices, given by :func:`_distinct_entries`, and vectors ``(3, k)``."""
+    xx, xy, xz, yy, yz, zz = entries
+    x, y, z = vector
+    product = torch.empty_like(vector)
+    torch.mul(xx, x, out=product[0]).addcmul_(xy, y).addcmul_(xz, z)
+    torch.mul(xy, x, out=product[1]).addcmul_(yy, y).addcmul_(yz, z)
+    torch.mul(xz, x, out=product[2]).addcmul_(yz, y).addcmul_(zz, z)
+    return product
 
 
 def _evenly_spread(group: Tensor, num_groups: int) -> Tensor:
