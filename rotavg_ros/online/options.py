@@ -38,7 +38,8 @@ class EstimatorOptions:
             too and says so.
         time_jump_s: going back by less is no jump; such odometry is out of order.
         max_odometry_samples: per robot; older messages are thinned out beyond it.
-        max_keyframes, max_edges: the graph stops growing there; what odometry still needs comes on top of the edges.
+        max_keyframes, max_edges: there the graph does without what can best be spared, see
+            :mod:`~rotavg_ros.online.thinning`; what odometry still needs comes on top of the edges.
         pending_capacity: edges that may wait at a time.
         pending_timeout_s: how long in data time.
         gauge: of the first keyframe of a component: the ``odometry``'s orientation there, or ``identity``.

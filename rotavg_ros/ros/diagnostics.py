@@ -22,7 +22,7 @@ _STALE_PERIODS = 10
 _RECENT_S = 60.0
 _SUSPICIOUS_OUTLIER_SHARE = 0.5
 # Refusals that a healthy system produces: a sender that repeats itself.
-_HARMLESS = {"duplicate_edge"}
+_HARMLESS = {"duplicate_edge", "marginalized_keyframe"}
 
 
 @dataclass
@@ -85,8 +85,8 @@ class Reporter:
         if counts.time_is_back:
             errors.append("time went back and odometry is refused since; call ~/reset to begin anew")
         warnings = _warnings(health, parameters, paused, now)
-        if counts.keyframes >= parameters.max_keyframes:
-            warnings.append("the graph is full: no new keyframes (max_keyframes)")
+        if counts.is_full:
+            warnings.append("the graph is full and nothing can be spared: no new keyframes (max_keyframes)")
         if health.lost > self._lost:
             warnings.append(f"{health.lost - self._lost} messages lost")
         if counts.odometry_restarts > self._restarts:
@@ -149,6 +149,8 @@ def _values(health: Health, counts: Counts, paused: bool, now: float) -> dict[st
         "components": str(0 if answer is None else answer.num_components),
         "joins": str(health.joins),
         "odometry restarts": str(counts.odometry_restarts),
+        "marginalized keyframes": str(counts.marginalized),
+        "dropped closures": str(counts.dropped_closures),
         "pending": str(counts.pending),
         "answer version": str(0 if answer is None else answer.version),
         "answer age s": "nan" if health.answered is None else f"{now - health.answered:.1f}",

@@ -128,13 +128,13 @@ class NodeParameters:
     )
     max_keyframes: int = _parameter(
         200_000,
-        "at so many keyframes the graph stops growing, and the diagnostics warn; odometry goes on from the last one",
+        "at so many keyframes those that can best be spared are taken out, first without any loss, then with some",
         low=1,
         high=100_000_000,
         live=True,
     )
     max_edges: int = _parameter(
-        2_000_000, "at so many edges further ones are refused", low=1, high=1_000_000_000, live=True
+        2_000_000, "at so many edges the loop closures that can best be spared are dropped", low=1, high=1_000_000_000, live=True
     )
     pending_capacity: int = _parameter(
         20_000, "edges that may wait for a keyframe or for odometry; the oldest go first", low=1, high=10_000_000
