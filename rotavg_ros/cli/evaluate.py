@@ -46,6 +46,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         suite_parser.add_argument(
             "--threads", type=positive_whole_number, metavar="N", help="CPU threads (default: torch's choice)"
         )
+        suite_parser.add_argument(
+            "--keep",
+            type=Path,
+            metavar="DIR",
+            help="keep answers here: a run that was interrupted goes on, and only what has changed is solved again",
+        )
         suite.add_arguments(suite_parser)
 
 
@@ -79,10 +85,10 @@ def _add_synthetic(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_synthetic(arguments: argparse.Namespace) -> Path:
-    core = _contenders(arguments.methods, synthetic.CORE)
+    core = _contenders(arguments.methods, synthetic.CORE, keep=arguments.keep)
     few = min(arguments.few_graphs, arguments.graphs)
     is_all = arguments.methods is not None or few == 0
-    more = {} if is_all else _contenders(None, [name for name in synthetic.ROWS if name not in synthetic.CORE])
+    more = {} if is_all else _contenders(None, _MORE, keep=arguments.keep)
     scores, scores_of_few = {}, {}
     for recipe in arguments.recipes:
         cases = synthetic.cases(recipe, arguments.graphs, arguments.seed)
@@ -121,7 +127,7 @@ def _run_robustness(arguments: argparse.Namespace) -> Path:
             training = robustness.SETTINGS[setting].training
             weights = None if training == robustness.PACKAGE else Path(folder) / training
             fit = [name for name in names if robustness.is_fit(setting, name)]
-            chosen = _contenders(fit, (), weights)
+            chosen = _contenders(fit, (), weights, arguments.keep)
             count = robustness.num_graphs(setting, arguments.graphs)
             scores[setting] = _score(robustness.cases(setting, count, arguments.seed), chosen, count, setting)
     command = f"rotavg evaluate robustness --graphs {arguments.graphs} --seed {arguments.seed}"
@@ -138,7 +144,7 @@ def _add_real(parser: argparse.ArgumentParser) -> None:
 
 def _run_real(arguments: argparse.Namespace) -> Path:
     data = _data(arguments, (real.LUND, real.MADRID, real.TOPOLOGIES))
-    chosen = _contenders(arguments.methods, real.METHODS)
+    chosen = _contenders(arguments.methods, real.METHODS, keep=arguments.keep)
     lund, madrid = real.lund_case(data), real.madrid_case(data)
     on_lund = _score([lund], chosen, 1, lund.name)
     fast = {name: contender for name, contender in chosen.items() if name not in real.SLOW_ON_TOPOLOGIES}
@@ -235,10 +241,10 @@ def _add_methods(parser: argparse.ArgumentParser, default: str) -> None:
 
 
 def _contenders(
-    names: Sequence[str] | None, default: Iterable[str], weights: Path | None = None
+    names: Sequence[str] | None, default: Iterable[str], weights: Path | None = None, keep: Path | None = None
 ) -> dict[str, Contender]:
     """Those asked for, or what can run here of the default."""
-    chosen = contenders(names if names is not None else [name for name in default if is_available(name)], weights)
+    chosen = contenders(names if names is not None else [name for name in default if is_available(name)], weights, keep)
     warm_up(tuple(chosen.values()))
     return chosen
 
@@ -250,6 +256,7 @@ def _score(cases: Iterable[Case], chosen: dict[str, Contender], count: int, desc
     return score_all(cases, chosen, watch)
 
 
+_MORE = [name for name in synthetic.ROWS if name not in synthetic.CORE]
 _ROBUSTNESS_METHODS = ("chatterjee", "neurora-paper", "neurora")
 _SUITES = (
     _Suite("synthetic", "the paper's synthetic table, and how well outliers are told", _add_synthetic, _run_synthetic),

@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> Path:
         raise slam_cases.SlamSuiteError(
             "the pose graphs are not part of the package; name the folder of the data sets with --data or $ROTAVG_DATA"
         )
-    chosen = slam_contenders.contenders(_methods(arguments))
+    chosen = slam_contenders.contenders(_methods(arguments), arguments.keep)
     slam_contenders.warm_up(tuple(chosen.values()))
 
     def watch(steps: Iterable[Step]) -> Iterable[Step]:

@@ -15,6 +15,7 @@ from torch import Tensor
 from rotavg_ros.datasets.synthetic import SFM_OUTLIER_ANGLE
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation import peers
+from rotavg_ros.evaluation.kept_answers import kept
 from rotavg_ros.evaluation.metrics import true_edge_noise
 from rotavg_ros.solver import METHODS, sfm_refinement, solve
 from rotavg_ros.solver.refinement import refine
@@ -60,29 +61,33 @@ class Answer:
     Attributes:
         body_from_world: ``(N, 4)``; every component in a gauge of its own.
         outlier_score: ``(M,)`` probability that the edge's noise exceeds 20°.
-        seconds: wall-clock time from graph to answer.
+        cpu_seconds: CPU time from graph to answer, of all threads.
     """
 
     body_from_world: Tensor
     outlier_score: Tensor
-    seconds: float
+    cpu_seconds: float
 
 
 Contender = Callable[[Case], "Answer | None"]
 
 
-def contenders(names: Sequence[str], weights: Path | None = None) -> dict[str, Contender]:
+def contenders(names: Sequence[str], weights: Path | None = None, keep: Path | None = None) -> dict[str, Contender]:
     """Contenders by name: a method of the solver, several joined by "+", "colmap", "shonan" or "oracle".
 
     A contender returns None for a case that is too large for it or on which it gives up.
 
     Args:
         weights: folder of networks to use in place of the package's.
+        keep: folder of the package's networks' and the peers' answers, to be found again by a later run.
 
     Raises:
         ContenderError: an unknown name, or a peer that is not installed.
     """
-    return {name: _contender(name, weights) for name in names}
+    chosen = {name: _contender(name, weights) for name in names}
+    if keep is None or weights is not None:
+        return chosen
+    return {name: kept(name, run, Answer, keep, _PEER_PACKAGES.get(name)) for name, run in chosen.items()}
 
 
 def is_available(name: str) -> bool:
@@ -108,9 +113,9 @@ def _contender(name: str, weights: Path | None) -> Contender:
 
 
 def _solve(name: str, weights: Path | None, case: Case) -> Answer:
-    start = time.perf_counter()
+    start = time.process_time()
     solution = solve(case.graph, method=name, profile="sfm", weights=weights)
-    return Answer(solution.body_from_world, solution.outlier_score, time.perf_counter() - start)
+    return Answer(solution.body_from_world, solution.outlier_score, time.process_time() - start)
 
 
 def _peer(run: Callable[[ViewGraph], peers.PeerAnswer], max_edges: int | None = None) -> Contender:
@@ -121,14 +126,14 @@ def _peer(run: Callable[[ViewGraph], peers.PeerAnswer], max_edges: int | None = 
             answer = run(case.graph)
         except peers.PeerError:
             return None
-        return Answer(answer.body_from_world, _residual_score(case, answer.body_from_world), answer.seconds)
+        return Answer(answer.body_from_world, _residual_score(case, answer.body_from_world), answer.cpu_seconds)
 
     return solve_case
 
 
 def _oracle(is_shaped: bool, case: Case) -> Answer:
     """Our refinement from the truth to convergence, every true inlier weighing one and every outlier nothing."""
-    start = time.perf_counter()
+    start = time.process_time()
     is_inlier = (case.noise_angle <= SFM_OUTLIER_ANGLE).double()
     roots = shortest_path_forest(case.graph).roots
     if is_shaped:
@@ -142,7 +147,7 @@ def _oracle(is_shaped: bool, case: Case) -> Answer:
         )
     else:
         orientations = refine(case.graph, case.truth, is_inlier, roots, _ORACLE_STEPS)
-    seconds = time.perf_counter() - start
+    seconds = time.process_time() - start
     return Answer(orientations, _residual_score(case, orientations), seconds)
 
 

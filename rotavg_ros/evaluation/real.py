@@ -94,7 +94,7 @@ def agreement(case: Case, chosen: Mapping[str, Contender]) -> Agreement:
 def errors_table(title: str, scores: Scores, names: tuple[str, ...], note: str) -> Table:
     """Errors against the truth, averaged over the cases."""
     rows: list[tuple[Cell, ...]] = [
-        (name, *(scores.mean(name, figure) for figure in ("mean_deg", "median_deg", "accuracy", "seconds")))
+        (name, *(scores.mean(name, figure) for figure in ("mean_deg", "median_deg", "accuracy", "cpu_seconds")))
         for name in names
         if scores.of(name)
     ]
@@ -103,7 +103,7 @@ def errors_table(title: str, scores: Scores, names: tuple[str, ...], note: str) 
         Column("mean °", ".3f"),
         Column("median °", ".3f"),
         Column("outlier accuracy", ".4f"),
-        Column("seconds", ".3f"),
+        Column("CPU s", ".3f"),
     )
     return Table(title, columns, tuple(rows), (note,))
 
@@ -117,7 +117,7 @@ def residual_table(title: str, found: Agreement) -> Table:
             float(residual.mean()),
             100 * float((residual < 5).mean()),
             100 * float((residual > 20).mean()),
-            found.answers[name].seconds,
+            found.answers[name].cpu_seconds,
         )
         for name, residual in found.residual_deg.items()
     ]
@@ -129,7 +129,7 @@ def residual_table(title: str, found: Agreement) -> Table:
         Column("mean °", ".2f"),
         Column("below 5°, %", ".1f"),
         Column("beyond 20°, %", ".1f"),
-        Column("seconds", ".2f"),
+        Column("CPU s", ".2f"),
     )
     note = "Residuals of all edges. A least-squares method lowers the mean at the expense of the quartiles."
     return Table(title, columns, tuple(rows), (note,))

@@ -62,7 +62,10 @@ def table(title: str, scores: Scores, minutes: float) -> Table:
     rows: list[tuple[Cell, ...]] = [
         (
             name,
-            *(scores.mean(name, figure) for figure in ("mean_deg", "median_deg", "accuracy", "roc_area", "seconds")),
+            *(
+                scores.mean(name, figure)
+                for figure in ("mean_deg", "median_deg", "accuracy", "roc_area", "cpu_seconds")
+            ),
             len(scores.of(name)),
         )
         for name in names
@@ -73,7 +76,7 @@ def table(title: str, scores: Scores, minutes: float) -> Table:
         Column("median °", ".1f"),
         Column("outlier accuracy", ".3f"),
         Column("ROC area", ".3f"),
-        Column("seconds", ".3f"),
+        Column("CPU s", ".3f"),
         Column("scenes", "d"),
     )
     note = (

@@ -93,7 +93,9 @@ def report(folder: Path, scores: dict[str, Scores], names: tuple[str, ...], comm
     for setting, of_setting in scores.items():
         about = SETTINGS[setting]
         for name in names:
-            figures = (of_setting.mean(name, figure) for figure in ("mean_deg", "median_deg", "accuracy", "seconds"))
+            figures = (
+                of_setting.mean(name, figure) for figure in ("mean_deg", "median_deg", "accuracy", "cpu_seconds")
+            )
             rows.append((about.title, _TRAINING_TITLES[about.training], name, *figures, len(of_setting.of(name))))
     columns = (
         Column("tested on"),
@@ -102,7 +104,7 @@ def report(folder: Path, scores: dict[str, Scores], names: tuple[str, ...], comm
         Column("mean °", ".2f"),
         Column("median °", ".2f"),
         Column("outlier accuracy", ".4f"),
-        Column("seconds", ".2f"),
+        Column("CPU s", ".2f"),
         Column("graphs", "d"),
         Column("paper: mean °", ".2f"),
     )

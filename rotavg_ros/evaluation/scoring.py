@@ -30,7 +30,7 @@ class Score:
     contender: str
     mean_deg: float
     median_deg: float
-    seconds: float
+    cpu_seconds: float
     accuracy: float
     precision: float
     recall: float
@@ -119,7 +119,7 @@ def score(case: Case, name: str, answer: Answer) -> Score:
         name,
         float(errors_deg.mean()),
         float(np.median(errors_deg)),
-        answer.seconds,
+        answer.cpu_seconds,
         counts.accuracy,
         counts.precision,
         counts.recall,

@@ -6,6 +6,7 @@ import importlib.util
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 from rotavg_ros.baselines.start import spanning_forest
 from rotavg_ros.evaluation import peers
 from rotavg_ros.evaluation.contenders import ContenderError
+from rotavg_ros.evaluation.kept_answers import kept
 from rotavg_ros.evaluation.least_squares import least_squares
 from rotavg_ros.evaluation.metrics import true_edge_noise
 from rotavg_ros.evaluation.slam_cases import SlamCase
@@ -32,12 +34,12 @@ class SlamAnswer:
     Attributes:
         body_from_world: ``(N, 4)``; every component in a gauge of its own.
         is_outlier: ``(M,)`` bool, its verdicts; where it gives none, whether the residual exceeds 10°.
-        seconds: wall-clock time from graph to answer.
+        cpu_seconds: CPU time from graph to answer, of all threads.
     """
 
     body_from_world: Tensor
     is_outlier: np.ndarray
-    seconds: float
+    cpu_seconds: float
 
 
 SlamContender = Callable[[SlamCase], "SlamAnswer | None"]
@@ -90,15 +92,21 @@ def is_available(name: str) -> bool:
     return name not in _PACKAGES or importlib.util.find_spec(_PACKAGES[name]) is not None
 
 
-def contenders(names: Sequence[str]) -> dict[str, SlamContender]:
+def contenders(names: Sequence[str], keep: Path | None = None) -> dict[str, SlamContender]:
     """Contenders by name: a method of the solver, a peer, "odometry", "least-squares" or "oracle".
 
     A contender returns None for a graph on which it gives up.
 
+    Args:
+        keep: folder of answers, to be found again by a later run.
+
     Raises:
         ContenderError: an unknown name, or a peer that is not installed.
     """
-    return {name: _contender(name) for name in names}
+    chosen = {name: _contender(name) for name in names}
+    if keep is None:
+        return chosen
+    return {name: kept(name, run, SlamAnswer, keep, _PACKAGES.get(name)) for name, run in chosen.items()}
 
 
 def _contender(name: str) -> SlamContender:
@@ -116,9 +124,9 @@ def _contender(name: str) -> SlamContender:
 
 
 def _run_method(name: str, case: SlamCase) -> SlamAnswer:
-    start = time.perf_counter()
+    start = time.process_time()
     solution = solve(case.graph, method=name, profile="slam")
-    seconds = time.perf_counter() - start
+    seconds = time.process_time() - start
     return SlamAnswer(solution.body_from_world, (solution.outlier_score > 0.5).numpy(), seconds)
 
 
@@ -129,13 +137,13 @@ def _run_peer(run: Callable[[ViewGraph], peers.PeerAnswer], case: SlamCase) -> S
         return None
     given = answer.is_outlier
     verdicts = _large_residual(case, answer.body_from_world) if given is None else given.numpy()
-    return SlamAnswer(answer.body_from_world, verdicts, answer.seconds)
+    return SlamAnswer(answer.body_from_world, verdicts, answer.cpu_seconds)
 
 
 def _run_reference(run: Callable[[SlamCase], Tensor], case: SlamCase) -> SlamAnswer:
-    start = time.perf_counter()
+    start = time.process_time()
     orientations = run(case)
-    seconds = time.perf_counter() - start
+    seconds = time.process_time() - start
     return SlamAnswer(orientations, _large_residual(case, orientations), seconds)
 
 

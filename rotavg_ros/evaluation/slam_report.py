@@ -53,7 +53,7 @@ def report(
         spoiled = (*classic, *kitti)
         tables["slam-verdicts"] = _verdicts("Verdicts on loop closures", scores, names, spoiled)
         tables["slam-worst"] = _worst("Where it is worst", scores, spoiled)
-    tables["slam-seconds"] = _seconds("Seconds for a whole graph", scores, names)
+    tables["slam-seconds"] = _seconds("CPU seconds for a whole graph", scores, names)
     if incremental:
         tables["slam-incremental"] = slam_live_tables.incremental("Incremental", incremental)
         for run in incremental:
@@ -112,7 +112,7 @@ def _recorded(title: str, scores: SlamScores, names: Sequence[str], graphs: Sequ
                         counts.precision,
                         counts.recall,
                         100 * good_flagged(counts),
-                        row.seconds,
+                        row.cpu_seconds,
                     )
                 )
     columns = (
@@ -122,7 +122,7 @@ def _recorded(title: str, scores: SlamScores, names: Sequence[str], graphs: Sequ
         Column("precision", ".3f"),
         Column("recall", ".3f"),
         Column("good flagged %", ".2f"),
-        Column("seconds", ".3f"),
+        Column("CPU s", ".3f"),
     )
     note = "Methods that give no verdicts are judged by their residuals: a closure with more than 10° is called false."
     return Table(title, columns, tuple(rows), (note,))
@@ -192,7 +192,7 @@ def _seconds(title: str, scores: SlamScores, names: Sequence[str]) -> Table:
         of_graph = SlamScores(tuple(row for row in scores.rows if row.graph_name == graph))
         pairs = of_graph.speed_ratios(OURS, _GNC).values()
         speed_up = [theirs / ours for ours, theirs in pairs]
-        seconds = [of_graph.where(name).mean("seconds") for name in names]
+        seconds = [of_graph.where(name).mean("cpu_seconds") for name in names]
         rows.append((graph, *seconds, geometric_mean(speed_up), min(speed_up, default=float("nan"))))
     columns = (
         Column("graph"),
@@ -217,11 +217,12 @@ def _cases(title: str, scores: SlamScores) -> Table:
             row.counts.false_negatives,
             row.counts.true_negatives,
             row.odometry_flagged,
-            row.seconds,
+            row.cpu_seconds,
         )
         for row in scores.rows
     ]
     headings = (
-        "graph condition seed method error_deg false_flagged good_flagged false_kept good_kept odometry_flagged seconds"
+        "graph condition seed method error_deg false_flagged good_flagged false_kept good_kept odometry_flagged "
+        "cpu_seconds"
     )
     return Table(title, tuple(Column(heading) for heading in headings.split()), tuple(rows))

@@ -35,7 +35,7 @@ class SlamScore:
     floored_deg: float
     counts: OutlierCounts
     odometry_flagged: int
-    seconds: float
+    cpu_seconds: float
 
 
 def score(case: SlamCase, name: str, answer: SlamAnswer) -> SlamScore:
@@ -53,7 +53,7 @@ def score(case: SlamCase, name: str, answer: SlamAnswer) -> SlamScore:
         max(error_deg, float(np.degrees(case.floor))),
         OutlierCounts.of(answer.is_outlier[decided], case.is_false[decided]),
         int((answer.is_outlier & ~case.is_closure & case.is_inlier).sum()),
-        answer.seconds,
+        answer.cpu_seconds,
     )
 
 
@@ -120,8 +120,9 @@ class SlamScores:
 
     def speed_ratios(self, contender: str, other: str) -> dict[str, tuple[float, float]]:
         """Seconds of both by case, where both answered."""
-        theirs = {row.case: row.seconds for row in self.where(other).rows}
-        return {row.case: (row.seconds, theirs[row.case]) for row in self.where(contender).rows if row.case in theirs}
+        theirs = {row.case: row.cpu_seconds for row in self.where(other).rows}
+        ours = {row.case: row.cpu_seconds for row in self.where(contender).rows}
+        return {case: (ours[case], theirs[case]) for case in ours if case in theirs}
 
     def mean(self, figure: str) -> float:
         """Mean of a figure over all rows; NaN without rows."""

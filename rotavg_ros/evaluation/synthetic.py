@@ -138,7 +138,7 @@ def _errors(title: str, scores: Scores, names: Sequence[str]) -> Table:
         rows.append(
             (
                 ROWS.get(name, name),
-                *(scores.mean(name, figure) for figure in ("mean_deg", "median_deg", "seconds")),
+                *(scores.mean(name, figure) for figure in ("mean_deg", "median_deg", "cpu_seconds")),
                 *(scores.ratio(name, FULL_PIPELINE, figure) for figure in ("mean_deg", "median_deg")),
                 published.mean_deg if published else None,
                 published.median_deg if published else None,
@@ -156,7 +156,7 @@ def _errors(title: str, scores: Scores, names: Sequence[str]) -> Table:
         Column("method"),
         Column("mean °", ".2f"),
         Column("median °", ".2f"),
-        Column("seconds", ".2f"),
+        Column("CPU s", ".2f"),
         Column("mean ÷ full pipeline", ".2f"),
         Column("median ÷ full pipeline", ".2f"),
         Column("paper: mean °", ".2f"),
@@ -190,6 +190,6 @@ def classification(title: str, scores: Scores, classifiers: dict[str, str]) -> T
 
 def per_graph(title: str, scores: Scores) -> Table:
     """One row per graph and method."""
-    columns = ("graph", "method", "mean_deg", "median_deg", "seconds", "accuracy", "precision", "recall", "roc_area")
-    rows = [(row.case, row.contender, *(getattr(row, figure) for figure in columns[2:])) for row in scores.rows]
-    return Table(title, tuple(Column(name, ".4f") for name in columns), tuple(rows))
+    figures = ("mean_deg", "median_deg", "cpu_seconds", "accuracy", "precision", "recall", "roc_area")
+    rows = [(row.case, row.contender, *(getattr(row, figure) for figure in figures)) for row in scores.rows]
+    return Table(title, tuple(Column(name, ".4f") for name in ("graph", "method", *figures)), tuple(rows))

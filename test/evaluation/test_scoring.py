@@ -30,7 +30,7 @@ def test_truth_in_another_gauge_scores_zero_degrees(cases: list[Case]) -> None:
     turned = rotations.multiply(case.truth, rotations.random(1, generator=torch.Generator().manual_seed(1)))
     known = score(case, "truth", Answer(turned, (case.noise_angle > np.radians(20)).double(), 0.5))
     assert known.mean_deg == pytest.approx(0, abs=1e-4)
-    assert (known.accuracy, known.precision, known.recall, known.roc_area, known.seconds) == (1, 1, 1, 1, 0.5)
+    assert (known.accuracy, known.precision, known.recall, known.roc_area, known.cpu_seconds) == (1, 1, 1, 1, 0.5)
 
 
 def test_error_of_one_orientation_is_its_angle(cases: list[Case]) -> None:
@@ -64,9 +64,9 @@ def test_ratios_are_of_the_same_cases(cases: list[Case]) -> None:
         return Answer(case.truth, torch.zeros(case.graph.num_edges), 1.0 if case.name == "0" else 9.0)
 
     scores = score_all(cases, {"first": only_first, "always": always})
-    assert scores.ratio("first", "always", "seconds") == 2
-    assert scores.mean("always", "seconds") == 5
-    assert np.isnan(scores.mean("nobody", "seconds"))
+    assert scores.ratio("first", "always", "cpu_seconds") == 2
+    assert scores.mean("always", "cpu_seconds") == 5
+    assert np.isnan(scores.mean("nobody", "cpu_seconds"))
 
 
 def test_scores_of_folds_add_up(cases: list[Case]) -> None:
