@@ -232,6 +232,24 @@ def test_edges_to_what_never_comes_wait_within_bounds(live_node) -> None:
     assert live_node.status["pending"] == "0"
 
 
+def test_a_full_graph_goes_on_and_what_is_left_is_right(live_node) -> None:
+    live_node.start(*EVERY_MESSAGE, "max_keyframes:=30")
+    for index in range(100):
+        live_node.odometry.publish(odometry(index))
+        if index % 10 == 9:
+            live_node.edges.publish(closure(index, index - 9, index))
+    answer = live_node.wait_for_silence()
+    ids = list(answer.keyframe_ids)
+    assert len(ids) <= 30 and ids[0] == 0 and ids[-1] == 99
+    orientations = Rotation.from_quat(np.array(answer.orientations).reshape(-1, 4))
+    truth = Rotation.concatenate([rotation(index) for index in ids])
+    assert (orientations * truth.inv()).magnitude().max() < 1e-6
+    assert int(live_node.status["marginalized keyframes"]) >= 70
+    live_node.edges.publish(closure(1000, 2, 98))  # one of them is surely gone
+    live_node.spin_until(lambda: 1000 in live_node.flags[-1].edge_ids)
+    assert len(live_node.answers[-1].keyframe_ids) == len(ids)
+
+
 def test_a_flood_is_survived_and_every_loss_counted(live_node) -> None:
     """Small queue, best effort: whatever did not come is known to be missing."""
     live_node.start(*EVERY_MESSAGE[:2], "solve_period_s:=0.2", "odometry_queue_depth:=50", reliable_odometry=False)
