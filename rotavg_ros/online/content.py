@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from rotavg_ros.online.problem import Problem
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.online.renumbering import Renumbering
 from rotavg_ros.online.time_jumps import BackwardJumps, LateMessage
+
+if TYPE_CHECKING:
+    from rotavg_ros.solver.slam_memory import SlamMemory
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,7 @@ class Content:
         self.answered = answered
         self.first_version = self.version = version
         self._answered_component: Tensor | None = None
+        self._memory: SlamMemory | None = None
         self._answered_revision = 0
         self._answer_was_cold = True
         self._ticked_revision = 0
@@ -112,6 +117,7 @@ class Content:
     def solve_anew(self) -> None:
         """Let the next tick solve though the graph is the same."""
         self._answered_revision = -1
+        self._memory = None
 
     def next_problem(self, force_cold: bool) -> Problem | None:
         """What is to be solved now; None if the last answer still stands."""
@@ -124,7 +130,7 @@ class Content:
         self._ticked_revision = snapshot.revision
         self._renumbering = None
         cold = force_cold or idle or not self.builder.options.warm_start
-        return Problem(snapshot, cold, self.answered, self._answered_component, self.builder.outlier)
+        return Problem(snapshot, cold, self.answered, self._answered_component, self.builder.outlier, self._memory)
 
     def accept(
         self,
@@ -133,6 +139,7 @@ class Content:
         outlier: NDArray[np.bool_],
         revision: int,
         was_cold: bool,
+        memory: SlamMemory | None,
     ) -> None:
         """Make the answer to the last problem the last answer.
 
@@ -140,11 +147,12 @@ class Content:
             body_from_world, component, outlier: orientations ``(N, 4)``, components ``(N,)`` and flags ``(M,)``.
             revision: of the graph that they are about.
             was_cold: solved from scratch.
+            memory: what the solver remembers of it; after a renumbering it fits no graph, and the solver sees that.
         """
         self.answered, self._answered_component, self.builder.outlier = body_from_world, component, outlier
         if self._renumbering is not None:
             self._renumber_answer(self._renumbering)
-        self._answered_revision, self._answer_was_cold = revision, was_cold
+        self._answered_revision, self._answer_was_cold, self._memory = revision, was_cold, memory
         self.version += 1
         self._world_from_odometry = corrections(self.builder, self.answered)
 

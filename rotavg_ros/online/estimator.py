@@ -243,6 +243,7 @@ class OnlineEstimator:
                 device=options.device,
                 refinement_steps=options.refinement_steps,
                 warm_start=warm_start,
+                memory=None if warm_start is None else problem.memory,
             )
             component = solution.component.cpu()
             with self._lock:
@@ -262,7 +263,7 @@ class OnlineEstimator:
             with self._lock:
                 if content is not self._content:
                     return None  # reset or loaded meanwhile
-                content.accept(body_from_world, component, answer.outlier, snapshot.revision, was_cold)
+                content.accept(body_from_world, component, answer.outlier, snapshot.revision, was_cold, solution.memory)
                 if options is not self.options:
                     content.solve_anew()
             return answer

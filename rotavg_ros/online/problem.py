@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,9 @@ from torch import Tensor
 
 from rotavg_ros.online.gauge import extend_along_edges, joins_components
 from rotavg_ros.online.growing_view_graph import GraphSnapshot
+
+if TYPE_CHECKING:
+    from rotavg_ros.solver.slam_memory import SlamMemory
 
 # While data flows, a flag changes only if the score passes the threshold by this share of the way to 0 or 1: on a
 # real robot's graph that halves the changes, and no more flags are wrong.
@@ -26,6 +30,7 @@ class Problem:
         answered: body_from_world ``(n, 4)`` of the last answer, for the first keyframes; None before the first.
         component: ``(n,)`` of the last answer; None where it is not known.
         outlier: ``(m,)`` flags of the last answer, of the first edges.
+        memory: what the solver remembers of the last answer.
     """
 
     snapshot: GraphSnapshot
@@ -33,6 +38,7 @@ class Problem:
     answered: Tensor | None
     component: Tensor | None
     outlier: NDArray[np.bool_]
+    memory: SlamMemory | None
 
     def warm_start(self) -> Tensor | None:
         """The last answer carried on to all keyframes ``(N, 4)``; None where it is no good start."""

@@ -22,6 +22,7 @@ class TreeSolution:
     method: str = "tree"
     profile: str = "slam"
     device: str = "cpu"
+    memory: None = None
 
 
 @dataclass
