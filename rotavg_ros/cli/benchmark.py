@@ -2,7 +2,8 @@
 
 Every contender runs in a process of its own, after a tiny graph that pays what a process pays once. Errors count
 against the truth. Contenders that would take too long of the given minutes are left out, and the report says so.
-With --soak, a live node holds a graph of 10 000 keyframes while odometry arrives over DDS.
+With --soak, a live node holds a graph of 10 000 keyframes while odometry arrives over DDS; with --soak --hours, the
+estimator drives for so long in this process, as fast as it goes.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from pathlib import Path
 import torch
 
 from rotavg_ros.cli.arguments import positive_number, positive_whole_number
+from rotavg_ros.errors import UserError
+from rotavg_ros.evaluation import long_run
 from rotavg_ros.evaluation.benchmark import report, schedule
 from rotavg_ros.evaluation.benchmark.cases import FAMILIES
 from rotavg_ros.evaluation.tables import Table, make_folder, write_report
@@ -40,6 +43,16 @@ CPU time says more. The load average was {load} before the run.
 """
 
 
+_HOURS_INTRODUCTION = """\
+The estimator in this process: odometry at 50 Hz of a robot that drives a figure of eight of 200 s again and again, a
+loop closure a second to a moment some laps ago, 20 % of them false, a tick every five minutes. Memory is what the
+process has grown by since its first, tiny solve; what a tick needs for itself is part of it. Errors are against the
+truth. The load average was {load} before the run.
+
+`{command}`
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``rotavg benchmark``."""
     parser.add_argument(
@@ -61,14 +74,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--keyframes", type=positive_whole_number, default=10_000, metavar="N", help="of a soak (default: 10000)"
     )
+    parser.add_argument(
+        "--hours",
+        type=positive_number,
+        metavar="H",
+        help="of a soak: so long a drive through the estimator, without DDS, for memory",
+    )
+    parser.add_argument(
+        "--max-keyframes", type=positive_whole_number, metavar="N", help="of such a drive (default: the node's)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure and report."""
     if arguments.threads is not None:
         torch.set_num_threads(arguments.threads)
+    if arguments.hours is not None and not arguments.soak:
+        raise UserError("--hours is of a soak; add --soak")
     make_folder(arguments.output)
-    print(_soak(arguments) if arguments.soak else _benchmark(arguments))
+    if arguments.hours is not None:
+        print(_long_run(arguments))
+    else:
+        print(_soak(arguments) if arguments.soak else _benchmark(arguments))
     return 0
 
 
@@ -106,6 +133,21 @@ def _soak(arguments: argparse.Namespace) -> Path:
         "The node under load",
         introduction,
         {"benchmark-soak": soak.table(rows)},
+        {},
+    )
+
+
+def _long_run(arguments: argparse.Namespace) -> Path:
+    load = _load()
+    rows = long_run.run(arguments.hours, arguments.max_keyframes)
+    limit = "" if arguments.max_keyframes is None else f" --max-keyframes {arguments.max_keyframes}"
+    name = "benchmark-hours" if arguments.max_keyframes is None else f"benchmark-hours-{arguments.max_keyframes}"
+    return write_report(
+        arguments.output,
+        name,
+        "Hours of driving",
+        _HOURS_INTRODUCTION.format(load=load, command=f"rotavg benchmark --soak --hours {arguments.hours:g}{limit}"),
+        {name: long_run.table("Memory and accuracy", rows)},
         {},
     )
 

@@ -76,3 +76,13 @@ def test_what_takes_too_long_is_left_out_and_said(monkeypatch: pytest.MonkeyPatc
     table = report.time_table("sfm-sparse", results)
     assert "COLMAP: 1000 nodes and about 10000 edges: not run" in table.to_markdown()
     assert np.isclose(float(str(table.rows[0][7])), 1.0)
+
+
+def test_hours_of_driving_with_a_limit(tmp_path: Path) -> None:
+    options = ["--soak", "--hours", "0.25", "--max-keyframes", "400"]
+    assert main(["benchmark", *options, "--output", str(tmp_path)]) == 0
+    with (tmp_path / "benchmark-hours-400.csv").open() as file:
+        last = list(csv.DictReader(file))[-1]
+    assert int(last["keyframes"]) <= 400 and int(last["marginalised"]) > 500
+    assert float(last["error °"]) < 0.8 * float(last["odometry's °"])
+    assert main(["benchmark", "--hours", "1", "--output", str(tmp_path)]) == 2
