@@ -1,7 +1,8 @@
 """Time the solver beside COLMAP and GTSAM on the same graphs; write tables (Markdown, CSV) and scaling pictures.
 
 Every contender runs in a process of its own, after a tiny graph that pays what a process pays once. Errors count
-against the truth. Contenders that would take too long of the given minutes are left out, and the report says so.
+against the truth. Contenders that would take too long of the given minutes are left out, and the report says so. One
+size by itself: --families sfm-dense --min-pairs 7000000 --max-pairs 9000000 --contenders neurora.
 With --soak, a live node holds a graph of 10 000 keyframes while odometry arrives over DDS; with --soak --hours, the
 estimator drives for so long in this process, as fast as it goes.
 """
@@ -18,19 +19,26 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation import long_run
 from rotavg_ros.evaluation.benchmark import report, schedule
 from rotavg_ros.evaluation.benchmark.cases import FAMILIES
+from rotavg_ros.evaluation.benchmark.measure import ENOUGH_S, LABELS
 from rotavg_ros.evaluation.tables import Table, make_folder, write_report
 
+# The load average below which nothing else ran to speak of.
+_QUIET_LOAD = 0.5
+_QUIET = ": nothing else ran to speak of."
+_BUSY = """:
+other work ran besides, so wall-clock times say little, CPU times are inflated by shared caches, and several threads
+by waiting for each other. Ratios with a peer in the same run are what counts."""
 _INTRODUCTION = """\
-Medians over {repeats} solves of the same process (one, from a million edges), after a warm-up on a triangle; graph in
-memory → orientations in memory; {threads} for every solver. CPU seconds are those of all threads. On a machine that
-does other work besides, wall-clock times say little, CPU times are inflated by shared caches, and several threads by
-waiting for each other; ratios with a peer that was measured in the same run, on one thread, are what counts. Peak
-memory is the whole process's, with interpreter, libraries and the graph; beside it what it was before the first solve.
-Errors are against the truth after one rotation of the world. The load average was {load} before the run.
+Medians over the solves of a process, {repeats} or as many as begin within {enough:g} s, after a warm-up on a triangle;
+graph in memory → orientations in memory; {threads} for every solver. CPU seconds are those of all threads. Peak
+memory is the whole process's, with interpreter, libraries and the graph; beside it what it was before the first
+solve. Errors are against the truth after one rotation of the world. GNC gets the odometry as known inliers and as its
+start, and the precisions that the graph states; it and Shonan are timed without what it takes to build their graphs.
+
+The load average was {load} before the run{quiet}
 
 `{command}`
 """
-
 
 _SOAK_INTRODUCTION = """\
 The installed node over DDS, in a process of its own. It holds a simulated city with as many loop closures as
@@ -63,7 +71,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--minutes", type=positive_number, default=20.0, help="about how long in all (default: 20)")
     parser.add_argument(
+        "--min-pairs", type=positive_whole_number, default=1, metavar="N", help="edges at least (default: 1)"
+    )
+    parser.add_argument(
         "--max-pairs", type=positive_whole_number, default=8_000_000, metavar="N", help="edges at most (default: 8e6)"
+    )
+    parser.add_argument(
+        "--contenders", nargs="+", choices=tuple(LABELS), default=list(LABELS), help="default: all of them"
     )
     parser.add_argument("--repeats", type=positive_whole_number, default=5, metavar="N", help="default: 5")
     parser.add_argument("--threads", type=positive_whole_number, metavar="N", help="CPU threads (default: torch's)")
@@ -101,21 +115,36 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _benchmark(arguments: argparse.Namespace) -> Path:
     load = _load()
-    results = schedule.run(arguments.families, arguments.minutes, arguments.max_pairs, arguments.repeats)
+    results = schedule.run(
+        arguments.families,
+        arguments.minutes,
+        (arguments.min_pairs, arguments.max_pairs),
+        arguments.repeats,
+        arguments.contenders,
+    )
     tables: dict[str, Table] = {}
+    results = {family: of_family for family, of_family in results.items() if of_family}
     for family, of_family in results.items():
         table = report.recipe_table(of_family) if family == "recipe" else report.time_table(family, of_family)
         tables[f"benchmark-{family}"] = table
     tables["benchmark-stages"] = report.stage_table(results)
     picture = "benchmark-scaling.png"
     report.draw_scaling(arguments.output / picture, results)
+    threads = torch.get_num_threads()
     command = (
         f"rotavg benchmark --families {' '.join(arguments.families)} --minutes {arguments.minutes:g} "
-        f"--max-pairs {arguments.max_pairs} --repeats {arguments.repeats} --threads {torch.get_num_threads()}"
+        f"--min-pairs {arguments.min_pairs} --max-pairs {arguments.max_pairs} "
+        f"--contenders {' '.join(arguments.contenders)} --repeats {arguments.repeats} --threads {threads}"
     )
-    count = torch.get_num_threads()
-    threads = "one thread" if count == 1 else f"{count} threads"
-    introduction = _INTRODUCTION.format(repeats=arguments.repeats, threads=threads, load=load, command=command)
+    introduction = _INTRODUCTION.format(
+        repeats=arguments.repeats,
+        enough=ENOUGH_S,
+        threads="one thread" if threads == 1 else f"{threads} threads",
+        load=load,
+        quiet=_QUIET if float(load.split()[0]) < _QUIET_LOAD else _BUSY,
+        command=command,
+    )
+    introduction += "".join(f"\n- {line}" for line in report.summary(results))
     pictures = {picture: "Time, error and memory over the number of edges"}
     return write_report(arguments.output, "benchmark", "Speed and memory", introduction, tables, pictures)
 

@@ -129,6 +129,18 @@ FAMILIES = {
         _draw_recipe,
         ("neurora", "neurora-paper", "neurora-cuda", "colmap"),
     ),
+    "sfm-sparse": Family(
+        "SfM, sparse: 20 neighbours a camera",
+        tuple(Case("sfm-sparse", nodes, 10 * nodes) for nodes in (100, 250, 1000, 2500, 10_000, 25_000)),
+        _draw_sfm,
+        _SFM,
+    ),
+    "slam": Family(
+        "SLAM: a city, one loop closure a keyframe, a tenth of them false",
+        tuple(Case("slam", nodes, 2 * nodes) for nodes in (100, 250, 1000, 2500, 10_000, 25_000)),
+        _draw_city,
+        ("neurora", "gnc", "colmap"),
+    ),
     "sfm-dense": Family(
         "SfM, dense: 25 % of all pairs up to 1000 cameras, then 10, 5, 2.5 %",
         (
@@ -141,17 +153,5 @@ FAMILIES = {
         _draw_sfm,
         _SFM,
         share=4.0,
-    ),
-    "sfm-sparse": Family(
-        "SfM, sparse: 20 neighbours a camera",
-        tuple(Case("sfm-sparse", nodes, 10 * nodes) for nodes in (100, 250, 1000, 2500, 10_000, 25_000)),
-        _draw_sfm,
-        _SFM,
-    ),
-    "slam": Family(
-        "SLAM: a city, one loop closure a keyframe, a tenth of them false",
-        tuple(Case("slam", nodes, 2 * nodes) for nodes in (100, 250, 1000, 2500, 10_000, 25_000)),
-        _draw_city,
-        ("neurora", "gnc", "colmap"),
     ),
 }

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from rotavg_ros.evaluation.benchmark.cases import FAMILIES
-from rotavg_ros.evaluation.benchmark.measure import LABELS, Measurement
+from rotavg_ros.evaluation.benchmark.measure import LABELS, OURS, Measurement
 from rotavg_ros.evaluation.benchmark.schedule import NO_GPU, Result
 from rotavg_ros.evaluation.plots import MUTED, PALETTE, style
 from rotavg_ros.evaluation.tables import Cell, Column, Table
@@ -21,6 +21,7 @@ _COLUMNS = (
     Column("nodes"),
     Column("edges"),
     Column("solver"),
+    Column("solves"),
     Column("s", ".3f"),
     Column("fastest", ".3f"),
     Column("slowest", ".3f"),
@@ -42,6 +43,33 @@ def time_table(family: str, results: Sequence[Result]) -> Table:
             ratio = None if reference is None else _cpu(measured) / _cpu(reference)
             rows.append(_row(contender, measured, ratio))
     return Table(FAMILIES[family].title, _COLUMNS, tuple(rows), _missing(results))
+
+
+def summary(results: Mapping[str, Sequence[Result]]) -> list[str]:
+    """How we compare with every peer, in words: on the largest graph that both have solved, and where it is ahead."""
+    lines = []
+    for family, of_family in results.items():
+        title = FAMILIES[family].title.partition(":")[0]
+        for peer in FAMILIES[family].contenders:
+            both = [one.measured for one in of_family if _REFERENCE in one.measured and peer in one.measured]
+            if peer not in OURS and both:
+                lines.append(_against(title, peer, [(one[_REFERENCE], one[peer]) for one in both]))
+    return lines
+
+
+def _against(title: str, peer: str, pairs: Sequence[tuple[Measurement, Measurement]]) -> str:
+    """One line; pairs are of ours and the peer's."""
+    ours, theirs = max(pairs, key=lambda pair: pair[0].edges)
+    cpu, wall = _cpu(theirs) / _cpu(ours), _wall(theirs) / _wall(ours)
+    line = (
+        f"{title}, {LABELS[peer]}: on the largest graph that both solved ({ours.nodes} nodes, {ours.edges} edges) it "
+        f"takes {cpu:.1f} times rotavg's CPU time and {wall:.1f} times its wall-clock time, for a mean error of "
+        f"{theirs.mean_deg:.2f}° (rotavg {ours.mean_deg:.2f}°)"
+    )
+    faster = [f"{ours.edges} edges" for ours, theirs in pairs if _cpu(theirs) < _cpu(ours)]
+    better = [f"{ours.edges} edges" for ours, theirs in pairs if theirs.mean_deg < ours.mean_deg]
+    losses = [f"{what} at {', '.join(where)}" for what, where in (("faster", faster), ("more exact", better)) if where]
+    return f"{line}; it is {' and '.join(losses)}." if losses else f"{line}; nowhere is it faster or more exact."
 
 
 def recipe_table(results: Sequence[Result]) -> Table:
@@ -112,6 +140,7 @@ def _row(contender: str, measured: Measurement, ratio: float | None) -> tuple[Ce
         measured.nodes,
         measured.edges,
         LABELS[contender],
+        len(measured.wall_seconds),
         _wall(measured),
         min(measured.wall_seconds),
         max(measured.wall_seconds),

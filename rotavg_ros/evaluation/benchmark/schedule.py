@@ -9,27 +9,25 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
 
 from rotavg_ros.evaluation.benchmark.cases import FAMILIES, Case, Family, save
-from rotavg_ros.evaluation.benchmark.measure import LABELS, OURS, Measurement
+from rotavg_ros.evaluation.benchmark.measure import ENOUGH_S, LABELS, OURS, Measurement
 from rotavg_ros.evaluation.contenders import is_available
 
 NO_GPU = "no GPU"
-# Costs grow a little faster than the number of edges.
+# Solves grow a little faster than the number of edges.
 _GROWTH = 1.2
 # A process beyond so many times its expected seconds is ended.
 _PATIENCE = 8.0
 _MIN_TIMEOUT_S = 120.0
-# What a contender may take of the time that is left.
-_SHARE_OF_REST = 0.35
+# What a peer may take of the time that is left: the largest graphs come last, and some must be left for them.
+_SHARE_OF_REST = 0.15
 # Who spreads work over threads reads one of these.
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-# Graphs of more edges are solved once.
-_FEW_REPEATS = 1_000_000
 # What drawing the graph takes is learnt like what a contender takes.
 _DRAWING = "drawing"
 
@@ -43,25 +41,42 @@ class Result:
     missing: dict[str, str] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class _Pace:
+    """How long a contender takes: seconds of a process before it solves, and of every edge for loading and solving."""
+
+    start_up: float
+    loading: float
+    solving: float
+
+
 @dataclass
 class _Budget:
     """The time that is left, and what is known of how long things take."""
 
     deadline: float
-    # Seconds of the shortest process so far: what one takes to start.
-    start_up: float = float("inf")
-    # Seconds beyond that per edge to the power of _GROWTH, by contender.
-    rate: dict[str, float] = field(default_factory=dict)
+    repeats: int
+    pace: dict[str, _Pace] = field(default_factory=dict)
 
     def expected(self, case: Case, contender: str) -> float:
-        """Seconds, 0 where nothing is known."""
-        if contender not in self.rate:
+        """Seconds of the whole process, 0 where nothing is known."""
+        if contender not in self.pace:
             return 0.0
-        return self.start_up + self.rate[contender] * float(case.expected_edges**_GROWTH)
+        pace = self.pace[contender]
+        solve = pace.solving * float(case.expected_edges**_GROWTH)
+        solves = min(self.repeats, 1 + int(ENOUGH_S / max(solve, 1e-9)))
+        return pace.start_up + pace.loading * case.expected_edges + solves * solve
 
-    def learn(self, case: Case, contender: str, seconds: float) -> None:
-        self.start_up = min(self.start_up, seconds)
-        self.rate[contender] = (seconds - self.start_up) / float(case.expected_edges**_GROWTH)
+    def learn(self, case: Case, contender: str, seconds: float, solves: Sequence[float]) -> None:
+        """From a process that took ``seconds``, ``solves`` of them for solving."""
+        besides = max(seconds - sum(solves), 0.0)
+        start_up = min(besides, self.pace[contender].start_up if contender in self.pace else besides)
+        solving = max(solves, default=0.0) / float(case.expected_edges**_GROWTH)
+        self.pace[contender] = _Pace(start_up, (besides - start_up) / case.expected_edges, solving)
+
+    def give_up(self, contender: str) -> None:
+        """It failed; on larger graphs it would fail again."""
+        self.pace[contender] = _Pace(float("inf"), 0.0, 0.0)
 
     @property
     def left(self) -> float:
@@ -69,15 +84,21 @@ class _Budget:
 
 
 def run(
-    families: Sequence[str], minutes: float, max_pairs: int, repeats: int, say: Callable[[str], None] = print
+    families: Sequence[str],
+    minutes: float,
+    pairs: tuple[int, int],
+    repeats: int,
+    contenders: Sequence[str] = tuple(LABELS),
+    say: Callable[[str], None] = print,
 ) -> dict[str, list[Result]]:
-    """Measure; families get their shares of the time.
+    """Measure; families get their shares of the time, and what those before them have left.
 
     Args:
         families: of :data:`FAMILIES`.
         minutes: about how long in all.
-        max_pairs: larger graphs are left out.
-        repeats: solves per process; of large graphs fewer.
+        pairs: graphs of fewer or more edges are left out.
+        repeats: solves per process at most.
+        contenders: of :data:`LABELS`; others are left out.
         say: told of every measurement.
     """
     results = {}
@@ -86,18 +107,17 @@ def run(
     with tempfile.TemporaryDirectory(prefix="rotavg-benchmark-") as folder:
         for name in families:
             spent += FAMILIES[name].share
-            budget = _Budget(start + 60 * minutes * spent / total)
-            results[name] = _run_family(FAMILIES[name], budget, max_pairs, repeats, Path(folder), say)
+            budget = _Budget(start + 60 * minutes * spent / total, repeats)
+            family = FAMILIES[name]
+            cases = tuple(case for case in family.cases if pairs[0] <= case.expected_edges <= pairs[1])
+            chosen = tuple(name for name in family.contenders if name in contenders)
+            results[name] = _run_family(replace(family, cases=cases, contenders=chosen), budget, Path(folder), say)
     return results
 
 
-def _run_family(
-    family: Family, budget: _Budget, max_pairs: int, repeats: int, folder: Path, say: Callable[[str], None]
-) -> list[Result]:
+def _run_family(family: Family, budget: _Budget, folder: Path, say: Callable[[str], None]) -> list[Result]:
     results = []
     for case in family.cases:
-        if case.expected_edges > max_pairs:
-            continue
         result = Result(case)
         results.append(result)
         for contender in family.contenders:
@@ -112,15 +132,15 @@ def _run_family(
         drawing = time.monotonic() - began
         for contender in runnable:
             began = time.monotonic()
-            outcome = _measure(path, contender, repeats if case.expected_edges < _FEW_REPEATS else 1, case, budget)
+            outcome = _measure(path, contender, case, budget)
             if isinstance(outcome, Measurement):
                 result.measured[contender] = outcome
-                budget.learn(case, contender, time.monotonic() - began)
+                budget.learn(case, contender, time.monotonic() - began, outcome.wall_seconds)
                 say(_line(case, outcome))
             else:
                 result.missing[contender] = outcome
-                budget.rate[contender] = float("inf")
-        budget.learn(case, _DRAWING, drawing + budget.start_up)
+                budget.give_up(contender)
+        budget.learn(case, _DRAWING, drawing, [drawing])
         path.unlink()
     return results
 
@@ -139,9 +159,10 @@ def _why_not(case: Case, contender: str, budget: _Budget) -> str | None:
     return None
 
 
-def _measure(path: Path, contender: str, repeats: int, case: Case, budget: _Budget) -> Measurement | str:
+def _measure(path: Path, contender: str, case: Case, budget: _Budget) -> Measurement | str:
     """Run one process; what went wrong in its place."""
-    command = [sys.executable, "-m", "rotavg_ros.evaluation.benchmark.measure", str(path), contender, str(repeats)]
+    command = [sys.executable, "-m", "rotavg_ros.evaluation.benchmark.measure", str(path), contender]
+    command.append(str(budget.repeats))
     timeout = max(_MIN_TIMEOUT_S, _PATIENCE * budget.expected(case, contender))
     threads = dict.fromkeys(_THREAD_VARIABLES, str(torch.get_num_threads()))
     try:
