@@ -8,8 +8,10 @@ from collections.abc import Iterable
 
 # Beyond 101 DDS ports would collide with the system's ephemeral ones.
 DOMAIN_IDS = range(1, 102)
-# Of the RTPS specification: where a domain's participants listen for each other.
+# Of the RTPS specification: where a domain's participants listen for each other, all of them at the first port (but not
+# those that keep to this machine), the first few each at one of the others.
 _BASE_PORT, _PORTS_PER_DOMAIN = 7400, 250
+_DISCOVERY_PORTS = (0, 10, 12, 14)
 
 
 def free_domain_id(candidates: Iterable[int] | None = None) -> int:
@@ -22,10 +24,15 @@ def free_domain_id(candidates: Iterable[int] | None = None) -> int:
         RuntimeError: all are in use.
     """
     for domain in random.sample(DOMAIN_IDS, len(DOMAIN_IDS)) if candidates is None else candidates:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind(("", _BASE_PORT + _PORTS_PER_DOMAIN * domain))
-            except OSError:
-                continue
+        if all(_is_free(_BASE_PORT + _PORTS_PER_DOMAIN * domain + offset) for offset in _DISCOVERY_PORTS):
             return domain
     raise RuntimeError("every ROS domain id that may be used is in use on this machine")
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("", port))
+        except OSError:
+            return False
+    return True

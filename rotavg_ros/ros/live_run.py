@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
+from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
@@ -45,8 +46,9 @@ def installed_node() -> Path:
     return executable
 
 
+@cache
 def keep_to_this_machine() -> None:
-    """Let this process and those it starts talk among themselves only: own domain, no network."""
+    """Let this process and those it starts talk among themselves only: own domain, no network; once for all."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
 
