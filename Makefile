@@ -16,7 +16,7 @@ demo: setup
 # make test [ARGS="-k node -x"]; without ARGS several files at a time: those over DDS mostly wait
 test:
 	@$(PYTHON) tools/setup_environment.py --for-tests
-	@$(BIN)/python -m pytest $(if $(strip $(ARGS)),$(ARGS),-n 4 --dist loadfile)
+	@$(BIN)/python -m pytest $(if $(strip $(ARGS)),$(ARGS),-n 3 --dist loadfile)
 
 # make bench [ARGS="--minutes 5 --max-pairs 200000"]: beside COLMAP and GTSAM, and the node under load; docs/results/
 bench: setup

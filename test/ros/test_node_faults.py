@@ -284,7 +284,7 @@ def test_a_flood_is_survived_and_every_loss_counted(live_node) -> None:
 )
 def test_a_mistake_at_the_start_is_one_line_and_exit_code_2(parameter: str, message: str) -> None:
     command = [NODE, "--ros-args", "-p", parameter]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert ended.returncode == 2, ended.stderr
     assert message in ended.stderr
     assert ended.stderr.startswith("rotavg_node: error: ") and ended.stderr.count("\n") == 1
@@ -294,7 +294,7 @@ def test_a_parameter_file_speaks_to_the_node_in_its_namespace(tmp_path: Path) ->
     path = tmp_path / "fleet.yaml"
     path.write_text(to_yaml(NodeParameters(), "/fleet/a/rotavg").replace("gauge: ", "gauge: up # "))
     command = [NODE, "--ros-args", "-r", "__ns:=/fleet/a", "--params-file", path]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert (ended.returncode, ended.stdout) == (2, "")
     assert ended.stderr == "rotavg_node: error: gauge is 'up'; choose from odometry, identity\n"
 
@@ -304,7 +304,7 @@ def test_a_foreign_state_file_is_refused_at_the_start(tmp_path: Path) -> None:
     np.savez(path, something=np.arange(3))
     content = path.read_bytes()
     command = [NODE, "--ros-args", "-p", f"state_file:={path}"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert ended.returncode == 2 and str(path) in ended.stderr and ended.stderr.count("\n") == 1
     assert path.read_bytes() == content
 

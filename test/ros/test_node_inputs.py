@@ -125,7 +125,7 @@ def test_graphs_of_other_systems(foreign_packages, live_node, start_process) -> 
 
 def test_a_package_that_is_not_installed_is_one_line() -> None:
     words = ["-p", f"edge_topics:=['{MAP_GRAPH}']", "-p", "keyframe_source:=edges"]
-    ended = subprocess.run([NODE, "--ros-args", *words], capture_output=True, text=True, timeout=60, check=False)
+    ended = subprocess.run([NODE, "--ros-args", *words], capture_output=True, text=True, timeout=300, check=False)
     assert ended.returncode == 2
     assert "install the package rtabmap_msgs" in ended.stderr and len(ended.stderr.splitlines()) == 1
 

@@ -51,7 +51,7 @@ class Listener:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
 
-    def spin_until(self, condition: Callable[[], bool], timeout: float = 60.0) -> None:
+    def spin_until(self, condition: Callable[[], bool], timeout: float = 300.0) -> None:
         deadline = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < deadline, f"{len(self.odometry)} odometry, {len(self.edges)} edges so far"
