@@ -57,6 +57,13 @@ _PRIOR_CLOSURE_SQUARE = np.radians(0.08) ** 2
 # the fit may raise that estimate by this factor at most, and not at all once closures are seen to err together.
 _MAX_STEP_VARIANCE_GAIN = 1.5
 _MIN_COMMON_SHARE = 0.06
+# This share of the good closures errs more than the others, and of what the rest predicts of them, by so many times the
+# variance; less where that would look like a false one. Else a closure that alone ties a long loop is called false for
+# an error of a degree, or for odometry that did not drift evenly.
+_TAIL_SHARE = 0.1
+_TAIL_RATIO = 16.0
+_MAX_TAIL_VARIANCE = np.radians(1.5) ** 2
+_MAX_PREDICTED_TAIL_VARIANCE = np.radians(3.0) ** 2
 
 
 @dataclass(frozen=True)
@@ -187,6 +194,8 @@ class _State:
         self._measured = graph.residual.t().contiguous()
         self._source, self._target = torch.from_numpy(graph.source), torch.from_numpy(graph.target)
         self.residual = self._residual_vectors()
+        # Of every edge if it is good: that it is no worse than most, and by how much less it weighs for that.
+        self.exact_share, self.exactness = np.ones(len(graph.source)), np.ones(len(graph.source))
         self.passes = 0
         self._changed = 1.0
         self.prediction_variance = np.full(len(graph.source), np.inf)
@@ -252,7 +261,7 @@ class _State:
         """
         graph, noise = self.graph, self.noise
         variance = graph.steps * np.where(graph.is_odometry, noise.step_variance, noise.closure_variance)
-        weight = np.maximum(self.inlier_probability, 1e-9) / variance
+        weight = np.maximum(self.inlier_probability * self.exactness, 1e-9) / variance
         # A pass after one that has not settled weighs as that did.
         if self.passes == 0 or not np.array_equal(weight, self._system.weight):
             is_near = self._changed < _NEAR and graph.num_nodes >= _ITERATING_PAYS
@@ -279,8 +288,9 @@ class _State:
         step_variance, closure_variance = noise.step_variance, noise.closure_variance
         if not self.hold_noise:
             step_variance = min(max_step_variance, _step_variance(square_per_step, redundancy[odometry], noise))
+            exact = self.exact_share[closure]
             closure_variance = _closure_variance(
-                square[closure], self.inlier_probability[closure], redundancy[closure], noise
+                square[closure], self.inlier_probability[closure] * exact, redundancy[closure] * exact, noise
             )
         share = outlier_share(self.inlier_probability[closure])
         self.noise = NoiseModel(noise.components, step_variance, closure_variance, share)
@@ -289,7 +299,17 @@ class _State:
         predicted_square = np.minimum(square / (1 - leverage) ** 2, np.pi**2)
         scale = np.where(odometry, 1.0, self.noise.closure_variance / noise.closure_variance)
         predicted_variance = scale * variance + self.prediction_variance
-        judged = self.noise.inlier_log_odds(predicted_square, predicted_variance) + self.noise.prior_log_odds
+        judged = self.noise.inlier_log_odds(predicted_square, predicted_variance)
+        tail = _tail_ratio(self.noise.closure_variance)
+        if tail > 1:
+            bound = np.maximum(_MAX_PREDICTED_TAIL_VARIANCE, self.prediction_variance)
+            tail_variance = tail * scale * variance + np.minimum(tail * self.prediction_variance, bound)
+            exact = judged + np.log1p(-_TAIL_SHARE)
+            inexact = self.noise.inlier_log_odds(predicted_square, tail_variance) + np.log(_TAIL_SHARE)
+            judged = np.logaddexp(exact, inexact)
+            self.exact_share = np.where(closure, expit(exact - inexact), 1.0)
+            self.exactness = self.exact_share + (1 - self.exact_share) / tail
+        judged = judged + self.noise.prior_log_odds
         probability = np.where(closure, expit(judged + self.prior_log_odds), self.inlier_probability)
         self._changed = changed = float(np.abs(probability - self.inlier_probability).max(initial=0.0))
         self.inlier_probability = probability
@@ -324,6 +344,11 @@ class _State:
         if_false = exceedance(self._discrepancy, self.prediction_variance, OUTLIER_ANGLE, noise.components)
         wrong = good * if_good + (1 - good) * if_false
         return np.asarray(np.where(self.graph.is_closure, wrong, 1 - good))
+
+
+def _tail_ratio(closure_variance: float) -> float:
+    """By how much larger the variance of the worse ones among good closures is."""
+    return float(np.clip(_MAX_TAIL_VARIANCE / closure_variance, 1.0, _TAIL_RATIO))
 
 
 def _step_variance(square: np.ndarray, redundancy: np.ndarray, noise: NoiseModel) -> float:
