@@ -96,9 +96,8 @@ def _candidates(
 def _best_set(cost: TruncatedCost, residual: Tensor, turn: Tensor, costs: np.ndarray) -> np.ndarray:
     """``(K,)`` bool: the nodes to turn by ``turn`` ``(4,)``, by a minimum cut."""
     source, target, num_nodes = cost.graph.source, cost.graph.target, cost.graph.num_nodes
-    every = turn.expand(len(residual), 4)
-    if_target = cost.of_edges(rotations.multiply(rotations.inverse(every), residual))
-    if_source = cost.of_edges(rotations.multiply(residual, every))
+    # Real parts of turn⁻¹ ∘ residual and of residual ∘ turn.
+    if_target, if_source = cost.of_cosines(residual @ turn), cost.of_cosines(residual @ rotations.inverse(turn))
     # Submodularity asks that turning one end or the other costs no less than turning neither or both.
     bound = 2 * costs
     raise_source = if_target < if_source

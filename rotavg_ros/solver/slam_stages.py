@@ -87,10 +87,11 @@ def prepare(graph: ViewGraph, *, scale_estimation: bool = True) -> Prepared:
     prepared, forest = _contract(graph, scale_estimation)
     if scale_estimation and prepared.noise.outlier_share > _BIASED_SHARE:
         noise = noise_between_neighbours(prepared.pairs, prepared.noise.components)
-        corrected = graph
-        for _ in range(_BIAS_ROUNDS):
-            contracted, forest = _contract(corrected, scale_estimation)
-            corrected = without_bias(corrected, estimate_bias(corrected, forest, contracted.closure_graph, noise))
+        corrected, closure_graph = graph, prepared.closure_graph
+        for number in range(_BIAS_ROUNDS):
+            if number > 0:
+                closure_graph, forest = draw_together(corrected)
+            corrected = without_bias(corrected, estimate_bias(corrected, forest, closure_graph, noise))
         unbiased, _ = _contract(corrected, scale_estimation)
         fewer_disagree = unbiased.noise.outlier_share < prepared.noise.outlier_share - _BIAS_GAIN
         if fewer_disagree and unbiased.noise.step_variance < prepared.noise.step_variance:

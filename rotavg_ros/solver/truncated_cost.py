@@ -60,7 +60,11 @@ class TruncatedCost:
 
     def of_edges(self, residual: Tensor) -> np.ndarray:
         """Cost of every edge with residuals ``(E, 4)``."""
-        square = (rotations.log(residual) ** 2).sum(dim=1).numpy()
+        return self.of_cosines(residual[:, 3])
+
+    def of_cosines(self, cosine: Tensor) -> np.ndarray:
+        """The same from the residuals' real parts ``(E,)``; the 1e-8 rad that these do not resolve cost nothing."""
+        square = (2 * cosine.abs().clamp(max=1).acos().numpy()) ** 2
         return np.asarray(np.minimum(square / (2 * _SLACK * self.variance), self.cap))
 
     def total(self, correction: Tensor) -> float:
