@@ -48,12 +48,14 @@ class NoiseModel:
         step_variance: of one odometry edge.
         closure_variance: of a good loop closure.
         outlier_share: share of the closures that are false.
+        likely_step_variance: the likeliest, where ``step_variance`` is kept low; what uncertainty is stated by.
     """
 
     components: int
     step_variance: float
     closure_variance: float
     outlier_share: float
+    likely_step_variance: float = 0.0
 
     def inlier_log_odds(self, squared_angle: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Log-odds of good against false, without the prior, for discrepancies of given total variance.
@@ -178,7 +180,8 @@ def _least_drift(data: Discrepancies, likeliest: NoiseModel) -> NoiseModel:
         profile.append(_maximise(data, start, _DOUBT_ITERATIONS, hold_step=True))
     bar = max(likelihood for likelihood, _ in profile) - _STEP_DOUBT
     least = [model for likelihood, model in profile if likelihood >= bar][-1]
-    return likeliest if least is profile[0][1] else least
+    least = likeliest if least is profile[0][1] else least
+    return replace(least, likely_step_variance=likeliest.step_variance)
 
 
 def _maximise(

@@ -318,7 +318,7 @@ def _slam_estimate(graph: ClosureGraph, estimate: SlamEstimate, memory: SlamMemo
     return _Estimate(
         graph.orientations(estimate.correction),
         torch.from_numpy(slam_stages.outlier_scores(graph, estimate.outlier_probability)),
-        torch.from_numpy(graph.variance(estimate.samples, estimate.noise.step_variance)),
+        torch.from_numpy(graph.variance(estimate.samples, estimate.stated_step_variance)),
         memory,
     )
 

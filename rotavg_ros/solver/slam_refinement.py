@@ -64,6 +64,8 @@ _TAIL_SHARE = 0.1
 _TAIL_RATIO = 16.0
 _MAX_TAIL_VARIANCE = np.radians(1.5) ** 2
 _MAX_PREDICTED_TAIL_VARIANCE = np.radians(3.0) ** 2
+# In larger graphs the likeliest drift is near what is believed.
+_MAX_NODES_TO_DRAW_AGAIN = 2000
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,7 @@ class SlamEstimate:
         outlier_probability: ``(E,)`` that its true noise exceeds :data:`OUTLIER_ANGLE`, or that a segment slipped.
         noise: the estimated noise model.
         samples: ``(K, k)`` errors, in rad, as they might be: their second moments are the estimate's covariance.
+        stated_step_variance: rad², what the samples are drawn with.
         common_share: share of the closures' error variance that neighbouring closures have in common.
         passes: number of sparse solves.
         steps: ``(E,)`` the graph's, more where closures err together.
@@ -89,6 +92,7 @@ class SlamEstimate:
     outlier_probability: np.ndarray
     noise: NoiseModel
     samples: np.ndarray
+    stated_step_variance: float
     common_share: float
     passes: int
     steps: np.ndarray
@@ -232,14 +236,32 @@ class _State:
         """Node values ``(K, k)`` → differences over the edges, target − source ``(E, k)``."""
         return np.asarray(values[self.graph.target] - values[self.graph.source])
 
+    def _variance(self, step_variance: float) -> np.ndarray:
+        """Of every edge, ``(E,)`` rad²."""
+        graph = self.graph
+        return np.asarray(graph.steps * np.where(graph.is_odometry, step_variance, self.noise.closure_variance))
+
+    def _weight(self, step_variance: float) -> np.ndarray:
+        """``(E,)``."""
+        return np.asarray(np.maximum(self.inlier_probability * self.exactness, 1e-9) / self._variance(step_variance))
+
     def estimate(self, share: float, max_step_variance: float) -> SlamEstimate:
         """What there is to say after the last pass."""
+        step_variance = self.noise.step_variance
+        if self.graph.num_nodes <= _MAX_NODES_TO_DRAW_AGAIN:
+            # Where closures are few, drift is taken to be less than it probably is, for the sake of the verdicts.
+            step_variance = max(step_variance, self.noise.likely_step_variance)
+        if step_variance == self.noise.step_variance:
+            samples = self.samples
+        else:
+            samples = self.pattern.factorize(self._weight(step_variance)).samples(self.probes)
         return SlamEstimate(
             rotations.normalize(self.correction),
             self.inlier_probability,
             self.outlier_probability(),
             self.noise,
-            self.samples,
+            samples,
+            step_variance,
             share,
             self.passes,
             self.graph.steps,
@@ -266,8 +288,7 @@ class _State:
             refresh: whether to estimate anew what the rest of the graph predicts of each edge.
         """
         graph, noise = self.graph, self.noise
-        variance = graph.steps * np.where(graph.is_odometry, noise.step_variance, noise.closure_variance)
-        weight = np.maximum(self.inlier_probability * self.exactness, 1e-9) / variance
+        variance, weight = self._variance(noise.step_variance), self._weight(noise.step_variance)
         # A pass after one that has not settled weighs as that did.
         if self.passes == 0 or not np.array_equal(weight, self._system.weight):
             is_near = self._changed < _NEAR and graph.num_nodes >= _ITERATING_PAYS
@@ -299,7 +320,7 @@ class _State:
                 square[closure], self.inlier_probability[closure] * exact, redundancy[closure] * exact, noise
             )
         share = outlier_share(self.inlier_probability[closure])
-        self.noise = NoiseModel(noise.components, step_variance, closure_variance, share)
+        self.noise = replace(noise, step_variance=step_variance, closure_variance=closure_variance, outlier_share=share)
 
         # What is left of the fit without the edge itself, and how far that may be off.
         predicted_square = np.minimum(square / (1 - leverage) ** 2, np.pi**2)
