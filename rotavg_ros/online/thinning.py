@@ -5,8 +5,9 @@ closures) within 2, 4, 8 … odometry steps of each other one stays, the older o
 is left covers all of its way, and a closure to anywhere finds a keyframe near by.
 
 1. Keyframes that no closure touches: taking them out changes nothing (:mod:`~rotavg_ros.online.marginalization`).
-2. Only when these do not suffice, closures: first those judged false, then of those that join the same two stretches of
-   the way all but the best, and those that span hardly more than a stretch; stretches double until enough is free.
+2. Only when these do not suffice, closures: first those judged false, then those that are not the best (the newest that
+   is not false) on either of the two stretches of the way that they join, and those that span hardly more than a
+   stretch; stretches double until enough is free. So every stretch that has closures keeps one.
 
 Closures without which the graph would fall apart, and those a user has accepted, stay.
 """
@@ -157,19 +158,17 @@ def _sparable_closures(
     ends = np.stack((source[closure], target[closure]), axis=1)
     ends.sort(axis=1)
     chain, position = way.chain[ends], way.position[ends]
-    # The best of those that join the same stretches: what has to stay, then what is not false, then the newest.
-    ranks = (-closure, false[closure], may_go[closure])
     span = np.where(chain[:, 0] == chain[:, 1], np.abs(position[:, 0] - position[:, 1]), np.inf)
+    # The best first: what has to stay, then what is not false, then the newest.
+    rank = np.empty(len(closure), dtype=np.int64)
+    rank[np.lexsort((-closure, false[closure], may_go[closure]))] = np.arange(len(closure))
     width = 1.0
     while width < 4 * way.length + 4:
-        stretch = np.floor_divide(position, width)
-        key = (chain[:, 0], stretch[:, 0], chain[:, 1], stretch[:, 1])
-        order = np.lexsort((*ranks, *key))
-        first = np.ones(len(order), dtype=bool)
-        first[1:] = np.any([np.diff(column[order]) != 0 for column in key], axis=0)
-        redundant = np.ones(len(order), dtype=bool)
-        redundant[order[first]] = False
-        redundant |= span <= width
+        stretches = np.stack((chain, np.floor_divide(position, width)), axis=-1).reshape(-1, 2)
+        stretch = np.unique(stretches, axis=0, return_inverse=True)[1].reshape(-1, 2)
+        best = np.full(stretch.max(initial=-1) + 1, len(closure))
+        np.minimum.at(best, stretch, rank[:, None])
+        redundant = (best[stretch] != rank[:, None]).all(axis=1) | (span <= width)
         yield closure[redundant & may_go[closure]]
         width *= 2
 
