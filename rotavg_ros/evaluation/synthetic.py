@@ -63,6 +63,7 @@ CORE = (
 # Whose outlier verdicts are compared: scores of ours, residuals of the others.
 _CLASSIFIERS = {
     "cleannet-spt": "CleanNet's score",
+    "neurora-paper": "NeuRoRA's score",
     "neurora": "full pipeline's score",
     "chatterjee": "Chatterjee & Govindu's residuals",
     "colmap": "COLMAP's residuals",

@@ -50,8 +50,8 @@ def node_states(network: MessagePassingNetwork, nodes: Tensor, features: Tensor,
 
     Args:
         nodes: ``(N, node_width)`` initial states.
-        features: ``(M, edge_width)`` float32 of the graph's edges as given; the first four columns are a rotation,
-            which the reversed edge has inverted.
+        features: ``(M, edge_width)`` float32 of the graph's edges as given; the first ``network.odd_width`` columns
+            change their sign where an edge is reversed.
         edges: over which messages run.
     """
     with _walk(network, features, edges) as walk:
@@ -75,7 +75,7 @@ def visit_activations(
 def _walk(network: MessagePassingNetwork, features: Tensor, edges: SortedEdges) -> Iterator[_Walk]:
     layers = [cast(MessagePassingLayer, layer) for layer in network.layers]
     with scratch(len(edges.source), layers[0].message_output.in_features + features.shape[1], features) as state:
-        yield _Walk(layers, features, edges, state)
+        yield _Walk(layers, network.odd_width, features, edges, state)
 
 
 class _Walk:
@@ -85,8 +85,16 @@ class _Walk:
         state: ``(E, hidden + edge_width)`` working memory: the activation of the layer before, then the features.
     """
 
-    def __init__(self, layers: list[MessagePassingLayer], features: Tensor, edges: SortedEdges, state: Tensor) -> None:
+    def __init__(
+        self,
+        layers: list[MessagePassingLayer],
+        odd_width: int,
+        features: Tensor,
+        edges: SortedEdges,
+        state: Tensor,
+    ) -> None:
         self.layers, self.features, self.edges, self.state = layers, features, edges, state
+        self.odd_width = odd_width
         self.hidden = layers[0].message_output.in_features
         on_cpu = features.device.type == "cpu"
         num_edges = len(edges.source)
@@ -145,7 +153,7 @@ class _Walk:
     def _write_features(self, tile: Tile, state: Tensor) -> None:
         gathered = self.features.index_select(0, self.edges.edge[tile.edges])
         sign = 1 - 2 * self.edges.is_reversed[tile.edges].to(gathered)
-        gathered[:, :3] *= sign[:, None]
+        gathered[:, : self.odd_width] *= sign[:, None]
         state[:, self.hidden :] = gathered
 
     def _gather_sum(self, tile: Tile, projected: Tensor) -> Tensor:

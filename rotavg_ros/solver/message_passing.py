@@ -57,11 +57,15 @@ class MessagePassingLayer(nn.Module):
         node_width: width of the incoming node states; 0 where they are still empty.
         edge_width: width of the edge features.
         hidden_width: width of messages and outgoing node states.
+        accumulates: the update is added to the node's state, which must be as wide, in place of becoming it.
     """
 
-    def __init__(self, node_width: int, edge_width: int, hidden_width: int = HIDDEN_WIDTH) -> None:
+    def __init__(
+        self, node_width: int, edge_width: int, hidden_width: int = HIDDEN_WIDTH, accumulates: bool = False
+    ) -> None:
         super().__init__()
         self.node_width = node_width
+        self.accumulates = accumulates
         self.edge_projection = nn.Linear(edge_width, hidden_width)
         if node_width:
             self.target_projection = nn.Linear(node_width, hidden_width, bias=False)
@@ -89,7 +93,8 @@ class MessagePassingLayer(nn.Module):
     def update_nodes(self, nodes: Tensor, mean: Tensor, is_connected: Tensor) -> Tensor:
         """New states ``(N, hidden)`` from old ones and the mean activation ``(N, hidden)`` of the edges that arrive."""
         message = self.message_output(mean) * is_connected.to(mean)
-        return torch.relu(self.update(torch.cat((nodes, message), dim=1)))
+        update: Tensor = self.update(torch.cat((nodes, message), dim=1))
+        return nodes + update if self.accumulates else torch.relu(update)
 
 
 class MessagePassingNetwork(nn.Module):
@@ -98,15 +103,27 @@ class MessagePassingNetwork(nn.Module):
     Args:
         node_width: width of the initial node states, 0 for none.
         edge_width: width of the edge features ``x``, which every layer sees.
+        odd_width: so many of them, the first, change their sign where an edge is reversed; of a rotation, x, y and z.
+        accumulates: from the second layer on, updates are added to the node states.
     """
 
     def __init__(
-        self, node_width: int, edge_width: int, hidden_width: int = HIDDEN_WIDTH, num_layers: int = NUM_LAYERS
+        self,
+        node_width: int,
+        edge_width: int,
+        hidden_width: int = HIDDEN_WIDTH,
+        num_layers: int = NUM_LAYERS,
+        odd_width: int = 3,
+        accumulates: bool = False,
     ) -> None:
         super().__init__()
+        self.odd_width = odd_width
         self.layers = nn.ModuleList(
             MessagePassingLayer(
-                node_width if first else hidden_width, edge_width + (0 if first else hidden_width), hidden_width
+                node_width if first else hidden_width,
+                edge_width + (0 if first else hidden_width),
+                hidden_width,
+                accumulates and not first,
             )
             for first in [True] + [False] * (num_layers - 1)
         )

@@ -241,12 +241,12 @@ def _solve_sfm(
             cleaned = sfm_stages.trust_all(graph)
         cleaned = sfm_stages.apply_labels(cleaned, graph.label)
     with watch.stage("bootstrap"):
-        orientations, roots = sfm_stages.bootstrap(cleaned, component)
+        orientations, roots, cleaned = sfm_stages.bootstrap(cleaned, component)
         if warm_start is not None:
             orientations = warm_start.double().to(graph.device)
     for _ in range(method.fine_tunings):
         with watch.stage("fine-tune"):
-            orientations = sfm_stages.fine_tune(networks.load("sfm-fine-net"), cleaned, orientations)
+            orientations = sfm_stages.fine_tune(networks.load("sfm-fine-net"), cleaned, orientations, component)
     default_steps = sfm_refinement.MAX_STEPS if method.shaped else refinement.DEFAULT_STEPS
     steps = (default_steps if method.refine else 0) if refinement_steps is None else refinement_steps
     if steps > 0:
@@ -268,7 +268,8 @@ def _solve_sfm(
                 orientations = refinement.refine(
                     graph, orientations, weight, roots, steps, component=component, edges=cleaned.edges
                 )
-    score = sfm_stages.outlier_score(graph, cleaned, orientations, component, refined=steps > 0)
+    fits = steps > 0 or method.fine_tunings > 0
+    score = sfm_stages.outlier_score(graph, cleaned, orientations, component, by_residuals=fits)
     return _Estimate(orientations, score, torch.full((graph.num_nodes,), torch.nan))
 
 

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import cast
 
 import torch
 from torch import Tensor
 
 from rotavg_ros.solver.clean_net import CleanEdges, CleanNet
-from rotavg_ros.solver.fine_net import FineNet
+from rotavg_ros.solver.fine_net import (
+    EVEN_FEATURES,
+    MIN_SCALE,
+    ODD_FEATURES,
+    FineNet,
+    edge_features,
+    node_features,
+)
 from rotavg_ros.solver.inference import node_states, visit_activations
 from rotavg_ros.solver.message_passing import MessagePassingLayer
 from rotavg_ros.solver.parallel import for_each, slices
@@ -51,13 +59,65 @@ def clean_edges(network: CleanNet, target_from_source: Tensor, edges: SortedEdge
     return CleanEdges(clean, logit)
 
 
-def fine_tuned(network: FineNet, graph: ViewGraph, body_from_world: Tensor, edges: SortedEdges) -> Tensor:
-    """FineNet's correction of ``body_from_world`` ``(N, 4)`` float32 over the ``edges`` of ``graph``."""
-    residuals = EdgeResiduals(graph, body_from_world)
-    features = body_from_world.new_empty(graph.num_edges, 4)
+def fine_tuned(
+    network: FineNet,
+    measured: ViewGraph,
+    rectified: Tensor,
+    outlier_logit: Tensor,
+    body_from_world: Tensor,
+    edges: SortedEdges,
+    component: Tensor,
+) -> Tensor:
+    """FineNet's correction of ``body_from_world`` ``(N, 4)`` float32.
+
+    Args:
+        rectified, outlier_logit: ``(M, 4)`` and ``(M,)``, what CleanNet says of the edges.
+        edges: those of them over which messages run.
+        component: ``(N,)`` connected components.
+    """
+    num_edges = measured.num_edges
+    residuals = [
+        EdgeResiduals(graph, body_from_world) for graph in (measured, replace(measured, target_from_source=rectified))
+    ]
+    raw, clean = (body_from_world.new_empty(3, num_edges) for _ in residuals)
+
+    def compare(part: slice) -> None:
+        for vectors, of_kind in zip((raw, clean), residuals, strict=True):
+            vectors[:, part] = of_kind.quaternions(part)[:3]
+
+    parts = slices(num_edges, SLICE_EDGES, raw.device)
+    for_each(compare, parts)
+    used = edges.edge[~edges.is_reversed]
+    scale = typical_size(raw[:, used], component[measured.source[used]], component)
+    features = raw.new_empty(num_edges, ODD_FEATURES + EVEN_FEATURES)
 
     def write(part: slice) -> None:
-        features[part] = residuals.quaternions(part).t()
+        unit = scale[measured.source[part], 0] if len(scale) > 1 else scale[0]
+        features[part] = edge_features(raw[:, part], clean[:, part], outlier_logit[part], unit).t()
 
-    for_each(write, slices(graph.num_edges, SLICE_EDGES, features.device))
-    return network.correct(body_from_world, node_states(network.network, body_from_world, features, edges))
+    for_each(write, parts)
+    states = node_features(body_from_world, edges.degree[:, None])
+    return network.correct(body_from_world, node_states(network.network, states, features, edges), scale)
+
+
+def typical_size(vectors: Tensor, group: Tensor, group_of_node: Tensor) -> Tensor:
+    """Median length of the vectors ``(3, k)`` of a node's group, ``(N, 1)``, or ``(1, 1)`` where there is but one.
+
+    Args:
+        group: ``(k,)`` of every vector; group_of_node: ``(N,)``.
+    """
+    length = (vectors * vectors).sum(dim=0).sqrt()
+    if not bool((group_of_node > 0).any()):
+        return (length.median() if len(length) else length.new_tensor(0.0)).clamp(min=MIN_SCALE).reshape(1, 1)
+    median = median_by_group(length, group, int(group_of_node.max()) + 1)
+    return torch.where(median.isfinite(), median, 0.0).clamp(min=MIN_SCALE)[group_of_node][:, None]
+
+
+def median_by_group(value: Tensor, group: Tensor, num_groups: int) -> Tensor:
+    """Lower median (torch's) ``(num_groups,)`` of the values ``(M,)`` of each group; infinite where there are none."""
+    by_value = value.sort()
+    by_group = group[by_value.indices].sort(stable=True).indices
+    count = torch.bincount(group, minlength=num_groups)
+    middle = count.cumsum(0) - count + (count - 1).clamp(min=0) // 2
+    ordered = torch.cat((by_value.values[by_group], value.new_full((1,), torch.inf)))
+    return torch.where(count > 0, ordered[middle], torch.inf)

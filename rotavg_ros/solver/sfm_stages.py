@@ -1,21 +1,21 @@
-"""The paper's stages on an SfM view-graph, as the pipeline runs them and as training sees them."""
+"""The paper's stages on an SfM view-graph, as the pipeline runs them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from rotavg_ros.solver.clean_net import CleanNet
-from rotavg_ros.solver.fine_net import FineNet, edge_residual
-from rotavg_ros.solver.message_passing import DirectedEdges
+from rotavg_ros.solver.fine_net import FineNet
 from rotavg_ros.solver.relaxed_forest import hubs, relaxed_forest
 from rotavg_ros.solver.residuals import EdgeResiduals
-from rotavg_ros.solver.sfm_inference import clean_edges, fine_tuned
+from rotavg_ros.solver.sfm_inference import clean_edges, fine_tuned, median_by_group
 from rotavg_ros.solver.sorted_edges import SortedEdges
-from rotavg_ros.solver.spanning_tree import compose, compose_orientations, shortest_path_forest
+from rotavg_ros.solver.spanning_tree import compose, shortest_path_forest
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # An edge whose outlier probability exceeds this is no inlier (ε of the paper; uncritical in 0.35–0.8).
@@ -28,6 +28,10 @@ _MIN_UNCERTAINTY = np.radians(0.01)
 OUTLIER_ANGLE = np.radians(20.0)
 # Cost of an edge in the tree, and what a certain outlier costs besides (the authors' released code, between the two).
 _EDGE_COST, _OUTLIER_COST = 0.1, 1.0
+# Divided by the edges of that end which has fewer: CleanNet rectifies well where an edge has company.
+_FRINGE_COST = 5.0
+# So many edges tell which of two trees fits better.
+_MISFIT_SAMPLE = 16_384
 
 
 @dataclass(frozen=True)
@@ -36,12 +40,14 @@ class Cleaned:
 
     Attributes:
         graph: the rectified measurements.
+        measured: the graph as it was given.
         outlier_probability: ``(M,)`` float32.
         is_inlier: ``(M,)`` bool.
         edges: all of the graph's edges, sorted.
     """
 
     graph: ViewGraph
+    measured: ViewGraph
     outlier_probability: Tensor
     is_inlier: Tensor
     edges: SortedEdges
@@ -58,13 +64,13 @@ def clean(network: CleanNet, graph: ViewGraph) -> Cleaned:
         result = clean_edges(network, graph.target_from_source.float().to(device), edges.to(device))
         probability = torch.sigmoid(result.outlier_logit).to(graph.device)
     rectified = replace(graph, target_from_source=result.target_from_source.to(graph.device).double())
-    return Cleaned(rectified, probability, probability < OUTLIER_THRESHOLD, edges)
+    return Cleaned(rectified, graph, probability, probability < OUTLIER_THRESHOLD, edges)
 
 
 def trust_all(graph: ViewGraph) -> Cleaned:
     """What stands in for CleanNet in methods without it: every measurement as it is."""
     nobody = torch.zeros(graph.num_edges, device=graph.device)
-    return Cleaned(graph, nobody, nobody < OUTLIER_THRESHOLD, SortedEdges.of(graph))
+    return Cleaned(graph, graph, nobody, nobody < OUTLIER_THRESHOLD, SortedEdges.of(graph))
 
 
 def apply_labels(cleaned: Cleaned, label: Tensor) -> Cleaned:
@@ -74,46 +80,93 @@ def apply_labels(cleaned: Cleaned, label: Tensor) -> Cleaned:
     return replace(cleaned, outlier_probability=probability, is_inlier=probability < OUTLIER_THRESHOLD)
 
 
-def bootstrap(cleaned: Cleaned, component: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Orientations along a shortest-path tree that avoids outliers, ``(N, 4)`` float64, and the trees' roots ``(C,)``.
+class Bootstrapped(NamedTuple):
+    """Where FineNet begins.
+
+    Attributes:
+        body_from_world: ``(N, 4)`` float64.
+        roots: ``(C,)`` the trees' roots, in the order of the components.
+        cleaned: without CleanNet's corrections where the measurements as they are were better.
+    """
+
+    body_from_world: Tensor
+    roots: Tensor
+    cleaned: Cleaned
+
+
+def bootstrap(cleaned: Cleaned, component: Tensor | None = None) -> Bootstrapped:
+    """Orientations along a shortest-path tree that avoids outliers.
+
+    A tree is composed of rectified measurements or of those as they are, whichever fits the latter better: where noise
+    is far below what CleanNet was trained on, rectifying does harm.
 
     Args:
         component: ``(N,)`` the graph's connected components; default: computed.
     """
     component = cleaned.graph.components() if component is None else component
-    cost = _EDGE_COST + _OUTLIER_COST * cleaned.outlier_probability
+    degree = cleaned.edges.degree
+    fewest = torch.minimum(degree[cleaned.graph.source], degree[cleaned.graph.target])
+    cost = _EDGE_COST + _OUTLIER_COST * cleaned.outlier_probability + _FRINGE_COST / fewest
     if cleaned.graph.device.type == "cpu":
         forest = shortest_path_forest(cleaned.graph, cost, edges=cleaned.edges, component=component)
-        return compose_orientations(forest, cleaned.graph), torch.from_numpy(forest.roots)
-    tree = relaxed_forest(cleaned.edges, cost, hubs(cleaned.edges, component))
-    return compose(tree.parent, tree.parent_edge, cleaned.graph), tree.roots
+        parent, parent_edge = torch.from_numpy(forest.parent), torch.from_numpy(forest.parent_edge)
+        roots = torch.from_numpy(forest.roots)
+    else:
+        tree = relaxed_forest(cleaned.edges, cost, hubs(cleaned.edges, component))
+        parent, parent_edge, roots = tree.parent, tree.parent_edge, tree.roots
+    rectified, raw = (compose(parent, parent_edge, graph) for graph in (cleaned.graph, cleaned.measured))
+    raw_is_better = _misfit(cleaned, raw, component) <= _misfit(cleaned, rectified, component)
+    if not bool(raw_is_better.any()):
+        return Bootstrapped(rectified, roots, cleaned)
+    chosen = raw_is_better[component][:, None]
+    relative = torch.where(
+        chosen[cleaned.graph.source], cleaned.measured.target_from_source, cleaned.graph.target_from_source
+    )
+    cleaned = replace(cleaned, graph=replace(cleaned.graph, target_from_source=relative))
+    return Bootstrapped(torch.where(chosen, raw, rectified), roots, cleaned)
 
 
-def fine_tune(network: FineNet, cleaned: Cleaned, body_from_world: Tensor) -> Tensor:
-    """FineNet over the inlier edges, ``(N, 4)`` float64, with gradients where they are enabled.
+def _misfit(cleaned: Cleaned, body_from_world: Tensor, component: Tensor) -> Tensor:
+    """Median angle between the inliers as they were measured and as ``body_from_world`` has them, per component."""
+    sample = cleaned.is_inlier.nonzero().squeeze(1)
+    sample = sample[:: 1 + len(sample) // _MISFIT_SAMPLE]
+    edges = cleaned.measured.select_edges(sample)
+    angle = EdgeResiduals(edges, body_from_world.float()).angles()
+    return median_by_group(angle, component[edges.source], int(component.max()) + 1)
+
+
+@torch.no_grad()
+def fine_tune(network: FineNet, cleaned: Cleaned, body_from_world: Tensor, component: Tensor | None = None) -> Tensor:
+    """FineNet over the inlier edges, without gradients, ``(N, 4)`` float64.
 
     The network may be on another device than the graph; what comes back is on the graph's.
+
+    Args:
+        component: ``(N,)`` the graph's connected components; default: computed.
     """
+    component = cleaned.graph.components() if component is None else component
     device = next(network.parameters()).device
-    if torch.is_grad_enabled():
-        inliers = cleaned.graph.select_edges(cleaned.is_inlier)
-        directed = DirectedEdges.of(inliers.source.to(device), inliers.target.to(device), inliers.num_nodes)
-        residual = edge_residual(body_from_world, inliers.target_from_source, inliers.source, inliers.target)
-        fine: Tensor = network(body_from_world.float().to(device), residual.float().to(device), directed)
-    else:
-        edges = cleaned.edges.select(cleaned.is_inlier).to(device)
-        fine = fine_tuned(network, cleaned.graph.to(device), body_from_world.float().to(device), edges)
+    fine = fine_tuned(
+        network,
+        cleaned.measured.to(device),
+        cleaned.graph.target_from_source.to(device),
+        cleaned.outlier_probability.logit().to(device),
+        body_from_world.float().to(device),
+        cleaned.edges.select(cleaned.is_inlier).to(device),
+        component.to(device),
+    )
     return fine.double().to(cleaned.graph.device)
 
 
 def outlier_score(
-    graph: ViewGraph, cleaned: Cleaned, body_from_world: Tensor, component: Tensor, refined: bool
+    graph: ViewGraph, cleaned: Cleaned, body_from_world: Tensor, component: Tensor, by_residuals: bool
 ) -> Tensor:
     """Probability that an edge's noise exceeds 20°, ``(M,)`` float64.
 
-    CleanNet's own without refinement; after it the residual, which is the noise but for the orientations' error.
+    CleanNet's own where there is but a tree; after FineNet or refinement that of the residual, which is the noise but
+    for the orientations' error.
     """
-    if not refined:
+    if not by_residuals:
         return cleaned.outlier_probability.double()
     return residual_score(graph, body_from_world, OUTLIER_ANGLE, component)
 
@@ -144,15 +197,5 @@ def residual_and_uncertainty(
     median = angle.median()
     if component is not None and bool((component > 0).any()):
         of_edge = component[graph.source]
-        median = _median_by_group(angle, of_edge, int(component.max()) + 1)[of_edge]
+        median = median_by_group(angle, of_edge, int(component.max()) + 1)[of_edge]
     return angle, (median * spread).clamp(min=_MIN_UNCERTAINTY)
-
-
-def _median_by_group(value: Tensor, group: Tensor, num_groups: int) -> Tensor:
-    """Lower median (torch's) ``(num_groups,)`` of the values ``(M,)`` of each group; infinite where there are none."""
-    by_value = value.sort()
-    by_group = group[by_value.indices].sort(stable=True).indices
-    count = torch.bincount(group, minlength=num_groups)
-    middle = count.cumsum(0) - count + (count - 1).clamp(min=0) // 2
-    ordered = torch.cat((by_value.values[by_group], value.new_full((1,), torch.inf)))
-    return torch.where(count > 0, ordered[middle], torch.inf)

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from rotavg_ros.errors import UserError
 
-_NETWORK, _OPTIMIZER = "network.", "optimizer."
+_NETWORK, _OPTIMIZER, _AVERAGE = "network.", "optimizer.", "average."
 
 
 class CheckpointError(UserError):
@@ -26,24 +26,35 @@ class CheckpointError(UserError):
 
 
 def save_checkpoint(
-    path: Path, network: nn.Module, optimizer: torch.optim.Optimizer, identity: dict[str, Any], state: dict[str, Any]
+    path: Path,
+    network: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    average: dict[str, Tensor],
+    identity: dict[str, Any],
+    state: dict[str, Any],
 ) -> None:
     """Write what :func:`load_checkpoint` needs.
 
     Args:
+        average: the mean weights so far by parameter; empty if none are kept.
         identity: what the run is; only a run of equal identity may resume it. Plain values.
         state: how far it has come. Plain values.
     """
     tensors = {_NETWORK + key: value for key, value in network.state_dict().items()}
+    tensors.update({_AVERAGE + key: value for key, value in average.items()})
     for number, moments in optimizer.state_dict()["state"].items():
         tensors.update({f"{_OPTIMIZER}{number}.{key}": value for key, value in moments.items()})
     save_tensors(path, tensors, {"identity": json.dumps(identity), "state": json.dumps(state)})
 
 
 def load_checkpoint(
-    path: Path, network: nn.Module, optimizer: torch.optim.Optimizer, identity: dict[str, Any]
+    path: Path,
+    network: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    average: dict[str, Tensor],
+    identity: dict[str, Any],
 ) -> dict[str, Any]:
-    """Bring network and optimizer to where the checkpoint left them; returns the state.
+    """Bring network, optimizer and mean weights to where the checkpoint left them; returns the state.
 
     Raises:
         CheckpointError: not a checkpoint, or one of another run.
@@ -70,7 +81,9 @@ def load_checkpoint(
             {key.removeprefix(_NETWORK): value for key, value in tensors.items() if key.startswith(_NETWORK)}
         )
         optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
-    except (RuntimeError, ValueError):
+        for key, value in average.items():
+            value.copy_(tensors[_AVERAGE + key])
+    except (RuntimeError, ValueError, KeyError):
         raise CheckpointError(f"{path}: of another network; choose another folder, or remove the file") from None
     assert isinstance(state, dict)
     return state

@@ -22,16 +22,20 @@ class TrainingConfig:
     Attributes:
         family: "sfm" or "slam", the networks' profile.
         recipe: SfM: "released", "released-spatial" (axes anywhere), "paper", "wide" (small and large noise, mostly on
-            topologies of dense clusters with a sparse fringe), "mixture" (the first three) or "broad" (all four); SLAM:
-            "wide".
+            topologies of dense clusters with a sparse fringe), "mixture" (the first three), "broad" or
+            "mostly-released" (all four); SLAM: "wide".
         nodes: cameras or keyframes of the training graphs, drawn uniformly (SLAM: in the logarithm).
         graphs: number of training graphs; each epoch sees all of them once.
         validation_nodes, validation_graphs: the same for the graphs that decide which weights are kept.
         epochs: passes over the training graphs.
         batch_graphs: graphs per step, joined into one disjoint graph.
         learning_rate, weight_decay: of Adam; the rate falls to zero along a cosine.
+        warmup_epochs: the rate grows over so many epochs first.
+        averaging: the weights that are validated and kept are an exponential mean over the steps, of which each weighs
+            so many times less than the one after it; 0 for the last step's own.
         edge_dropout: share of each graph's edges left out anew in every epoch.
-        passes: FineNet: how often it is applied in a row, as NeuRoRA-v2 does; every pass counts in the loss.
+        passes: FineNet: how often it is applied in a row at most, as NeuRoRA-v2 does; it learns from the last pass,
+            and fewer are likelier.
         seed: of data, initial weights and order.
     """
 
@@ -45,12 +49,17 @@ class TrainingConfig:
     batch_graphs: int = 8
     learning_rate: float = 5e-5
     weight_decay: float = 1e-4
+    warmup_epochs: int = 0
+    averaging: float = 0.0
     edge_dropout: float = 0.25
     passes: int = 1
     seed: int = 0
 
     def __post_init__(self) -> None:
-        recipes = {"sfm": ("released", "released-spatial", "paper", "wide", "mixture", "broad"), "slam": ("wide",)}
+        recipes = {
+            "sfm": ("released", "released-spatial", "paper", "wide", "mixture", "broad", "mostly-released"),
+            "slam": ("wide",),
+        }
         if self.family not in recipes:
             raise TrainingConfigError(f"family is {self.family!r}; choose from {', '.join(recipes)}")
         if self.recipe not in recipes[self.family]:
@@ -64,6 +73,10 @@ class TrainingConfig:
             low, high = getattr(self, name)
             if not 10 <= low <= high:
                 raise TrainingConfigError(f"{name} is [{low}, {high}]; use an ascending pair of at least 10")
+        if self.warmup_epochs < 0:
+            raise TrainingConfigError(f"warmup_epochs is {self.warmup_epochs}; it must not be negative")
+        if not 0 <= self.averaging < 1:
+            raise TrainingConfigError(f"averaging is {self.averaging}; a share in [0, 1)")
         if not 0 <= self.edge_dropout < 1:
             raise TrainingConfigError(f"edge_dropout is {self.edge_dropout}; a share in [0, 1)")
 

@@ -9,8 +9,9 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.message_passing import DirectedEdges
 
 OUTLIER_LOSS_WEIGHT = 10.0
-NODE_LOSS_WEIGHT = 0.1
+NODE_LOSS_WEIGHT = 1.0
 _SMALL = 1e-8
+_WEISZFELD_STEPS, _WEISZFELD_SMOOTHING = 4, 0.01
 
 
 def quaternion_distance(a: Tensor, b: Tensor) -> Tensor:
@@ -42,11 +43,41 @@ def clean_net_loss(
 
 
 def fine_net_loss(
-    body_from_world: Tensor, truth: Tensor, source: Tensor, target: Tensor, edges: DirectedEdges
+    body_from_world: Tensor, truth: Tensor, scale: Tensor, graph: Tensor, edges: DirectedEdges
 ) -> dict[str, Tensor]:
-    """Edge term (relative orientations, gauge-free) plus 0.1 × node term; ``truth`` in the estimate's gauge."""
-    relative = rotations.multiply(body_from_world[target], rotations.inverse(body_from_world[source]))
-    true_relative = rotations.multiply(truth[target], rotations.inverse(truth[source]))
-    edge = degree_normalised(quaternion_distance(relative, true_relative), edges)
-    node = quaternion_distance(body_from_world, truth).mean()
+    """Edge term (errors of relative orientations) plus node term, either in units of the graph's noise.
+
+    The node term is about a robust mean of each graph's errors, so that no gauge is learned: it is the error that is
+    reported, and weighs as much as the edge term (in the paper, where the gauge is the tree's, a tenth).
+
+    Args:
+        body_from_world, truth: ``(N, 4)``, in about the same gauge.
+        scale: ``(N, 1)`` typical residual of the node's graph (half an angle in radians).
+        graph: ``(N,)`` of every node.
+    """
+    difference = rotations.canonical(rotations.multiply(rotations.inverse(truth), body_from_world))
+    error = 2 * difference[:, :3]
+    error = error - _robust_means(error.detach(), graph)[graph]
+    size = _length(error)
+    half = len(edges.source) // 2
+    apart = _length(error[edges.target[:half]] - error[edges.source[:half]])
+    unit = 2 * scale.squeeze(1)
+    edge = degree_normalised(apart / unit[edges.target[:half]], edges)
+    node = (size / unit).mean()
     return {"loss": edge + NODE_LOSS_WEIGHT * node, "edge": edge, "node": node}
+
+
+def _robust_means(vectors: Tensor, group: Tensor) -> Tensor:
+    """Geometric medians of the vectors ``(N, 3)`` of each group, ``(groups, 3)``, by a few steps of Weiszfeld's."""
+    num_groups = int(group.max()) + 1
+    mean = vectors.new_zeros(num_groups, 3)
+    for _ in range(_WEISZFELD_STEPS):
+        weight = 1 / (_length(vectors - mean[group])[:, None] + _WEISZFELD_SMOOTHING)
+        total = weight.new_zeros(num_groups, 1).index_add(0, group, weight)
+        mean = vectors.new_zeros(num_groups, 3).index_add(0, group, weight * vectors) / total
+    return mean
+
+
+def _length(vectors: Tensor) -> Tensor:
+    # The gradient of the root is infinite at zero.
+    return ((vectors**2).sum(-1) + _SMALL).sqrt()

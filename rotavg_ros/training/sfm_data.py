@@ -50,6 +50,7 @@ class SfmBatch:
 _MIXTURES = {
     "mixture": {"released": 0.5, "released-spatial": 0.25, "paper": 0.25},
     "broad": {"released": 0.45, "released-spatial": 0.15, "paper": 0.15, "wide": 0.25},
+    "mostly-released": {"released": 0.6, "released-spatial": 0.1, "paper": 0.15, "wide": 0.15},
 }
 _WIDE_NOISE_DEG = (0.2, 30.0)
 _WIDE_OUTLIER_SHARE = (0.0, 0.3)

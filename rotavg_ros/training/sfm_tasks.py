@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -12,15 +11,14 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.datasets.synthetic import SyntheticGraph
-from rotavg_ros.evaluation.metrics import gauge_alignment, orientation_errors
+from rotavg_ros.evaluation.metrics import orientation_errors
 from rotavg_ros.solver.clean_net import CleanNet
 from rotavg_ros.solver.fine_net import FineNet
-from rotavg_ros.solver.message_passing import DirectedEdges
-from rotavg_ros.solver.sfm_stages import bootstrap, clean, fine_tune
+from rotavg_ros.solver.sfm_stages import fine_tune
 from rotavg_ros.training.config import TrainingConfig
-from rotavg_ros.training.losses import clean_net_loss, fine_net_loss, quaternion_distance
+from rotavg_ros.training.fine_data import FineBatch, StartedGraph
+from rotavg_ros.training.losses import clean_net_loss, fine_net_loss
 from rotavg_ros.training.sfm_data import SfmBatch, join, sample_graph
-from rotavg_ros.view_graph import ViewGraph
 
 
 class GivenGraphs(NamedTuple):
@@ -92,7 +90,7 @@ class SfmCleanTask(_SfmTask):
 
 
 class SfmFineTask(_SfmTask):
-    """FineNet: starts from a trained CleanNet's tree (loss: edge + 0.1 · node)."""
+    """FineNet: starts from a trained CleanNet's tree (loss: edge + node)."""
 
     def __init__(
         self, config: TrainingConfig, device: torch.device, clean_net: CleanNet, given: GivenGraphs | None = None
@@ -101,47 +99,33 @@ class SfmFineTask(_SfmTask):
         self.device = device
         torch.manual_seed(config.seed)
         self.network = FineNet().to(device)
-        self.clean_net = clean_net.to(device).eval()
+        clean_net = clean_net.to(device).eval()
+        self._started = [StartedGraph.of(clean_net, graph) for graph in self.graphs]
+        self._validation_started = [StartedGraph.of(clean_net, graph) for graph in self.validation]
+        # How likely it is that so many passes go before the one that is learned from: the fewer, the likelier.
+        odds = 1 / np.arange(1, config.passes + 1)
+        self._odds = odds / odds.sum()
 
     def batches(self, rng: np.random.Generator) -> Iterator[dict[str, Tensor]]:
-        for batch in self._joined_batches(rng):
-            passes, start, edges = self._forward(batch.to(self.device))
-            truth = _align(batch, start).to(self.device)
-            source, target = batch.source.to(self.device), batch.target.to(self.device)
-            terms = [fine_net_loss(fine.float(), truth, source, target, edges) for fine in passes]
-            yield {key: torch.stack([of_pass[key] for of_pass in terms]).mean() for key in terms[0]}
-
-    def _forward(self, batch: SfmBatch) -> tuple[list[Tensor], Tensor, DirectedEdges]:
-        """Orientations after every pass, and the tree's."""
-        graph = ViewGraph.create(batch.source, batch.target, batch.measured.double(), num_nodes=len(batch.truth))
-        with torch.no_grad():
-            cleaned = clean(self.clean_net, graph)
-            start, _ = bootstrap(cleaned)
-        fine, passes = start.to(self.device), []
-        for _ in range(self.config.passes):
-            fine = fine_tune(self.network, cleaned, fine)
-            passes.append(fine)
-        return passes, start.cpu(), batch.edges
+        order = rng.permutation(len(self._started))
+        for first in range(0, len(order), self.config.batch_graphs):
+            chosen = [self._started[index] for index in order[first : first + self.config.batch_graphs]]
+            batch = FineBatch.of(chosen, self.config.edge_dropout, rng).to(self.device)
+            start = batch.start
+            with torch.no_grad():
+                for _ in range(int(rng.choice(len(self._odds), p=self._odds))):
+                    start, _ = batch.fine_tune(self.network, start)
+            fine, scale = batch.fine_tune(self.network, start)
+            yield fine_net_loss(fine, batch.truth, scale, batch.graph, batch.edges)
 
     def validate(self) -> dict[str, float]:
         rows = []
-        for graph in self.validation:
-            batch = join([graph])
-            passes, start, _ = self._forward(batch.to(self.device))
-            errors = [torch.rad2deg(orientation_errors(x.cpu(), graph.body_from_world)) for x in (start, passes[-1])]
-            distance = [quaternion_distance(x.cpu(), _align(batch, x.cpu().double())).mean() for x in passes]
-            objective = float(torch.stack(distance).mean())
-            rows.append([objective, *(float(f(e)) for e in errors for f in (torch.mean, torch.median))])
-        names = ("objective", "tree_mean_deg", "tree_median_deg", "mean_deg", "median_deg")
-        return dict(zip(names, np.mean(rows, axis=0).tolist(), strict=True))
-
-
-def _align(batch: SfmBatch, start: Tensor) -> Tensor:
-    """The truth in the gauge of ``start``, graph by graph, ``(N, 4)`` float32."""
-    truth = batch.truth.cpu().double()
-    offsets = batch.first_node.tolist()
-    aligned = [
-        rotations.multiply(truth[low:high], gauge_alignment(start[low:high].double(), truth[low:high]))
-        for low, high in pairwise(offsets)
-    ]
-    return rotations.canonical(torch.cat(aligned)).float()
+        for graph in self._validation_started:
+            errors, estimate = [orientation_errors(graph.start, graph.truth)], graph.start
+            for _ in range(2):
+                estimate = fine_tune(self.network, graph.cleaned, estimate)
+                errors.append(orientation_errors(estimate, graph.truth))
+            rows.append([float(torch.rad2deg(f(e))) for e in errors for f in (torch.mean, torch.median)])
+        names = ("tree_mean_deg", "tree_median_deg", "mean_deg", "median_deg", "v2_mean_deg", "v2_median_deg")
+        figures = dict(zip(names, np.mean(rows, axis=0).tolist(), strict=True))
+        return {"objective": figures["mean_deg"] + figures["median_deg"], **figures}

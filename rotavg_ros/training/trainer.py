@@ -8,6 +8,7 @@ import math
 import subprocess
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -97,9 +98,14 @@ class Trainer:
         self.optimizer = torch.optim.Adam(
             task.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
+        # Mean weights by parameter, if there is to be a mean.
+        parameters = dict(task.network.named_parameters()) if config.averaging > 0 else {}
+        self._average = {key: value.detach().clone() for key, value in parameters.items()}
         self._state = _State()
         if self._checkpoint_path.exists():
-            state = load_checkpoint(self._checkpoint_path, task.network, self.optimizer, self._identity())
+            state = load_checkpoint(
+                self._checkpoint_path, task.network, self.optimizer, self._average, self._identity()
+            )
             self._state = _State(**state)
         self._drop_log_after(self._state.epoch)
 
@@ -121,18 +127,23 @@ class Trainer:
         for epoch in bar:
             start = time.perf_counter()
             losses = self._train(epoch)
-            with torch.no_grad():
+            with torch.no_grad(), self._averaged():
                 figures = self.task.validate()
-            seconds = self._state.seconds + time.perf_counter() - start
-            best = min(self._state.best, figures["objective"])
-            is_better = best < self._state.best
-            self._state = _State(epoch + 1, best, seconds)
-            # The checkpoint comes last: whatever a kill interrupts before it is repeated by the resumed run.
-            if is_better:
-                self._save_weights(figures)
+                seconds = self._state.seconds + time.perf_counter() - start
+                best = min(self._state.best, figures["objective"])
+                is_better = best < self._state.best
+                self._state = _State(epoch + 1, best, seconds)
+                # The checkpoint comes last: whatever a kill interrupts before it is repeated by the resumed run.
+                if is_better:
+                    self._save_weights(figures)
             self._log(epoch, losses, figures)
             save_checkpoint(
-                self._checkpoint_path, self.task.network, self.optimizer, self._identity(), asdict(self._state)
+                self._checkpoint_path,
+                self.task.network,
+                self.optimizer,
+                self._average,
+                self._identity(),
+                asdict(self._state),
             )
             bar.set_postfix_str(" ".join(f"{key} {value:.4g}" for key, value in {**losses, **figures}.items()))
         return figures
@@ -141,9 +152,8 @@ class Trainer:
         """One epoch; returns the mean of every loss term."""
         network = self.task.network
         network.train()
-        rate = self.config.learning_rate * 0.5 * (1 + math.cos(math.pi * epoch / self.config.epochs))
         for group in self.optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = self._learning_rate(epoch)
         # Each epoch has its own random numbers, so that a resumed run draws what an unbroken one would.
         rng = np.random.default_rng((self.config.seed, epoch))
         totals: dict[str, float] = {}
@@ -154,10 +164,31 @@ class Trainer:
             terms["loss"].backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(network.parameters(), _MAX_GRADIENT_NORM)
             self.optimizer.step()
+            self._follow()
             for key, value in terms.items():
                 totals[key] = totals.get(key, 0.0) + float(value.detach()) / self.task.num_batches()
         network.eval()
         return totals
+
+    def _learning_rate(self, epoch: int) -> float:
+        warmup = self.config.warmup_epochs
+        rising = min(1.0, (epoch + 1) / (warmup + 1))
+        return self.config.learning_rate * rising * 0.5 * (1 + math.cos(math.pi * epoch / self.config.epochs))
+
+    @torch.no_grad()
+    def _follow(self) -> None:
+        """Let the mean weights follow the network's."""
+        parameters = dict(self.task.network.named_parameters())
+        for key, mean in self._average.items():
+            mean.lerp_(parameters[key], 1 - self.config.averaging)
+
+    @contextmanager
+    def _averaged(self) -> Iterator[None]:
+        """Inside, the network has the mean weights, if such are kept."""
+        own = {key: value.detach().clone() for key, value in self.task.network.named_parameters()}
+        self.task.network.load_state_dict({**self.task.network.state_dict(), **self._average})
+        yield
+        self.task.network.load_state_dict({**self.task.network.state_dict(), **own})
 
     def _identity(self) -> dict[str, Any]:
         return {**metadata(self.name), "config": self.config.to_dict(), **self.inputs}

@@ -17,7 +17,7 @@ from torch import Tensor
 from rotavg_ros import ViewGraph, rotations
 from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.solver import inference, tuning
-from rotavg_ros.solver.fine_net import edge_residual
+from rotavg_ros.solver.fine_net import MIN_SCALE, edge_features, edge_residual
 from rotavg_ros.solver.inference import Tuning
 from rotavg_ros.solver.message_passing import DirectedEdges, MessagePassingNetwork
 from rotavg_ros.solver.network_store import load_network
@@ -73,19 +73,31 @@ def test_single_precision_is_exact_to_a_hundred_thousandth(recipe: PaperRecipe |
 def _differences(graph: ViewGraph, start: Tensor, dtype: torch.dtype) -> tuple[float, float, float]:
     """The engine against ``forward``: outlier probabilities, corrected measurements, corrected orientations."""
     clean_net, fine_net = (deepcopy(load_network(name)).to(dtype) for name in ("sfm-clean-net", "sfm-fine-net"))
-    measured, start = graph.target_from_source.to(dtype), start.to(dtype)
+    measured, start, component = graph.target_from_source.to(dtype), start.to(dtype), graph.components()
     directed = DirectedEdges.of(graph.source, graph.target, graph.num_nodes, dtype)
     expected = clean_net(measured, directed)
-    residual = edge_residual(start, measured, graph.source, graph.target)
+    rectified, logit = expected.target_from_source, expected.outlier_logit
+    raw, clean = (
+        rotations.canonical(edge_residual(start, relative, graph.source, graph.target)).t()[:3]
+        for relative in (measured, rectified)
+    )
+    scale = torch.stack([_median_length(raw, component[graph.source] == number) for number in component])[:, None]
+    features = edge_features(raw, clean, logit, scale[graph.source, 0]).t()
     with workers():
         edges = SortedEdges.of(graph)
         found = clean_edges(clean_net, measured, edges)
-        fine = fine_tuned(fine_net, graph, start, edges)
+        fine = fine_tuned(fine_net, graph, rectified, logit, start, edges, component)
     return (
-        float((found.outlier_logit.sigmoid() - expected.outlier_logit.sigmoid()).abs().max()),
-        _apart(found.target_from_source, expected.target_from_source),
-        _apart(fine, fine_net(start, residual, directed)),
+        float((found.outlier_logit.sigmoid() - logit.sigmoid()).abs().max()),
+        _apart(found.target_from_source, rectified),
+        _apart(fine, fine_net(start, features, scale, directed)),
     )
+
+
+def _median_length(vectors: Tensor, chosen: Tensor) -> Tensor:
+    """Of the chosen columns of ``(3, k)``; as little as it may be where none is chosen."""
+    length = vectors[:, chosen].norm(dim=0)
+    return length.median().clamp(min=MIN_SCALE) if len(length) else length.new_tensor(MIN_SCALE)
 
 
 def _apart(found: Tensor, expected: Tensor) -> float:
@@ -95,15 +107,17 @@ def _apart(found: Tensor, expected: Tensor) -> float:
 
 
 @torch.no_grad()
-def test_any_widths_and_any_subset_of_the_edges() -> None:
+@pytest.mark.parametrize("accumulates", [False, True])
+def test_any_widths_and_any_subset_of_the_edges(accumulates: bool) -> None:
     graph = _random_graph(20, 80, 0)
     kept = torch.from_numpy(np.random.default_rng(1).random(80) < 0.6)
     torch.manual_seed(0)
-    network = MessagePassingNetwork(node_width=3, edge_width=7, hidden_width=16, num_layers=3)
-    states, extra = torch.randn(20, 3), torch.randn(80, 3)
-    features = torch.cat((graph.target_from_source.float(), extra), dim=1)
+    network = MessagePassingNetwork(
+        node_width=3, edge_width=7, hidden_width=16, num_layers=3, odd_width=5, accumulates=accumulates
+    )
+    states, features = torch.randn(20, 3), torch.randn(80, 7)
     few = graph.select_edges(kept)
-    turned = torch.cat((rotations.inverse(few.target_from_source).float(), extra[kept]), dim=1)
+    turned = features[kept] * torch.tensor([-1.0] * 5 + [1.0] * 2)
     directed = DirectedEdges.of(few.source, few.target, 20)
     expected, _ = network(states, torch.cat((features[kept], turned)), directed)
     actual = inference.node_states(network, states, features, SortedEdges.of(graph).select(kept))

@@ -56,6 +56,8 @@ def test_exact_sfm_graphs_are_solved_exactly(seed: int) -> None:
     target = np.concatenate((np.arange(1, 40), (source[39:] + rng.integers(1, 40, 200)) % 40))
     truth = random_truth(40, seed)
     assert _max_error_deg(measured(truth, source, target), truth, method="spt") < 1e-4
+    # CleanNet expects noise, and sees some; but the measurements as they are fit themselves better.
+    assert _max_error_deg(measured(truth, source, target), truth, method="neurora-paper") < 0.01
     assert _max_error_deg(measured(truth, source, target), truth, refinement_steps=20) < 0.01
 
 
@@ -190,19 +192,22 @@ def test_a_warm_start_ends_where_the_cold_one_does() -> None:
 
 @pytest.mark.parametrize("recipe", [ReleasedRecipe(cameras=(150, 150)), PaperRecipe(cameras=(150, 150))])
 def test_the_networks_beat_the_tree(recipe: ReleasedRecipe | PaperRecipe) -> None:
-    """Mean error of every stage, on graphs that no network has seen."""
-    errors = {}
+    """Mean and median error, and accuracy of the flags, of every stage on graphs that no network has seen."""
+    rows = {}
     for method in ("spt", "cleannet-spt", "neurora-paper", "neurora"):
-        rows = []
+        of_method = []
         for seed in range(3):
-            graph = recipe.sample(np.random.default_rng((99, seed)))
-            solution = solve(graph.graph, method=method)
-            error = orientation_errors(solution.body_from_world, graph.body_from_world)
-            rows.append(float(torch.rad2deg(error).mean()))
-        errors[method] = np.mean(rows)
-    assert errors["cleannet-spt"] < 0.7 * errors["spt"]
-    assert errors["neurora-paper"] < errors["cleannet-spt"]
-    assert errors["neurora"] < errors["neurora-paper"]
+            sample = recipe.sample(np.random.default_rng((99, seed)))
+            solution = solve(sample.graph, method=method)
+            error = torch.rad2deg(orientation_errors(solution.body_from_world, sample.body_from_world))
+            right = (solution.outlier_score > 0.5) == sample.is_outlier
+            of_method.append([float(error.mean()), float(error.median()), float(right.double().mean())])
+        rows[method] = np.mean(of_method, axis=0)
+    mean, median, accuracy = ({method: row[column] for method, row in rows.items()} for column in range(3))
+    assert mean["cleannet-spt"] < 0.7 * mean["spt"]
+    assert mean["neurora-paper"] < 0.85 * mean["cleannet-spt"]
+    assert median["neurora"] < median["neurora-paper"] < 0.6 * median["cleannet-spt"]
+    assert accuracy["neurora"] > accuracy["cleannet-spt"] < accuracy["neurora-paper"]
 
 
 @pytest.mark.parametrize(

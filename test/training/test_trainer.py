@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ EPOCHS = 4
 SFM = TrainingConfig(
     nodes=(12, 20), graphs=6, validation_nodes=(20, 20), validation_graphs=2, epochs=EPOCHS, batch_graphs=2, seed=5
 )
+FINE = replace(SFM, warmup_epochs=1, averaging=0.9, passes=2)
 SLAM = TrainingConfig(
     family="slam",
     recipe="wide",
@@ -52,7 +54,7 @@ def make_task(name: str) -> tuple[TrainingTask, TrainingConfig]:
     if name == "sfm-clean-net":
         return SfmCleanTask(SFM, CPU), SFM
     torch.manual_seed(0)
-    return SfmFineTask(SFM, CPU, CleanNet()), SFM
+    return SfmFineTask(FINE, CPU, CleanNet()), FINE
 
 
 def make_trainer(name: str, folder: Path) -> Trainer:
@@ -98,12 +100,12 @@ def test_kill_while_saving_loses_nothing(interrupted: str, tmp_path: Path, monke
     class KilledError(BaseException):
         pass
 
-    replace = checkpoint.os.replace
+    os_replace = checkpoint.os.replace
 
     def killed_before(source: Path, target: Path) -> None:
         if Path(target).name == name + interrupted:
             raise KilledError
-        replace(source, target)
+        os_replace(source, target)
 
     with monkeypatch.context() as patch:
         patch.setattr(checkpoint.os, "replace", killed_before)
@@ -135,6 +137,33 @@ def test_best_weights_and_their_card_are_kept(tmp_path: Path) -> None:
     assert card["command"] == "rotavg train clean-net tiny"
     assert card["extra"] == "7"
     assert {"commit", "hardware", "hours", "torch", "version"} <= card.keys()
+
+
+def test_kept_weights_are_the_mean_over_the_steps(tmp_path: Path) -> None:
+    class Task:
+        def __init__(self) -> None:
+            self.network = torch.nn.Linear(1, 1, bias=False)
+            self.own: list[torch.Tensor] = []
+
+        def batches(self, rng: np.random.Generator) -> Iterator[dict[str, torch.Tensor]]:
+            for _ in range(self.num_batches()):
+                yield {"loss": (self.network.weight - 7).square().sum()}
+                self.own.append(self.network.weight.detach().clone())
+
+        def num_batches(self) -> int:
+            return 5
+
+        def validate(self) -> dict[str, float]:
+            return {"objective": float((self.network.weight - 7).abs())}
+
+    task = Task()
+    mean = task.network.weight.detach().clone()
+    Trainer(task, TrainingConfig(epochs=2, averaging=0.75, learning_rate=0.1), tmp_path, "tiny").run()
+    assert len(task.own) == 10
+    for weight in task.own:
+        mean = 0.75 * mean + 0.25 * weight
+    torch.testing.assert_close(load_file(tmp_path / "tiny.safetensors")["weight"], mean)
+    assert torch.equal(task.network.weight, task.own[-1])
 
 
 def test_finished_run_has_nothing_left_to_do(tmp_path: Path) -> None:

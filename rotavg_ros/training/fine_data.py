@@ -1,0 +1,116 @@
+"""What FineNet is trained on: graphs behind CleanNet and the tree, which are computed once as they do not change."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.datasets.synthetic import SyntheticGraph
+from rotavg_ros.evaluation.metrics import gauge_alignment
+from rotavg_ros.solver.clean_net import CleanNet
+from rotavg_ros.solver.fine_net import FineNet, edge_features, edge_residual
+from rotavg_ros.solver.message_passing import DirectedEdges
+from rotavg_ros.solver.sfm_inference import typical_size
+from rotavg_ros.solver.sfm_stages import Cleaned, bootstrap, clean
+
+
+@dataclass(frozen=True)
+class StartedGraph:
+    """A graph where FineNet begins (N nodes).
+
+    Attributes:
+        cleaned: what CleanNet says of it.
+        start: ``(N, 4)`` float64, the tree's orientations.
+        truth: ``(N, 4)`` float64, in the gauge of ``start``.
+    """
+
+    cleaned: Cleaned
+    start: Tensor
+    truth: Tensor
+
+    @classmethod
+    def of(cls, clean_net: CleanNet, graph: SyntheticGraph) -> StartedGraph:
+        start, _, cleaned = bootstrap(clean(clean_net, graph.graph))
+        truth = rotations.multiply(graph.body_from_world, gauge_alignment(start, graph.body_from_world))
+        return cls(cleaned, start, truth)
+
+
+@dataclass(frozen=True)
+class FineBatch:
+    """Several graphs as one disjoint graph of its inlier edges (float32; N nodes, M edges in all).
+
+    Attributes:
+        source, target: ``(M,)``.
+        measured, rectified: ``(M, 4)`` target_from_source before and after CleanNet.
+        outlier_logit: ``(M,)``.
+        start, truth: ``(N, 4)`` body_from_world.
+        graph: ``(N,)`` of every node.
+        edges: both directions of the edges.
+    """
+
+    source: Tensor
+    target: Tensor
+    measured: Tensor
+    rectified: Tensor
+    outlier_logit: Tensor
+    start: Tensor
+    truth: Tensor
+    graph: Tensor
+    edges: DirectedEdges
+
+    @classmethod
+    def of(cls, graphs: Sequence[StartedGraph], edge_dropout: float, rng: np.random.Generator) -> FineBatch:
+        """Every graph loses a share of ``edge_dropout`` of its inlier edges at random."""
+        sizes = [len(graph.start) for graph in graphs]
+        offsets = np.concatenate(([0], np.cumsum(sizes)))
+        columns: list[list[Tensor]] = [[] for _ in range(5)]
+        for graph, offset in zip(graphs, offsets[:-1].tolist(), strict=True):
+            cleaned = graph.cleaned
+            kept = cleaned.is_inlier.nonzero().squeeze(1)
+            kept = kept[torch.from_numpy(rng.random(len(kept)) >= edge_dropout)]
+            for column, value in zip(
+                columns,
+                (
+                    cleaned.measured.source[kept] + offset,
+                    cleaned.measured.target[kept] + offset,
+                    cleaned.measured.target_from_source[kept].float(),
+                    cleaned.graph.target_from_source[kept].float(),
+                    cleaned.outlier_probability[kept].logit(),
+                ),
+                strict=True,
+            ):
+                column.append(value)
+        source, target, measured, rectified, logit = (torch.cat(column) for column in columns)
+        return cls(
+            source,
+            target,
+            measured,
+            rectified,
+            logit,
+            torch.cat([graph.start for graph in graphs]).float(),
+            torch.cat([graph.truth for graph in graphs]).float(),
+            torch.arange(len(graphs)).repeat_interleave(torch.tensor(sizes)),
+            DirectedEdges.of(source, target, int(offsets[-1])),
+        )
+
+    def to(self, device: torch.device) -> FineBatch:
+        """The same on another device."""
+        edges = DirectedEdges(*(getattr(self.edges, n).to(device) for n in ("source", "target", "inverse_degree")))
+        moved = {name: value.to(device) for name, value in vars(self).items() if name != "edges"}
+        return FineBatch(**moved, edges=edges)
+
+    def fine_tune(self, network: FineNet, body_from_world: Tensor) -> tuple[Tensor, Tensor]:
+        """One pass of ``network`` from ``body_from_world`` ``(N, 4)``; what it gives and the scale ``(N, 1)``."""
+        with torch.no_grad():
+            raw, clean = (
+                rotations.canonical(edge_residual(body_from_world, relative, self.source, self.target)).t()[:3]
+                for relative in (self.measured, self.rectified)
+            )
+            scale = typical_size(raw, self.graph[self.source], self.graph).expand(len(self.start), 1)
+            features = edge_features(raw, clean, self.outlier_logit, scale[self.source, 0]).t()
+        return network(body_from_world, features, scale, self.edges), scale
