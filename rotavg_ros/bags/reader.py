@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.interfaces import Connection, QosDurability
@@ -17,6 +17,7 @@ from rosbags.rosbag2 import ReaderError as Rosbag2Error
 from rotavg_ros.bags.message_types import typestore
 from rotavg_ros.errors import UserError
 
+_Record = TypeVar("_Record")
 # Files that are bags by themselves.
 RECORDING_SUFFIXES = (".mcap", ".db3", ".bag")
 
@@ -39,6 +40,24 @@ class BagMessage:
     message_type: str
     time_ns: int
     data: bytes
+
+
+class Sound(Generic[_Record]):
+    """Records of a bag up to where it is damaged.
+
+    Attributes:
+        damage: the message about it, once that place has been reached; None: the bag is whole so far.
+    """
+
+    def __init__(self, records: Iterator[_Record]) -> None:
+        self._records = records
+        self.damage: str | None = None
+
+    def __iter__(self) -> Iterator[_Record]:
+        try:
+            yield from self._records
+        except BagReadError as error:
+            self.damage = str(error)
 
 
 class BagReader:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -80,11 +81,15 @@ def run(arguments: argparse.Namespace) -> int:
                 + ", ".join(f"{use.topic} ({use.type_name})" for use in plan.topics)
             )
         window = Window(arguments.start, arguments.duration, arguments.rate)
-        print(_replay(bag, plan, window, arguments))
-    return 0
+        summary = _replay(bag, plan, window, arguments)
+    print(_told(summary, arguments.output))
+    if summary["damage"] is None:
+        return 0
+    print(f"rotavg: warning: {summary['damage']}; what could be read is in {arguments.output}", file=sys.stderr)
+    return 2
 
 
-def _replay(bag: BagReader, plan: Plan, window: Window, arguments: argparse.Namespace) -> str:
+def _replay(bag: BagReader, plan: Plan, window: Window, arguments: argparse.Namespace) -> dict[str, Any]:
     # The solver and the pictures take seconds to import: not before there is something to do for them.
     from rotavg_ros.replay.assemble import assemble
     from rotavg_ros.replay.outputs import RECORDING, output_folder, write_summary, write_tables
@@ -101,8 +106,7 @@ def _replay(bag: BagReader, plan: Plan, window: Window, arguments: argparse.Name
             write_tables(folder, record)
             if not arguments.no_report:
                 write_report(record, folder)
-            summary = write_summary(folder, record, bag.path, outcome)
-    return _told(summary, arguments.output)
+            return write_summary(folder, record, bag.path, outcome)
 
 
 @contextmanager
@@ -138,7 +142,7 @@ def _described(plan: Plan) -> str:
 
 def _told(summary: dict[str, Any], output: Path) -> str:
     lines = []
-    if summary["interrupted"]:
+    if summary["interrupted"] and summary["damage"] is None:
         lines.append(f"interrupted after {summary['duration_s']:.1f} s of the bag; what is done is written")
     if not summary["loop_closures"]:
         lines.append("no loop closures in this bag: orientations are the odometry's, and nothing could be corrected")

@@ -27,7 +27,7 @@ def assemble(bag: BagReader, plan: Plan, outcome: Outcome) -> RunRecord:
     """Everything that is known about a replay.
 
     Raises:
-        BagReadError, GraphFileError: a reference that cannot be read, or that belongs to something else.
+        GraphFileError: a reference that cannot be read, or that belongs to something else.
     """
     answer = outcome.answer
     trajectories = outcome.estimator.trajectories(answer)
@@ -44,7 +44,7 @@ def assemble(bag: BagReader, plan: Plan, outcome: Outcome) -> RunRecord:
         rejected=outcome.estimator.counts().rejected,
         options=dataclasses.asdict(plan.parameters),
         wall_seconds=outcome.wall_seconds,
-        interrupted=outcome.interrupted,
+        interrupted=outcome.interrupted or outcome.damage is not None,
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rotavg_ros.bags.reader import BagReader
+from rotavg_ros.bags.reader import BagReader, Sound
 from rotavg_ros.inputs import (
     EDGE_CONVERTERS,
     ODOMETRY_CONVERTERS,
@@ -105,10 +105,12 @@ def read_translations(bag: BagReader, plan: Plan, start_ns: int, stop_ns: int) -
     topic, edge_topic = plan.translations
     vectors = [
         (float(message.vector.x), float(message.vector.y), float(message.vector.z))
-        for _, _, message in bag.decoded([topic], start_ns, stop_ns)
+        for _, _, message in Sound(bag.decoded([topic], start_ns, stop_ns))
     ]
     whole = start_ns <= bag.start_ns and stop_ns >= bag.end_ns
-    edges = bag.num_messages([edge_topic]) if whole else sum(1 for _ in bag.decoded([edge_topic], start_ns, stop_ns))
+    edges = (
+        bag.num_messages([edge_topic]) if whole else sum(1 for _ in Sound(bag.decoded([edge_topic], start_ns, stop_ns)))
+    )
     return vectors if len(vectors) == edges else []
 
 
@@ -135,7 +137,7 @@ def _read_reference(bag: BagReader, source: Input, start_ns: int, stop_ns: int) 
 
 
 def _records(bag: BagReader, source: Input, start_ns: int, stop_ns: int) -> Iterator[OdometryRecord]:
-    for _, _, message in bag.decoded([source.topic], start_ns, stop_ns):
+    for _, _, message in Sound(bag.decoded([source.topic], start_ns, stop_ns)):
         try:
             yield ODOMETRY_CONVERTERS[source.type_name](message, IDENTITY)
         except RejectedInputError:

@@ -111,7 +111,7 @@ class RunRecord:
         rejected: inputs refused, by :class:`~rotavg_ros.online.RejectReason` value.
         options: the parameters, by the node's names.
         wall_seconds: that the replay took.
-        interrupted: stopped by Ctrl-C before the bag's end.
+        interrupted: stopped by Ctrl-C, or by damage to the bag, before its end.
     """
 
     name: str

@@ -12,10 +12,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rotavg_ros.bags.reader import BagReader
+from rotavg_ros.bags.reader import BagReader, BagReadError, Sound
 from rotavg_ros.errors import UserError
 from rotavg_ros.inputs import OdometryRecord
 from rotavg_ros.online import Answer, OnlineEstimator
+from rotavg_ros.online.measurements import OWN_EDGE_ID
 from rotavg_ros.replay.feed import Feed, read_translations
 from rotavg_ros.replay.plan import Plan
 from rotavg_ros.replay.record import TickRecord
@@ -52,6 +53,7 @@ class Outcome:
         start_ns, end_ns: bag time of the replayed part.
         failures: ticks whose solve failed; the last one did not.
         interrupted: before the end.
+        damage: why the bag could not be read to its end; None: it could.
         wall_seconds: that it took.
     """
 
@@ -63,6 +65,7 @@ class Outcome:
     end_ns: int
     failures: int
     interrupted: bool
+    damage: str | None
     wall_seconds: float
 
 
@@ -91,7 +94,7 @@ def replay(
         stop: asked between messages whether the user wants it to end.
 
     Raises:
-        BagReadError: a damaged bag.
+        BagReadError: a bag that is damaged before anything could be made of it.
         ReplayError: no message, or none from which a keyframe could be made.
     """
     started = time.perf_counter()
@@ -106,7 +109,8 @@ def replay(
         feed = Feed(estimator, plan, read_translations(bag, plan, start_ns, stop_ns), loop.on_odometry)
         end_ns, interrupted = start_ns, False
         is_whole = start_ns == bag.start_ns and stop_ns == bag.end_ns
-        for topic, time_ns, message in bag.decoded(feed.topics, *((None, None) if is_whole else (start_ns, stop_ns))):
+        records = Sound(bag.decoded(feed.topics, *((None, None) if is_whole else (start_ns, stop_ns))))
+        for topic, time_ns, message in records:
             if window.rate > 0:
                 _wait_until(started + (time_ns - start_ns) / _NANOSECONDS / window.rate, stop)
             if interrupted := stop():
@@ -115,9 +119,12 @@ def replay(
             feed(topic, message)
             progress((time_ns - end_ns) / _NANOSECONDS)
             end_ns = time_ns
+        damage = records.damage
         answer = loop.finish()
     if answer is None and interrupted:
         raise ReplayError(f"{bag.path}: interrupted before the first keyframe; there is nothing to write")
+    if answer is None and damage is not None:
+        raise BagReadError(damage)
     if answer is None:
         raise ReplayError(f"{bag.path}: {_why_nothing(plan, estimator.counts().rejected)}")
     return Outcome(
@@ -129,6 +136,7 @@ def replay(
         end_ns,
         loop.failures,
         interrupted,
+        damage,
         time.perf_counter() - started,
     )
 
@@ -192,8 +200,6 @@ class _Loop:
     def _note(self, answer: Answer | None) -> bool:
         if answer is None:
             return False
-        before = np.zeros(0, dtype=bool) if self._last is None else self._last.outlier
-        shared = min(len(before), len(answer.outlier))
         tick = TickRecord(
             stamp_ns=self._now_ns,
             seconds=answer.seconds,
@@ -201,11 +207,22 @@ class _Loop:
             keyframes=len(answer.keyframe_id),
             edges=len(answer.outlier),
             outliers=int(answer.outlier.sum()),
-            flips=int((before[:shared] != answer.outlier[:shared]).sum()),
+            flips=0 if self._last is None else _flips(self._last, answer),
         )
         self.ticks.append(tick)
         self._last = answer
         return True
+
+
+def _flips(before: Answer, now: Answer) -> int:
+    """How many edges in both answers have changed their flags."""
+    shared = min(len(before.edge_id), len(now.edge_id))
+    if (before.edge_id[:shared] == now.edge_id[:shared]).all():
+        return int((before.outlier[:shared] != now.outlier[:shared]).sum())
+    # Keyframes were marginalised in between; of the estimator's own edges it is not known which was which.
+    _, old, new = np.intersect1d(before.edge_id, now.edge_id, return_indices=True)
+    is_known = now.edge_id[new] != OWN_EDGE_ID
+    return int((before.outlier[old] != now.outlier[new])[is_known].sum())
 
 
 def _bounds(bag: BagReader, window: Window) -> tuple[int, int]:

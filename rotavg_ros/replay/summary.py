@@ -31,6 +31,7 @@ def summarize(record: RunRecord, bag: Path, outcome: Outcome) -> dict[str, Any]:
         "bag": str(bag),
         "duration_s": record.duration_s,
         "interrupted": record.interrupted,
+        "damage": outcome.damage,
         "keyframes": len(answer.keyframe_id),
         "edges": len(answer.outlier),
         "loop_closures": int(closures.sum()),

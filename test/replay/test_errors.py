@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -82,7 +83,6 @@ def unknown_compression(folder: Path, small: Path) -> Path:
     ("broken", "says"),
     [
         (truncated, "not a readable bag, or a truncated one"),
-        (corrupted, "the bag is damaged: only "),
         (zero_length, "not a readable bag, or a truncated one"),
         (without_messages, "has no messages"),
         (without_odometry, "its topics: /wind (geometry_msgs/msg/Vector3Stamped)"),
@@ -99,6 +99,18 @@ def test_a_bag_that_cannot_be_replayed(
     assert error.startswith("rotavg: error: ")
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_what_comes_before_the_damage_is_written(
+    tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = corrupted(tmp_path, small)
+    assert main(["replay", str(bag), "--output", str(tmp_path / "out"), "--no-report"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"rotavg: warning: {bag}: ") and error.count("\n") == 1
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["damage"] in error and summary["interrupted"] and summary["keyframes"] > 0
+    assert (tmp_path / "out" / "trajectory.tum").exists()
 
 
 @pytest.mark.parametrize(
