@@ -47,7 +47,7 @@ class SlamMemory:
         inlier_probability: ``(M,)`` that an edge is not a false one; all of a segment have that of the segment.
         prior_log_odds: ``(M,)`` what the network said of closures.
         steps: ``(M,)`` variance of a closure in units of the closures'; more than 1 where neighbours err together.
-        exactness: ``(M,)`` how much of its weight a closure has that errs more than most.
+        exact_share: ``(M,)`` probability of a good closure to err no more than most.
         chain_noise: the noise as the odometry has it.
         noise: the noise as the refinement left it.
         max_step_variance: rad², as the refinement kept it.
@@ -60,7 +60,7 @@ class SlamMemory:
     inlier_probability: np.ndarray
     prior_log_odds: np.ndarray
     steps: np.ndarray
-    exactness: np.ndarray
+    exact_share: np.ndarray
     chain_noise: NoiseModel
     noise: NoiseModel
     max_step_variance: float
@@ -95,7 +95,7 @@ class SlamMemory:
             closure_graph.edge_values(estimate.inlier_probability),
             closure_graph.edge_values(prior_log_odds),
             closure_graph.edge_values(estimate.steps),
-            closure_graph.edge_values(estimate.exactness),
+            closure_graph.edge_values(estimate.exact_share),
             chain_noise,
             estimate.noise,
             estimate.max_step_variance,
@@ -127,7 +127,7 @@ class SlamMemory:
             start.prior_log_odds,
             self.max_step_variance,
             self._rank(closure_graph),
-            self._extended(self.exactness, closure_graph, 1.0),
+            self._extended(self.exact_share, closure_graph, 1.0),
         )
         if estimate is None:
             return None

@@ -44,7 +44,7 @@ _ITERATING_PAYS = 4000
 _NEAR = 0.2
 # Of a graph that has grown by a few edges: passes at most, and when they end; the next update goes on from there.
 _UPDATE_PASSES = 5
-_UPDATED_STEP = np.radians(0.2)
+_UPDATED_STEP = np.radians(0.02)
 _UPDATED_PROBABILITY = 0.02
 # A graph that turns by more than this is solved as a whole.
 _MAX_UPDATE = np.radians(20.0)
@@ -84,7 +84,7 @@ class SlamEstimate:
         steps: ``(E,)`` the graph's, more where closures err together.
         max_step_variance: what the step variance was kept under, rad².
         rank: ``(K,)`` where each key node stands in the order of elimination; None if there was none.
-        exactness: ``(E,)`` by how much less a good closure weighs because it errs more than most.
+        exact_share: ``(E,)`` probability of a good closure to err no more than most.
     """
 
     correction: Tensor
@@ -98,7 +98,7 @@ class SlamEstimate:
     steps: np.ndarray
     max_step_variance: float
     rank: np.ndarray | None
-    exactness: np.ndarray
+    exact_share: np.ndarray
 
 
 def refine(
@@ -155,7 +155,7 @@ def update(
     log_odds: np.ndarray,
     max_step_variance: float,
     rank: np.ndarray,
-    exactness: np.ndarray,
+    exact_share: np.ndarray,
 ) -> SlamEstimate | None:
     """The same for a graph that has grown a little since :func:`refine`, from the verdicts and noise it ended with.
 
@@ -163,13 +163,15 @@ def update(
         graph: with steps as :class:`SlamEstimate` has them.
         max_step_variance: as :class:`SlamEstimate` has it.
         rank: ``(K,)`` order of elimination.
-        exactness: as :class:`SlamEstimate` has it.
+        exact_share: as :class:`SlamEstimate` has it.
 
     Returns:
         None if orientations turn by so much that all has to be judged anew.
     """
     state = _State(graph, correction, inlier_probability, noise, log_odds, False, rank)
-    state.exactness = exactness
+    state.is_update = True
+    state.exact_share = exact_share
+    state.exactness = exact_share + (1 - exact_share) / _tail_ratio(noise.closure_variance)
     for _ in range(_UPDATE_PASSES):
         moved, changed = state.one_pass(max_step_variance, refresh=not state.has_predictions)
         if moved > _MAX_UPDATE:
@@ -185,6 +187,8 @@ class _State:
     _system: FactorisedLaplacian
     _factorised: FactorisedLaplacian
     _samples: np.ndarray | None = None
+    # Few edges are new, so that few weights change much from pass to pass.
+    is_update = False
 
     def __init__(
         self,
@@ -267,7 +271,7 @@ class _State:
             self.graph.steps,
             max_step_variance,
             self.pattern.rank,
-            self.exactness,
+            self.exact_share,
         )
 
     def alternate(self, max_step_variance: float, max_passes: int) -> None:
@@ -291,7 +295,7 @@ class _State:
         variance, weight = self._variance(noise.step_variance), self._weight(noise.step_variance)
         # A pass after one that has not settled weighs as that did.
         if self.passes == 0 or not np.array_equal(weight, self._system.weight):
-            is_near = self._changed < _NEAR and graph.num_nodes >= _ITERATING_PAYS
+            is_near = (self._changed < _NEAR or self.is_update) and graph.num_nodes >= _ITERATING_PAYS
             if self.passes == 0 or refresh or not is_near:
                 self._system = self._factorised = self.pattern.factorize(weight)
                 self._samples = None if refresh else self._samples
@@ -351,7 +355,9 @@ class _State:
         if not refresh:
             gain = weight * self.prediction_variance
             return np.asarray(np.minimum(gain / (1 + gain), _MAX_LEVERAGE))
-        resistance = (self.difference(self.samples) ** 2).mean(axis=1)
+        # A few columns at a time, which stay in a core's cache.
+        parts = np.array_split(self.samples, _NUM_PROBES // 4, axis=1)
+        resistance = sum((self.difference(part) ** 2).sum(axis=1) for part in parts) / _NUM_PROBES
         leverage = np.clip(weight * resistance, 0.0, _MAX_LEVERAGE)
         self.prediction_variance, self._prediction_pass = resistance / (1 - leverage), self.passes
         return np.asarray(leverage)
