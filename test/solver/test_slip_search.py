@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import networkx
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import ncx2
 
 from rotavg_ros import EdgeKind, ViewGraph, rotations, solve
+from rotavg_ros.evaluation import slam_cases, slam_contenders, slam_scoring
 from rotavg_ros.evaluation.metrics import orientation_errors
 from rotavg_ros.solver import slam_stages
 from rotavg_ros.solver.cycle_votes import count_votes
@@ -20,32 +24,34 @@ from rotavg_ros.solver.truncated_cost import TruncatedCost
 from test.solver.graphs import as_quaternions, measured, random_truth, small_noise
 
 LAP, LAPS = 40, 4
-NUM_NODES = LAP * LAPS
 SLIPS = {25: 50.0, 90: -35.0}  # after these nodes, degrees
 
 
-def laps(planar: bool, false_share: float, seed: int = 0) -> tuple[ViewGraph, Rotation, np.ndarray, np.ndarray]:
-    """Laps with a closure to every earlier lap at each node; odometry slips twice. Truth, false closures, slips."""
+def laps(
+    planar: bool, false_share: float, seed: int = 0, num_laps: int = LAPS, slips: dict[int, float] = SLIPS
+) -> tuple[ViewGraph, Rotation, np.ndarray, np.ndarray]:
+    """Laps with a closure to every earlier lap at each node; odometry slips. Truth, false closures, slips."""
     rng = np.random.default_rng(seed)
-    truth = random_truth(NUM_NODES, seed, planar)
-    first, second = np.triu_indices(LAPS, 1)
+    num_nodes = LAP * num_laps
+    truth = random_truth(num_nodes, seed, planar)
+    first, second = np.triu_indices(num_laps, 1)
     place = np.arange(LAP)[:, None]
     source, target = (place + LAP * first).ravel(), (place + LAP * second).ravel()
     num_closures = len(source)
-    source = np.concatenate((np.arange(NUM_NODES - 1), source))
-    target = np.concatenate((np.arange(1, NUM_NODES), target))
-    sigma = np.repeat([0.1, 0.5], [NUM_NODES - 1, num_closures])
+    source = np.concatenate((np.arange(num_nodes - 1), source))
+    target = np.concatenate((np.arange(1, num_nodes), target))
+    sigma = np.repeat([0.1, 0.5], [num_nodes - 1, num_closures])
     noise = small_noise(len(source), sigma, seed, planar)
     is_false = np.zeros(len(source), dtype=bool)
-    is_false[NUM_NODES - 1 + rng.permutation(num_closures)[: round(false_share * num_closures)]] = True
+    is_false[num_nodes - 1 + rng.permutation(num_closures)[: round(false_share * num_closures)]] = True
     wrong = Rotation.random(int(is_false.sum()), random_state=seed).as_rotvec()
     vector = noise.as_rotvec()
     vector[is_false] = [0, 0, 1] * rng.uniform(-np.pi, np.pi, (len(wrong), 1)) if planar else wrong
-    for step, angle in SLIPS.items():
+    for step, angle in slips.items():
         vector[step] = np.radians(angle) * np.array([0, 0, 1.0] if planar else [0.6, 0, 0.8])
-    kind = np.repeat([EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE], [NUM_NODES - 1, num_closures])
+    kind = np.repeat([EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE], [num_nodes - 1, num_closures])
     graph = measured(truth, source, target, Rotation.from_rotvec(vector), kind=kind)
-    return graph, truth, is_false, np.isin(np.arange(len(source)), list(SLIPS))
+    return graph, truth, is_false, np.isin(np.arange(len(source)), list(slips))
 
 
 @pytest.mark.parametrize("planar", [True, False])
@@ -61,6 +67,41 @@ def test_slips_and_false_closures_are_told_apart(planar: bool, false_share: floa
     without = solve(graph, profile="slam", method="neurora-without-slip-search")
     errors = orientation_errors(without.body_from_world, as_quaternions(truth), graph.components())
     assert np.degrees(float(errors.mean())) > 5
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_slips_that_nearly_cancel_do_not_pass_for_drift(seed: int) -> None:
+    graph, truth, is_false, is_slip = laps(
+        planar=True, false_share=0.3, seed=seed, num_laps=3, slips={25: 50.0, 29: -40.0, 90: -35.0, 100: 30.0}
+    )
+    solution = solve(graph, profile="slam")
+    errors = orientation_errors(solution.body_from_world, as_quaternions(truth), graph.components())
+    assert np.degrees(float(errors.mean())) < 0.5
+    flagged = (solution.outlier_score > 0.5).numpy()
+    assert flagged[is_slip].all()
+    assert not flagged[~is_false & ~is_slip].any()
+
+
+def test_groups_of_false_closures_do_not_pass_for_slips() -> None:
+    """A stretch of the second lap that all its closures turn alike could be two slips, at a lower cost one by one."""
+    graph = laps(planar=True, false_share=0.0, num_laps=3, slips={})[0]
+    source, target = graph.source.numpy(), graph.target.numpy()
+    in_group = (graph.kind == EdgeKind.LOOP_CLOSURE).numpy() & (source % LAP >= 10) & (source % LAP < 18)
+    in_group &= (source < LAP) & (target < 2 * LAP)
+    turn = rotations.exp(torch.tensor([0.0, 0.0, np.radians(40.0)]).double()).expand(graph.num_edges, 4)
+    turned = rotations.multiply(graph.target_from_source, turn)
+    wrong = torch.where(torch.from_numpy(in_group)[:, None], turned, graph.target_from_source)
+    solution = solve(replace(graph, target_from_source=wrong), profile="slam")
+    np.testing.assert_array_equal((solution.outlier_score > 0.5).numpy(), in_group)
+
+
+def test_a_closure_that_alone_ties_a_loop_may_err_more_than_most(shared_data: Path) -> None:
+    """FR079, in which odometry drifts unevenly; calling good closures false for that tripled the error."""
+    (case,) = slam_cases.cases(shared_data, ["FR079"], [0.1], [5], hard=False)
+    contenders = slam_contenders.contenders(["neurora", "oracle"])
+    scores = slam_scoring.score_all([case], contenders)
+    (ratio,) = scores.ratios("neurora", ["FR079"]).values()
+    assert ratio < 1.5
 
 
 def test_the_answer_depends_on_neither_order_nor_gauge() -> None:
