@@ -9,7 +9,8 @@ from typing import Any
 from rotavg_ros.inputs.fields import edge_id_of, target_from_source, to_tuple, to_vector
 from rotavg_ros.inputs.records import EdgeRecord, Source
 from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason, quaternion
-from rotavg_ros.online.measurements import RejectedInputError
+from rotavg_ros.online.fingerprints import Fingerprints
+from rotavg_ros.online.measurements import MAX_ID, RejectedInputError
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.view_graph import EdgeKind
 
@@ -33,12 +34,12 @@ class ForeignGraph:
 
     def __init__(self, source: Source) -> None:
         self._source = source
-        self._seen: set[tuple[object, ...]] = set()
+        self._seen = Fingerprints(_MOST_REMEMBERED)
         self._stamp_ns: dict[Key, int] = {}
         self._odometry: dict[tuple[Key, Key], Quaternion] = {}
 
     def forget(self) -> None:
-        self._seen.clear()
+        self._seen = Fingerprints(_MOST_REMEMBERED)
         self._stamp_ns.clear()
         self._odometry.clear()
 
@@ -61,7 +62,7 @@ class ForeignGraph:
             precision: rad⁻², 0 unknown.
         """
         source_from_target = to_tuple(rotation)
-        measurement = (*ends, kind, source_from_target)
+        measurement = hash((*ends, kind, source_from_target)) & MAX_ID
         if measurement in self._seen:
             return
         try:
@@ -74,7 +75,6 @@ class ForeignGraph:
             if quaternion.angle_between(self._odometry.setdefault(ends, inside), inside) > _LARGEST_REFINEMENT:
                 yield EdgeRecord(RejectReason.CONTRADICTORY_ODOMETRY)
                 return
-        _make_room(self._seen)
         self._seen.add(measurement)
         source, target = (KeyframeReference(*key, self._stamp_ns.get(key)) for key in ends)
         edge_id = edge_id_of(ends[0][1], ends[1][1], kind)
@@ -83,7 +83,7 @@ class ForeignGraph:
         yield EdgeRecord(EdgeMeasurement(edge_id, source, target, inside, kind, precision, position))
 
 
-def _make_room(memory: set[Any] | dict[Any, Any]) -> None:
+def _make_room(memory: dict[Any, Any]) -> None:
     if len(memory) >= _MOST_REMEMBERED:
         memory.clear()
 
