@@ -34,8 +34,9 @@ from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 _FILL = 0.9
 # If less than this share of the limit could be spared, it is not tried again before a tenth of it has come.
 _WORTHWHILE = 0.01
-# Of how many marginalised keyframes it stays known where they were, in limits of keyframes.
+# Of how many marginalised keyframes it stays known where they were: so many limits of keyframes, or a few megabytes.
 _REMEMBERED = 4
+_REMEMBERED_AT_LEAST = 50_000
 
 
 class GraphBuilder:
@@ -239,9 +240,8 @@ class GraphBuilder:
         )
         if not surplus_keyframes and not surplus_edges:
             return
-        renumbering = graph.compact(
-            surplus_keyframes, surplus_edges, self.outlier, _REMEMBERED * self.options.max_keyframes
-        )
+        remembered = max(_REMEMBERED * self.options.max_keyframes, _REMEMBERED_AT_LEAST)
+        renumbering = graph.compact(surplus_keyframes, surplus_edges, self.outlier, remembered)
         gained = sizes[0] - graph.num_keyframes, sizes[1] - graph.num_edges
         for index, limit in enumerate(limits):
             if (surplus_keyframes, surplus_edges)[index] and gained[index] < max(1, _WORTHWHILE * limit):

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros import rotations
 from rotavg_ros.datasets.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.datasets.trajectories import World
-from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
+from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator, graph_builder
 from rotavg_ros.online.fingerprints import Fingerprints
 from rotavg_ros.solver.fine_net import edge_residual
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
@@ -123,7 +123,8 @@ def test_indices_follow_even_while_a_solve_is_under_way(judging, solver, tmp_pat
     assert estimator.tick(force_cold=True).num_components == 1
 
 
-def test_a_closure_to_a_marginalized_keyframe_is_tied_to_the_nearest_that_is_left(solver):
+def test_a_closure_to_a_marginalized_keyframe_is_tied_to_the_nearest_that_is_left(solver, monkeypatch):
+    monkeypatch.setattr(graph_builder, "_REMEMBERED_AT_LEAST", 100)
     estimator = OnlineEstimator(replace(EVERY_MESSAGE, max_keyframes=30), solver)
     drive = Drive(estimator, 400)
     drive.go(60)
