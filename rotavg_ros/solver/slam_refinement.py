@@ -46,6 +46,8 @@ _NEAR = 0.2
 _UPDATE_PASSES = 5
 _UPDATED_STEP = np.radians(0.02)
 _UPDATED_PROBABILITY = 0.02
+# After an update's first pass a probability that would change by more than this goes half the way.
+_SWING = 0.2
 # A graph that turns by more than this is solved as a whole.
 _MAX_UPDATE = np.radians(20.0)
 # An edge that alone holds two parts of the graph together has leverage 1; it cannot be judged by the others.
@@ -342,6 +344,10 @@ class _State:
             self.exactness = self.exact_share + (1 - self.exact_share) / tail
         judged = judged + self.noise.prior_log_odds
         probability = np.where(closure, expit(judged + self.prior_log_odds), self.inlier_probability)
+        if self.is_update and self.passes > 1:
+            # Closures of which each is good if the other is not would change places from update to update.
+            is_swinging = np.abs(probability - self.inlier_probability) > _SWING
+            probability = np.where(is_swinging, (probability + self.inlier_probability) / 2, probability)
         self._changed = changed = float(np.abs(probability - self.inlier_probability).max(initial=0.0))
         self.inlier_probability = probability
         self._discrepancy = np.sqrt(predicted_square)
