@@ -18,6 +18,7 @@ INWARD = {
     "datasets": {"errors", "rotations", "view_graph"},
     "online": {"errors", "rotations", "solver", "view_graph"},
     "inputs": {"online", "view_graph"},
+    "settings": {"errors", "inputs", "online", "solver", "view_graph"},
 }
 # Others' packages that only one part may know.
 BORDERS = {"rclpy": "ros", "rosbags": "bags", "mcap": "bags"}

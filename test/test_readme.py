@@ -12,7 +12,7 @@ import numpy as np
 from rotavg_ros import solve
 from rotavg_ros.cli.main import COMMANDS
 from rotavg_ros.datasets.graph_file import read_graph
-from rotavg_ros.ros.parameters import to_markdown
+from rotavg_ros.settings.text import to_markdown
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 
@@ -20,7 +20,7 @@ README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding=
 def test_the_parameter_table_is_the_nodes_own() -> None:
     table = re.search(r"^<!-- parameters: .*-->\n(.*?)^<!-- end of parameters -->$", README, re.MULTILINE | re.DOTALL)
     assert table is not None
-    assert table[1] == to_markdown(), "paste the output of rotavg_ros.ros.parameters.to_markdown()"
+    assert table[1] == to_markdown(), "paste the output of rotavg_ros.settings.text.to_markdown()"
 
 
 def test_every_command_is_in_the_table() -> None:

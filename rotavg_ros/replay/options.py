@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.ros.parameters import NODE_NAME, NodeParameters
+from rotavg_ros.settings.parameters import NODE_NAME, NodeParameters
 
 Values = dict[str, Any]
 

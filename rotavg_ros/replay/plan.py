@@ -15,7 +15,7 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
 from rotavg_ros.replay.record import TopicUse
 from rotavg_ros.replay.topics import Candidate, Candidates, find_candidates
-from rotavg_ros.ros.parameters import NodeParameters
+from rotavg_ros.settings.parameters import NodeParameters
 
 # Parameters that name topics, and those with so many numbers or names for each of them.
 _PER_TOPIC = {

@@ -13,7 +13,7 @@ from rotavg_ros.bags.writer import BagWriter
 from rotavg_ros.inputs import OdometryRecord
 from rotavg_ros.online import Answer, OnlineEstimator
 from rotavg_ros.online.drawing import draw
-from rotavg_ros.ros.parameters import NODE_NAME, NodeParameters
+from rotavg_ros.settings.parameters import NODE_NAME, NodeParameters
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind
 

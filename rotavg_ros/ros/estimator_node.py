@@ -18,12 +18,12 @@ from rotavg_ros.online import OnlineEstimator
 from rotavg_ros.ros import parameter_server
 from rotavg_ros.ros.diagnostics import Health, Reporter
 from rotavg_ros.ros.outputs import Outputs
-from rotavg_ros.ros.parameters import NODE_NAME, NodeParameters
 from rotavg_ros.ros.services import Services
 from rotavg_ros.ros.solving import Solving
 from rotavg_ros.ros.subscriptions import Subscriptions
 from rotavg_ros.ros.warm_up import warm_up
 from rotavg_ros.ros.worker import Worker
+from rotavg_ros.settings.parameters import NODE_NAME, NodeParameters
 from rotavg_ros.version import __version__
 
 _SHORT_SOLVE_S = 0.2  # a longer one need not be waited for at the end: nobody would read its answer

@@ -85,7 +85,8 @@ def _run(stop: _StopSignal) -> int:
 
 def _answer_arguments(arguments: list[str]) -> int:
     if arguments == ["--print-parameters"]:
-        from rotavg_ros.ros.parameters import NodeParameters, to_yaml
+        from rotavg_ros.settings.parameters import NodeParameters
+        from rotavg_ros.settings.text import to_yaml
 
         print(to_yaml(NodeParameters()), end="")
         return 0

@@ -16,9 +16,9 @@ from visualization_msgs.msg import MarkerArray
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import Answer, OnlineEstimator
 from rotavg_ros.ros.conversions import flags_message, orientations_message, to_quaternion_message
-from rotavg_ros.ros.parameters import NodeParameters
 from rotavg_ros.ros.topics import LATCHED, publisher
 from rotavg_ros.ros.visualization import markers_message, path_message
+from rotavg_ros.settings.parameters import NodeParameters
 
 
 class Outputs:

@@ -17,7 +17,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.ros.parameters import NodeParameters, ParameterError, default
+from rotavg_ros.settings.fields import ParameterError, default
+from rotavg_ros.settings.parameters import NodeParameters
 
 
 def declare(node: Node) -> NodeParameters:

@@ -20,8 +20,8 @@ from rotavg_ros.ros.diagnostics import Health
 from rotavg_ros.ros.edge_intake import EdgeIntake
 from rotavg_ros.ros.message_counting import TopicCounter
 from rotavg_ros.ros.outputs import Outputs
-from rotavg_ros.ros.parameters import NodeParameters
 from rotavg_ros.ros.topics import overrides, user_error_about
+from rotavg_ros.settings.parameters import NodeParameters
 
 _LOG_PERIOD_S = 5.0
 

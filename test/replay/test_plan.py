@@ -16,7 +16,8 @@ from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.bags.writer import BagWriter
 from rotavg_ros.replay.options import ReplayOptionError, read_parameter_file
 from rotavg_ros.replay.plan import Plan, Wishes, make_plan
-from rotavg_ros.ros.parameters import NodeParameters, to_yaml
+from rotavg_ros.settings.parameters import NodeParameters
+from rotavg_ros.settings.text import to_yaml
 
 IMU = "sensor_msgs/msg/Imu"
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])

@@ -26,7 +26,8 @@ import rotavg_ros
 from rotavg_ros.inputs import Source
 from rotavg_ros.inputs.rotavg import edge_from_message
 from rotavg_ros.online import Answer, OnlineEstimator
-from rotavg_ros.ros.parameters import NodeParameters, to_yaml
+from rotavg_ros.settings.parameters import NodeParameters
+from rotavg_ros.settings.text import to_yaml
 
 pytestmark = pytest.mark.ros
 

@@ -12,7 +12,9 @@ rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup
 from rclpy.parameter import Parameter
 
 from rotavg_ros.ros import parameter_server
-from rotavg_ros.ros.parameters import NodeParameters, ParameterError, to_markdown, to_yaml
+from rotavg_ros.settings.fields import ParameterError
+from rotavg_ros.settings.parameters import NodeParameters
+from rotavg_ros.settings.text import to_markdown, to_yaml
 
 
 @pytest.fixture

@@ -4,101 +4,84 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from rotavg_ros.errors import UserError
 from rotavg_ros.inputs import BRINGS_KEYFRAMES, Source
 from rotavg_ros.online import EstimatorOptions, quaternion
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.online.time_jumps import POLICIES
+from rotavg_ros.settings.fields import ParameterError, check, parameter
 from rotavg_ros.solver import DEVICES, PROFILES
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE
 
 NODE_NAME = "rotavg"
 
 
-class ParameterError(UserError):
-    """Parameters that cannot be, alone or together."""
-
-
-def _parameter(
-    default: Any,
-    description: str,
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    choices: tuple[str, ...] = (),
-    live: bool = False,
-) -> Any:
-    metadata = {"description": description, "low": low, "high": high, "choices": choices, "live": live}
-    return field(default=default, metadata=metadata)
-
-
 @dataclass(frozen=True)
 class NodeParameters:
     """Every parameter of the node; ``live`` ones can be changed while it runs."""
 
-    odometry_topics: tuple[str, ...] = _parameter(
+    odometry_topics: tuple[str, ...] = parameter(
         ("odom",), "topics of odometry, one per robot, 'topic' (nav_msgs/msg/Odometry) or 'topic:package/msg/Type'"
     )
-    robots: tuple[str, ...] = _parameter(
+    robots: tuple[str, ...] = parameter(
         ("robot",),
         "name of the robot behind each odometry topic; messages that number robots mean places in this list, counted "
         "from 0, or the numbers themselves where these are the names",
     )
-    odometry_sensor_orientations: tuple[float, ...] = _parameter(
+    odometry_sensor_orientations: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0, 1.0),
         "orientation of each odometry topic's sensor frame in the body frame, xyzw one after the other; one for all, "
         "or one per odometry topic",
     )
-    edge_topics: tuple[str, ...] = _parameter(
+    edge_topics: tuple[str, ...] = parameter(
         ("relative_rotations", "relative_rotation_arrays:rotavg_msgs/msg/RelativeRotationArray"),
         "topics of relative rotations, 'topic' (rotavg_msgs/msg/RelativeRotation) or 'topic:package/msg/Type'",
     )
-    edge_robots: tuple[str, ...] = _parameter(
+    edge_robots: tuple[str, ...] = parameter(
         ("",),
         "robot that an edge topic's messages are about where they name none; one for all, or one per edge topic; "
         "empty: the first of robots",
     )
-    edge_sensor_orientations: tuple[float, ...] = _parameter(
+    edge_sensor_orientations: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0, 1.0),
         "orientation of each edge topic's sensor frame in the body frame, xyzw one after the other; one for all, "
         "or one per edge topic",
     )
-    world_frame: str = _parameter("map", "frame id of what is published")
-    publish_tf: bool = _parameter(False, "publish world → odometry frame (rotation only) on /tf; needs tf2_msgs")
-    odometry_queue_depth: int = _parameter(10_000, "messages that may wait per odometry topic", low=1, high=1_000_000)
-    edge_queue_depth: int = _parameter(10_000, "messages that may wait per edge topic", low=1, high=1_000_000)
+    world_frame: str = parameter("map", "frame id of what is published")
+    publish_tf: bool = parameter(False, "publish world → odometry frame (rotation only) on /tf; needs tf2_msgs")
+    odometry_queue_depth: int = parameter(10_000, "messages that may wait per odometry topic", low=1, high=1_000_000)
+    edge_queue_depth: int = parameter(10_000, "messages that may wait per edge topic", low=1, high=1_000_000)
 
-    keyframe_source: str = _parameter(
+    keyframe_source: str = parameter(
         "odometry",
         "'odometry': keyframes are chosen from odometry messages; 'edges': a front end sends them as odometry edges",
         choices=("odometry", "edges"),
     )
-    unknown_keyframes: str = _parameter(
+    unknown_keyframes: str = parameter(
         "wait", "an edge that names an unknown keyframe waits for it, or creates it", choices=("wait", "create")
     )
-    keyframe_angle_deg: float = _parameter(
+    keyframe_angle_deg: float = parameter(
         5.0, "turn that makes a keyframe; 0 switches the criterion off", low=0.0, high=360.0, live=True
     )
-    keyframe_distance_m: float = _parameter(
+    keyframe_distance_m: float = parameter(
         0.5, "way that makes a keyframe; 0 switches the criterion off", low=0.0, high=1e6, live=True
     )
-    keyframe_interval_s: float = _parameter(
+    keyframe_interval_s: float = parameter(
         0.0,
         "time that makes a keyframe; 0 switches the criterion off; with all three off every message is one",
         low=0.0,
         high=1e6,
         live=True,
     )
-    stamp_tolerance_s: float = _parameter(
+    stamp_tolerance_s: float = parameter(
         0.1, "how far before the first or after the last odometry an edge's stamp may be", low=0.0, high=60.0, live=True
     )
-    max_odometry_gap_s: float = _parameter(
+    max_odometry_gap_s: float = parameter(
         5.0, "between odometry messages farther apart no edge is placed", low=0.0, high=1e6, live=True
     )
-    max_turn_rate_deg_s: float = _parameter(
+    max_turn_rate_deg_s: float = parameter(
         360.0,
         "odometry that turns faster has jumped, and begins a new component if it goes on from there; 0: believe all, "
         "a return to zero as well",
@@ -106,70 +89,72 @@ class NodeParameters:
         high=1e6,
         live=True,
     )
-    max_speed_m_s: float = _parameter(
+    max_speed_m_s: float = parameter(
         50.0, "odometry that moves faster has jumped, likewise; 0: any speed", low=0.0, high=1e6, live=True
     )
-    max_stamp_lead_s: float = _parameter(
+    max_stamp_lead_s: float = parameter(
         60.0,
         "a stamp farther ahead of the last needs a second message to be believed; 0: believe all",
         low=0.0,
         high=1e9,
         live=True,
     )
-    on_time_jump: str = _parameter(
+    on_time_jump: str = parameter(
         "reset",
         "when the data's time goes back (a bag or a simulation that begins again): begin anew; or refuse odometry "
         "until it is ahead again, silently or with an error in the diagnostics",
         choices=POLICIES,
         live=True,
     )
-    time_jump_s: float = _parameter(
+    time_jump_s: float = parameter(
         1.0, "going back by less is no jump; such odometry is refused as out of order", low=0.0, high=1e6, live=True
     )
-    max_keyframes: int = _parameter(
+    max_keyframes: int = parameter(
         200_000,
         "at so many keyframes those that can best be spared are taken out, first without any loss, then with some",
         low=1,
         high=100_000_000,
         live=True,
     )
-    max_edges: int = _parameter(
-        2_000_000, "at so many edges the loop closures that can best be spared are dropped", low=1, high=1_000_000_000, live=True
+    max_edges: int = parameter(
+        2_000_000,
+        "at so many edges the loop closures that can best be spared are dropped",
+        low=1,
+        high=1_000_000_000,
+        live=True,
     )
-    pending_capacity: int = _parameter(
+    pending_capacity: int = parameter(
         20_000, "edges that may wait for a keyframe or for odometry; the oldest go first", low=1, high=10_000_000
     )
-    pending_timeout_s: float = _parameter(300.0, "how long they may wait, in the data's time", low=0.0, high=1e9)
-    gauge: str = _parameter(
+    pending_timeout_s: float = parameter(300.0, "how long they may wait, in the data's time", low=0.0, high=1e9)
+    gauge: str = parameter(
         "odometry",
         "orientation of the first keyframe of a component: the odometry's, or identity",
         choices=("odometry", "identity"),
     )
 
-    solve_period_s: float = _parameter(
+    solve_period_s: float = parameter(
         0.5, "how often to look for something new to solve", low=0.01, high=3600.0, live=True
     )
-    method: str = _parameter("neurora", "solver, as in `rotavg solve --method`", live=True)
-    profile: str = _parameter("auto", "'slam', 'sfm', or by what the edges are", choices=tuple(PROFILES), live=True)
-    device: str = _parameter("auto", "where the networks run", choices=tuple(DEVICES))
-    refinement_steps: int = _parameter(
+    method: str = parameter("neurora", "solver, as in `rotavg solve --method`", live=True)
+    profile: str = parameter("auto", "'slam', 'sfm', or by what the edges are", choices=tuple(PROFILES), live=True)
+    device: str = parameter("auto", "where the networks run", choices=tuple(DEVICES))
+    refinement_steps: int = parameter(
         -1, "refinement steps at most, 0 for none, -1 for the profile's own number", low=-1, high=1000, live=True
     )
-    warm_start: bool = _parameter(True, "start from the last answer while data flows", live=True)
-    outlier_threshold: float = _parameter(
-        0.5, "an edge with a higher score is an outlier", low=0.0, high=1.0, live=True
-    )
-    solver_threads: int = _parameter(0, "threads of a solve; 0: all cores but one", low=0, high=1024)
+    warm_start: bool = parameter(True, "start from the last answer while data flows", live=True)
+    outlier_threshold: float = parameter(0.5, "an edge with a higher score is an outlier", low=0.0, high=1.0, live=True)
+    solver_threads: int = parameter(0, "threads of a solve; 0: all cores but one", low=0, high=1024)
 
-    state_file: str = _parameter("", "file for ~/save and ~/load, read at start if it exists; empty: none")
-    autosave_period_s: float = _parameter(0.0, "save the state this often if it changed; 0: never", low=0.0, high=1e6)
-    odometry_timeout_s: float = _parameter(
+    state_file: str = parameter("", "file for ~/save and ~/load, read at start if it exists; empty: none")
+    autosave_period_s: float = parameter(0.0, "save the state this often if it changed; 0: never", low=0.0, high=1e6)
+    odometry_timeout_s: float = parameter(
         5.0, "diagnostics warn when no odometry has come for longer", low=0.1, high=1e6, live=True
     )
 
     def __post_init__(self) -> None:
-        for parameter in fields(self):
-            _check(parameter, getattr(self, parameter.name))
+        for each in fields(self):
+            check(each, getattr(self, each.name))
         self._check_topics()
         if self.autosave_period_s > 0 and not self.state_file:
             raise ParameterError("autosave_period_s is set but state_file is empty; name a file")
@@ -245,46 +230,8 @@ class NodeParameters:
         Raises:
             ParameterError: the values do not fit, one by one or together.
         """
-        ours = {parameter.name for parameter in fields(self)}
+        ours = {each.name for each in fields(self)}
         return replace(self, **{name: _python(value) for name, value in values.items() if name in ours})
-
-
-def default(parameter: Field[Any]) -> Any:
-    """A field's default, with lists for tuples, as rclpy and YAML want them."""
-    assert parameter.default is not MISSING
-    return list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
-
-
-def to_yaml(parameters: NodeParameters, node_name: str = f"/{NODE_NAME}") -> str:
-    """A parameter file for ``--params-file``, every parameter with its description."""
-    lines = [f"{node_name}:", "  ros__parameters:"]
-    for parameter in fields(parameters):
-        value = getattr(parameters, parameter.name)
-        lines.append(f"    # {parameter.metadata['description']}")
-        lines.append(f"    {parameter.name}: {_yaml(list(value) if isinstance(value, tuple) else value)}")
-    return "\n".join(lines) + "\n"
-
-
-def to_markdown() -> str:
-    """The README's table."""
-    lines = ["| parameter | default | range | live | |", "|---|---|---|---|---|"]
-    for parameter in fields(NodeParameters):
-        about = parameter.metadata
-        allowed = " ".join(f"`{choice}`" for choice in about["choices"])
-        if about["low"] is not None:
-            allowed = f"{about['low']:g} … {about['high']:g}"
-        live = "yes" if about["live"] else ""
-        name, value = parameter.name, _yaml(default(parameter))
-        lines.append(f"| `{name}` | `{value}` | {allowed} | {live} | {about['description']} |")
-    return "\n".join(lines) + "\n"
-
-
-def _check(parameter: Field[Any], value: Any) -> None:
-    about, name = parameter.metadata, parameter.name
-    if about["choices"] and value not in about["choices"]:
-        raise ParameterError(f"{name} is {value!r}; choose from {', '.join(about['choices'])}")
-    if about["low"] is not None and not about["low"] <= value <= about["high"]:
-        raise ParameterError(f"{name} is {value}; it must be between {about['low']:g} and {about['high']:g}")
 
 
 def _check_orientations(what: str, numbers: tuple[float, ...], topics: int) -> None:
@@ -304,11 +251,3 @@ def _orientations(numbers: tuple[float, ...], topics: int) -> list[Quaternion]:
 
 def _python(value: Any) -> Any:
     return value if isinstance(value, (bool, int, float, str)) else tuple(value)
-
-
-def _yaml(value: Any) -> str:
-    if isinstance(value, list):
-        return "[" + ", ".join(_yaml(entry) for entry in value) + "]"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f'"{value}"' if isinstance(value, str) else repr(value)
