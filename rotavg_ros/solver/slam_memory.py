@@ -29,7 +29,7 @@ from rotavg_ros.solver.slam_stages import CleanedClosures, Prepared, draw_togeth
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # The whole solve runs again after so many updates, or once there are so many more closures.
-_MAX_UPDATES = 30
+_MAX_UPDATES = 60
 _MAX_GROWTH = 0.05
 # Closures whose verdict may turn in an update, and what share of all.
 _MAX_TURNED, _MAX_SHARE_TURNED = 2, 0.002
