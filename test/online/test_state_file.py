@@ -194,7 +194,7 @@ def test_killed_at_any_moment_only_what_came_since_the_last_save_is_lost(tmp_pat
     command = [sys.executable, "-c", KILL, tmp_path / "state.npz"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert ended.returncode == 0, ended.stderr
-    assert int(ended.stdout) > 100, "they got somewhere"
+    assert int(ended.stdout) > 20, "they got somewhere"  # even on a machine that does ten other things
 
 
 def test_options_may_differ_after_the_restart(filled, solver, tmp_path):
