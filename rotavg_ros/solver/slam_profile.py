@@ -1,0 +1,81 @@
+"""The SLAM profile: contract the odometry, clean, bootstrap, refine, expand; or go on from the last solve."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.solver import slam_refinement, slam_stages
+from rotavg_ros.solver.closure_graph import ClosureGraph
+from rotavg_ros.solver.methods import DEFAULT_METHOD, NETWORK_METHODS, Method
+from rotavg_ros.solver.profile import Estimate, Networks, Stopwatch
+from rotavg_ros.solver.slam_memory import SlamMemory
+from rotavg_ros.solver.slam_refinement import SlamEstimate
+from rotavg_ros.view_graph import ViewGraph
+
+
+def solve_slam(
+    graph: ViewGraph,
+    method: Method,
+    refinement_steps: int | None,
+    warm_start: Tensor | None,
+    networks: Networks,
+    watch: Stopwatch,
+) -> Estimate:
+    """One method on a graph that lives on the CPU.
+
+    Args:
+        refinement_steps: passes at most, 0 for none; None: as many as there may be.
+        warm_start: ``(N, 4)`` body_from_world instead of the tree's.
+    """
+    with watch.stage("contract"):
+        prepared = slam_stages.prepare(graph, scale_estimation=method.scale_estimation)
+    with watch.stage("clean"):
+        network = networks.load("slam-clean-net") if method.clean else None
+        cleaned = slam_stages.clean(network, prepared, graph.label)
+    with watch.stage("bootstrap"):
+        if warm_start is not None:
+            correction = prepared.closure_graph.corrections(warm_start.double())
+        elif method.tree_start:
+            correction = slam_stages.bootstrap(prepared, cleaned)
+        else:
+            correction = rotations.identity(prepared.closure_graph.num_nodes)
+    steps = (slam_refinement.MAX_PASSES if method.refine else 0) if refinement_steps is None else refinement_steps
+    if steps > 0:
+        with watch.stage("refine"):
+            estimate = slam_stages.refine(
+                prepared,
+                cleaned,
+                correction,
+                steps,
+                scale_estimation=method.scale_estimation,
+                slip_search=method.slip_search,
+            )
+        with watch.stage("expand"):
+            is_default = method is NETWORK_METHODS[DEFAULT_METHOD]
+            memory = SlamMemory.of(graph, prepared, cleaned, estimate) if is_default else None
+            return _slam_estimate(prepared.closure_graph, estimate, memory)
+    with watch.stage("expand"):
+        score = slam_stages.outlier_scores(prepared.closure_graph, 1 - cleaned.inlier_probability)
+        orientations = prepared.closure_graph.orientations(correction)
+    return Estimate(orientations, torch.from_numpy(score), torch.full((graph.num_nodes,), torch.nan))
+
+
+def _slam_estimate(graph: ClosureGraph, estimate: SlamEstimate, memory: SlamMemory | None) -> Estimate:
+    """From the closure graph's nodes and edges to the view-graph's."""
+    return Estimate(
+        graph.orientations(estimate.correction),
+        torch.from_numpy(slam_stages.outlier_scores(graph, estimate.outlier_probability)),
+        torch.from_numpy(graph.variance(estimate.samples, estimate.stated_step_variance)),
+        memory,
+    )
+
+
+def update_slam(
+    graph: ViewGraph, memory: SlamMemory, warm_start: Tensor, networks: Networks, watch: Stopwatch
+) -> Estimate | None:
+    """The SLAM profile's solve of a graph that has grown by a few edges; None if the whole of it is due."""
+    with watch.stage("update"):
+        updated = memory.updated(graph, networks.load("slam-clean-net"), warm_start.double())
+        return None if updated is None else _slam_estimate(*updated)
