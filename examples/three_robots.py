@@ -37,6 +37,7 @@ INTER_ROBOT = "/closures_between_robots"
 KEEP_ALL = QoSProfile(depth=10_000)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PATIENCE_S = 240.0
+SETTLE_S = 2.0  # a subscription that this side has found has not always found this side yet, and would miss the start
 
 
 def drive() -> SimulatedRun:
@@ -75,6 +76,7 @@ def be_robot(name: str) -> None:
     node.create_subscription(AbsoluteOrientations, "/fleet/abs_orientations", fleet.append, LATCHED)
     wait_until(node, lambda: all(each.get_subscription_count() > 1 for each in (odometry, closures[False])))
     wait_until(node, lambda: closures[True].get_subscription_count() > 0)
+    time.sleep(SETTLE_S)
     due = closures_of(run, number)
     odom_from_body = Rotation.from_quat(run.odometry_world_from_body[first]).inv() * Rotation.from_quat(
         run.odometry_world_from_body
@@ -155,7 +157,8 @@ class Onlooker:
 
     def __init__(self, node: Node) -> None:
         self.answers: dict[str, AbsoluteOrientations] = {}
-        self.last_news = time.monotonic()
+        self._last_news = time.monotonic()
+        self._longest_silence = 0.0
         self._components = 0
         for name in (*ROBOTS, "fleet"):
             node.create_subscription(
@@ -166,11 +169,18 @@ class Onlooker:
             )
 
     def _note(self, name: str, answer: AbsoluteOrientations) -> None:
-        self.answers[name], self.last_news = answer, time.monotonic()
+        if name in self.answers:
+            self._longest_silence = max(self._longest_silence, time.monotonic() - self._last_news)
+        self.answers[name], self._last_news = answer, time.monotonic()
         components = len(set(answer.components))
         if name == "fleet" and components != self._components:
             self._components = components
             print(f"fleet: {len(answer.keyframe_ids)} keyframes in {components} components", flush=True)
+
+    def nothing_more_comes(self) -> bool:
+        """Whether all have answered, and have been silent for longer than a loaded machine explains."""
+        silence = time.monotonic() - self._last_news
+        return len(self.answers) == len(ROBOTS) + 1 and silence > max(5.0, 3 * self._longest_silence)
 
 
 def errors_deg(answer: AbsoluteOrientations, run: SimulatedRun) -> dict[str, float]:
@@ -200,7 +210,7 @@ def main() -> int:
     robots = [subprocess.Popen([sys.executable, __file__, "--robot", name]) for name in ROBOTS]
     try:
         wait_until(node, lambda: all(robot.poll() is not None for robot in robots))
-        wait_until(node, lambda: len(onlooker.answers) == len(nodes) and time.monotonic() - onlooker.last_news > 5)
+        wait_until(node, onlooker.nothing_more_comes)
     finally:
         for process in (*robots, *nodes):
             process.terminate()

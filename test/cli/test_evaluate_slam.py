@@ -49,7 +49,7 @@ def test_report(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = (data / "results" / "slam.md").read_text(encoding="utf-8")
     for file in (data / "results").glob("*.png"):
         assert f"({file.name})" in text
-    assert "GNC" not in text.split("## Seconds")[0]
+    assert "GNC" not in text.split("## CPU seconds")[0]
 
 
 @pytest.mark.parametrize(
