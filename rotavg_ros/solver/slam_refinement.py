@@ -36,8 +36,9 @@ _MAX_SETTLING_PASSES = 5
 _CONVERGED_STEP = np.radians(0.002)
 _CONVERGED_PROBABILITY = 2e-3
 # What the rest of the graph predicts of an edge changes little from pass to pass: it is estimated anew this often, and
-# before the passes end.
-_PASSES_PER_PREDICTION = 3
+# before the passes end; also once probabilities have changed, in sum, by more than this share of the closures believed.
+_PASSES_PER_PREDICTION = 4
+_MAX_CHANGED_SHARE = 0.02
 # From so many nodes on, a system is solved from the factorisation of a few passes before.
 _ITERATING_PAYS = 4000
 # … if the last pass changed no probability by more than this.
@@ -214,7 +215,7 @@ class _State:
         self.passes = 0
         self._changed = 1.0
         self.prediction_variance = np.full(len(graph.source), np.inf)
-        self._prediction_pass = -_PASSES_PER_PREDICTION
+        self._prediction_pass, self._changed_since_prediction = -_PASSES_PER_PREDICTION, 0.0
         self._discrepancy: np.ndarray | None = None
 
     @property
@@ -280,12 +281,16 @@ class _State:
         """Passes until convergence, or until there have been ``max_passes`` in all; at least one."""
         settled = False
         while True:
-            is_stale = self.passes - self._prediction_pass >= _PASSES_PER_PREDICTION
-            refresh = settled or is_stale or self.passes + 1 >= max_passes
+            refresh = settled or self._is_prediction_old() or self.passes + 1 >= max_passes
             moved, changed = self.one_pass(max_step_variance, refresh)
             settled = moved < _CONVERGED_STEP and changed < _CONVERGED_PROBABILITY
             if self.passes >= max_passes or (settled and refresh):
                 return
+
+    def _is_prediction_old(self) -> bool:
+        believed = float(self.inlier_probability[self.graph.is_closure].sum())
+        has_changed = self._changed_since_prediction > _MAX_CHANGED_SHARE * believed
+        return has_changed or self.passes + 1 - self._prediction_pass >= _PASSES_PER_PREDICTION
 
     def one_pass(self, max_step_variance: float, refresh: bool) -> tuple[float, float]:
         """Solve, re-estimate the noise, judge; returns the largest correction (rad) and change of a probability.
@@ -348,7 +353,9 @@ class _State:
             # Closures of which each is good if the other is not would change places from update to update.
             is_swinging = np.abs(probability - self.inlier_probability) > _SWING
             probability = np.where(is_swinging, (probability + self.inlier_probability) / 2, probability)
-        self._changed = changed = float(np.abs(probability - self.inlier_probability).max(initial=0.0))
+        change = np.abs(probability - self.inlier_probability)
+        self._changed = changed = float(change.max(initial=0.0))
+        self._changed_since_prediction += float(change.sum())
         self.inlier_probability = probability
         self._discrepancy = np.sqrt(predicted_square)
         return moved, changed
@@ -366,6 +373,7 @@ class _State:
         resistance = sum((self.difference(part) ** 2).sum(axis=1) for part in parts) / _NUM_PROBES
         leverage = np.clip(weight * resistance, 0.0, _MAX_LEVERAGE)
         self.prediction_variance, self._prediction_pass = resistance / (1 - leverage), self.passes
+        self._changed_since_prediction = 0.0
         return np.asarray(leverage)
 
     def outlier_probability(self) -> np.ndarray:
