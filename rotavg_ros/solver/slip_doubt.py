@@ -17,8 +17,10 @@ from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.noise_model import NoiseModel, log_uniform_density, noise_between_neighbours
 from rotavg_ros.solver.slam_refinement import SlamEstimate
 
-# The solution is in strong doubt if this share of what at least so many neighbours agree upon is rejected by it,
+# The solution is in strong doubt if this share of what at least so many neighbours agree upon is rejected by it (the
+# second, where it rejects most closures: groups of false ones would have to be most, and lone ones do not agree),
 _DOUBTED_SHARE = 0.53
+_DOUBTED_SHARE_OF_MOST = 0.35
 _MIN_SUPPORTERS = 2
 # in some if it explains most closures, but so much larger a share disagrees with the odometry,
 _MOST = 0.6
@@ -51,12 +53,12 @@ def measure_doubt(graph: ClosureGraph, pairs: AgreementPairs, estimate: SlamEsti
     supporters = np.bincount(pairs.first, agree(pairs, by_chain), len(rejected))
     # A group of false closures agrees with itself; it must not outvote the rest by its size.
     weight = np.where(supporters >= _MIN_SUPPORTERS, 1 / (1 + supporters), 0.0)
-    rejected_weight = float((weight * rejected).sum())
-    if rejected_weight > _DOUBTED_SHARE * weight.sum():
+    rejected_weight, rejected_share = float((weight * rejected).sum()), float(rejected.mean())
+    doubted_share = _DOUBTED_SHARE_OF_MOST if rejected_share > _MOST else _DOUBTED_SHARE
+    if rejected_weight > doubted_share * weight.sum():
         by_chance = float(_weight_by_chance(pairs, by_chain, len(rejected))[rejected].sum())
-        if rejected_weight - by_chance > _DOUBTED_SHARE * (weight.sum() - by_chance):
+        if rejected_weight - by_chance > doubted_share * (weight.sum() - by_chance):
             return Doubt.STRONG
-    rejected_share = float(rejected.mean())
     if rejected_share > _MOST:
         return Doubt.NONE
     explains_more = by_chain.outlier_share - rejected_share > _DOUBTED_DIFFERENCE

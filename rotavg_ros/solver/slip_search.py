@@ -45,6 +45,8 @@ _MIN_TRUST = 1e-3
 # A new solution must be better by this many nats; so much worse it may be if false closures come in groups.
 _MIN_GAIN = 10.0
 _MAX_LOSS_IF_GROUPED = 20.0
+# A slip beside a node without good closures costs the same on either side of it; rounding must not choose.
+_TIE = 0.1
 _FALSE_SQUARE = np.pi**2 / 3 + 2
 
 
@@ -87,8 +89,8 @@ def search_for_slips(
     is_small = len(graph.source) <= _MAX_EDGES_TO_JUMP
     if is_small:
         starts = (correction, estimate.correction)
-        found = [jump_to_optimum(cost, start, pairs, is_agreed, votes.closure > 0) for start in starts]
-        correction = min(found, key=cost.total)
+        annealed, trusting = (jump_to_optimum(cost, start, pairs, is_agreed, votes.closure > 0) for start in starts)
+        correction = trusting if cost.total(trusting) < cost.total(annealed) - _TIE else annealed
     gain = cost.total(estimate.correction) - cost.total(correction)
     gain_if_grouped = _grouped_cost(cost, estimate.correction, pairs, is_agreed) - _grouped_cost(
         cost, correction, pairs, is_agreed
