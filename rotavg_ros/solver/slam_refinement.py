@@ -38,7 +38,7 @@ _CONVERGED_PROBABILITY = 2e-3
 # What the rest of the graph predicts of an edge changes little from pass to pass: it is estimated anew this often, and
 # before the passes end; also once probabilities have changed, in sum, by more than this share of the closures believed.
 _PASSES_PER_PREDICTION = 4
-_MAX_CHANGED_SHARE = 0.02
+_MAX_CHANGED_SHARE = 0.2
 # From so many nodes on, a system is solved from the factorisation of a few passes before.
 _ITERATING_PAYS = 4000
 # … if the last pass changed no probability by more than this.
