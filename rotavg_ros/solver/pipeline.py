@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.errors import UserError
-from rotavg_ros.solver import devices, sfm_stages, slam_refinement
+from rotavg_ros.solver import devices, sfm_stages, slam_judging, slam_refinement
 from rotavg_ros.solver.devices import DEVICES
 from rotavg_ros.solver.methods import BASELINES, DEFAULT_METHOD, METHODS, NETWORK_METHODS
 from rotavg_ros.solver.parallel import workers
@@ -24,7 +24,7 @@ from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
 
 PROFILES = ("auto", "slam", "sfm")
 # The noise that makes an edge an outlier, in radians.
-_OUTLIER_ANGLE = {"sfm": sfm_stages.OUTLIER_ANGLE, "slam": slam_refinement.OUTLIER_ANGLE}
+_OUTLIER_ANGLE = {"sfm": sfm_stages.OUTLIER_ANGLE, "slam": slam_judging.OUTLIER_ANGLE}
 
 
 @torch.no_grad()

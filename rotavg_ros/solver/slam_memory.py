@@ -24,7 +24,7 @@ from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.common_error import RUN_GAP_STEPS
 from rotavg_ros.solver.noise_model import NoiseModel
 from rotavg_ros.solver.slam_clean_net import SlamCleanNet
-from rotavg_ros.solver.slam_refinement import SlamEstimate
+from rotavg_ros.solver.slam_passes import SlamEstimate
 from rotavg_ros.solver.slam_stages import CleanedClosures, Prepared, draw_together, judge_closures
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 

@@ -11,7 +11,7 @@ from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.methods import DEFAULT_METHOD, NETWORK_METHODS, Method
 from rotavg_ros.solver.profile import Estimate, Networks, Stopwatch
 from rotavg_ros.solver.slam_memory import SlamMemory
-from rotavg_ros.solver.slam_refinement import SlamEstimate
+from rotavg_ros.solver.slam_passes import SlamEstimate
 from rotavg_ros.view_graph import ViewGraph
 
 

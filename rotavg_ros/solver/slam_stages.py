@@ -23,7 +23,7 @@ from rotavg_ros.solver.noise_model import (
 )
 from rotavg_ros.solver.slam_clean_net import SlamCleanNet, closure_features
 from rotavg_ros.solver.slam_inference import false_log_odds
-from rotavg_ros.solver.slam_refinement import SlamEstimate
+from rotavg_ros.solver.slam_passes import SlamEstimate
 from rotavg_ros.solver.slip_search import search_for_slips
 from rotavg_ros.solver.spanning_tree import (
     SpanningForest,

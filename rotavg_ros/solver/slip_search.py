@@ -28,7 +28,7 @@ from rotavg_ros.solver.noise_model import (
     estimate_noise,
     noise_between_neighbours,
 )
-from rotavg_ros.solver.slam_refinement import SlamEstimate
+from rotavg_ros.solver.slam_passes import SlamEstimate
 from rotavg_ros.solver.slip_doubt import Doubt, agree, measure_doubt
 from rotavg_ros.solver.spanning_tree import compose_orientations, shortest_path_forest
 from rotavg_ros.solver.truncated_cost import TruncatedCost
