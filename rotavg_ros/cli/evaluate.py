@@ -96,7 +96,9 @@ def _run_synthetic(arguments: argparse.Namespace) -> Path:
         if more:
             cases = synthetic.cases(recipe, few, arguments.seed)
             scores_of_few[recipe] = _score(cases, more, few, f"{recipe}, more methods")
-    command = f"rotavg evaluate synthetic --graphs {arguments.graphs} --seed {arguments.seed} --few-graphs {few}"
+    command = f"rotavg evaluate synthetic --graphs {arguments.graphs} --seed {arguments.seed}"
+    command += f" --recipes {' '.join(arguments.recipes)}"
+    command += f" --methods {' '.join(core)}" if arguments.methods else f" --few-graphs {few}"
     return synthetic.report(arguments.output, scores, tuple(core), scores_of_few, tuple(more), command)
 
 

@@ -44,7 +44,7 @@ _MAX_EDGES_TO_JUMP = 3000
 _MIN_TRUST = 1e-3
 # A new solution must be better by this many nats; so much worse it may be if false closures come in groups.
 _MIN_GAIN = 10.0
-_MAX_LOSS_IF_GROUPED = 20.0
+_MAX_LOSS_IF_GROUPED = 15.0
 # A slip beside a node without good closures costs the same on either side of it; rounding must not choose.
 _TIE = 0.1
 _FALSE_SQUARE = np.pi**2 / 3 + 2
