@@ -16,7 +16,8 @@ from rotavg_ros.cli.arguments import positive_number, positive_whole_number, who
 from rotavg_ros.cli.progress import progress, working
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation import real, rgbd, robustness, synthetic
-from rotavg_ros.evaluation.contenders import Case, Contender, contenders, is_available, warm_up
+from rotavg_ros.evaluation.contenders import Case, Contender, contenders, warm_up
+from rotavg_ros.evaluation.named_peers import is_available
 from rotavg_ros.evaluation.scoring import Scores, Step, score_all
 from rotavg_ros.evaluation.small_training import train_networks
 from rotavg_ros.evaluation.tables import Table, make_folder, write_report
@@ -60,6 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.threads is not None:
         torch.set_num_threads(arguments.threads)
     make_folder(arguments.output)
+    if arguments.keep is not None:
+        make_folder(arguments.keep)
     suite = next(suite for suite in _SUITES if suite.name == arguments.suite)
     print(suite.run(arguments))
     return 0
@@ -88,7 +91,8 @@ def _run_synthetic(arguments: argparse.Namespace) -> Path:
     core = _contenders(arguments.methods, synthetic.CORE, keep=arguments.keep)
     few = min(arguments.few_graphs, arguments.graphs)
     is_all = arguments.methods is not None or few == 0
-    more = {} if is_all else _contenders(None, _MORE, keep=arguments.keep)
+    others = [name for name in synthetic.ROWS if name not in synthetic.CORE]
+    more = {} if is_all else _contenders(None, others, keep=arguments.keep)
     scores, scores_of_few = {}, {}
     for recipe in arguments.recipes:
         cases = synthetic.cases(recipe, arguments.graphs, arguments.seed)
@@ -194,8 +198,10 @@ def _run_rgbd(arguments: argparse.Namespace) -> Path:
             with tempfile.TemporaryDirectory() as folder:
                 train_networks(Path(folder), fold.training, 60 * arguments.minutes, from_package=True)
                 trained = contenders(rgbd.TRAINED, Path(folder))
-                own = {rgbd.PACKAGE_PREFIX + name: method for name, method in contenders(rgbd.TRAINED).items()}
-                scores.extend(score_all(fold.test, {**contenders(rgbd.UNTRAINED), **own, **trained}))
+                own = contenders(rgbd.TRAINED, keep=arguments.keep)
+                own = {rgbd.PACKAGE_PREFIX + method: contender for method, contender in own.items()}
+                untrained = contenders(rgbd.UNTRAINED, keep=arguments.keep)
+                scores.extend(score_all(fold.test, {**untrained, **own, **trained}))
         tables[f"rgbd-{name}"] = rgbd.table(name, scores, arguments.minutes)
     command = f"rotavg evaluate rgbd --folds {arguments.folds} --minutes {arguments.minutes:g}"
     introduction = (
@@ -246,9 +252,9 @@ def _contenders(
     names: Sequence[str] | None, default: Iterable[str], weights: Path | None = None, keep: Path | None = None
 ) -> dict[str, Contender]:
     """Those asked for, or what can run here of the default."""
-    chosen = contenders(names if names is not None else [name for name in default if is_available(name)], weights, keep)
-    warm_up(tuple(chosen.values()))
-    return chosen
+    chosen = names if names is not None else [name for name in default if is_available(name)]
+    warm_up(tuple(contenders(chosen, weights).values()))
+    return contenders(chosen, weights, keep)
 
 
 def _score(cases: Iterable[Case], chosen: dict[str, Contender], count: int, description: str) -> Scores:
@@ -258,7 +264,6 @@ def _score(cases: Iterable[Case], chosen: dict[str, Contender], count: int, desc
     return score_all(cases, chosen, watch)
 
 
-_MORE = [name for name in synthetic.ROWS if name not in synthetic.CORE]
 _ROBUSTNESS_METHODS = ("chatterjee", "neurora-paper", "neurora")
 _SUITES = (
     _Suite("synthetic", "the paper's synthetic table, and how well outliers are told", _add_synthetic, _run_synthetic),

@@ -11,6 +11,7 @@ from rotavg_ros.cli.arguments import share, whole_number
 from rotavg_ros.cli.progress import progress
 from rotavg_ros.datasets.graph_file import read_graph
 from rotavg_ros.evaluation import slam_cases, slam_contenders, slam_incremental, slam_report, slam_uncertainty
+from rotavg_ros.evaluation.named_peers import is_available
 from rotavg_ros.evaluation.slam_scoring import REFERENCE, Step, score_all
 
 _INCREMENTAL = ("B25b_0.000",)
@@ -79,8 +80,9 @@ def run(arguments: argparse.Namespace) -> Path:
         raise slam_cases.SlamSuiteError(
             "the pose graphs are not part of the package; name the folder of the data sets with --data or $ROTAVG_DATA"
         )
-    chosen = slam_contenders.contenders(_methods(arguments), arguments.keep)
-    slam_contenders.warm_up(tuple(chosen.values()))
+    names = _methods(arguments)
+    slam_contenders.warm_up(tuple(slam_contenders.contenders(names).values()))
+    chosen = slam_contenders.contenders(names, arguments.keep)
 
     def watch(steps: Iterable[Step]) -> Iterable[Step]:
         return progress(steps, description="solving", unit="solve")
@@ -99,7 +101,7 @@ def run(arguments: argparse.Namespace) -> Path:
 
 def _methods(arguments: argparse.Namespace) -> list[str]:
     """Those asked for, or all that can run here; always with ours and the oracle, which ratios need."""
-    names = arguments.methods or [name for name in slam_contenders.ROWS if slam_contenders.is_available(name)]
+    names = arguments.methods or [name for name in slam_contenders.ROWS if is_available(name)]
     if not arguments.peers:
         names = [name for name in names if name not in slam_contenders.PEERS]
     return list(dict.fromkeys((slam_contenders.OURS, *names, REFERENCE)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,9 +13,10 @@ from torch import Tensor
 
 from rotavg_ros.datasets.synthetic import SFM_OUTLIER_ANGLE
 from rotavg_ros.errors import UserError
-from rotavg_ros.evaluation import peers
 from rotavg_ros.evaluation.kept_answers import kept
 from rotavg_ros.evaluation.metrics import true_edge_noise
+from rotavg_ros.evaluation.named_peers import peer_solver
+from rotavg_ros.evaluation.peers import PeerAnswer
 from rotavg_ros.solver import METHODS, sfm_refinement, solve
 from rotavg_ros.solver.refinement import refine
 from rotavg_ros.solver.sfm_stages import residual_score
@@ -26,14 +26,14 @@ from rotavg_ros.view_graph import ViewGraph
 FULL_PIPELINE = "neurora"
 # Until it moves no more: a few steps would remember the truth that they start from.
 _ORACLE_STEPS = 50
+_PEERS = ("colmap", "shonan")
 # Shonan's matrices beyond this many edges take minutes.
-_SHONAN_MAX_EDGES = 150_000
-_PEER_PACKAGES = {"colmap": "pycolmap", "shonan": "gtsam"}
-EXTRA_CONTENDERS = ("colmap", "shonan", "oracle", "oracle-shaped")
+_MAX_EDGES = {"shonan": 150_000}
+_ORACLES = ("oracle", "oracle-shaped")
 
 
 class ContenderError(UserError):
-    """An unknown or unavailable contender; the message lists the choices or the remedy."""
+    """An unknown contender; the message lists the choices."""
 
 
 @dataclass(frozen=True)
@@ -79,37 +79,26 @@ def contenders(names: Sequence[str], weights: Path | None = None, keep: Path | N
 
     Args:
         weights: folder of networks to use in place of the package's.
-        keep: folder of the package's networks' and the peers' answers, to be found again by a later run.
+        keep: folder of answers, but for those of such networks, to be found again by a later run.
 
     Raises:
-        ContenderError: an unknown name, or a peer that is not installed.
+        ContenderError: an unknown name.
+        PeerError: a peer that is not installed.
     """
-    chosen = {name: _contender(name, weights) for name in names}
-    if keep is None or weights is not None:
-        return chosen
-    return {name: kept(name, run, Answer, keep, _PEER_PACKAGES.get(name)) for name, run in chosen.items()}
+    return {name: _contender(name, weights, keep) for name in names}
 
 
-def is_available(name: str) -> bool:
-    """Whether what a contender needs is installed."""
-    return name not in _PEER_PACKAGES or importlib.util.find_spec(_PEER_PACKAGES[name]) is not None
-
-
-def _contender(name: str, weights: Path | None) -> Contender:
-    if not is_available(name):
-        package = _PEER_PACKAGES[name]
-        raise ContenderError(f"method {name!r} needs {package}, which is not installed; run: pip install {package}")
-    if name == "colmap":
-        return _peer(peers.colmap)
-    if name == "shonan":
-        return _peer(peers.shonan, _SHONAN_MAX_EDGES)
-    if name in ("oracle", "oracle-shaped"):
-        return partial(_oracle, name == "oracle-shaped")
+def _contender(name: str, weights: Path | None, keep: Path | None) -> Contender:
+    if name in _PEERS:
+        return _peer(peer_solver(name, keep), _MAX_EDGES.get(name))
+    if name in _ORACLES:
+        return kept(name, partial(_oracle, name == "oracle-shaped"), Answer, keep, __name__)
     unknown = [part for part in name.split("+") if part not in METHODS]
     if unknown:
-        choices = ", ".join((*METHODS, *EXTRA_CONTENDERS))
+        choices = ", ".join((*METHODS, *_PEERS, *_ORACLES))
         raise ContenderError(f"unknown method {unknown[0]!r}; choose from {choices}, or combine: A+B")
-    return partial(_solve, name, weights)
+    # Networks of a folder are those of one run, and nobody asks for their answers again.
+    return kept(name, partial(_solve, name, weights), Answer, None if weights else keep, __name__)
 
 
 def _solve(name: str, weights: Path | None, case: Case) -> Answer:
@@ -118,13 +107,12 @@ def _solve(name: str, weights: Path | None, case: Case) -> Answer:
     return Answer(solution.body_from_world, solution.outlier_score, time.process_time() - start)
 
 
-def _peer(run: Callable[[ViewGraph], peers.PeerAnswer], max_edges: int | None = None) -> Contender:
+def _peer(run: Callable[[ViewGraph], PeerAnswer | None], max_edges: int | None) -> Contender:
     def solve_case(case: Case) -> Answer | None:
         if max_edges is not None and case.graph.num_edges > max_edges:
             return None
-        try:
-            answer = run(case.graph)
-        except peers.PeerError:
+        answer = run(case.graph)
+        if answer is None:
             return None
         return Answer(answer.body_from_world, _residual_score(case, answer.body_from_world), answer.cpu_seconds)
 

@@ -6,7 +6,9 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import os
+import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,40 +17,50 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import rotavg_ros
+from rotavg_ros.evaluation.source_files import source_files
+from rotavg_ros.evaluation.tables import ReportError
+from rotavg_ros.solver import network_store
 
-CaseT = TypeVar("CaseT")
+QuestionT = TypeVar("QuestionT")
 AnswerT = TypeVar("AnswerT")
-_PACKAGE = Path(rotavg_ros.__file__).parent
-# What an answer of ours may depend on besides the case.
-_SOURCES = ("solver", "baselines", "rotations.py", "view_graph.py", "evaluation/least_squares.py")
-_PEER_SOURCES = ("evaluation/peers.py",)
+# Whose versions an answer may depend on, whoever gives it.
+_LIBRARIES = ("numpy", "scipy", "torch")
+# What reading a file that is missing or damaged may end in.
+_UNREADABLE = (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile)
 _ANSWERED = "answered"
 
 
 def kept(
     name: str,
-    contender: Callable[[CaseT], AnswerT | None],
+    solver: Callable[[QuestionT], AnswerT | None],
     answer_type: Callable[..., AnswerT],
-    folder: Path,
+    folder: Path | None,
+    module: str,
     peer_package: str | None = None,
-) -> Callable[[CaseT], AnswerT | None]:
-    """The contender, but for cases that it has answered before.
+) -> Callable[[QuestionT], AnswerT | None]:
+    """The solver, but for questions that it has answered before; a file that cannot be read is no answer.
 
-    An answer is found again by the contents of the case, the contender's name and its version: for ours that of every
-    source file and weight of the solver, for a peer that of its package.
+    An answer is found again by the solver's name, the contents of the question, and all that the answer may depend on
+    besides: the sources that ``module`` reaches, the networks' weights if they are among what it reads, the versions
+    of the libraries, and the number of threads, by which CPU times differ.
 
     Args:
-        answer_type: a dataclass of tensors, arrays and numbers.
-        peer_package: whose version counts, for a peer.
+        answer_type: a dataclass of tensors, arrays, numbers and None.
+        folder: where answers are kept; None: nowhere.
+        module: dotted name of the module that defines the solver.
+        peer_package: the library that does the work, for a peer.
     """
-    version = _version(_PEER_SOURCES, peer_package) if peer_package else _version(_SOURCES, "torch")
+    if folder is None:
+        return solver
+    keeping = folder
+    libraries = (*_LIBRARIES, peer_package) if peer_package else _LIBRARIES
+    version = f"{_version(module, libraries)}, {torch.get_num_threads()} threads"
 
-    def answer(case: CaseT) -> AnswerT | None:
-        path = folder / f"{name.replace('/', '_')}-{_digest(case, name, version)}.npz"
-        if path.exists():
+    def answer(question: QuestionT) -> AnswerT | None:
+        path = keeping / f"{name.replace('/', '_')}-{_digest(question, name, version)}.npz"
+        with suppress(*_UNREADABLE):
             return _read(path, answer_type)
-        found = contender(case)
+        found = solver(question)
         _write(path, found)
         return found
 
@@ -57,22 +69,32 @@ def kept(
 
 def _write(path: Path, answer: Any) -> None:
     """All at once: whoever is interrupted leaves no half of a file."""
-    fields = {} if answer is None else {f.name: np.asarray(getattr(answer, f.name)) for f in dataclasses.fields(answer)}
-    path.parent.mkdir(parents=True, exist_ok=True)
+    given = {} if answer is None else {field.name: getattr(answer, field.name) for field in dataclasses.fields(answer)}
+    arrays = {name: np.asarray(value) for name, value in given.items() if value is not None}
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    with unfinished.open("wb") as file:
-        np.savez(file, allow_pickle=False, **{_ANSWERED: np.asarray(answer is not None), **fields})
-    unfinished.replace(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with unfinished.open("wb") as file:
+            np.savez(file, allow_pickle=False, **{_ANSWERED: np.asarray(answer is not None), **arrays})
+        unfinished.replace(path)
+    except OSError as error:
+        raise ReportError(f"{path.parent}: an answer cannot be kept here ({error.strerror})") from None
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def _read(path: Path, answer_type: Callable[..., AnswerT]) -> AnswerT | None:
-    with np.load(path) as archive:
+    with path.open("rb") as file, np.load(file) as archive:
         if not archive[_ANSWERED]:
             return None
         values: dict[str, Any] = {}
         for field in dataclasses.fields(answer_type):  # type: ignore[arg-type]
+            kinds = str(field.type).split(" | ")
+            if field.name not in archive and "None" in kinds:
+                values[field.name] = None
+                continue
             value = archive[field.name]
-            is_tensor = field.type == Tensor.__name__
+            is_tensor = Tensor.__name__ in kinds
             values[field.name] = torch.from_numpy(value) if is_tensor else value if value.ndim else value.item()
         return answer_type(**values)
 
@@ -100,11 +122,11 @@ def _parts(value: Any) -> Iterator[str | bytes]:
 
 
 @cache
-def _version(sources: tuple[str, ...], package: str) -> str:
-    found = hashlib.sha256(importlib.metadata.version(package).encode())
-    for source in sources:
-        path = _PACKAGE / source
-        files = sorted(p for p in path.rglob("*") if p.suffix in (".py", ".safetensors")) if path.is_dir() else [path]
-        for file in files:
-            found.update(file.read_bytes())
+def _version(module: str, libraries: tuple[str, ...]) -> str:
+    found = hashlib.sha256(" ".join(map(importlib.metadata.version, libraries)).encode())
+    sources = source_files(module)
+    reads_weights = Path(network_store.__file__) in sources
+    weights = sorted(network_store.WEIGHTS_FOLDER.glob("*.safetensors")) if reads_weights else []
+    for file in (*sources, *weights):
+        found.update(file.read_bytes())
     return found.hexdigest()

@@ -67,7 +67,10 @@ class _Clock:
     @contextmanager
     def running(self) -> Iterator[None]:
         start, cpu_start = time.perf_counter(), time.process_time()
-        yield
+        try:
+            yield
+        except RuntimeError as error:  # GTSAM's word for a linear system without a solution
+            raise PeerError(f"the peer gave up: {error}") from None
         self.seconds += time.perf_counter() - start
         self.cpu_seconds += time.process_time() - cpu_start
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +13,12 @@ import torch
 from torch import Tensor
 
 from rotavg_ros.baselines.start import spanning_forest
-from rotavg_ros.evaluation import peers
 from rotavg_ros.evaluation.contenders import ContenderError
 from rotavg_ros.evaluation.kept_answers import kept
 from rotavg_ros.evaluation.least_squares import least_squares
 from rotavg_ros.evaluation.metrics import true_edge_noise
+from rotavg_ros.evaluation.named_peers import peer_solver
+from rotavg_ros.evaluation.peers import PeerAnswer
 from rotavg_ros.evaluation.slam_cases import SlamCase
 from rotavg_ros.solver import METHODS, solve
 from rotavg_ros.solver.spanning_tree import compose_orientations
@@ -57,17 +58,12 @@ def _oracle(case: SlamCase) -> Tensor:
     return least_squares(case.graph, case.is_inlier)
 
 
-_PEERS: dict[str, Callable[[ViewGraph], peers.PeerAnswer]] = {
-    "gnc": peers.gnc,
-    "isam2": peers.isam2_huber,
-    "colmap": peers.colmap,
-}
+PEERS = ("gnc", "isam2", "colmap")
 _REFERENCES: dict[str, Callable[[SlamCase], Tensor]] = {
     "odometry": _odometry,
     "least-squares": _least_squares,
     "oracle": _oracle,
 }
-_PACKAGES = {"gnc": "gtsam", "isam2": "gtsam", "colmap": "pycolmap"}
 ROWS: dict[str, str] = {
     OURS: "**ours** (NeuRoRA for SLAM)",
     "neurora-without-cleannet": "· without CleanNet",
@@ -84,12 +80,6 @@ ROWS: dict[str, str] = {
     "odometry": "odometry alone",
     "oracle": "oracle: least squares on the true inliers",
 }
-PEERS = tuple(_PEERS)
-
-
-def is_available(name: str) -> bool:
-    """Whether what a contender needs is installed."""
-    return name not in _PACKAGES or importlib.util.find_spec(_PACKAGES[name]) is not None
 
 
 def contenders(names: Sequence[str], keep: Path | None = None) -> dict[str, SlamContender]:
@@ -101,26 +91,23 @@ def contenders(names: Sequence[str], keep: Path | None = None) -> dict[str, Slam
         keep: folder of answers, to be found again by a later run.
 
     Raises:
-        ContenderError: an unknown name, or a peer that is not installed.
+        ContenderError: an unknown name.
+        PeerError: a peer that is not installed.
     """
-    chosen = {name: _contender(name) for name in names}
-    if keep is None:
-        return chosen
-    return {name: kept(name, run, SlamAnswer, keep, _PACKAGES.get(name)) for name, run in chosen.items()}
+    return {name: _contender(name, keep) for name in names}
 
 
-def _contender(name: str) -> SlamContender:
-    if name in _PEERS:
-        if not is_available(name):
-            package = _PACKAGES[name]
-            raise ContenderError(f"method {name!r} needs {package}, which is not installed; run: pip install {package}")
-        return lambda case: _run_peer(_PEERS[name], case)
+def _contender(name: str, keep: Path | None) -> SlamContender:
+    if name in PEERS:
+        return partial(_run_peer, peer_solver(name, keep))
     if name in _REFERENCES:
-        return lambda case: _run_reference(_REFERENCES[name], case)
-    if name not in METHODS:
-        choices = ", ".join((*METHODS, *_PEERS, *_REFERENCES))
+        run = partial(_run_reference, _REFERENCES[name])
+    elif name in METHODS:
+        run = partial(_run_method, name)
+    else:
+        choices = ", ".join((*METHODS, *PEERS, *_REFERENCES))
         raise ContenderError(f"unknown method {name!r}; choose from {choices}")
-    return lambda case: _run_method(name, case)
+    return kept(name, run, SlamAnswer, keep, __name__)
 
 
 def _run_method(name: str, case: SlamCase) -> SlamAnswer:
@@ -130,10 +117,9 @@ def _run_method(name: str, case: SlamCase) -> SlamAnswer:
     return SlamAnswer(solution.body_from_world, (solution.outlier_score > 0.5).numpy(), seconds)
 
 
-def _run_peer(run: Callable[[ViewGraph], peers.PeerAnswer], case: SlamCase) -> SlamAnswer | None:
-    try:
-        answer = run(case.graph)
-    except (peers.PeerError, RuntimeError):  # GTSAM's word for a linear system without a solution
+def _run_peer(run: Callable[[ViewGraph], PeerAnswer | None], case: SlamCase) -> SlamAnswer | None:
+    answer = run(case.graph)
+    if answer is None:
         return None
     given = answer.is_outlier
     verdicts = _large_residual(case, answer.body_from_world) if given is None else given.numpy()

@@ -103,15 +103,17 @@ def write_report(
 
 
 def make_folder(folder: Path) -> None:
-    """Create the folder for results before hours of work depend on it.
+    """Create a folder to write to before hours of work depend on it.
 
     Raises:
-        ReportError: it cannot be.
+        ReportError: it cannot be, or nothing can be written there.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ReportError(f"{folder}: cannot be used as output folder ({error.strerror})") from None
+        raise ReportError(f"{folder}: cannot be used as a folder ({error.strerror}); choose another") from None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ReportError(f"{folder}: cannot be written (Permission denied); choose another")
 
 
 def provenance() -> str:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -163,9 +164,13 @@ def test_rgbd(tmp_path: Path) -> None:
             registration_rms=np.ones(graph.num_edges),
             body_from_world_gt=sample.body_from_world.numpy(),
         )
+    keep = tmp_path / "kept"
     command = ["evaluate", "rgbd", "--data", str(tmp_path), "--sets", "redwood_fgr", "--folds", "2"]
-    assert main([*command, "--minutes", "0.001", "--output", str(tmp_path), "--threads", "1"]) == 0
+    command += ["--minutes", "0.001", "--output", str(tmp_path), "--keep", str(keep), "--threads", "1"]
+    assert main(command) == 0
     with (tmp_path / "rgbd-redwood_fgr.csv").open() as file:
         rows = {row["method"]: row for row in csv.DictReader(file)}
     assert {row["scenes"] for row in rows.values()} == {"4"}
     assert rows["neurora-paper"]["mean °"] != rows["package: neurora-paper"]["mean °"]
+    of_package = Counter(path.name.rpartition("-")[0] for path in keep.iterdir())
+    assert of_package == dict.fromkeys(("chatterjee", "weiszfeld", "cleannet-spt", "neurora-paper", "neurora"), 4)

@@ -43,7 +43,7 @@ def test_report(tmp_path: Path) -> None:
 
 def test_folder_that_cannot_be(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(UserError, match="cannot be used as output folder"):
+    with pytest.raises(UserError, match=r"cannot be used as a folder .*; choose another"):
         make_folder(tmp_path / "file")
     with pytest.raises(UserError, match="cannot be written"):
         write_report(tmp_path / "nowhere", "report", "", "", {"errors": TABLE}, {})

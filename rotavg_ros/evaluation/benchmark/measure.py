@@ -18,9 +18,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from rotavg_ros.evaluation import peers
 from rotavg_ros.evaluation.benchmark.cases import load
 from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.evaluation.named_peers import PEERS
 from rotavg_ros.solver import solve
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
 
@@ -116,10 +116,8 @@ def _ours(contender: str) -> Callable[[ViewGraph], _Run]:
 
 
 def _peer(contender: str) -> Callable[[ViewGraph], _Run]:
-    solver = {"colmap": peers.colmap, "shonan": peers.shonan, "gnc": peers.gnc}[contender]
-
     def run(graph: ViewGraph) -> _Run:
-        answer = solver(graph)
+        answer = PEERS[contender].solve(graph)
         return _Run(answer.body_from_world, answer.seconds, answer.cpu_seconds, {})
 
     return run

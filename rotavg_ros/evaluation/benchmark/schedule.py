@@ -16,7 +16,7 @@ import torch
 
 from rotavg_ros.evaluation.benchmark.cases import FAMILIES, Case, Family, save
 from rotavg_ros.evaluation.benchmark.measure import ENOUGH_S, LABELS, OURS, Measurement
-from rotavg_ros.evaluation.contenders import is_available
+from rotavg_ros.evaluation.named_peers import is_available
 
 NO_GPU = "no GPU"
 # Solves grow a little faster than the number of edges.
