@@ -131,18 +131,13 @@ def _benchmark(arguments: argparse.Namespace) -> Path:
     picture = "benchmark-scaling.png"
     report.draw_scaling(arguments.output / picture, results)
     threads = torch.get_num_threads()
-    command = (
-        f"rotavg benchmark --families {' '.join(arguments.families)} --minutes {arguments.minutes:g} "
-        f"--min-pairs {arguments.min_pairs} --max-pairs {arguments.max_pairs} "
-        f"--contenders {' '.join(arguments.contenders)} --repeats {arguments.repeats} --threads {threads}"
-    )
     introduction = _INTRODUCTION.format(
         repeats=arguments.repeats,
         enough=ENOUGH_S,
         threads="one thread" if threads == 1 else f"{threads} threads",
         load=load,
         quiet=_QUIET if float(load.split()[0]) < _QUIET_LOAD else _BUSY,
-        command=command,
+        command=arguments.command_line,
     )
     introduction += "".join(f"\n- {line}" for line in report.summary(results))
     pictures = {picture: "Time, error and memory over the number of edges"}
@@ -154,8 +149,7 @@ def _soak(arguments: argparse.Namespace) -> Path:
 
     load = _load()
     rows = soak.run(arguments.keyframes, arguments.seconds)
-    command = f"rotavg benchmark --soak --seconds {arguments.seconds:g} --keyframes {arguments.keyframes}"
-    introduction = _SOAK_INTRODUCTION.format(load=load, command=command)
+    introduction = _SOAK_INTRODUCTION.format(load=load, command=arguments.command_line)
     return write_report(
         arguments.output,
         "benchmark-soak",
@@ -169,13 +163,12 @@ def _soak(arguments: argparse.Namespace) -> Path:
 def _long_run(arguments: argparse.Namespace) -> Path:
     load = _load()
     rows = long_run.run(arguments.hours, arguments.max_keyframes)
-    limit = "" if arguments.max_keyframes is None else f" --max-keyframes {arguments.max_keyframes}"
     name = "benchmark-hours" if arguments.max_keyframes is None else f"benchmark-hours-{arguments.max_keyframes}"
     return write_report(
         arguments.output,
         name,
         "Hours of driving",
-        _HOURS_INTRODUCTION.format(load=load, command=f"rotavg benchmark --soak --hours {arguments.hours:g}{limit}"),
+        _HOURS_INTRODUCTION.format(load=load, command=arguments.command_line),
         {name: long_run.table("Memory and accuracy", rows)},
         {},
     )

@@ -100,10 +100,7 @@ def _run_synthetic(arguments: argparse.Namespace) -> Path:
         if more:
             cases = synthetic.cases(recipe, few, arguments.seed)
             scores_of_few[recipe] = _score(cases, more, few, f"{recipe}, more methods")
-    command = f"rotavg evaluate synthetic --graphs {arguments.graphs} --seed {arguments.seed}"
-    command += f" --recipes {' '.join(arguments.recipes)}"
-    command += f" --methods {' '.join(core)}" if arguments.methods else f" --few-graphs {few}"
-    return synthetic.report(arguments.output, scores, tuple(core), scores_of_few, tuple(more), command)
+    return synthetic.report(arguments.output, scores, tuple(core), scores_of_few, tuple(more), arguments.command_line)
 
 
 def _add_robustness(parser: argparse.ArgumentParser) -> None:
@@ -136,8 +133,7 @@ def _run_robustness(arguments: argparse.Namespace) -> Path:
             chosen = _contenders(fit, (), weights, arguments.keep)
             count = robustness.num_graphs(setting, arguments.graphs)
             scores[setting] = _score(robustness.cases(setting, count, arguments.seed), chosen, count, setting)
-    command = f"rotavg evaluate robustness --graphs {arguments.graphs} --seed {arguments.seed}"
-    return robustness.report(arguments.output, scores, names, f"{command} --minutes {arguments.minutes:g}")
+    return robustness.report(arguments.output, scores, names, arguments.command_line)
 
 
 def _add_real(parser: argparse.ArgumentParser) -> None:
@@ -172,7 +168,7 @@ def _run_real(arguments: argparse.Namespace) -> Path:
         graphs[f"real-topologies-{number}-graphs"] = synthetic.per_graph(title, scores)
     tables["real-madrid-residuals"] = real.residual_table(madrid.name, found)
     tables["real-madrid-agreement"] = real.agreement_table(f"{madrid.name}: who agrees with whom", found)
-    introduction = f"`rotavg evaluate real --seed {arguments.seed}`"
+    introduction = f"`{arguments.command_line}`"
     return write_report(arguments.output, "real", "Real view-graphs", introduction, tables, {}, graphs)
 
 
@@ -203,9 +199,9 @@ def _run_rgbd(arguments: argparse.Namespace) -> Path:
                 untrained = contenders(rgbd.UNTRAINED, keep=arguments.keep)
                 scores.extend(score_all(fold.test, {**untrained, **own, **trained}))
         tables[f"rgbd-{name}"] = rgbd.table(name, scores, arguments.minutes)
-    command = f"rotavg evaluate rgbd --folds {arguments.folds} --minutes {arguments.minutes:g}"
     introduction = (
-        f"`{command}`: scans registered pairwise, most of the registrations wrong; degrees per scene, averaged."
+        f"`{arguments.command_line}`: scans registered pairwise, most of the registrations wrong; degrees per scene, "
+        "averaged."
     )
     return write_report(arguments.output, "rgbd", "RGB-D scans", introduction, tables, {})
 

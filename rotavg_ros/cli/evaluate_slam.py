@@ -96,7 +96,7 @@ def run(arguments: argparse.Namespace) -> Path:
         for name in progress(_UNCERTAINTY_GRAPHS, description="uncertainty", total=len(_UNCERTAINTY_GRAPHS)):
             graph_file = read_graph(data / "slam" / f"{name}.g2o")
             checks += slam_uncertainty.check(name, graph_file, _UNCERTAINTY_DRAWS, arguments.seeds[0])
-    return slam_report.report(arguments.output, scores, runs, checks, _command(arguments))
+    return slam_report.report(arguments.output, scores, runs, checks, arguments.command_line)
 
 
 def _methods(arguments: argparse.Namespace) -> list[str]:
@@ -109,16 +109,3 @@ def _methods(arguments: argparse.Namespace) -> list[str]:
 
 def _watch_ticks(description: str) -> Callable[[Iterable[int]], Iterable[int]]:
     return lambda ticks: progress(ticks, description=description, unit="tick")
-
-
-def _command(arguments: argparse.Namespace) -> str:
-    words = ["rotavg evaluate slam --seeds", *map(str, arguments.seeds)]
-    if tuple(arguments.graphs) != slam_cases.GRAPHS:
-        words += ["--graphs", *arguments.graphs]
-    if tuple(arguments.shares) != slam_cases.SHARES:
-        words += ["--shares", *map(str, arguments.shares)]
-    if arguments.methods:
-        words += ["--methods", *arguments.methods]
-    if not arguments.peers:
-        words.append("--no-peers")
-    return " ".join(words)

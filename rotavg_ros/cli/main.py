@@ -10,12 +10,16 @@ import sys
 from collections.abc import Sequence
 from typing import NamedTuple, NoReturn
 
+from rotavg_ros.cli.command_line import command_line
 from rotavg_ros.errors import UserError
 from rotavg_ros.version import __version__
 
 
 class Command(NamedTuple):
-    """A subcommand; its module has ``add_arguments(parser)`` and ``run(arguments) -> exit code``."""
+    """A subcommand; its module has ``add_arguments(parser)`` and ``run(arguments) -> exit code``.
+
+    Besides its options, ``arguments`` has ``command_line``, the whole command as it may be typed again, for reports.
+    """
 
     name: str
     module: str
@@ -64,7 +68,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a terminal without UTF-8, a file name without encoding
     try:
-        return _run(arguments)
+        parsed = parse(arguments)
+        exit_code: int = parsed.run(parsed)
+        return exit_code
     except UserError as error:
         print_error(error)
         return EXIT_USER_ERROR
@@ -82,7 +88,12 @@ def print_error(error: UserError) -> None:
     print(f"rotavg: error: {error}", file=sys.stderr)
 
 
-def _run(arguments: list[str]) -> int:
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """What the words after ``rotavg`` say; besides options, ``run`` and ``command_line`` (see :class:`Command`).
+
+    Raises:
+        UsageError: they make no command.
+    """
     # Only the chosen subcommand gets its arguments; the others are known by name and one line of help.
     chosen = next((word for word in arguments if not word.startswith("-")), None)
     parser = _Parser(
@@ -90,7 +101,6 @@ def _run(arguments: list[str]) -> int:
     )
     parser.add_argument("--version", action="version", version=f"rotavg {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    run = None
     for command in COMMANDS:
         subparser = subparsers.add_parser(command.name, help=command.help)
         if command.name == chosen:
@@ -98,11 +108,10 @@ def _run(arguments: list[str]) -> int:
             subparser.description = (module.__doc__ or command.help).strip()
             subparser.formatter_class = argparse.RawDescriptionHelpFormatter
             module.add_arguments(subparser)
-            run = module.run
+            subparser.set_defaults(run=module.run)
     parsed = parser.parse_args(arguments)
-    assert run is not None, "argparse accepts only the names in COMMANDS"
-    exit_code: int = run(parsed)
-    return exit_code
+    parsed.command_line = command_line(parser, parsed)
+    return parsed
 
 
 if __name__ == "__main__":
