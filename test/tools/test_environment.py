@@ -59,8 +59,8 @@ def test_other_machines_are_referred_to_a_workspace(monkeypatch: pytest.MonkeyPa
         environment.check_machine()
 
 
-def test_folder_with_a_space_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(environment, "ROOT", Path("/home/some one/rotavg_ros"))
+def test_folder_with_a_space_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(environment, "ROOT", tmp_path / "some one" / "rotavg_ros")
     with pytest.raises(environment.SetupError, match="space in its name"):
         environment.check_machine()
 
