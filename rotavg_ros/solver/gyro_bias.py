@@ -9,27 +9,43 @@ to is refined by expectation–maximisation, taken out of the odometry, and esti
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.special import expit
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.closure_graph import ClosureGraph
-from rotavg_ros.solver.noise_model import NoiseModel
+from rotavg_ros.solver.noise_model import NoiseModel, log_uniform_density
 from rotavg_ros.solver.spanning_tree import SpanningForest, accumulate_to_root
 from rotavg_ros.view_graph import ViewGraph
 
 # Proposals come from so many closures, those that span the least odometry first: their angles have not wrapped around.
 _MAX_PROPOSALS = 60
+# More closures than this say no more of three numbers.
+_MAX_CLOSURES = 1500
 _EM_ITERATIONS = 10
 # Prior standard deviation of a component of the bias, rad per step.
 _PRIOR_BIAS = np.radians(1.0)
 
 
+class BiasEstimate(NamedTuple):
+    """A bias of the odometry.
+
+    Attributes:
+        bias: ``(3,)`` rad per step.
+        explained: share of the closures that are good with it, less the share that are good without.
+    """
+
+    bias: np.ndarray
+    explained: float
+
+
 def estimate_bias(
     graph: ViewGraph, forest: SpanningForest, closure_graph: ClosureGraph, noise: NoiseModel
-) -> np.ndarray:
-    """Bias ``(3,)`` rad per step that the closures speak of; zeros where none can be told.
+) -> BiasEstimate:
+    """The bias that the closures speak of; zeros where none can be told.
 
     Args:
         graph: the view-graph.
@@ -37,8 +53,9 @@ def estimate_bias(
         noise: of steps and closures without the bias.
     """
     closure = np.flatnonzero(closure_graph.is_closure & np.isfinite(closure_graph.path_steps))
+    closure = closure[:: max(1, len(closure) // _MAX_CLOSURES)]
     if len(closure) == 0:
-        return np.zeros(3)
+        return BiasEstimate(np.zeros(3), 0.0)
     nodes = closure_graph.nodes
     drift = _drift_per_bias(graph, forest, closure_graph)
     ends = nodes[closure_graph.source[closure]], nodes[closure_graph.target[closure]]
@@ -46,31 +63,40 @@ def estimate_bias(
     measured = closure_graph.residual[torch.from_numpy(closure)]
     steps = np.maximum(closure_graph.path_steps[closure], 1.0)
     variance = steps * noise.step_variance + noise.closure_variance
+    highest = noise.prior_log_odds - noise.components / 2 * np.log(2 * np.pi * variance)
 
-    def remainder(bias: np.ndarray) -> np.ndarray:
-        predicted = rotations.exp(torch.from_numpy(-design @ bias))
-        return np.asarray(rotations.log(rotations.multiply(predicted, measured)).numpy())
+    def log_odds(squared_angle: np.ndarray) -> np.ndarray:
+        uniform = log_uniform_density(np.sqrt(squared_angle).ravel(), noise.components)
+        return np.asarray(highest - squared_angle / (2 * variance) - uniform.reshape(squared_angle.shape))
 
-    def log_odds(rest: np.ndarray) -> np.ndarray:
-        return noise.inlier_log_odds((rest**2).sum(axis=1), variance) + noise.prior_log_odds
-
-    def solve(weight: np.ndarray, rest: np.ndarray, about: np.ndarray) -> np.ndarray:
-        weighted = design * (weight / variance)[:, None, None]
-        normal = np.einsum("cij,cik->jk", weighted, design) + np.eye(3) / _PRIOR_BIAS**2
-        gradient = np.einsum("cij,ci->j", weighted, rest) - about / _PRIOR_BIAS**2
-        return np.asarray(np.linalg.solve(normal, gradient))
-
-    residual = remainder(np.zeros(3))
-    proposals = [np.zeros(3)]
-    for number in np.argsort(steps, kind="stable")[:_MAX_PROPOSALS]:
-        proposals.append(solve((np.arange(len(closure)) == number).astype(np.float64), residual, np.zeros(3)))
-    support = [float(np.logaddexp(0, log_odds(remainder(bias))).sum()) for bias in proposals]
-    bias = proposals[int(np.argmax(support))]
+    proposed = np.argsort(steps, kind="stable")[:_MAX_PROPOSALS]
+    residual = rotations.log(measured).numpy()
+    inverse_variance = 1 / variance[proposed, None, None]
+    normal = np.swapaxes(design[proposed], 1, 2) * inverse_variance
+    proposals = np.linalg.solve(
+        normal @ design[proposed] + np.eye(3) / _PRIOR_BIAS**2, normal @ residual[proposed, :, None]
+    )[..., 0]
+    proposals = np.concatenate((np.zeros((1, 3)), proposals))
+    of_proposals = log_odds(_squared_angles(design, measured.numpy(), proposals))
+    bias = proposals[np.logaddexp(0, of_proposals).sum(axis=1).argmax()]
     for _ in range(_EM_ITERATIONS):
-        rest = remainder(bias)
-        weight = 1 / (1 + np.exp(np.clip(-log_odds(rest), -50, 50)))
-        bias = bias + solve(weight, rest, bias)
-    return np.asarray(bias)
+        rest = rotations.log(rotations.multiply(rotations.exp(torch.from_numpy(-design @ bias)), measured)).numpy()
+        weight = expit(log_odds((rest**2).sum(axis=1))) / variance
+        weighted = (design * weight[:, None, None]).reshape(-1, 3)
+        normal = weighted.T @ design.reshape(-1, 3) + np.eye(3) / _PRIOR_BIAS**2
+        bias = bias + np.linalg.solve(normal, weighted.T @ rest.ravel() - bias / _PRIOR_BIAS**2)
+    good = log_odds(_squared_angles(design, measured.numpy(), bias[None])) > 0
+    return BiasEstimate(bias, float(good.mean() - (of_proposals[0] > 0).mean()))
+
+
+def _squared_angles(design: np.ndarray, measured: np.ndarray, biases: np.ndarray) -> np.ndarray:
+    """What is left of closures ``(C, 4)`` under each of B biases ``(B, 3)``, ``(B, C)`` rad²; design ``(C, 3, 3)``."""
+    predicted = np.einsum("cij,bj->ibc", design, biases)
+    half = np.sqrt((predicted**2).sum(axis=0)) / 2
+    along = np.einsum("ibc,ci->bc", predicted, measured[:, :3]) / 2
+    # The real part of exp(-predicted) ∘ measured.
+    cosine = np.cos(half) * measured[:, 3] + np.sinc(half / np.pi) * along
+    return np.asarray((2 * np.arccos(np.minimum(np.abs(cosine), 1.0))) ** 2)
 
 
 def without_bias(graph: ViewGraph, bias: np.ndarray) -> ViewGraph:
@@ -99,4 +125,4 @@ def _drift_per_bias(graph: ViewGraph, forest: SpanningForest, closure_graph: Clo
     world_from_body = rotations.to_matrix(rotations.inverse(closure_graph.odometry_orientation)).numpy()
     step = np.zeros((graph.num_nodes, 9))
     step[child] = (sign[:, None, None] * world_from_body[earlier]).reshape(-1, 9)
-    return np.stack([accumulate_to_root(forest, column) for column in step.T], axis=1).reshape(-1, 3, 3)
+    return accumulate_to_root(forest, step).reshape(-1, 3, 3)

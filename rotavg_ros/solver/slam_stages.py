@@ -24,6 +24,7 @@ from rotavg_ros.solver.noise_model import (
 from rotavg_ros.solver.slam_clean_net import SlamCleanNet, closure_features
 from rotavg_ros.solver.slam_inference import false_log_odds
 from rotavg_ros.solver.slam_passes import SlamEstimate
+from rotavg_ros.solver.slip_doubt import agree
 from rotavg_ros.solver.slip_search import search_for_slips
 from rotavg_ros.solver.spanning_tree import (
     SpanningForest,
@@ -43,6 +44,9 @@ _FALSE_SQUARE = np.pi**2 / 3 + 2
 _BIASED_SHARE = 0.5
 _BIAS_GAIN = 0.2
 _BIAS_ROUNDS = 2
+# It is not looked for, or not any further, where a cheaper look promises less than such parts of that gain: at most the
+# closures that disagree and are confirmed by a neighbour, and what the first round explains.
+_BIAS_CONFIRMED, _BIAS_EXPLAINED = 0.75, 0.4
 # How much of the network's log-odds the refinement adds to its own: a part, since both have seen some of the same
 # evidence, and the less the more closures are false, since agreement by chance is then as common as by truth.
 _NETWORK_SHARE = 0.6
@@ -85,18 +89,35 @@ def prepare(graph: ViewGraph, *, scale_estimation: bool = True) -> Prepared:
         scale_estimation: if not, the noise is what edges of either kind state in the median.
     """
     prepared, forest = _contract(graph, scale_estimation)
-    if scale_estimation and prepared.noise.outlier_share > _BIASED_SHARE:
-        noise = noise_between_neighbours(prepared.pairs, prepared.noise.components)
-        corrected, closure_graph = graph, prepared.closure_graph
-        for number in range(_BIAS_ROUNDS):
-            if number > 0:
-                closure_graph, forest = draw_together(corrected)
-            corrected = without_bias(corrected, estimate_bias(corrected, forest, closure_graph, noise))
-        unbiased, _ = _contract(corrected, scale_estimation)
-        fewer_disagree = unbiased.noise.outlier_share < prepared.noise.outlier_share - _BIAS_GAIN
-        if fewer_disagree and unbiased.noise.step_variance < prepared.noise.step_variance:
+    if scale_estimation and prepared.noise.outlier_share > _BIASED_SHARE and _may_be_biased(prepared):
+        unbiased = _without_bias(graph, prepared, forest)
+        if unbiased is not None and unbiased.noise.step_variance < prepared.noise.step_variance:
             return replace(unbiased, is_unbiased=True)
     return prepared
+
+
+def _may_be_biased(prepared: Prepared) -> bool:
+    """Whether enough closures disagree with the odometry that neighbours confirm: others no bias will explain."""
+    is_agreed = agree(prepared.pairs, prepared.noise)
+    is_confirmed = np.bincount(prepared.pairs.first, is_agreed, len(prepared.squared_angle)) > 0
+    disagrees = judge_by_chain(prepared.noise, prepared.squared_angle, prepared.path_steps) < 0
+    return bool((disagrees & is_confirmed).mean() > _BIAS_CONFIRMED * _BIAS_GAIN)
+
+
+def _without_bias(graph: ViewGraph, prepared: Prepared, forest: SpanningForest) -> Prepared | None:
+    """The graph prepared with the likeliest bias taken out of its odometry; None if that explains too few closures."""
+    noise = noise_between_neighbours(prepared.pairs, prepared.noise.components)
+    corrected, closure_graph = graph, prepared.closure_graph
+    for number in range(_BIAS_ROUNDS):
+        if number > 0:
+            closure_graph, forest = draw_together(corrected)
+        estimate = estimate_bias(corrected, forest, closure_graph, noise)
+        if number == 0 and estimate.explained < _BIAS_EXPLAINED * _BIAS_GAIN:
+            return None
+        corrected = without_bias(corrected, estimate.bias)
+    unbiased, _ = _contract(corrected, scale_estimation=True)
+    fewer_disagree = unbiased.noise.outlier_share < prepared.noise.outlier_share - _BIAS_GAIN
+    return unbiased if fewer_disagree else None
 
 
 def _contract(graph: ViewGraph, scale_estimation: bool) -> tuple[Prepared, SpanningForest]:
@@ -108,7 +129,7 @@ def _contract(graph: ViewGraph, scale_estimation: bool) -> tuple[Prepared, Spann
     pairs = agreement_pairs(closure_graph)
     components = rotation_components(graph)
     if scale_estimation:
-        noise = estimate_noise(discrepancies(squared_angle, path_steps, pairs), components)
+        noise = estimate_noise(discrepancies(squared_angle, path_steps, pairs, components), components)
     else:
         noise = _stated_noise(graph, components)
     return Prepared(closure_graph, squared_angle, path_steps, pairs, noise), forest
@@ -229,7 +250,7 @@ def outlier_scores(graph: ClosureGraph, outlier_probability: np.ndarray) -> np.n
 
 def _stated_noise(graph: ViewGraph, components: int) -> NoiseModel:
     """Medians of what the edges of either kind state; the prior where they state nothing."""
-    prior = estimate_noise(discrepancies(np.empty(0), np.empty(0), NO_PAIRS), components)
+    prior = estimate_noise(discrepancies(np.empty(0), np.empty(0), NO_PAIRS, components), components)
     stated = {True: prior.step_variance, False: prior.closure_variance}
     precision = graph.precision.numpy()
     for kind in stated:

@@ -119,8 +119,8 @@ def compose(parent: Tensor, parent_edge: Tensor, graph: ViewGraph) -> Tensor:
 
 
 def accumulate_to_root(forest: SpanningForest, value: np.ndarray) -> np.ndarray:
-    """Sum of ``value`` ``(N,)`` over each node's way to its root; a node's value belongs to its parent edge."""
-    total = np.where(forest.parent_edge >= 0, value, 0.0)
+    """Sum of ``value`` ``(N, …)`` over each node's way to its root; a node's value belongs to its parent edge."""
+    total = value * (forest.parent_edge >= 0).reshape(-1, *(1,) * (value.ndim - 1))
     ancestor = forest.parent
     while True:
         farther = ancestor[ancestor]

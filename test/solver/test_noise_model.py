@@ -57,7 +57,7 @@ def test_without_closures_the_prior_stands() -> None:
     prepared = prepare(measured(random_truth(20, 0), source, target, kind=kind))
     assert len(agreement_pairs(prepared.closure_graph).first) == 0
     empty = np.empty(0)
-    model = estimate_noise(discrepancies(empty, empty, prepared.pairs), 3)
+    model = estimate_noise(discrepancies(empty, empty, prepared.pairs, 3), 3)
     assert 0 < model.step_variance < 1 and 0 < model.outlier_share < 1
 
 
