@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -22,6 +23,8 @@ from rotavg_ros.solver.sorted_edges import SortedEdges
 from rotavg_ros.view_graph import ViewGraph
 
 _MAX_ITERATIONS = 300
+# With fewer edges a product takes less time than waking another worker.
+_WORTH_WORKERS = 50_000
 Preconditioner = Callable[[Tensor], Tensor]
 
 
@@ -36,8 +39,9 @@ class Arrivals:
         self.num_nodes = edges.num_nodes
         self._patterns = []
         for chosen in (~edges.is_reversed, edges.is_reversed):
-            before = torch.cat((chosen.new_zeros(1, dtype=torch.int32), chosen.cumsum(0, dtype=torch.int32)))
-            self._patterns.append((before[edges.first], edges.source[chosen], edges.edge[chosen]))
+            rows = chosen.nonzero().squeeze(1)
+            first = torch.searchsorted(rows, edges.first, out_int32=True)
+            self._patterns.append((first, edges.source.index_select(0, rows), edges.edge.index_select(0, rows)))
 
     def matrices(self, weight: Tensor) -> list[Tensor]:
         """W and Wᵀ ``(N, N)`` of the edges' ``weight`` ``(M,)``."""
@@ -51,48 +55,54 @@ class Arrivals:
 
 
 class BlockLaplacian:
-    """``L`` of a graph.
+    """``L`` of a graph, in the weights' precision. Vectors have their components in rows, ``(3, N)``.
 
     Args:
         arrivals: the graph's.
-        weight: ``(M,)`` float64, positive.
+        weight: ``(M,)`` positive.
         shape: what the ends say, S and T.
         component: ``(N,)``; each of the C components is solved by itself.
     """
 
     def __init__(self, arrivals: Arrivals, weight: Tensor, shape: NoiseShape, component: Tensor) -> None:
         self._matrices = arrivals.matrices(weight)
-        self._near = (shape.at_target, shape.at_source)
-        self._far = (shape.at_source, shape.at_target)
+        self._threads = None if len(weight) > _WORTH_WORKERS else 1
         self._component = component
         self._num_components = int(component.max()) + 1
-        degree = weight.new_ones(arrivals.num_nodes, 1)
-        self._diagonal = torch.zeros_like(shape.at_source)
+        # (3, 3, N): what is said of an edge at the end that it comes from, and at the one where it arrives.
+        at_source, at_target = (
+            end.to(weight).permute(1, 2, 0).contiguous() for end in (shape.at_source, shape.at_target)
+        )
+        self._far, self._near = (at_source, at_target), (at_target, at_source)
+        one = weight.new_ones(1, arrivals.num_nodes)
+        self._diagonal = torch.zeros_like(at_source)
         for matrix, near, far in zip(self._matrices, self._near, self._far, strict=True):
-            self._diagonal += (matrix @ far.flatten(1)).view_as(far) + (matrix @ degree)[:, :, None] * near
+            arriving = _arriving(matrix, torch.cat((far.flatten(0, 1), one)))
+            self._diagonal += arriving[:9].view_as(far) + arriving[9] * near
 
     def product(self, x: Tensor) -> Tensor:
-        """``L x`` ``(N, 3)``."""
+        """``L x`` ``(3, N)``."""
         parts = [x] * 2
 
         def one_way(number: int) -> None:
-            far, near = self._far[number], self._near[number]
-            arriving = self._matrices[number] @ torch.cat((_apply(far, x), x), dim=1)
-            parts[number] = arriving[:, :3] + _apply(near, arriving[:, 3:])
+            arriving = _arriving(self._matrices[number], torch.cat((_apply(self._far[number], x), x)))
+            parts[number] = _apply(self._near[number], arriving[3:]).add_(arriving[:3])
 
-        for_each(one_way, (0, 1))
-        return _apply(self._diagonal, x) - parts[0] - parts[1]
+        for_each(one_way, (0, 1), self._threads)
+        return _apply(self._diagonal, x).sub_(parts[0]).sub_(parts[1])
 
     def diagonal_solve(self) -> Preconditioner:
         """A preconditioner for well-knit graphs: what solves by the blocks on the diagonal alone."""
-        isolated = self._diagonal.diagonal(dim1=1, dim2=2).sum(dim=1) <= 0
-        inverse = torch.linalg.inv(self._diagonal + isolated[:, None, None] * torch.eye(3).to(self._diagonal))
-        return lambda x: _apply(inverse, x)
+        blocks = self._diagonal.permute(2, 0, 1)
+        isolated = blocks.diagonal(dim1=1, dim2=2).sum(dim=1) <= 0
+        # Unlike inv, inv_ex does not stop to look whether all went well.
+        inverse = torch.linalg.inv_ex(blocks + isolated[:, None, None] * torch.eye(3).to(blocks)).inverse
+        return partial(_apply, inverse.permute(1, 2, 0).contiguous())
 
     def solve(
         self, force: Tensor, precondition: Preconditioner, tolerance: float, relative_tolerance: float
     ) -> tuple[Tensor, bool]:
-        """``L⁻¹ force`` ``(N, 3)``, up to a constant in every component, and whether it is as good as asked for.
+        """``L⁻¹ force`` ``(3, N)``, up to a constant in every component, and whether it is as good as asked for.
 
         Args:
             force: sums to zero over every component.
@@ -110,22 +120,30 @@ class BlockLaplacian:
                 return solution, True
             image = self.product(direction)
             curvature = self._dot(direction, image)
-            length = torch.where(is_open & (curvature > 0), energy / curvature, 0.0)[self._component, None]
-            solution += length * direction
-            residual -= length * image
+            length = self._of_node(torch.where(is_open & (curvature > 0), energy / curvature, 0.0))
+            solution.addcmul_(length, direction)
+            residual.addcmul_(length, image, value=-1)
             scaled = precondition(residual)
             previous, energy = energy, self._dot(residual, scaled)
-            ratio = torch.where(previous > 0, energy / previous, 0.0)
-            direction = scaled + ratio[self._component, None] * direction
+            ratio = self._of_node(torch.where(previous > 0, energy / previous, 0.0))
+            direction = torch.addcmul(scaled, ratio, direction)
         return solution, False
+
+    def _of_node(self, value: Tensor) -> Tensor:
+        """What each node's component has, of ``(C,)``: ``(N,)``, or ``(1,)`` where there is but one."""
+        return value if self._num_components == 1 else value[self._component]
 
     def _dot(self, a: Tensor, b: Tensor) -> Tensor:
         """Inner products ``(C,)`` by component."""
-        return a.new_zeros(self._num_components).index_add_(0, self._component, (a * b).sum(dim=1))
+        if self._num_components == 1:  # index_add would take a node after the other
+            return torch.dot(a.flatten(), b.flatten())[None]
+        return a.new_zeros(self._num_components).index_add_(0, self._component, (a * b).sum(dim=0))
 
     def _largest(self, x: Tensor) -> Tensor:
         """Largest absolute entries ``(C,)`` by component."""
-        return x.new_zeros(self._num_components).scatter_reduce(0, self._component, x.abs().amax(dim=1), "amax")
+        if self._num_components == 1:
+            return x.abs().max()[None]
+        return x.new_zeros(self._num_components).scatter_reduce(0, self._component, x.abs().amax(dim=0), "amax")
 
 
 def factorised(graph: ViewGraph, weight: Tensor, shape: NoiseShape, roots: Tensor) -> Preconditioner:
@@ -133,9 +151,14 @@ def factorised(graph: ViewGraph, weight: Tensor, shape: NoiseShape, roots: Tenso
     trace = (shape.at_source[graph.source] + shape.at_target[graph.target]).diagonal(dim1=1, dim2=2).sum(dim=1)
     ends = graph.source.cpu().numpy(), graph.target.cpu().numpy()
     system = LaplacianSystem(graph.num_nodes, *ends, (weight * trace / 3).cpu().numpy(), roots.cpu().numpy())
-    return lambda x: torch.from_numpy(system.solve(x.cpu().numpy())).to(x)
+    return lambda x: torch.from_numpy(system.solve(x.t().cpu().double().numpy())).t().to(x)
+
+
+def _arriving(matrix: Tensor, rows: Tensor) -> Tensor:
+    """``matrix @ rowsᵀ``, components in rows again, ``(k, N)``; sparse products want them side by side."""
+    return (matrix @ rows.t().contiguous()).t().contiguous()
 
 
 def _apply(matrices: Tensor, x: Tensor) -> Tensor:
-    """Each of ``(N, 3, 3)`` to its vector of ``(N, 3)``."""
-    return (matrices * x[:, None, :]).sum(dim=2)
+    """Each of the matrices ``(3, 3, N)`` to its vector of ``(3, N)``."""
+    return (matrices * x).sum(dim=1)

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 
-_ITERATIONS = 10
+# From nothing, and from what the last step's residuals said.
+_ITERATIONS, _FURTHER_ITERATIONS = 10, 3
 # No axis is believed to be more exact than this share of the worst; none is more exact than this angle.
 _MIN_RATIO = 0.1
 _MIN_SCALE = np.radians(1e-4)
@@ -30,10 +31,12 @@ class NoiseShape:
 
     Attributes:
         at_source, at_target: ``(N, 3, 3)`` rad⁻², symmetric.
+        scatter: what they were estimated as in the cameras' frames, ``(C, 3, 3)`` at either end; None: nothing was.
     """
 
     at_source: Tensor
     at_target: Tensor
+    scatter: tuple[Tensor, Tensor] | None = None
 
     @classmethod
     def round(cls, num_nodes: int, device: torch.device) -> NoiseShape:
@@ -50,6 +53,7 @@ class NoiseShape:
         body_from_world: Tensor,
         component: Tensor,
         redundancy: Tensor,
+        before: NoiseShape | None = None,
     ) -> NoiseShape:
         """From the residuals at given orientations, every component for itself.
 
@@ -59,21 +63,25 @@ class NoiseShape:
             body_from_world: ``(N, 4)``.
             component: ``(N,)``.
             redundancy: ``(C,)`` how many edges each component has beyond a spanning tree.
+            before: what was estimated a step ago.
         """
         matrix = rotations.to_matrix(body_from_world)
-        ends = []
-        for end in (source, target):
+        starts = (None, None) if before is None or before.scatter is None else before.scatter
+        ends, scatters = [], []
+        for end, start in zip((source, target), starts, strict=True):
             in_camera = (matrix[end] @ residual[:, :, None]).squeeze(-1)
-            covariance = _as_far_as_supported(scatter(in_camera, component[end], len(redundancy)), redundancy)
-            information = torch.linalg.inv(covariance)[component] / 2
+            scatters.append(scatter(in_camera, component[end], len(redundancy), start))
+            covariance = _as_far_as_supported(scatters[-1], redundancy)
+            information = torch.linalg.inv_ex(covariance).inverse[component] / 2
             ends.append(matrix.transpose(1, 2) @ information @ matrix)
-        return cls(*ends)
+        return cls(ends[0], ends[1], (scatters[0], scatters[1]))
 
 
-def scatter(vectors: Tensor, group: Tensor, num_groups: int) -> Tensor:
+def scatter(vectors: Tensor, group: Tensor, num_groups: int, start: Tensor | None = None) -> Tensor:
     """Robust covariance ``(G, 3, 3)`` about zero of the vectors ``(K, 3)`` of each group ``(K,)``, up to its scale.
 
-    The maximum likelihood estimate for Student's t with one degree of freedom (Kent & Tyler 1991).
+    The maximum likelihood estimate for Student's t with one degree of freedom (Kent & Tyler 1991), sought from
+    ``start``, an estimate from much the same vectors.
     """
     rows = vectors.t().contiguous()
     count = torch.bincount(group, minlength=num_groups).clamp(min=1)[:, None, None]
@@ -89,14 +97,17 @@ def scatter(vectors: Tensor, group: Tensor, num_groups: int) -> Tensor:
         return moment
 
     def squared_lengths(covariance: Tensor) -> Tensor:
-        inverse = torch.linalg.inv(covariance)
+        inverse = torch.linalg.inv_ex(covariance).inverse
         turned = inverse[0] @ rows if num_groups == 1 else (inverse.permute(1, 2, 0)[:, :, group] * rows).sum(dim=1)
         squares: Tensor = (rows * turned).sum(dim=0)
         return squares
 
-    mean_square = second_moment(torch.ones_like(rows[0])).diagonal(dim1=1, dim2=2).mean(dim=1)
-    covariance = mean_square[:, None, None] * unit
-    for _ in range(_ITERATIONS):
+    if start is None:
+        mean_square = second_moment(torch.ones_like(rows[0])).diagonal(dim1=1, dim2=2).mean(dim=1)
+        covariance, iterations = mean_square[:, None, None] * unit, _ITERATIONS
+    else:
+        covariance, iterations = start, _FURTHER_ITERATIONS
+    for _ in range(iterations):
         covariance = second_moment(4 / (1 + squared_lengths(covariance)))
     return covariance
 

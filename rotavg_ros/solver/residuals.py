@@ -14,57 +14,76 @@ from rotavg_ros.solver.parallel import for_each, slices
 from rotavg_ros.view_graph import ViewGraph
 
 SLICE_EDGES = 16_384
-# Below this squared sine the series of x / sin(x) is exact to double precision.
-_SMALL_SINE_SQUARED = 1e-8
+# So small a squared sine counts as this, which makes angle / sine two, as it is, instead of 0/0.
+_MIN_SINE_SQUARED = 1e-30
 
 
 class EdgeResiduals:
-    """``e_uv = R_v⁻¹ R̃_uv R_u`` of any slice of a graph's edges, w ≥ 0.
+    """``e_uv = R_v⁻¹ R̃_uv R_u`` of any slice of a graph's edges.
 
     Args:
         graph: M edges.
         body_from_world: ``(N, 4)``; its type is that of the results.
+        measured: ``(4, M)`` of the same type, the graph's measurements as :func:`measured_rows` gives them; default:
+            made of the graph's, slice by slice.
     """
 
-    def __init__(self, graph: ViewGraph, body_from_world: Tensor) -> None:
-        self._graph = graph
+    def __init__(self, graph: ViewGraph, body_from_world: Tensor, measured: Tensor | None = None) -> None:
+        self._graph, self._measured = graph, measured
         self._orientation = body_from_world.t().contiguous()
         self._inverse = self._orientation.clone()
         self._inverse[:3].neg_()
 
     def quaternions(self, edges: slice) -> Tensor:
-        """``(4, k)``."""
-        graph = self._graph
-        measured = graph.target_from_source[edges].to(self._orientation.dtype).t().contiguous()
-        at_source = self._orientation.index_select(1, graph.source[edges])
-        at_target = self._inverse.index_select(1, graph.target[edges])
-        residual = multiply_rows(at_target, multiply_rows(measured, at_source))
+        """``(4, k)``, w ≥ 0."""
+        residual = self._either_sign(edges)
         return residual.mul_(1 - 2 * (residual[3] < 0).to(residual))
 
     def vectors(self, edges: slice) -> Tensor:
         """Rotation vectors ``(3, k)`` in radians, of length at most π."""
-        return log_rows(self.quaternions(edges))
+        return log_rows(self._either_sign(edges))
 
     def angles(self) -> Tensor:
         """``(M,)`` radians."""
         angles = self._orientation.new_empty(self._graph.num_edges)
 
         def write(edges: slice) -> None:
-            residual = self.quaternions(edges)
+            residual = self._either_sign(edges)
             sine = (residual[:3] * residual[:3]).sum(dim=0).sqrt()  # four times as fast as torch's norm over rows
-            angles[edges] = 2 * torch.atan2(sine, residual[3])
+            angles[edges] = 2 * torch.atan2(sine, residual[3].abs())
 
         for_each(write, slices(len(angles), SLICE_EDGES, angles.device))
         return angles
 
+    def _either_sign(self, edges: slice) -> Tensor:
+        """``(4, k)``."""
+        graph = self._graph
+        if self._measured is None:
+            measured = graph.target_from_source[edges].to(self._orientation.dtype).t().contiguous()
+        else:
+            measured = self._measured[:, edges]
+        at_source = self._orientation.index_select(1, graph.source[edges])
+        at_target = self._inverse.index_select(1, graph.target[edges])
+        return multiply_rows(at_target, multiply_rows(measured, at_source))
+
+
+def measured_rows(target_from_source: Tensor, dtype: torch.dtype) -> Tensor:
+    """Measurements ``(M, 4)`` of any type → their components in rows ``(4, M)``."""
+    rows = target_from_source.new_empty(4, len(target_from_source), dtype=dtype)
+
+    def write(edges: slice) -> None:
+        rows[:, edges] = target_from_source[edges].t()
+
+    for_each(write, slices(len(target_from_source), SLICE_EDGES, rows.device))
+    return rows
+
 
 def log_rows(a: Tensor) -> Tensor:
-    """Unit quaternions with w ≥ 0 whose components are rows, ``(4, k)`` → rotation vectors ``(3, k)`` in radians."""
+    """Unit quaternions of either sign, components in rows, ``(4, k)`` → rotation vectors ``(3, k)`` in radians."""
     vector, cosine = a[:3], a[3]
-    sine_squared = (vector * vector).sum(dim=0)
-    sine = sine_squared.sqrt()
-    factor = 2 * torch.atan2(sine, cosine) / sine
-    return vector * torch.where(sine_squared < _SMALL_SINE_SQUARED, 2 + sine_squared / 3, factor)
+    sine = (vector * vector).sum(dim=0).clamp_(min=_MIN_SINE_SQUARED).sqrt_()
+    # The arc tangent has the sign of w, so the vector comes out the same for a quaternion and its negative.
+    return vector * torch.div(sine, cosine).atan_().mul_(2).div_(sine)
 
 
 def multiply_rows(a: Tensor, b: Tensor) -> Tensor:
