@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -138,7 +139,9 @@ class ViewGraph:
         return self.kind == EdgeKind.ODOMETRY
 
     def to(self, device: torch.device | str) -> ViewGraph:
-        """The same graph on another device."""
+        """The same graph on another device; itself if it is there."""
+        if self.device == torch.device(device):
+            return self
         moved = {f.name: getattr(self, f.name).to(device) for f in fields(self) if f.name != "num_nodes"}
         return replace(self, **moved)
 
@@ -153,10 +156,13 @@ class ViewGraph:
         Args:
             edges: ``(M,)`` mask of the edges that connect; default all.
         """
-        source, target = (end.cpu().numpy() for end in (self.source, self.target))
         if edges is not None:
-            keep = edges.cpu().numpy()
-            source, target = source[keep], target[keep]
+            return self.select_edges(edges)._components
+        return self._components
+
+    @cached_property
+    def _components(self) -> Tensor:
+        source, target = (end.cpu().numpy() for end in (self.source, self.target))
         adjacency = coo_array(
             (np.ones(len(source), dtype=np.int8), (source, target)), shape=(self.num_nodes, self.num_nodes)
         )

@@ -29,6 +29,19 @@ _RELATIVE_TOLERANCE = 1e-3
 _MAX_ITERATIONS = 8
 
 
+def incidence_matrix(num_nodes: int, source: np.ndarray, target: np.ndarray) -> csr_array:
+    """Bᵀ ``(N, E)``: column e has 1 at the target of edge e and -1 at its source."""
+    columns = np.stack((target, source), axis=1).ravel()
+    shape = num_nodes, len(source)
+    by_edge = csc_array((np.tile([1.0, -1.0], len(source)), columns, np.arange(0, 2 * len(source) + 1, 2)), shape=shape)
+    return csr_array(by_edge)
+
+
+def root_stiffness(weight: np.ndarray) -> float:
+    """How stiffly roots are tied to zero in a graph with weights ``(E,)``."""
+    return _GROUNDING * max(float(weight.max(initial=0.0)), 1.0)
+
+
 class LaplacianPattern:
     """A graph whose Laplacian is factorised for one choice of weights after another.
 
@@ -48,12 +61,7 @@ class LaplacianPattern:
         rank: np.ndarray | None = None,
     ) -> None:
         self.num_nodes, self.source, self.target, self.roots = num_nodes, source, target, roots
-        edges = np.arange(len(source))
-        ends, signs = np.concatenate((target, source)), np.repeat([1.0, -1.0], len(source))
-        # Bᵀ, (N, E): parallel edges have columns of their own, so nothing coincides.
-        order = np.argsort(ends, kind="stable")
-        first = np.concatenate(([0], np.cumsum(np.bincount(ends, minlength=num_nodes))))
-        self._incidence = csr_array((signs[order], np.tile(edges, 2)[order], first), shape=(num_nodes, len(source)))
+        self._incidence = incidence_matrix(num_nodes, source, target)
         self.rank = rank
         self._lay_out(np.arange(num_nodes) if rank is None else rank)
 
@@ -87,7 +95,7 @@ class LaplacianPattern:
     def matrix(self, weight: np.ndarray) -> csc_array:
         """``L``, rows and columns in the order of elimination as far as it is known."""
         degree = abs(self._incidence) @ weight
-        degree[self.roots] += _GROUNDING * max(float(weight.max(initial=0.0)), 1.0)
+        degree[self.roots] += root_stiffness(weight)
         values = np.bincount(self._slot, np.concatenate((-weight, -weight, degree)), len(self._row))
         return csc_array((values, self._row, self._first), shape=(self.num_nodes, self.num_nodes))
 
@@ -117,7 +125,7 @@ def _solve_sparse(factor: SuperLU, node: np.ndarray, rank: np.ndarray, right_han
 
 
 class _Iteration:
-    """``L⁻¹ b`` by conjugate gradients (Hestenes & Stiefel 1952), see :meth:`LaplacianPattern.near`."""
+    """``L⁻¹ b`` by conjugate gradients, see :meth:`LaplacianPattern.near`."""
 
     def __init__(self, pattern: LaplacianPattern, weight: np.ndarray, factorised: FactorisedLaplacian) -> None:
         self._pattern, self._weight, self._precondition = pattern, weight, factorised.solve
@@ -126,23 +134,46 @@ class _Iteration:
         self._node, self._rank = np.argsort(rank), rank
 
     def __call__(self, right_hand_side: np.ndarray) -> np.ndarray:
-        solution, residual = np.zeros_like(right_hand_side), right_hand_side.copy()
-        scaled = self._precondition(residual)
-        goal = _RELATIVE_TOLERANCE * np.abs(scaled).max(initial=0.0)
-        direction, energy = scaled, (residual * scaled).sum(axis=0)
-        for _ in range(_MAX_ITERATIONS):
-            image = (self._matrix @ direction[self._node])[self._rank]
-            curvature = (direction * image).sum(axis=0)
-            length = np.divide(energy, curvature, out=np.zeros_like(energy), where=curvature > 0)
-            solution += length * direction
-            residual -= length * image
-            scaled = self._precondition(residual)
-            if np.abs(scaled).max(initial=0.0) <= goal:
-                return solution
-            previous, energy = energy, (residual * scaled).sum(axis=0)
-            ratio = np.divide(energy, previous, out=np.zeros_like(energy), where=previous > 0)
-            direction = scaled + ratio * direction
-        return self._pattern.factorize(self._weight).solve(right_hand_side)
+        solution = iterate(self._product, self._precondition, right_hand_side)
+        return self._pattern.factorize(self._weight).solve(right_hand_side) if solution is None else solution
+
+    def _product(self, columns: np.ndarray) -> np.ndarray:
+        return np.asarray((self._matrix @ columns[self._node])[self._rank])
+
+
+def iterate(
+    product: Callable[[np.ndarray], np.ndarray],
+    precondition: Callable[[np.ndarray], np.ndarray],
+    right_hand_side: np.ndarray,
+    *,
+    tolerance: float = 0.0,
+    max_iterations: int = _MAX_ITERATIONS,
+) -> np.ndarray | None:
+    """``L⁻¹ b`` by preconditioned conjugate gradients (Hestenes & Stiefel 1952); None if they take too long.
+
+    Args:
+        product, precondition: ``L x`` and ``M⁻¹ x`` of ``(N, k)`` columns, M near L.
+        right_hand_side: ``(N, k)``.
+        tolerance: in the solution's unit; it ends where ``M⁻¹`` of the residual is below it, or below a thousandth of
+            what it was at the beginning.
+    """
+    solution, residual = np.zeros_like(right_hand_side), right_hand_side.copy()
+    scaled = precondition(residual)
+    goal = max(tolerance, _RELATIVE_TOLERANCE * float(np.abs(scaled).max(initial=0.0)))
+    direction, energy = scaled, (residual * scaled).sum(axis=0)
+    for _ in range(max_iterations):
+        image = product(direction)
+        curvature = (direction * image).sum(axis=0)
+        length = np.divide(energy, curvature, out=np.zeros_like(energy), where=curvature > 0)
+        solution += length * direction
+        residual -= length * image
+        scaled = precondition(residual)
+        if float(np.abs(scaled).max(initial=0.0)) <= goal:
+            return solution
+        previous, energy = energy, (residual * scaled).sum(axis=0)
+        ratio = np.divide(energy, previous, out=np.zeros_like(energy), where=previous > 0)
+        direction = scaled + ratio * direction
+    return None
 
 
 class FactorisedLaplacian:
@@ -190,31 +221,3 @@ class LaplacianSystem(FactorisedLaplacian):
     ) -> None:
         once = LaplacianPattern(num_nodes, source, target, roots).factorize(weight)
         super().__init__(once._incidence, weight, once._solve)
-
-
-def probe_signs(first: np.ndarray, second: np.ndarray, num_probes: int) -> np.ndarray:
-    """Signs ±1 ``(E, num_probes)`` int8 that depend on an edge's two node numbers alone; reversing it negates them.
-
-    Hashed (SplitMix64), not drawn: the order of the edges and edges that are added later change nothing. Parallel edges
-    share their signs; their number among the parallels is mixed in to keep them independent.
-    """
-    low, high = np.minimum(first, second).astype(np.uint64), np.maximum(first, second).astype(np.uint64)
-    order = np.lexsort((high, low))
-    same = np.zeros(len(low), dtype=np.int64)
-    repeated = (np.diff(low[order]) == 0) & (np.diff(high[order]) == 0)
-    run = np.arange(1, len(low))
-    start = np.maximum.accumulate(np.where(repeated, 0, run)) if len(low) > 1 else run
-    same[order[1:]] = np.where(repeated, run - start, 0)
-    key = _mix(low * np.uint64(0x9E3779B97F4A7C15) ^ _mix(high ^ _mix(same.astype(np.uint64))))
-    words = -(-num_probes // 64)
-    bits = np.stack([_mix(key + np.uint64(word + 1)) for word in range(words)], axis=1).astype("<u8")
-    is_positive = np.unpackbits(bits.view(np.uint8), axis=1, count=num_probes, bitorder="little").view(bool)
-    is_positive ^= (first > second)[:, None]
-    return np.asarray(2 * is_positive.view(np.int8) - np.int8(1))
-
-
-def _mix(value: np.ndarray) -> np.ndarray:
-    """The finaliser of SplitMix64 (Steele et al. 2014); unsigned arithmetic wraps around."""
-    value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return np.asarray(value ^ (value >> np.uint64(31)))

@@ -5,27 +5,29 @@ verdicts, the noise and the order of elimination are still right. New closures a
 then a few passes of the refinement go on from where the last ones ended. All closures are judged again in these, so
 that a verdict can still change; when several do, or the graph has grown by some percent, or some number of updates
 later, the whole solve runs again, and with it the search for slips and biases.
+
+An update of a large graph *follows* the one before: it solves from that one's factorisation (``grown_laplacian.py``),
+believes its noise, and takes what the rest of the graph predicts of an old closure, and the uncertainty of an old
+keyframe, to be what they were. Now and then, an update *renews* these.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
-from scipy.special import expit
 
-from rotavg_ros import rotations
-from rotavg_ros.solver import slam_refinement
-from rotavg_ros.solver.agreement import NUM_NEIGHBOURS, agreement_pairs, closure_ends
 from rotavg_ros.solver.closure_graph import ClosureGraph
-from rotavg_ros.solver.common_error import RUN_GAP_STEPS
+from rotavg_ros.solver.grown_laplacian import GrownLaplacian, OlderFactor
+from rotavg_ros.solver.new_closures import judge_new_closures
 from rotavg_ros.solver.noise_model import NoiseModel
 from rotavg_ros.solver.slam_clean_net import SlamCleanNet
-from rotavg_ros.solver.slam_passes import SlamEstimate
-from rotavg_ros.solver.slam_stages import CleanedClosures, Prepared, draw_together, judge_closures
+from rotavg_ros.solver.slam_passes import SlamEstimate, Verdicts
+from rotavg_ros.solver.slam_stages import CleanedClosures, Prepared, draw_together
+from rotavg_ros.solver.slam_system import ITERATING_PAYS, GrownSystem, StaleFactorError
+from rotavg_ros.solver.slam_update import Start, follow, grown_variance, renew
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # The whole solve runs again after so many updates, or once there are so many more closures.
@@ -35,12 +37,24 @@ _MAX_GROWTH = 0.05
 _MAX_TURNED, _MAX_SHARE_TURNED = 2, 0.002
 # With fewer closures than this, the whole solve takes no longer than an update.
 _MIN_CLOSURES = 200
+# So many updates in a row follow the one before, with so many new closures in all.
+_MAX_FOLLOWED = 29
+_MAX_COLUMNS = 256
 _COLUMNS = ("source", "target", "target_from_source", "kind", "label", "steps")
+
+
+class Updated(NamedTuple):
+    """The outcome of an update: the closure graph, its verdicts, and variance ``(N,)`` of the nodes in rad²."""
+
+    closure_graph: ClosureGraph
+    verdicts: Verdicts
+    variance: np.ndarray
+    memory: SlamMemory
 
 
 @dataclass(frozen=True)
 class SlamMemory:
-    """Of a graph of M edges.
+    """Of a graph of N nodes and M edges.
 
     Attributes:
         graph: the view-graph.
@@ -48,12 +62,16 @@ class SlamMemory:
         prior_log_odds: ``(M,)`` what the network said of closures.
         steps: ``(M,)`` variance of a closure in units of the closures'; more than 1 where neighbours err together.
         exact_share: ``(M,)`` probability of a good closure to err no more than most.
+        prediction_variance: ``(M,)`` rad², of what the rest of the graph predicts of a closure.
+        variance: ``(N,)`` rad², of the orientations.
         chain_noise: the noise as the odometry has it.
         noise: the noise as the refinement left it.
         max_step_variance: rad², as the refinement kept it.
         elimination: ``(K,)`` nodes in the order of elimination.
+        factor: what the next update may solve from; None where it factorises anew.
         closures: how many there were when the whole solve ran.
         updates: how many there have been since.
+        followed: how many since predictions were estimated.
     """
 
     graph: ViewGraph
@@ -61,52 +79,42 @@ class SlamMemory:
     prior_log_odds: np.ndarray
     steps: np.ndarray
     exact_share: np.ndarray
+    prediction_variance: np.ndarray
+    variance: np.ndarray
     chain_noise: NoiseModel
     noise: NoiseModel
     max_step_variance: float
     elimination: np.ndarray
+    factor: OlderFactor | None
     closures: int
     updates: int = 0
+    followed: int = 0
 
     @classmethod
     def of(
-        cls, graph: ViewGraph, prepared: Prepared, cleaned: CleanedClosures, estimate: SlamEstimate
-    ) -> SlamMemory | None:
-        """After a whole solve; None where an update could not go on from it."""
-        closures = int(prepared.closure_graph.is_closure.sum())
-        if closures < _MIN_CLOSURES or prepared.is_unbiased or estimate.rank is None:
-            return None
-        return cls._of(graph, prepared.closure_graph, cleaned.prior_log_odds, prepared.noise, estimate, closures, 0)
-
-    @classmethod
-    def _of(
         cls,
         graph: ViewGraph,
-        closure_graph: ClosureGraph,
-        prior_log_odds: np.ndarray,
-        chain_noise: NoiseModel,
+        prepared: Prepared,
+        cleaned: CleanedClosures,
         estimate: SlamEstimate,
-        closures: int,
-        updates: int,
-    ) -> SlamMemory:
-        assert estimate.rank is not None
+        variance: np.ndarray,
+    ) -> SlamMemory | None:
+        """After a whole solve, with variances of the nodes ``(N,)``; None where an update could not go on from it."""
+        closure_graph = prepared.closure_graph
+        closures = int(closure_graph.is_closure.sum())
+        if closures < _MIN_CLOSURES or prepared.is_unbiased or estimate.rank is None:
+            return None
         return cls(
-            graph,
-            closure_graph.edge_values(estimate.inlier_probability),
-            closure_graph.edge_values(prior_log_odds),
-            closure_graph.edge_values(estimate.steps),
-            closure_graph.edge_values(estimate.exact_share),
-            chain_noise,
-            estimate.noise,
-            estimate.max_step_variance,
-            closure_graph.nodes[np.argsort(estimate.rank)],
-            closures,
-            updates,
+            **_by_edge(closure_graph, estimate, cleaned.prior_log_odds),
+            **_of_estimate(closure_graph, estimate),
+            graph=graph,
+            variance=variance,
+            chain_noise=prepared.noise,
+            max_step_variance=estimate.max_step_variance,
+            closures=closures,
         )
 
-    def updated(
-        self, graph: ViewGraph, network: SlamCleanNet | None, body_from_world: torch.Tensor
-    ) -> tuple[ClosureGraph, SlamEstimate, SlamMemory] | None:
+    def updated(self, graph: ViewGraph, network: SlamCleanNet | None, body_from_world: torch.Tensor) -> Updated | None:
         """Solve a graph that has grown from this one; None if it has not, or the whole solve should run.
 
         Args:
@@ -118,25 +126,86 @@ class SlamMemory:
         if num_closures > (1 + _MAX_GROWTH) * self.closures:
             return None
         closure_graph, _ = draw_together(graph)
-        start = self._start(closure_graph, network)
-        estimate = slam_refinement.update(
-            replace(closure_graph, steps=start.steps),
-            closure_graph.corrections(body_from_world),
-            start.inlier_probability,
-            self.noise,
-            start.prior_log_odds,
-            self.max_step_variance,
-            self._rank(closure_graph),
-            self._extended(self.exact_share, closure_graph, 1.0),
+        start, new_closures = self._start(closure_graph, network, body_from_world)
+        updated = self._follow(graph, start) or self._renew(graph, start)
+        if updated is None:
+            return None
+        turned = np.abs(updated.verdicts.inlier_probability - start.inlier_probability) > 0.5
+        turned[new_closures] = False
+        return None if turned.sum() > max(_MAX_TURNED, _MAX_SHARE_TURNED * num_closures) else updated
+
+    def _follow(self, graph: ViewGraph, start: Start) -> Updated | None:
+        """From the factorisation, the noise and the predictions of before; None if they no longer serve."""
+        closure_graph, older = start.graph, self.factor
+        if older is None or self.followed >= _MAX_FOLLOWED or not older.fits(closure_graph):
+            return None
+        if graph.num_edges - older.num_edges - int(graph.is_odometry[older.num_edges :].sum()) > _MAX_COLUMNS:
+            return None
+        weight = start.weight
+        system = GrownSystem(GrownLaplacian(older, closure_graph, weight), start.prediction_variance)
+        try:
+            verdicts = follow(start, system)
+        except StaleFactorError:
+            return None
+        if verdicts is None:
+            return None
+        variance = grown_variance(self.variance, closure_graph, weight)
+        memory = replace(
+            self,
+            **_by_edge(closure_graph, verdicts, start.prior_log_odds),
+            graph=graph,
+            variance=variance,
+            factor=system.laplacian.factor,
+            updates=self.updates + 1,
+            followed=self.followed + 1,
         )
+        return Updated(closure_graph, verdicts, variance, memory)
+
+    def _renew(self, graph: ViewGraph, start: Start) -> Updated | None:
+        """Factorised and estimated anew; None if orientations turn by too much."""
+        closure_graph = start.graph
+        estimate = renew(start, self._rank(closure_graph), self.max_step_variance)
         if estimate is None:
             return None
-        turned = np.abs(estimate.inlier_probability - start.inlier_probability) > 0.5
-        turned[start.new_closures] = False
-        if turned.sum() > max(_MAX_TURNED, _MAX_SHARE_TURNED * num_closures):
-            return None
-        numbers = self.chain_noise, estimate, self.closures, self.updates + 1
-        return closure_graph, estimate, self._of(graph, closure_graph, start.prior_log_odds, *numbers)
+        variance = closure_graph.variance(estimate.samples, estimate.stated_step_variance)
+        memory = replace(
+            self,
+            **_by_edge(closure_graph, estimate, start.prior_log_odds),
+            **_of_estimate(closure_graph, estimate),
+            graph=graph,
+            variance=variance,
+            updates=self.updates + 1,
+            followed=0,
+        )
+        return Updated(closure_graph, estimate, variance, memory)
+
+    def _start(
+        self, graph: ClosureGraph, network: SlamCleanNet | None, body_from_world: torch.Tensor
+    ) -> tuple[Start, np.ndarray]:
+        """What is known of all edges, and of new closures what those around them say; and which are new."""
+        closure = np.flatnonzero(graph.is_closure)
+        new = closure[graph.view_graph_edge[closure - graph.num_segments] >= self.graph.num_edges]
+        steps, inlier_probability, prior = (
+            graph.steps.copy(),
+            *(
+                self._extended(value, graph, otherwise)
+                for value, otherwise in ((self.inlier_probability, 1.0), (self.prior_log_odds, 0.0))
+            ),
+        )
+        steps[closure] = self._extended(self.steps, graph, 1.0)[closure]
+        if len(new):
+            judged = judge_new_closures(network, self.chain_noise, graph, closure, new, steps)
+            inlier_probability[new], prior[new], steps[new] = judged
+        start = Start(
+            replace(graph, steps=steps),
+            graph.corrections(body_from_world),
+            inlier_probability,
+            self.noise,
+            prior,
+            self._extended(self.exact_share, graph, 1.0),
+            self._extended(self.prediction_variance, graph, 0.0),
+        )
+        return start, new
 
     def _extended(self, value: np.ndarray, closure_graph: ClosureGraph, otherwise: float) -> np.ndarray:
         """Values ``(M,)`` of this graph's edges → those of a larger one's closure graph ``(E,)``; a segment's least."""
@@ -148,36 +217,6 @@ class SlamMemory:
         out[closure_graph.num_segments :] = of_edge[closure_graph.view_graph_edge]
         return out
 
-    def _start(self, graph: ClosureGraph, network: SlamCleanNet | None) -> _Start:
-        """What is known of all edges, and of new closures what those around them say."""
-        inlier_probability = self._extended(self.inlier_probability, graph, 1.0)
-        prior = self._extended(self.prior_log_odds, graph, 0.0)
-        closure = np.flatnonzero(graph.is_closure)
-        steps = graph.steps.copy()
-        steps[closure] = self._extended(self.steps, graph, 1.0)[closure]
-        is_new = graph.view_graph_edge[closure - graph.num_segments] >= self.graph.num_edges
-        new = closure[is_new]
-        if len(new) == 0:
-            return _Start(inlier_probability, prior, steps, new)
-        ends = closure_ends(graph, closure)
-        tree = KDTree(ends, balanced_tree=False, compact_nodes=False)
-        distance, neighbour = tree.query(ends[is_new], k=NUM_NEIGHBOURS + 1, p=1)
-        # Where closures err together, the new one errs as that next to it.
-        is_near = ~is_new[neighbour] & (distance <= RUN_GAP_STEPS)
-        nearest = np.take_along_axis(neighbour, is_near.argmax(axis=1)[:, None], axis=1)[:, 0]
-        steps[new] = np.where(is_near.any(axis=1), steps[closure[nearest]], 1.0)
-        # Messages run from neighbour to neighbour; what is farther than two rounds away hardly counts.
-        around = np.unique(neighbour)
-        around = np.union1d(around, tree.query(ends[around], k=NUM_NEIGHBOURS + 1, p=1)[1])
-        chosen = closure[around]
-        squared_angle = (rotations.log(graph.residual[torch.from_numpy(chosen)]) ** 2).sum(dim=1).numpy()
-        log_odds, of_network = judge_closures(
-            network, self.chain_noise, squared_angle, graph.path_steps[chosen], agreement_pairs(graph, chosen)
-        )
-        judged = is_new[around]
-        inlier_probability[new], prior[new] = expit(log_odds[judged]), of_network[judged]
-        return _Start(inlier_probability, prior, steps, new)
-
     def _rank(self, graph: ClosureGraph) -> np.ndarray:
         """Order of elimination ``(K,)``: as it was, and what is new comes last."""
         place = np.full(len(graph.odometry_orientation), np.iinfo(np.int64).max)
@@ -187,13 +226,25 @@ class SlamMemory:
         return rank
 
 
-class _Start(NamedTuple):
-    """``(E,)`` probabilities of being good, prior log-odds and variances in units of the kind's; the new closures."""
+def _by_edge(graph: ClosureGraph, verdicts: Verdicts, prior_log_odds: np.ndarray) -> dict[str, Any]:
+    """What is remembered of every edge of the view-graph, ``(M,)`` each."""
+    return {
+        "inlier_probability": graph.edge_values(verdicts.inlier_probability),
+        "prior_log_odds": graph.edge_values(prior_log_odds),
+        "steps": graph.edge_values(verdicts.steps),
+        "exact_share": graph.edge_values(verdicts.exact_share),
+        "prediction_variance": graph.edge_values(verdicts.prediction_variance),
+    }
 
-    inlier_probability: np.ndarray
-    prior_log_odds: np.ndarray
-    steps: np.ndarray
-    new_closures: np.ndarray
+
+def _of_estimate(graph: ClosureGraph, estimate: SlamEstimate) -> dict[str, Any]:
+    """What is remembered of the passes."""
+    assert estimate.rank is not None
+    return {
+        "noise": estimate.noise,
+        "elimination": graph.nodes[np.argsort(estimate.rank)],
+        "factor": OlderFactor.of(graph, estimate.factorised.solve) if graph.num_nodes >= ITERATING_PAYS else None,
+    }
 
 
 def _begins_with(graph: ViewGraph, earlier: ViewGraph) -> bool:

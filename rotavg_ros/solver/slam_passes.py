@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.closure_graph import ClosureGraph
-from rotavg_ros.solver.laplacian import FactorisedLaplacian, LaplacianPattern, probe_signs
+from rotavg_ros.solver.laplacian import FactorisedLaplacian
 from rotavg_ros.solver.noise_model import NoiseModel, outlier_share
 from rotavg_ros.solver.residuals import log_rows, multiply_rows
 from rotavg_ros.solver.slam_judging import (
@@ -27,8 +27,8 @@ from rotavg_ros.solver.slam_judging import (
     judge,
     outlier_probability,
 )
+from rotavg_ros.solver.slam_system import System, leverage
 
-_NUM_PROBES = 48
 # Residuals say nothing of noise or falsehood while the orientations still turn by more than this.
 _SETTLED_STEP = np.radians(3.0)
 _MAX_SETTLING_PASSES = 5
@@ -38,59 +38,62 @@ _CONVERGED_PROBABILITY = 2e-3
 # before the passes end; also once probabilities have changed, in sum, by more than this share of the closures believed.
 _PASSES_PER_PREDICTION = 4
 _MAX_CHANGED_SHARE = 0.2
-# From so many nodes on, a system is solved from the factorisation of a few passes before.
-_ITERATING_PAYS = 4000
-# … if the last pass changed no probability by more than this.
+# A system is solved from the factorisation of a few passes before if the last pass changed no probability by more.
 _NEAR = 0.2
 # After an update's first pass a probability that would change by more than this goes half the way.
 _SWING = 0.2
-# An edge that alone holds two parts of the graph together has leverage 1; it cannot be judged by the others.
-_MAX_LEVERAGE = 0.999
-# In larger graphs the likeliest drift is near what is believed.
-_MAX_NODES_TO_DRAW_AGAIN = 2000
+# What the most certainly false edge weighs, of what it would if it were good.
+_MIN_TRUST = 1e-9
 
 
 @dataclass(frozen=True)
-class SlamEstimate:
-    """The refined closure graph (K key nodes, E edges).
+class Verdicts:
+    """On a closure graph (K key nodes, E edges).
 
     Attributes:
         correction: ``(K, 4)`` C.
         inlier_probability: ``(E,)`` that an edge is not a false one, which is what it weighs.
         outlier_probability: ``(E,)`` that its true noise exceeds 10° (``OUTLIER_ANGLE``), or that a segment slipped.
         noise: the estimated noise model.
-        samples: ``(K, k)`` errors, in rad, as they might be: their second moments are the estimate's covariance.
-        stated_step_variance: rad², what the samples are drawn with.
-        common_share: share of the closures' error variance that neighbouring closures have in common.
-        passes: number of sparse solves.
         steps: ``(E,)`` the graph's, more where closures err together.
-        max_step_variance: what the step variance was kept under, rad².
-        rank: ``(K,)`` where each key node stands in the order of elimination; None if there was none.
         exact_share: ``(E,)`` probability of a good closure to err no more than most.
+        prediction_variance: ``(E,)`` rad², of what the rest of the graph predicts of each edge.
     """
 
     correction: Tensor
     inlier_probability: np.ndarray
     outlier_probability: np.ndarray
     noise: NoiseModel
+    steps: np.ndarray
+    exact_share: np.ndarray
+    prediction_variance: np.ndarray
+
+
+@dataclass(frozen=True)
+class SlamEstimate(Verdicts):
+    """The refined closure graph.
+
+    Attributes:
+        samples: ``(K, k)`` errors, in rad, as they might be: their second moments are the estimate's covariance.
+        stated_step_variance: rad², what the samples are drawn with.
+        common_share: share of the closures' error variance that neighbouring closures have in common.
+        passes: number of sparse solves.
+        max_step_variance: what the step variance was kept under, rad².
+        rank: ``(K,)`` where each key node stands in the order of elimination; None if there was none.
+        factorised: the last factorisation.
+    """
+
     samples: np.ndarray
     stated_step_variance: float
     common_share: float
     passes: int
-    steps: np.ndarray
     max_step_variance: float
     rank: np.ndarray | None
-    exact_share: np.ndarray
+    factorised: FactorisedLaplacian
 
 
 class Passes:
     """The unknowns of a SLAM graph's refinement, and what the last pass saw of them."""
-
-    _system: FactorisedLaplacian
-    _factorised: FactorisedLaplacian
-    _samples: np.ndarray | None = None
-    # Few edges are new, so that few weights change much from pass to pass.
-    is_update = False
 
     def __init__(
         self,
@@ -100,12 +103,15 @@ class Passes:
         noise: NoiseModel,
         prior_log_odds: np.ndarray,
         hold_noise: bool,
-        rank: np.ndarray | None = None,
+        system: System,
+        is_update: bool = False,
     ) -> None:
         self.graph, self.correction, self.noise, self.hold_noise = graph, correction, noise, hold_noise
         self.inlier_probability, self.prior_log_odds = inlier_probability, prior_log_odds
-        self.pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots, rank)
-        self.probes = probe_signs(graph.nodes[graph.source], graph.nodes[graph.target], _NUM_PROBES)
+        self.system = system
+        # Few edges are new, so that few weights change much from pass to pass.
+        self.is_update = is_update
+        self._closure = np.flatnonzero(graph.is_closure)
         self._measured = graph.residual.t().contiguous()
         self._source, self._target = torch.from_numpy(graph.source), torch.from_numpy(graph.target)
         self.residual = self._residual_vectors()
@@ -113,7 +119,6 @@ class Passes:
         self.exact_share, self.exactness = np.ones(len(graph.source)), np.ones(len(graph.source))
         self.passes = 0
         self._changed = 1.0
-        self.prediction_variance = np.full(len(graph.source), np.inf)
         self._prediction_pass, self._changed_since_prediction = -_PASSES_PER_PREDICTION, 0.0
         self._discrepancy: np.ndarray | None = None
 
@@ -121,13 +126,6 @@ class Passes:
     def has_predictions(self) -> bool:
         """Whether there has been an estimate of what the rest of the graph predicts of each edge."""
         return self._prediction_pass > 0
-
-    @property
-    def samples(self) -> np.ndarray:
-        """Errors ``(K, probes)`` as they might be under the weights last factorised; drawn when they are asked for."""
-        if self._samples is None:
-            self._samples = self._factorised.samples(self.probes)
-        return self._samples
 
     def _residual_vectors(self) -> np.ndarray:
         """Rotation vectors ``(E, 3)`` in radians, of ``fine_net.edge_residual``."""
@@ -142,38 +140,20 @@ class Passes:
         """Node values ``(K, k)`` → differences over the edges, target − source ``(E, k)``."""
         return np.asarray(values[self.graph.target] - values[self.graph.source])
 
-    def _variance(self, step_variance: float) -> np.ndarray:
-        """Of every edge, ``(E,)`` rad²."""
-        graph = self.graph
-        return np.asarray(graph.steps * np.where(graph.is_odometry, step_variance, self.noise.closure_variance))
+    def weight(self, noise: NoiseModel) -> np.ndarray:
+        """Of every edge, ``(E,)`` rad⁻²."""
+        return edge_weight(self.inlier_probability * self.exactness, edge_variance(self.graph, noise))
 
-    def _weight(self, step_variance: float) -> np.ndarray:
-        """``(E,)``."""
-        return np.asarray(np.maximum(self.inlier_probability * self.exactness, 1e-9) / self._variance(step_variance))
-
-    def estimate(self, share: float, max_step_variance: float) -> SlamEstimate:
+    def verdicts(self) -> Verdicts:
         """What there is to say after the last pass."""
-        step_variance = self.noise.step_variance
-        if self.graph.num_nodes <= _MAX_NODES_TO_DRAW_AGAIN:
-            # Where closures are few, drift is taken to be less than it probably is, for the sake of the verdicts.
-            step_variance = max(step_variance, self.noise.likely_step_variance)
-        if step_variance == self.noise.step_variance:
-            samples = self.samples
-        else:
-            samples = self.pattern.factorize(self._weight(step_variance)).samples(self.probes)
-        return SlamEstimate(
+        return Verdicts(
             rotations.normalize(self.correction),
             self.inlier_probability,
             self.outlier_probability(),
             self.noise,
-            samples,
-            step_variance,
-            share,
-            self.passes,
             self.graph.steps,
-            max_step_variance,
-            self.pattern.rank,
             self.exact_share,
+            self.system.prediction_variance,
         )
 
     def alternate(self, max_step_variance: float, max_passes: int) -> None:
@@ -198,16 +178,9 @@ class Passes:
             refresh: whether to estimate anew what the rest of the graph predicts of each edge.
         """
         graph, noise = self.graph, self.noise
-        variance, weight = self._variance(noise.step_variance), self._weight(noise.step_variance)
-        # A pass after one that has not settled weighs as that did.
-        if self.passes == 0 or not np.array_equal(weight, self._system.weight):
-            is_near = (self._changed < _NEAR or self.is_update) and graph.num_nodes >= _ITERATING_PAYS
-            if self.passes == 0 or refresh or not is_near:
-                self._system = self._factorised = self.pattern.factorize(weight)
-                self._samples = None if refresh else self._samples
-            else:
-                self._system = self.pattern.near(weight, self._factorised)
-        step = self._system.fit(self.residual)
+        variance, weight = edge_variance(graph, noise), self.weight(noise)
+        is_near = self._changed < _NEAR or self.is_update
+        step = self.system.solve(weight, self.residual, refresh=refresh, is_near=is_near)
         self.correction = rotations.multiply(self.correction, rotations.exp(torch.from_numpy(step)))
         self.residual = self._residual_vectors()
         self.passes += 1
@@ -217,62 +190,71 @@ class Passes:
             return moved, 1.0
 
         square = (self.residual**2).sum(axis=1)
-        leverage = self._leverage(weight, refresh)
-        odometry, closure = graph.is_odometry, graph.is_closure
-        redundancy = self.inlier_probability * (1 - leverage)
-        # A run's inflated variance is what its closures weigh, not what each of them errs.
-        square_per_step = self.inlier_probability[odometry] * square[odometry] / graph.steps[odometry]
-        step_variance, closure_variance = noise.step_variance, noise.closure_variance
+        if refresh:
+            self.system.predict(weight)
+            self._prediction_pass, self._changed_since_prediction = self.passes, 0.0
+        prediction_variance = self.system.prediction_variance
+        leave_out = 1 - leverage(weight, prediction_variance)
+        self.noise = replace(noise, outlier_share=outlier_share(self.inlier_probability[self._closure]))
         if not self.hold_noise:
-            step_variance = min(
-                max_step_variance, estimated_step_variance(square_per_step, redundancy[odometry], noise)
-            )
-            exact = self.exact_share[closure]
-            closure_variance = estimated_closure_variance(
-                square[closure], self.inlier_probability[closure] * exact, redundancy[closure] * exact, noise
-            )
-        share = outlier_share(self.inlier_probability[closure])
-        self.noise = replace(noise, step_variance=step_variance, closure_variance=closure_variance, outlier_share=share)
+            self._estimate_noise(square, self.inlier_probability * leave_out, max_step_variance)
 
         # What is left of the fit without the edge itself, and how far that may be off.
-        predicted_square = np.minimum(square / (1 - leverage) ** 2, np.pi**2)
-        scale = np.where(odometry, 1.0, self.noise.closure_variance / noise.closure_variance)
-        judged = judge(self.noise, predicted_square, scale * variance, self.prediction_variance)
+        closure = self._closure
+        predicted_square = np.minimum(square[closure] / leave_out[closure] ** 2, np.pi**2)
+        scale = self.noise.closure_variance / noise.closure_variance
+        judged = judge(self.noise, predicted_square, scale * variance[closure], prediction_variance[closure])
         if judged.exact_share is not None:
-            self.exact_share = np.where(closure, judged.exact_share, 1.0)
+            self.exact_share[closure] = judged.exact_share
             self.exactness = exactness_of(self.exact_share, self.noise.closure_variance)
-        probability = np.where(closure, expit(judged.log_odds + self.prior_log_odds), self.inlier_probability)
+        before = self.inlier_probability[closure]
+        probability = expit(judged.log_odds + self.prior_log_odds[closure])
         if self.is_update and self.passes > 1:
             # Closures of which each is good if the other is not would change places from update to update.
-            is_swinging = np.abs(probability - self.inlier_probability) > _SWING
-            probability = np.where(is_swinging, (probability + self.inlier_probability) / 2, probability)
-        change = np.abs(probability - self.inlier_probability)
+            is_swinging = np.abs(probability - before) > _SWING
+            probability = np.where(is_swinging, (probability + before) / 2, probability)
+        change = np.abs(probability - before)
+        self.inlier_probability = self.inlier_probability.copy()
+        self.inlier_probability[closure] = probability
         self._changed = changed = float(change.max(initial=0.0))
         self._changed_since_prediction += float(change.sum())
-        self.inlier_probability = probability
         self._discrepancy = np.sqrt(predicted_square)
         return moved, changed
 
-    def _leverage(self, weight: np.ndarray, refresh: bool) -> np.ndarray:
-        """Of every edge, ``(E,)``; and the variance of what the rest of the graph predicts of it, new or as it was.
-
-        That variance does not depend on the edge's own weight, so it stays right where an edge's verdict is changed.
-        """
-        if not refresh:
-            gain = weight * self.prediction_variance
-            return np.asarray(np.minimum(gain / (1 + gain), _MAX_LEVERAGE))
-        # A few columns at a time, which stay in a core's cache.
-        parts = np.array_split(self.samples, _NUM_PROBES // 4, axis=1)
-        resistance = sum((self.difference(part) ** 2).sum(axis=1) for part in parts) / _NUM_PROBES
-        leverage = np.clip(weight * resistance, 0.0, _MAX_LEVERAGE)
-        self.prediction_variance, self._prediction_pass = resistance / (1 - leverage), self.passes
-        self._changed_since_prediction = 0.0
-        return np.asarray(leverage)
+    def _estimate_noise(self, square: np.ndarray, redundancy: np.ndarray, max_step_variance: float) -> None:
+        """Both variances, from the residuals' squares, rad², and the redundancies that they leave; ``(E,)`` each."""
+        graph, noise = self.graph, self.noise
+        odometry, closure = graph.is_odometry, self._closure
+        # A run's inflated variance is what its closures weigh, not what each of them errs.
+        square_per_step = self.inlier_probability[odometry] * square[odometry] / graph.steps[odometry]
+        step_variance = estimated_step_variance(square_per_step, redundancy[odometry], noise)
+        exact = self.exact_share[closure]
+        closure_variance = estimated_closure_variance(
+            square[closure], self.inlier_probability[closure] * exact, redundancy[closure] * exact, noise
+        )
+        self.noise = replace(
+            noise, step_variance=min(max_step_variance, step_variance), closure_variance=closure_variance
+        )
 
     def outlier_probability(self) -> np.ndarray:
         """That a closure's true noise exceeds 10° (``OUTLIER_ANGLE``), or that a segment slipped, ``(E,)``."""
-        good = self.inlier_probability
-        if self._discrepancy is None:
-            return np.asarray(1 - good)
-        wrong = outlier_probability(self.noise, good, self._discrepancy, self.prediction_variance)
-        return np.asarray(np.where(self.graph.is_closure, wrong, 1 - good))
+        probability = 1 - self.inlier_probability
+        if self._discrepancy is not None:
+            closure = self._closure
+            probability[closure] = outlier_probability(
+                self.noise,
+                self.inlier_probability[closure],
+                self._discrepancy,
+                self.system.prediction_variance[closure],
+            )
+        return probability
+
+
+def edge_variance(graph: ClosureGraph, noise: NoiseModel) -> np.ndarray:
+    """Of every edge's own noise, if it is good, ``(E,)`` rad²."""
+    return np.asarray(graph.steps * np.where(graph.is_odometry, noise.step_variance, noise.closure_variance))
+
+
+def edge_weight(trust: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Trust of every edge in [0, 1] over its variance, ``(E,)``; enough at least for the system to be solvable."""
+    return np.asarray(np.maximum(trust, _MIN_TRUST) / variance)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -11,7 +12,7 @@ from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.methods import DEFAULT_METHOD, NETWORK_METHODS, Method
 from rotavg_ros.solver.profile import Estimate, Networks, Stopwatch
 from rotavg_ros.solver.slam_memory import SlamMemory
-from rotavg_ros.solver.slam_passes import SlamEstimate
+from rotavg_ros.solver.slam_passes import Verdicts
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -53,21 +54,25 @@ def solve_slam(
                 slip_search=method.slip_search,
             )
         with watch.stage("expand"):
+            closure_graph = prepared.closure_graph
+            variance = closure_graph.variance(estimate.samples, estimate.stated_step_variance)
             is_default = method is NETWORK_METHODS[DEFAULT_METHOD]
-            memory = SlamMemory.of(graph, prepared, cleaned, estimate) if is_default else None
-            return _slam_estimate(prepared.closure_graph, estimate, memory)
+            memory = SlamMemory.of(graph, prepared, cleaned, estimate, variance) if is_default else None
+            return _slam_estimate(closure_graph, estimate, variance, memory)
     with watch.stage("expand"):
         score = slam_stages.outlier_scores(prepared.closure_graph, 1 - cleaned.inlier_probability)
         orientations = prepared.closure_graph.orientations(correction)
     return Estimate(orientations, torch.from_numpy(score), torch.full((graph.num_nodes,), torch.nan))
 
 
-def _slam_estimate(graph: ClosureGraph, estimate: SlamEstimate, memory: SlamMemory | None) -> Estimate:
-    """From the closure graph's nodes and edges to the view-graph's."""
+def _slam_estimate(
+    graph: ClosureGraph, verdicts: Verdicts, variance: np.ndarray, memory: SlamMemory | None
+) -> Estimate:
+    """From the closure graph's nodes and edges to the view-graph's, of whose nodes ``variance`` ``(N,)`` is."""
     return Estimate(
-        graph.orientations(estimate.correction),
-        torch.from_numpy(slam_stages.outlier_scores(graph, estimate.outlier_probability)),
-        torch.from_numpy(graph.variance(estimate.samples, estimate.stated_step_variance)),
+        graph.orientations(verdicts.correction),
+        torch.from_numpy(slam_stages.outlier_scores(graph, verdicts.outlier_probability)),
+        torch.from_numpy(variance),
         memory,
     )
 

@@ -11,8 +11,8 @@ from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_s
 from rotavg_ros.datasets.trajectories import World
 from rotavg_ros.online.marginalization import Columns, can_be_marginalized, marginalize
 from rotavg_ros.online.marginalized_keyframes import MarginalizedIndex, MarginalizedKeyframes
-from rotavg_ros.solver import slam_passes, solve
-from rotavg_ros.solver.laplacian import probe_signs
+from rotavg_ros.solver import slam_system, solve
+from rotavg_ros.solver.probes import probe_signs
 from rotavg_ros.view_graph import ViewGraph
 
 COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
@@ -111,7 +111,7 @@ def test_the_solver_says_the_same_of_those_that_are_left(monkeypatch):
         return probe_signs(ranks[: len(source)], ranks[len(source) :], count)
 
     # Uncertainties are estimated with random signs that hang on the nodes' numbers; here these must not matter.
-    monkeypatch.setattr(slam_passes, "probe_signs", signs_by_rank)
+    monkeypatch.setattr(slam_system, "probe_signs", signs_by_rank)
     config = SlamSimulationConfig(
         World.CITY, num_keyframes=600, laps=3, keyframe_distance_m=2.0, closures_per_keyframe=0.1, false_share=0.2
     )

@@ -7,6 +7,7 @@ import pytest
 
 from rotavg_ros.solver import laplacian
 from rotavg_ros.solver.laplacian import LaplacianPattern, LaplacianSystem
+from rotavg_ros.solver.probes import likeliest_leverage, probe_signs
 
 
 def random_graph(num_nodes: int, num_edges: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -57,3 +58,22 @@ def test_other_weights_and_a_known_order_give_the_same_solution() -> None:
         exact = pattern.factorize(changed).fit(difference)
         error = np.abs(pattern.near(changed, factorised).fit(difference) - exact).max()
         assert error < 1e-2 * np.abs(exact).max()
+
+
+def test_leverage_is_told_from_a_few_probes_however_large_it_is() -> None:
+    rng = np.random.default_rng(2)
+    source, target = random_graph(300, 120, rng)
+    weight = 10.0 ** rng.uniform(-2, 2, len(source))
+    system = LaplacianSystem(300, source, target, weight, np.array([0]))
+    incidence = np.zeros((300, len(source)))
+    incidence[target, np.arange(len(source))], incidence[source, np.arange(len(source))] = 1.0, -1.0
+    exact = weight * np.einsum("ne,ne->e", incidence, system.solve(incidence))
+    assert (exact > 0.9).sum() > 50
+    signs = probe_signs(source, target, 48)
+    samples = system.samples(signs)
+    scaled = np.sqrt(weight)[:, None] * (samples[target] - samples[source])
+    leverage = likeliest_leverage((scaled**2).mean(axis=1), (scaled * signs).mean(axis=1))
+    judged = (exact > 0.5) & (exact < 0.999)
+    # By how much an edge is less certain without itself; from the mean square alone: 1.6 in the mean.
+    error = np.log((1 - leverage[judged]) / (1 - exact[judged]))
+    assert np.sqrt((error**2).mean()) < 0.3

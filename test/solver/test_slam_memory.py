@@ -40,12 +40,17 @@ def grown(solution: Solution, graph: ViewGraph) -> Solution:
     return solve(graph, warm_start=start, memory=solution.memory)
 
 
-def test_updates_end_where_a_whole_solve_does(city: ViewGraph) -> None:
+@pytest.mark.parametrize("is_large", [False, True], ids=["factorised anew", "followed"])
+def test_updates_end_where_a_whole_solve_does(city: ViewGraph, monkeypatch: pytest.MonkeyPatch, is_large: bool) -> None:
+    if is_large:
+        monkeypatch.setattr(slam_memory, "ITERATING_PAYS", 0)
     solution = solve(until(city, 500))
-    updates = 0
+    updates = followed = 0
     for num_keyframes in range(508, NUM_KEYFRAMES + 1, 4):
         solution = grown(solution, until(city, num_keyframes))
         updates += "update" in solution.stage_seconds and "refine" not in solution.stage_seconds
+        followed += solution.memory is not None and solution.memory.followed > 0
+    assert followed >= 10 if is_large else followed == 0
     assert updates >= 15  # of 24; the others have seen the whole graph
     whole = solve(city)
     difference = torch.rad2deg(rotations.angle_between(solution.body_from_world, whole.body_from_world))
