@@ -42,9 +42,11 @@ _MAX_LOCATED_STEPS = 3.0
 _MAX_EDGES_TO_JUMP = 3000
 # Weight of a closure that its neighbours speak against.
 _MIN_TRUST = 1e-3
-# A new solution must be better by this many nats; so much worse it may be if false closures come in groups.
+# A new solution must be better by this many nats; so much worse it may be if false closures come in groups, and only
+# by such a part of what it is better by else.
 _MIN_GAIN = 10.0
 _MAX_LOSS_IF_GROUPED = 15.0
+_MAX_LOST_SHARE = 0.05
 # A slip beside a node without good closures costs the same on either side of it; rounding must not choose.
 _TIE = 0.1
 _FALSE_SQUARE = np.pi**2 / 3 + 2
@@ -95,7 +97,8 @@ def search_for_slips(
     gain_if_grouped = _grouped_cost(cost, estimate.correction, pairs, is_agreed) - _grouped_cost(
         cost, correction, pairs, is_agreed
     )
-    if min(gain, gain_if_grouped + (_MIN_GAIN + _MAX_LOSS_IF_GROUPED if doubt == Doubt.STRONG else 0)) < _MIN_GAIN:
+    may_lose = min(_MAX_LOSS_IF_GROUPED, _MAX_LOST_SHARE * gain) if doubt == Doubt.STRONG else -_MIN_GAIN
+    if gain < _MIN_GAIN or gain_if_grouped < -may_lose:
         return None
     # Without the slips, the odometry tells how it drifts.
     noise = _noise_without_slips(cost, correction, noise)
