@@ -5,6 +5,9 @@ from __future__ import annotations
 import argparse
 import math
 
+# As for the node's solver_threads; far more exhaust the process's memory maps before anything is solved.
+_MAX_THREADS = 1024
+
 
 def whole_number(text: str) -> int:
     """A whole number, 0 or more."""
@@ -19,6 +22,14 @@ def positive_whole_number(text: str) -> int:
     number = _whole(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f"is {text}; it must be 1 or more")
+    return number
+
+
+def thread_count(text: str) -> int:
+    """A number of threads that a process can have."""
+    number = positive_whole_number(text)
+    if number > _MAX_THREADS:
+        raise argparse.ArgumentTypeError(f"is {text}; it must be {_MAX_THREADS} or less")
     return number
 
 

@@ -14,9 +14,10 @@ from pathlib import Path
 
 import torch
 
-from rotavg_ros.cli.arguments import positive_whole_number
+from rotavg_ros.cli.arguments import thread_count
 from rotavg_ros.cli.progress import working
 from rotavg_ros.errors import UserError
+from rotavg_ros.evaluation.tables import make_folder
 from rotavg_ros.solver.clean_net import CleanNet
 from rotavg_ros.solver.network_store import WEIGHTS_FOLDER, read_network
 from rotavg_ros.training.config import TrainingConfig, TrainingConfigError
@@ -46,9 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--start", type=Path, metavar="WEIGHTS", help="weights of the same network to go on from (default: drawn)"
     )
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default: auto")
-    parser.add_argument(
-        "--threads", type=positive_whole_number, metavar="N", help="CPU threads (default: torch's choice)"
-    )
+    parser.add_argument("--threads", type=thread_count, metavar="N", help="CPU threads (default: torch's choice)")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -111,14 +110,22 @@ def make_trainer(
     """
     if network == "clean-net" and clean_net is not None:
         raise TrainCommandError("--clean-net is for fine-net; to go on with a CleanNet, give the same --output")
+    if config.goes_on_from and start is None:
+        raise TrainCommandError(
+            f"{origin}: goes on from the weights that `rotavg train {network} {config.goes_on_from}` makes; name them "
+            "with --start"
+        )
+    if config.family == "slam" and network == "fine-net":
+        raise TrainCommandError("the SLAM profile has no FineNet; its refinement does that work")
+    if config.family == "slam" and device == "cuda":
+        raise TrainCommandError("the SLAM profile's CleanNet trains on the CPU, where its graphs live")
     name = f"{config.family}-{network}"
+    # What is wrong with any of the files shows before the minutes that drawing graphs takes.
+    given = None if start is None else read_network(name, start)
+    make_folder(output)
     inputs: dict[str, str] = {}
     task: TrainingTask
     if config.family == "slam":
-        if network == "fine-net":
-            raise TrainCommandError("the SLAM profile has no FineNet; its refinement does that work")
-        if device == "cuda":
-            raise TrainCommandError("the SLAM profile's CleanNet trains on the CPU, where its graphs live")
         with working("simulating pose graphs"):
             task = SlamCleanTask(config)
     elif network == "clean-net":
@@ -130,10 +137,11 @@ def make_trainer(
         with working("drawing view-graphs"):
             task = SfmFineTask(config, _torch_device(device), before)
     command = f"rotavg train {network} {Path(origin).stem if Path(origin).exists() else origin}"
-    if start is not None:
-        before_training = read_network(name, start)
-        inputs["start_fingerprint"] = fingerprint(before_training)
-        task.network.load_state_dict(before_training.state_dict())
+    if clean_net is not None:
+        command += " --clean-net WEIGHTS"
+    if given is not None:
+        inputs["start_fingerprint"] = fingerprint(given)
+        task.network.load_state_dict(given.state_dict())
         command += " --start WEIGHTS"
     return Trainer(task, config, output, name, inputs, command)
 

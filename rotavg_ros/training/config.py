@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,7 @@ class TrainingConfig:
         passes: FineNet: how often it is applied in a row at most, as NeuRoRA-v2 does; it learns from the last pass,
             and fewer are likelier.
         seed: of data, initial weights and order.
+        goes_on_from: the configuration whose weights this one begins with (``rotavg train --start``); empty: none.
     """
 
     family: str = "sfm"
@@ -54,6 +56,7 @@ class TrainingConfig:
     edge_dropout: float = 0.25
     passes: int = 1
     seed: int = 0
+    goes_on_from: str = ""
 
     def __post_init__(self) -> None:
         recipes = {
@@ -75,6 +78,12 @@ class TrainingConfig:
                 raise TrainingConfigError(f"{name} is [{low}, {high}]; use an ascending pair of at least 10")
         if self.warmup_epochs < 0:
             raise TrainingConfigError(f"warmup_epochs is {self.warmup_epochs}; it must not be negative")
+        if not 0 < self.learning_rate < math.inf:
+            raise TrainingConfigError(f"learning_rate is {self.learning_rate}; it must be positive")
+        if not 0 <= self.weight_decay < math.inf:
+            raise TrainingConfigError(f"weight_decay is {self.weight_decay}; it must not be negative")
+        if self.seed < 0:
+            raise TrainingConfigError(f"seed is {self.seed}; it must not be negative")
         if not 0 <= self.averaging < 1:
             raise TrainingConfigError(f"averaging is {self.averaging}; a share in [0, 1)")
         if not 0 <= self.edge_dropout < 1:
@@ -107,7 +116,7 @@ class TrainingConfig:
             kind = type(defaults[key])
             try:
                 values[key] = tuple(int(item) for item in value) if kind is tuple else kind(value)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 raise TrainingConfigError(f"{origin}: {key} is {value!r}, expected like {defaults[key]!r}") from None
             if kind is tuple and len(values[key]) != 2:
                 raise TrainingConfigError(f"{origin}: {key} is {value!r}, expected a pair")

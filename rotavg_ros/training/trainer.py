@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from rotavg_ros.errors import UserError
+from rotavg_ros.evaluation.tables import make_folder
 from rotavg_ros.solver.network_store import metadata
 from rotavg_ros.training.checkpoint import load_checkpoint, save_checkpoint, save_tensors, save_text
 from rotavg_ros.training.config import TrainingConfig
@@ -87,10 +88,7 @@ class Trainer:
     ) -> None:
         self.task, self.config, self.name, self.command = task, config, name, command
         self.inputs = dict(inputs or {})
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise TrainingError(f"{folder}: cannot be used as output folder ({error.strerror})") from None
+        make_folder(folder)
         self.weights_path = folder / f"{name}.safetensors"
         self.card_path = folder / f"{name}.json"
         self._checkpoint_path = folder / f"{name}.checkpoint.safetensors"
@@ -107,7 +105,8 @@ class Trainer:
                 self._checkpoint_path, task.network, self.optimizer, self._average, self._identity()
             )
             self._state = _State(**state)
-        self._drop_log_after(self._state.epoch)
+        with self._writing():
+            self._drop_log_after(self._state.epoch)
 
     @property
     def epochs_done(self) -> int:
@@ -117,7 +116,7 @@ class Trainer:
         """Train to the end (or ``max_epochs`` more epochs); returns the last validation's figures.
 
         Raises:
-            TrainingError: the loss is no number any more.
+            TrainingError: the loss is no number any more, or a file cannot be written.
         """
         last = self.config.epochs if max_epochs is None else min(self.config.epochs, self._state.epoch + max_epochs)
         figures: dict[str, float] = {}
@@ -127,7 +126,7 @@ class Trainer:
         for epoch in bar:
             start = time.perf_counter()
             losses = self._train(epoch)
-            with torch.no_grad(), self._averaged():
+            with torch.no_grad(), self._averaged(), self._writing():
                 figures = self.task.validate()
                 seconds = self._state.seconds + time.perf_counter() - start
                 best = min(self._state.best, figures["objective"])
@@ -136,15 +135,16 @@ class Trainer:
                 # The checkpoint comes last: whatever a kill interrupts before it is repeated by the resumed run.
                 if is_better:
                     self._save_weights(figures)
-            self._log(epoch, losses, figures)
-            save_checkpoint(
-                self._checkpoint_path,
-                self.task.network,
-                self.optimizer,
-                self._average,
-                self._identity(),
-                asdict(self._state),
-            )
+            with self._writing():
+                self._log(epoch, losses, figures)
+                save_checkpoint(
+                    self._checkpoint_path,
+                    self.task.network,
+                    self.optimizer,
+                    self._average,
+                    self._identity(),
+                    asdict(self._state),
+                )
             bar.set_postfix_str(" ".join(f"{key} {value:.4g}" for key, value in {**losses, **figures}.items()))
         return figures
 
@@ -190,6 +190,15 @@ class Trainer:
         yield
         self.task.network.load_state_dict({**self.task.network.state_dict(), **own})
 
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Inside, files of the run are written; an older one that cannot be replaced stays as it is."""
+        try:
+            yield
+        except OSError as error:
+            path = error.filename2 or error.filename or self.weights_path.parent
+            raise TrainingError(f"{path}: cannot be written ({error.strerror}); mend that and run it again") from None
+
     def _identity(self) -> dict[str, Any]:
         return {**metadata(self.name), "config": self.config.to_dict(), **self.inputs}
 
@@ -218,7 +227,7 @@ class Trainer:
     def _drop_log_after(self, epoch: int) -> None:
         """Forget lines of epochs that are going to be repeated."""
         if self._log_path.exists():
-            lines = self._log_path.read_text().splitlines(keepends=True)
+            lines = self._log_path.read_text(errors="replace").splitlines(keepends=True)
             save_text(self._log_path, "".join(lines[:epoch]))
 
 

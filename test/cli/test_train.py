@@ -13,6 +13,7 @@ from rotavg_ros.solver.network_store import WEIGHTS_FOLDER, load_network
 from rotavg_ros.training.trainer import fingerprint
 
 CPU = ("--device", "cpu", "--threads", "1")
+OTHER_WEIGHTS = WEIGHTS_FOLDER / "sfm-clean-net.safetensors"
 TINY = """
 family: sfm
 nodes: [12, 20]
@@ -88,6 +89,10 @@ def test_training_goes_on_from_given_weights(config: Path, tmp_path: Path) -> No
         (["clean-net", "slam-clean-net", "--device", "cuda"], "on the CPU"),
         (["clean-net", "sfm-clean-net", "--clean-net", "x"], "--clean-net is for fine-net"),
         (["fine-net", "sfm-fine-net", "--clean-net", "x.safetensors"], "x.safetensors: missing"),
+        (["clean-net", "sfm-clean-net-broad"], "`rotavg train clean-net sfm-clean-net` makes; name them with --start"),
+        (["fine-net", "sfm-fine-net-settled", "--start", "x.safetensors"], "x.safetensors: missing"),
+        (["fine-net", "sfm-fine-net", "--start", str(OTHER_WEIGHTS)], '"network": "sfm-clean-net"'),
+        (["fine-net", "slam-clean-net", "--start", str(OTHER_WEIGHTS)], "no FineNet"),
         (["clean-net", "sfm-clean-net", "--threads", "0"], "must be 1 or more"),
         (["big-net", "sfm-clean-net"], "big-net"),
     ],
@@ -110,6 +115,9 @@ def test_mistakes_take_one_line(
         ("- 1", "expected `key: value` lines"),
         ("family: cars", "family is 'cars'"),
         ("epochs: {", "not a readable YAML file"),
+        ("learning_rate: .nan", "learning_rate is nan"),
+        ("seed: -1", "seed is -1"),
+        ("graphs: .inf", "graphs is inf"),
     ],
 )
 def test_bad_configurations(text: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -123,7 +131,18 @@ def test_bad_configurations(text: str, message: str, tmp_path: Path, capsys: pyt
 
 def test_output_that_is_a_file(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "clean-net", str(config), "--output", str(config), *CPU]) == 2
-    assert "cannot be used as output folder" in capsys.readouterr().err
+    assert "cannot be used as a folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("taken", ["safetensors", "json", "log.jsonl", "checkpoint.safetensors"])
+def test_a_folder_in_the_way_of_a_file(
+    config: Path, tmp_path: Path, taken: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / f"sfm-clean-net.{taken}"
+    folder.mkdir()
+    assert main(["train", "clean-net", str(config), "--output", str(tmp_path), *CPU]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"rotavg: error: {folder}: ") and error.count("\n") == 1
 
 
 def test_no_gpu(
