@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 
-from rotavg_ros.cli.arguments import positive_number, positive_whole_number
+from rotavg_ros.cli.arguments import positive_number, positive_whole_number, thread_count
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation import long_run
 from rotavg_ros.evaluation.benchmark import report, schedule
@@ -22,6 +22,7 @@ from rotavg_ros.evaluation.benchmark.cases import FAMILIES
 from rotavg_ros.evaluation.benchmark.measure import ENOUGH_S, LABELS
 from rotavg_ros.evaluation.tables import Table, make_folder, write_report
 
+_SOAK_KEYFRAMES, _SOAK_SECONDS = 10_000, 60.0
 # The load average below which nothing else ran to speak of.
 _QUIET_LOAD = 0.5
 _QUIET = ": nothing else ran to speak of."
@@ -61,6 +62,10 @@ truth. The load average was {load} before the run.
 """
 
 
+class BenchmarkUsageError(UserError):
+    """Options that do not fit together."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``rotavg benchmark``."""
     parser.add_argument(
@@ -80,13 +85,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--contenders", nargs="+", choices=tuple(LABELS), default=list(LABELS), help="default: all of them"
     )
     parser.add_argument("--repeats", type=positive_whole_number, default=5, metavar="N", help="default: 5")
-    parser.add_argument("--threads", type=positive_whole_number, metavar="N", help="CPU threads (default: torch's)")
+    parser.add_argument("--threads", type=thread_count, metavar="N", help="CPU threads (default: torch's)")
     parser.add_argument("--soak", action="store_true", help="the node under load instead of the solvers")
     parser.add_argument(
-        "--seconds", type=positive_number, default=60.0, metavar="S", help="of a soak, for each rate (default: 60)"
+        "--seconds", type=positive_number, metavar="S", help=f"of a soak, for each rate (default: {_SOAK_SECONDS:g})"
     )
     parser.add_argument(
-        "--keyframes", type=positive_whole_number, default=10_000, metavar="N", help="of a soak (default: 10000)"
+        "--keyframes", type=positive_whole_number, metavar="N", help=f"of a soak (default: {_SOAK_KEYFRAMES})"
     )
     parser.add_argument(
         "--hours",
@@ -101,16 +106,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure and report."""
+    _check(arguments)
     if arguments.threads is not None:
         torch.set_num_threads(arguments.threads)
-    if arguments.hours is not None and not arguments.soak:
-        raise UserError("--hours is of a soak; add --soak")
     make_folder(arguments.output)
     if arguments.hours is not None:
         print(_long_run(arguments))
     else:
         print(_soak(arguments) if arguments.soak else _benchmark(arguments))
     return 0
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """An option of another kind of run would pass unheard."""
+    hours = arguments.hours is not None
+    for option, is_heard, remedy in (
+        ("--hours", arguments.soak, "add --soak"),
+        ("--max-keyframes", arguments.soak and hours, "add --soak --hours H"),
+        ("--seconds", arguments.soak and not hours, "give it with --soak and without --hours"),
+        ("--keyframes", arguments.soak and not hours, "give it with --soak and without --hours"),
+    ):
+        if getattr(arguments, option[2:].replace("-", "_")) is not None and not is_heard:
+            raise BenchmarkUsageError(f"{option} means nothing here; {remedy}")
+    if arguments.min_pairs > arguments.max_pairs:
+        raise BenchmarkUsageError(
+            f"--min-pairs {arguments.min_pairs} is more than --max-pairs {arguments.max_pairs}; no graph lies between"
+        )
 
 
 def _benchmark(arguments: argparse.Namespace) -> Path:
@@ -148,7 +169,7 @@ def _soak(arguments: argparse.Namespace) -> Path:
     from rotavg_ros.ros import soak  # needs ROS 2, which the rest does not
 
     load = _load()
-    rows = soak.run(arguments.keyframes, arguments.seconds)
+    rows = soak.run(arguments.keyframes or _SOAK_KEYFRAMES, arguments.seconds or _SOAK_SECONDS)
     introduction = _SOAK_INTRODUCTION.format(load=load, command=arguments.command_line)
     return write_report(
         arguments.output,

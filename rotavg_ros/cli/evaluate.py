@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 
 from rotavg_ros.cli import evaluate_slam
-from rotavg_ros.cli.arguments import positive_number, positive_whole_number, whole_number
+from rotavg_ros.cli.arguments import positive_number, positive_whole_number, thread_count, whole_number
 from rotavg_ros.cli.progress import progress, working
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation import real, rgbd, robustness, synthetic
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--output", type=Path, default=Path("docs/results"), metavar="DIR", help="default: docs/results"
         )
         suite_parser.add_argument(
-            "--threads", type=positive_whole_number, metavar="N", help="CPU threads (default: torch's choice)"
+            "--threads", type=thread_count, metavar="N", help="CPU threads (default: torch's choice)"
         )
         suite_parser.add_argument(
             "--keep",

@@ -91,4 +91,31 @@ def test_hours_of_driving_with_a_limit(tmp_path: Path) -> None:
         last = list(csv.DictReader(file))[-1]
     assert int(last["keyframes"]) <= 400 and int(last["marginalised"]) > 500
     assert float(last["error °"]) < 0.8 * float(last["odometry's °"])
-    assert main(["benchmark", "--hours", "1", "--output", str(tmp_path)]) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--hours 1", "--hours means nothing here; add --soak"),
+        ("--max-keyframes 100", "--max-keyframes means nothing here; add --soak --hours H"),
+        ("--soak --max-keyframes 100", "--max-keyframes means nothing here"),
+        ("--soak --hours 1 --seconds 3", "--seconds means nothing here"),
+        ("--soak --hours -1", "--hours: is -1; it must be positive"),
+        ("--soak --hours 1 --max-keyframes 0", "--max-keyframes: is 0; it must be 1 or more"),
+        ("--min-pairs 100 --max-pairs 10", "--min-pairs 100 is more than --max-pairs 10"),
+        ("--families slam --max-pairs 10", "no graph of slam has between 1 and 10 edges; they have about 200, 500"),
+        ("--families slam --contenders shonan --max-pairs 200", "none of the contenders runs on these graphs"),
+        ("--threads 0", "--threads: is 0; it must be 1 or more"),
+        ("--threads 100000", "--threads: is 100000; it must be 1024 or less"),
+        ("--repeats 0", "--repeats: is 0; it must be 1 or more"),
+        ("--families magic", "invalid choice: 'magic'"),
+    ],
+)
+def test_mistakes_leave_an_older_report(
+    words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "benchmark.md").write_text("measured before")
+    assert main(["benchmark", *words.split(), "--output", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert (tmp_path / "benchmark.md").read_text() == "measured before"

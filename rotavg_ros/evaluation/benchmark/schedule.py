@@ -14,6 +14,7 @@ from pathlib import Path
 
 import torch
 
+from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.benchmark.cases import FAMILIES, Case, Family, save
 from rotavg_ros.evaluation.benchmark.measure import ENOUGH_S, LABELS, OURS, Measurement
 from rotavg_ros.evaluation.named_peers import is_available
@@ -30,6 +31,10 @@ _SHARE_OF_REST = 0.15
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 # What drawing the graph takes is learnt like what a contender takes.
 _DRAWING = "drawing"
+
+
+class BenchmarkError(UserError):
+    """Nothing that could be measured; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +105,16 @@ def run(
         repeats: solves per process at most.
         contenders: of :data:`LABELS`; others are left out.
         say: told of every measurement.
+
+    Raises:
+        BenchmarkError: no graph is of such a size, or no contender could be measured on any.
     """
+    sizes = sorted({case.expected_edges for name in families for case in FAMILIES[name].cases})
+    if not any(pairs[0] <= size <= pairs[1] for size in sizes):
+        raise BenchmarkError(
+            f"no graph of {', '.join(families)} has between {pairs[0]} and {pairs[1]} edges; "
+            f"they have about {', '.join(map(str, sizes))}"
+        )
     results = {}
     start, spent = time.monotonic(), 0.0
     total = sum(FAMILIES[name].share for name in families)
@@ -112,6 +126,13 @@ def run(
             cases = tuple(case for case in family.cases if pairs[0] <= case.expected_edges <= pairs[1])
             chosen = tuple(name for name in family.contenders if name in contenders)
             results[name] = _run_family(replace(family, cases=cases, contenders=chosen), budget, Path(folder), say)
+    of_all = [result for of_family in results.values() for result in of_family]
+    if not any(result.measured for result in of_all):
+        reasons = {f"{name}: {reason}" for result in of_all for name, reason in result.missing.items()}
+        raise BenchmarkError(
+            f"nothing was measured ({'; '.join(sorted(reasons)) or 'none of the contenders runs on these graphs'}); "
+            "choose other --contenders or --families"
+        )
     return results
 
 
