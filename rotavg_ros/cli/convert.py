@@ -24,7 +24,7 @@ from rotavg_ros.errors import UserError
 
 
 class ConvertError(UserError):
-    """An output that is there already."""
+    """An output that must not or cannot be written."""
 
 
 class Format(NamedTuple):
@@ -66,8 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, attach what came in further files, write."""
-    if arguments.output.exists() and not arguments.overwrite:
-        raise ConvertError(f"{arguments.output}: exists already; choose another OUTPUT or give --overwrite")
+    _check_output(arguments.input, arguments.output, overwrite=arguments.overwrite)
     with working(f"converting {arguments.input}"):
         graph_file = format_of(arguments.input).read_graph(arguments.input)
         if arguments.stamps is not None:
@@ -82,6 +81,20 @@ def run(arguments: argparse.Namespace) -> int:
     skipped = "".join(f"; skipped {count} × {kind}" for kind, count in graph_file.skipped.items())
     print(f"{arguments.input} → {arguments.output}: {counts}{skipped}{left_out}")
     return 0
+
+
+def _check_output(source: Path, output: Path, *, overwrite: bool) -> None:
+    if output.exists() and not overwrite:
+        raise ConvertError(f"{output}: exists already; choose another OUTPUT or give --overwrite")
+    # Comments, landmarks, a bag's other topics: what is not a view-graph's would be gone.
+    if output.exists() and source.exists() and output.samefile(source):
+        raise ConvertError(f"{output}: is the INPUT itself; choose another OUTPUT")
+    bags, files = FORMATS
+    suffix = output.suffix.lower()
+    if suffix and suffix in bags.suffixes and not output.is_dir():
+        raise ConvertError(f"{output}: a bag is written as a folder; choose an OUTPUT without {output.suffix}")
+    if suffix in files.suffixes and output.is_dir():
+        raise ConvertError(f"{output}: is a folder; remove it or choose another OUTPUT")
 
 
 def format_of(path: Path) -> ModuleType:

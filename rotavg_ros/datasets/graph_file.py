@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -203,7 +203,7 @@ def reading(path: Path) -> Iterator[None]:
         raise GraphFileError.at(path, None, "no such file; check the path") from None
     except IsADirectoryError:
         raise GraphFileError.at(
-            path, None, "is a directory; give a view-graph file (`rotavg convert` makes one of a bag)"
+            path, None, "is a directory; give a file (`rotavg convert` makes a view-graph file of a bag)"
         ) from None
     except PermissionError:
         raise GraphFileError.at(path, None, "permission denied; check the file's rights") from None
@@ -225,4 +225,5 @@ def writing(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise GraphFileError.at(path, None, f"cannot be written: {error.strerror or error}") from None
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # below a file there is nothing to remove
+            temporary.unlink()

@@ -80,7 +80,8 @@ def _write(path: Path, answer: Any) -> None:
     except OSError as error:
         raise ReportError(f"{path.parent}: an answer cannot be kept here ({error.strerror})") from None
     finally:
-        unfinished.unlink(missing_ok=True)
+        with suppress(OSError):
+            unfinished.unlink()
 
 
 def _read(path: Path, answer_type: Callable[..., AnswerT]) -> AnswerT | None:

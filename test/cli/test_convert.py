@@ -52,10 +52,16 @@ def test_stamps_and_truth(graph_path: Path, tmp_path: Path, capsys: pytest.Captu
 
 def test_refusals(graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "truth.csv").write_text("1.01, 0, 0, 0.5\n")
+    (tmp_path / "folder.npz").mkdir()
+    before = graph_path.read_text()
     for words, message in (
         (["missing.g2o", "x.npz"], "missing.g2o: no such file"),
         ([str(graph_path), str(tmp_path / "x.foo")], "unknown suffix '.foo'"),
         ([str(graph_path), str(tmp_path / "none" / "x.npz")], "cannot be written: No such file or directory"),
+        ([str(graph_path), str(graph_path / "x.npz")], "cannot be written: Not a directory"),
+        ([str(graph_path), str(tmp_path / "folder.npz" / ".." / "graph.g2o"), "--overwrite"], "is the INPUT itself"),
+        ([str(graph_path), str(tmp_path / "folder.npz"), "--overwrite"], "folder.npz: is a folder"),
+        ([str(graph_path), str(tmp_path / "x.mcap")], "choose an OUTPUT without .mcap"),
         ([str(graph_path), str(tmp_path / "x.npz"), "--truth", str(tmp_path / "truth.csv")], "no stamps"),
     ):
         assert main(["convert", *words]) == 2
@@ -64,3 +70,4 @@ def test_refusals(graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
         assert message in error
         assert len(error.splitlines()) == 1
     assert not (tmp_path / "x.npz").exists()
+    assert graph_path.read_text() == before
