@@ -42,11 +42,12 @@ _MAX_LOCATED_STEPS = 3.0
 _MAX_EDGES_TO_JUMP = 3000
 # Weight of a closure that its neighbours speak against.
 _MIN_TRUST = 1e-3
-# A new solution must be better by this many nats; so much worse it may be if false closures come in groups, and only
-# by such a part of what it is better by else.
+# A new solution must be better by this many nats, also if false closures come in groups; where doubt is strong, it may
+# then lose such a part of what it gains else. It must bring back so many closures more than it gives up: two locate a
+# slip, and what brings back none is drift.
 _MIN_GAIN = 10.0
-_MAX_LOSS_IF_GROUPED = 15.0
-_MAX_LOST_SHARE = 0.05
+_MAX_LOST_SHARE = 0.07
+_MIN_REGAINED = 2
 # A slip beside a node without good closures costs the same on either side of it; rounding must not choose.
 _TIE = 0.1
 _FALSE_SQUARE = np.pi**2 / 3 + 2
@@ -93,12 +94,7 @@ def search_for_slips(
         starts = (correction, estimate.correction)
         annealed, trusting = (jump_to_optimum(cost, start, pairs, is_agreed, votes.closure > 0) for start in starts)
         correction = trusting if cost.total(trusting) < cost.total(annealed) - _TIE else annealed
-    gain = cost.total(estimate.correction) - cost.total(correction)
-    gain_if_grouped = _grouped_cost(cost, estimate.correction, pairs, is_agreed) - _grouped_cost(
-        cost, correction, pairs, is_agreed
-    )
-    may_lose = min(_MAX_LOSS_IF_GROUPED, _MAX_LOST_SHARE * gain) if doubt == Doubt.STRONG else -_MIN_GAIN
-    if gain < _MIN_GAIN or gain_if_grouped < -may_lose:
+    if not _is_better(cost, correction, estimate.correction, pairs, is_agreed, doubt):
         return None
     # Without the slips, the odometry tells how it drifts.
     noise = _noise_without_slips(cost, correction, noise)
@@ -107,6 +103,23 @@ def search_for_slips(
         everyone = np.ones(len(votes.closure), dtype=bool)
         correction = jump_to_optimum(cost, cost.descend(correction), pairs, is_agreed, everyone)
     return SlipStart(correction, expit(cost.log_odds(correction)), noise)
+
+
+def _is_better(
+    cost: TruncatedCost, found: Tensor, estimate: Tensor, pairs: AgreementPairs, is_agreed: np.ndarray, doubt: Doubt
+) -> bool:
+    """Whether corrections ``(K, 4)`` with slips are worth what they cost."""
+    # As far as a descent gets without a search, nothing was found.
+    before = min(estimate, cost.descend(estimate), key=cost.total)
+    gain = cost.total(before) - cost.total(found)
+    if_grouped = [_grouped_cost(cost, correction, pairs, is_agreed) for correction in (estimate, found)]
+    enough_if_grouped = -_MAX_LOST_SHARE * gain if doubt == Doubt.STRONG else _MIN_GAIN
+    believed = [int((cost.log_odds(correction) > 0)[cost.graph.is_closure].sum()) for correction in (before, found)]
+    return (
+        gain >= _MIN_GAIN
+        and if_grouped[0] - if_grouped[1] >= enough_if_grouped
+        and believed[1] - believed[0] >= _MIN_REGAINED
+    )
 
 
 def _no_slip_log_odds(steps: np.ndarray, components: int) -> np.ndarray:
