@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ import torch
 
 from rotavg_ros.cli import evaluate_slam
 from rotavg_ros.cli.arguments import positive_number, positive_whole_number, thread_count, whole_number
+from rotavg_ros.cli.data_folder import add_data_argument, data_folder
 from rotavg_ros.cli.progress import progress, working
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation import real, rgbd, robustness, synthetic
@@ -24,7 +24,7 @@ from rotavg_ros.evaluation.tables import Table, make_folder, write_report
 
 
 class EvaluateError(UserError):
-    """Options or data that an evaluation cannot work with."""
+    """Options that an evaluation cannot work with."""
 
 
 class _Suite(NamedTuple):
@@ -137,7 +137,7 @@ def _run_robustness(arguments: argparse.Namespace) -> Path:
 
 
 def _add_real(parser: argparse.ArgumentParser) -> None:
-    _add_data(parser)
+    add_data_argument(parser)
     _add_methods(parser, " ".join(real.METHODS))
     parser.add_argument(
         "--seed", type=whole_number, default=0, metavar="S", help="of the noise on real topologies (default: 0)"
@@ -145,7 +145,7 @@ def _add_real(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_real(arguments: argparse.Namespace) -> Path:
-    data = _data(arguments, (real.LUND, real.MADRID, real.TOPOLOGIES))
+    data = data_folder(arguments, (real.LUND, real.MADRID, real.TOPOLOGIES))
     chosen = _contenders(arguments.methods, real.METHODS, keep=arguments.keep)
     lund, madrid = real.lund_case(data), real.madrid_case(data)
     on_lund = _score([lund], chosen, 1, lund.name)
@@ -173,7 +173,7 @@ def _run_real(arguments: argparse.Namespace) -> Path:
 
 
 def _add_rgbd(parser: argparse.ArgumentParser) -> None:
-    _add_data(parser)
+    add_data_argument(parser)
     parser.add_argument("--sets", nargs="+", choices=rgbd.SETS, default=list(rgbd.SETS), help="default: all")
     parser.add_argument(
         "--folds", type=positive_whole_number, default=4, metavar="K", help="of the cross-validation (default: 4)"
@@ -183,7 +183,7 @@ def _add_rgbd(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_rgbd(arguments: argparse.Namespace) -> Path:
-    data = _data(arguments, [f"rgbd/{name}" for name in arguments.sets])
+    data = data_folder(arguments, [f"rgbd/{name}" for name in arguments.sets])
     if arguments.folds < 2:
         raise EvaluateError("--folds must be 2 or more: what is tested must not be trained on")
     split = {name: list(rgbd.folds(data / "rgbd" / name, arguments.folds, arguments.scenes)) for name in arguments.sets}
@@ -204,20 +204,6 @@ def _run_rgbd(arguments: argparse.Namespace) -> Path:
         "averaged."
     )
     return write_report(arguments.output, "rgbd", "RGB-D scans", introduction, tables, {})
-
-
-def _add_data(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data", type=Path, metavar="DIR", help="folder of the data sets (default: $ROTAVG_DATA)")
-
-
-def _data(arguments: argparse.Namespace, needed: Sequence[str]) -> Path:
-    folder = arguments.data or (Path(os.environ["ROTAVG_DATA"]) if "ROTAVG_DATA" in os.environ else None)
-    if folder is None:
-        raise EvaluateError("real data is not part of the package; name its folder with --data or $ROTAVG_DATA")
-    missing = [name for name in needed if not (folder / name).exists()]
-    if missing:
-        raise EvaluateError(f"{folder}: lacks {', '.join(missing)}; see the documentation of the data sets")
-    return Path(folder)
 
 
 def _add_minutes(parser: argparse.ArgumentParser) -> None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from rotavg_ros.cli.arguments import share, whole_number
+from rotavg_ros.cli.data_folder import add_data_argument, data_folder
 from rotavg_ros.cli.progress import progress
 from rotavg_ros.datasets.graph_file import read_graph
 from rotavg_ros.evaluation import slam_cases, slam_contenders, slam_incremental, slam_report, slam_uncertainty
@@ -70,19 +70,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=True,
         help="compare the stated uncertainty with errors under known noise",
     )
-    parser.add_argument("--data", type=Path, metavar="DIR", help="folder of the data sets (default: $ROTAVG_DATA)")
+    add_data_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> Path:
     """Run the suite and write the report; returns the Markdown file."""
-    data = arguments.data or (Path(os.environ["ROTAVG_DATA"]) if "ROTAVG_DATA" in os.environ else None)
-    if data is None:
-        raise slam_cases.SlamSuiteError(
-            "the pose graphs are not part of the package; name the folder of the data sets with --data or $ROTAVG_DATA"
-        )
     names = _methods(arguments)
-    slam_contenders.warm_up(tuple(slam_contenders.contenders(names).values()))
     chosen = slam_contenders.contenders(names, arguments.keep)
+    # What the last table needs shows before the hours that the others take.
+    more = [_uncertainty_file(name) for name in _UNCERTAINTY_GRAPHS] if arguments.uncertainty else []
+    data = data_folder(arguments, ("slam", *more))
+    slam_contenders.warm_up(tuple(slam_contenders.contenders(names).values()))
 
     def watch(steps: Iterable[Step]) -> Iterable[Step]:
         return progress(steps, description="solving", unit="solve")
@@ -94,9 +92,13 @@ def run(arguments: argparse.Namespace) -> Path:
     checks: list[slam_uncertainty.UncertaintyCheck] = []
     if arguments.uncertainty:
         for name in progress(_UNCERTAINTY_GRAPHS, description="uncertainty", total=len(_UNCERTAINTY_GRAPHS)):
-            graph_file = read_graph(data / "slam" / f"{name}.g2o")
+            graph_file = read_graph(data / _uncertainty_file(name))
             checks += slam_uncertainty.check(name, graph_file, _UNCERTAINTY_DRAWS, arguments.seeds[0])
     return slam_report.report(arguments.output, scores, runs, checks, arguments.command_line)
+
+
+def _uncertainty_file(name: str) -> str:
+    return f"slam/{name}.g2o"
 
 
 def _methods(arguments: argparse.Namespace) -> list[str]:

@@ -119,12 +119,13 @@ def make_folder(folder: Path) -> None:
 def provenance() -> str:
     """What produced the figures: version, commit, machine."""
     return (
-        f"rotavg_ros {__version__}, commit {_commit()}; torch {torch.__version__}, {torch.get_num_threads()} of "
+        f"rotavg_ros {__version__}, commit {commit()}; torch {torch.__version__}, {torch.get_num_threads()} of "
         f"{os.cpu_count()} CPU threads, {platform.machine()}"
     )
 
 
-def _commit() -> str:
+def commit() -> str:
+    """Of the sources that run, "-dirty" where they have been changed since; "unknown" outside a checkout."""
     try:
         command = ["git", "describe", "--always", "--dirty"]
         result = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import subprocess
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -19,7 +18,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.evaluation.tables import make_folder
+from rotavg_ros.evaluation.tables import commit, make_folder
 from rotavg_ros.solver.network_store import metadata
 from rotavg_ros.training.checkpoint import load_checkpoint, save_checkpoint, save_tensors, save_text
 from rotavg_ros.training.config import TrainingConfig
@@ -212,7 +211,7 @@ class Trainer:
             "hours": round(self._state.seconds / 3600, 3),
             "hardware": _hardware(self.task.network),
             "version": __version__,
-            "commit": _commit(),
+            "commit": commit(),
             "torch": torch.__version__,
             "validation": {key: round(value, 5) for key, value in figures.items()},
         }
@@ -242,12 +241,3 @@ def fingerprint(network: nn.Module) -> str:
 def _hardware(network: nn.Module) -> str:
     device = next(network.parameters()).device
     return torch.cuda.get_device_name(device) if device.type == "cuda" else f"CPU, {torch.get_num_threads()} threads"
-
-
-def _commit() -> str:
-    try:
-        command = ["git", "rev-parse", "--short", "HEAD"]
-        result = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return result.stdout.strip()

@@ -2,12 +2,10 @@ from __future__ import annotations
 
 import csv
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from scipy.io import savemat
 
 from rotavg_ros import rotations
@@ -15,13 +13,6 @@ from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.graph_file import GraphFile, write_graph
 from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.evaluation import robustness, synthetic
-
-
-@pytest.fixture(autouse=True)
-def _keep_threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def test_synthetic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +12,6 @@ import torch
 from rotavg_ros import rotations
 from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.graph_file import GraphFile, write_graph
-
-
-@pytest.fixture(autouse=True)
-def _keep_threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture
@@ -55,8 +47,9 @@ def test_report(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ([], "name the folder of the data sets with --data or $ROTAVG_DATA"),
-        (["--data", "."], "lacks slam"),
+        ([], "name their folder with --data or $ROTAVG_DATA"),
+        (["--data", "."], ".: lacks slam;"),
+        (["--data", ".", "--uncertainty"], ".: lacks slam, slam/CSAIL.g2o, slam/intel.g2o"),
         (["--shares", "2"], "must lie between 0 and 1"),
         (["--seeds", "-1"], "must be 0 or more"),
         (["--graphs", "nowhere"], "invalid choice: 'nowhere'"),
