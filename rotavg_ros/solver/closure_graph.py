@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.fine_net import edge_residual
-from rotavg_ros.solver.spanning_tree import SpanningForest, accumulate_to_root, compose_orientations
+from rotavg_ros.solver.odometry_paths import OdometryPaths, follow
+from rotavg_ros.solver.spanning_tree import SpanningForest
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -40,7 +40,7 @@ class ClosureGraph:
         view_graph_edge: ``(E - S,)`` the view-graph edge of each edge that is no segment.
         segment_of_edge: ``(M,)`` the segment that holds each view-graph edge, -1 for those above.
         share_of_segment: ``(M,)`` how much of its segment's steps a view-graph edge is; 1 for those above.
-        odometry_orientation: ``(N, 4)`` R⁰, body_from_world.
+        paths: what it was drawn together along, with R⁰.
     """
 
     nodes: np.ndarray
@@ -55,13 +55,18 @@ class ClosureGraph:
     view_graph_edge: np.ndarray
     segment_of_edge: np.ndarray
     share_of_segment: np.ndarray
-    odometry_orientation: Tensor
+    paths: OdometryPaths
     # Every view-graph node lies `fraction` of the way (in variance) from key node `above` to key node `below`.
     above: np.ndarray
     below: np.ndarray
     fraction: np.ndarray
     # Odometry steps between the two; 0 at a key node.
     length: np.ndarray
+
+    @property
+    def odometry_orientation(self) -> Tensor:
+        """R⁰, body_from_world ``(N, 4)``."""
+        return self.paths.orientation
 
     @property
     def num_nodes(self) -> int:
@@ -108,30 +113,29 @@ class ClosureGraph:
 
 def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
     """Draw the odometry chains of ``graph`` (on the CPU) together along ``forest``."""
+    return contract_along(graph, OdometryPaths.along(graph, forest))
+
+
+def contract_along(graph: ViewGraph, paths: OdometryPaths) -> ClosureGraph:
+    """The same where what lies along the forest is known."""
     num_nodes, num_edges = graph.num_nodes, graph.num_edges
     source, target = graph.source.numpy(), graph.target.numpy()
     is_odometry = graph.is_odometry.numpy()
     steps = graph.steps.numpy()
-    parent, parent_edge = forest.parent, forest.parent_edge
+    parent, parent_edge = paths.forest.parent, paths.forest.parent_edge
+    hangs_on_odometry, depth, other = paths.hangs_on_odometry, paths.depth, paths.outside
 
-    tree_odometry = np.zeros(num_edges, dtype=bool)
-    tree_odometry[parent_edge[parent_edge >= 0]] = True
-    tree_odometry &= is_odometry
-
-    is_root = parent_edge < 0
-    hangs_on_odometry = ~is_root & tree_odometry[parent_edge]
     children = np.bincount(parent[hangs_on_odometry], minlength=num_nodes)
-    is_key = is_root | ~hangs_on_odometry | (children != 1)
-    is_key[source[~tree_odometry]] = True
-    is_key[target[~tree_odometry]] = True
+    is_key = ~hangs_on_odometry | (children != 1)
+    is_key[source[other]] = True
+    is_key[target[other]] = True
     nodes = np.flatnonzero(is_key)
     key_of_node = np.cumsum(is_key) - 1
 
-    above_node = _follow(np.where(is_key, np.arange(num_nodes), parent))
+    above_node = follow(np.where(is_key, np.arange(num_nodes), parent))
     only_child = np.arange(num_nodes)
     only_child[parent[hangs_on_odometry]] = np.flatnonzero(hangs_on_odometry)
-    below_node = _follow(np.where(is_key, np.arange(num_nodes), only_child))
-    depth = accumulate_to_root(forest, np.where(hangs_on_odometry, steps[parent_edge], 0.0))
+    below_node = follow(np.where(is_key, np.arange(num_nodes), only_child))
     length = depth[below_node] - depth[above_node]
     fraction = np.divide(depth - depth[above_node], length, out=np.zeros(num_nodes), where=length > 0)
 
@@ -143,75 +147,28 @@ def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
     segment_of_edge = np.full(num_edges, -1, dtype=np.int64)
     below_edge = np.flatnonzero(hangs_on_odometry)
     segment_of_edge[parent_edge[below_edge]] = segment_of_key[below_node[below_edge]]
-    other = _in_canonical_order(graph, np.flatnonzero(~tree_odometry))
 
-    orientation = compose_orientations(forest, graph)
-    residual = edge_residual(orientation, graph.target_from_source[other], graph.source[other], graph.target[other])
-    chain = _odometry_chain(forest, hangs_on_odometry)
-    path_steps = np.where(
-        chain[source[other]] == chain[target[other]],
-        _path_length(forest, depth, source[other], target[other]),
-        np.inf,
-    )
     segment_steps = depth[segment_end] - depth[segment_start]
     share_of_segment = np.ones(num_edges)
     on_segment = segment_of_edge >= 0
     share_of_segment[on_segment] = steps[on_segment] / segment_steps[segment_of_edge[on_segment]]
-    _, chain_number = np.unique(chain, return_inverse=True)
+    _, chain_number = np.unique(paths.chain, return_inverse=True)
     return ClosureGraph(
         nodes=nodes,
         position=(depth + 4.0 * max(num_nodes, depth.max(initial=0.0)) * chain_number)[nodes],
-        roots=key_of_node[forest.roots],
+        roots=key_of_node[paths.forest.roots],
         source=key_of_node[np.concatenate((segment_start, source[other]))],
         target=key_of_node[np.concatenate((segment_end, target[other]))],
-        residual=torch.cat((rotations.identity(len(segment_end)), rotations.canonical(residual))),
+        residual=torch.cat((rotations.identity(len(segment_end)), paths.residual)),
         is_odometry=np.concatenate((np.ones(len(segment_end), dtype=bool), is_odometry[other])),
         steps=np.concatenate((segment_steps, np.where(is_odometry, steps, 1.0)[other])),
-        path_steps=np.concatenate((segment_steps, path_steps)),
+        path_steps=np.concatenate((segment_steps, paths.path_steps)),
         view_graph_edge=other,
         segment_of_edge=segment_of_edge,
         share_of_segment=share_of_segment,
-        odometry_orientation=orientation,
+        paths=paths,
         above=key_of_node[above_node],
         below=key_of_node[below_node],
         fraction=fraction,
         length=length,
     )
-
-
-def _in_canonical_order(graph: ViewGraph, edges: np.ndarray) -> np.ndarray:
-    """Sorted by their ends, parallels by angle: the answer must not depend on the order in which edges arrived."""
-    source, target = graph.source.numpy()[edges], graph.target.numpy()[edges]
-    cosine = graph.target_from_source[:, 3].numpy()[edges]
-    return edges[np.lexsort((cosine, np.maximum(source, target), np.minimum(source, target)))]
-
-
-def _follow(pointer: np.ndarray) -> np.ndarray:
-    """The fixed point that each chain of pointers ends in."""
-    while True:
-        farther = pointer[pointer]
-        if np.array_equal(farther, pointer):
-            return pointer
-        pointer = farther
-
-
-def _odometry_chain(forest: SpanningForest, hangs_on_odometry: np.ndarray) -> np.ndarray:
-    """A number per node, equal where odometry alone connects two nodes along the forest."""
-    return _follow(np.where(hangs_on_odometry, forest.parent, np.arange(len(forest.parent))))
-
-
-def _path_length(forest: SpanningForest, depth: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Length of the ways between nodes of the same tree, by lifting both to their lowest common ancestor."""
-    level = accumulate_to_root(forest, np.ones(len(depth))).astype(np.int64)
-    jumps = [forest.parent]
-    while not np.array_equal(jumps[-1][jumps[-1]], jumps[-1]):
-        jumps.append(jumps[-1][jumps[-1]])
-    low, high = np.where(level[a] >= level[b], a, b), np.where(level[a] >= level[b], b, a)
-    excess = level[low] - level[high]
-    for power, jump in enumerate(jumps):
-        low = np.where((excess >> power) & 1 == 1, jump[low], low)
-    for jump in reversed(jumps):
-        apart = jump[low] != jump[high]
-        low, high = np.where(apart, jump[low], low), np.where(apart, jump[high], high)
-    ancestor = np.where(low == high, low, forest.parent[low])
-    return np.asarray(depth[a] + depth[b] - 2 * depth[ancestor])

@@ -96,8 +96,8 @@ class GrownLaplacian:
         """Put other weights ``(E,)`` into force."""
         self.weight = weight
         self._stiffness = root_stiffness(weight)
-        inner = np.diag(1 / weight[self.closures]) + self._between
-        self._inner = torch.linalg.inv(torch.from_numpy(inner))
+        inner = torch.from_numpy(np.diag(1 / weight[self.closures]) + self._between)
+        self._inner = torch.cholesky_inverse(torch.linalg.cholesky(inner))
 
     def fit(self, difference: np.ndarray) -> np.ndarray | None:
         """Node values ``(K, k)`` whose differences over the edges fit ``(E, k)`` best; None if that takes too long."""

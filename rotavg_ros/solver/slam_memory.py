@@ -6,23 +6,27 @@ then a few passes of the refinement go on from where the last ones ended. All cl
 that a verdict can still change; when several do, or the graph has grown by some percent, or some number of updates
 later, the whole solve runs again, and with it the search for slips and biases.
 
-An update of a large graph *follows* the one before: it solves from that one's factorisation (``grown_laplacian.py``),
+An update of a large graph *follows* the one before: it solves from an earlier factorisation (``grown_laplacian.py``),
 believes its noise, and takes what the rest of the graph predicts of an old closure, and the uncertainty of an old
-keyframe, to be what they were. Now and then, an update *renews* these.
+keyframe, to be what they were. An update of a small one *renews* these.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from rotavg_ros.solver.closure_graph import ClosureGraph
+from rotavg_ros.solver.closure_graph import ClosureGraph, contract_along
 from rotavg_ros.solver.grown_laplacian import GrownLaplacian, OlderFactor
+from rotavg_ros.solver.laplacian import LaplacianPattern
 from rotavg_ros.solver.new_closures import judge_new_closures
 from rotavg_ros.solver.noise_model import NoiseModel
+from rotavg_ros.solver.odometry_paths import OdometryPaths
 from rotavg_ros.solver.slam_clean_net import SlamCleanNet
 from rotavg_ros.solver.slam_passes import SlamEstimate, Verdicts
 from rotavg_ros.solver.slam_stages import CleanedClosures, Prepared, draw_together
@@ -37,9 +41,8 @@ _MAX_GROWTH = 0.05
 _MAX_TURNED, _MAX_SHARE_TURNED = 2, 0.002
 # With fewer closures than this, the whole solve takes no longer than an update.
 _MIN_CLOSURES = 200
-# So many updates in a row follow the one before, with so many new closures in all.
-_MAX_FOLLOWED = 29
-_MAX_COLUMNS = 256
+# New closures that an update solves for from an older factorisation; with more, another one is cheaper.
+_MAX_COLUMNS = 80
 _COLUMNS = ("source", "target", "target_from_source", "kind", "label", "steps")
 
 
@@ -68,10 +71,10 @@ class SlamMemory:
         noise: the noise as the refinement left it.
         max_step_variance: rad², as the refinement kept it.
         elimination: ``(K,)`` nodes in the order of elimination.
+        paths: of the closure graph.
         factor: what the next update may solve from; None where it factorises anew.
         closures: how many there were when the whole solve ran.
         updates: how many there have been since.
-        followed: how many since predictions were estimated.
     """
 
     graph: ViewGraph
@@ -85,10 +88,10 @@ class SlamMemory:
     noise: NoiseModel
     max_step_variance: float
     elimination: np.ndarray
+    paths: OdometryPaths
     factor: OlderFactor | None
     closures: int
     updates: int = 0
-    followed: int = 0
 
     @classmethod
     def of(
@@ -125,7 +128,8 @@ class SlamMemory:
         num_closures = int((~graph.is_odometry).sum())
         if num_closures > (1 + _MAX_GROWTH) * self.closures:
             return None
-        closure_graph, _ = draw_together(graph)
+        paths = self.paths.grown(graph)
+        closure_graph = draw_together(graph)[0] if paths is None else contract_along(graph, paths)
         start, new_closures = self._start(closure_graph, network, body_from_world)
         updated = self._follow(graph, start) or self._renew(graph, start)
         if updated is None:
@@ -135,18 +139,15 @@ class SlamMemory:
         return None if turned.sum() > max(_MAX_TURNED, _MAX_SHARE_TURNED * num_closures) else updated
 
     def _follow(self, graph: ViewGraph, start: Start) -> Updated | None:
-        """From the factorisation, the noise and the predictions of before; None if they no longer serve."""
-        closure_graph, older = start.graph, self.factor
-        if older is None or self.followed >= _MAX_FOLLOWED or not older.fits(closure_graph):
+        """With noise and predictions of before; None where they are not for that, or no longer serve."""
+        if self.factor is None:
             return None
-        if graph.num_edges - older.num_edges - int(graph.is_odometry[older.num_edges :].sum()) > _MAX_COLUMNS:
-            return None
-        weight = start.weight
-        system = GrownSystem(GrownLaplacian(older, closure_graph, weight), start.prediction_variance)
-        try:
-            verdicts = follow(start, system)
-        except StaleFactorError:
-            return None
+        closure_graph, weight, verdicts = start.graph, start.weight, None
+        for older in self._factors(start, weight):
+            laplacian = GrownLaplacian(older, closure_graph, weight)
+            with suppress(StaleFactorError):
+                verdicts = follow(start, GrownSystem(laplacian, start.prediction_variance))
+                break
         if verdicts is None:
             return None
         variance = grown_variance(self.variance, closure_graph, weight)
@@ -155,11 +156,19 @@ class SlamMemory:
             **_by_edge(closure_graph, verdicts, start.prior_log_odds),
             graph=graph,
             variance=variance,
-            factor=system.laplacian.factor,
+            factor=laplacian.factor,
             updates=self.updates + 1,
-            followed=self.followed + 1,
         )
         return Updated(closure_graph, verdicts, variance, memory)
+
+    def _factors(self, start: Start, weight: np.ndarray) -> Iterator[OlderFactor]:
+        """What may be solved from: the factor there is, as long as not too much is new, and another one."""
+        graph, older = start.graph, self.factor
+        if older is not None and older.fits(graph) and (graph.view_graph_edge >= older.num_edges).sum() <= _MAX_COLUMNS:
+            yield older
+        rank = self._rank(graph)
+        pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots, rank)
+        yield OlderFactor.of(graph, pattern.factorize(weight).solve)
 
     def _renew(self, graph: ViewGraph, start: Start) -> Updated | None:
         """Factorised and estimated anew; None if orientations turn by too much."""
@@ -175,7 +184,6 @@ class SlamMemory:
             graph=graph,
             variance=variance,
             updates=self.updates + 1,
-            followed=0,
         )
         return Updated(closure_graph, estimate, variance, memory)
 
@@ -234,6 +242,7 @@ def _by_edge(graph: ClosureGraph, verdicts: Verdicts, prior_log_odds: np.ndarray
         "steps": graph.edge_values(verdicts.steps),
         "exact_share": graph.edge_values(verdicts.exact_share),
         "prediction_variance": graph.edge_values(verdicts.prediction_variance),
+        "paths": graph.paths,
     }
 
 

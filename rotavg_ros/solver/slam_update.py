@@ -14,10 +14,11 @@ from rotavg_ros.solver.slam_passes import Passes, SlamEstimate, Verdicts, edge_v
 from rotavg_ros.solver.slam_refinement import estimate
 from rotavg_ros.solver.slam_system import System, WholeSystem
 
-# Passes at most, and when they end; the next update goes on from there.
+# Passes at most, and when they end: a pass that changes no verdict leaves little to do for another one, if it did not
+# turn much. The next update goes on from there.
 _MAX_PASSES = 5
 _MAX_FOLLOWING_PASSES = 3
-_CONVERGED_STEP = np.radians(0.02)
+_CONVERGED_STEP = np.radians(1.0)
 _CONVERGED_PROBABILITY = 0.02
 # A graph that turns by more than this is solved as a whole.
 _MAX_STEP = np.radians(20.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import networkx
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from rotavg_ros import EdgeKind, ViewGraph, rotations
 from rotavg_ros.solver.closure_graph import ClosureGraph, contract
 from rotavg_ros.solver.fine_net import edge_residual
 from rotavg_ros.solver.laplacian import LaplacianSystem
+from rotavg_ros.solver.odometry_paths import OdometryPaths
 from rotavg_ros.solver.spanning_tree import minimum_spanning_forest
 
 from .graphs import measured, random_truth, slam_edges, small_noise
@@ -103,3 +106,41 @@ def test_graphs_without_closures_or_without_odometry() -> None:
     loops = measured(random_truth(3, 0), np.array([0, 1, 2]), np.array([1, 2, 0]))
     contracted = _contract(loops)
     assert contracted.num_segments == 0 and contracted.num_nodes == 3
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_paths_that_grow_are_those_of_the_grown_graph(seed: int) -> None:
+    graph = _slam_graph(60, 20, seed)
+    arrival = torch.maximum(graph.source, graph.target)
+    graph = graph.select_edges(torch.argsort(arrival, stable=True))
+    arrival = arrival.sort().values
+    paths: OdometryPaths | None = None
+    for num_nodes in (30, 31, 45, 45, 60):
+        part = replace(graph.select_edges(arrival < num_nodes), num_nodes=num_nodes)
+        forest = minimum_spanning_forest(part, torch.where(part.is_odometry, 1.0, 1e6))
+        whole = OdometryPaths.along(part, forest)
+        paths = whole if paths is None else paths.grown(part)
+        assert paths is not None
+        for name in ("hangs_on_odometry", "depth", "level", "chain", "outside", "path_steps"):
+            np.testing.assert_array_equal(getattr(paths, name), getattr(whole, name), err_msg=name)
+        for name in ("parent", "parent_edge", "component"):
+            np.testing.assert_array_equal(getattr(paths.forest, name), getattr(whole.forest, name), err_msg=name)
+        torch.testing.assert_close(paths.orientation, whole.orientation, rtol=0, atol=1e-12)
+        torch.testing.assert_close(paths.residual, whole.residual, rtol=0, atol=1e-12)
+
+
+def test_paths_that_would_have_to_be_laid_anew_do_not_grow() -> None:
+    graph = _slam_graph(30, 8, 2)
+    early = replace(graph.select_edges(torch.maximum(graph.source, graph.target) < 20), num_nodes=20)
+    paths = OdometryPaths.along(early, minimum_spanning_forest(early, torch.where(early.is_odometry, 1.0, 1e6)))
+
+    def with_edge(source: int, target: int, kind: EdgeKind, num_nodes: int = 20) -> ViewGraph:
+        ends = [*early.source.tolist(), source], [*early.target.tolist(), target]
+        measured_too = torch.cat((early.target_from_source, rotations.identity(1)))
+        kinds = torch.cat((early.kind, torch.tensor([int(kind)])))
+        return ViewGraph.create(*ends, measured_too, kind=kinds, num_nodes=num_nodes)
+
+    assert paths.grown(with_edge(19, 20, EdgeKind.ODOMETRY, 21)) is not None
+    assert paths.grown(with_edge(2, 12, EdgeKind.LOOP_CLOSURE)) is not None
+    assert paths.grown(with_edge(2, 12, EdgeKind.ODOMETRY)) is None  # another way along odometry
+    assert paths.grown(with_edge(2, 20, EdgeKind.LOOP_CLOSURE, 21)) is None  # a chain of its own

@@ -49,7 +49,8 @@ def test_updates_end_where_a_whole_solve_does(city: ViewGraph, monkeypatch: pyte
     for num_keyframes in range(508, NUM_KEYFRAMES + 1, 4):
         solution = grown(solution, until(city, num_keyframes))
         updates += "update" in solution.stage_seconds and "refine" not in solution.stage_seconds
-        followed += solution.memory is not None and solution.memory.followed > 0
+        factor = None if solution.memory is None else solution.memory.factor
+        followed += factor is not None and len(factor.closures) > 0
     assert followed >= 10 if is_large else followed == 0
     assert updates >= 15  # of 24; the others have seen the whole graph
     whole = solve(city)
