@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver.parallel import for_each
 
 # From nothing, and from what the last step's residuals said.
 _ITERATIONS, _FURTHER_ITERATIONS = 10, 3
@@ -67,14 +68,19 @@ class NoiseShape:
         """
         matrix = rotations.to_matrix(body_from_world)
         starts = (None, None) if before is None or before.scatter is None else before.scatter
-        ends, scatters = [], []
-        for end, start in zip((source, target), starts, strict=True):
+        ends = (source, target)
+        shapes, scatters = [matrix] * 2, [matrix] * 2
+
+        def estimate(number: int) -> None:
+            end = ends[number]
             in_camera = (matrix[end] @ residual[:, :, None]).squeeze(-1)
-            scatters.append(scatter(in_camera, component[end], len(redundancy), start))
-            covariance = _as_far_as_supported(scatters[-1], redundancy)
+            scatters[number] = scatter(in_camera, component[end], len(redundancy), starts[number])
+            covariance = _as_far_as_supported(scatters[number], redundancy)
             information = torch.linalg.inv_ex(covariance).inverse[component] / 2
-            ends.append(matrix.transpose(1, 2) @ information @ matrix)
-        return cls(ends[0], ends[1], (scatters[0], scatters[1]))
+            shapes[number] = matrix.transpose(1, 2) @ information @ matrix
+
+        for_each(estimate, (0, 1))
+        return cls(shapes[0], shapes[1], (scatters[0], scatters[1]))
 
 
 def scatter(vectors: Tensor, group: Tensor, num_groups: int, start: Tensor | None = None) -> Tensor:

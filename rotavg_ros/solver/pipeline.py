@@ -28,6 +28,7 @@ _OUTLIER_ANGLE = {"sfm": sfm_stages.OUTLIER_ANGLE, "slam": slam_judging.OUTLIER_
 
 
 @torch.no_grad()
+@workers()
 def solve(
     graph: ViewGraph,
     *,
@@ -126,17 +127,16 @@ class _Job:
 def _run(job: _Job, graph: ViewGraph, networks: Networks) -> tuple[Estimate, dict[str, float]]:
     """Every link of the method; with the seconds of its stages."""
     watch = Stopwatch()
-    with workers():
-        graph, start = graph.to(networks.device), job.warm_start
-        component = job.component.to(networks.device)
-        for name in job.names[:-1]:
-            start = _solve_once(graph, component, name, job.profile, None, start, networks, watch).body_from_world
-        last, steps = job.names[-1], job.last_steps
-        if job.memory is not None and start is not None and job.may_update:
-            estimate = update_slam(graph, job.memory, start, networks, watch)
-            if estimate is not None:
-                return estimate, watch.seconds
-        return _solve_once(graph, component, last, job.profile, steps, start, networks, watch), watch.seconds
+    graph, start = graph.to(networks.device), job.warm_start
+    component = job.component.to(networks.device)
+    for name in job.names[:-1]:
+        start = _solve_once(graph, component, name, job.profile, None, start, networks, watch).body_from_world
+    last, steps = job.names[-1], job.last_steps
+    if job.memory is not None and start is not None and job.may_update:
+        estimate = update_slam(graph, job.memory, start, networks, watch)
+        if estimate is not None:
+            return estimate, watch.seconds
+    return _solve_once(graph, component, last, job.profile, steps, start, networks, watch), watch.seconds
 
 
 def _solve_once(

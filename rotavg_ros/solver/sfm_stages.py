@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -115,7 +116,8 @@ def bootstrap(cleaned: Cleaned, component: Tensor | None = None) -> Bootstrapped
         tree = relaxed_forest(cleaned.edges, cost, hubs(cleaned.edges, component))
         parent, parent_edge, roots = tree.parent, tree.parent_edge, tree.roots
     rectified, raw = (compose(parent, parent_edge, graph) for graph in (cleaned.graph, cleaned.measured))
-    raw_is_better = _misfit(cleaned, raw, component) <= _misfit(cleaned, rectified, component)
+    rectified_misfit, raw_misfit = _misfits(cleaned, (rectified, raw), component)
+    raw_is_better = raw_misfit <= rectified_misfit
     if not bool(raw_is_better.any()):
         return Bootstrapped(rectified, roots, cleaned)
     chosen = raw_is_better[component][:, None]
@@ -126,13 +128,14 @@ def bootstrap(cleaned: Cleaned, component: Tensor | None = None) -> Bootstrapped
     return Bootstrapped(torch.where(chosen, raw, rectified), roots, cleaned)
 
 
-def _misfit(cleaned: Cleaned, body_from_world: Tensor, component: Tensor) -> Tensor:
-    """Median angle between the inliers as they were measured and as ``body_from_world`` has them, per component."""
+def _misfits(cleaned: Cleaned, candidates: Sequence[Tensor], component: Tensor) -> list[Tensor]:
+    """Median angle between the inliers as measured and as each of ``candidates`` has them, per component."""
     sample = cleaned.is_inlier.nonzero().squeeze(1)
     sample = sample[:: 1 + len(sample) // _MISFIT_SAMPLE]
     edges = cleaned.measured.select_edges(sample)
-    angle = EdgeResiduals(edges, body_from_world.float()).angles()
-    return median_by_group(angle, component[edges.source], int(component.max()) + 1)
+    angles = [EdgeResiduals(edges, body_from_world.float()).angles() for body_from_world in candidates]
+    count = int(component.max()) + 1
+    return [median_by_group(angle, component[edges.source], count) for angle in angles]
 
 
 @torch.no_grad()
@@ -180,22 +183,25 @@ def residual_score(
     and the closer to certainty on either side, the better the ends are known.
     """
     angle, uncertainty = residual_and_uncertainty(graph, body_from_world, component)
-    return torch.sigmoid((angle - outlier_angle) / (SCORE_SCALE * uncertainty))
+    return torch.sigmoid((angle - outlier_angle) / (SCORE_SCALE * uncertainty)).double()
 
 
 def residual_and_uncertainty(
     graph: ViewGraph, body_from_world: Tensor, component: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Residual angle of every edge and, up to a constant, the error of the orientations at its ends; ``(M,)`` rad.
+    """Residual angle of every edge and, up to a constant, the error of the orientations at its ends.
 
     A node's error falls with the root of its number of edges d: median residual · √(1/d_source + 1/d_target), the
     median of each ``component`` ``(N,)`` for itself; default: of all edges.
+
+    Returns:
+        Both ``(M,)`` float32 radians.
     """
-    angle = EdgeResiduals(graph, body_from_world).angles()
-    degree = torch.bincount(torch.cat((graph.source, graph.target)), minlength=graph.num_nodes).double()
-    spread = (1 / degree[graph.source] + 1 / degree[graph.target]).sqrt()
+    angle = EdgeResiduals(graph, body_from_world.float()).angles()
+    share = 1 / torch.bincount(torch.cat((graph.source, graph.target)), minlength=graph.num_nodes).float()
+    spread = share.index_select(0, graph.source).add_(share.index_select(0, graph.target)).sqrt_()
     median = angle.median()
     if component is not None and bool((component > 0).any()):
         of_edge = component[graph.source]
         median = median_by_group(angle, of_edge, int(component.max()) + 1)[of_edge]
-    return angle, (median * spread).clamp(min=_MIN_UNCERTAINTY)
+    return angle, (median * spread).clamp_(min=_MIN_UNCERTAINTY)

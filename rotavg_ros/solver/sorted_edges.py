@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from rotavg_ros.view_graph import ViewGraph
@@ -38,12 +39,10 @@ class SortedEdges:
     @classmethod
     def of(cls, graph: ViewGraph) -> SortedEdges:
         num_edges = graph.num_edges
-        arrival = torch.cat((graph.target, graph.source)).int()
-        order = arrival.sort(stable=True).indices
-        source = torch.cat((graph.source, graph.target)).int()[order]
+        first, order = _by_arrival(torch.cat((graph.target, graph.source)).int(), graph.num_nodes)
+        source = torch.cat((graph.source, graph.target)).int().index_select(0, order)
         is_reversed = order >= num_edges
-        edge = order.sub_(is_reversed * num_edges).int()
-        return cls(_offsets(torch.bincount(arrival, minlength=graph.num_nodes)), source, edge, is_reversed)
+        return cls(first, source, order - num_edges * is_reversed.int(), is_reversed)
 
     @property
     def num_nodes(self) -> int:
@@ -81,5 +80,12 @@ class SortedEdges:
         return [Tile(slice(low, high), slice(start, end)) for low, high, start, end in bounds]
 
 
-def _offsets(count: Tensor) -> Tensor:
-    return torch.cat((count.new_zeros(1), count.cumsum(0))).int()
+def _by_arrival(arrival: Tensor, num_nodes: int) -> tuple[Tensor, Tensor]:
+    """Where the edges that arrive at each node begin in their order by node, ``(N + 1,)``, and that order; int32."""
+    if arrival.device.type == "cpu" and 0 < len(arrival) < 2**31:
+        # Transposing a matrix with one entry in every row is a counting sort: a quarter of the time of torch's.
+        edge = np.arange(len(arrival) + 1, dtype=np.int32)
+        by_node = csr_array((edge[:-1], arrival.numpy(), edge), shape=(len(arrival), num_nodes)).tocsc()
+        return torch.from_numpy(by_node.indptr), torch.from_numpy(by_node.indices)
+    count = torch.bincount(arrival, minlength=num_nodes)
+    return torch.cat((count.new_zeros(1), count.cumsum(0))).int(), arrival.sort(stable=True).indices.int()

@@ -62,7 +62,7 @@ def shortest_path_forest(
     labels = (graph.components() if component is None else component).numpy()
     priority = -edges.degree.numpy() if root == "hub" else np.zeros(graph.num_nodes)
     roots = _first_per_component(labels, priority)
-    costs = np.ones(len(edges.source)) if cost is None else cost.detach().double()[edges.edge].numpy()
+    costs = np.ones(len(edges.source)) if cost is None else cost.detach().index_select(0, edges.edge).double().numpy()
     # Rows of the matrix are symmetric, parallel edges included, which Dijkstra's algorithm does not mind.
     adjacency = csr_array((costs, edges.source.numpy(), edges.first.numpy()), shape=(graph.num_nodes, graph.num_nodes))
     _, parent, _ = dijkstra(adjacency, directed=True, indices=roots, return_predecessors=True, min_only=True)

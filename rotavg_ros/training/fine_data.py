@@ -111,6 +111,6 @@ class FineBatch:
                 rotations.canonical(edge_residual(body_from_world, relative, self.source, self.target)).t()[:3]
                 for relative in (self.measured, self.rectified)
             )
-            scale = typical_size(raw, self.graph[self.source], self.graph).expand(len(self.start), 1)
+            scale = typical_size(raw, self.source, self.graph).expand(len(self.start), 1)
             features = edge_features(raw, clean, self.outlier_logit, scale[self.source, 0]).t()
         return network(body_from_world, features, scale, self.edges), scale
