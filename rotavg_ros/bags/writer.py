@@ -44,7 +44,7 @@ class BagWriter:
         self._connections: dict[str, Connection] = {}
 
     def __enter__(self) -> BagWriter:
-        self._refuse_existing()
+        refuse_existing(self._path, overwrite=self._overwrite)
         try:
             shutil.rmtree(self._workplace, ignore_errors=True)
             self._writer = Writer(self._workplace / self._path.name, version=8, storage_plugin=StoragePlugin.MCAP)
@@ -112,16 +112,22 @@ class BagWriter:
             shutil.rmtree(self._path)
         (self._workplace / self._path.name).rename(self._path)
 
-    def _refuse_existing(self) -> None:
-        if not self._path.exists():
-            return
-        if not self._overwrite:
-            raise BagWriteError(f"{self._path}: exists already; choose another --output or give --overwrite")
-        if not self._path.is_dir() or not _is_bag_or_empty(list(self._path.iterdir())):
-            raise BagWriteError(f"{self._path}: is not a bag, so --overwrite leaves it alone; choose another --output")
-
     def _cannot_write(self, error: OSError) -> BagWriteError:
         return BagWriteError(f"{self._path}: cannot be written: {error.strerror or error}")
+
+
+def refuse_existing(path: Path, *, overwrite: bool) -> None:
+    """Nothing that is no bag is ever replaced, and a bag only on request.
+
+    Raises:
+        BagWriteError: something is at the bag's place.
+    """
+    if not path.exists():
+        return
+    if not overwrite:
+        raise BagWriteError(f"{path}: exists already; choose another --output or give --overwrite")
+    if not path.is_dir() or not _is_bag_or_empty(list(path.iterdir())):
+        raise BagWriteError(f"{path}: is not a bag, so --overwrite leaves it alone; choose another --output")
 
 
 def _is_bag_or_empty(content: Sequence[Path]) -> bool:

@@ -49,6 +49,14 @@ def non_negative_number(text: str) -> float:
     return number
 
 
+def finite_number(text: str) -> float:
+    """A number of either sign."""
+    number = _number(text)
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"is {text}; it must be finite")
+    return number
+
+
 def share(text: str) -> float:
     """A number between 0 and 1."""
     number = _number(text)

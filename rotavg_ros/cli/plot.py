@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from rotavg_ros.cli.arguments import positive_number
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.graph_file import read_graph
 from rotavg_ros.datasets.ground_truth import attach_truth
@@ -31,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     statistics.add_argument("--truth", type=Path, metavar="FILE", help="ground truth, for graphs without their own")
     statistics.add_argument("--output", type=Path, metavar="PNG", help="default: <graph>-statistics.png, here")
     statistics.add_argument(
-        "--outlier-angle", type=float, metavar="DEG", help="default: 20, or 10 if the graph has odometry"
+        "--outlier-angle", type=positive_number, metavar="DEG", help="default: 20, or 10 if the graph has odometry"
     )
 
 

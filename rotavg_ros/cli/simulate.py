@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from rotavg_ros.bags.run_bag import write_run_bag
-from rotavg_ros.cli.arguments import whole_number
+from rotavg_ros.bags.writer import refuse_existing
+from rotavg_ros.cli.arguments import finite_number, non_negative_number, positive_number, share, whole_number
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.graph_file import write_graph
 from rotavg_ros.datasets.robot_run import ROBOT_WORLDS, robot_run_config
@@ -31,18 +32,28 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     """What the run is like; shared with ``rotavg demo``."""
     parser.add_argument("--world", choices=ROBOT_WORLDS, default="building", help="default: building")
     parser.add_argument("--dimensions", type=int, choices=(2, 3), default=2, help="3: ramps and uneven ground")
-    parser.add_argument("--laps", type=float, default=4, help="visits of every place, about (default: 4)")
+    parser.add_argument("--laps", type=positive_number, default=4, help="visits of every place, about (default: 4)")
     parser.add_argument(
-        "--false-share", type=float, default=0.3, metavar="SHARE", help="of the closures (default: 0.3)"
+        "--false-share", type=share, default=0.3, metavar="SHARE", help="of the closures (default: 0.3)"
     )
     parser.add_argument("--grouped", action="store_true", help="false closures in groups that agree with each other")
-    parser.add_argument("--closures-per-minute", type=float, default=20, metavar="N", help="default: 20")
-    parser.add_argument("--closure-noise-deg", type=float, default=1.0, metavar="DEG", help="RMS angle (default: 1)")
+    parser.add_argument("--closures-per-minute", type=non_negative_number, default=20, metavar="N", help="default: 20")
     parser.add_argument(
-        "--odometry-noise-deg", type=float, default=0.1, metavar="DEG", help="RMS angle every 0.1 s (default: 0.1)"
+        "--closure-noise-deg", type=non_negative_number, default=1.0, metavar="DEG", help="RMS angle (default: 1)"
     )
     parser.add_argument(
-        "--odometry-bias-deg-per-min", type=float, default=2.0, metavar="DEG", help="gyroscope bias (default: 2)"
+        "--odometry-noise-deg",
+        type=non_negative_number,
+        default=0.1,
+        metavar="DEG",
+        help="RMS angle every 0.1 s (default: 0.1)",
+    )
+    parser.add_argument(
+        "--odometry-bias-deg-per-min",
+        type=finite_number,
+        default=2.0,
+        metavar="DEG",
+        help="gyroscope bias (default: 2)",
     )
     parser.add_argument("--seed", type=whole_number, default=0, help="same seed, same run (default: 0)")
 
@@ -65,11 +76,13 @@ def simulate(arguments: argparse.Namespace) -> SimulatedRun:
 
 def run(arguments: argparse.Namespace) -> int:
     """Simulate and write."""
+    refuse_existing(arguments.output, overwrite=arguments.overwrite)
     with working("simulating"):
         simulated = simulate(arguments)
-        write_run_bag(arguments.output, simulated, overwrite=arguments.overwrite)
+        # First what is likelier to fail, so that no bag lies there of a command that did not work.
         if arguments.graph is not None:
             write_graph(arguments.graph, simulated.to_graph_file())
+        write_run_bag(arguments.output, simulated, overwrite=arguments.overwrite)
     print(f"{arguments.output}: {describe(simulated)}")
     return 0
 

@@ -64,12 +64,14 @@ def test_the_graph_comes_with_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        (["--false-share", "1.5"], "false_share is 1.5"),
-        (["--laps", "0"], "laps is 0"),
-        (["--closures-per-minute", "-3"], "must not be negative"),
-        (["--closure-noise-deg", "nan"], "closure_noise_deg is nan"),
+        (["--false-share", "1.5"], "--false-share: is 1.5; it must lie between 0 and 1"),
+        (["--laps", "0.5"], "laps is 0.5"),
+        (["--closures-per-minute", "-3"], "--closures-per-minute: is -3; it must be 0 or more"),
+        (["--closure-noise-deg", "nan"], "--closure-noise-deg: is nan"),
         (["--world", "moon"], "invalid choice: 'moon'"),
+        (["--odometry-bias-deg-per-min", "inf"], "--odometry-bias-deg-per-min: is inf; it must be finite"),
         (["--seed", "-1"], "must be 0 or more"),
+        (["--graph", "graph.unknown"], "unknown suffix '.unknown'"),
     ],
 )
 def test_mistakes_are_one_line(

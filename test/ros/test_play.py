@@ -125,7 +125,7 @@ def test_interrupted(
     ("options", "complaint"),
     [
         (["--topics", "/lidar"], "no topic /lidar; the bag has /ground_truth, /odom"),
-        (["--rate", "-1"], "the rate is -1"),
+        (["--rate", "-1"], "--rate: is -1; it must be 0 or more"),
         (["--max-messages-per-second", "0"], "must be positive"),
     ],
 )
