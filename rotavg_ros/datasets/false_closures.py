@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.datasets.graph_file import GraphFile
+from rotavg_ros.datasets.slip_places import CROSSED, SlipRule, slip_places
 from rotavg_ros.errors import UserError
 from rotavg_ros.view_graph import EdgeKind
 
@@ -97,20 +98,18 @@ def insert_slips(
     share: float,
     rng: np.random.Generator,
     *,
-    max_steps_between_closures: int = 3,
-    min_closures_across: int = 2,
+    rule: SlipRule = CROSSED,
 ) -> SpoiledGraph:
     """Let odometry slip: turn a share of its edges by 20–60°, where good loop closures can locate a slip.
 
-    An edge qualifies if the stretch of odometry between the neighbouring ends of good closures that contains it has at
-    most ``max_steps_between_closures`` edges, and at least ``min_closures_across`` good closures span it. A closure is
-    good if it is within 10° of the reference.
+    A closure is good if it is within 10° of the reference.
 
     Args:
         graph_file: the graph; odometry edges connect consecutive nodes.
         body_from_world: ``(N, 4)`` xyzw, a clean reference.
         share: of all odometry edges; fewer slip where fewer qualify.
         rng: source of every random choice.
+        rule: which edges qualify.
 
     Raises:
         FalseClosureError: a share outside [0, 1], or a reference of another size than the graph.
@@ -124,17 +123,7 @@ def insert_slips(
     good = (kind == EdgeKind.LOOP_CLOSURE) & (noise <= np.radians(FALSE_CLOSURE_DEG))
     first, last = np.minimum(source, target), np.maximum(source, target)
 
-    # Step k leads from node k to node k + 1.
-    is_end = np.zeros(graph.num_nodes, dtype=bool)
-    is_end[first[good]] = is_end[last[good]] = True
-    stretch = np.cumsum(is_end)[:-1]
-    short = np.bincount(stretch, minlength=graph.num_nodes + 1)[stretch] <= max_steps_between_closures
-    short &= (stretch > 0) & (stretch < is_end.sum())
-    across = np.cumsum(
-        np.bincount(first[good], minlength=graph.num_nodes) - np.bincount(last[good], minlength=graph.num_nodes)
-    )[:-1]
-    locatable = np.append(short & (across >= min_closures_across), False)
-
+    locatable = slip_places(first[good], last[good], graph.num_nodes, rule)
     odometry = np.flatnonzero((kind == EdgeKind.ODOMETRY) & (last - first == 1))
     candidates = odometry[locatable[first[odometry]]]
     chosen = np.sort(rng.permutation(candidates)[: round(share * len(odometry))])

@@ -16,6 +16,7 @@ from rotavg_ros.datasets import kitti
 from rotavg_ros.datasets.false_closures import FALSE_CLOSURE_DEG, insert_slips, replace_closures
 from rotavg_ros.datasets.graph_file import GraphFile, read_graph
 from rotavg_ros.datasets.ground_truth import attach_stamps, attach_truth
+from rotavg_ros.datasets.slip_places import CROSSED, LOCATABLE
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.least_squares import least_squares
 from rotavg_ros.evaluation.metrics import true_edge_noise
@@ -32,7 +33,10 @@ _SLIP_CLOSURE_SHARE = 0.3
 # Keeps these random numbers apart from all that training draws.
 _STREAM = 0x51A3
 
-AS_RECORDED, GROUPED, SLIPS = "as recorded", "30 % grouped", "slips + 30 %"
+AS_RECORDED, GROUPED = "as recorded", "30 % grouped"
+# Slips wherever two good closures lie across, and only where they cannot be taken for slips elsewhere.
+SLIPS, LOCATABLE_SLIPS = "slips + 30 %", "locatable slips + 30 %"
+SLIP_RULES = {SLIPS: CROSSED, LOCATABLE_SLIPS: LOCATABLE}
 RANDOM = "% random"
 
 
@@ -137,7 +141,8 @@ def cases(
 ) -> Iterator[SlamCase]:
     """Every graph under every condition with every seed; where nothing is random, once.
 
-    Odometry slips only where good closures are dense enough to locate a slip; graphs without such places are left out.
+    Odometry slips only where good closures are dense enough (:data:`SLIP_RULES`); graphs without such places are left
+    out.
 
     Args:
         data: folder of the data sets, with ``slam/``.
@@ -158,13 +163,14 @@ def cases(
             yield recorded_case(name, source.read(data / "slam", np.random.default_rng(0)))
             continue
         conditions = [*((share_condition(share), share) for share in shares)]
-        conditions += [(GROUPED, _GROUPED_SHARE), (SLIPS, _SLIP_CLOSURE_SHARE)] if hard else []
+        if hard:
+            conditions += [(GROUPED, _GROUPED_SHARE), *((slips, _SLIP_CLOSURE_SHARE) for slips in SLIP_RULES)]
         for condition, share in conditions:
             once = share == 0 and not source.is_redrawn
             for seed in seeds[:1] if once else seeds:
                 graph_file = source.read(data / "slam", _random(seed, name))
                 case = spoiled_case(name, graph_file, condition, share, seed)
-                if condition != SLIPS or not case.is_inlier[~case.is_closure].all():
+                if condition not in SLIP_RULES or not case.is_inlier[~case.is_closure].all():
                     yield case
 
 
@@ -183,8 +189,8 @@ def spoiled_case(name: str, graph_file: GraphFile, condition: str, share: float,
     rng = _random(seed, f"{name} {condition}")
     spoiled = replace_closures(graph_file, truth, share, rng, grouped=condition == GROUPED)
     was_spoiled = spoiled.spoiled
-    if condition == SLIPS:
-        spoiled = insert_slips(spoiled.graph_file, truth, _SLIP_SHARE, rng)
+    if condition in SLIP_RULES:
+        spoiled = insert_slips(spoiled.graph_file, truth, _SLIP_SHARE, rng, rule=SLIP_RULES[condition])
         was_spoiled = was_spoiled | spoiled.spoiled
     graph = spoiled.graph_file.graph
     return SlamCase(name, condition, seed, graph, torch.from_numpy(truth), floor, ~was_spoiled, spoiled.noise)

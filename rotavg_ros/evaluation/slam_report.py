@@ -90,6 +90,10 @@ def _ratios(title: str, scores: SlamScores, names: Sequence[str], graphs: Sequen
     for condition in conditions:
         columns += [Column(condition, ".2f"), Column("worst", ".1f")]
     notes = [f"Geometric mean and worst case over: {', '.join(graphs)}."]
+    for condition in conditions:
+        absent = sorted(set(graphs) - set(scores.where(OURS, graphs, condition).graphs), key=graphs.index)
+        if absent:
+            notes.append(f"{condition}: without {', '.join(absent)}, which have no place that qualifies.")
     total = len(scores.where(OURS, graphs).rows)
     gave_up = [f"{ROWS.get(name, name)}: {total - len(scores.where(name, graphs).rows)}" for name in names]
     gave_up = [text for text in gave_up if not text.endswith(": 0")]

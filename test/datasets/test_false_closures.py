@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros.datasets.false_closures import FalseClosureError, insert_slips, replace_closures
 from rotavg_ros.datasets.graph_file import GraphFile
 from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.slip_places import CROSSED, LOCATABLE, SlipRule, crossing_difference, slip_places
 from rotavg_ros.datasets.trajectories import World
 from rotavg_ros.view_graph import EdgeKind
 
@@ -94,6 +95,36 @@ def test_slips_can_be_located() -> None:
         assert after - before <= 3
         low, high = np.minimum(source, target)[closures], np.maximum(source, target)[closures]
         assert ((low <= step) & (high > step)).sum() >= 2
+
+
+@given(seed=st.integers(0, 10_000), num_nodes=st.integers(3, 24), density=st.floats(0.1, 1.5))
+@settings(max_examples=60, deadline=None)
+def test_a_place_qualifies_if_no_other_is_spanned_by_nearly_the_same(seed: int, num_nodes: int, density: float) -> None:
+    """Against sets of closures, compared one by one."""
+    rng = np.random.default_rng(seed)
+    ends = np.sort([rng.permutation(num_nodes)[:2] for _ in range(1 + round(density * num_nodes))], axis=1)
+    first, last = ends.T
+    spanning = [{c for c, (low, high) in enumerate(ends) if low <= k < high} for k in range(num_nodes - 1)]
+    literal = slip_places(first, last, num_nodes, CROSSED)
+    rule = SlipRule(min_across=3, min_difference=2)
+    found = slip_places(first, last, num_nodes, rule)
+    assert not found[-1]
+    for k, one in enumerate(spanning):
+        assert crossing_difference(first, last, num_nodes, k).tolist() == [len(one ^ other) for other in spanning]
+        far = [other for j, other in enumerate(spanning) if abs(j - k) > rule.max_stretch]
+        ends_before = [end for end in ends.ravel() if end <= k]
+        ends_after = [end for end in ends.ravel() if end > k]
+        is_short = bool(ends_before and ends_after) and min(ends_after) - max(ends_before) <= rule.max_stretch
+        assert literal[k] == (is_short and len(one) >= 2)
+        assert found[k] == (is_short and len(one) >= 3 and all(len(one ^ other) >= 2 for other in far))
+
+
+def test_there_and_back_no_place_can_be_told_from_its_mirror_image() -> None:
+    """A slip on the way out and one on the way back are the same to all closures but near the turning point."""
+    first = np.arange(20)
+    last = 40 - first
+    assert slip_places(first, last, 41, CROSSED)[1:-2].all()
+    np.testing.assert_array_equal(np.flatnonzero(slip_places(first, last, 41, LOCATABLE)), [19, 20])
 
 
 def test_no_slips_where_nothing_could_locate_them() -> None:

@@ -162,8 +162,10 @@ def test_graphs_come_from_the_data_folder(tmp_path: Path) -> None:
     drawn = list(slam_cases.cases(tmp_path, ["CSAIL"], [0.0, 0.5], [3, 4]))
     conditions = [(case.condition, case.seed) for case in drawn]
     assert conditions[:3] == [("0 % random", 3), ("50 % random", 3), ("50 % random", 4)]
-    assert conditions[3:] == [(slam_cases.GROUPED, 3), (slam_cases.GROUPED, 4), (slam_cases.SLIPS, 3),
-                              (slam_cases.SLIPS, 4)]  # fmt: skip
+    # Laps that are tied together all along locate a slip but for which of them slipped: not every draw has a place.
+    hard = (slam_cases.GROUPED, slam_cases.SLIPS, slam_cases.LOCATABLE_SLIPS)
+    assert set(conditions[3:7]) == {(condition, seed) for condition in hard[:2] for seed in (3, 4)}
+    assert set(conditions[7:]) <= {(hard[2], seed) for seed in (3, 4)}
 
 
 @pytest.mark.parametrize("graphs", [["CSAIL"], ["nowhere"]])
