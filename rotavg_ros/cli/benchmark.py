@@ -44,7 +44,7 @@ The load average was {load} before the run{quiet}
 _SOAK_INTRODUCTION = """\
 The installed node over DDS, in a process of its own. It holds a simulated city with as many loop closures as
 keyframes, four keyframes a second go on coming, and odometry arrives at the rate below. Ticks count from when the graph
-was solved, their percentiles from the node's start; latency is from the odometry's stamp to the corrected orientation.
+was solved, but for the longest before; latency is from the odometry's stamp to the corrected orientation.
 Milliseconds, as the node reports them; on a machine that does other work besides, they are mostly waiting, and the
 CPU time says more. The load average was {load} before the run.
 

@@ -80,6 +80,7 @@ class Reporter:
         received = sum(counter.received for counter in health.odometry.values())
         rate = (received - self._odometry_received) / max(now - self._reported, 1e-3)
         values["odometry rate hz"] = f"{rate:.1f}"
+        values["latest ticks ms"] = " ".join(f"{tick:.1f}" for tick in health.ticks.between_ms(self._reported, now))
         dropped = sum(count for reason, count in counts.rejected.items() if reason not in _HARMLESS)
         errors = _errors(health, parameters, paused, now)
         if counts.time_is_back:

@@ -95,8 +95,12 @@ class Durations:
         recent = [seconds for _, seconds in list(self._recent)]
         return 1e3 * float(np.percentile(recent, percent)) if recent else float("nan")
 
+    def between_ms(self, began: float, ended: float) -> list[float]:
+        """All that ended between two moments of the monotonic clock, in milliseconds."""
+        return [1e3 * seconds for when, seconds in list(self._recent) if began <= when < ended]
+
     def median_ms(self, window_s: float) -> float:
         """Milliseconds, of the last so many seconds; NaN where nothing happened in them."""
-        began = time.monotonic() - window_s
-        inside = [seconds for when, seconds in list(self._recent) if when >= began]
-        return 1e3 * float(np.median(inside)) if inside else float("nan")
+        now = time.monotonic()
+        inside = self.between_ms(now - window_s, now)
+        return float(np.median(inside)) if inside else float("nan")

@@ -67,6 +67,11 @@ class Recorder:
         """The node's last diagnostics, name → value; empty before the first."""
         return self._reports[-1] if self._reports else {}
 
+    @property
+    def reports(self) -> list[dict[str, str]]:
+        """The node's diagnostics since it began, or since they were forgotten."""
+        return list(self._reports)
+
     def forget_reports(self) -> None:
         """Judge rest by reports that come from now on."""
         self._reports.clear()
