@@ -69,12 +69,23 @@ class BenchmarkUsageError(UserError):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``rotavg benchmark``."""
     parser.add_argument(
-        "--output", type=Path, default=Path("docs/results"), metavar="DIR", help="default: docs/results"
+        "--output",
+        type=Path,
+        default=Path("docs/results"),
+        metavar="DIR",
+        help="folder for the report (default: docs/results)",
     )
     parser.add_argument(
-        "--families", nargs="+", choices=tuple(FAMILIES), default=list(FAMILIES), help="default: all of them"
+        "--families",
+        nargs="+",
+        choices=tuple(FAMILIES),
+        default=list(FAMILIES),
+        metavar="NAME",
+        help=f"of {', '.join(FAMILIES)} (default: all)",
     )
-    parser.add_argument("--minutes", type=positive_number, default=20.0, help="about how long in all (default: 20)")
+    parser.add_argument(
+        "--minutes", type=positive_number, default=20.0, metavar="M", help="about how long in all (default: 20)"
+    )
     parser.add_argument(
         "--min-pairs", type=positive_whole_number, default=1, metavar="N", help="edges at least (default: 1)"
     )
@@ -82,9 +93,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-pairs", type=positive_whole_number, default=8_000_000, metavar="N", help="edges at most (default: 8e6)"
     )
     parser.add_argument(
-        "--contenders", nargs="+", choices=tuple(LABELS), default=list(LABELS), help="default: all of them"
+        "--contenders",
+        nargs="+",
+        choices=tuple(LABELS),
+        default=list(LABELS),
+        metavar="NAME",
+        help=f"of {', '.join(LABELS)} (default: all)",
     )
-    parser.add_argument("--repeats", type=positive_whole_number, default=5, metavar="N", help="default: 5")
+    parser.add_argument(
+        "--repeats", type=positive_whole_number, default=5, metavar="N", help="solves by each, at most (default: 5)"
+    )
     parser.add_argument("--threads", type=thread_count, metavar="N", help="CPU threads (default: torch's)")
     parser.add_argument("--soak", action="store_true", help="the node under load instead of the solvers")
     parser.add_argument(

@@ -4,7 +4,7 @@
   .toro .graph        TORO pose graph
   .isam               iSAM pose graph, in the plane
   .txt                1DSfM EGs.txt
-  .npz                arrays, see the README
+  .npz                arrays, see docs/formats.md
   a folder            rosbag2 (MCAP): edges, chained odometry, ground truth; also read: .mcap, .db3, .bag
 
 Says what the output format has no room for.
@@ -50,8 +50,8 @@ FORMATS = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``rotavg convert``."""
-    parser.add_argument("input", type=Path, metavar="INPUT")
-    parser.add_argument("output", type=Path, metavar="OUTPUT")
+    parser.add_argument("input", type=Path, metavar="INPUT", help="view-graph file or bag")
+    parser.add_argument("output", type=Path, metavar="OUTPUT", help="where to; its suffix says which format")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing OUTPUT")
     parser.add_argument(
         "--stamps", type=Path, metavar="TXT", help="text file with one stamp in seconds per node, ascending by id"

@@ -42,7 +42,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for suite in _SUITES:
         suite_parser = suites.add_parser(suite.name, help=suite.help, description=suite.help)
         suite_parser.add_argument(
-            "--output", type=Path, default=Path("docs/results"), metavar="DIR", help="default: docs/results"
+            "--output",
+            type=Path,
+            default=Path("docs/results"),
+            metavar="DIR",
+            help="folder for the report (default: docs/results)",
         )
         suite_parser.add_argument(
             "--threads", type=thread_count, metavar="N", help="CPU threads (default: torch's choice)"
@@ -76,7 +80,8 @@ def _add_synthetic(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         choices=tuple(synthetic.RECIPES),
         default=["released", "paper"],
-        help="generators of the graphs (default: released paper)",
+        metavar="NAME",
+        help=f"generators of the graphs, of {', '.join(synthetic.RECIPES)} (default: released paper)",
     )
     parser.add_argument(
         "--few-graphs",
@@ -174,7 +179,14 @@ def _run_real(arguments: argparse.Namespace) -> Path:
 
 def _add_rgbd(parser: argparse.ArgumentParser) -> None:
     add_data_argument(parser)
-    parser.add_argument("--sets", nargs="+", choices=rgbd.SETS, default=list(rgbd.SETS), help="default: all")
+    parser.add_argument(
+        "--sets",
+        nargs="+",
+        choices=rgbd.SETS,
+        default=list(rgbd.SETS),
+        metavar="NAME",
+        help=f"of {', '.join(rgbd.SETS)} (default: all)",
+    )
     parser.add_argument(
         "--folds", type=positive_whole_number, default=4, metavar="K", help="of the cross-validation (default: 4)"
     )

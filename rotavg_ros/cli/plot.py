@@ -27,12 +27,16 @@ class PlotError(UserError):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``rotavg plot``."""
     kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True)
-    statistics = kinds.add_parser("statistics", help="histograms of the noise's angles and axes")
+    about = "histograms of the noise's angles and axes"
+    statistics = kinds.add_parser("statistics", help=about, description=about)
     statistics.add_argument("graph", type=Path, metavar="GRAPH", help="view-graph file")
     statistics.add_argument("--truth", type=Path, metavar="FILE", help="ground truth, for graphs without their own")
     statistics.add_argument("--output", type=Path, metavar="PNG", help="default: <graph>-statistics.png, here")
     statistics.add_argument(
-        "--outlier-angle", type=positive_number, metavar="DEG", help="default: 20, or 10 if the graph has odometry"
+        "--outlier-angle",
+        type=positive_number,
+        metavar="DEG",
+        help="noise of an outlier (default: 20, or 10 if the graph has odometry)",
     )
 
 

@@ -31,13 +31,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     """What the run is like; shared with ``rotavg demo``."""
     parser.add_argument("--world", choices=ROBOT_WORLDS, default="building", help="default: building")
-    parser.add_argument("--dimensions", type=int, choices=(2, 3), default=2, help="3: ramps and uneven ground")
-    parser.add_argument("--laps", type=positive_number, default=4, help="visits of every place, about (default: 4)")
+    parser.add_argument(
+        "--dimensions", type=int, choices=(2, 3), default=2, help="3: ramps and uneven ground (default: 2)"
+    )
+    parser.add_argument(
+        "--laps", type=positive_number, default=4, metavar="N", help="visits of every place, about (default: 4)"
+    )
     parser.add_argument(
         "--false-share", type=share, default=0.3, metavar="SHARE", help="of the closures (default: 0.3)"
     )
     parser.add_argument("--grouped", action="store_true", help="false closures in groups that agree with each other")
-    parser.add_argument("--closures-per-minute", type=non_negative_number, default=20, metavar="N", help="default: 20")
+    parser.add_argument(
+        "--closures-per-minute", type=non_negative_number, default=20, metavar="N", help="good and false (default: 20)"
+    )
     parser.add_argument(
         "--closure-noise-deg", type=non_negative_number, default=1.0, metavar="DEG", help="RMS angle (default: 1)"
     )
@@ -55,7 +61,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DEG",
         help="gyroscope bias (default: 2)",
     )
-    parser.add_argument("--seed", type=whole_number, default=0, help="same seed, same run (default: 0)")
+    parser.add_argument("--seed", type=whole_number, default=0, metavar="S", help="same seed, same run (default: 0)")
 
 
 def simulate(arguments: argparse.Namespace) -> SimulatedRun:

@@ -1,6 +1,7 @@
 """Train a network of NeuRoRA on simulated view-graphs.
 
-CONFIG is a YAML file, or the name of one that comes with the package (sfm-clean-net, sfm-fine-net, slam-clean-net).
+CONFIG is a YAML file, or the name of one that comes with the package: sfm-clean-net, sfm-fine-net, slam-clean-net, and
+the second stages that the package's own networks went through, sfm-clean-net-broad and sfm-fine-net-settled.
 DIR gets, for the network NAME, the best weights (NAME.safetensors), their model card (NAME.json), a log with a line per
 epoch (NAME.log.jsonl) and a checkpoint. Run the same command again after an interruption: training goes on as if it had
 never stopped. A FineNet learns on what a CleanNet leaves, so train CleanNet first, into the same DIR.
@@ -34,7 +35,7 @@ class TrainCommandError(UserError):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``rotavg train``."""
-    parser.add_argument("network", choices=("clean-net", "fine-net"))
+    parser.add_argument("network", choices=("clean-net", "fine-net"), help="of SLAM graphs, a CleanNet alone")
     parser.add_argument("config", metavar="CONFIG", help="YAML file, or the name of one of the package's")
     parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for weights and checkpoint")
     parser.add_argument(
