@@ -91,7 +91,9 @@ def rotate(a: Tensor, vector: Tensor) -> Tensor:
 
 def to_matrix(a: Tensor) -> Tensor:
     """Unit quaternions ``(..., 4)`` to rotation matrices ``(..., 3, 3)``."""
-    return torch.stack([rotate(a, basis.expand(*a.shape[:-1], 3)) for basis in torch.eye(3).to(a)], dim=-1)
+    return torch.stack(
+        [rotate(a, basis.expand(*a.shape[:-1], 3)) for basis in torch.eye(3, dtype=a.dtype, device=a.device)], dim=-1
+    )
 
 
 def from_matrix(matrix: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from rotavg_ros.solver.laplacian import LaplacianSystem
 from rotavg_ros.solver.noise_shape import NoiseShape
-from rotavg_ros.solver.parallel import for_each
+from rotavg_ros.solver.parallel import for_each, threads_on
 from rotavg_ros.solver.sorted_edges import SortedEdges
 from rotavg_ros.view_graph import ViewGraph
 
@@ -66,7 +66,7 @@ class BlockLaplacian:
 
     def __init__(self, arrivals: Arrivals, weight: Tensor, shape: NoiseShape, component: Tensor) -> None:
         self._matrices = arrivals.matrices(weight)
-        self._threads = None if len(weight) > _WORTH_WORKERS else 1
+        self._threads = threads_on(weight.device) if len(weight) > _WORTH_WORKERS else 1
         self._component = component
         self._num_components = int(component.max()) + 1
         # (3, 3, N): what is said of an edge at the end that it comes from, and at the one where it arrives.
@@ -95,8 +95,9 @@ class BlockLaplacian:
         """A preconditioner for well-knit graphs: what solves by the blocks on the diagonal alone."""
         blocks = self._diagonal.permute(2, 0, 1)
         isolated = blocks.diagonal(dim1=1, dim2=2).sum(dim=1) <= 0
+        unit = torch.eye(3, dtype=blocks.dtype, device=blocks.device)
         # Unlike inv, inv_ex does not stop to look whether all went well.
-        inverse = torch.linalg.inv_ex(blocks + isolated[:, None, None] * torch.eye(3).to(blocks)).inverse
+        inverse = torch.linalg.inv_ex(blocks + isolated[:, None, None] * unit).inverse
         return partial(_apply, inverse.permute(1, 2, 0).contiguous())
 
     def solve(

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.parallel import for_each
+from rotavg_ros.solver.parallel import for_each, threads_on
 
 # From nothing, and from what the last step's residuals said.
 _ITERATIONS, _FURTHER_ITERATIONS = 10, 3
@@ -79,7 +79,7 @@ class NoiseShape:
             information = torch.linalg.inv_ex(covariance).inverse[component] / 2
             shapes[number] = matrix.transpose(1, 2) @ information @ matrix
 
-        for_each(estimate, (0, 1))
+        for_each(estimate, (0, 1), threads_on(residual.device))
         return cls(shapes[0], shapes[1], (scatters[0], scatters[1]))
 
 

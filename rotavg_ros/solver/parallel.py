@@ -86,6 +86,11 @@ def for_each(work: Callable[[Item], None], items: Sequence[Item], threads: int |
         pass
 
 
+def threads_on(device: torch.device) -> int | None:
+    """For :func:`for_each`: all workers on a CPU, one for an accelerator, whose queue a single thread keeps full."""
+    return None if device.type == "cpu" else 1
+
+
 def slices(length: int, size: int, device: torch.device) -> list[slice]:
     """What covers ``range(length)``: slices of ``size`` on a CPU, for its caches, and one slice on an accelerator."""
     size = size if device.type == "cpu" else max(length, 1)

@@ -137,6 +137,8 @@ class _Problem:
         of_edge = component[graph.source]
         self.redundancy = torch.bincount(of_edge, minlength=len(roots)) - self.num_nodes + 1
         self.some = graph.select_edges(_evenly_spread(of_edge, len(roots)))
+        self.component_of_some = component[self.some.source]
+        self.count_of_some = torch.bincount(self.component_of_some, minlength=len(roots)).clamp(min=1)
         self.measured = measured_rows(graph.target_from_source, torch.float32)
 
     def mean(self, value: Tensor) -> Tensor:
@@ -154,9 +156,8 @@ class _Problem:
     def typical(self, residual: Tensor) -> Tensor:
         """Geometric mean of some residuals' lengths in each component, ``(C,)`` rad."""
         logarithm = (residual * residual).sum(dim=0).clamp(min=_MIN_RESIDUAL**2).log() / 2
-        of_edge = self.component[self.some.source]
-        total = logarithm.new_zeros(len(self.roots)).index_add_(0, of_edge, logarithm)
-        return torch.exp(total / torch.bincount(of_edge, minlength=len(self.roots)).clamp(min=1))
+        total = logarithm.new_zeros(len(self.roots)).index_add_(0, self.component_of_some, logarithm)
+        return torch.exp(total / self.count_of_some)
 
     def shape(self, residual: Tensor, orientations: Tensor, before: NoiseShape) -> NoiseShape:
         """The noise's shape as some residuals have it."""

@@ -72,6 +72,8 @@ class SortedEdges:
 
     def tiles(self, num_edges: int) -> list[Tile]:
         """All nodes in order, cut into tiles of about ``num_edges`` edges; a node's edges are never split."""
+        if len(self.source) <= num_edges and self.num_nodes:  # an accelerator's case; nothing need be read back
+            return [Tile(slice(0, self.num_nodes), slice(0, len(self.source)))]
         first = self.first.cpu().numpy()
         cuts = np.searchsorted(first, np.arange(0, first[-1], num_edges), side="left")
         nodes = np.unique(np.concatenate(([0], cuts, [self.num_nodes])))

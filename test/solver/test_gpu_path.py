@@ -1,0 +1,88 @@
+"""The way of a solve on a GPU, walked on a pretended one: nothing is left behind, nothing goes to and fro."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros import rotations, solve, solve_batch
+from rotavg_ros.datasets.synthetic import PaperRecipe
+from rotavg_ros.solver import devices
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+
+from .pretended_gpu import Traffic, pretended_gpu
+from .test_devices import assert_same
+
+
+def _graph(cameras: int = 50, share: float = 0.4, seed: int = 0) -> ViewGraph:
+    recipe = PaperRecipe(cameras=(cameras, cameras), pair_share=(share, share))
+    graph = recipe.sample(np.random.default_rng(seed)).graph
+    label = torch.where(torch.arange(graph.num_edges) % 50 == 0, EdgeLabel.REJECTED, EdgeLabel.AUTOMATIC)
+    return replace(graph, label=label)
+
+
+@pytest.fixture(autouse=True)
+def _a_gpu_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(devices, "gpu_problem", lambda: None)
+
+
+def _forget(traffic: Traffic) -> None:
+    for record in (traffic.to_gpu, traffic.from_gpu, traffic.waits):
+        record.clear()
+
+
+@pytest.mark.parametrize(("method", "waits"), [("neurora", 100), ("neurora-v2", 25), ("neurora-round", 100)])
+def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> None:
+    graph = _graph()
+    with pretended_gpu() as traffic:
+        solve(graph, method=method, device="cuda")  # the networks go over once per process
+        _forget(traffic)
+        found = solve(graph, method=method, device="cuda")
+    assert found.device == "cuda"
+    assert_same(found, solve(graph, method=method, device="cpu"))
+    edges, nodes = graph.num_edges, graph.num_nodes
+    # The seven columns of a view-graph, and every node's component.
+    assert sorted(traffic.to_gpu) == sorted([(edges,)] * 6 + [(edges, 4), (nodes,)])
+    assert sorted(traffic.from_gpu) == sorted([(edges,), (nodes, 4)])
+    assert len(traffic.waits) <= waits
+
+
+def test_waits_do_not_grow_with_the_graph() -> None:
+    counts = []
+    for cameras in (40, 160):
+        with pretended_gpu() as traffic:
+            solve(_graph(cameras), method="neurora-v2", device="cuda")
+        counts.append(len(traffic.waits))
+    assert counts[1] <= counts[0] + 2  # a deeper tree takes a round more
+
+
+def test_batches_warm_starts_and_loose_graphs_stay_together() -> None:
+    """Where the graph is loosely knit, the CPU factorises; the rest is as above."""
+    graphs = [_graph(), _graph(40, 0.2, 1), ViewGraph.create([], [], np.empty((0, 4)), num_nodes=3)]
+    with pretended_gpu():
+        batch = solve_batch(graphs, device="cuda")
+        warm = solve(graphs[1], device="cuda", warm_start=batch[1].body_from_world)
+    for found, expected in zip(batch, solve_batch(graphs, device="cpu"), strict=True):
+        assert_same(found, expected)
+    assert_same(warm, solve(graphs[1], device="cpu", warm_start=batch[1].body_from_world))
+
+
+def test_the_pretended_gpu_refuses_what_a_gpu_refuses() -> None:
+    with pretended_gpu() as traffic:
+        there, here = torch.ones(3, device="cuda"), torch.ones(3)
+        assert (there.device.type, (there * torch.tensor(2.0)).device.type) == ("cuda", "cuda")
+        with pytest.raises(RuntimeError, match="same device"):
+            there + here
+        with pytest.raises(RuntimeError, match="same device"):
+            there[torch.tensor([0])] = 1.0
+        with pytest.raises(TypeError, match="numpy"):
+            there.numpy()
+        assert not (traffic.waits or traffic.from_gpu)
+        assert bool((there.cpu() == here).all())
+        assert float(there[there > 0].sum()) == 3
+        assert (traffic.waits, traffic.from_gpu) == (["__getitem__", "__float__"], [(3,)])
+        rotations.to_matrix(rotations.identity(2, device="cuda"))
+        assert not traffic.to_gpu
