@@ -80,6 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
                 f"{bag.path}: no topic is odometry or relative rotations, so there is nothing to replay; its topics: "
                 + ", ".join(f"{use.topic} ({use.type_name})" for use in plan.topics)
             )
+        _check_inputs(bag.path, plan, arguments.output)
         window = Window(arguments.start, arguments.duration, arguments.rate)
         summary = _replay(bag, plan, window, arguments)
     print(_told(summary, arguments.output))
@@ -87,6 +88,13 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     print(f"rotavg: warning: {summary['damage']}; what could be read is in {arguments.output}", file=sys.stderr)
     return 2
+
+
+def _check_inputs(bag: Path, plan: Plan, output: Path) -> None:
+    """The answer's files must not take the place of what they are made from."""
+    files = [reference for reference in plan.references.values() if isinstance(reference, Path)]
+    if output.resolve() == bag.resolve() or any(path.resolve().parent == output.resolve() for path in (bag, *files)):
+        raise ReplayUsageError(f"{output}: has the bag or a reference in it; choose another --output")
 
 
 def _replay(bag: BagReader, plan: Plan, window: Window, arguments: argparse.Namespace) -> dict[str, Any]:

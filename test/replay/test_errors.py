@@ -113,6 +113,22 @@ def test_what_comes_before_the_damage_is_written(
     assert (tmp_path / "out" / "trajectory.tum").exists()
 
 
+def test_nothing_it_was_given_is_overwritten(tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = make_bag(tmp_path / "run")  # whose file has the name of the answer's
+    truth = tmp_path / "out" / "trajectory.tum"
+    truth.parent.mkdir()
+    truth.write_text("1.0 0 0 0 0 0 0 1\n2.0 1 0 0 0 0 0 1\n")
+    before = (bag / "run.mcap").read_bytes()
+    for words in (
+        [str(bag), "--output", str(bag)],
+        [str(bag / "run.mcap"), "--output", str(bag / ".." / "run")],
+        [str(small), "--reference", str(truth), "--output", str(truth.parent)],
+    ):
+        assert main(["replay", *words, "--overwrite", "--no-report"]) == 2
+        assert "has the bag or a reference in it; choose another --output" in capsys.readouterr().err
+    assert (bag / "run.mcap").read_bytes() == before and truth.read_text().startswith("1.0")
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [
