@@ -93,7 +93,7 @@ class _Course:
     @classmethod
     def drive(cls, hours: float, rng: np.random.Generator) -> _Course:
         """A figure of eight, again and again."""
-        count = round(3600 * hours * _RATE_HZ)
+        count = max(1, round(3600 * hours * _RATE_HZ))
         phase = 2 * np.pi * np.arange(count + 1) / (_LAP_S * _RATE_HZ)
         step = np.diff(np.stack((_COURSE_M[0] * np.sin(phase), _COURSE_M[1] * np.sin(2 * phase)), axis=1), axis=0)
         heading = np.arctan2(step[:, 1], step[:, 0])
