@@ -18,8 +18,10 @@ from scipy.sparse.linalg import SuperLU, splu
 
 # How much stiffer than its own edges a root is tied to zero.
 _GROUNDING = 1e6
-# A graph with more than this share of all pairs fills in completely, and dense Cholesky is then many times faster.
-_DENSE_SHARE = 0.01
+# A graph with more than this share of all pairs, and so many edges per node, fills in completely, and dense Cholesky is
+# then many times faster; with fewer it is no faster however small the graph, and OpenBLAS spreads it over the cores,
+# which wait for each other longer than they work.
+_DENSE_SHARE, _DENSE_EDGES_PER_NODE = 0.01, 8
 _DENSE_MAX_NODES = 5000
 # From eight columns on, SuperLU's many little products are large enough for OpenBLAS to spread each over the cores,
 # which costs more than it saves: 48 columns on 8600 nodes took 180 ms of CPU time at once and 28 ms in fours.
@@ -76,7 +78,9 @@ class LaplacianPattern:
     def factorize(self, weight: np.ndarray) -> FactorisedLaplacian:
         """The system with positive weights ``(E,)``; a node reached by tiny weights alone stays solvable."""
         matrix = self.matrix(weight)
-        if len(self.source) > _DENSE_SHARE * self.num_nodes**2 / 2 and self.num_nodes <= _DENSE_MAX_NODES:
+        num_edges, num_nodes = len(self.source), self.num_nodes
+        is_dense = num_edges > max(_DENSE_SHARE * num_nodes**2 / 2, _DENSE_EDGES_PER_NODE * num_nodes)
+        if is_dense and num_nodes <= _DENSE_MAX_NODES:
             # Weights that span all of double precision can leave no positive pivot; the sparse factorisation copes.
             with suppress(np.linalg.LinAlgError):
                 factor = partial(cho_solve, cho_factor(matrix.toarray(), lower=True, overwrite_a=True))

@@ -21,6 +21,7 @@ def random_graph(num_nodes: int, num_edges: int, rng: np.random.Generator) -> tu
 @pytest.mark.parametrize("dense_share", [0.0, np.inf], ids=["dense", "sparse"])
 def test_fit_is_the_least_squares_solution(monkeypatch: pytest.MonkeyPatch, dense_share: float) -> None:
     monkeypatch.setattr(laplacian, "_DENSE_SHARE", dense_share)
+    monkeypatch.setattr(laplacian, "_DENSE_EDGES_PER_NODE", dense_share)
     rng = np.random.default_rng(0)
     source, target = random_graph(20, 60, rng)
     weight, difference = rng.uniform(0.1, 10, len(source)), rng.standard_normal((len(source), 3))
