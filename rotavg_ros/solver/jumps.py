@@ -10,20 +10,21 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.agreement import AgreementPairs
+from rotavg_ros.solver.minimum_cut import TwoLabels
 from rotavg_ros.solver.truncated_cost import TruncatedCost
 
 _MAX_ROUNDS = 3
 _MAX_CANDIDATES = 40
 # An improvement by less than this many nats is none.
 _MIN_GAIN = 0.5
-# scipy's maximum flow counts in integers.
-_UNIT = 1000.0
+# Conductance of edges that are as wrong as can be, for an electrical flow that leaves them alone.
+_MIN_CARRIED = 1e-6
 
 
 def jump_to_optimum(
@@ -52,10 +53,16 @@ def _round_of_jumps(
     residual = cost.residual(correction)
     costs = cost.of_edges(residual)
     gained = 0.0
-    for edge in _candidates(cost, costs, pairs, is_agreed, is_trusted):
+    candidates = _candidates(cost, costs, pairs, is_agreed, is_trusted)
+    if len(candidates) == 0:
+        return correction, gained
+    # What an edge loses if one end turns is what it is yet short of its cap, or less if it turns but a little.
+    system = cost.pattern.factorize(np.maximum(cost.cap - costs, _MIN_CARRIED))
+    bounds = _turns(cost, residual, residual[candidates], costs).gain_bounds(system)
+    for edge in candidates[bounds > _MIN_GAIN]:
         if costs[edge] < 0.5 * cost.cap[edge]:
             continue
-        moves = _best_set(cost, residual, residual[edge], costs)
+        moves = _turns(cost, residual, residual[[edge]], costs).best_set()
         moved = torch.from_numpy(np.flatnonzero(moves))
         if len(moved) in (0, len(moves)):
             continue
@@ -93,34 +100,10 @@ def _candidates(
     return np.concatenate((segments, closure[leaders]))
 
 
-def _best_set(cost: TruncatedCost, residual: Tensor, turn: Tensor, costs: np.ndarray) -> np.ndarray:
-    """``(K,)`` bool: the nodes to turn by ``turn`` ``(4,)``, by a minimum cut."""
-    source, target, num_nodes = cost.graph.source, cost.graph.target, cost.graph.num_nodes
+def _turns(cost: TruncatedCost, residual: Tensor, turns: Tensor, costs: np.ndarray) -> TwoLabels:
+    """Which nodes to turn by each of ``turns`` ``(Q, 4)``; residuals ``(E, 4)`` and costs ``(E,)`` as they are now."""
+    graph = cost.graph
     # Real parts of turn⁻¹ ∘ residual and of residual ∘ turn.
-    if_target, if_source = cost.of_cosines(residual @ turn), cost.of_cosines(residual @ rotations.inverse(turn))
-    # Submodularity asks that turning one end or the other costs no less than turning neither or both.
-    bound = 2 * costs
-    raise_source = if_target < if_source
-    if_source, if_target = (
-        np.where(raise_source, np.maximum(if_source, bound - if_target), if_source),
-        np.where(raise_source, if_target, np.maximum(if_target, bound - if_source)),
-    )
-    # A labelling x ∈ {0 stays, 1 turns} costs, up to a constant,
-    # Σ (if_source − c)(x_u − x_v) + (if_source + if_target − 2c)(1 − x_u) x_v.
-    unary = np.bincount(source, if_source - costs, num_nodes) - np.bincount(target, if_source - costs, num_nodes)
-    pair = if_source + if_target - bound
-    stays, turns = num_nodes, num_nodes + 1
-    nodes = np.arange(num_nodes)
-    capacity = np.concatenate((pair, np.maximum(unary, 0), np.maximum(-unary, 0)))
-    rows = np.concatenate((source, np.full(num_nodes, stays), nodes))
-    columns = np.concatenate((target, nodes, np.full(num_nodes, turns)))
-    units = np.rint(_UNIT * capacity).astype(np.int32)
-    network = csr_array(coo_array((units, (rows, columns)), shape=(num_nodes + 2,) * 2))
-    network.sum_duplicates()
-    network.eliminate_zeros()
-    left = csr_array(network - maximum_flow(network, stays, turns).flow)
-    left.eliminate_zeros()
-    reached = breadth_first_order(left, stays, return_predecessors=False)
-    moves = np.ones(num_nodes + 2, dtype=bool)
-    moves[reached] = False
-    return moves[:num_nodes]
+    if_target = cost.of_cosines(residual @ turns.T) - costs[:, None]
+    if_source = cost.of_cosines(residual @ rotations.inverse(turns).T) - costs[:, None]
+    return TwoLabels.create(graph.num_nodes, graph.source, graph.target, if_target, if_source)

@@ -17,6 +17,8 @@ from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.fine_net import edge_residual
 from rotavg_ros.solver.laplacian import LaplacianPattern
 from rotavg_ros.solver.noise_model import NoiseModel
+from rotavg_ros.solver.residuals import EdgeResiduals
+from rotavg_ros.view_graph import ViewGraph
 
 # Estimates on the way to the optimum fit worse than the optimum: their variance counts this many times.
 _SLACK = 2.0
@@ -36,12 +38,14 @@ class TruncatedCost:
         variance: ``(E,)`` rad² per component.
         cap: ``(E,)`` what a wrong edge costs, ≥ 0.
         pattern: the graph's Laplacian.
+        edges: the graph's edges and residuals as edges between its corrections.
     """
 
     graph: ClosureGraph
     variance: np.ndarray
     cap: np.ndarray
     pattern: LaplacianPattern
+    edges: ViewGraph
 
     @staticmethod
     def create(graph: ClosureGraph, noise: NoiseModel, log_odds: np.ndarray) -> TruncatedCost:
@@ -51,7 +55,8 @@ class TruncatedCost:
         around = variance + np.where(graph.is_odometry, 2.0, 1.0) * noise.closure_variance
         cap = noise.inlier_log_odds(np.zeros(len(variance)), around) + np.clip(log_odds, -100, 100)
         pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots)
-        return TruncatedCost(graph, variance, np.maximum(cap, 0.0), pattern)
+        edges = ViewGraph.create(graph.source, graph.target, graph.residual, num_nodes=graph.num_nodes)
+        return TruncatedCost(graph, variance, np.maximum(cap, 0.0), pattern, edges)
 
     def residual(self, correction: Tensor) -> Tensor:
         """``(E, 4)``."""
@@ -63,9 +68,9 @@ class TruncatedCost:
         return self.of_cosines(residual[:, 3])
 
     def of_cosines(self, cosine: Tensor) -> np.ndarray:
-        """The same from the residuals' real parts ``(E,)``; the 1e-8 rad that these do not resolve cost nothing."""
-        square = (2 * cosine.abs().clamp(max=1).acos().numpy()) ** 2
-        return np.asarray(np.minimum(square / (2 * _SLACK * self.variance), self.cap))
+        """The same from the residuals' real parts ``(E, …)``; the 1e-8 rad that these do not resolve cost nothing."""
+        square = (2 * cosine.abs().clamp(max=1).acos().numpy().T) ** 2
+        return np.asarray(np.minimum(square / (2 * _SLACK * self.variance), self.cap).T)
 
     def total(self, correction: Tensor) -> float:
         """Cost of a solution ``(K, 4)``, in nats."""
@@ -87,23 +92,25 @@ class TruncatedCost:
         scale = 2 * self.cap
         if trust is None:
             for _ in range(_DESCENT_STEPS):
-                correction = self._step(correction, (scale / (self._square(correction) + scale + 1e-12)) ** 2)
+                vectors, square = self._vectors(correction)
+                correction = self._step(correction, vectors, (scale / (square + scale + 1e-12)) ** 2)
             return correction
         for _ in range(_SETTLING_STEPS):
-            correction = self._step(correction, trust)
-        convexity = (
-            float((2 * self._square(correction) / np.maximum(scale, 1e-12)).max(initial=0.0, where=scale > 0)) + 1
-        )
+            correction = self._step(correction, self._vectors(correction)[0], trust)
+        vectors, square = self._vectors(correction)
+        convexity = float((2 * square / np.maximum(scale, 1e-12)).max(initial=0.0, where=scale > 0)) + 1
         while convexity > 1 / _ANNEALING_FACTOR:
             annealed = max(convexity, 1.0) * scale + 1e-12
-            correction = self._step(correction, trust * (annealed / (self._square(correction) + annealed)) ** 2)
+            correction = self._step(correction, vectors, trust * (annealed / (square + annealed)) ** 2)
             convexity /= _ANNEALING_FACTOR
+            vectors, square = self._vectors(correction)
         return correction
 
-    def _square(self, correction: Tensor) -> np.ndarray:
-        return np.asarray((rotations.log(self.residual(correction)) ** 2).sum(dim=1).numpy() / self.variance)
+    def _vectors(self, correction: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals as rotation vectors ``(E, 3)`` in radians, and their squares in units of the variance ``(E,)``."""
+        vectors = EdgeResiduals(self.edges, correction).vectors(slice(None)).numpy()
+        return vectors.T, (vectors * vectors).sum(axis=0) / self.variance
 
-    def _step(self, correction: Tensor, factor: np.ndarray) -> Tensor:
-        system = self.pattern.factorize(np.maximum(factor, _MIN_WEIGHT) / self.variance)
-        step = system.fit(rotations.log(self.residual(correction)).numpy())
+    def _step(self, correction: Tensor, vectors: np.ndarray, factor: np.ndarray) -> Tensor:
+        step = self.pattern.factorize(np.maximum(factor, _MIN_WEIGHT) / self.variance).fit(vectors)
         return rotations.normalize(rotations.multiply(correction, rotations.exp(torch.from_numpy(step))))
