@@ -21,8 +21,8 @@ from scipy.sparse.linalg import splu
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.laplacian import incidence_matrix, iterate, root_stiffness
 
-# A step that no orientation could be seen to take.
-_TOLERANCE = np.radians(0.001)
+# Conjugate gradients end at a step that no orientation could be seen to take, or at a hundredth of the first one.
+_TOLERANCE, _RELATIVE_TOLERANCE = np.radians(0.002), 1e-2
 _MAX_ITERATIONS = 12
 
 

@@ -151,6 +151,7 @@ def iterate(
     right_hand_side: np.ndarray,
     *,
     tolerance: float = 0.0,
+    relative_tolerance: float = _RELATIVE_TOLERANCE,
     max_iterations: int = _MAX_ITERATIONS,
 ) -> np.ndarray | None:
     """``L⁻¹ b`` by preconditioned conjugate gradients (Hestenes & Stiefel 1952); None if they take too long.
@@ -158,12 +159,12 @@ def iterate(
     Args:
         product, precondition: ``L x`` and ``M⁻¹ x`` of ``(N, k)`` columns, M near L.
         right_hand_side: ``(N, k)``.
-        tolerance: in the solution's unit; it ends where ``M⁻¹`` of the residual is below it, or below a thousandth of
-            what it was at the beginning.
+        tolerance, relative_tolerance: it ends where ``M⁻¹`` of the residual, in the solution's unit, is below the one,
+            or below the other times what it was at the beginning.
     """
     solution, residual = np.zeros_like(right_hand_side), right_hand_side.copy()
     scaled = precondition(residual)
-    goal = max(tolerance, _RELATIVE_TOLERANCE * float(np.abs(scaled).max(initial=0.0)))
+    goal = max(tolerance, relative_tolerance * float(np.abs(scaled).max(initial=0.0)))
     direction, energy = scaled, (residual * scaled).sum(axis=0)
     for _ in range(max_iterations):
         image = product(direction)

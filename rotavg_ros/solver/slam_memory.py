@@ -22,6 +22,7 @@ import numpy as np
 import torch
 
 from rotavg_ros.solver.closure_graph import ClosureGraph, contract_along
+from rotavg_ros.solver.grown_edges import begins_with, carried_over
 from rotavg_ros.solver.grown_laplacian import GrownLaplacian, OlderFactor
 from rotavg_ros.solver.laplacian import LaplacianPattern
 from rotavg_ros.solver.new_closures import judge_new_closures
@@ -32,18 +33,15 @@ from rotavg_ros.solver.slam_passes import SlamEstimate, Verdicts
 from rotavg_ros.solver.slam_stages import CleanedClosures, Prepared, draw_together
 from rotavg_ros.solver.slam_system import ITERATING_PAYS, GrownSystem, StaleFactorError
 from rotavg_ros.solver.slam_update import Start, follow, grown_variance, renew
-from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+from rotavg_ros.view_graph import ViewGraph
 
-# The whole solve runs again after so many updates, or once there are so many more closures.
+# The whole solve runs again after so many updates, or once there are so many more closures, in number and as a share.
 _MAX_UPDATES = 60
-_MAX_GROWTH = 0.05
+_MAX_NEW, _MAX_GROWTH = 0, 0.05
 # Closures whose verdict may turn in an update, and what share of all.
 _MAX_TURNED, _MAX_SHARE_TURNED = 2, 0.002
-# With fewer closures than this, the whole solve takes no longer than an update.
-_MIN_CLOSURES = 200
 # New closures that an update solves for from an older factorisation; with more, another one is cheaper.
 _MAX_COLUMNS = 80
-_COLUMNS = ("source", "target", "target_from_source", "kind", "label", "steps")
 
 
 class Updated(NamedTuple):
@@ -62,6 +60,7 @@ class SlamMemory:
     Attributes:
         graph: the view-graph.
         inlier_probability: ``(M,)`` that an edge is not a false one; all of a segment have that of the segment.
+        outlier_probability: ``(M,)`` that its true noise exceeds 10°, likewise.
         prior_log_odds: ``(M,)`` what the network said of closures.
         steps: ``(M,)`` variance of a closure in units of the closures'; more than 1 where neighbours err together.
         exact_share: ``(M,)`` probability of a good closure to err no more than most.
@@ -70,7 +69,7 @@ class SlamMemory:
         chain_noise: the noise as the odometry has it.
         noise: the noise as the refinement left it.
         max_step_variance: rad², as the refinement kept it.
-        elimination: ``(K,)`` nodes in the order of elimination.
+        elimination: ``(K,)`` nodes in the order of elimination; None if there was none.
         paths: of the closure graph.
         factor: what the next update may solve from; None where it factorises anew.
         closures: how many there were when the whole solve ran.
@@ -79,6 +78,7 @@ class SlamMemory:
 
     graph: ViewGraph
     inlier_probability: np.ndarray
+    outlier_probability: np.ndarray
     prior_log_odds: np.ndarray
     steps: np.ndarray
     exact_share: np.ndarray
@@ -87,7 +87,7 @@ class SlamMemory:
     chain_noise: NoiseModel
     noise: NoiseModel
     max_step_variance: float
-    elimination: np.ndarray
+    elimination: np.ndarray | None
     paths: OdometryPaths
     factor: OlderFactor | None
     closures: int
@@ -105,7 +105,7 @@ class SlamMemory:
         """After a whole solve, with variances of the nodes ``(N,)``; None where an update could not go on from it."""
         closure_graph = prepared.closure_graph
         closures = int(closure_graph.is_closure.sum())
-        if closures < _MIN_CLOSURES or prepared.is_unbiased or estimate.rank is None:
+        if prepared.is_unbiased:
             return None
         return cls(
             **_by_edge(closure_graph, estimate, cleaned.prior_log_odds),
@@ -123,20 +123,37 @@ class SlamMemory:
         Args:
             body_from_world: ``(N, 4)`` start.
         """
-        if self.updates >= _MAX_UPDATES or not _begins_with(graph, self.graph):
+        if self.updates >= _MAX_UPDATES or not begins_with(graph, self.graph):
             return None
         num_closures = int((~graph.is_odometry).sum())
-        if num_closures > (1 + _MAX_GROWTH) * self.closures:
+        if num_closures > self.closures + max(_MAX_NEW, _MAX_GROWTH * self.closures):
             return None
         paths = self.paths.grown(graph)
         closure_graph = draw_together(graph)[0] if paths is None else contract_along(graph, paths)
         start, new_closures = self._start(closure_graph, network, body_from_world)
+        if len(new_closures) == 0:
+            return self._extend(graph, start)
         updated = self._follow(graph, start) or self._renew(graph, start)
         if updated is None:
             return None
         turned = np.abs(updated.verdicts.inlier_probability - start.inlier_probability) > 0.5
         turned[new_closures] = False
         return None if turned.sum() > max(_MAX_TURNED, _MAX_SHARE_TURNED * num_closures) else updated
+
+    def _extend(self, graph: ViewGraph, start: Start) -> Updated:
+        """With odometry alone, which says nothing of what was there."""
+        closure_graph = start.graph
+        outlier_probability = carried_over(self.outlier_probability, closure_graph, 0.0)
+        verdicts = Verdicts(
+            start.correction,
+            start.inlier_probability,
+            np.where(closure_graph.is_closure, outlier_probability, 1 - start.inlier_probability),
+            self.noise,
+            closure_graph.steps,
+            start.exact_share,
+            start.prediction_variance,
+        )
+        return self._updated(graph, start, verdicts, self.factor)
 
     def _follow(self, graph: ViewGraph, start: Start) -> Updated | None:
         """With noise and predictions of before; None where they are not for that, or no longer serve."""
@@ -150,16 +167,14 @@ class SlamMemory:
                 break
         if verdicts is None:
             return None
-        variance = grown_variance(self.variance, closure_graph, weight)
-        memory = replace(
-            self,
-            **_by_edge(closure_graph, verdicts, start.prior_log_odds),
-            graph=graph,
-            variance=variance,
-            factor=laplacian.factor,
-            updates=self.updates + 1,
-        )
-        return Updated(closure_graph, verdicts, variance, memory)
+        return self._updated(graph, start, verdicts, laplacian.factor)
+
+    def _updated(self, graph: ViewGraph, start: Start, verdicts: Verdicts, factor: OlderFactor | None) -> Updated:
+        """With the noise and predictions of before."""
+        variance = grown_variance(self.variance, start.graph, start.weight)
+        by_edge = _by_edge(start.graph, verdicts, start.prior_log_odds)
+        memory = replace(self, **by_edge, graph=graph, variance=variance, factor=factor, updates=self.updates + 1)
+        return Updated(start.graph, verdicts, variance, memory)
 
     def _factors(self, start: Start, weight: np.ndarray) -> Iterator[OlderFactor]:
         """What may be solved from: the factor there is, as long as not too much is new, and another one."""
@@ -196,11 +211,11 @@ class SlamMemory:
         steps, inlier_probability, prior = (
             graph.steps.copy(),
             *(
-                self._extended(value, graph, otherwise)
+                carried_over(value, graph, otherwise)
                 for value, otherwise in ((self.inlier_probability, 1.0), (self.prior_log_odds, 0.0))
             ),
         )
-        steps[closure] = self._extended(self.steps, graph, 1.0)[closure]
+        steps[closure] = carried_over(self.steps, graph, 1.0)[closure]
         if len(new):
             judged = judge_new_closures(network, self.chain_noise, graph, closure, new, steps)
             inlier_probability[new], prior[new], steps[new] = judged
@@ -210,23 +225,15 @@ class SlamMemory:
             inlier_probability,
             self.noise,
             prior,
-            self._extended(self.exact_share, graph, 1.0),
-            self._extended(self.prediction_variance, graph, 0.0),
+            carried_over(self.exact_share, graph, 1.0),
+            carried_over(self.prediction_variance, graph, 0.0),
         )
         return start, new
 
-    def _extended(self, value: np.ndarray, closure_graph: ClosureGraph, otherwise: float) -> np.ndarray:
-        """Values ``(M,)`` of this graph's edges → those of a larger one's closure graph ``(E,)``; a segment's least."""
-        of_edge = np.full(len(closure_graph.segment_of_edge), otherwise)
-        of_edge[: len(value)] = value
-        out = np.full(len(closure_graph.source), otherwise)
-        on_segment = closure_graph.segment_of_edge >= 0
-        np.minimum.at(out, closure_graph.segment_of_edge[on_segment], of_edge[on_segment])
-        out[closure_graph.num_segments :] = of_edge[closure_graph.view_graph_edge]
-        return out
-
-    def _rank(self, graph: ClosureGraph) -> np.ndarray:
+    def _rank(self, graph: ClosureGraph) -> np.ndarray | None:
         """Order of elimination ``(K,)``: as it was, and what is new comes last."""
+        if self.elimination is None:
+            return None
         place = np.full(len(graph.odometry_orientation), np.iinfo(np.int64).max)
         place[self.elimination] = np.arange(len(self.elimination))
         rank = np.empty(graph.num_nodes, dtype=np.int64)
@@ -238,6 +245,7 @@ def _by_edge(graph: ClosureGraph, verdicts: Verdicts, prior_log_odds: np.ndarray
     """What is remembered of every edge of the view-graph, ``(M,)`` each."""
     return {
         "inlier_probability": graph.edge_values(verdicts.inlier_probability),
+        "outlier_probability": graph.edge_values(verdicts.outlier_probability),
         "prior_log_odds": graph.edge_values(prior_log_odds),
         "steps": graph.edge_values(verdicts.steps),
         "exact_share": graph.edge_values(verdicts.exact_share),
@@ -248,17 +256,8 @@ def _by_edge(graph: ClosureGraph, verdicts: Verdicts, prior_log_odds: np.ndarray
 
 def _of_estimate(graph: ClosureGraph, estimate: SlamEstimate) -> dict[str, Any]:
     """What is remembered of the passes."""
-    assert estimate.rank is not None
     return {
         "noise": estimate.noise,
-        "elimination": graph.nodes[np.argsort(estimate.rank)],
+        "elimination": None if estimate.rank is None else graph.nodes[np.argsort(estimate.rank)],
         "factor": OlderFactor.of(graph, estimate.factorised.solve) if graph.num_nodes >= ITERATING_PAYS else None,
     }
-
-
-def _begins_with(graph: ViewGraph, earlier: ViewGraph) -> bool:
-    """Whether all edges of ``earlier`` come first in ``graph``, as they were, and of the others none has a label."""
-    count = earlier.num_edges
-    if count > graph.num_edges or bool((graph.label[count:] != EdgeLabel.AUTOMATIC).any()):
-        return False
-    return all(torch.equal(getattr(graph, name)[:count], getattr(earlier, name)) for name in _COLUMNS)

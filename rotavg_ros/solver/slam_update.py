@@ -69,11 +69,11 @@ class Start:
         return state
 
 
-def renew(start: Start, rank: np.ndarray, max_step_variance: float) -> SlamEstimate | None:
+def renew(start: Start, rank: np.ndarray | None, max_step_variance: float) -> SlamEstimate | None:
     """Factorise, estimate the noise and every edge's prediction anew.
 
     Args:
-        rank: ``(K,)`` order of elimination.
+        rank: ``(K,)`` order of elimination; None if it is not known.
         max_step_variance: rad², see :class:`~rotavg_ros.solver.slam_passes.SlamEstimate`.
 
     Returns:

@@ -60,6 +60,25 @@ def test_updates_end_where_a_whole_solve_does(city: ViewGraph, monkeypatch: pyte
     torch.testing.assert_close(solution.uncertainty.mean(), whole.uncertainty.mean(), rtol=0.1, atol=0.0)
 
 
+def test_odometry_alone_says_nothing_of_what_was_there(city: ViewGraph) -> None:
+    before = solve(until(city, 500))
+    graph = until(city, 520)
+    is_known = torch.maximum(graph.source, graph.target) < 500
+    graph = graph.select_edges(is_known | graph.is_odometry)
+    after = grown(before, graph)
+    assert "refine" not in after.stage_seconds
+    torch.testing.assert_close(after.body_from_world[:500], before.body_from_world, rtol=0, atol=1e-9)
+    num_known = int(is_known.sum())
+    torch.testing.assert_close(after.outlier_score[:num_known], before.outlier_score)
+    torch.testing.assert_close(after.uncertainty[:500], before.uncertainty)
+    new = graph.select_edges(torch.arange(num_known, graph.num_edges))
+    predicted = rotations.multiply(new.target_from_source, after.body_from_world[new.source])
+    assert float(rotations.angle_between(predicted, after.body_from_world[new.target]).max()) < 1e-6
+    variance = after.uncertainty[499:].numpy() ** 2
+    np.testing.assert_allclose(np.diff(variance), np.diff(variance)[0])  # a random walk
+    assert variance[1] > variance[0]
+
+
 @pytest.mark.parametrize("was_good", [True, False])
 def test_a_wrong_verdict_is_put_right_in_an_update(city: ViewGraph, was_good: bool) -> None:
     graph = until(city, 500)
