@@ -47,13 +47,6 @@ class CalibrationBins:
         return float((rows[:, 0] * np.abs(rows[:, 1] - rows[:, 2])).sum() / max(rows[:, 0].sum(), 1))
 
 
-def reliability(probability: Tensor, happened: Tensor, bins: int = _BINS) -> np.ndarray:
-    """:attr:`CalibrationBins.rows` of one set of scores."""
-    collected = CalibrationBins(bins)
-    collected.add(probability, happened)
-    return collected.rows
-
-
 def expected_calibration_error(probability: Tensor, happened: Tensor, bins: int = _BINS) -> float:
     """:attr:`CalibrationBins.error` of one set of scores."""
     collected = CalibrationBins(bins)

@@ -9,14 +9,15 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rotavg_ros import rotations
+from rotavg_ros.datasets.false_closures import FALSE_CLOSURE_DEG
 from rotavg_ros.evaluation.metrics import OutlierCounts, gauge_alignment, orientation_errors, true_edge_noise
 from rotavg_ros.evaluation.node_answer import NodeAnswer
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
 
 FloatArray = NDArray[np.floating]
 
-_FALSE_CLOSURE_RAD = np.radians(10)
-_CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
+_FALSE_CLOSURE_RAD = np.radians(FALSE_CLOSURE_DEG)
 
 
 @dataclass(frozen=True)
@@ -175,4 +176,4 @@ def _errors(estimate: FloatArray, truth: FloatArray, component: NDArray[np.int64
 
 
 def _inverse(quaternions: FloatArray) -> torch.Tensor:
-    return torch.from_numpy(quaternions * _CONJUGATE)
+    return rotations.inverse(torch.from_numpy(quaternions))

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros.baselines.start import spanning_forest
+from rotavg_ros.datasets.false_closures import FALSE_CLOSURE_DEG
 from rotavg_ros.evaluation.contenders import ContenderError
 from rotavg_ros.evaluation.kept_answers import kept
 from rotavg_ros.evaluation.least_squares import least_squares
@@ -25,7 +26,7 @@ from rotavg_ros.solver.spanning_tree import compose_orientations
 from rotavg_ros.view_graph import ViewGraph
 
 OURS = "neurora"
-_OUTLIER_ANGLE = np.radians(10.0)
+_OUTLIER_ANGLE = np.radians(FALSE_CLOSURE_DEG)
 
 
 @dataclass(frozen=True)

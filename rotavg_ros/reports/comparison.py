@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from rotavg_ros import rotations
 from rotavg_ros.datasets.ground_truth import MAX_STAMP_DISTANCE_NS
 from rotavg_ros.evaluation.metrics import gauge_alignment, orientation_errors
 
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
     from rotavg_ros.replay.record import Reference, RobotRecord
 
 FloatArray = NDArray[np.float64]
-
-_CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -193,4 +192,4 @@ def _finite(rows: FloatArray) -> NDArray[np.bool_]:
 
 
 def _inverse(quaternions: FloatArray) -> torch.Tensor:
-    return torch.from_numpy(quaternions * _CONJUGATE)
+    return rotations.inverse(torch.from_numpy(quaternions))

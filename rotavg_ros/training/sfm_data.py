@@ -23,8 +23,6 @@ class SfmBatch:
         source, target: ``(M,)``.
         measured, true_relative: ``(M, 4)`` target_from_source.
         is_outlier: ``(M,)`` bool.
-        truth: ``(N, 4)`` body_from_world.
-        first_node: ``(graphs + 1,)`` offsets of the graphs' nodes.
         edges: both directions of the edges.
     """
 
@@ -33,16 +31,12 @@ class SfmBatch:
     measured: Tensor
     true_relative: Tensor
     is_outlier: Tensor
-    truth: Tensor
-    first_node: Tensor
     edges: DirectedEdges
 
     def to(self, device: torch.device) -> SfmBatch:
+        """The same on another device."""
         edges = DirectedEdges(*(getattr(self.edges, n).to(device) for n in ("source", "target", "inverse_degree")))
-        moved = {
-            name: getattr(self, name).to(device)
-            for name in ("source", "target", "measured", "true_relative", "is_outlier", "truth", "first_node")
-        }
+        moved = {name: value.to(device) for name, value in vars(self).items() if name != "edges"}
         return SfmBatch(**moved, edges=edges)
 
 
@@ -112,7 +106,5 @@ def join(
         torch.cat(measured),
         rotations.canonical(true_relative),
         torch.cat(outlier),
-        truth,
-        torch.from_numpy(first_node),
         DirectedEdges.of(sources, targets, len(truth)),
     )

@@ -7,7 +7,7 @@ import torch
 from rotavg_ros import rotations
 from rotavg_ros.datasets.synthetic import ReleasedRecipe
 from rotavg_ros.errors import UserError
-from rotavg_ros.evaluation.calibration import CalibrationBins, expected_calibration_error, reliability
+from rotavg_ros.evaluation.calibration import CalibrationBins, expected_calibration_error
 from rotavg_ros.evaluation.contenders import Answer, Case, contenders, warm_up
 from rotavg_ros.evaluation.scoring import Scores, roc_area, score, score_all
 
@@ -95,9 +95,7 @@ def test_bins_collect_what_is_added() -> None:
     bins = CalibrationBins()
     bins.add(torch.tensor([0.05, 0.95]), torch.tensor([False, True]))
     bins.add(torch.tensor([0.05, 1.0]), torch.tensor([True, True]))
-    together = reliability(torch.tensor([0.05, 0.95, 0.05, 1.0]), torch.tensor([False, True, True, True]))
-    np.testing.assert_allclose(bins.rows, together)
-    assert bins.rows[0, 2] == 0.5
+    np.testing.assert_allclose(bins.rows, [[2, 0.05, 0.5], [2, 0.975, 1.0]])
 
 
 def test_an_interrupted_run_keeps_the_cases_that_all_have_solved(cases: list[Case]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -120,13 +120,13 @@ def draw_scaling(path: Path, results: Mapping[str, Sequence[Result]]) -> None:
     figure.savefig(path)
 
 
-def _draw(axes: Axes, results: Sequence[Result], value: object, title: str) -> None:
+def _draw(axes: Axes, results: Sequence[Result], value: Callable[[Measurement], float], title: str) -> None:
     contenders = dict.fromkeys(name for result in results for name in result.measured)
     for name in contenders:
         points = [result.measured[name] for result in results if name in result.measured]
         colour = PALETTE[list(LABELS).index(name) % len(PALETTE)]
         edges = [point.edges for point in points]
-        axes.plot(edges, [value(point) for point in points], "o-", color=colour, markersize=4, label=LABELS[name])  # type: ignore[operator]
+        axes.plot(edges, [value(point) for point in points], "o-", color=colour, markersize=4, label=LABELS[name])
     axes.set_xscale("log")
     axes.set_yscale("log")
     for axis in (axes.xaxis, axes.yaxis):
