@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from scipy.spatial.transform import Rotation
 
 rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import QuaternionStamped
+from geometry_msgs.msg import Quaternion, QuaternionStamped
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -132,7 +133,8 @@ class LiveNode:
         self.reports = 0
         self.said: list[tuple[int, str]] = []
         self.reported_at: Time | None = None
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        # Deeper than what the node keeps: a late test must not miss what the next answer follows at once.
+        latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         probe.create_subscription(AbsoluteOrientations, "/abs_orientations", self.answers.append, latched)
         probe.create_subscription(OutlierFlags, "/outlier_flags", self.flags.append, latched)
         probe.create_subscription(QuaternionStamped, "/orientation", self.orientations.append, 10_000)
@@ -162,6 +164,15 @@ class LiveNode:
         return {
             tuple(info.endpoint_gid) for topic in topics for info in self.probe.get_subscriptions_info_by_topic(topic)
         }
+
+    def turn(self, start: int, stop: int) -> None:
+        """Odometry of seconds ``start`` to ``stop``: a robot that turns on a slope, by 0.2 rad a second."""
+        for index in range(start, stop):
+            message = Odometry()
+            message.header.stamp = Time(sec=1000 + index)
+            x, y, z, w = Rotation.from_rotvec([0.1, 0, 0.2 * index]).as_quat().tolist()
+            message.pose.pose.orientation = Quaternion(x=x, y=y, z=z, w=w)
+            self.odometry.publish(message)
 
     def spin_until(self, condition: Callable[[], bool], timeout: float = 300.0) -> None:
         """Take messages until the condition holds; fails when the node ends or the time is over."""

@@ -10,7 +10,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
-from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion
 from nav_msgs.msg import Odometry
 from rotavg_msgs.msg import KeyframeReference, RelativeRotation
@@ -40,15 +39,6 @@ sys.exit(main())
 """
 
 
-def feed(live_node, start: int, stop: int) -> None:
-    for index in range(start, stop):
-        message = Odometry()
-        message.header.stamp = Time(sec=1000 + index)
-        x, y, z, w = Rotation.from_rotvec([0.1, 0, 0.2 * index]).as_quat().tolist()
-        message.pose.pose.orientation = Quaternion(x=x, y=y, z=z, w=w)
-        live_node.odometry.publish(message)
-
-
 def says(live_node, level: int, *words: str) -> None:
     """Wait for the next report of this level with these words in its message."""
 
@@ -65,11 +55,11 @@ def says(live_node, level: int, *words: str) -> None:
 def test_silence_refusals_and_contradictions_are_warned_of_and_pass(live_node) -> None:
     live_node.start(*EVERY_MESSAGE, "odometry_timeout_s:=1.5")
     says(live_node, WARN, "no odometry yet")
-    feed(live_node, 0, 20)
+    live_node.turn(0, 20)
     says(live_node, OK, "ok")
     says(live_node, WARN, "no odometry for")
     live_node.odometry.publish(Odometry())  # a quaternion of zeros, stamped 1970
-    feed(live_node, 20, 30)
+    live_node.turn(20, 30)
     says(live_node, WARN, "1 inputs refused")
     for edge_id in range(12):  # closures that contradict odometry and each other
         ends = [KeyframeReference(id=index) for index in (edge_id, 29 - edge_id)]
@@ -78,7 +68,7 @@ def test_silence_refusals_and_contradictions_are_warned_of_and_pass(live_node) -
         live_node.edges.publish(RelativeRotation(id=edge_id, source=ends[0], target=ends[1], rotation=rotation, kind=1))
     says(live_node, WARN, "% of the loop closures are outliers")
     assert live_node.call("reset").success
-    feed(live_node, 0, 20)
+    live_node.turn(0, 20)
     says(live_node, OK, "ok")
 
 
@@ -86,10 +76,10 @@ def test_a_solver_that_fails_or_hangs_stops_nothing_else(live_node, tmp_path: Pa
     order = tmp_path / "order"
     order.write_text("work")
     live_node.start(*EVERY_MESSAGE, command=[sys.executable, "-c", SABOTAGED, order])
-    feed(live_node, 0, 10)
+    live_node.turn(0, 10)
     live_node.wait_for_silence()
     order.write_text("fail")
-    feed(live_node, 10, 20)
+    live_node.turn(10, 20)
     says(live_node, ERROR, "solving fails: the factorisation broke down")
     refused = live_node.call("solve_now")
     assert not refused.success and "factorisation" in refused.message
@@ -100,7 +90,7 @@ def test_a_solver_that_fails_or_hangs_stops_nothing_else(live_node, tmp_path: Pa
     assert "Traceback" not in live_node.process.output
 
     order.write_text("hang")
-    feed(live_node, 20, 30)
+    live_node.turn(20, 30)
     says(live_node, ERROR, "the answer is stale")
     live_node.spin_until(lambda: len(live_node.orientations) == 30)
     assert live_node.stop(signal.SIGTERM) == 0

@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from scipy.spatial.transform import Rotation
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Quaternion
-from nav_msgs.msg import Odometry
 from rosgraph_msgs.msg import Clock
 
 pytestmark = pytest.mark.ros
@@ -18,20 +15,11 @@ pytestmark = pytest.mark.ros
 EVERY_MESSAGE = ("keyframe_angle_deg:=0.0", "keyframe_distance_m:=0.0", "solve_period_s:=0.1")
 
 
-def feed(live_node, start: int, stop: int) -> None:
-    for index in range(start, stop):
-        message = Odometry()
-        message.header.stamp = Time(sec=1000 + index)
-        x, y, z, w = Rotation.from_rotvec([0.1, 0, 0.2 * index]).as_quat().tolist()
-        message.pose.pose.orientation = Quaternion(x=x, y=y, z=z, w=w)
-        live_node.odometry.publish(message)
-
-
 def test_a_bag_that_is_played_again_begins_a_new_graph(live_node) -> None:
     live_node.start(*EVERY_MESSAGE)
-    feed(live_node, 0, 30)
+    live_node.turn(0, 30)
     first = live_node.wait_for_silence()
-    feed(live_node, 0, 20)
+    live_node.turn(0, 20)
     live_node.spin_until(lambda: live_node.status["time jumps"] == "1")
     again = live_node.wait_for_silence()
     assert list(again.keyframe_ids) == list(range(20))
@@ -43,13 +31,13 @@ def test_a_bag_that_is_played_again_begins_a_new_graph(live_node) -> None:
 
 def test_a_clock_that_goes_back_is_an_error_where_that_is_asked_for(live_node) -> None:
     live_node.start(*EVERY_MESSAGE, "on_time_jump:=error")
-    feed(live_node, 0, 10)
+    live_node.turn(0, 10)
     live_node.wait_for_silence()
-    feed(live_node, 0, 9)
+    live_node.turn(0, 9)
     live_node.spin_until(lambda: live_node.status["level"] == "2")
     assert "call ~/reset" in live_node.status["message"] and live_node.status["keyframes"] == "10"
     assert live_node.call("reset").success
-    feed(live_node, 0, 9)
+    live_node.turn(0, 9)
     live_node.spin_until(lambda: live_node.status["keyframes"] == "9" and live_node.status["level"] == "0")
 
 
@@ -64,9 +52,9 @@ def test_simulated_time_that_restarts(live_node) -> None:
         live_node.spin_until(lambda: condition() or clock.publish(Clock(clock=Time(sec=seconds))))
 
     with_clock_at(1030, lambda: live_node.reported_at == Time(sec=1030))
-    feed(live_node, 0, 30)
+    live_node.turn(0, 30)
     assert len(live_node.wait_for_silence().keyframe_ids) == 30
     with_clock_at(1000, lambda: live_node.status["keyframes"] == "0" and live_node.status["time jumps"] == "1")
     live_node.spin_until(lambda: len(live_node.answers[-1].keyframe_ids) == 0)
-    feed(live_node, 0, 3)
+    live_node.turn(0, 3)
     live_node.spin_until(lambda: live_node.status["keyframes"] == "3")
