@@ -108,7 +108,8 @@ def _alternate(state: Passes, max_step_variance: float, max_passes: int) -> bool
 
 
 def grown_variance(known: np.ndarray, graph: ClosureGraph, weight: np.ndarray) -> np.ndarray:
-    """Variance of all nodes ``(N,)``, rad²: that of new ones as the best single way from an older one has it.
+    """Variance of all nodes ``(N,)``, rad²: that of new ones as the best single way from an older one, or from the first
+    of a new component, has it.
 
     Args:
         known: ``(n,)`` of the first n nodes.
@@ -117,6 +118,7 @@ def grown_variance(known: np.ndarray, graph: ClosureGraph, weight: np.ndarray) -
     is_known = graph.nodes < len(known)
     at_key = np.full(graph.num_nodes, np.inf)
     at_key[is_known] = known[graph.nodes[is_known]]
+    at_key[graph.roots] = 0.0
     edge = np.flatnonzero(~is_known[graph.source] | ~is_known[graph.target])
     ends = np.concatenate((graph.source[edge], graph.target[edge]))
     others = np.concatenate((graph.target[edge], graph.source[edge]))

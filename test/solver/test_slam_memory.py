@@ -79,6 +79,31 @@ def test_odometry_alone_says_nothing_of_what_was_there(city: ViewGraph) -> None:
     assert variance[1] > variance[0]
 
 
+@pytest.mark.parametrize("is_large", [False, True], ids=["factorised anew", "followed"])
+@pytest.mark.parametrize("has_closure", [False, True])
+def test_a_second_robot_begins(
+    city: ViewGraph, monkeypatch: pytest.MonkeyPatch, has_closure: bool, is_large: bool
+) -> None:
+    if is_large:
+        monkeypatch.setattr(slam_memory, "ITERATING_PAYS", 0)
+    before = solve(until(city, 500))
+    first = 504 if has_closure else 500
+    chain = until(city, 4)
+    chain = chain.select_edges(chain.is_odometry)
+    known, both = until(city, 500), until(city, first)
+    later = both.select_edges(torch.maximum(both.source, both.target) >= 500)
+    parts = known, later, replace(chain, source=chain.source + first, target=chain.target + first)
+    names = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
+    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    graph = ViewGraph(first + 4, **columns)
+    after, whole = grown(before, graph), solve(graph)
+    assert "refine" not in after.stage_seconds
+    assert float(after.uncertainty[first]) == 0.0
+    torch.testing.assert_close(after.uncertainty[first:], whole.uncertainty[first:], rtol=0.3, atol=0.0)
+    angle = rotations.angle_between(after.body_from_world, whole.body_from_world)
+    assert np.degrees(float(angle.mean())) < 0.1
+
+
 @pytest.mark.parametrize("was_good", [True, False])
 def test_a_wrong_verdict_is_put_right_in_an_update(city: ViewGraph, was_good: bool) -> None:
     graph = until(city, 500)
