@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import log_expit
 
 from rotavg_ros.solver.agreement import AgreementPairs
 from rotavg_ros.solver.closure_graph import ClosureGraph
@@ -18,6 +17,10 @@ from rotavg_ros.solver.noise_model import NoiseModel
 
 _ROUNDS = 20
 _DAMPING = 0.5
+# Messages that all change by less than this, in nats, are final; what they are kept within, and probabilities.
+_SETTLED = 0.02
+_MAX_LOG_ODDS = 50.0
+_MIN_PROBABILITY = np.float32(1e-6)
 # Cycles that share a closure share its error; each counts this much of an independent one.
 _TEMPER = 0.5
 # A cycle through more segments than this tells nobody's fault.
@@ -47,24 +50,33 @@ def count_votes(
         segment_log_odds: ``(S,)`` the same of each segment.
     """
     num_segments = graph.num_segments
-    cycle, member, square, steps = _cycles(graph, pairs)
-    num_cycles = len(square)
-    variance = np.maximum(steps, 0.5) * noise.step_variance + 2 * noise.closure_variance
-    closes = noise.inlier_log_odds(square, variance)[cycle]
+    first, member, square, steps = _cycles(graph, pairs)
     prior = np.concatenate((segment_log_odds, closure_log_odds))
-    message = np.zeros(len(cycle))
+    if len(square) == 0:
+        return CycleVotes(prior[num_segments:], prior[:num_segments])
+    variance = np.maximum(steps, 0.5) * noise.step_variance + 2 * noise.closure_variance
+    closes = noise.inlier_log_odds(square, variance)
+    length = np.diff(first, append=len(member))
+    # By how much likelier the cycle's discrepancy is if all are good; messages are good to 1e-6 in single precision.
+    ratio = np.repeat(np.exp(np.clip(closes, -_MAX_LOG_ODDS, _MAX_LOG_ODDS)), length).astype(np.float32)
+    message = np.zeros(len(member), dtype=np.float32)
     for _ in range(_ROUNDS):
         belief = prior + np.bincount(member, message, len(prior))
-        is_good = log_expit(belief[member] - message)
-        others_good = np.minimum(np.bincount(cycle, is_good, num_cycles)[cycle] - is_good, -1e-9)
-        vote = np.logaddexp(np.log(-np.expm1(others_good)), others_good + closes)
-        message = _DAMPING * message + (1 - _DAMPING) * _TEMPER * vote
+        not_good = np.exp(np.minimum(message - belief.astype(np.float32)[member], _MAX_LOG_ODDS))
+        is_good = np.maximum(1 / (1 + not_good), _MIN_PROBABILITY)
+        all_good = np.repeat(np.multiply.reduceat(is_good, first), length)
+        others_good = np.minimum(all_good / is_good, 1 - _MIN_PROBABILITY)
+        vote = np.log(1 - others_good + others_good * ratio)
+        change = (1 - _DAMPING) * (_TEMPER * vote - message)
+        message += change
+        if np.abs(change).max() < _SETTLED:
+            break
     belief = prior + np.bincount(member, message, len(prior))
     return CycleVotes(belief[num_segments:], belief[:num_segments])
 
 
 def _cycles(graph: ClosureGraph, pairs: AgreementPairs) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Cycle and member of every incidence (segments first, then closures); squared angle and steps of every cycle."""
+    """First member of every cycle, members (segments first, then closures); squared angle and steps of every cycle."""
     closure, num_segments = np.flatnonzero(graph.is_closure), graph.num_segments
     first, second = np.minimum(pairs.first, pairs.second), np.maximum(pairs.first, pairs.second)
     _, unique = np.unique(first * np.int64(len(closure)) + second, return_index=True)
@@ -88,4 +100,8 @@ def _cycles(graph: ClosureGraph, pairs: AgreementPairs) -> tuple[np.ndarray, np.
         within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         cycle.append(np.repeat(number, count))
         member.append(order[np.repeat(begin, count) + within])
-    return np.concatenate(cycle), np.concatenate(member), pairs.squared_angle[unique][kept], pairs.steps[unique][kept]
+    by_cycle = np.argsort(np.concatenate(cycle), kind="stable")
+    chosen = unique[kept]
+    lengths = 2 + (counts[0] + counts[1])[kept]
+    members = np.concatenate(member)[by_cycle]
+    return np.cumsum(lengths) - lengths, members, pairs.squared_angle[chosen], pairs.steps[chosen]

@@ -17,7 +17,8 @@ from scipy.special import expit
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.closure_graph import ClosureGraph
-from rotavg_ros.solver.noise_model import NoiseModel, log_uniform_density
+from rotavg_ros.solver.mixture import log_uniform_density
+from rotavg_ros.solver.noise_model import NoiseModel
 from rotavg_ros.solver.spanning_tree import SpanningForest, accumulate_to_root
 from rotavg_ros.view_graph import ViewGraph
 

@@ -38,8 +38,9 @@ def jump_to_optimum(
         is_agreed: ``(P,)`` bool, the pairs that agree.
         is_trusted: ``(C,)`` bool, closures whose residual is worth a jump.
     """
+    hopeless = np.zeros(len(cost.cap))
     for _ in range(_MAX_ROUNDS):
-        jumped, gained = _round_of_jumps(cost, correction, pairs, is_agreed, is_trusted)
+        jumped, gained = _round_of_jumps(cost, correction, pairs, is_agreed, is_trusted, hopeless)
         if gained < _MIN_GAIN:
             break
         correction = min(jumped, cost.descend(jumped), key=cost.total)
@@ -47,9 +48,18 @@ def jump_to_optimum(
 
 
 def _round_of_jumps(
-    cost: TruncatedCost, correction: Tensor, pairs: AgreementPairs, is_agreed: np.ndarray, is_trusted: np.ndarray
+    cost: TruncatedCost,
+    correction: Tensor,
+    pairs: AgreementPairs,
+    is_agreed: np.ndarray,
+    is_trusted: np.ndarray,
+    hopeless: np.ndarray,
 ) -> tuple[Tensor, float]:
-    """One jump by each wrong edge that still is one when its turn comes; corrections and the cost saved."""
+    """One jump by each wrong edge that still is one when its turn comes; corrections and the cost saved.
+
+    Args:
+        hopeless: ``(E,)`` what an edge's jump might have gained when it gained nothing; brought up to date.
+    """
     residual = cost.residual(correction)
     costs = cost.of_edges(residual)
     gained = 0.0
@@ -59,12 +69,16 @@ def _round_of_jumps(
     # What an edge loses if one end turns is what it is yet short of its cap, or less if it turns but a little.
     system = cost.pattern.factorize(np.maximum(cost.cap - costs, _MIN_CARRIED))
     bounds = _turns(cost, residual, residual[candidates], costs).gain_bounds(system)
-    for edge in candidates[bounds > _MIN_GAIN]:
+    for edge in candidates[bounds > hopeless[candidates] + _MIN_GAIN]:
         if costs[edge] < 0.5 * cost.cap[edge]:
             continue
-        moves = _turns(cost, residual, residual[[edge]], costs).best_set()
-        moved = torch.from_numpy(np.flatnonzero(moves))
-        if len(moved) in (0, len(moves)):
+        question = _turns(cost, residual, residual[[edge]], costs)
+        bound = float(question.gain_bounds(system)[0])
+        if bound <= hopeless[edge] + _MIN_GAIN:
+            continue
+        hopeless[edge] = bound
+        moved = torch.from_numpy(np.flatnonzero(question.best_set()))
+        if len(moved) in (0, cost.graph.num_nodes):
             continue
         tried = correction.clone()
         # Norms multiply with every jump; rounding errors would, too.
@@ -75,6 +89,7 @@ def _round_of_jumps(
         if gain > _MIN_GAIN:
             correction, residual, costs = tried, tried_residual, tried_costs
             gained += gain
+            hopeless[edge] = 0.0
     return correction, gained
 
 

@@ -30,21 +30,26 @@ class Discrepancies:
         steps: ``(D,)`` odometry steps that each passes.
         closures: number of closures in each.
         weight: what each counts for.
-        log_uniform: ``(D,)`` log density of the uniform distribution at each.
     """
 
     squared_angle: np.ndarray
     steps: np.ndarray
     closures: int
     weight: float
-    log_uniform: np.ndarray
 
     def thinned(self, size: int) -> Discrepancies:
         """Evenly spread rows, about ``size``, that weigh as much as all of them."""
         stride = max(1, len(self.steps) // size)
-        columns = (np.ascontiguousarray(c[::stride]) for c in (self.squared_angle, self.steps, self.log_uniform))
-        squared_angle, steps, log_uniform = columns
-        return Discrepancies(squared_angle, steps, self.closures, stride * self.weight, log_uniform)
+        return Discrepancies(self.squared_angle[::stride], self.steps[::stride], self.closures, stride * self.weight)
+
+
+def log_uniform_density(angle: np.ndarray, components: int) -> np.ndarray:
+    """Log density of the uniform distribution over rotations at a rotation vector of length ``angle`` (rad)."""
+    if components == 1:
+        return np.full(len(angle), -np.log(2 * np.pi))
+    # Haar measure in rotation-vector coordinates: (1 − cos θ) / (4π² θ²).
+    half = np.sinc(np.minimum(angle, np.pi) / (2 * np.pi))
+    return np.asarray(np.log(half * half / (8 * np.pi**2)))
 
 
 class Mixtures(NamedTuple):
@@ -76,11 +81,10 @@ class MixtureFit:
     def __init__(self, kinds: Sequence[Discrepancies], components: int) -> None:
         self._k = components
         # In single precision exponentials and logarithms take a fifth of the time.
-        squared_angle, steps, log_uniform = (
-            np.concatenate(columns, dtype=np.float32)
-            for columns in zip(*((kind.squared_angle, kind.steps, kind.log_uniform) for kind in kinds), strict=True)
-        )
-        self._half_square, self._steps = squared_angle / 2, steps
+        squared_angle = np.concatenate([kind.squared_angle for kind in kinds], dtype=np.float32)
+        log_uniform = log_uniform_density(np.sqrt(squared_angle), components).astype(np.float32)
+        self._half_square = squared_angle / 2
+        self._steps = np.concatenate([kind.steps for kind in kinds], dtype=np.float32)
         self._false = log_uniform + np.float32(components / 2 * np.log(2 * np.pi))
         size = [len(kind.steps) for kind in kinds]
         self._closures = np.repeat([kind.closures for kind in kinds], size).astype(np.float32)

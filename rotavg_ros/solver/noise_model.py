@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 
 from rotavg_ros.solver.agreement import AgreementPairs
-from rotavg_ros.solver.mixture import Discrepancies, MixtureFit, Mixtures
+from rotavg_ros.solver.mixture import Discrepancies, MixtureFit, Mixtures, log_uniform_density
 
 # What is assumed where there is nothing to estimate from.
 _PRIOR_STEP_VARIANCE = np.radians(0.3) ** 2
@@ -74,36 +74,20 @@ class NoiseModel:
         return float(np.log1p(-self.outlier_share) - np.log(self.outlier_share))
 
 
-def log_uniform_density(angle: np.ndarray, components: int) -> np.ndarray:
-    """Log density of the uniform distribution over rotations at a rotation vector of length ``angle`` (rad)."""
-    if components == 1:
-        return np.full(len(angle), -np.log(2 * np.pi))
-    # Haar measure in rotation-vector coordinates: (1 − cos θ) / (4π² θ²).
-    half = np.sinc(np.minimum(angle, np.pi) / (2 * np.pi))
-    return np.asarray(np.log(half * half / (8 * np.pi**2)))
-
-
 def outlier_share(inlier_probability: np.ndarray) -> float:
     """Share of false closures, kept off 0 and 1 by a prior of a few counts."""
     false_count, total_count = _PRIOR_OUTLIER_COUNTS[0], sum(_PRIOR_OUTLIER_COUNTS)
     return float(((1 - inlier_probability).sum() + false_count) / (len(inlier_probability) + total_count))
 
 
-def discrepancies(
-    squared_angle: np.ndarray, path_steps: np.ndarray, pairs: AgreementPairs, components: int
-) -> list[Discrepancies]:
+def discrepancies(squared_angle: np.ndarray, path_steps: np.ndarray, pairs: AgreementPairs) -> list[Discrepancies]:
     """Of every closure with the odometry (``(C,)`` each; infinite steps tell nothing), and of agreeing closures."""
     on_chain = np.isfinite(path_steps)
     # Every closure has as many pairs; together they count as one.
     per_closure = len(pairs.first) / max(len(np.unique(pairs.first)), 1)
-
-    def kind(squared_angle: np.ndarray, steps: np.ndarray, closures: int, weight: float) -> Discrepancies:
-        uniform = log_uniform_density(np.sqrt(squared_angle), components)
-        return Discrepancies(squared_angle, steps, closures, weight, uniform)
-
     return [
-        kind(squared_angle[on_chain], np.maximum(path_steps[on_chain], 1.0), 1, 1.0),
-        kind(pairs.squared_angle, np.maximum(pairs.steps, 0.5), 2, 1 / max(per_closure, 1.0)),
+        Discrepancies(squared_angle[on_chain], np.maximum(path_steps[on_chain], 1.0), 1, 1.0),
+        Discrepancies(pairs.squared_angle, np.maximum(pairs.steps, 0.5), 2, 1 / max(per_closure, 1.0)),
     ]
 
 
@@ -151,7 +135,7 @@ def _likeliest(data: Sequence[Discrepancies], few: MixtureFit, components: int) 
 
 def noise_between_neighbours(pairs: AgreementPairs, components: int) -> NoiseModel:
     """The noise as neighbouring closures see it: without the odometry that lies farther between, so immune to slips."""
-    data = discrepancies(np.empty(0), np.empty(0), pairs, components)
+    data = discrepancies(np.empty(0), np.empty(0), pairs)
     likeliest = _likeliest(data, MixtureFit([kind.thinned(_EM_THINNED[0]) for kind in data], components), components)
     model = _prior(components) if likeliest is None else _model(likeliest, components)
     # Where few closures share their ends, odometry takes their noise for its own; but none is better than a step.

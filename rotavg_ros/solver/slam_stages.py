@@ -129,7 +129,7 @@ def _contract(graph: ViewGraph, scale_estimation: bool) -> tuple[Prepared, Spann
     pairs = agreement_pairs(closure_graph)
     components = rotation_components(graph)
     if scale_estimation:
-        noise = estimate_noise(discrepancies(squared_angle, path_steps, pairs, components), components)
+        noise = estimate_noise(discrepancies(squared_angle, path_steps, pairs), components)
     else:
         noise = _stated_noise(graph, components)
     return Prepared(closure_graph, squared_angle, path_steps, pairs, noise), forest
@@ -250,7 +250,7 @@ def outlier_scores(graph: ClosureGraph, outlier_probability: np.ndarray) -> np.n
 
 def _stated_noise(graph: ViewGraph, components: int) -> NoiseModel:
     """Medians of what the edges of either kind state; the prior where they state nothing."""
-    prior = estimate_noise(discrepancies(np.empty(0), np.empty(0), NO_PAIRS, components), components)
+    prior = estimate_noise(discrepancies(np.empty(0), np.empty(0), NO_PAIRS), components)
     stated = {True: prior.step_variance, False: prior.closure_variance}
     precision = graph.precision.numpy()
     for kind in stated:

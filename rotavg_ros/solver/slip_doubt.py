@@ -14,7 +14,8 @@ from scipy.special import gammainc
 
 from rotavg_ros.solver.agreement import AgreementPairs
 from rotavg_ros.solver.closure_graph import ClosureGraph
-from rotavg_ros.solver.noise_model import NoiseModel, log_uniform_density, noise_between_neighbours
+from rotavg_ros.solver.mixture import log_uniform_density
+from rotavg_ros.solver.noise_model import NoiseModel, noise_between_neighbours
 from rotavg_ros.solver.slam_passes import SlamEstimate
 
 # The solution is in strong doubt if this share of what at least so many neighbours agree upon is rejected by it (the

@@ -151,8 +151,7 @@ def _noise_without_slips(cost: TruncatedCost, correction: Tensor, noise: NoiseMo
     closure = torch.from_numpy(graph.is_closure)
     square = (rotations.log(residual[closure]) ** 2).sum(dim=1).numpy()
     pairs = agreement_pairs(replace(graph, residual=residual))
-    path_steps, components = graph.path_steps[graph.is_closure], noise.components
-    return estimate_noise(discrepancies(square, path_steps, pairs, components), components)
+    return estimate_noise(discrepancies(square, graph.path_steps[graph.is_closure], pairs), noise.components)
 
 
 def _tree(cost: TruncatedCost, trust: np.ndarray, segment_log_odds: np.ndarray) -> Tensor:

@@ -23,7 +23,9 @@ from rotavg_ros.view_graph import ViewGraph
 # Estimates on the way to the optimum fit worse than the optimum: their variance counts this many times.
 _SLACK = 2.0
 _SETTLING_STEPS = 2
-_ANNEALING_FACTOR = 1.4
+# By this the loss is annealed from step to step; by more while it is so convex that no edge stands out.
+_ANNEALING_FACTOR, _COARSE_FACTOR = 1.4, 2.0
+_COARSE_CONVEXITY = 100.0
 _DESCENT_STEPS = 8
 # Weight of what is believed wrong: enough to keep a graph solvable that falls apart without it.
 _MIN_WEIGHT = 1e-9
@@ -102,7 +104,7 @@ class TruncatedCost:
         while convexity > 1 / _ANNEALING_FACTOR:
             annealed = max(convexity, 1.0) * scale + 1e-12
             correction = self._step(correction, vectors, trust * (annealed / (square + annealed)) ** 2)
-            convexity /= _ANNEALING_FACTOR
+            convexity /= _COARSE_FACTOR if convexity > _COARSE_CONVEXITY else _ANNEALING_FACTOR
             vectors, square = self._vectors(correction)
         return correction
 

@@ -7,8 +7,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import norm
 
-from rotavg_ros.solver.mixture import Discrepancies, MixtureFit, Mixtures
-from rotavg_ros.solver.noise_model import log_uniform_density
+from rotavg_ros.solver.mixture import Discrepancies, MixtureFit, Mixtures, log_uniform_density
 
 COMPONENTS = 3
 
@@ -24,7 +23,7 @@ def drawn_kinds() -> list[Discrepancies]:
         angle = np.where(
             rng.random(count) < false_share, rng.uniform(0.5, np.pi, count), np.linalg.norm(vector, axis=1)
         )
-        kinds.append(Discrepancies(angle**2, steps, closures, 1 / closures, log_uniform_density(angle, COMPONENTS)))
+        kinds.append(Discrepancies(angle**2, steps, closures, 1 / closures))
     return kinds
 
 
@@ -35,7 +34,8 @@ def log_likelihood(kinds: list[Discrepancies], models: Mixtures) -> float:
         sigma = np.sqrt(kind.steps * models.step_variance[0] + kind.closures * models.closure_variance[0])
         # A rotation vector along one axis has the density of all of its length.
         good = norm.logpdf(np.sqrt(kind.squared_angle), scale=sigma) + (COMPONENTS - 1) * norm.logpdf(0, scale=sigma)
-        total += kind.weight * np.logaddexp(np.log(1 - share) + good, np.log(share) + kind.log_uniform).sum()
+        uniform = log_uniform_density(np.sqrt(kind.squared_angle), COMPONENTS)
+        total += kind.weight * np.logaddexp(np.log(1 - share) + good, np.log(share) + uniform).sum()
     return float(total)
 
 

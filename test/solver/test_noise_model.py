@@ -8,7 +8,8 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.solver.agreement import agreement_pairs
-from rotavg_ros.solver.noise_model import NoiseModel, discrepancies, estimate_noise, log_uniform_density
+from rotavg_ros.solver.mixture import log_uniform_density
+from rotavg_ros.solver.noise_model import NoiseModel, discrepancies, estimate_noise
 from rotavg_ros.solver.slam_stages import prepare
 
 from .graphs import measured, random_truth, slam_edges, small_noise
@@ -57,7 +58,7 @@ def test_without_closures_the_prior_stands() -> None:
     prepared = prepare(measured(random_truth(20, 0), source, target, kind=kind))
     assert len(agreement_pairs(prepared.closure_graph).first) == 0
     empty = np.empty(0)
-    model = estimate_noise(discrepancies(empty, empty, prepared.pairs, 3), 3)
+    model = estimate_noise(discrepancies(empty, empty, prepared.pairs), 3)
     assert 0 < model.step_variance < 1 and 0 < model.outlier_share < 1
 
 
