@@ -25,11 +25,15 @@ class _Crew:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
+        self._here = threading.local()
         self._active = 0
         self._pool: ThreadPoolExecutor | None = None
         self.size = 1
 
     def enter(self) -> None:
+        self._here.depth = self._depth() + 1
+        if self._here.depth > 1:
+            return
         with self._lock:
             if self._active == 0:
                 self.size = torch.get_num_threads()
@@ -37,6 +41,9 @@ class _Crew:
             torch.set_num_threads(1)
 
     def leave(self) -> None:
+        self._here.depth -= 1
+        if self._here.depth > 0:  # what is around this goes on with one thread for each operation
+            return
         with self._lock:
             torch.set_num_threads(self.size)
             self._active -= 1
@@ -45,6 +52,10 @@ class _Crew:
                 if self._pool is not None:
                     self._pool.shutdown()
                     self._pool = None
+
+    def _depth(self) -> int:
+        """How often this thread is inside."""
+        return getattr(self._here, "depth", 0)
 
     def pool(self) -> ThreadPoolExecutor:
         with self._lock:

@@ -175,6 +175,8 @@ def test_what_a_worker_raises_arrives_and_threads_are_given_back() -> None:
     torch.set_num_threads(2)
     try:
         with workers():
+            with workers():
+                pass
             assert (num_workers(), torch.get_num_threads()) == (2, 1)
             with pytest.raises(ValueError, match="item 0"):
                 for_each(fail, range(8))
