@@ -53,11 +53,15 @@ def read_network(name: str, path: Path) -> nn.Module:
         WeightsError: as :func:`load_network`.
     """
     network = NETWORKS[name]()
+    if path.is_dir():
+        raise WeightsError(f"{path}: is a folder, need {name}.safetensors; {_REMEDY}")
     try:
         with safe_open(path, framework="pt") as file:
             stated = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
-    except FileNotFoundError:
+    except FileNotFoundError:  # safetensors' word for a file without permission, too
+        if path.exists():
+            raise WeightsError(f"{path}: permission denied; check the file's rights") from None
         raise WeightsError(f"{path}: missing; {_REMEDY}") from None
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: damaged ({error}); {_REMEDY}") from None

@@ -98,7 +98,9 @@ class TrainingConfig:
         """
         try:
             content = yaml.safe_load(path.read_text())
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        except OSError as error:
+            raise TrainingConfigError(f"{path}: cannot be read ({error.strerror}); give a YAML file") from None
+        except (UnicodeDecodeError, yaml.YAMLError) as error:
             reason = str(error).splitlines()[0]
             raise TrainingConfigError(f"{path}: not a readable YAML file ({reason})") from None
         if not isinstance(content, dict):

@@ -84,6 +84,8 @@ def test_training_goes_on_from_given_weights(config: Path, tmp_path: Path) -> No
         (["clean-net", "sfm-clean-net-broad"], "`rotavg train clean-net sfm-clean-net` makes; name them with --start"),
         (["fine-net", "sfm-fine-net-settled", "--start", "x.safetensors"], "x.safetensors: missing"),
         (["fine-net", "sfm-fine-net", "--start", str(OTHER_WEIGHTS)], '"network": "sfm-clean-net"'),
+        (["fine-net", "sfm-fine-net", "--start", str(WEIGHTS_FOLDER)], "is a folder, need sfm-fine-net.safetensors"),
+        (["clean-net", str(WEIGHTS_FOLDER)], "cannot be read (Is a directory)"),
         (["fine-net", "slam-clean-net", "--start", str(OTHER_WEIGHTS)], "no FineNet"),
         (["clean-net", "sfm-clean-net", "--threads", "0"], "must be 1 or more"),
         (["big-net", "sfm-clean-net"], "big-net"),
