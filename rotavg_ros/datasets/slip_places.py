@@ -24,7 +24,7 @@ class SlipRule:
         min_across: good closures that span it, at least.
         min_difference: good closures that span either it or another step, but not both, at least; for every other step
             that lies more than ``max_stretch`` steps away. If one slip is moved to another such place, with whatever
-            turn, this many good closures at least contradict it (nothing is said of two slips in place of one).
+            turn, this many good closures at least contradict it. (Nothing is said of several slips moved at once.)
     """
 
     max_stretch: int = 3
@@ -34,8 +34,9 @@ class SlipRule:
 
 # Two good closures across, which may be the same that span other places.
 CROSSED = SlipRule()
-# Two more than the two that speak for a slip at all, and two that speak against it elsewhere.
-LOCATABLE = SlipRule(min_across=4, min_difference=2)
+# A slip is about as rare as two false closures. So two more contradict whoever overlooks this one, or moves it to
+# another place, even where another slip is already.
+LOCATABLE = SlipRule(min_across=4, min_difference=4)
 
 
 def slip_places(first: IntArray, last: IntArray, num_nodes: int, rule: SlipRule) -> BoolArray:

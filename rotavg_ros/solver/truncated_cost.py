@@ -1,7 +1,8 @@
 """A truncated least-squares cost on a closure graph, in which odometry may slip, and its descent from a start.
 
 An edge costs half its squared residual in units of its variance, but no more than it takes to call it wrong: the
-log-odds of being good that an edge without residual has. So the cost counts, in nats, how much is wrong.
+log-odds of being good that an edge without residual has; twice that if it takes two slips. So the cost counts, in nats,
+how much is wrong.
 """
 
 from __future__ import annotations
@@ -27,6 +28,11 @@ _SETTLING_STEPS = 2
 _ANNEALING_FACTOR, _COARSE_FACTOR = 1.4, 2.0
 _COARSE_CONVEXITY = 100.0
 _DESCENT_STEPS = 8
+# Odometry does not drift evenly: one segment in so many drifts by so much more (in variance) than its length tells.
+_UNEVEN_SHARE = 0.1
+_UNEVEN_RATIO = 16.0
+# A slip is less than a right angle; a segment that turns by more has slipped twice.
+_MAX_SLIP = np.pi / 2
 # Weight of what is believed wrong: enough to keep a graph solvable that falls apart without it.
 _MIN_WEIGHT = 1e-9
 
@@ -41,6 +47,7 @@ class TruncatedCost:
         cap: ``(E,)`` what a wrong edge costs, ≥ 0.
         pattern: the graph's Laplacian.
         edges: the graph's edges and residuals as edges between its corrections.
+        uneven_cost: what a segment costs beforehand that drifts more than its length tells.
     """
 
     graph: ClosureGraph
@@ -48,6 +55,7 @@ class TruncatedCost:
     cap: np.ndarray
     pattern: LaplacianPattern
     edges: ViewGraph
+    uneven_cost: float
 
     @staticmethod
     def create(graph: ClosureGraph, noise: NoiseModel, log_odds: np.ndarray) -> TruncatedCost:
@@ -56,9 +64,10 @@ class TruncatedCost:
         # Without the edge, the way round passes at least one closure more; a segment's, two.
         around = variance + np.where(graph.is_odometry, 2.0, 1.0) * noise.closure_variance
         cap = noise.inlier_log_odds(np.zeros(len(variance)), around) + np.clip(log_odds, -100, 100)
+        uneven = float(noise.components / 2 * np.log(_UNEVEN_RATIO) - np.log(_UNEVEN_SHARE))
         pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots)
         edges = ViewGraph.create(graph.source, graph.target, graph.residual, num_nodes=graph.num_nodes)
-        return TruncatedCost(graph, variance, np.maximum(cap, 0.0), pattern, edges)
+        return TruncatedCost(graph, variance, np.maximum(cap, 0.0), pattern, edges, uneven)
 
     def residual(self, correction: Tensor) -> Tensor:
         """``(E, 4)``."""
@@ -72,7 +81,13 @@ class TruncatedCost:
     def of_cosines(self, cosine: Tensor) -> np.ndarray:
         """The same from the residuals' real parts ``(E, …)``; the 1e-8 rad that these do not resolve cost nothing."""
         square = (2 * cosine.abs().clamp(max=1).acos().numpy().T) ** 2
-        return np.asarray(np.minimum(square / (2 * _SLACK * self.variance), self.cap).T)
+        slips = np.where(self.graph.is_odometry & (square > _MAX_SLIP**2), 2.0, 1.0)
+        return np.asarray(np.minimum(self._if_good(square), slips * self.cap).T)
+
+    def _if_good(self, square: np.ndarray) -> np.ndarray:
+        """Cost of edges that are not wrong, by their squared residuals ``(…, E)`` in rad²."""
+        usual = square / (2 * _SLACK * self.variance)
+        return np.where(self.graph.is_odometry, np.minimum(usual, self.uneven_cost + usual / _UNEVEN_RATIO), usual)
 
     def total(self, correction: Tensor) -> float:
         """Cost of a solution ``(K, 4)``, in nats."""
@@ -81,7 +96,7 @@ class TruncatedCost:
     def log_odds(self, correction: Tensor) -> np.ndarray:
         """``(E,)`` of each edge to be good, by its residual."""
         square = (rotations.log(self.residual(correction)) ** 2).sum(dim=1).numpy()
-        return np.asarray(self.cap - square / (2 * _SLACK * self.variance))
+        return np.asarray(self.cap - self._if_good(square))
 
     def descend(self, correction: Tensor, trust: np.ndarray | None = None) -> Tensor:
         """Gauss–Newton with Geman–McClure weights, the smooth sibling of the truncated cost; corrections ``(K, 4)``.
