@@ -10,6 +10,7 @@ from torch import Tensor
 from rotavg_ros.solver.agreement import AgreementPairs
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.common_error import closure_runs, common_share, variance_factor
+from rotavg_ros.solver.drift_posterior import expected_step_variance
 from rotavg_ros.solver.noise_model import NoiseModel
 from rotavg_ros.solver.slam_passes import Passes, SlamEstimate
 from rotavg_ros.solver.slam_system import WholeSystem
@@ -74,20 +75,36 @@ def refine(
 
 def estimate(state: Passes, system: WholeSystem, share: float, max_step_variance: float) -> SlamEstimate:
     """What there is to say after the last pass."""
-    noise = state.noise
-    if state.graph.num_nodes <= _MAX_NODES_TO_DRAW_AGAIN and noise.likely_step_variance > noise.step_variance:
-        # Where closures are few, drift is taken to be less than it probably is, for the sake of the verdicts.
-        noise = replace(noise, step_variance=noise.likely_step_variance)
-        samples = system.pattern.factorize(state.weight(noise)).samples(system.probes)
+    step_variance = state.noise.step_variance if state.hold_noise else _stated_step_variance(state)
+    if step_variance != state.noise.step_variance:
+        # What the solution does to errors of this size, though it takes odometry for better than that.
+        error = system.probes / np.sqrt(state.weight(replace(state.noise, step_variance=step_variance)))[:, None]
+        samples = system.factorised.fit(error)
     else:
         samples = system.samples
     return SlamEstimate(
         **vars(state.verdicts()),
         samples=samples,
-        stated_step_variance=noise.step_variance,
+        stated_step_variance=step_variance,
         common_share=share,
         passes=state.passes,
         max_step_variance=max_step_variance,
         rank=system.pattern.rank,
         factorised=system.factorised,
     )
+
+
+def _stated_step_variance(state: Passes) -> float:
+    """Of the odometry, rad² per step, as uncertainty is stated by it.
+
+    Where closures are few, drift is taken to be less than it probably is, for the sake of the verdicts.
+    """
+    graph, noise = state.graph, state.noise
+    has_slips = bool((state.inlier_probability[graph.is_odometry] < 0.5).any())
+    if not has_slips:
+        expected = expected_step_variance(graph, state.inlier_probability, noise.closure_variance, noise.components)
+        if np.isfinite(expected):
+            return expected
+    if graph.num_nodes <= _MAX_NODES_TO_DRAW_AGAIN:
+        return max(noise.step_variance, noise.likely_step_variance)
+    return noise.step_variance
