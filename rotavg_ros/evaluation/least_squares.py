@@ -19,6 +19,8 @@ _CONVERGED_STEP = np.radians(1e-4)
 # that is not: enough for a graph that falls apart without it to stay solvable.
 _DEFAULT_PRECISION = np.radians(1.0) ** -2
 _LEFT_OUT = 1e-9
+# What ties a component's first node to the identity, in units of the heaviest edge.
+_GROUNDING = 1e3
 
 
 def least_squares(graph: ViewGraph, is_used: np.ndarray) -> Tensor:
@@ -59,7 +61,7 @@ def chordal_orientations(graph: ViewGraph, is_used: np.ndarray) -> Tensor:
     identity = np.eye(3)
     degree = np.bincount(source, weight, num_nodes) + np.bincount(target, weight, num_nodes)
     grounding = np.zeros(num_nodes)
-    grounding[_roots(graph)] = 1e3 * weight.max(initial=1.0)
+    grounding[_roots(graph)] = _GROUNDING * weight.max(initial=1.0)
     # ‖M_v − R̃_uv M_u‖² over all edges has the normal matrix of a Laplacian with rotations for off-diagonal entries.
     blocks = np.concatenate((-measured, -measured.transpose(0, 2, 1), (degree + grounding)[:, None, None] * identity))
     rows = np.concatenate((target, source, np.arange(num_nodes)))
