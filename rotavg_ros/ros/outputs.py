@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from functools import partial
 
 from geometry_msgs.msg import QuaternionStamped, TransformStamped
@@ -20,6 +21,9 @@ from rotavg_ros.ros.topics import LATCHED, publisher
 from rotavg_ros.ros.visualization import markers_message, path_message
 from rotavg_ros.settings.parameters import NodeParameters
 
+# After a drawing the worker does other things for so many times as long: at 10 000 keyframes one takes half a second.
+_REST = 4.0
+
 
 class Outputs:
     """All publishers but that of the diagnostics.
@@ -32,6 +36,7 @@ class Outputs:
         self._estimator = estimator
         self._robots, self._frame_id = parameters.robots, parameters.world_frame
         self._drawn: dict[Publisher, tuple[int, int]] = {}
+        self._rests_until = 0.0  # on the monotonic clock
         latched = partial(publisher, node, qos=LATCHED)
         self._orientations = latched(AbsoluteOrientations, "abs_orientations")
         self._flags = latched(OutlierFlags, "outlier_flags")
@@ -57,8 +62,12 @@ class Outputs:
         self._flags.publish(flags_message(answer, self._frame_id))
 
     def draw(self, answer: Answer | None) -> None:
-        """Path and markers of the last answer, for those who look; again when somebody begins to."""
-        if answer is None:
+        """Path and markers of the last answer, for those who look; again when somebody begins to.
+
+        Called once a second at least, so that what is left out because too much time went into drawing comes later.
+        """
+        started = time.monotonic()
+        if answer is None or started < self._rests_until:
             return
         missing = [p for p in (*self._paths.values(), self._markers) if self._lacks(p, answer)]
         if not missing:
@@ -69,6 +78,8 @@ class Outputs:
                 path.publish(path_message(trajectories[robot], self._frame_id))
         if self._markers in missing:
             self._markers.publish(markers_message(answer, list(trajectories.values()), self._frame_id))
+        ended = time.monotonic()
+        self._rests_until = ended + _REST * (ended - started)
 
     def _lacks(self, picture: Publisher, answer: Answer) -> bool:
         """Whether somebody looks who has not been sent this answer yet; from now on they have."""
