@@ -198,13 +198,13 @@ def _references(
         raise PlanError(f"{len(wanted)} references for {len(robots)} robots; give at most one per robot")
     references: dict[str, Input | Path] = {}
     for robot, entry in zip(robots, wanted, strict=False):
-        if (
-            entry.partition(":")[0] not in bag.topics
-            and Path(entry).exists()
-            and Path(entry).suffix not in RECORDING_SUFFIXES
-        ):
+        path, is_topic = Path(entry), entry.partition(":")[0] in bag.topics
+        if not is_topic and path.exists() and path.suffix not in RECORDING_SUFFIXES:
             read_pose_file(entry)  # a mistake shows before the replay, not after it
-            references[robot] = Path(entry)
+            references[robot] = path
+        elif not is_topic and path.suffix and not path.exists():  # no topic's name has a dot
+            names = ", ".join(candidate.topic for candidate in found.references) or "none"
+            raise PlanError(f"{entry}: no such file, and no topic of that name; candidates for a reference: {names}")
         else:
             (references[robot],) = _chosen(bag, [entry], ODOMETRY_CONVERTERS, "a reference", found.references)
     return references

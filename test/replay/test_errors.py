@@ -135,7 +135,7 @@ def test_nothing_it_was_given_is_overwritten(tmp_path: Path, small: Path, capsys
         (["--odometry", "/odometry"], "no topic /odometry; candidates for odometry: /odom"),
         (["--odometry", "/wind"], "/wind is geometry_msgs/msg/Vector3Stamped, of which no odometry can be made"),
         (["--edges", "/loops"], "no topic /loops; candidates for relative rotations: none"),
-        (["--reference", "truth.tum"], "no topic /truth.tum; candidates for a reference"),
+        (["--reference", "truth.tum"], "truth.tum: no such file, and no topic of that name; candidates for a"),
         (["--odometry", "none"], "nothing to replay"),
         (["--start", "100"], "lasts 4.9 s"),
         (["--start", "-1"], "must be 0 or more"),
