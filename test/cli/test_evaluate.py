@@ -63,6 +63,10 @@ def test_robustness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(robustness.SETTINGS, name, robustness.Setting(setting.title, setting.training, tiny))
     command = ["evaluate", "robustness", "--graphs", "1", "--minutes", "0.001", "--settings", "easy", "easy-easy"]
     assert main([*command, "--methods", "neurora-paper", "--output", str(tmp_path), "--threads", "1"]) == 0
+    assert (
+        "`rotavg evaluate robustness --threads 1 --graphs 1 --methods neurora-paper --settings easy easy-easy"
+        in (tmp_path / "robustness.md").read_text()
+    )
     with (tmp_path / "robustness.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert rows[0]["trained on"] == "the package's networks"
@@ -159,6 +163,8 @@ def test_rgbd(tmp_path: Path) -> None:
     command = ["evaluate", "rgbd", "--data", str(tmp_path), "--sets", "redwood_fgr", "--folds", "2"]
     command += ["--minutes", "0.001", "--output", str(tmp_path), "--keep", str(keep), "--threads", "1"]
     assert main(command) == 0
+    report = (tmp_path / "rgbd.md").read_text()
+    assert "`rotavg evaluate rgbd --threads 1 --sets redwood_fgr --folds 2 --minutes 0.001`: " in report
     with (tmp_path / "rgbd-redwood_fgr.csv").open() as file:
         rows = {row["method"]: row for row in csv.DictReader(file)}
     assert {row["scenes"] for row in rows.values()} == {"4"}

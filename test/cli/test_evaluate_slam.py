@@ -39,6 +39,10 @@ def test_report(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [row["method"] for row in rows] == ["neurora", "odometry", "chatterjee", "oracle"] * 2
     assert [row["condition"] for row in rows[::4]] == ["0 % random", "50 % random"]
     text = (data / "results" / "slam.md").read_text(encoding="utf-8")
+    again = (
+        "--graphs CSAIL --seeds 4 --shares 0 0.5 --no-hard --methods odometry chatterjee --no-peers --incremental CSAIL"
+    )
+    assert f"`rotavg evaluate slam --threads 1 {again} --no-uncertainty`" in text
     for file in (data / "results").glob("*.png"):
         assert f"({file.name})" in text
     assert "GNC" not in text.split("## CPU seconds")[0]
