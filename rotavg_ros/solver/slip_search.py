@@ -38,8 +38,9 @@ from rotavg_ros.view_graph import ViewGraph
 # says nothing more, and neither does where in it the slip was.
 _SLIP_PROBABILITY = 0.01
 _MAX_LOCATED_STEPS = 3.0
-# In larger graphs loops are dense; there annealing alone finds the slips, and jumps take long.
-_MAX_EDGES_TO_JUMP = 3000
+# Jumps take long in larger graphs. Up to the first size they are tried from both starts, up to the second from one.
+_MAX_EDGES_TO_JUMP_TWICE = 3000
+_MAX_EDGES_TO_JUMP = 20000
 # Weight of a closure that its neighbours speak against.
 _MIN_TRUST = 1e-3
 # A new solution must be better by this many nats, also if false closures come in groups; where doubt is strong, it may
@@ -89,17 +90,18 @@ def search_for_slips(
     trust[graph.is_closure] = np.maximum(expit(votes.closure), _MIN_TRUST)
     cost = TruncatedCost.create(graph, noise, prior)
     correction = cost.descend(_tree(cost, trust, votes.segment), trust)
-    is_small = len(graph.source) <= _MAX_EDGES_TO_JUMP
-    if is_small:
-        starts = (correction, estimate.correction)
-        annealed, trusting = (jump_to_optimum(cost, start, pairs, is_agreed, votes.closure > 0) for start in starts)
-        correction = trusting if cost.total(trusting) < cost.total(annealed) - _TIE else annealed
+    num_edges = len(graph.source)
+    if num_edges <= _MAX_EDGES_TO_JUMP:
+        correction = jump_to_optimum(cost, correction, pairs, is_agreed, votes.closure > 0)
+    if num_edges <= _MAX_EDGES_TO_JUMP_TWICE:
+        trusting = jump_to_optimum(cost, estimate.correction, pairs, is_agreed, votes.closure > 0)
+        correction = trusting if cost.total(trusting) < cost.total(correction) - _TIE else correction
     if not _is_better(cost, correction, estimate.correction, pairs, is_agreed, doubt):
         return None
     # Without the slips, the odometry tells how it drifts.
     noise = _noise_without_slips(cost, correction, noise)
     cost = TruncatedCost.create(graph, noise, prior)
-    if is_small:
+    if num_edges <= _MAX_EDGES_TO_JUMP:
         everyone = np.ones(len(votes.closure), dtype=bool)
         correction = jump_to_optimum(cost, cost.descend(correction), pairs, is_agreed, everyone)
     return SlipStart(correction, expit(cost.log_odds(correction)), noise)
