@@ -40,7 +40,7 @@ class Arrivals:
         self._patterns = []
         for chosen in (~edges.is_reversed, edges.is_reversed):
             rows = chosen.nonzero().squeeze(1)
-            first = torch.searchsorted(rows, edges.first, out_int32=True)
+            first = torch.searchsorted(rows, edges.first.long(), out_int32=True)
             self._patterns.append((first, edges.source.index_select(0, rows), edges.edge.index_select(0, rows)))
 
     def matrices(self, weight: Tensor) -> list[Tensor]:
