@@ -32,8 +32,8 @@ from rotavg_ros.solver.slam_system import System, leverage
 # Residuals say nothing of noise or falsehood while the orientations still turn by more than this.
 _SETTLED_STEP = np.radians(3.0)
 _MAX_SETTLING_PASSES = 5
-_CONVERGED_STEP = np.radians(0.002)
-_CONVERGED_PROBABILITY = 2e-3
+_CONVERGED_STEP = np.radians(0.01)
+_CONVERGED_PROBABILITY = 5e-3
 # What the rest of the graph predicts of an edge changes little from pass to pass: it is estimated anew this often, and
 # before the passes end; also once probabilities have changed, in sum, by more than this share of the closures believed.
 _PASSES_PER_PREDICTION = 4
@@ -160,7 +160,9 @@ class Passes:
         """Passes until convergence, or until there have been ``max_passes`` in all; at least one."""
         settled = False
         while True:
-            refresh = settled or self._is_prediction_old() or self.passes + 1 >= max_passes
+            # The last pass of all needs no predictions of its own right after new ones.
+            is_last = self.passes + 1 >= max_passes and self._prediction_pass < self.passes - 1
+            refresh = settled or self._is_prediction_old() or is_last
             moved, changed = self.one_pass(max_step_variance, refresh)
             settled = moved < _CONVERGED_STEP and changed < _CONVERGED_PROBABILITY
             if self.passes >= max_passes or (settled and refresh):
