@@ -21,7 +21,7 @@ from rotavg_ros.view_graph import ViewGraph
 _ANGLE_RANGES_DEG = (30, 60, 90, 120, 180)
 _ANGLE_BINS = 72
 _EDGES_PER_CELL = 25
-_LATITUDE_CELLS = (8, 24)  # fewest and most; twice as many around
+_LATITUDE_CELLS = (8, 24)  # fewest and most, about; twice as many around
 _STEPS_PER_CELL = 8  # cells are drawn in steps of latitude, so that they follow the curved outline
 _MIN_ANGLE_DEG = 0.01  # below it an axis is rounding
 
@@ -72,7 +72,7 @@ def draw(path: Path, noise: EdgeNoise, title: str, outlier_angle_deg: float) -> 
     quantiles = np.percentile(noise.angle_deg, (50, 90)) if len(noise.angle_deg) else (np.nan, np.nan)
     outliers = 100 * (noise.angle_deg > outlier_angle_deg).mean() if len(noise.angle_deg) else np.nan
     subtitle = (
-        f"{len(noise.angle_deg)} edges, {what}   ·   median {quantiles[0]:.2f}°, 90 % below {quantiles[1]:.1f}°   ·   "
+        f"{len(noise.angle_deg)} edges, {what}   ·   median {quantiles[0]:.3g}°, 90 % below {quantiles[1]:.3g}°   ·   "
         f"{outliers:.1f} % beyond {outlier_angle_deg:g}°"
     )
     figure.text(0.025, 0.885, subtitle, fontsize=10, color=MUTED, va="center")
@@ -108,8 +108,10 @@ def _draw_axes(figure: Figure, sphere: GeoAxes, axis: np.ndarray) -> None:
     longitude = np.arctan2(axis[:, 0], axis[:, 2])
     # Bins of equal width in longitude and in the sine of latitude are cells of equal area.
     cells = int(np.clip(np.sqrt(len(axis) / (2 * _EDGES_PER_CELL)), *_LATITUDE_CELLS))
+    # Odd numbers, so that the axis of a planar graph lies in the middle of a cell and not in a corner of four.
+    cells, around = cells | 1, 2 * cells | 1
     counts, longitudes, heights = np.histogram2d(
-        longitude, axis[:, 1], bins=(2 * cells, cells), range=((-np.pi, np.pi), (-1.0, 1.0))
+        longitude, axis[:, 1], bins=(around, cells), range=((-np.pi, np.pi), (-1.0, 1.0))
     )
     density = counts / max(counts.mean(), np.finfo(float).tiny)
     boundaries = np.arcsin(heights)
