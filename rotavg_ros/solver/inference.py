@@ -94,7 +94,9 @@ class _Walk:
         state: Tensor,
     ) -> None:
         self.layers, self.features, self.edges, self.state = layers, features, edges, state
-        self.odd_width = odd_width
+        # Of the features of edges as given, and of edges reversed.
+        self.signs = features.new_ones(2, features.shape[1])
+        self.signs[1, :odd_width] = -1
         self.hidden = layers[0].message_output.in_features
         on_cpu = features.device.type == "cpu"
         num_edges = len(edges.source)
@@ -151,10 +153,9 @@ class _Walk:
         return nodes if visit is not None else updated
 
     def _write_features(self, tile: Tile, state: Tensor) -> None:
-        gathered = self.features.index_select(0, self.edges.edge[tile.edges])
-        sign = 1 - 2 * self.edges.is_reversed[tile.edges].to(gathered)
-        gathered[:, : self.odd_width] *= sign[:, None]
-        state[:, self.hidden :] = gathered
+        # A row of signs for every edge, since torch is slow at spreading one sign over a few columns.
+        signs = self.signs.index_select(0, self.edges.is_reversed[tile.edges].int())
+        state[:, self.hidden :] = signs.mul_(self.features.index_select(0, self.edges.edge[tile.edges]))
 
     def _gather_sum(self, tile: Tile, projected: Tensor) -> Tensor:
         """Sum of the projections of both ends, ``(edges of the tile, hidden)``."""
