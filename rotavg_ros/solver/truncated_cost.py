@@ -28,6 +28,7 @@ _SETTLING_STEPS = 2
 _ANNEALING_FACTOR, _COARSE_FACTOR = 1.4, 2.0
 _COARSE_CONVEXITY = 100.0
 _DESCENT_STEPS = 8
+_SETTLED_STEP = np.radians(0.03)
 # Odometry does not drift evenly: one segment in so many drifts by so much more (in variance) than its length tells.
 _UNEVEN_SHARE = 0.1
 _UNEVEN_RATIO = 16.0
@@ -110,15 +111,17 @@ class TruncatedCost:
         if trust is None:
             for _ in range(_DESCENT_STEPS):
                 vectors, square = self._vectors(correction)
-                correction = self._step(correction, vectors, (scale / (square + scale + 1e-12)) ** 2)
+                correction, moved = self._step(correction, vectors, (scale / (square + scale + 1e-12)) ** 2)
+                if moved < _SETTLED_STEP:
+                    break
             return correction
         for _ in range(_SETTLING_STEPS):
-            correction = self._step(correction, self._vectors(correction)[0], trust)
+            correction, _ = self._step(correction, self._vectors(correction)[0], trust)
         vectors, square = self._vectors(correction)
         convexity = float((2 * square / np.maximum(scale, 1e-12)).max(initial=0.0, where=scale > 0)) + 1
         while convexity > 1 / _ANNEALING_FACTOR:
             annealed = max(convexity, 1.0) * scale + 1e-12
-            correction = self._step(correction, vectors, trust * (annealed / (square + annealed)) ** 2)
+            correction, _ = self._step(correction, vectors, trust * (annealed / (square + annealed)) ** 2)
             convexity /= _COARSE_FACTOR if convexity > _COARSE_CONVEXITY else _ANNEALING_FACTOR
             vectors, square = self._vectors(correction)
         return correction
@@ -128,6 +131,8 @@ class TruncatedCost:
         vectors = EdgeResiduals(self.edges, correction).vectors(slice(None)).numpy()
         return vectors.T, (vectors * vectors).sum(axis=0) / self.variance
 
-    def _step(self, correction: Tensor, vectors: np.ndarray, factor: np.ndarray) -> Tensor:
+    def _step(self, correction: Tensor, vectors: np.ndarray, factor: np.ndarray) -> tuple[Tensor, float]:
+        """The next corrections, and the largest component of a node's turn in radians."""
         step = self.pattern.factorize(np.maximum(factor, _MIN_WEIGHT) / self.variance).fit(vectors)
-        return rotations.normalize(rotations.multiply(correction, rotations.exp(torch.from_numpy(step))))
+        turned = rotations.multiply(correction, rotations.exp(torch.from_numpy(step)))
+        return rotations.normalize(turned), float(np.abs(step).max(initial=0.0))
