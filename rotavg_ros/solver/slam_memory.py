@@ -35,13 +35,15 @@ from rotavg_ros.solver.slam_system import ITERATING_PAYS, GrownSystem, StaleFact
 from rotavg_ros.solver.slam_update import Start, follow, grown_variance, renew
 from rotavg_ros.view_graph import ViewGraph
 
-# The whole solve runs again after so many updates, or once there are so many more closures, in number and as a share.
+# The whole solve runs again after so many updates, or once there are so many more closures. Of few closures that is
+# none: while little is known, each new one may change what is believed of the others.
 _MAX_UPDATES = 60
-_MAX_NEW, _MAX_GROWTH = 0, 0.05
+_MAX_GROWTH = 0.05
 # Closures whose verdict may turn in an update, and what share of all.
 _MAX_TURNED, _MAX_SHARE_TURNED = 2, 0.002
 # New closures that an update solves for from an older factorisation; with more, another one is cheaper.
 _MAX_COLUMNS = 80
+_NEXT_TO_NOTHING = 1e-9
 
 
 class Updated(NamedTuple):
@@ -126,12 +128,12 @@ class SlamMemory:
         if self.updates >= _MAX_UPDATES or not begins_with(graph, self.graph):
             return None
         num_closures = int((~graph.is_odometry).sum())
-        if num_closures > self.closures + max(_MAX_NEW, _MAX_GROWTH * self.closures):
+        if num_closures > (1 + _MAX_GROWTH) * self.closures:
             return None
         paths = self.paths.grown(graph)
         closure_graph = draw_together(graph)[0] if paths is None else contract_along(graph, paths)
         start, new_closures = self._start(closure_graph, network, body_from_world)
-        if len(new_closures) == 0:
+        if len(new_closures) == 0 and paths is not None:
             return self._extend(graph, start)
         updated = self._follow(graph, start) or self._renew(graph, start)
         if updated is None:
@@ -181,9 +183,11 @@ class SlamMemory:
         graph, older = start.graph, self.factor
         if older is not None and older.fits(graph) and (graph.view_graph_edge >= older.num_edges).sum() <= _MAX_COLUMNS:
             yield older
-        rank = self._rank(graph)
-        pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots, rank)
-        yield OlderFactor.of(graph, pattern.factorize(weight).solve)
+        pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots, self._rank(graph))
+        # Without what has just come, so that predictions of it are exact.
+        is_new = np.append(np.zeros(graph.num_segments, dtype=bool), graph.view_graph_edge >= self.graph.num_edges)
+        solve = pattern.factorize(np.where(is_new, _NEXT_TO_NOTHING * weight, weight)).solve
+        yield replace(OlderFactor.of(graph, solve), num_edges=self.graph.num_edges)
 
     def _renew(self, graph: ViewGraph, start: Start) -> Updated | None:
         """Factorised and estimated anew; None if orientations turn by too much."""

@@ -108,8 +108,7 @@ def _alternate(state: Passes, max_step_variance: float, max_passes: int) -> bool
 
 
 def grown_variance(known: np.ndarray, graph: ClosureGraph, weight: np.ndarray) -> np.ndarray:
-    """Variance of all nodes ``(N,)``, rad²: that of new ones as the best single way from an older one, or from the first
-    of a new component, has it.
+    """Variance of all nodes ``(N,)``, rad²; of new ones as the best single way from an older one has it.
 
     Args:
         known: ``(n,)`` of the first n nodes.
