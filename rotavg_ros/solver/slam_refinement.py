@@ -11,6 +11,7 @@ from rotavg_ros.solver.agreement import AgreementPairs
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.common_error import closure_runs, common_share, variance_factor
 from rotavg_ros.solver.drift_posterior import expected_step_variance
+from rotavg_ros.solver.moved_slips import with_moved_slips
 from rotavg_ros.solver.noise_model import NoiseModel
 from rotavg_ros.solver.slam_passes import Passes, SlamEstimate
 from rotavg_ros.solver.slam_system import WholeSystem
@@ -82,8 +83,18 @@ def estimate(state: Passes, system: WholeSystem, share: float, max_step_variance
         samples = system.factorised.fit(error)
     else:
         samples = system.samples
+    verdicts = state.verdicts()
+    if not state.hold_noise:
+        samples = with_moved_slips(
+            samples,
+            state.graph,
+            verdicts.correction,
+            state.inlier_probability,
+            state.noise,
+            state.prior_log_odds,
+        )
     return SlamEstimate(
-        **vars(state.verdicts()),
+        **vars(verdicts),
         samples=samples,
         stated_step_variance=step_variance,
         common_share=share,

@@ -82,7 +82,7 @@ def search_for_slips(
     noise = noise_between_neighbours(pairs, by_chain.components)
     is_agreed = agree(pairs, noise)
     prior = log_odds + np.where(
-        graph.is_odometry, _no_slip_log_odds(graph.steps, noise.components), noise.prior_log_odds
+        graph.is_odometry, no_slip_log_odds(graph.steps, noise.components), noise.prior_log_odds
     )
     finite = np.clip(prior, -50, 50)
     votes = count_votes(graph, pairs, noise, finite[graph.is_closure], finite[: graph.num_segments])
@@ -124,7 +124,7 @@ def _is_better(
     )
 
 
-def _no_slip_log_odds(steps: np.ndarray, components: int) -> np.ndarray:
+def no_slip_log_odds(steps: np.ndarray, components: int) -> np.ndarray:
     """Log-odds of segments to be good beforehand, a slip being less than a right angle and as likely to be any."""
     narrower = np.log(2.0) if components == 1 else np.log(2 / (1 - np.cos(np.pi / 4)))
     none = np.log1p(-_SLIP_PROBABILITY) * np.minimum(steps, _MAX_LOCATED_STEPS)
