@@ -126,7 +126,7 @@ def _parts(value: Any) -> Iterator[str | bytes]:
 def _version(module: str, libraries: tuple[str, ...]) -> str:
     found = hashlib.sha256(" ".join(map(importlib.metadata.version, libraries)).encode())
     sources = source_files(module)
-    reads_weights = Path(network_store.__file__) in sources
+    reads_weights = any(source.samefile(network_store.__file__) for source in sources)
     weights = sorted(network_store.WEIGHTS_FOLDER.glob("*.safetensors")) if reads_weights else []
     for file in (*sources, *weights):
         found.update(file.read_bytes())

@@ -16,6 +16,7 @@ from rotavg_ros.evaluation.contenders import Answer, Case, contenders
 from rotavg_ros.evaluation.kept_answers import kept
 from rotavg_ros.evaluation.peers import PeerAnswer
 from rotavg_ros.evaluation.source_files import source_files
+from rotavg_ros.solver import network_store
 from rotavg_ros.view_graph import ViewGraph
 
 MODULE = "rotavg_ros.evaluation.contenders"
@@ -93,6 +94,18 @@ def test_an_answer_goes_when_a_source_behind_it_changes(
     ask()
     assert len(solved) == 2
     kept_answers._version.cache_clear()
+
+
+def test_other_weights_are_other_networks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "some.safetensors").write_text("other weights")
+    versions = {}
+    for weights in (network_store.WEIGHTS_FOLDER, tmp_path):
+        monkeypatch.setattr(network_store, "WEIGHTS_FOLDER", weights)
+        kept_answers._version.cache_clear()
+        versions[weights] = [kept_answers._version(module, ()) for module in (MODULE, peers.__name__)]
+    kept_answers._version.cache_clear()
+    (ours, theirs), (ours_then, theirs_then) = versions.values()
+    assert ours != ours_then and theirs == theirs_then
 
 
 def test_sources_behind_a_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
