@@ -132,14 +132,14 @@ class SlamMemory:
             return None
         paths = self.paths.grown(graph)
         closure_graph = draw_together(graph)[0] if paths is None else contract_along(graph, paths)
-        start, new_closures = self._start(closure_graph, network, body_from_world)
-        if len(new_closures) == 0 and paths is not None:
+        start = self._start(closure_graph, network, body_from_world)
+        if paths is not None and not start.is_new.any():
             return self._extend(graph, start)
         updated = self._follow(graph, start) or self._renew(graph, start)
         if updated is None:
             return None
         turned = np.abs(updated.verdicts.inlier_probability - start.inlier_probability) > 0.5
-        turned[new_closures] = False
+        turned[start.is_new] = False
         return None if turned.sum() > max(_MAX_TURNED, _MAX_SHARE_TURNED * num_closures) else updated
 
     def _extend(self, graph: ViewGraph, start: Start) -> Updated:
@@ -185,8 +185,7 @@ class SlamMemory:
             yield older
         pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots, self._rank(graph))
         # Without what has just come, so that predictions of it are exact.
-        is_new = np.append(np.zeros(graph.num_segments, dtype=bool), graph.view_graph_edge >= self.graph.num_edges)
-        solve = pattern.factorize(np.where(is_new, _NEXT_TO_NOTHING * weight, weight)).solve
+        solve = pattern.factorize(np.where(self._came_later(graph), _NEXT_TO_NOTHING * weight, weight)).solve
         yield replace(OlderFactor.of(graph, solve), num_edges=self.graph.num_edges)
 
     def _renew(self, graph: ViewGraph, start: Start) -> Updated | None:
@@ -206,12 +205,11 @@ class SlamMemory:
         )
         return Updated(closure_graph, estimate, variance, memory)
 
-    def _start(
-        self, graph: ClosureGraph, network: SlamCleanNet | None, body_from_world: torch.Tensor
-    ) -> tuple[Start, np.ndarray]:
-        """What is known of all edges, and of new closures what those around them say; and which are new."""
+    def _start(self, graph: ClosureGraph, network: SlamCleanNet | None, body_from_world: torch.Tensor) -> Start:
+        """What is known of all edges, and of new closures what those around them say."""
         closure = np.flatnonzero(graph.is_closure)
-        new = closure[graph.view_graph_edge[closure - graph.num_segments] >= self.graph.num_edges]
+        is_new = graph.is_closure & self._came_later(graph)
+        new = np.flatnonzero(is_new)
         steps, inlier_probability, prior = (
             graph.steps.copy(),
             *(
@@ -223,7 +221,7 @@ class SlamMemory:
         if len(new):
             judged = judge_new_closures(network, self.chain_noise, graph, closure, new, steps)
             inlier_probability[new], prior[new], steps[new] = judged
-        start = Start(
+        return Start(
             replace(graph, steps=steps),
             graph.corrections(body_from_world),
             inlier_probability,
@@ -231,8 +229,12 @@ class SlamMemory:
             prior,
             carried_over(self.exact_share, graph, 1.0),
             carried_over(self.prediction_variance, graph, 0.0),
+            is_new,
         )
-        return start, new
+
+    def _came_later(self, graph: ClosureGraph) -> np.ndarray:
+        """Edges ``(E,)`` outside the forest that this knows nothing of."""
+        return np.append(np.zeros(graph.num_segments, dtype=bool), graph.view_graph_edge >= self.graph.num_edges)
 
     def _rank(self, graph: ClosureGraph) -> np.ndarray | None:
         """Order of elimination ``(K,)``: as it was, and what is new comes last."""

@@ -40,8 +40,8 @@ _PASSES_PER_PREDICTION = 4
 _MAX_CHANGED_SHARE = 0.2
 # A system is solved from the factorisation of a few passes before if the last pass changed no probability by more.
 _NEAR = 0.2
-# After an update's first pass a probability that would change by more than this goes half the way.
-_SWING = 0.2
+# In an update, the probability of an older closure that would change by more than this goes half the way.
+_SWING = 0.02
 # What the most certainly false edge weighs, of what it would if it were good.
 _MIN_TRUST = 1e-9
 
@@ -104,13 +104,13 @@ class Passes:
         prior_log_odds: np.ndarray,
         hold_noise: bool,
         system: System,
-        is_update: bool = False,
+        is_new: np.ndarray | None = None,
     ) -> None:
         self.graph, self.correction, self.noise, self.hold_noise = graph, correction, noise, hold_noise
         self.inlier_probability, self.prior_log_odds = inlier_probability, prior_log_odds
         self.system = system
-        # Few edges are new, so that few weights change much from pass to pass.
-        self.is_update = is_update
+        # In an update few edges are new, so that few weights change much from pass to pass.
+        self._is_new = is_new
         self._closure = np.flatnonzero(graph.is_closure)
         self._measured = graph.residual.t().contiguous()
         self._source, self._target = torch.from_numpy(graph.source), torch.from_numpy(graph.target)
@@ -181,7 +181,7 @@ class Passes:
         """
         graph, noise = self.graph, self.noise
         variance, weight = edge_variance(graph, noise), self.weight(noise)
-        is_near = self._changed < _NEAR or self.is_update
+        is_near = self._changed < _NEAR or self._is_new is not None
         step = self.system.solve(weight, self.residual, refresh=refresh, is_near=is_near)
         self.correction = rotations.multiply(self.correction, rotations.exp(torch.from_numpy(step)))
         self.residual = self._residual_vectors()
@@ -211,9 +211,9 @@ class Passes:
             self.exactness = exactness_of(self.exact_share, self.noise.closure_variance)
         before = self.inlier_probability[closure]
         probability = expit(judged.log_odds + self.prior_log_odds[closure])
-        if self.is_update and self.passes > 1:
+        if self._is_new is not None:
             # Closures of which each is good if the other is not would change places from update to update.
-            is_swinging = np.abs(probability - before) > _SWING
+            is_swinging = ~self._is_new[closure] & (np.abs(probability - before) > _SWING)
             probability = np.where(is_swinging, (probability + before) / 2, probability)
         change = np.abs(probability - before)
         self.inlier_probability = self.inlier_probability.copy()

@@ -36,6 +36,7 @@ class Start:
         prior_log_odds: ``(E,)`` of being good, beyond the common outlier share; ±inf decide it.
         exact_share: ``(E,)`` probability of a good closure to err no more than most.
         prediction_variance: ``(E,)`` rad², of what the rest of the graph predicts of each edge.
+        is_new: ``(E,)`` bool, closures that have just come.
     """
 
     graph: ClosureGraph
@@ -45,6 +46,7 @@ class Start:
     prior_log_odds: np.ndarray
     exact_share: np.ndarray
     prediction_variance: np.ndarray
+    is_new: np.ndarray
 
     @property
     def weight(self) -> np.ndarray:
@@ -62,7 +64,7 @@ class Start:
             self.prior_log_odds,
             hold_noise,
             system,
-            is_update=True,
+            is_new=self.is_new,
         )
         state.exact_share = self.exact_share.copy()
         state.exactness = exactness_of(self.exact_share, self.noise.closure_variance)
