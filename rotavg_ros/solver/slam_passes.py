@@ -33,7 +33,9 @@ from rotavg_ros.solver.slam_system import System, leverage
 _SETTLED_STEP = np.radians(3.0)
 _MAX_SETTLING_PASSES = 5
 _CONVERGED_STEP = np.radians(0.01)
-_CONVERGED_PROBABILITY = 5e-3
+# … or by this share of what a step of odometry errs.
+_CONVERGED_NOISE_SHARE = 0.05
+_CONVERGED_PROBABILITY = 0.01
 # What the rest of the graph predicts of an edge changes little from pass to pass: it is estimated anew this often, and
 # before the passes end; also once probabilities have changed, in sum, by more than this share of the closures believed.
 _PASSES_PER_PREDICTION = 4
@@ -164,7 +166,8 @@ class Passes:
             is_last = self.passes + 1 >= max_passes and self._prediction_pass < self.passes - 1
             refresh = settled or self._is_prediction_old() or is_last
             moved, changed = self.one_pass(max_step_variance, refresh)
-            settled = moved < _CONVERGED_STEP and changed < _CONVERGED_PROBABILITY
+            converged_step = max(_CONVERGED_STEP, _CONVERGED_NOISE_SHARE * np.sqrt(self.noise.step_variance))
+            settled = moved < converged_step and changed < _CONVERGED_PROBABILITY
             if self.passes >= max_passes or (settled and refresh):
                 return
 
