@@ -42,7 +42,7 @@ _MAX_GROWTH = 0.05
 # Closures whose verdict may turn in an update, and what share of all.
 _MAX_TURNED, _MAX_SHARE_TURNED = 2, 0.002
 # New closures that an update solves for from an older factorisation; with more, another one is cheaper.
-_MAX_COLUMNS = 80
+_MAX_COLUMNS = 128
 _NEXT_TO_NOTHING = 1e-9
 
 
