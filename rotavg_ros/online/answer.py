@@ -82,9 +82,8 @@ class Answer:
         outlier_threshold: NDArray[np.float64],
         version: int,
         was_cold: bool,
-        seconds: float,
     ) -> Answer:
-        """What a solve of a snapshot says, with the orientations ``(N, 4)`` in their fixed gauge.
+        """What a solve of a snapshot says, with the orientations ``(N, 4)`` in their fixed gauge; ``seconds`` is 0.
 
         An edge is an outlier if its score exceeds its threshold, ``(M,)``; what a user has accepted has the score 0,
         what was rejected 1.
@@ -113,7 +112,7 @@ class Answer:
             outlier_score=score.numpy(),
             outlier=score.numpy() > outlier_threshold,
             was_cold=was_cold,
-            seconds=seconds,
+            seconds=0.0,  # known when the tick is over
             stage_seconds=dict(solution.stage_seconds),
             method=solution.method,
             profile=solution.profile,

@@ -5,12 +5,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from rotavg_ros.online import state_file
+from rotavg_ros.online import free_memory, state_file
 from rotavg_ros.online.anchoring import root_orientations
 from rotavg_ros.online.answer import Answer
 from rotavg_ros.online.content import Content, Counts
@@ -27,6 +28,9 @@ from rotavg_ros.view_graph import EdgeLabel
 if TYPE_CHECKING:
     from rotavg_ros.solver import Solution
 
+
+# Solves of so many edges take memory that is worth the milliseconds of giving it back.
+_MANY_EDGES = 5000
 
 # The signature of :func:`rotavg_ros.solve`.
 Solver = Callable[..., "Solution"]
@@ -230,43 +234,50 @@ class OnlineEstimator:
         """
         with self._tick_lock:
             started = time.perf_counter()
-            with self._lock:
-                content, options = self._content, self.options
-                problem = None if self._paused and not force_cold else content.next_problem(force_cold)
-            if problem is None:
+            answer = self._tick(force_cold)
+            if answer is None:
                 return None
-            snapshot, warm_start = problem.snapshot, problem.warm_start()
-            solution = self._solver(
-                snapshot.graph,
-                method=options.method,
-                profile=options.profile,
-                device=options.device,
-                refinement_steps=options.refinement_steps,
-                warm_start=warm_start,
-                memory=None if warm_start is None else problem.memory,
-            )
-            component = solution.component.cpu()
-            with self._lock:
-                roots = root_orientations(content.builder, snapshot, component, problem.answered)
-            body_from_world = fix_gauge(solution.body_from_world.cpu(), component, roots)
-            was_cold = warm_start is None
-            answer = Answer.of_solution(
-                snapshot,
-                solution,
-                body_from_world,
-                component,
-                problem.thresholds(options.outlier_threshold, was_cold),
-                content.version + 1,
-                was_cold,
-                time.perf_counter() - started,
-            )
-            with self._lock:
-                if content is not self._content:
-                    return None  # reset or loaded meanwhile
-                content.accept(body_from_world, component, answer.outlier, snapshot.revision, was_cold, solution.memory)
-                if options is not self.options:
-                    content.solve_anew()
-            return answer
+            if len(answer.source) >= _MANY_EDGES:
+                free_memory.give_back()
+            return replace(answer, seconds=time.perf_counter() - started)
+
+    def _tick(self, force_cold: bool) -> Answer | None:
+        with self._lock:
+            content, options = self._content, self.options
+            problem = None if self._paused and not force_cold else content.next_problem(force_cold)
+        if problem is None:
+            return None
+        snapshot, warm_start = problem.snapshot, problem.warm_start()
+        solution = self._solver(
+            snapshot.graph,
+            method=options.method,
+            profile=options.profile,
+            device=options.device,
+            refinement_steps=options.refinement_steps,
+            warm_start=warm_start,
+            memory=None if warm_start is None else problem.memory,
+        )
+        component = solution.component.cpu()
+        with self._lock:
+            roots = root_orientations(content.builder, snapshot, component, problem.answered)
+        body_from_world = fix_gauge(solution.body_from_world.cpu(), component, roots)
+        was_cold = warm_start is None
+        answer = Answer.of_solution(
+            snapshot,
+            solution,
+            body_from_world,
+            component,
+            problem.thresholds(options.outlier_threshold, was_cold),
+            content.version + 1,
+            was_cold,
+        )
+        with self._lock:
+            if content is not self._content:
+                return None  # reset or loaded meanwhile
+            content.accept(body_from_world, component, answer.outlier, snapshot.revision, was_cold, solution.memory)
+            if options is not self.options:
+                content.solve_anew()
+        return answer
 
 
 def _default_solver() -> Solver:

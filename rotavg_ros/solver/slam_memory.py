@@ -73,7 +73,8 @@ class SlamMemory:
         max_step_variance: rad², as the refinement kept it.
         elimination: ``(K,)`` nodes in the order of elimination; None if there was none.
         paths: of the closure graph.
-        factor: what the next update may solve from; None where it factorises anew.
+        factor: what the next update may solve from; None where it factorises anew, which large graphs and those of
+            which much is new at a time do.
         closures: how many there were when the whole solve ran.
         updates: how many there have been since.
     """
@@ -159,7 +160,7 @@ class SlamMemory:
 
     def _follow(self, graph: ViewGraph, start: Start) -> Updated | None:
         """With noise and predictions of before; None where they are not for that, or no longer serve."""
-        if self.factor is None:
+        if start.graph.num_nodes < ITERATING_PAYS:
             return None
         closure_graph, weight, verdicts = start.graph, start.weight, None
         for older in self._factors(start, weight):
@@ -169,7 +170,8 @@ class SlamMemory:
                 break
         if verdicts is None:
             return None
-        return self._updated(graph, start, verdicts, laplacian.factor)
+        is_spent = len(laplacian.closures) > _MAX_COLUMNS
+        return self._updated(graph, start, verdicts, None if is_spent else laplacian.factor)
 
     def _updated(self, graph: ViewGraph, start: Start, verdicts: Verdicts, factor: OlderFactor | None) -> Updated:
         """With the noise and predictions of before."""

@@ -54,13 +54,13 @@ def test_updates_end_where_a_whole_solve_does(
     for num_keyframes in range(508, NUM_KEYFRAMES + 1, 4):
         solution = grown(solution, until(city, num_keyframes))
         updates += "update" in solution.stage_seconds and "refine" not in solution.stage_seconds
-        factor = None if solution.memory is None else solution.memory.factor
-        followed += factor is not None and len(factor.closures) > 0
         assert solution.memory is not None
+        factor = solution.memory.factor
+        followed += factor is not None and len(factor.closures) > 0
         assert (
             solution.memory.prediction_variance[solution.memory.graph.kind.numpy() == EdgeKind.LOOP_CLOSURE] > 0
         ).all()
-    assert followed >= 10 if is_large else followed == 0
+    assert followed >= 10 if is_large and max_columns else followed == 0
     assert updates >= 15  # of 24; the others have seen the whole graph
     whole = solve(city)
     difference = torch.rad2deg(rotations.angle_between(solution.body_from_world, whole.body_from_world))

@@ -1,0 +1,48 @@
+"""Memory that a solve took goes back to the system."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rotavg_ros.online import estimator, free_memory
+from rotavg_ros.online.estimator import OnlineEstimator
+from rotavg_ros.online.measurements import EdgeMeasurement, KeyframeReference
+
+MEGABYTE = 1_000_000
+
+
+def resident_bytes() -> int:
+    for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+        if line.startswith("VmRSS"):
+            return 1024 * int(line.split()[1])
+    pytest.skip("the kernel does not say how much memory the process has")
+
+
+def test_free_memory_below_what_is_kept_goes_back() -> None:
+    if free_memory._malloc_trim() is None:
+        pytest.skip("the C library cannot give memory back")
+    pieces = [bytearray(10_000) for _ in range(10_000)]
+    kept = pieces[-1]
+    full = resident_bytes()
+    pieces.clear()
+    free_memory.give_back()
+    assert full - resident_bytes() > 80 * MEGABYTE
+    assert len(kept) == 10_000
+
+
+@pytest.mark.parametrize(("many", "times"), [(3, 1), (4, 0)])
+def test_ticks_of_large_graphs_give_memory_back(monkeypatch: pytest.MonkeyPatch, many: int, times: int) -> None:
+    calls: list[None] = []
+    monkeypatch.setattr(estimator, "_MANY_EDGES", many)
+    monkeypatch.setattr(free_memory, "give_back", lambda: calls.append(None))
+    online = OnlineEstimator()
+    for index in range(3):
+        online.add_odometry("robot", index * 10**9, (0.0, 0.0, 0.0, 1.0), (index, 0.0, 0.0))
+    ends = KeyframeReference("robot", 0), KeyframeReference("robot", 2)
+    online.add_edge(EdgeMeasurement(0, *ends, (0.0, 0.0, 0.0, 1.0)))
+    answer = online.tick()
+    assert answer is not None and len(answer.source) == 3
+    assert answer.seconds > 0
+    assert len(calls) == times
