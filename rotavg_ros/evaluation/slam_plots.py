@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from rotavg_ros.evaluation.slam_scoring import REFERENCE, SlamScores, geometric_
 _MARKERS = "osD^vP*X<>"
 # Without refinement no closure bends a good odometry, so that these lines would lie on its own.
 _LIKE_ODOMETRY = ("cleannet-spt", "spt")
+# Characters in a line below the axis.
+_LABEL_WIDTH = 9
 
 
 def ratios(path: Path, scores: SlamScores, rows: dict[str, str], graphs: Sequence[str], title: str) -> None:
@@ -55,7 +58,7 @@ def ratios(path: Path, scores: SlamScores, rows: dict[str, str], graphs: Sequenc
     axes.axhline(1, color=INK, linewidth=0.9, linestyle=(0, (4, 3)), zorder=1)
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}×"))
-    axes.set_xticks(position, conditions)
+    axes.set_xticks(position, [textwrap.fill(condition, _LABEL_WIDTH) for condition in conditions])
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8.5, labelcolor=INK)
     style(axes, title)
     axes.set_xlabel("loop closures that are false", fontsize=9, color=MUTED)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rotavg_ros.solver import Solution
 
 
-# Solves of so many edges take memory that is worth the milliseconds of giving it back.
+# Whole solves of so many edges take memory that is worth the ten milliseconds of giving it back.
 _MANY_EDGES = 5000
 
 # The signature of :func:`rotavg_ros.solve`.
@@ -237,7 +237,7 @@ class OnlineEstimator:
             answer = self._tick(force_cold)
             if answer is None:
                 return None
-            if len(answer.source) >= _MANY_EDGES:
+            if len(answer.source) >= _MANY_EDGES and set(answer.stage_seconds) != {"update"}:
                 free_memory.give_back()
             return replace(answer, seconds=time.perf_counter() - started)
 

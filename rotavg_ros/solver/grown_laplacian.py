@@ -19,7 +19,7 @@ from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
 
 from rotavg_ros.solver.closure_graph import ClosureGraph
-from rotavg_ros.solver.laplacian import incidence_matrix, iterate, root_stiffness
+from rotavg_ros.solver.laplacian import FactorisedLaplacian, incidence_matrix, iterate, root_stiffness
 
 # Conjugate gradients end at a step that no orientation could be seen to take, or at a hundredth of the first one.
 _TOLERANCE, _RELATIVE_TOLERANCE = np.radians(0.002), 1e-2
@@ -35,6 +35,7 @@ class OlderFactor:
         roots: of these, those that are tied to zero.
         num_edges: of the view-graph at that time.
         solve: ``L⁻¹ b`` for ``(K', k)`` columns.
+        num_entries: numbers that the factorisation consists of.
         closures: ``(r,)`` view-graph edges that came later, ascending.
         columns: ``(K', r)`` float32, solutions for a unit force between the ends of each.
     """
@@ -43,14 +44,16 @@ class OlderFactor:
     roots: np.ndarray
     num_edges: int
     solve: Callable[[np.ndarray], np.ndarray]
+    num_entries: int
     closures: np.ndarray
     columns: np.ndarray
 
     @classmethod
-    def of(cls, graph: ClosureGraph, solve: Callable[[np.ndarray], np.ndarray]) -> OlderFactor:
+    def of(cls, graph: ClosureGraph, factorised: FactorisedLaplacian) -> OlderFactor:
         """What has just been factorised."""
         nothing = np.empty(0, dtype=np.int64), np.empty((graph.num_nodes, 0), dtype=np.float32)
-        return cls(graph.nodes, graph.nodes[graph.roots], len(graph.segment_of_edge), solve, *nothing)
+        roots, num_edges = graph.nodes[graph.roots], len(graph.segment_of_edge)
+        return cls(graph.nodes, roots, num_edges, factorised.solve, factorised.num_entries, *nothing)
 
     def fits(self, graph: ClosureGraph) -> bool:
         """Whether the graph has the same components as before."""

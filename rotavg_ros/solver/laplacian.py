@@ -84,8 +84,8 @@ class LaplacianPattern:
             # Weights that span all of double precision can leave no positive pivot; the sparse factorisation copes.
             with suppress(np.linalg.LinAlgError):
                 factor = partial(cho_solve, cho_factor(matrix.toarray(), lower=True, overwrite_a=True))
-                return FactorisedLaplacian(self._incidence, weight, factor)
-        return FactorisedLaplacian(self._incidence, weight, self._factorize_sparse(matrix))
+                return FactorisedLaplacian(self._incidence, weight, factor, num_nodes**2)
+        return FactorisedLaplacian(self._incidence, weight, *self._factorize_sparse(matrix))
 
     def near(self, weight: np.ndarray, factorised: FactorisedLaplacian) -> FactorisedLaplacian:
         """The system with other weights, solved by conjugate gradients that an earlier factorisation preconditions.
@@ -94,7 +94,7 @@ class LaplacianPattern:
         iterations, the system is factorised after all.
         """
         solve = _Iteration(self, weight, factorised)
-        return FactorisedLaplacian(self._incidence, weight, solve)
+        return FactorisedLaplacian(self._incidence, weight, solve, factorised.num_entries)
 
     def matrix(self, weight: np.ndarray) -> csc_array:
         """``L``, rows and columns in the order of elimination as far as it is known."""
@@ -103,7 +103,8 @@ class LaplacianPattern:
         values = np.bincount(self._slot, np.concatenate((-weight, -weight, degree)), len(self._row))
         return csc_array((values, self._row, self._first), shape=(self.num_nodes, self.num_nodes))
 
-    def _factorize_sparse(self, matrix: csc_array) -> Callable[[np.ndarray], np.ndarray]:
+    def _factorize_sparse(self, matrix: csc_array) -> tuple[Callable[[np.ndarray], np.ndarray], int]:
+        """How to solve, and the number of entries in both factors."""
         is_ordered = self.rank is not None
         factor = splu(
             matrix,
@@ -117,7 +118,7 @@ class LaplacianPattern:
             # This one is in the nodes' own order; from the next one on, the matrix is laid out in that of elimination.
             self.rank = factor.perm_c.astype(np.int64)
             self._lay_out(self.rank)
-        return partial(_solve_sparse, factor, np.argsort(rank), rank)
+        return partial(_solve_sparse, factor, np.argsort(rank), rank), factor.nnz
 
 
 def _solve_sparse(factor: SuperLU, node: np.ndarray, rank: np.ndarray, right_hand_side: np.ndarray) -> np.ndarray:
@@ -188,10 +189,17 @@ class FactorisedLaplacian:
         incidence: Bᵀ, ``(N, E)``.
         weight: ``(E,)``.
         solve: ``L⁻¹ b`` for ``(N, k)`` columns.
+        num_entries: numbers that the factorisation consists of.
     """
 
-    def __init__(self, incidence: csr_array, weight: np.ndarray, solve: Callable[[np.ndarray], np.ndarray]) -> None:
-        self._incidence, self.weight, self._solve = incidence, weight, solve
+    def __init__(
+        self,
+        incidence: csr_array,
+        weight: np.ndarray,
+        solve: Callable[[np.ndarray], np.ndarray],
+        num_entries: int,
+    ) -> None:
+        self._incidence, self.weight, self._solve, self.num_entries = incidence, weight, solve, num_entries
 
     def incidence_sum(self, edge_values: np.ndarray) -> np.ndarray:
         """``Bᵀ x``: at every node the values ``(E, k)`` of edges that end there, less those that start there."""
@@ -225,4 +233,4 @@ class LaplacianSystem(FactorisedLaplacian):
         self, num_nodes: int, source: np.ndarray, target: np.ndarray, weight: np.ndarray, roots: np.ndarray
     ) -> None:
         once = LaplacianPattern(num_nodes, source, target, roots).factorize(weight)
-        super().__init__(once._incidence, weight, once._solve)
+        super().__init__(once._incidence, weight, once._solve, once.num_entries)

@@ -41,8 +41,12 @@ _MAX_UPDATES = 60
 _MAX_GROWTH = 0.05
 # Closures whose verdict may turn in an update, and what share of all.
 _MAX_TURNED, _MAX_SHARE_TURNED = 2, 0.002
-# New closures that an update solves for from an older factorisation; with more, another one is cheaper.
+# New closures that an update solves for from an older factorisation; with more, another one is cheaper. If so many are
+# new at once, the whole solve runs.
 _MAX_COLUMNS = 128
+# A factorisation with more entries per node and edge, of 12 bytes at least, takes more memory than is to be spent on it, and
+# is not kept.
+_MAX_ENTRIES = 24
 _NEXT_TO_NOTHING = 1e-9
 
 
@@ -73,8 +77,7 @@ class SlamMemory:
         max_step_variance: rad², as the refinement kept it.
         elimination: ``(K,)`` nodes in the order of elimination; None if there was none.
         paths: of the closure graph.
-        factor: what the next update may solve from; None where it factorises anew, which large graphs and those of
-            which much is new at a time do.
+        factor: what the next update may solve from; None where it factorises anew.
         closures: how many there were when the whole solve ran.
         updates: how many there have been since.
     """
@@ -112,7 +115,7 @@ class SlamMemory:
             return None
         return cls(
             **_by_edge(closure_graph, estimate, cleaned.prior_log_odds),
-            **_of_estimate(closure_graph, estimate),
+            **_of_estimate(graph, closure_graph, estimate),
             graph=graph,
             variance=variance,
             chain_noise=prepared.noise,
@@ -129,7 +132,8 @@ class SlamMemory:
         if self.updates >= _MAX_UPDATES or not begins_with(graph, self.graph):
             return None
         num_closures = int((~graph.is_odometry).sum())
-        if num_closures > (1 + _MAX_GROWTH) * self.closures:
+        num_new = num_closures - int((~self.graph.is_odometry).sum())
+        if num_closures > (1 + _MAX_GROWTH) * self.closures or num_new > _MAX_COLUMNS:
             return None
         paths = self.paths.grown(graph)
         closure_graph = draw_together(graph)[0] if paths is None else contract_along(graph, paths)
@@ -170,8 +174,7 @@ class SlamMemory:
                 break
         if verdicts is None:
             return None
-        is_spent = len(laplacian.closures) > _MAX_COLUMNS
-        return self._updated(graph, start, verdicts, None if is_spent else laplacian.factor)
+        return self._updated(graph, start, verdicts, _if_small(laplacian.factor, graph))
 
     def _updated(self, graph: ViewGraph, start: Start, verdicts: Verdicts, factor: OlderFactor | None) -> Updated:
         """With the noise and predictions of before."""
@@ -187,8 +190,8 @@ class SlamMemory:
             yield older
         pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots, self._rank(graph))
         # Without what has just come, so that predictions of it are exact.
-        solve = pattern.factorize(np.where(self._came_later(graph), _NEXT_TO_NOTHING * weight, weight)).solve
-        yield replace(OlderFactor.of(graph, solve), num_edges=self.graph.num_edges)
+        factorised = pattern.factorize(np.where(self._came_later(graph), _NEXT_TO_NOTHING * weight, weight))
+        yield replace(OlderFactor.of(graph, factorised), num_edges=self.graph.num_edges)
 
     def _renew(self, graph: ViewGraph, start: Start) -> Updated | None:
         """Factorised and estimated anew; None if orientations turn by too much."""
@@ -200,7 +203,7 @@ class SlamMemory:
         memory = replace(
             self,
             **_by_edge(closure_graph, estimate, start.prior_log_odds),
-            **_of_estimate(closure_graph, estimate),
+            **_of_estimate(graph, closure_graph, estimate),
             graph=graph,
             variance=variance,
             updates=self.updates + 1,
@@ -262,10 +265,17 @@ def _by_edge(graph: ClosureGraph, verdicts: Verdicts, prior_log_odds: np.ndarray
     }
 
 
-def _of_estimate(graph: ClosureGraph, estimate: SlamEstimate) -> dict[str, Any]:
+def _of_estimate(graph: ViewGraph, closure_graph: ClosureGraph, estimate: SlamEstimate) -> dict[str, Any]:
     """What is remembered of the passes."""
+    is_large = closure_graph.num_nodes >= ITERATING_PAYS
+    factor = OlderFactor.of(closure_graph, estimate.factorised) if is_large else None
     return {
         "noise": estimate.noise,
-        "elimination": None if estimate.rank is None else graph.nodes[np.argsort(estimate.rank)],
-        "factor": OlderFactor.of(graph, estimate.factorised.solve) if graph.num_nodes >= ITERATING_PAYS else None,
+        "elimination": None if estimate.rank is None else closure_graph.nodes[np.argsort(estimate.rank)],
+        "factor": None if factor is None else _if_small(factor, graph),
     }
+
+
+def _if_small(factor: OlderFactor, graph: ViewGraph) -> OlderFactor | None:
+    """What is worth its memory."""
+    return factor if factor.num_entries <= _MAX_ENTRIES * (graph.num_nodes + graph.num_edges) else None

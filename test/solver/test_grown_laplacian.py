@@ -43,7 +43,7 @@ def system(graph: ClosureGraph, weight: np.ndarray) -> LaplacianSystem:
 def grown(drive: ViewGraph, ticks: list[int]) -> tuple[ClosureGraph, np.ndarray, GrownLaplacian]:
     """What the last of several ticks has, each of which goes on from the one before; the first factorises."""
     graph, weight = until(drive, ticks[0])
-    older = OlderFactor.of(graph, system(graph, weight).solve)
+    older = OlderFactor.of(graph, system(graph, weight))
     for num_keyframes in ticks[1:]:
         graph, weight = until(drive, num_keyframes)
         assert older.fits(graph)

@@ -41,14 +41,14 @@ def grown(solution: Solution, graph: ViewGraph) -> Solution:
 
 
 @pytest.mark.parametrize(
-    ("is_large", "max_columns"), [(False, 80), (True, 80), (True, 0)], ids=["renewed", "followed", "factorised anew"]
+    ("is_large", "max_entries"), [(False, 24), (True, 24), (True, 0)], ids=["renewed", "followed", "factorised anew"]
 )
 def test_updates_end_where_a_whole_solve_does(
-    city: ViewGraph, monkeypatch: pytest.MonkeyPatch, is_large: bool, max_columns: int
+    city: ViewGraph, monkeypatch: pytest.MonkeyPatch, is_large: bool, max_entries: int
 ) -> None:
     if is_large:
         monkeypatch.setattr(slam_memory, "ITERATING_PAYS", 0)
-        monkeypatch.setattr(slam_memory, "_MAX_COLUMNS", max_columns)
+        monkeypatch.setattr(slam_memory, "_MAX_ENTRIES", max_entries)
     solution = solve(until(city, 500))
     updates = followed = 0
     for num_keyframes in range(508, NUM_KEYFRAMES + 1, 4):
@@ -60,7 +60,7 @@ def test_updates_end_where_a_whole_solve_does(
         assert (
             solution.memory.prediction_variance[solution.memory.graph.kind.numpy() == EdgeKind.LOOP_CLOSURE] > 0
         ).all()
-    assert followed >= 10 if is_large and max_columns else followed == 0
+    assert followed >= 10 if is_large and max_entries else followed == 0
     assert updates >= 15  # of 24; the others have seen the whole graph
     whole = solve(city)
     difference = torch.rad2deg(rotations.angle_between(solution.body_from_world, whole.body_from_world))
@@ -125,6 +125,14 @@ def test_a_wrong_verdict_is_put_right_in_an_update(city: ViewGraph, was_good: bo
     after = grown(replace(before, memory=memory), until(city, 502))
     assert "refine" not in after.stage_seconds
     assert bool(after.outlier_score[edge] < 0.5) is was_good
+
+
+def test_much_that_is_new_is_judged_as_a_whole(city: ViewGraph, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(slam_memory, "_MAX_COLUMNS", 3)
+    solution = solve(until(city, 500))
+    for num_keyframes, is_whole in ((502, False), (520, True)):
+        solution = grown(solution, until(city, num_keyframes))
+        assert ("refine" in solution.stage_seconds) is is_whole
 
 
 @pytest.mark.parametrize("change", ["label", "rotation", "fewer edges"])
