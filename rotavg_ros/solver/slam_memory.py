@@ -44,8 +44,7 @@ _MAX_TURNED, _MAX_SHARE_TURNED = 2, 0.002
 # New closures that an update solves for from an older factorisation; with more, another one is cheaper. If so many are
 # new at once, the whole solve runs.
 _MAX_COLUMNS = 128
-# A factorisation with more entries per node and edge, of 12 bytes at least, takes more memory than is to be spent on it, and
-# is not kept.
+# A factorisation with more entries per node and edge, of 12 bytes at least, takes more memory than it is worth.
 _MAX_ENTRIES = 24
 _NEXT_TO_NOTHING = 1e-9
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from rotavg_ros.evaluation.benchmark.cases import FAMILIES
 from rotavg_ros.evaluation.benchmark.measure import LABELS, OURS, Measurement
@@ -17,6 +17,8 @@ from rotavg_ros.evaluation.plots import MUTED, PALETTE, style
 from rotavg_ros.evaluation.tables import Cell, Column, Table
 
 _REFERENCE = "neurora"
+# On an axis that spans less than this factor, 2 and 5 are labelled, too.
+_FEW_DECADES = 100
 _COLUMNS = (
     Column("nodes"),
     Column("edges"),
@@ -116,7 +118,12 @@ def draw_scaling(path: Path, results: Mapping[str, Sequence[Result]]) -> None:
             _draw(row[0], results[family], _cpu, f"{title}: CPU seconds")
             _draw(row[1], results[family], _mean_error, "mean error, degrees")
             _draw(row[2], results[family], lambda one: one.peak_bytes / 1e6, "peak memory of the process, MB")
-        rows[0][0].legend(frameon=False, fontsize=8)
+        handles = {
+            label: handle for axes in rows.flat for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(
+            handles.values(), handles.keys(), loc="outside upper left", ncols=len(handles), frameon=False, fontsize=9
+        )
     figure.savefig(path)
 
 
@@ -129,8 +136,12 @@ def _draw(axes: Axes, results: Sequence[Result], value: Callable[[Measurement], 
         axes.plot(edges, [value(point) for point in points], "o-", color=colour, markersize=4, label=LABELS[name])
     axes.set_xscale("log")
     axes.set_yscale("log")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_minor_formatter(NullFormatter())  # on less than a decade they would overlap
+    axes.xaxis.set_minor_formatter(NullFormatter())  # on less than a decade they would overlap
+    low, high = axes.get_ylim()
+    if high < _FEW_DECADES * low:
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_xlabel("edges", fontsize=9, color=MUTED)
     style(axes, title)
 
