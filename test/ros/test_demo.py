@@ -51,7 +51,7 @@ def test_somebodys_own_graph_without_truth(tmp_path: Path, start_process: Callab
     [
         (["--truth", "truth.csv"], "belong to --graph"),
         (["--graph", "nothing.g2o"], "no such file"),
-        (["--laps", "0"], "laps is 0"),
+        (["--laps", "0"], "--laps: is 0; it must be positive"),
         (["--rate", "nan"], "--rate: is nan; it must be 0 or more"),
     ],
 )
