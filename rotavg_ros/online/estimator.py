@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from rotavg_ros.solver import Solution
 
 
-# Whole solves of so many edges take memory that is worth the ten milliseconds of giving it back.
-_MANY_EDGES = 5000
+# Whole solves of so many edges take memory that is worth the milliseconds of giving it back.
+_MANY_EDGES = 1000
 
 # The signature of :func:`rotavg_ros.solve`.
 Solver = Callable[..., "Solution"]
