@@ -46,3 +46,6 @@ def test_ticks_of_large_graphs_give_memory_back(monkeypatch: pytest.MonkeyPatch,
     assert answer is not None and len(answer.source) == 3
     assert answer.seconds > 0
     assert len(calls) == times
+    # What goes on from the answer before takes little.
+    online.add_odometry("robot", 3 * 10**9, (0.0, 0.0, 0.0, 1.0), (3, 0.0, 0.0))
+    assert online.tick() is not None and len(calls) == times
