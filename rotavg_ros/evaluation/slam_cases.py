@@ -139,7 +139,7 @@ def share_condition(share: float) -> str:
 def cases(
     data: Path, graphs: Sequence[str], shares: Sequence[float], seeds: Sequence[int], hard: bool = True
 ) -> Iterator[SlamCase]:
-    """Every graph under every condition with every seed; where nothing is random, once.
+    """Every graph under every condition with every seed; where nothing is random, once. Named twice is named once.
 
     Odometry slips only where good closures are dense enough (:data:`SLIP_RULES`); graphs without such places are left
     out.
@@ -152,6 +152,7 @@ def cases(
     Raises:
         SlamSuiteError: an unknown graph, or no data.
     """
+    graphs, shares, seeds = tuple(dict.fromkeys(graphs)), tuple(dict.fromkeys(shares)), tuple(dict.fromkeys(seeds))
     for name in graphs:
         if name not in _SOURCES:
             raise SlamSuiteError(f"unknown graph {name!r}; choose from {', '.join(GRAPHS)}")

@@ -159,7 +159,7 @@ def test_report(tmp_path: Path) -> None:
 def test_graphs_come_from_the_data_folder(tmp_path: Path) -> None:
     (tmp_path / "slam").mkdir()
     write_graph(tmp_path / "slam" / "CSAIL.g2o", laps())
-    drawn = list(slam_cases.cases(tmp_path, ["CSAIL"], [0.0, 0.5], [3, 4]))
+    drawn = list(slam_cases.cases(tmp_path, ["CSAIL", "CSAIL"], [0.0, 0.5, 0.5], [3, 4, 3]))
     conditions = [(case.condition, case.seed) for case in drawn]
     assert conditions[:3] == [("0 % random", 3), ("50 % random", 3), ("50 % random", 4)]
     # Laps that are tied together all along locate a slip but for which of them slipped: not every draw has a place.
