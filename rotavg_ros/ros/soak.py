@@ -106,7 +106,7 @@ def _soak(graph: ViewGraph, num_keyframes: int, seconds: float, rate_hz: float) 
             [installed_node(), "--ros-args", *settings], stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
         )
         try:
-            _wait(recorder, node, lambda _: True, "did not start")
+            _wait(recorder, node, lambda _: sender.is_heard, "did not start")
             sender.send_edges_up_to(num_keyframes)
             _wait(recorder, node, lambda report: int(report["keyframes"]) >= num_keyframes, "did not take the graph")
             before = _wait(recorder, node, lambda report: report["answer cold"] == "true", "did not solve the graph")
@@ -183,6 +183,11 @@ class _Sender:
     def __exit__(self, *_: object) -> None:
         self._node.destroy_node()
         rclpy.shutdown(context=self._context)
+
+    @property
+    def is_heard(self) -> bool:
+        """Whether somebody subscribes to both topics; edges sent before are lost, and the graph would stay in parts."""
+        return all(publisher.get_subscription_count() for publisher in (self._edges, self._odometry))
 
     def send_edges_up_to(self, num_keyframes: int) -> None:
         """Whatever connects the first so many keyframes and has not been sent."""
