@@ -33,6 +33,7 @@ _EDGES_PER_MESSAGE = 500
 _PAUSE_S = 0.05
 _TURN_RATE = 0.2  # rad/s
 _TIMEOUT_S = 600.0
+_SETTLE_S = 1.0  # a subscription that this side has found has not always found this side yet
 _ODOMETRY_TOPIC, _EDGE_TOPIC = "odom", "relative_rotation_arrays"
 
 
@@ -107,6 +108,7 @@ def _soak(graph: ViewGraph, num_keyframes: int, seconds: float, rate_hz: float) 
         )
         try:
             _wait(recorder, node, lambda _: sender.is_heard, "did not start")
+            time.sleep(_SETTLE_S)
             sender.send_edges_up_to(num_keyframes)
             _wait(recorder, node, lambda report: int(report["keyframes"]) >= num_keyframes, "did not take the graph")
             before = _wait(recorder, node, lambda report: report["answer cold"] == "true", "did not solve the graph")
