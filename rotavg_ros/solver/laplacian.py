@@ -25,7 +25,9 @@ _DENSE_SHARE, _DENSE_EDGES_PER_NODE = 0.01, 8
 _DENSE_MAX_NODES = 5000
 # From eight columns on, SuperLU's many little products are large enough for OpenBLAS to spread each over the cores,
 # which costs more than it saves: 48 columns on 8600 nodes took 180 ms of CPU time at once and 28 ms in fours.
-_COLUMNS_AT_ONCE = 4
+# Products of six are still on one thread.
+_COLUMNS_AT_ONCE = 6
+_ENTRIES_AT_ONCE = 100_000
 # Conjugate gradients from a factorisation with other weights; after so many iterations another one is cheaper.
 _RELATIVE_TOLERANCE = 1e-3
 _MAX_ITERATIONS = 8
@@ -71,7 +73,10 @@ class LaplacianPattern:
         """Find where weights and degrees go in a matrix in compressed columns, rows and columns ordered by ``rank``."""
         row, column = rank[np.concatenate((self.source, self.target))], rank[np.concatenate((self.target, self.source))]
         keys = np.concatenate((column * self.num_nodes + row, rank * (self.num_nodes + 1)))
-        occupied, self._slot = np.unique(keys, return_inverse=True)
+        occupied, slot = np.unique(keys, return_inverse=True)
+        off_diagonal, diagonal = np.split(slot, [2 * len(self.source)])
+        self._slot = np.concatenate((off_diagonal, diagonal[self.source], diagonal[self.target]))
+        self._root_slot = diagonal[self.roots]
         self._row = (occupied % self.num_nodes).astype(np.int32)
         self._first = np.searchsorted(occupied, np.arange(self.num_nodes + 1) * self.num_nodes).astype(np.int32)
 
@@ -98,9 +103,8 @@ class LaplacianPattern:
 
     def matrix(self, weight: np.ndarray) -> csc_array:
         """``L``, rows and columns in the order of elimination as far as it is known."""
-        degree = abs(self._incidence) @ weight
-        degree[self.roots] += root_stiffness(weight)
-        values = np.bincount(self._slot, np.concatenate((-weight, -weight, degree)), len(self._row))
+        values = np.bincount(self._slot, np.concatenate((-weight, -weight, weight, weight)), len(self._row))
+        values[self._root_slot] += root_stiffness(weight)
         return csc_array((values, self._row, self._first), shape=(self.num_nodes, self.num_nodes))
 
     def _factorize_sparse(self, matrix: csc_array) -> tuple[Callable[[np.ndarray], np.ndarray], int]:
@@ -110,7 +114,9 @@ class LaplacianPattern:
             matrix,
             permc_spec="NATURAL" if is_ordered else "MMD_AT_PLUS_A",
             diag_pivot_thresh=0.0,
-            relax=1,  # a quarter faster than SuperLU's default on pose graphs, whose supernodes are small
+            # Supernodes of pose graphs are small: a quarter faster than SuperLU's default, and a third more.
+            relax=1,
+            panel_size=1,
             options={"SymmetricMode": True},
         )
         rank = np.arange(self.num_nodes) if self.rank is None else self.rank
@@ -123,10 +129,10 @@ class LaplacianPattern:
 
 def _solve_sparse(factor: SuperLU, node: np.ndarray, rank: np.ndarray, right_hand_side: np.ndarray) -> np.ndarray:
     """Solve ``(N, k)`` columns; the matrix has ``node[i]`` in row i, and node v in row ``rank[v]``."""
-    columns = np.asfortranarray(right_hand_side[node])
+    columns = np.asfortranarray(right_hand_side.take(node, axis=0))
     starts = range(0, columns.shape[1], _COLUMNS_AT_ONCE)
     parts = [factor.solve(columns[:, start : start + _COLUMNS_AT_ONCE]) for start in starts]
-    return np.asarray(np.concatenate(parts, axis=1)[rank])
+    return np.asarray(np.concatenate(parts, axis=1).take(rank, axis=0))
 
 
 class _Iteration:
@@ -143,7 +149,7 @@ class _Iteration:
         return self._pattern.factorize(self._weight).solve(right_hand_side) if solution is None else solution
 
     def _product(self, columns: np.ndarray) -> np.ndarray:
-        return np.asarray((self._matrix @ columns[self._node])[self._rank])
+        return np.asarray((self._matrix @ columns.take(self._node, axis=0)).take(self._rank, axis=0))
 
 
 def iterate(
@@ -220,9 +226,9 @@ class FactorisedLaplacian:
         variances of estimated differences, with a relative error of √(2/k).
         """
         root = np.sqrt(self.weight)[:, None]
-        # A few columns at a time stay in a core's cache from the signs to the solution.
-        starts = range(0, signs.shape[1], _COLUMNS_AT_ONCE)
-        columns = (signs[:, start : start + _COLUMNS_AT_ONCE] for start in starts)
+        # Of a large graph a few columns at a time stay in a core's cache from the signs to the solution.
+        count = max(_COLUMNS_AT_ONCE, _ENTRIES_AT_ONCE // max(len(root), 1))
+        columns = (signs[:, start : start + count] for start in range(0, signs.shape[1], count))
         return np.concatenate([self.solve(self.incidence_sum(root * few)) for few in columns], axis=1)
 
 

@@ -16,10 +16,10 @@ from scipy.special import expit
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver import quaternion_rows
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.laplacian import FactorisedLaplacian
 from rotavg_ros.solver.noise_model import NoiseModel, outlier_share
-from rotavg_ros.solver.residuals import log_rows, multiply_rows
 from rotavg_ros.solver.slam_judging import (
     estimated_closure_variance,
     estimated_step_variance,
@@ -108,14 +108,15 @@ class Passes:
         system: System,
         is_new: np.ndarray | None = None,
     ) -> None:
-        self.graph, self.correction, self.noise, self.hold_noise = graph, correction, noise, hold_noise
+        self.graph, self.noise, self.hold_noise = graph, noise, hold_noise
         self.inlier_probability, self.prior_log_odds = inlier_probability, prior_log_odds
         self.system = system
         # In an update few edges are new, so that few weights change much from pass to pass.
         self._is_new = is_new
         self._closure = np.flatnonzero(graph.is_closure)
-        self._measured = graph.residual.t().contiguous()
-        self._source, self._target = torch.from_numpy(graph.source), torch.from_numpy(graph.target)
+        # Components in rows.
+        self._correction = np.ascontiguousarray(correction.numpy().T)
+        self._measured = np.ascontiguousarray(graph.residual.numpy().T)
         self.residual = self._residual_vectors()
         # Of every edge if it is good: that it is no worse than most, and by how much less it weighs for that.
         self.exact_share, self.exactness = np.ones(len(graph.source)), np.ones(len(graph.source))
@@ -131,16 +132,12 @@ class Passes:
 
     def _residual_vectors(self) -> np.ndarray:
         """Rotation vectors ``(E, 3)`` in radians, of ``fine_net.edge_residual``."""
-        rows = self.correction.t().contiguous()
-        at_target = rows.index_select(1, self._target)
-        at_target[:3].neg_()
-        residual = multiply_rows(at_target, multiply_rows(self._measured, rows.index_select(1, self._source)))
-        vectors = log_rows(residual.mul_(1 - 2 * (residual[3] < 0).to(residual)))
-        return np.asarray(vectors.t().contiguous().numpy())
+        residual = quaternion_rows.residual(self._correction, self._measured, self.graph.source, self.graph.target)
+        return np.ascontiguousarray(quaternion_rows.log(residual).T)
 
     def difference(self, values: np.ndarray) -> np.ndarray:
         """Node values ``(K, k)`` → differences over the edges, target − source ``(E, k)``."""
-        return np.asarray(values[self.graph.target] - values[self.graph.source])
+        return np.asarray(values.take(self.graph.target, axis=0) - values.take(self.graph.source, axis=0))
 
     def weight(self, noise: NoiseModel) -> np.ndarray:
         """Of every edge, ``(E,)`` rad⁻²."""
@@ -149,7 +146,7 @@ class Passes:
     def verdicts(self) -> Verdicts:
         """What there is to say after the last pass."""
         return Verdicts(
-            rotations.normalize(self.correction),
+            rotations.canonical(torch.from_numpy(np.ascontiguousarray(self._correction.T))),
             self.inlier_probability,
             self.outlier_probability(),
             self.noise,
@@ -186,7 +183,8 @@ class Passes:
         variance, weight = edge_variance(graph, noise), self.weight(noise)
         is_near = self._changed < _NEAR or self._is_new is not None
         step = self.system.solve(weight, self.residual, refresh=refresh, is_near=is_near)
-        self.correction = rotations.multiply(self.correction, rotations.exp(torch.from_numpy(step)))
+        turned = quaternion_rows.multiply(self._correction, quaternion_rows.exp(step.T))
+        self._correction = quaternion_rows.normalize(turned)
         self.residual = self._residual_vectors()
         self.passes += 1
         moved = float(np.abs(step).max(initial=0.0))

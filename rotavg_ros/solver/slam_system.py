@@ -12,6 +12,8 @@ from rotavg_ros.solver.laplacian import FactorisedLaplacian, LaplacianPattern
 from rotavg_ros.solver.probes import likeliest_leverage, probe_signs
 
 _NUM_PROBES = 48
+# So many rows of probes stay in a core's cache.
+_EDGES_AT_ONCE = 1024
 # From so many nodes on, a system is solved from an earlier factorisation.
 ITERATING_PAYS = 4000
 # An edge that alone holds two parts of the graph together has leverage 1; it cannot be judged by the others.
@@ -90,14 +92,14 @@ class WholeSystem:
 
     def predict(self, weight: np.ndarray) -> None:
         """See :class:`System`."""
-        scale, pattern = np.sqrt(weight), self.pattern
-        square, product = np.zeros(len(scale)), np.zeros(len(scale))
-        # A few columns at a time, which stay in a core's cache.
-        for start in range(0, _NUM_PROBES, 4):
-            columns = slice(start, start + 4)
-            difference = self.samples[pattern.target, columns] - self.samples[pattern.source, columns]
-            square += np.einsum("ek,ek->e", difference, difference)
-            product += np.einsum("ek,ek->e", difference, self.probes[:, columns])
+        scale, samples = np.sqrt(weight), self.samples
+        square, product = np.empty(len(scale)), np.empty(len(scale))
+        for start in range(0, len(scale), _EDGES_AT_ONCE):
+            edges = slice(start, start + _EDGES_AT_ONCE)
+            difference = samples.take(self.pattern.target[edges], axis=0)
+            difference -= samples.take(self.pattern.source[edges], axis=0)
+            np.einsum("ek,ek->e", difference, difference, out=square[edges])
+            np.einsum("ek,ek->e", difference, self.probes[edges].astype(np.float64), out=product[edges])
         leverage = likeliest_leverage(weight * square / _NUM_PROBES, scale * product / _NUM_PROBES)
         leverage = np.minimum(leverage, _MAX_LEVERAGE)
         self.prediction_variance = leverage / (weight * (1 - leverage))
