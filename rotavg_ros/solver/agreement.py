@@ -20,7 +20,7 @@ NUM_NEIGHBOURS = 16
 
 @dataclass(frozen=True)
 class AgreementPairs:
-    """Every closure with those nearest to it (C closures, P = C · k pairs, k ≤ 16, grouped by ``first``).
+    """Every closure with those nearest to it (C closures, P ≤ C · k pairs, k ≤ 16, grouped by ``first``).
 
     Attributes:
         first, second: ``(P,)`` closures, as positions among the closures.
@@ -46,7 +46,7 @@ def closure_ends(graph: ClosureGraph, closure: np.ndarray) -> np.ndarray:
 def agreement_pairs(
     graph: ClosureGraph, closure: np.ndarray | None = None, num_neighbours: int = NUM_NEIGHBOURS
 ) -> AgreementPairs:
-    """The nearest closures of every closure, by steps along the odometry.
+    """The nearest closures of every closure, by steps along the odometry, that connect the same chains of it.
 
     Args:
         closure: ``(C,)`` edges of the graph to pair; default: all of its closures.
@@ -69,4 +69,15 @@ def agreement_pairs(
     # The angle between two unit quaternions is twice that between the 4-vectors; as angles are squared, what the cosine
     # cannot resolve (1e-8 rad) is nothing.
     cosine = (residual[:, None] * residual[second].view(len(closure), count, 4)).sum(dim=2).abs().flatten()
-    return AgreementPairs(first, second, steps[~itself], ((2 * cosine.clamp(max=1).acos()) ** 2).numpy())
+    pairs = AgreementPairs(first, second, steps[~itself], ((2 * cosine.clamp(max=1).acos()) ** 2).numpy())
+    return _between_same_chains(pairs, graph, closure)
+
+
+def _between_same_chains(pairs: AgreementPairs, graph: ClosureGraph, closure: np.ndarray) -> AgreementPairs:
+    """Without those whose closures do not connect the same two chains: no number of steps lies between their ends."""
+    chain = graph.paths.chain[graph.nodes]
+    chains = np.sort(np.stack((chain[graph.source[closure]], chain[graph.target[closure]]), axis=1), axis=1)
+    if (chains == chains[0]).all():
+        return pairs
+    kept = (chains[pairs.first] == chains[pairs.second]).all(axis=1)
+    return AgreementPairs(pairs.first[kept], pairs.second[kept], pairs.steps[kept], pairs.squared_angle[kept])

@@ -53,6 +53,21 @@ def test_scales_are_found_again(planar: bool, step_deg: float, closure_deg: floa
     assert model.outlier_share == pytest.approx(false_share, abs=0.06)
 
 
+def test_scales_are_found_again_where_robots_meet() -> None:
+    """Eight chains that only closures connect: what lies between two chains is no number of steps."""
+    source, target, kind = slam_edges(800, 300, 7)
+    is_kept = (kind == 1) | (target % 100 != 0)
+    source, target, kind = source[is_kept], target[is_kept], kind[is_kept]
+    noise = small_noise(len(source), np.where(kind == 0, 0.5, 1.0), 8)
+    prepared = prepare(measured(random_truth(800, 3), source, target, noise, kind=kind))
+    assert 0.5 < np.degrees(np.sqrt(prepared.noise.step_variance)) / 0.5 < 2
+    assert 0.5 < np.degrees(np.sqrt(prepared.noise.closure_variance)) / 1.0 < 2
+    pairs, graph = prepared.pairs, prepared.closure_graph
+    chain = graph.nodes // 100
+    ends = np.sort(np.stack((chain[graph.source], chain[graph.target]), axis=1)[graph.is_closure], axis=1)
+    np.testing.assert_array_equal(ends[pairs.first], ends[pairs.second])
+
+
 def test_without_closures_the_prior_stands() -> None:
     source, target, kind = slam_edges(20, 0, 0)
     prepared = prepare(measured(random_truth(20, 0), source, target, kind=kind))
