@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -11,6 +13,7 @@ from rotavg_ros.solver import slam_refinement, slam_stages
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.methods import DEFAULT_METHOD, NETWORK_METHODS, Method
 from rotavg_ros.solver.profile import Estimate, Networks, Stopwatch
+from rotavg_ros.solver.repeated_edges import first_of_each
 from rotavg_ros.solver.slam_memory import SlamMemory
 from rotavg_ros.solver.slam_passes import Verdicts
 from rotavg_ros.view_graph import ViewGraph
@@ -24,12 +27,29 @@ def solve_slam(
     networks: Networks,
     watch: Stopwatch,
 ) -> Estimate:
-    """One method on a graph that lives on the CPU.
+    """One method on a graph that lives on the CPU; what it states more than once counts once.
 
     Args:
         refinement_steps: passes at most, 0 for none; None: as many as there may be.
         warm_start: ``(N, 4)`` body_from_world instead of the tree's.
     """
+    repeats = first_of_each(graph)
+    if repeats is None:
+        return _solve_once(graph, method, refinement_steps, warm_start, networks, watch)
+    first, says_as = (torch.from_numpy(edges) for edges in repeats)
+    estimate = _solve_once(graph.select_edges(first), method, refinement_steps, warm_start, networks, watch)
+    return replace(estimate, outlier_score=estimate.outlier_score[says_as], memory=None)
+
+
+def _solve_once(
+    graph: ViewGraph,
+    method: Method,
+    refinement_steps: int | None,
+    warm_start: Tensor | None,
+    networks: Networks,
+    watch: Stopwatch,
+) -> Estimate:
+    """The same for a graph without repetitions."""
     with watch.stage("contract"):
         prepared = slam_stages.prepare(graph, scale_estimation=method.scale_estimation)
     with watch.stage("clean"):
