@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.agreement import AgreementPairs
-from rotavg_ros.solver.minimum_cut import TwoLabels
+from rotavg_ros.solver.minimum_cut import FlowNetwork, TwoLabels
 from rotavg_ros.solver.truncated_cost import TruncatedCost
 
 _MAX_ROUNDS = 3
@@ -39,8 +39,9 @@ def jump_to_optimum(
         is_trusted: ``(C,)`` bool, closures whose residual is worth a jump.
     """
     hopeless = np.zeros(len(cost.cap))
+    network = FlowNetwork(cost.graph.num_nodes, cost.graph.source, cost.graph.target)
     for _ in range(_MAX_ROUNDS):
-        jumped, gained = _round_of_jumps(cost, correction, pairs, is_agreed, is_trusted, hopeless)
+        jumped, gained = _round_of_jumps(cost, correction, pairs, is_agreed, is_trusted, hopeless, network)
         if gained < _MIN_GAIN:
             break
         correction = min(jumped, cost.descend(jumped), key=cost.total)
@@ -54,6 +55,7 @@ def _round_of_jumps(
     is_agreed: np.ndarray,
     is_trusted: np.ndarray,
     hopeless: np.ndarray,
+    network: FlowNetwork,
 ) -> tuple[Tensor, float]:
     """One jump by each wrong edge that still is one when its turn comes; corrections and the cost saved.
 
@@ -77,7 +79,7 @@ def _round_of_jumps(
         if bound <= hopeless[edge] + _MIN_GAIN:
             continue
         hopeless[edge] = bound
-        moved = torch.from_numpy(np.flatnonzero(question.best_set()))
+        moved = torch.from_numpy(np.flatnonzero(question.best_set(network)))
         if len(moved) in (0, cost.graph.num_nodes):
             continue
         tried = correction.clone()
@@ -119,6 +121,8 @@ def _turns(cost: TruncatedCost, residual: Tensor, turns: Tensor, costs: np.ndarr
     """Which nodes to turn by each of ``turns`` ``(Q, 4)``; residuals ``(E, 4)`` and costs ``(E,)`` as they are now."""
     graph = cost.graph
     # Real parts of turn⁻¹ ∘ residual and of residual ∘ turn.
-    if_target = cost.of_cosines(residual @ turns.T) - costs[:, None]
-    if_source = cost.of_cosines(residual @ rotations.inverse(turns).T) - costs[:, None]
+    if_target = cost.of_cosines(residual @ turns.T)
+    if_target -= costs[:, None]
+    if_source = cost.of_cosines(residual @ rotations.inverse(turns).T)
+    if_source -= costs[:, None]
     return TwoLabels.create(graph.num_nodes, graph.source, graph.target, if_target, if_source)

@@ -20,6 +20,7 @@ from rotavg_ros.solver import slam_stages
 from rotavg_ros.solver.cycle_votes import count_votes
 from rotavg_ros.solver.exceedance import exceedance
 from rotavg_ros.solver.jumps import _turns
+from rotavg_ros.solver.minimum_cut import FlowNetwork
 from rotavg_ros.solver.noise_model import NoiseModel, noise_between_neighbours
 from rotavg_ros.solver.truncated_cost import TruncatedCost
 from test.solver.graphs import as_quaternions, measured, random_truth, small_noise
@@ -190,7 +191,8 @@ def test_a_jump_takes_the_set_that_an_exhaustive_search_finds() -> None:
     least = min(energy(turns) for turns in bits)
     assert least < costs.sum() - 1
     question = _turns(cost, residual, turn[None], costs)
-    assert energy(question.best_set()) == pytest.approx(least, abs=0.05)
+    network = FlowNetwork(closures.num_nodes, closures.source, closures.target)
+    assert energy(question.best_set(network)) == pytest.approx(least, abs=0.05)
     gained = float(costs.sum()) - least
     for weight in (np.ones(len(costs)), 1e-6 + cost.cap - costs):
         (bound,) = question.gain_bounds(cost.pattern.factorize(weight))
