@@ -1,8 +1,8 @@
 """Doubt in a solution that trusts the odometry: what speaks for slips, measured cheaply.
 
-If odometry slipped, closures that their neighbours confirm are rejected; or the slip passes for drift, and the map
-explains closures that the odometry does not, or drifts farther than neighbouring closures see it drift. All of this is
-cheap to measure, and a search for slips is not.
+If odometry slipped, closures that their neighbours confirm are rejected, all that span the slip; or the slip passes for
+drift, and the map explains closures that the odometry does not, or drifts farther than neighbouring closures see it
+drift. All of this is cheap to measure, and a search for slips is not.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from enum import IntEnum
 import numpy as np
 from scipy.special import gammainc
 
-from rotavg_ros.solver.agreement import AgreementPairs
+from rotavg_ros.solver.agreement import AgreementPairs, closure_ends
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.mixture import log_uniform_density
 from rotavg_ros.solver.noise_model import NoiseModel, noise_between_neighbours
@@ -23,6 +23,9 @@ from rotavg_ros.solver.slam_passes import SlamEstimate
 _DOUBTED_SHARE = 0.53
 _DOUBTED_SHARE_OF_MOST = 0.35
 _MIN_SUPPORTERS = 2
+# or if it rejects so many that neighbours confirm across one step, and believes at most such a share of those across
+# it: a false closure, or a group, is contradicted by good ones across the same steps,
+_SPANNING, _BELIEVED_SHARE = 10, 0.05
 # in some if it explains most closures, but so much larger a share disagrees with the odometry,
 _MOST = 0.6
 _DOUBTED_DIFFERENCE = 0.05
@@ -53,6 +56,8 @@ def measure_doubt(graph: ClosureGraph, pairs: AgreementPairs, estimate: SlamEsti
     rejected = estimate.inlier_probability[graph.is_closure] < 0.5
     supporters = np.bincount(pairs.first, agree(pairs, by_chain), len(rejected))
     # A group of false closures agrees with itself; it must not outvote the rest by its size.
+    if _has_contradicted_step(graph, rejected, supporters >= _MIN_SUPPORTERS):
+        return Doubt.STRONG
     weight = np.where(supporters >= _MIN_SUPPORTERS, 1 / (1 + supporters), 0.0)
     rejected_weight, rejected_share = float((weight * rejected).sum()), float(rejected.mean())
     doubted_share = _DOUBTED_SHARE_OF_MOST if rejected_share > _MOST else _DOUBTED_SHARE
@@ -66,6 +71,22 @@ def measure_doubt(graph: ClosureGraph, pairs: AgreementPairs, estimate: SlamEsti
     if explains_more or (rejected_share > _NOTABLE_SHARE and _drifts_farther(pairs, estimate, by_chain)):
         return Doubt.SOME
     return Doubt.NONE
+
+
+def _has_contradicted_step(graph: ClosureGraph, rejected: np.ndarray, is_confirmed: np.ndarray) -> bool:
+    """Whether all that speaks of some step of the odometry speaks against it; closures ``(C,)`` each."""
+    closure = np.flatnonzero(graph.is_closure)
+    on_chain = np.isfinite(graph.path_steps[closure])
+    at, ends = np.unique(closure_ends(graph, closure[on_chain]), return_inverse=True)
+    first, last = ends.reshape(-1, 2).T
+
+    def spanning(chosen: np.ndarray) -> np.ndarray:
+        """How many of the chosen closures span what follows each end of a closure."""
+        chosen = chosen[on_chain]
+        return np.cumsum(np.bincount(first[chosen], minlength=len(at)) - np.bincount(last[chosen], minlength=len(at)))
+
+    against = spanning(rejected & is_confirmed)
+    return bool(((against >= _SPANNING) & (spanning(~rejected) <= _BELIEVED_SHARE * against)).any())
 
 
 def agree(pairs: AgreementPairs, noise: NoiseModel) -> np.ndarray:

@@ -84,6 +84,16 @@ def test_slips_that_nearly_cancel_do_not_pass_for_drift(seed: int) -> None:
     assert not flagged[~is_false & ~is_slip].any()
 
 
+@pytest.mark.parametrize("planar", [True, False])
+def test_a_slip_that_few_closures_span_is_found(planar: bool) -> None:
+    """Near the end of the run one closure in nine spans it; each of those speaks against the odometry there."""
+    graph, truth, _, is_slip = laps(planar, false_share=0.0, slips={150: 40.0})
+    solution = solve(graph, profile="slam")
+    errors = orientation_errors(solution.body_from_world, as_quaternions(truth), graph.components())
+    assert np.degrees(float(errors.mean())) < 0.5
+    np.testing.assert_array_equal((solution.outlier_score > 0.5).numpy(), is_slip)
+
+
 def test_groups_of_false_closures_do_not_pass_for_slips() -> None:
     """A stretch of the second lap that all its closures turn alike could be two slips, at a lower cost one by one."""
     graph = laps(planar=True, false_share=0.0, num_laps=3, slips={})[0]
