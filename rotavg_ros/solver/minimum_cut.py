@@ -105,12 +105,12 @@ class FlowNetwork:
         begin = np.concatenate((source, target, stays, node, node, turns))
         end = np.concatenate((target, source, node, stays, turns, node))
         arcs, slot = np.unique(begin * self._size + end, return_inverse=True)
-        self._begin, self._end = np.divmod(arcs, self._size)
+        begin, end = np.divmod(arcs, self._size)
+        self._end, self._reverse = end, np.searchsorted(arcs, end * self._size + begin)
         # Arcs back from the nodes to the one terminal, and from the other, carry nothing.
         kinds = (len(source), len(source), num_nodes, num_nodes, num_nodes, num_nodes)
         carries = np.repeat((True, True, True, False, True, False), kinds)
-        self._slot, self._is_terminal = slot[carries], np.maximum(self._begin, self._end) >= num_nodes
-        self._first = np.searchsorted(self._begin, np.arange(self._size + 1))
+        self._slot, self._first = slot[carries], np.searchsorted(begin, np.arange(self._size + 1))
 
     def minimum_cut(self, forwards: np.ndarray, backwards: np.ndarray, supply: np.ndarray) -> np.ndarray:
         """``(N,)`` bool, the most nodes of least cost.
@@ -123,8 +123,7 @@ class FlowNetwork:
         values = np.concatenate((forwards, backwards, np.maximum(supply, 0), np.maximum(-supply, 0)))
         capacity = np.rint(_UNIT * np.bincount(self._slot, values, len(self._end))).astype(np.int32)
         # With both directions of every arc there, capacities and flows have the same layout.
-        is_used = np.append(supply != 0, (True, True))
-        chosen = np.flatnonzero(~self._is_terminal | (is_used[self._begin] & is_used[self._end]))
+        chosen = np.flatnonzero(capacity + capacity.take(self._reverse))
         network = self._matrix(chosen, capacity[chosen])
         is_open = network.data > maximum_flow(network, stays, turns).flow.data
         left = self._matrix(chosen[is_open], np.ones(int(is_open.sum()), dtype=np.int8))

@@ -8,6 +8,7 @@ them notice. So the costs of all places are sums along the chain.
 from __future__ import annotations
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
@@ -49,14 +50,19 @@ def with_moved_slips(
     prior = np.where(graph.is_odometry, no_slip_log_odds(graph.steps, noise.components), noise.prior_log_odds)
     cost = TruncatedCost.create(graph, noise, log_odds + prior)
     residual = cost.residual(correction)
+    costs = cost.of_edges(residual)[:, None]
+    turns = residual[torch.from_numpy(slipped)]
+    # By how much edges cost more if only their source turns, or only their target; turned back, the other way round.
+    if_source = cost.of_cosines(residual @ rotations.inverse(turns).T) - costs
+    if_target = cost.of_cosines(residual @ turns.T) - costs
     ends, last = np.stack((rank[graph.source], rank[graph.target])), len(rank) - 1
     columns = []
-    for segment in slipped:
-        turn, gap = residual[segment], int(segment_source[segment])
+    for number, segment in enumerate(slipped):
+        gap, by_source, by_target = int(segment_source[segment]), if_source[:, number], if_target[:, number]
         # What follows turns back, or what leads there turns along.
-        after = _beyond(cost, residual, turn, ends, gap + 1, chain)
-        before = _beyond(cost, residual, rotations.inverse(turn), last - ends, last - gap, chain[::-1])[::-1]
-        square = float((rotations.log(turn) ** 2).sum()) / noise.components
+        after = _beyond(by_source, by_target, ends, gap + 1, chain)
+        before = _beyond(by_target, by_source, last - ends, last - gap, chain[::-1])[::-1]
+        square = float((rotations.log(turns[number]) ** 2).sum()) / noise.components
         either = 1.0 + after.max() + before.max()
         columns += [np.sqrt(square / either * moved[rank]) for moved in (after, before)]
     width = samples.shape[1] + len(columns)
@@ -64,21 +70,17 @@ def with_moved_slips(
 
 
 def _beyond(
-    cost: TruncatedCost, residual: Tensor, turn: Tensor, ends: np.ndarray, first: int, chain: np.ndarray
+    if_source: np.ndarray, if_target: np.ndarray, ends: np.ndarray, first: int, chain: np.ndarray
 ) -> np.ndarray:
     """``(K,)`` by rank: how likely the slip lies beyond a key node, in units of how likely it is where it was found.
 
     Args:
-        residual: ``(E, 4)``.
-        turn: ``(4,)`` of the key nodes between the old and the new place.
+        if_source, if_target: ``(E,)`` what edges cost more if only this end turns as key nodes between the places do.
         ends: ``(2, E)`` rank of each edge's source and target along the way.
         first: rank of the first key node that turns.
         chain: ``(K,)`` by rank, a number that is the same along one chain.
     """
     num_nodes = len(chain)
-    costs = cost.of_edges(residual)
-    if_source = cost.of_cosines(residual @ rotations.inverse(turn)) - costs
-    if_target = cost.of_cosines(residual @ turn) - costs
     in_reach = ends >= first
     change = np.bincount(ends[0], if_source * in_reach[0], num_nodes)
     change += np.bincount(ends[1], if_target * in_reach[1], num_nodes)

@@ -37,6 +37,7 @@ def refine(
     log_odds: np.ndarray | None = None,
     max_passes: int = MAX_PASSES,
     hold_noise: bool = False,
+    rank: np.ndarray | None = None,
 ) -> SlamEstimate:
     """Alternate solving and judging until neither moves; once more if neighbouring closures err together.
 
@@ -48,9 +49,10 @@ def refine(
         log_odds: ``(E,)`` prior log-odds of each edge to be good, beyond the common outlier share; ±inf decide it.
         max_passes: sparse solves at most, at least 1.
         hold_noise: keep both variances as given.
+        rank: ``(K,)`` where each key node stands in the order of elimination, if that is known.
     """
     prior = np.zeros(len(graph.source)) if log_odds is None else log_odds
-    system = WholeSystem(graph)
+    system = WholeSystem(graph, rank)
     state = Passes(graph, correction, inlier_probability, noise, prior, hold_noise, system)
     max_step_variance = _MAX_STEP_VARIANCE_GAIN * noise.step_variance
     state.alternate(max_step_variance, (max_passes + 1) // 2)

@@ -223,7 +223,9 @@ def refine(
     """Refine from corrections ``(K, 4)``; if the outcome looks as if odometry had slipped, from a second start, too."""
     graph, pairs, prior = prepared.closure_graph, prepared.pairs, cleaned.prior_log_odds
 
-    def run(start: Tensor, inlier_probability: np.ndarray, noise: NoiseModel) -> SlamEstimate:
+    def run(
+        start: Tensor, inlier_probability: np.ndarray, noise: NoiseModel, rank: np.ndarray | None = None
+    ) -> SlamEstimate:
         return slam_refinement.refine(
             graph,
             pairs,
@@ -233,11 +235,14 @@ def refine(
             log_odds=prior,
             max_passes=max_passes,
             hold_noise=not scale_estimation,
+            rank=rank,
         )
 
     estimate = run(correction, cleaned.inlier_probability, prepared.noise)
     second = search_for_slips(graph, pairs, estimate, prepared.noise, prior) if slip_search else None
-    return estimate if second is None else run(second.correction, second.inlier_probability, second.noise)
+    if second is None:
+        return estimate
+    return run(second.correction, second.inlier_probability, second.noise, estimate.rank)
 
 
 def outlier_scores(graph: ClosureGraph, outlier_probability: np.ndarray) -> np.ndarray:

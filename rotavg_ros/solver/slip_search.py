@@ -88,7 +88,7 @@ def search_for_slips(
     votes = count_votes(graph, pairs, noise, finite[graph.is_closure], finite[: graph.num_segments])
     trust = np.ones(len(graph.source))
     trust[graph.is_closure] = np.maximum(expit(votes.closure), _MIN_TRUST)
-    cost = TruncatedCost.create(graph, noise, prior)
+    cost = TruncatedCost.create(graph, noise, prior, estimate.rank)
     correction = cost.descend(_tree(cost, trust, votes.segment), trust)
     num_edges = len(graph.source)
     if num_edges <= _MAX_EDGES_TO_JUMP:
@@ -100,7 +100,7 @@ def search_for_slips(
         return None
     # Without the slips, the odometry tells how it drifts.
     noise = _noise_without_slips(cost, correction, noise)
-    cost = TruncatedCost.create(graph, noise, prior)
+    cost = TruncatedCost.create(graph, noise, prior, estimate.rank)
     if num_edges <= _MAX_EDGES_TO_JUMP:
         everyone = np.ones(len(votes.closure), dtype=bool)
         correction = jump_to_optimum(cost, cost.descend(correction), pairs, is_agreed, everyone)

@@ -8,6 +8,7 @@ how much is wrong.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -47,7 +48,7 @@ class TruncatedCost:
         graph: the closure graph.
         variance: ``(E,)`` rad² per component.
         cap: ``(E,)`` what a wrong edge costs, ≥ 0.
-        pattern: the graph's Laplacian.
+        rank: ``(K,)`` where each key node stands in the order of elimination, if that is known.
         measured: ``(4, E)``, the graph's residuals, components in rows.
         cap_of_two: ``(E,)`` what it costs if it is wrong by more than one slip.
         uneven_cost: ``(E,)`` what a segment costs beforehand that drifts more than its length tells; inf for closures.
@@ -57,7 +58,7 @@ class TruncatedCost:
     graph: ClosureGraph
     variance: np.ndarray
     cap: np.ndarray
-    pattern: LaplacianPattern
+    rank: np.ndarray | None
     measured: np.ndarray
     cap_of_two: np.ndarray
     uneven_cost: np.ndarray
@@ -65,12 +66,12 @@ class TruncatedCost:
 
     @staticmethod
     def create(
-        graph: ClosureGraph, noise: NoiseModel, log_odds: np.ndarray, pattern: LaplacianPattern | None = None
+        graph: ClosureGraph, noise: NoiseModel, log_odds: np.ndarray, rank: np.ndarray | None = None
     ) -> TruncatedCost:
         """From the noise and each edge's prior log-odds of being good, ``(E,)``; ±inf decide it.
 
         Args:
-            pattern: of the graph, if there is one.
+            rank: ``(K,)`` where each key node stands in the order of elimination, if that is known.
         """
         variance = graph.steps * np.where(graph.is_odometry, noise.step_variance, noise.closure_variance)
         # Without the edge, the way round passes at least one closure more; a segment's, two.
@@ -81,12 +82,16 @@ class TruncatedCost:
         # The squared residual, in units of the variance, at which a good edge costs as much as a wrong one.
         limit = 2 * _SLACK * np.where(graph.is_odometry, np.maximum(cap, _UNEVEN_RATIO * (cap - uneven)), cap)
         reach = np.cos(np.minimum(np.sqrt(limit * variance), np.pi) / 2) - _ROUNDING
-        if pattern is None:
-            pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots)
         measured = np.ascontiguousarray(graph.residual.numpy().T)
         cap_of_two = np.where(graph.is_odometry, 2 * cap, cap)
         uneven_cost = np.where(graph.is_odometry, uneven, np.inf)
-        return TruncatedCost(graph, variance, cap, pattern, measured, cap_of_two, uneven_cost, reach)
+        return TruncatedCost(graph, variance, cap, rank, measured, cap_of_two, uneven_cost, reach)
+
+    @cached_property
+    def pattern(self) -> LaplacianPattern:
+        """The graph's Laplacian."""
+        graph = self.graph
+        return LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots, self.rank)
 
     def residual(self, correction: Tensor) -> Tensor:
         """``(E, 4)`` of either sign."""
