@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver import quaternion_rows
 from rotavg_ros.solver.odometry_paths import OdometryPaths, follow
 from rotavg_ros.solver.spanning_tree import SpanningForest
 from rotavg_ros.view_graph import ViewGraph
@@ -82,9 +83,13 @@ class ClosureGraph:
 
     def orientations(self, correction: Tensor) -> Tensor:
         """Corrections of the key nodes ``(K, 4)`` → orientations of all nodes, body_from_world ``(N, 4)``."""
-        fraction = torch.from_numpy(self.fraction)
-        spread = rotations.slerp(correction[self.above], correction[self.below], fraction)
-        return rotations.normalize(rotations.multiply(self.odometry_orientation, spread))
+        rows = np.ascontiguousarray(correction.numpy().T)
+        above, below = rows.take(self.above, axis=1), rows.take(self.below, axis=1)
+        turn = quaternion_rows.log(quaternion_rows.multiply(quaternion_rows.inverse(above), below))
+        spread = quaternion_rows.multiply(above, quaternion_rows.exp(self.fraction * turn))
+        odometry = np.ascontiguousarray(self.odometry_orientation.numpy().T)
+        orientation = torch.from_numpy(quaternion_rows.multiply(odometry, spread).T.copy())
+        return rotations.normalize(orientation)
 
     def variance(self, samples: np.ndarray, step_variance: float) -> np.ndarray:
         """Variance of all nodes ``(N,)`` from samples of the key nodes' errors ``(K, k)``; rad².

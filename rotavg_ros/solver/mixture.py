@@ -89,9 +89,10 @@ class MixtureFit:
         size = [len(kind.steps) for kind in kinds]
         self._closures = np.repeat([kind.closures for kind in kinds], size).astype(np.float32)
         self._weight = np.repeat([kind.weight for kind in kinds], size)
-        self._kind = np.repeat(np.arange(len(kinds)), size)
+        self._size = size
         # (D, kinds): sums over each kind are one product.
-        self._membership = (np.eye(len(kinds))[self._kind] * self._weight[:, None]).astype(np.float32)
+        kind = np.repeat(np.arange(len(kinds)), size)
+        self._membership = (np.eye(len(kinds))[kind] * self._weight[:, None]).astype(np.float32)
         self._total = np.array([kind.weight * len(kind.steps) for kind in kinds])
         self._constant = float(self._weight @ log_uniform)
 
@@ -138,7 +139,7 @@ class MixtureFit:
         variance = closure_variance * self._closures
         variance += from_steps
         surprise = self._half_square / variance
-        odds = np.log(1 / models.false_share - 1).astype(np.float32)[:, self._kind]
+        odds = np.repeat(np.log(1 / models.false_share - 1).astype(np.float32), self._size, axis=1)
         odds -= self._false
         odds -= surprise
         part = np.divide(from_steps, variance, out=from_steps)
@@ -149,11 +150,11 @@ class MixtureFit:
         log_likelihood = np.log(either, out=either) @ self._weight
         log_likelihood += self._constant + np.log(models.false_share) @ self._total
         # Of what is good, the part that is the steps'; and expected squares of both parts, given their sum.
-        of_steps = np.multiply(part, good, out=part)
-        sum_good, sum_steps, square, square_steps = (
-            (values @ self._membership).astype(np.float64)
-            for values in (good, of_steps, good * surprise, of_steps * surprise)
-        )
+        values = np.empty((4, *good.shape), dtype=np.float32)
+        values[0] = good
+        np.multiply(part, good, out=values[1])
+        np.multiply(values[:2], surprise, out=values[2:])
+        sum_good, sum_steps, square, square_steps = (values @ self._membership).astype(np.float64)
         steps, squares, squares_of_steps = sum_steps.sum(axis=1), 2 * square.sum(axis=1), 2 * square_steps.sum(axis=1)
         all_good = sum_good.sum(axis=1)
         step_square = models.step_variance * (squares_of_steps + k * (all_good - steps))

@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import breadth_first_order, dijkstra, minimum_spanning
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver import quaternion_rows
 from rotavg_ros.solver.residuals import multiply_rows
 from rotavg_ros.solver.sorted_edges import SortedEdges
 from rotavg_ros.view_graph import ViewGraph
@@ -95,7 +96,22 @@ def minimum_spanning_forest(graph: ViewGraph, cost: Tensor) -> SpanningForest:
 
 def compose_orientations(forest: SpanningForest, graph: ViewGraph) -> Tensor:
     """Orientations along the forest, body_from_world ``(N, 4)`` float64 on the CPU, roots at the identity."""
-    return compose(torch.from_numpy(forest.parent), torch.from_numpy(forest.parent_edge), graph.to("cpu"))
+    child = np.flatnonzero(forest.parent_edge >= 0)
+    edge = forest.parent_edge[child]
+    graph = graph.to("cpu")
+    rows = np.zeros((4, len(forest.parent)))
+    rows[3] = 1.0
+    rows[:, child] = graph.target_from_source.numpy().take(edge, axis=0).T
+    leaves_child = graph.target.numpy().take(edge) != child
+    rows[:3, child[leaves_child]] *= -1.0
+    ancestor = forest.parent
+    while True:
+        farther = ancestor.take(ancestor)
+        if np.array_equal(farther, ancestor):
+            unit = quaternion_rows.normalize(rows) * np.where(rows[3] < 0, -1.0, 1.0)
+            return torch.from_numpy(np.ascontiguousarray(unit.T))
+        rows = quaternion_rows.multiply(rows, rows.take(ancestor, axis=1))
+        ancestor = farther
 
 
 def compose(parent: Tensor, parent_edge: Tensor, graph: ViewGraph) -> Tensor:
