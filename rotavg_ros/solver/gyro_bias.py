@@ -16,6 +16,7 @@ import torch
 from scipy.special import expit
 
 from rotavg_ros import rotations
+from rotavg_ros.solver import quaternion_rows
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.mixture import log_uniform_density
 from rotavg_ros.solver.noise_model import NoiseModel
@@ -61,7 +62,8 @@ def estimate_bias(
     drift = _drift_per_bias(graph, forest, closure_graph)
     ends = nodes[closure_graph.source[closure]], nodes[closure_graph.target[closure]]
     design = drift[ends[0]] - drift[ends[1]]
-    measured = closure_graph.residual[torch.from_numpy(closure)]
+    measured = closure_graph.residual.numpy()[closure]
+    measured_rows = np.ascontiguousarray(measured.T)
     steps = np.maximum(closure_graph.path_steps[closure], 1.0)
     variance = steps * noise.step_variance + noise.closure_variance
     highest = noise.prior_log_odds - noise.components / 2 * np.log(2 * np.pi * variance)
@@ -71,30 +73,35 @@ def estimate_bias(
         return np.asarray(highest - squared_angle / (2 * variance) - uniform.reshape(squared_angle.shape))
 
     proposed = np.argsort(steps, kind="stable")[:_MAX_PROPOSALS]
-    residual = rotations.log(measured).numpy()
+    residual = quaternion_rows.log(measured_rows).T
     inverse_variance = 1 / variance[proposed, None, None]
     normal = np.swapaxes(design[proposed], 1, 2) * inverse_variance
     proposals = np.linalg.solve(
         normal @ design[proposed] + np.eye(3) / _PRIOR_BIAS**2, normal @ residual[proposed, :, None]
     )[..., 0]
     proposals = np.concatenate((np.zeros((1, 3)), proposals))
-    of_proposals = log_odds(_squared_angles(design, measured.numpy(), proposals))
-    bias = proposals[np.logaddexp(0, of_proposals).sum(axis=1).argmax()]
+    # To choose among proposals single precision will do.
+    single = (array.astype(np.float32) for array in (design, measured, proposals))
+    of_proposals = log_odds(_squared_angles(*single)).astype(np.float32)
+    softplus = np.maximum(of_proposals, 0) + np.log(1 + np.exp(-np.abs(of_proposals)))
+    bias = proposals[softplus.sum(axis=1, dtype=np.float64).argmax()]
     for _ in range(_EM_ITERATIONS):
-        rest = rotations.log(rotations.multiply(rotations.exp(torch.from_numpy(-design @ bias)), measured)).numpy()
+        turned = quaternion_rows.multiply(quaternion_rows.exp(-(design @ bias).T), measured_rows)
+        rest = np.ascontiguousarray(quaternion_rows.log(turned).T)
         weight = expit(log_odds((rest**2).sum(axis=1))) / variance
         weighted = (design * weight[:, None, None]).reshape(-1, 3)
         normal = weighted.T @ design.reshape(-1, 3) + np.eye(3) / _PRIOR_BIAS**2
         bias = bias + np.linalg.solve(normal, weighted.T @ rest.ravel() - bias / _PRIOR_BIAS**2)
-    good = log_odds(_squared_angles(design, measured.numpy(), bias[None])) > 0
+    good = log_odds(_squared_angles(design, measured, bias[None])) > 0
     return BiasEstimate(bias, float(good.mean() - (of_proposals[0] > 0).mean()))
 
 
 def _squared_angles(design: np.ndarray, measured: np.ndarray, biases: np.ndarray) -> np.ndarray:
     """What is left of closures ``(C, 4)`` under each of B biases ``(B, 3)``, ``(B, C)`` rad²; design ``(C, 3, 3)``."""
-    predicted = np.einsum("cij,bj->ibc", design, biases)
-    half = np.sqrt((predicted**2).sum(axis=0)) / 2
-    along = np.einsum("ibc,ci->bc", predicted, measured[:, :3]) / 2
+    by_bias = biases @ design.transpose(2, 1, 0).reshape(3, -1)
+    predicted = by_bias.reshape(len(biases), 3, len(design))
+    half = np.sqrt(np.einsum("bic,bic->bc", predicted, predicted)) / 2
+    along = np.einsum("bic,ci->bc", predicted, measured[:, :3]) / 2
     # The real part of exp(-predicted) ∘ measured.
     cosine = np.cos(half) * measured[:, 3] + np.sinc(half / np.pi) * along
     return np.asarray((2 * np.arccos(np.minimum(np.abs(cosine), 1.0))) ** 2)
