@@ -70,16 +70,21 @@ def _round_of_jumps(
         return correction, gained
     # What an edge loses if one end turns is what it is yet short of its cap, or less if it turns but a little.
     system = cost.pattern.factorize(np.maximum(cost.cap - costs, _MIN_CARRIED))
-    bounds = _turns(cost, residual, residual[candidates], costs).gain_bounds(system)
-    for edge in candidates[bounds > hopeless[candidates] + _MIN_GAIN]:
+    questions = _turns(cost, residual, residual[candidates], costs)
+    bounds = questions.gain_bounds(system)
+    for number in np.flatnonzero(bounds > hopeless[candidates] + _MIN_GAIN):
+        edge = candidates[number]
         if costs[edge] < 0.5 * cost.cap[edge]:
             continue
-        question = _turns(cost, residual, residual[[edge]], costs)
-        bound = float(question.gain_bounds(system)[0])
-        if bound <= hopeless[edge] + _MIN_GAIN:
-            continue
+        # Until something turns, all questions stand as they were put at first.
+        question, column, bound = questions, int(number), float(bounds[number])
+        if gained > 0:
+            question, column = _turns(cost, residual, residual[[edge]], costs), 0
+            bound = float(question.gain_bounds(system)[0])
+            if bound <= hopeless[edge] + _MIN_GAIN:
+                continue
         hopeless[edge] = bound
-        moved = torch.from_numpy(np.flatnonzero(question.best_set(network)))
+        moved = torch.from_numpy(np.flatnonzero(question.best_set(network, column)))
         if len(moved) in (0, cost.graph.num_nodes):
             continue
         tried = correction.clone()
