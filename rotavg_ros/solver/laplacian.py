@@ -104,6 +104,8 @@ class LaplacianPattern:
     def matrix(self, weight: np.ndarray) -> csc_array:
         """``L``, rows and columns in the order of elimination as far as it is known."""
         values = np.bincount(self._slot, np.concatenate((-weight, -weight, weight, weight)), len(self._row))
+        # Counts of nothing are integers, also with weights.
+        values = values.astype(np.float64, copy=False)
         values[self._root_slot] += root_stiffness(weight)
         return csc_array((values, self._row, self._first), shape=(self.num_nodes, self.num_nodes))
 

@@ -78,3 +78,9 @@ def test_leverage_is_told_from_a_few_probes_however_large_it_is() -> None:
     # By how much an edge is less certain without itself; from the mean square alone: 1.6 in the mean.
     error = np.log((1 - leverage[judged]) / (1 - exact[judged]))
     assert np.sqrt((error**2).mean()) < 0.3
+
+
+def test_a_node_without_edges_stays_where_it_is() -> None:
+    nothing = np.empty(0, dtype=np.int64)
+    pattern = LaplacianPattern(1, nothing, nothing, np.array([0]))
+    np.testing.assert_array_equal(pattern.factorize(np.empty(0)).fit(np.empty((0, 3))), np.zeros((1, 3)))
