@@ -36,7 +36,10 @@ class ClosureGraph:
         source, target: ``(E,)`` key nodes.
         residual: ``(E, 4)`` float64 e⁰; the identity on segments.
         is_odometry: ``(E,)`` bool; all segments, and odometry edges outside the forest.
-        steps: ``(E,)`` variance in units of one edge of its kind: odometry steps passed, 1 for a closure.
+        own_steps: ``(E,)`` variance of each edge's own noise in units of one edge of its kind: odometry steps passed;
+            of closures 1, or what they state as far as that is believed.
+        steps: ``(E,)`` the variance by which it weighs, likewise; more where closures err together.
+        stated_variance: ``(E,)`` rad², what closures state; NaN where unknown, and of odometry.
         path_steps: ``(E,)`` odometry steps between the edge's ends along the forest; inf where a bridge is passed.
         view_graph_edge: ``(E - S,)`` the view-graph edge of each edge that is no segment.
         segment_of_edge: ``(M,)`` the segment that holds each view-graph edge, -1 for those above.
@@ -51,7 +54,9 @@ class ClosureGraph:
     target: np.ndarray
     residual: Tensor
     is_odometry: np.ndarray
+    own_steps: np.ndarray
     steps: np.ndarray
+    stated_variance: np.ndarray
     path_steps: np.ndarray
     view_graph_edge: np.ndarray
     segment_of_edge: np.ndarray
@@ -157,6 +162,8 @@ def contract_along(graph: ViewGraph, paths: OdometryPaths) -> ClosureGraph:
     share_of_segment = np.ones(num_edges)
     on_segment = segment_of_edge >= 0
     share_of_segment[on_segment] = steps[on_segment] / segment_steps[segment_of_edge[on_segment]]
+    own_steps = np.concatenate((segment_steps, np.where(is_odometry, steps, 1.0)[other]))
+    stated_variance = np.where(is_odometry, np.nan, 1 / graph.precision.numpy())[other]
     _, chain_number = np.unique(paths.chain, return_inverse=True)
     return ClosureGraph(
         nodes=nodes,
@@ -166,7 +173,9 @@ def contract_along(graph: ViewGraph, paths: OdometryPaths) -> ClosureGraph:
         target=key_of_node[np.concatenate((segment_end, target[other]))],
         residual=torch.cat((rotations.identity(len(segment_end)), paths.residual)),
         is_odometry=np.concatenate((np.ones(len(segment_end), dtype=bool), is_odometry[other])),
-        steps=np.concatenate((segment_steps, np.where(is_odometry, steps, 1.0)[other])),
+        own_steps=own_steps,
+        steps=own_steps,
+        stated_variance=np.concatenate((np.full(len(segment_end), np.nan), stated_variance)),
         path_steps=np.concatenate((segment_steps, paths.path_steps)),
         view_graph_edge=other,
         segment_of_edge=segment_of_edge,

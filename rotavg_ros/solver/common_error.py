@@ -47,6 +47,7 @@ def common_share(
     run: np.ndarray,
     inlier_probability: np.ndarray,
     residual: np.ndarray,
+    own_steps: np.ndarray,
     samples: np.ndarray,
     closure_variance: float,
     components: int,
@@ -60,15 +61,18 @@ def common_share(
         run: ``(C,)``.
         inlier_probability: ``(C,)``.
         residual: ``(C, 3)`` rad, all from older to newer end.
+        own_steps: ``(C,)`` variance of each closure's own noise in units of σ².
         samples: ``(C, K)`` differences of the fit's samples over the closures, in the same direction.
         closure_variance: σ², rad².
         components: 1 for planar graphs, else 3.
     """
-    size = np.maximum(np.bincount(run, inlier_probability), 1e-9)
+    size = np.bincount(run, inlier_probability)
+    weight = inlier_probability / own_steps
+    total = np.maximum(np.bincount(run, weight), 1e-9)
 
     def scatter(values: np.ndarray) -> float:
-        mean = np.stack([np.bincount(run, inlier_probability * column) / size for column in values.T], axis=1)
-        return float((inlier_probability[:, None] * (values - mean[run]) ** 2).sum())
+        mean = np.stack([np.bincount(run, weight * column) / total for column in values.T], axis=1)
+        return float((weight[:, None] * (values - mean[run]) ** 2).sum())
 
     observed = scatter(residual) / components
     expected = closure_variance * np.maximum(size - 1, 0).sum() - scatter(samples) / samples.shape[1]

@@ -4,7 +4,8 @@ A hundred closures that span the same stretches are a handful of measurements of
 likeliest variance of a step can then be a fiftieth of the true one, and an uncertainty stated by it a seventh. So the
 errors that closures have in common by passing the same steps are taken for what they are,
 
-    r ~ N(0, σ_o² A + σ_c² I),        A_ij: odometry steps that closures i and j both pass,
+    r ~ N(0, σ_o² A + σ_c² F),        A_ij: odometry steps that closures i and j both pass,
+                                      F: diagonal, each closure's own variance in units of σ_c²,
 
 and the variance of a step is averaged over its posterior, since that is what the variance of an error averages to.
 """
@@ -39,8 +40,10 @@ def expected_step_variance(graph: ClosureGraph, trust: np.ndarray, closure_varia
     low, high = ends.min(axis=0), ends.max(axis=0)
     shared = np.maximum(np.minimum(high[:, None], high) - np.maximum(low[:, None], low), 0.0)
     forward = np.where(ends[0] < ends[1], 1.0, -1.0)[:, None]
+    own_deviation = np.sqrt(graph.own_steps[closure])
     discrepancy = forward * rotations.log(graph.residual[closure]).numpy()[:, 3 - components :]
-    variance_of_shared, basis = np.linalg.eigh(shared)
+    discrepancy = discrepancy / own_deviation[:, None]
+    variance_of_shared, basis = np.linalg.eigh(shared / np.outer(own_deviation, own_deviation))
     square = ((basis.T @ discrepancy) ** 2).sum(axis=1)
 
     step = np.radians(_GRID_STEP_DEG) ** 2

@@ -19,11 +19,11 @@ from rotavg_ros.solver.slam_stages import judge_closures
 
 
 class NewClosures(NamedTuple):
-    """Of n closures ``(n,)`` each: probability of being good, prior log-odds, variance in units of the closures'."""
+    """Of n closures ``(n,)`` each: probability of being good, prior log-odds, inflation for common errors."""
 
     inlier_probability: np.ndarray
     prior_log_odds: np.ndarray
-    steps: np.ndarray
+    variance_factor: np.ndarray
 
 
 def judge_new_closures(
@@ -32,7 +32,7 @@ def judge_new_closures(
     graph: ClosureGraph,
     closure: np.ndarray,
     new: np.ndarray,
-    steps: np.ndarray,
+    variance_factor: np.ndarray,
 ) -> NewClosures:
     """By their discrepancies with the odometry and, with a network, by the few hundred closures around them.
 
@@ -40,7 +40,7 @@ def judge_new_closures(
         noise: as the odometry has it.
         closure: ``(C,)`` the graph's closures, ascending.
         new: ``(n,)`` of these, the new ones.
-        steps: ``(E,)`` variances of the others in units of their kind's.
+        variance_factor: ``(E,)`` of the others, see :func:`~rotavg_ros.solver.common_error.variance_factor`.
     """
     is_new = np.isin(closure, new, assume_unique=True)
     ends = closure_ends(graph, closure)
@@ -61,5 +61,5 @@ def judge_new_closures(
     return NewClosures(
         expit(log_odds[judged]),
         of_network[judged],
-        np.where(is_near.any(axis=1), steps[closure[nearest]], 1.0),
+        np.where(is_near.any(axis=1), variance_factor[closure[nearest]], 1.0),
     )

@@ -33,6 +33,7 @@ from rotavg_ros.solver.slam_passes import SlamEstimate, Verdicts
 from rotavg_ros.solver.slam_stages import CleanedClosures, Prepared, draw_together
 from rotavg_ros.solver.slam_system import ITERATING_PAYS, GrownSystem, StaleFactorError
 from rotavg_ros.solver.slam_update import Start, follow, grown_variance, renew
+from rotavg_ros.solver.stated_precision import StatedTrust, believing
 from rotavg_ros.view_graph import ViewGraph
 
 # The whole solve runs again after so many updates, or once there are so many more closures. Of few closures that is
@@ -67,7 +68,9 @@ class SlamMemory:
         inlier_probability: ``(M,)`` that an edge is not a false one; all of a segment have that of the segment.
         outlier_probability: ``(M,)`` that its true noise exceeds 10°, likewise.
         prior_log_odds: ``(M,)`` what the network said of closures.
-        steps: ``(M,)`` variance of a closure in units of the closures'; more than 1 where neighbours err together.
+        steps: ``(M,)`` variance by which a closure weighs in units of the closures', see
+            :class:`~rotavg_ros.solver.closure_graph.ClosureGraph`.
+        trust: how far the variances that closures state are believed.
         exact_share: ``(M,)`` probability of a good closure to err no more than most.
         prediction_variance: ``(M,)`` rad², of what the rest of the graph predicts of a closure.
         variance: ``(N,)`` rad², of the orientations.
@@ -86,6 +89,7 @@ class SlamMemory:
     outlier_probability: np.ndarray
     prior_log_odds: np.ndarray
     steps: np.ndarray
+    trust: StatedTrust
     exact_share: np.ndarray
     prediction_variance: np.ndarray
     variance: np.ndarray
@@ -117,6 +121,7 @@ class SlamMemory:
             **_of_estimate(graph, closure_graph, estimate),
             graph=graph,
             variance=variance,
+            trust=estimate.trust,
             chain_noise=prepared.noise,
             max_step_variance=estimate.max_step_variance,
             closures=closures,
@@ -195,7 +200,7 @@ class SlamMemory:
     def _renew(self, graph: ViewGraph, start: Start) -> Updated | None:
         """Factorised and estimated anew; None if orientations turn by too much."""
         closure_graph = start.graph
-        estimate = renew(start, self._rank(closure_graph), self.max_step_variance)
+        estimate = renew(start, self._rank(closure_graph), self.trust, self.max_step_variance)
         if estimate is None:
             return None
         variance = closure_graph.variance(estimate.samples, estimate.stated_step_variance)
@@ -214,19 +219,19 @@ class SlamMemory:
         closure = np.flatnonzero(graph.is_closure)
         is_new = graph.is_closure & self._came_later(graph)
         new = np.flatnonzero(is_new)
-        steps, inlier_probability, prior = (
-            graph.steps.copy(),
-            *(
-                carried_over(value, graph, otherwise)
-                for value, otherwise in ((self.inlier_probability, 1.0), (self.prior_log_odds, 0.0))
-            ),
+        inlier_probability, prior = (
+            carried_over(value, graph, otherwise)
+            for value, otherwise in ((self.inlier_probability, 1.0), (self.prior_log_odds, 0.0))
         )
-        steps[closure] = carried_over(self.steps, graph, 1.0)[closure]
+        graph = believing(graph, self.trust)
+        # By how much a closure weighs less for those that err as it does.
+        factor = np.ones(len(graph.source))
+        factor[closure] = carried_over(self.steps, graph, 1.0)[closure] / graph.own_steps[closure]
         if len(new):
-            judged = judge_new_closures(network, self.chain_noise, graph, closure, new, steps)
-            inlier_probability[new], prior[new], steps[new] = judged
+            judged = judge_new_closures(network, self.chain_noise, graph, closure, new, factor)
+            inlier_probability[new], prior[new], factor[new] = judged
         return Start(
-            replace(graph, steps=steps),
+            replace(graph, steps=factor * graph.own_steps),
             graph.corrections(body_from_world),
             inlier_probability,
             self.noise,

@@ -26,8 +26,10 @@ from rotavg_ros.solver.slam_judging import (
     exactness_of,
     judge,
     outlier_probability,
+    tail_ratio,
 )
 from rotavg_ros.solver.slam_system import System, leverage
+from rotavg_ros.solver.stated_precision import StatedTrust
 
 # Residuals say nothing of noise or falsehood while the orientations still turn by more than this.
 _SETTLED_STEP = np.radians(3.0)
@@ -79,6 +81,7 @@ class SlamEstimate(Verdicts):
         samples: ``(K, k)`` errors, in rad, as they might be: their second moments are the estimate's covariance.
         stated_step_variance: rad², what the samples are drawn with.
         common_share: share of the closures' error variance that neighbouring closures have in common.
+        trust: how far the variances that closures state are believed.
         passes: number of sparse solves.
         max_step_variance: what the step variance was kept under, rad².
         rank: ``(K,)`` where each key node stands in the order of elimination; None if there was none.
@@ -88,6 +91,7 @@ class SlamEstimate(Verdicts):
     samples: np.ndarray
     stated_step_variance: float
     common_share: float
+    trust: StatedTrust
     passes: int
     max_step_variance: float
     rank: np.ndarray | None
@@ -129,6 +133,17 @@ class Passes:
     def has_predictions(self) -> bool:
         """Whether there has been an estimate of what the rest of the graph predicts of each edge."""
         return self._prediction_pass > 0
+
+    @property
+    def tail_ratio(self) -> np.ndarray:
+        """``(E,)``, see :func:`~rotavg_ros.solver.slam_judging.tail_ratio`; on odometry without meaning."""
+        return tail_ratio(self.noise.closure_variance * self.graph.own_steps)
+
+    @property
+    def discrepancy(self) -> np.ndarray:
+        """``(C,)`` rad, of every closure with what the rest of the graph predicts of it."""
+        assert self._discrepancy is not None
+        return self._discrepancy
 
     def _residual_vectors(self) -> np.ndarray:
         """Rotation vectors ``(E, 3)`` in radians, of ``fine_net.edge_residual``."""
@@ -206,10 +221,16 @@ class Passes:
         closure = self._closure
         predicted_square = np.minimum(square[closure] / leave_out[closure] ** 2, np.pi**2)
         scale = self.noise.closure_variance / noise.closure_variance
-        judged = judge(self.noise, predicted_square, scale * variance[closure], prediction_variance[closure])
+        judged = judge(
+            self.noise,
+            predicted_square,
+            scale * variance[closure],
+            prediction_variance[closure],
+            self.tail_ratio[closure],
+        )
         if judged.exact_share is not None:
             self.exact_share[closure] = judged.exact_share
-            self.exactness = exactness_of(self.exact_share, self.noise.closure_variance)
+            self.exactness = exactness_of(self.exact_share, self.tail_ratio)
         before = self.inlier_probability[closure]
         probability = expit(judged.log_odds + self.prior_log_odds[closure])
         if self._is_new is not None:
@@ -229,8 +250,10 @@ class Passes:
         graph, noise = self.graph, self.noise
         odometry, closure = graph.is_odometry, self._closure
         # A run's inflated variance is what its closures weigh, not what each of them errs.
-        square_per_step = self.inlier_probability[odometry] * square[odometry] / graph.steps[odometry]
-        step_variance = estimated_step_variance(square_per_step, redundancy[odometry], noise)
+        square = square / graph.own_steps
+        step_variance = estimated_step_variance(
+            self.inlier_probability[odometry] * square[odometry], redundancy[odometry], noise
+        )
         exact = self.exact_share[closure]
         closure_variance = estimated_closure_variance(
             square[closure], self.inlier_probability[closure] * exact, redundancy[closure] * exact, noise
@@ -245,10 +268,11 @@ class Passes:
         if self._discrepancy is not None:
             closure = self._closure
             probability[closure] = outlier_probability(
-                self.noise,
                 self.inlier_probability[closure],
                 self._discrepancy,
+                self.noise.closure_variance * self.graph.own_steps[closure],
                 self.system.prediction_variance[closure],
+                self.noise.components,
             )
         return probability
 

@@ -15,6 +15,7 @@ from rotavg_ros.solver.moved_slips import with_moved_slips
 from rotavg_ros.solver.noise_model import NoiseModel
 from rotavg_ros.solver.slam_passes import Passes, SlamEstimate
 from rotavg_ros.solver.slam_system import WholeSystem
+from rotavg_ros.solver.stated_precision import NO_TRUST, StatedTrust, believing, estimate_trust
 
 MAX_PASSES = 30
 # From the answer of a graph that has hardly changed since: on a real robot's graph, tick by tick, as good as 30.
@@ -23,6 +24,9 @@ WARM_PASSES = 10
 # the fit may raise that estimate by this factor at most, and not at all once closures are seen to err together.
 _MAX_STEP_VARIANCE_GAIN = 1.5
 _MIN_COMMON_SHARE = 0.06
+# Where what closures state is believed, they are judged anew by so many passes before it is asked whether they err
+# together.
+_BELIEVING_PASSES = 3
 # In larger graphs the likeliest drift is near what is believed.
 _MAX_NODES_TO_DRAW_AGAIN = 2000
 
@@ -56,27 +60,71 @@ def refine(
     state = Passes(graph, correction, inlier_probability, noise, prior, hold_noise, system)
     max_step_variance = _MAX_STEP_VARIANCE_GAIN * noise.step_variance
     state.alternate(max_step_variance, (max_passes + 1) // 2)
-    share = 0.0
-    closure = np.flatnonzero(graph.is_closure)
+    share, trust = 0.0, NO_TRUST
     if len(pairs.first) and state.passes < max_passes:
-        good = state.inlier_probability[closure]
-        older_end = np.minimum(graph.position[graph.source], graph.position[graph.target])[closure]
-        run = closure_runs(pairs, good > 0.5, older_end)
-        # Closures run old → new and new → old; their errors compare in one direction only.
-        direction = np.where(graph.position[graph.source] < graph.position[graph.target], 1.0, -1.0)[closure, None]
-        residual, samples = direction * state.residual[closure], direction * state.difference(system.samples)[closure]
-        share = common_share(run, good, residual, samples, state.noise.closure_variance, noise.components)
+        run = _runs(state, pairs)
+        share = _common_share(state, system, run)
+        trust = NO_TRUST if hold_noise or not state.has_predictions else _estimate_trust(state, run, share)
+        is_believed = trust.exponent > 0
+        if is_believed:
+            state.graph = believing(graph, trust)
+            state.alternate(max_step_variance, min(state.passes + _BELIEVING_PASSES, max_passes))
+            run = _runs(state, pairs)
+            share = _common_share(state, system, run)
         if share > _MIN_COMMON_SHARE:
-            steps = graph.steps.copy()
-            steps[closure] *= variance_factor(run, good, share)
-            state.graph = replace(graph, steps=steps)
+            state.graph = _with_common_errors(state, run, share)
             state.noise = replace(state.noise, step_variance=min(noise.step_variance, state.noise.step_variance))
             max_step_variance = noise.step_variance
+        if (share > _MIN_COMMON_SHARE or is_believed) and state.passes < max_passes:
             state.alternate(max_step_variance, max_passes)
-    return estimate(state, system, share, max_step_variance)
+    return estimate(state, system, share, trust, max_step_variance)
 
 
-def estimate(state: Passes, system: WholeSystem, share: float, max_step_variance: float) -> SlamEstimate:
+def _estimate_trust(state: Passes, run: np.ndarray, share: float) -> StatedTrust:
+    closure = np.flatnonzero(state.graph.is_closure)
+    good = state.inlier_probability[closure]
+    return estimate_trust(
+        state.noise,
+        state.graph.stated_variance[closure],
+        good,
+        state.discrepancy**2,
+        state.system.prediction_variance[closure],
+        1 / variance_factor(run, good, share),
+    )
+
+
+def _runs(state: Passes, pairs: AgreementPairs) -> np.ndarray:
+    graph, closure = state.graph, np.flatnonzero(state.graph.is_closure)
+    older_end = np.minimum(graph.position[graph.source], graph.position[graph.target])[closure]
+    return closure_runs(pairs, state.inlier_probability[closure] > 0.5, older_end)
+
+
+def _with_common_errors(state: Passes, run: np.ndarray, share: float) -> ClosureGraph:
+    graph, closure = state.graph, np.flatnonzero(state.graph.is_closure)
+    steps = graph.own_steps.copy()
+    steps[closure] *= variance_factor(run, state.inlier_probability[closure], share)
+    return replace(graph, steps=steps)
+
+
+def _common_share(state: Passes, system: WholeSystem, run: np.ndarray) -> float:
+    graph = state.graph
+    closure = np.flatnonzero(graph.is_closure)
+    # Closures run old → new and new → old; their errors compare in one direction only.
+    direction = np.where(graph.position[graph.source] < graph.position[graph.target], 1.0, -1.0)[closure, None]
+    return common_share(
+        run,
+        state.inlier_probability[closure],
+        direction * state.residual[closure],
+        graph.own_steps[closure],
+        direction * state.difference(system.samples)[closure],
+        state.noise.closure_variance,
+        state.noise.components,
+    )
+
+
+def estimate(
+    state: Passes, system: WholeSystem, share: float, trust: StatedTrust, max_step_variance: float
+) -> SlamEstimate:
     """What there is to say after the last pass."""
     step_variance = state.noise.step_variance if state.hold_noise else _stated_step_variance(state)
     if step_variance != state.noise.step_variance:
@@ -100,6 +148,7 @@ def estimate(state: Passes, system: WholeSystem, share: float, max_step_variance
         samples=samples,
         stated_step_variance=step_variance,
         common_share=share,
+        trust=trust,
         passes=state.passes,
         max_step_variance=max_step_variance,
         rank=system.pattern.rank,

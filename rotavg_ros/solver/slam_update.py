@@ -9,10 +9,11 @@ from torch import Tensor
 
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.noise_model import NoiseModel
-from rotavg_ros.solver.slam_judging import exactness_of
+from rotavg_ros.solver.slam_judging import exactness_of, tail_ratio
 from rotavg_ros.solver.slam_passes import Passes, SlamEstimate, Verdicts, edge_variance, edge_weight
 from rotavg_ros.solver.slam_refinement import estimate
 from rotavg_ros.solver.slam_system import System, WholeSystem
+from rotavg_ros.solver.stated_precision import StatedTrust
 
 # Passes at most, and when they end: a pass that changes no verdict leaves little to do for another one, if it did not
 # turn much. The next update goes on from there.
@@ -49,10 +50,14 @@ class Start:
     is_new: np.ndarray
 
     @property
+    def exactness(self) -> np.ndarray:
+        """What every edge weighs for erring no more than most, ``(E,)``."""
+        return exactness_of(self.exact_share, tail_ratio(self.noise.closure_variance * self.graph.own_steps))
+
+    @property
     def weight(self) -> np.ndarray:
         """Of every edge, ``(E,)`` rad⁻²."""
-        exactness = exactness_of(self.exact_share, self.noise.closure_variance)
-        return edge_weight(self.inlier_probability * exactness, edge_variance(self.graph, self.noise))
+        return edge_weight(self.inlier_probability * self.exactness, edge_variance(self.graph, self.noise))
 
     def passes(self, system: System, hold_noise: bool) -> Passes:
         """Ready for the first pass."""
@@ -67,15 +72,16 @@ class Start:
             is_new=self.is_new,
         )
         state.exact_share = self.exact_share.copy()
-        state.exactness = exactness_of(self.exact_share, self.noise.closure_variance)
+        state.exactness = self.exactness
         return state
 
 
-def renew(start: Start, rank: np.ndarray | None, max_step_variance: float) -> SlamEstimate | None:
+def renew(start: Start, rank: np.ndarray | None, trust: StatedTrust, max_step_variance: float) -> SlamEstimate | None:
     """Factorise, estimate the noise and every edge's prediction anew.
 
     Args:
         rank: ``(K,)`` order of elimination; None if it is not known.
+        trust: how far the variances that closures state are believed; the graph's ``own_steps`` say as much.
         max_step_variance: rad², see :class:`~rotavg_ros.solver.slam_passes.SlamEstimate`.
 
     Returns:
@@ -83,9 +89,8 @@ def renew(start: Start, rank: np.ndarray | None, max_step_variance: float) -> Sl
     """
     system = WholeSystem(start.graph, rank)
     state = start.passes(system, hold_noise=False)
-    return (
-        estimate(state, system, 0.0, max_step_variance) if _alternate(state, max_step_variance, _MAX_PASSES) else None
-    )
+    settled = _alternate(state, max_step_variance, _MAX_PASSES)
+    return estimate(state, system, 0.0, trust, max_step_variance) if settled else None
 
 
 def follow(start: Start, system: System) -> Verdicts | None:

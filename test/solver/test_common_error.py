@@ -24,13 +24,16 @@ def test_runs_link_near_good_closures() -> None:
     assert len(set(run.tolist())) == 4
 
 
+@pytest.mark.parametrize("spread", [0.0, 0.8])
 @pytest.mark.parametrize("share", [0.0, 0.6])
-def test_the_share_of_a_common_error_is_estimated(share: float) -> None:
+def test_the_share_of_a_common_error_is_estimated(share: float, spread: float) -> None:
     """Analysis of variance on known components, with nothing taken up by a fit."""
     rng = np.random.default_rng(0)
     run = np.repeat(np.arange(60), 8)
-    residual = np.sqrt(share) * rng.standard_normal((60, 3))[run] + np.sqrt(1 - share) * rng.standard_normal((480, 3))
-    estimate = common_share(run, np.ones(480), residual, np.zeros((480, 4)), 1.0, 3)
+    own = np.sqrt(1 - share) * rng.standard_normal((480, 3))
+    deviation = np.exp(spread * rng.standard_normal(480))
+    residual = np.sqrt(share) * rng.standard_normal((60, 3))[run] + deviation[:, None] * own
+    estimate = common_share(run, np.ones(480), residual, deviation**2, np.zeros((480, 4)), 1.0, 3)
     assert estimate == pytest.approx(share, abs=0.06)
 
 

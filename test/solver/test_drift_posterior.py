@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -33,6 +35,10 @@ def drifting(step_deg: float, closure_deg: float, seed: int, backward: bool = Fa
 
 def test_the_likelihood_is_that_of_errors_with_steps_in_common() -> None:
     graph = drifting(0.2, 0.5, 3, backward=True)
+    relative = np.linspace(0.3, 3.0, len(LOW))
+    own_steps = graph.own_steps.copy()
+    own_steps[graph.is_closure] = relative
+    graph = replace(graph, own_steps=own_steps)
     discrepancy = graph.residual[graph.is_closure][:, 2].numpy() * 2
     passed = np.array([[len(set(range(*a)) & set(range(*b))) for b in zip(LOW, HIGH, strict=True)]
                        for a in zip(LOW, HIGH, strict=True)], dtype=float)  # fmt: skip
@@ -41,7 +47,7 @@ def test_the_likelihood_is_that_of_errors_with_steps_in_common() -> None:
     posterior = np.zeros(len(step))
     for i, sigma in enumerate(step):
         for closure in own:
-            covariance = np.radians(sigma) ** 2 * passed + np.radians(closure) ** 2 * np.eye(len(LOW))
+            covariance = np.radians(sigma) ** 2 * passed + np.radians(closure) ** 2 * np.diag(relative[order])
             posterior[i] += multivariate_normal.pdf(discrepancy[order], cov=covariance)
         posterior[i] *= np.exp(-(np.log10(sigma / 0.3) ** 2) / 2)
     expected = (posterior * np.radians(step) ** 2).sum() / posterior.sum()
