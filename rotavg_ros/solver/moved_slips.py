@@ -14,7 +14,7 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.noise_model import NoiseModel
-from rotavg_ros.solver.slip_search import no_slip_log_odds
+from rotavg_ros.solver.slip_search import prior_log_odds
 from rotavg_ros.solver.truncated_cost import TruncatedCost
 
 
@@ -47,8 +47,7 @@ def with_moved_slips(
     follows = np.zeros(len(rank), dtype=bool)
     follows[segment_target] = True
     chain = np.cumsum(~follows)
-    prior = np.where(graph.is_odometry, no_slip_log_odds(graph.steps, noise.components), noise.prior_log_odds)
-    cost = TruncatedCost.create(graph, noise, log_odds + prior)
+    cost = TruncatedCost.create(graph, noise, prior_log_odds(graph, noise, log_odds))
     residual = cost.residual(correction)
     costs = cost.of_edges(residual)[:, None]
     turns = residual[torch.from_numpy(slipped)]

@@ -3,12 +3,12 @@
 A few steps of odometry that are off by tens of degrees (a wheel that spins, a collision) make every closure that
 spans them disagree with it, and a solution that trusts the odometry calls them all false. What gives it away is that
 neighbouring closures, which do not care how far apart their ends are along the odometry, still agree with each other
-(``cycle_votes.py``). Then, and only then, another solution is sought in which segments of the odometry may be wrong,
-from two starts, and the one of lower cost is taken.
+(``cycle_votes.py``). Then, and only then, another solution is sought in which segments of the odometry may be wrong.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,8 +38,10 @@ from rotavg_ros.view_graph import ViewGraph
 # says nothing more, and neither does where in it the slip was.
 _SLIP_PROBABILITY = 0.01
 _MAX_LOCATED_STEPS = 3.0
-# Jumps take long in larger graphs. Up to the first size they are tried from both starts, up to the second from one.
-_MAX_EDGES_TO_JUMP_TWICE = 3000
+# Jumps begin with slips that are half as dear.
+_ANNEALED = (0.5, _SLIP_PROBABILITY)
+# They take long in larger graphs. Above the first size they begin so only once it is clear that odometry slipped.
+_MAX_EDGES_TO_ANNEAL_TWICE = 3000
 _MAX_EDGES_TO_JUMP = 20000
 # Weight of a closure that its neighbours speak against.
 _MIN_TRUST = 1e-3
@@ -49,8 +51,6 @@ _MIN_TRUST = 1e-3
 _MIN_GAIN = 10.0
 _MAX_LOST_SHARE = 0.07
 _MIN_REGAINED = 2
-# A slip beside a node without good closures costs the same on either side of it; rounding must not choose.
-_TIE = 0.1
 _FALSE_SQUARE = np.pi**2 / 3 + 2
 
 
@@ -81,30 +81,54 @@ def search_for_slips(
         return None
     noise = noise_between_neighbours(pairs, by_chain.components)
     is_agreed = agree(pairs, noise)
-    prior = log_odds + np.where(
-        graph.is_odometry, no_slip_log_odds(graph.steps, noise.components), noise.prior_log_odds
-    )
-    finite = np.clip(prior, -50, 50)
+    priors = [prior_log_odds(graph, noise, log_odds, probability) for probability in _ANNEALED]
+    finite = np.clip(priors[-1], -50, 50)
     votes = count_votes(graph, pairs, noise, finite[graph.is_closure], finite[: graph.num_segments])
     trust = np.ones(len(graph.source))
     trust[graph.is_closure] = np.maximum(expit(votes.closure), _MIN_TRUST)
-    cost = TruncatedCost.create(graph, noise, prior, estimate.rank)
+    costs = _costs(graph, noise, priors, estimate.rank)
+    cost = costs[-1]
     correction = cost.descend(_tree(cost, trust, votes.segment), trust)
     num_edges = len(graph.source)
     if num_edges <= _MAX_EDGES_TO_JUMP:
-        correction = jump_to_optimum(cost, correction, pairs, is_agreed, votes.closure > 0)
-    if num_edges <= _MAX_EDGES_TO_JUMP_TWICE:
-        trusting = jump_to_optimum(cost, estimate.correction, pairs, is_agreed, votes.closure > 0)
-        correction = trusting if cost.total(trusting) < cost.total(correction) - _TIE else correction
+        first = costs if num_edges <= _MAX_EDGES_TO_ANNEAL_TWICE else costs[-1:]
+        correction = _jump(first, correction, pairs, is_agreed, votes.closure > 0)
     if not _is_better(cost, correction, estimate.correction, pairs, is_agreed, doubt):
         return None
     # Without the slips, the odometry tells how it drifts.
     noise = _noise_without_slips(cost, correction, noise)
-    cost = TruncatedCost.create(graph, noise, prior, estimate.rank)
+    costs = _costs(graph, noise, priors, estimate.rank)
+    cost = costs[-1]
     if num_edges <= _MAX_EDGES_TO_JUMP:
         everyone = np.ones(len(votes.closure), dtype=bool)
-        correction = jump_to_optimum(cost, cost.descend(correction), pairs, is_agreed, everyone)
+        correction = _jump(costs, cost.descend(correction), pairs, is_agreed, everyone)
     return SlipStart(correction, expit(cost.log_odds(correction)), noise)
+
+
+def _costs(
+    graph: ClosureGraph, noise: NoiseModel, priors: Sequence[np.ndarray], rank: np.ndarray | None
+) -> list[TruncatedCost]:
+    """By each prior ``(E,)`` in turn."""
+    return [TruncatedCost.create(graph, noise, prior, rank) for prior in priors]
+
+
+def _jump(
+    costs: Sequence[TruncatedCost],
+    correction: Tensor,
+    pairs: AgreementPairs,
+    is_agreed: np.ndarray,
+    is_trusted: np.ndarray,
+) -> Tensor:
+    """Jumps to an optimum of one cost after the other; corrections ``(K, 4)`` that cost the last no more than given.
+
+    A stretch that turned by itself takes two slips, and its neighbour another: more than a single jump may bring back.
+    While slips are cheap, the odometry falls apart as closures want it; then what was not worth its slips is put
+    together again.
+    """
+    found = correction
+    for cost in costs:
+        found = jump_to_optimum(cost, found, pairs, is_agreed, is_trusted)
+    return min(found, correction, key=costs[-1].total)
 
 
 def _is_better(
@@ -124,10 +148,22 @@ def _is_better(
     )
 
 
-def no_slip_log_odds(steps: np.ndarray, components: int) -> np.ndarray:
-    """Log-odds of segments to be good beforehand, a slip being less than a right angle and as likely to be any."""
+def prior_log_odds(
+    graph: ClosureGraph, noise: NoiseModel, log_odds: np.ndarray, slip_probability: float = _SLIP_PROBABILITY
+) -> np.ndarray:
+    """``(E,)`` of every edge to be good beforehand: ``log_odds`` ``(E,)`` and what is common to its kind."""
+    no_slip = no_slip_log_odds(graph.steps, noise.components, slip_probability)
+    return np.asarray(log_odds + np.where(graph.is_odometry, no_slip, noise.prior_log_odds))
+
+
+def no_slip_log_odds(steps: np.ndarray, components: int, slip_probability: float = _SLIP_PROBABILITY) -> np.ndarray:
+    """Log-odds of segments to be good beforehand, a slip being less than a right angle and as likely to be any.
+
+    Args:
+        slip_probability: of one step.
+    """
     narrower = np.log(2.0) if components == 1 else np.log(2 / (1 - np.cos(np.pi / 4)))
-    none = np.log1p(-_SLIP_PROBABILITY) * np.minimum(steps, _MAX_LOCATED_STEPS)
+    none = np.log1p(-slip_probability) * np.minimum(steps, _MAX_LOCATED_STEPS)
     return np.asarray(none - np.log(-np.expm1(none)) - narrower)
 
 
@@ -153,7 +189,9 @@ def _noise_without_slips(cost: TruncatedCost, correction: Tensor, noise: NoiseMo
     closure = torch.from_numpy(graph.is_closure)
     square = (rotations.log(residual[closure]) ** 2).sum(dim=1).numpy()
     pairs = agreement_pairs(replace(graph, residual=residual))
-    return estimate_noise(discrepancies(square, graph.path_steps[graph.is_closure], pairs), noise.components)
+    found = estimate_noise(discrepancies(square, graph.path_steps[graph.is_closure], pairs), noise.components)
+    # What odometry takes for its own of the closures' noise would be lost to them; none is better than a step.
+    return replace(found, closure_variance=max(found.closure_variance, found.step_variance))
 
 
 def _tree(cost: TruncatedCost, trust: np.ndarray, segment_log_odds: np.ndarray) -> Tensor:

@@ -22,6 +22,8 @@ from rotavg_ros.solver.exceedance import exceedance
 from rotavg_ros.solver.jumps import _turns
 from rotavg_ros.solver.minimum_cut import FlowNetwork
 from rotavg_ros.solver.noise_model import NoiseModel, noise_between_neighbours
+from rotavg_ros.solver.slip_doubt import agree
+from rotavg_ros.solver.slip_search import _jump, prior_log_odds
 from rotavg_ros.solver.truncated_cost import TruncatedCost
 from test.solver.graphs import as_quaternions, measured, random_truth, small_noise
 
@@ -207,6 +209,25 @@ def test_a_jump_takes_the_set_that_an_exhaustive_search_finds() -> None:
     for weight in (np.ones(len(costs)), 1e-6 + cost.cap - costs):
         (bound,) = question.gain_bounds(cost.pattern.factorize(weight))
         assert gained <= bound + 1e-6
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_stretch_that_slips_cut_in_two_is_turned_part_by_part(seed: int) -> None:
+    """Two closures want either part turned: less than the slips that a first jump adds, more than all of them."""
+    graph, truth, _, _ = laps(
+        planar=True, false_share=0.0, seed=seed, num_laps=2, slips={20: 50.0, 22: -35.0, 24: -15.0}
+    )
+    prepared = slam_stages.prepare(graph)
+    closures, pairs = prepared.closure_graph, prepared.pairs
+    noise = NoiseModel(1, np.radians(0.1) ** 2, np.radians(0.5) ** 2, 0.3)
+    prior = np.zeros(len(closures.source))
+    costs = [TruncatedCost.create(closures, noise, prior_log_odds(closures, noise, prior, p)) for p in (0.5, 0.01)]
+    start = rotations.identity(closures.num_nodes)
+    everyone = np.ones(int(closures.is_closure.sum()), dtype=bool)
+    found = _jump(costs, start, pairs, agree(pairs, noise), everyone)
+    at_truth = costs[-1].descend(closures.corrections(as_quaternions(truth)))
+    assert costs[-1].total(found) < costs[-1].total(at_truth) + 0.1
+    assert costs[-1].total(_jump(costs[-1:], start, pairs, agree(pairs, noise), everyone)) > costs[-1].total(found) + 10
 
 
 def test_exceedance_is_the_noncentral_chi_distribution() -> None:
