@@ -21,7 +21,7 @@ from rotavg_ros.solver.mixture import log_uniform_density
 from rotavg_ros.solver.noise_model import NoiseModel
 from rotavg_ros.solver.slam_judging import TAIL_RATIO, TAIL_SHARE
 
-# Variances that are stated to be farther from what is typical than by this factor count as that far.
+# A variance that is stated to be farther from what is typical than by this factor says nothing.
 _MAX_RATIO = 100.0
 # What closures state is worth nothing beforehand with this probability; else all exponents are as likely.
 _WORTHLESS = 0.95
@@ -48,9 +48,9 @@ class StatedTrust(NamedTuple):
     typical: float
 
     def relative_variance(self, stated: np.ndarray) -> np.ndarray:
-        """Of closures in units of σ_c² ``(C,)`` by what they state, rad²; 1 where that is NaN."""
-        ratio = np.clip(stated / self.typical, 1 / _MAX_RATIO, _MAX_RATIO)
-        return np.where(np.isnan(stated), 1.0, ratio**self.exponent)
+        """Of closures in units of σ_c² ``(C,)`` by what they state, rad²; 1 where that is NaN or absurd."""
+        ratio = stated / self.typical
+        return np.where((ratio >= 1 / _MAX_RATIO) & (ratio <= _MAX_RATIO), ratio, 1.0) ** self.exponent
 
 
 NO_TRUST = StatedTrust(0.0, 1.0)

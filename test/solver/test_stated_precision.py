@@ -46,17 +46,14 @@ def test_the_exponent_is_found(exponent: float) -> None:
 
 
 def test_absurd_and_missing_variances_do_not_matter() -> None:
-    """Each counts at most as a factor of ten from what is typical, in standard deviation."""
     stated, square, predicted = discrepancies(1.0, 0)
-    square[: NUM_CLOSURES // 20] = np.radians(1.0) ** 2
-    stated[0 : NUM_CLOSURES // 20 : 3] = 1e-300
-    stated[1 : NUM_CLOSURES // 20 : 3] = 1e300
-    stated[2 : NUM_CLOSURES // 20 : 3] = np.nan
+    square[:20] = np.radians(1.0) ** 2
+    stated[:20] = np.tile([1e-300, 1e300, np.nan, np.inf], 5)
     trust = trust_in(stated, square, predicted)
     assert trust.exponent > 0.8
     relative = trust.relative_variance(stated)
-    assert relative.max() <= 100 and relative.min() >= 0.01
-    assert (relative[np.isnan(stated)] == 1).all()
+    assert (relative[:20] == 1).all()
+    assert relative[20:].std() > 1
 
 
 @cache
