@@ -86,6 +86,8 @@ class SlamEstimate(Verdicts):
         max_step_variance: what the step variance was kept under, rad².
         rank: ``(K,)`` where each key node stands in the order of elimination; None if there was none.
         factorised: the last factorisation.
+        in_false_group: ``(E,)`` bool, believed closures that are false if the group they belong to is judged as one;
+            looked for once the first passes have settled.
     """
 
     samples: np.ndarray
@@ -96,6 +98,7 @@ class SlamEstimate(Verdicts):
     max_step_variance: float
     rank: np.ndarray | None
     factorised: FactorisedLaplacian
+    in_false_group: np.ndarray
 
 
 class Passes:

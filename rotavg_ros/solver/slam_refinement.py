@@ -11,6 +11,7 @@ from rotavg_ros.solver.agreement import AgreementPairs
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.common_error import closure_runs, common_share, variance_factor
 from rotavg_ros.solver.drift_posterior import expected_step_variance
+from rotavg_ros.solver.group_verdicts import false_groups
 from rotavg_ros.solver.moved_slips import with_moved_slips
 from rotavg_ros.solver.noise_model import NoiseModel
 from rotavg_ros.solver.slam_passes import Passes, SlamEstimate
@@ -61,6 +62,9 @@ def refine(
     max_step_variance = _MAX_STEP_VARIANCE_GAIN * noise.step_variance
     state.alternate(max_step_variance, (max_passes + 1) // 2)
     share, trust = 0.0, NO_TRUST
+    in_false_group = np.zeros(len(graph.source), dtype=bool)
+    if len(pairs.first) and not hold_noise:
+        in_false_group[graph.is_closure] = false_groups(state, system, pairs)
     if len(pairs.first) and state.passes < max_passes:
         run = _runs(state, pairs)
         share = _common_share(state, system, run)
@@ -77,7 +81,8 @@ def refine(
             max_step_variance = noise.step_variance
         if (share > _MIN_COMMON_SHARE or is_believed) and state.passes < max_passes:
             state.alternate(max_step_variance, max_passes)
-    return estimate(state, system, share, trust, max_step_variance)
+    refined = estimate(state, system, share, trust, max_step_variance)
+    return replace(refined, in_false_group=in_false_group)
 
 
 def _estimate_trust(state: Passes, run: np.ndarray, share: float) -> StatedTrust:
@@ -153,6 +158,7 @@ def estimate(
         max_step_variance=max_step_variance,
         rank=system.pattern.rank,
         factorised=system.factorised,
+        in_false_group=np.zeros(len(state.graph.source), dtype=bool),
     )
 
 

@@ -13,6 +13,7 @@ from rotavg_ros import rotations
 from rotavg_ros.solver import slam_refinement
 from rotavg_ros.solver.agreement import NO_PAIRS, AgreementPairs, agreement_pairs
 from rotavg_ros.solver.closure_graph import ClosureGraph, contract
+from rotavg_ros.solver.group_search import without_false_groups
 from rotavg_ros.solver.gyro_bias import estimate_bias, without_bias
 from rotavg_ros.solver.noise_model import (
     NoiseModel,
@@ -24,7 +25,7 @@ from rotavg_ros.solver.noise_model import (
 from rotavg_ros.solver.slam_clean_net import SlamCleanNet, closure_features
 from rotavg_ros.solver.slam_inference import false_log_odds
 from rotavg_ros.solver.slam_passes import SlamEstimate
-from rotavg_ros.solver.slip_doubt import agree
+from rotavg_ros.solver.slip_doubt import Doubt, agree, measure_doubt
 from rotavg_ros.solver.slip_search import search_for_slips
 from rotavg_ros.solver.spanning_tree import (
     SpanningForest,
@@ -220,11 +221,18 @@ def refine(
     scale_estimation: bool = True,
     slip_search: bool = True,
 ) -> SlamEstimate:
-    """Refine from corrections ``(K, 4)``; if the outcome looks as if odometry had slipped, from a second start, too."""
+    """Refine from corrections ``(K, 4)``; again where groups of closures are false that were believed.
+
+    If the outcome looks as if odometry had slipped, from a second start, too.
+    """
     graph, pairs, prior = prepared.closure_graph, prepared.pairs, cleaned.prior_log_odds
 
     def run(
-        start: Tensor, inlier_probability: np.ndarray, noise: NoiseModel, rank: np.ndarray | None = None
+        start: Tensor,
+        inlier_probability: np.ndarray,
+        noise: NoiseModel,
+        log_odds: np.ndarray,
+        rank: np.ndarray | None = None,
     ) -> SlamEstimate:
         return slam_refinement.refine(
             graph,
@@ -232,17 +240,20 @@ def refine(
             start,
             inlier_probability,
             noise,
-            log_odds=prior,
+            log_odds=log_odds,
             max_passes=max_passes,
             hold_noise=not scale_estimation,
             rank=rank,
         )
 
-    estimate = run(correction, cleaned.inlier_probability, prepared.noise)
-    second = search_for_slips(graph, pairs, estimate, prepared.noise, prior) if slip_search else None
+    estimate = run(correction, cleaned.inlier_probability, prepared.noise, prior)
+    doubt = measure_doubt(graph, pairs, estimate, prepared.noise) if slip_search else Doubt.NONE
+    without = without_false_groups(run, estimate, graph, pairs, prepared.noise, prior, doubt)
+    rivals = [estimate.correction] if without is estimate else [estimate.correction, without.correction]
+    second = search_for_slips(graph, pairs, estimate, prepared.noise, prior, doubt, rivals)
     if second is None:
-        return estimate
-    return run(second.correction, second.inlier_probability, second.noise, estimate.rank)
+        return without
+    return run(second.correction, second.inlier_probability, second.noise, prior, estimate.rank)
 
 
 def outlier_scores(graph: ClosureGraph, outlier_probability: np.ndarray) -> np.ndarray:

@@ -55,6 +55,7 @@ class WholeSystem:
     Attributes:
         pattern: of the graph.
         probes: ``(E, k)`` signs ±1.
+        sampled_weight: ``(E,)`` the weights under which the samples were last drawn.
     """
 
     def __init__(self, graph: ClosureGraph, rank: np.ndarray | None = None) -> None:
@@ -65,6 +66,7 @@ class WholeSystem:
         self._system: FactorisedLaplacian | None = None
         self._factorised: FactorisedLaplacian | None = None
         self._samples: np.ndarray | None = None
+        self.sampled_weight = np.empty(0)
 
     @property
     def factorised(self) -> FactorisedLaplacian:
@@ -77,6 +79,7 @@ class WholeSystem:
         """Errors ``(K, probes)`` as they might be under the weights last factorised; drawn when they are asked for."""
         if self._samples is None:
             self._samples = self.factorised.samples(self.probes)
+            self.sampled_weight = self.factorised.weight
         return self._samples
 
     def solve(self, weight: np.ndarray, residual: np.ndarray, *, refresh: bool, is_near: bool) -> np.ndarray:

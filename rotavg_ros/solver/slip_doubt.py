@@ -53,6 +53,8 @@ def measure_doubt(graph: ClosureGraph, pairs: AgreementPairs, estimate: SlamEsti
     Args:
         by_chain: the noise as it looks if odometry never slips.
     """
+    if len(pairs.first) == 0:
+        return Doubt.NONE
     rejected = estimate.inlier_probability[graph.is_closure] < 0.5
     supporters = np.bincount(pairs.first, agree(pairs, by_chain), len(rejected))
     # A group of false closures agrees with itself; it must not outvote the rest by its size.

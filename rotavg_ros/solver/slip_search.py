@@ -29,7 +29,7 @@ from rotavg_ros.solver.noise_model import (
     noise_between_neighbours,
 )
 from rotavg_ros.solver.slam_passes import SlamEstimate
-from rotavg_ros.solver.slip_doubt import Doubt, agree, measure_doubt
+from rotavg_ros.solver.slip_doubt import Doubt, agree
 from rotavg_ros.solver.spanning_tree import compose_orientations, shortest_path_forest
 from rotavg_ros.solver.truncated_cost import TruncatedCost
 from rotavg_ros.view_graph import ViewGraph
@@ -69,14 +69,17 @@ def search_for_slips(
     estimate: SlamEstimate,
     by_chain: NoiseModel,
     log_odds: np.ndarray,
+    doubt: Doubt,
+    rivals: Sequence[Tensor],
 ) -> SlipStart | None:
     """A better start than ``estimate``, or None if there is none to be found or no reason to look for one.
 
     Args:
         by_chain: the noise as it looks if odometry never slips.
         log_odds: ``(E,)`` prior log-odds of each edge to be good, beyond the common outlier share; ±inf decide it.
+        doubt: in ``estimate``.
+        rivals: corrections ``(K, 4)`` of ``estimate`` and other solutions, all of which slips have to outdo.
     """
-    doubt = Doubt.NONE if len(pairs.first) == 0 else measure_doubt(graph, pairs, estimate, by_chain)
     if doubt == Doubt.NONE:
         return None
     noise = noise_between_neighbours(pairs, by_chain.components)
@@ -93,7 +96,7 @@ def search_for_slips(
     if num_edges <= _MAX_EDGES_TO_JUMP:
         first = costs if num_edges <= _MAX_EDGES_TO_ANNEAL_TWICE else costs[-1:]
         correction = _jump(first, correction, pairs, is_agreed, votes.closure > 0)
-    if not _is_better(cost, correction, estimate.correction, pairs, is_agreed, doubt):
+    if not _is_better(cost, correction, rivals, pairs, is_agreed, doubt):
         return None
     # Without the slips, the odometry tells how it drifts.
     noise = _noise_without_slips(cost, correction, noise)
@@ -132,18 +135,23 @@ def _jump(
 
 
 def _is_better(
-    cost: TruncatedCost, found: Tensor, estimate: Tensor, pairs: AgreementPairs, is_agreed: np.ndarray, doubt: Doubt
+    cost: TruncatedCost,
+    found: Tensor,
+    rivals: Sequence[Tensor],
+    pairs: AgreementPairs,
+    is_agreed: np.ndarray,
+    doubt: Doubt,
 ) -> bool:
-    """Whether corrections ``(K, 4)`` with slips are worth what they cost."""
+    """Whether corrections ``(K, 4)`` with slips are worth what they cost, beside all ``rivals``."""
     # As far as a descent gets without a search, nothing was found.
-    before = min(estimate, cost.descend(estimate), key=cost.total)
+    before = min((start for rival in rivals for start in (rival, cost.descend(rival))), key=cost.total)
     gain = cost.total(before) - cost.total(found)
-    if_grouped = [_grouped_cost(cost, correction, pairs, is_agreed) for correction in (estimate, found)]
+    if_grouped = min(grouped_cost(cost, rival, pairs, is_agreed) for rival in rivals)
     enough_if_grouped = -_MAX_LOST_SHARE * gain if doubt == Doubt.STRONG else _MIN_GAIN
     believed = [int((cost.log_odds(correction) > 0)[cost.graph.is_closure].sum()) for correction in (before, found)]
     return (
         gain >= _MIN_GAIN
-        and if_grouped[0] - if_grouped[1] >= enough_if_grouped
+        and if_grouped - grouped_cost(cost, found, pairs, is_agreed) >= enough_if_grouped
         and believed[1] - believed[0] >= _MIN_REGAINED
     )
 
@@ -167,7 +175,7 @@ def no_slip_log_odds(steps: np.ndarray, components: int, slip_probability: float
     return np.asarray(none - np.log(-np.expm1(none)) - narrower)
 
 
-def _grouped_cost(cost: TruncatedCost, correction: Tensor, pairs: AgreementPairs, is_agreed: np.ndarray) -> float:
+def grouped_cost(cost: TruncatedCost, correction: Tensor, pairs: AgreementPairs, is_agreed: np.ndarray) -> float:
     """The cost of a solution ``(K, 4)`` if wrong closures that agree with each other have one reason to be wrong."""
     costs, closure = cost.of_edges(cost.residual(correction)), cost.graph.is_closure
     wrong = costs[closure] > 0.5 * cost.cap[closure]
