@@ -1,14 +1,15 @@
 """Expectation–maximisation for rotations that differ by noise of two kinds, or by anything.
 
 A discrepancy between two estimates is Gaussian in k components with variance ``steps · step_variance + closures ·
-closure_variance``, or one of them is false and it is uniform over all rotations. The step in which both variances are
-estimated treats each discrepancy as the sum of its two parts, of which only the sum is seen.
+closure_variance``, or one of them is false and it is uniform over all rotations (or, as a near miss, over those by a
+small angle). The step in which both variances are estimated treats each discrepancy as the sum of its two parts, of
+which only the sum is seen.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,8 @@ import numpy as np
 _PRIOR_STEP_SQUARE = np.radians(0.02) ** 2
 _PRIOR_CLOSURE_SQUARE = np.radians(0.3) ** 2
 _SHARE_BOUNDS = (0.005, 0.995)
+# Rotations by less than this are near misses: places that look alike are often nearly the same.
+NEAR_MISS = np.radians(35.0)
 # Log-likelihood that is no gain, in nats.
 _TOLERANCE = 0.01
 
@@ -30,17 +33,29 @@ class Discrepancies:
         steps: ``(D,)`` odometry steps that each passes.
         closures: number of closures in each.
         weight: what each counts for.
+        near_share: share of the false ones that are near misses (:data:`NEAR_MISS`).
     """
 
     squared_angle: np.ndarray
     steps: np.ndarray
     closures: int
     weight: float
+    near_share: float = 0.0
 
     def thinned(self, size: int) -> Discrepancies:
         """Evenly spread rows, about ``size``, that weigh as much as all of them."""
         stride = max(1, len(self.steps) // size)
-        return Discrepancies(self.squared_angle[::stride], self.steps[::stride], self.closures, stride * self.weight)
+        rows = slice(None, None, stride)
+        return replace(
+            self, squared_angle=self.squared_angle[rows], steps=self.steps[rows], weight=stride * self.weight
+        )
+
+    def log_false_density(self, components: int) -> np.ndarray:
+        """Log density of each if it is false: uniform over all rotations, or over the near ones."""
+        angle = np.sqrt(self.squared_angle)
+        all_of_them = np.pi if components == 1 else np.pi / (1 - np.sinc(NEAR_MISS / np.pi))
+        denser = np.where(angle < NEAR_MISS, 1 + self.near_share * (all_of_them / NEAR_MISS - 1), 1 - self.near_share)
+        return np.asarray(log_uniform_density(angle, components) + np.log(denser))
 
 
 def log_uniform_density(angle: np.ndarray, components: int) -> np.ndarray:
@@ -82,10 +97,10 @@ class MixtureFit:
         self._k = components
         # In single precision exponentials and logarithms take a fifth of the time.
         squared_angle = np.concatenate([kind.squared_angle for kind in kinds], dtype=np.float32)
-        log_uniform = log_uniform_density(np.sqrt(squared_angle), components).astype(np.float32)
+        log_false = np.concatenate([kind.log_false_density(components) for kind in kinds], dtype=np.float32)
         self._half_square = squared_angle / 2
         self._steps = np.concatenate([kind.steps for kind in kinds], dtype=np.float32)
-        self._false = log_uniform + np.float32(components / 2 * np.log(2 * np.pi))
+        self._false = log_false + np.float32(components / 2 * np.log(2 * np.pi))
         size = [len(kind.steps) for kind in kinds]
         self._closures = np.repeat([kind.closures for kind in kinds], size).astype(np.float32)
         self._weight = np.repeat([kind.weight for kind in kinds], size)
@@ -94,7 +109,7 @@ class MixtureFit:
         kind = np.repeat(np.arange(len(kinds)), size)
         self._membership = (np.eye(len(kinds))[kind] * self._weight[:, None]).astype(np.float32)
         self._total = np.array([kind.weight * len(kind.steps) for kind in kinds])
-        self._constant = float(self._weight @ log_uniform)
+        self._constant = float(self._weight @ log_false)
 
     def maximise(self, models: Mixtures, iterations: int, *, hold_step: bool = False) -> tuple[Mixtures, np.ndarray]:
         """So many iterations of each model, fewer if none gains; with the log-likelihoods ``(S,)`` before the last.

@@ -27,6 +27,9 @@ _EM_STARTS_STEP_DEG = (0.02, 0.1, 0.5, 2.0)
 _EM_STARTS_CLOSURE_DEG = (0.3, 2.0)
 # False share of the odometry's discrepancies and of the neighbours' to start from.
 _EM_START_SHARES = (0.5, 0.7)
+# Of the false ones so many are taken for near misses, off by 10–30° as where the same place is seen from elsewhere. If
+# there were none, a graph with many would look as if all of its closures erred by 8°, and its odometry not at all.
+_NEAR_MISS_SHARE = 0.2
 # Rows of either kind used to choose among the starts, and to converge.
 _EM_THINNED = (1000, 5000)
 # Of the starts, so many are kept after so many iterations each.
@@ -80,14 +83,21 @@ def outlier_share(inlier_probability: np.ndarray) -> float:
     return float(((1 - inlier_probability).sum() + false_count) / (len(inlier_probability) + total_count))
 
 
-def discrepancies(squared_angle: np.ndarray, path_steps: np.ndarray, pairs: AgreementPairs) -> list[Discrepancies]:
-    """Of every closure with the odometry (``(C,)`` each; infinite steps tell nothing), and of agreeing closures."""
+def discrepancies(
+    squared_angle: np.ndarray, path_steps: np.ndarray, pairs: AgreementPairs, near_share: float = _NEAR_MISS_SHARE
+) -> list[Discrepancies]:
+    """Of every closure with the odometry (``(C,)`` each; infinite steps tell nothing), and of agreeing closures.
+
+    Args:
+        near_share: share of the false closures that are near misses, as their neighbours see them. Odometry drifts by
+            as much, so that it cannot tell.
+    """
     on_chain = np.isfinite(path_steps)
     # Every closure has as many pairs; together they count as one.
     per_closure = len(pairs.first) / max(len(np.unique(pairs.first)), 1)
     return [
         Discrepancies(squared_angle[on_chain], np.maximum(path_steps[on_chain], 1.0), 1, 1.0),
-        Discrepancies(pairs.squared_angle, np.maximum(pairs.steps, 0.5), 2, 1 / max(per_closure, 1.0)),
+        Discrepancies(pairs.squared_angle, np.maximum(pairs.steps, 0.5), 2, 1 / max(per_closure, 1.0), near_share),
     ]
 
 
@@ -135,7 +145,7 @@ def _likeliest(data: Sequence[Discrepancies], few: MixtureFit, components: int) 
 
 def noise_between_neighbours(pairs: AgreementPairs, components: int) -> NoiseModel:
     """The noise as neighbouring closures see it: without the odometry that lies farther between, so immune to slips."""
-    data = discrepancies(np.empty(0), np.empty(0), pairs)
+    data = discrepancies(np.empty(0), np.empty(0), pairs, 0.0)
     likeliest = _likeliest(data, MixtureFit([kind.thinned(_EM_THINNED[0]) for kind in data], components), components)
     model = _prior(components) if likeliest is None else _model(likeliest, components)
     # Where few closures share their ends, odometry takes their noise for its own; but none is better than a step.

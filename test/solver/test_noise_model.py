@@ -7,6 +7,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
+from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.trajectories import World
 from rotavg_ros.solver.agreement import agreement_pairs
 from rotavg_ros.solver.mixture import log_uniform_density
 from rotavg_ros.solver.noise_model import NoiseModel, discrepancies, estimate_noise
@@ -66,6 +68,24 @@ def test_scales_are_found_again_where_robots_meet() -> None:
     chain = graph.nodes // 100
     ends = np.sort(np.stack((chain[graph.source], chain[graph.target]), axis=1)[graph.is_closure], axis=1)
     np.testing.assert_array_equal(ends[pairs.first], ends[pairs.second])
+
+
+def test_near_misses_do_not_pass_for_noise() -> None:
+    """False closures that are off by 10–30°, not by anything."""
+    config = SlamSimulationConfig(
+        world=World.SPHERE,
+        dimensions=3,
+        num_keyframes=800,
+        odometry_noise_deg=1.7,
+        closures_per_keyframe=1.0,
+        closure_noise_deg=1.7,
+        false_share=0.3,
+        near_miss_share=1.0,
+        in_place_share=1.0,
+    )
+    model = prepare(simulate_slam_graph(config, np.random.default_rng(0)).graph).noise
+    assert 0.6 < np.degrees(np.sqrt(model.step_variance)) < 2
+    assert np.degrees(np.sqrt(model.closure_variance)) < 2
 
 
 def test_without_closures_the_prior_stands() -> None:
