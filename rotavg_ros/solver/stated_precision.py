@@ -23,6 +23,9 @@ from rotavg_ros.solver.slam_judging import TAIL_RATIO, TAIL_SHARE
 
 # A variance that is stated to be farther from what is typical than by this factor says nothing.
 _MAX_RATIO = 100.0
+# No closure is believed to be more than twice as exact as is typical: one that overstates its precision bends the map,
+# one that understates it is hardly missed.
+_MIN_RATIO = 0.25
 # What closures state is worth nothing beforehand with this probability; else all exponents are as likely.
 _WORTHLESS = 0.95
 _EXPONENTS = np.linspace(0.0, 1.0, 5)
@@ -50,7 +53,8 @@ class StatedTrust(NamedTuple):
     def relative_variance(self, stated: np.ndarray) -> np.ndarray:
         """Of closures in units of σ_c² ``(C,)`` by what they state, rad²; 1 where that is NaN or absurd."""
         ratio = stated / self.typical
-        return np.where((ratio >= 1 / _MAX_RATIO) & (ratio <= _MAX_RATIO), ratio, 1.0) ** self.exponent
+        is_absurd = ~((ratio >= 1 / _MAX_RATIO) & (ratio <= _MAX_RATIO))
+        return np.where(is_absurd, 1.0, np.maximum(ratio, _MIN_RATIO)) ** self.exponent
 
 
 NO_TRUST = StatedTrust(0.0, 1.0)

@@ -53,7 +53,7 @@ def test_absurd_and_missing_variances_do_not_matter() -> None:
     assert trust.exponent > 0.8
     relative = trust.relative_variance(stated)
     assert (relative[:20] == 1).all()
-    assert relative[20:].std() > 1
+    assert relative[20:].std() > 1 and relative.min() > 0.2
 
 
 @cache
