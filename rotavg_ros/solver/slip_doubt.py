@@ -24,8 +24,10 @@ _DOUBTED_SHARE = 0.53
 _DOUBTED_SHARE_OF_MOST = 0.35
 _MIN_SUPPORTERS = 2
 # or if it rejects so many that neighbours confirm across one step, and believes at most such a share of those across
-# it: a false closure, or a group, is contradicted by good ones across the same steps,
+# it: a false closure, or a group, is contradicted by good ones across the same steps, where there are some. Where there
+# are none, two groups may look like a slip (and vain searches take ten times as long as the rest): more weight is due,
 _SPANNING, _BELIEVED_SHARE = 10, 0.05
+_SPANNING_WEIGHT = 2.5
 # in some if it explains most closures, but so much larger a share disagrees with the odometry,
 _MOST = 0.6
 _DOUBTED_DIFFERENCE = 0.05
@@ -58,9 +60,9 @@ def measure_doubt(graph: ClosureGraph, pairs: AgreementPairs, estimate: SlamEsti
     rejected = estimate.inlier_probability[graph.is_closure] < 0.5
     supporters = np.bincount(pairs.first, agree(pairs, by_chain), len(rejected))
     # A group of false closures agrees with itself; it must not outvote the rest by its size.
-    if _has_contradicted_step(graph, rejected, supporters >= _MIN_SUPPORTERS):
-        return Doubt.STRONG
     weight = np.where(supporters >= _MIN_SUPPORTERS, 1 / (1 + supporters), 0.0)
+    if _has_contradicted_step(graph, rejected, weight):
+        return Doubt.STRONG
     rejected_weight, rejected_share = float((weight * rejected).sum()), float(rejected.mean())
     doubted_share = _DOUBTED_SHARE_OF_MOST if rejected_share > _MOST else _DOUBTED_SHARE
     if rejected_weight > doubted_share * weight.sum():
@@ -75,20 +77,26 @@ def measure_doubt(graph: ClosureGraph, pairs: AgreementPairs, estimate: SlamEsti
     return Doubt.NONE
 
 
-def _has_contradicted_step(graph: ClosureGraph, rejected: np.ndarray, is_confirmed: np.ndarray) -> bool:
-    """Whether all that speaks of some step of the odometry speaks against it; closures ``(C,)`` each."""
+def _has_contradicted_step(graph: ClosureGraph, rejected: np.ndarray, weight: np.ndarray) -> bool:
+    """Whether all that speaks of some step of the odometry speaks against it; closures ``(C,)`` each.
+
+    Args:
+        weight: of those that their neighbours confirm, together about one for a whole group; else 0.
+    """
     closure = np.flatnonzero(graph.is_closure)
     on_chain = np.isfinite(graph.path_steps[closure])
     at, ends = np.unique(closure_ends(graph, closure[on_chain]), return_inverse=True)
     first, last = ends.reshape(-1, 2).T
 
-    def spanning(chosen: np.ndarray) -> np.ndarray:
-        """How many of the chosen closures span what follows each end of a closure."""
-        chosen = chosen[on_chain]
-        return np.cumsum(np.bincount(first[chosen], minlength=len(at)) - np.bincount(last[chosen], minlength=len(at)))
+    def spanning(value: np.ndarray) -> np.ndarray:
+        """Sum of the values of the closures that span what follows each end of a closure."""
+        begin, end = (np.bincount(place, value[on_chain], len(at)) for place in (first, last))
+        return np.cumsum(begin - end)
 
-    against = spanning(rejected & is_confirmed)
-    return bool(((against >= _SPANNING) & (spanning(~rejected) <= _BELIEVED_SHARE * against)).any())
+    speaks_against = rejected & (weight > 0)
+    against = spanning(speaks_against)
+    is_contradicted = (against >= _SPANNING) & (spanning(~rejected) <= _BELIEVED_SHARE * against)
+    return bool((is_contradicted & (spanning(speaks_against * weight) >= _SPANNING_WEIGHT)).any())
 
 
 def agree(pairs: AgreementPairs, noise: NoiseModel) -> np.ndarray:
