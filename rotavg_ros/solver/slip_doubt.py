@@ -28,6 +28,8 @@ _MIN_SUPPORTERS = 2
 # are none, two groups may look like a slip (and vain searches take ten times as long as the rest): more weight is due,
 _SPANNING, _BELIEVED_SHARE = 10, 0.05
 _SPANNING_WEIGHT = 2.5
+# (as many neighbours would confirm one by chance less often than this)
+_CHANCE = 0.05
 # in some if it explains most closures, but so much larger a share disagrees with the odometry,
 _MOST = 0.6
 _DOUBTED_DIFFERENCE = 0.05
@@ -61,12 +63,15 @@ def measure_doubt(graph: ClosureGraph, pairs: AgreementPairs, estimate: SlamEsti
     supporters = np.bincount(pairs.first, agree(pairs, by_chain), len(rejected))
     # A group of false closures agrees with itself; it must not outvote the rest by its size.
     weight = np.where(supporters >= _MIN_SUPPORTERS, 1 / (1 + supporters), 0.0)
-    if _has_contradicted_step(graph, rejected, weight):
+    expected = _supporters_by_chance(pairs, by_chain, len(rejected))
+    # P(n ≥ m) for n ~ Poisson(λ)
+    is_confirmed = gammainc(np.maximum(supporters, 1), expected) < _CHANCE
+    if _has_contradicted_step(graph, rejected, np.where(is_confirmed, weight, 0.0)):
         return Doubt.STRONG
     rejected_weight, rejected_share = float((weight * rejected).sum()), float(rejected.mean())
     doubted_share = _DOUBTED_SHARE_OF_MOST if rejected_share > _MOST else _DOUBTED_SHARE
     if rejected_weight > doubted_share * weight.sum():
-        by_chance = float(_weight_by_chance(pairs, by_chain, len(rejected))[rejected].sum())
+        by_chance = float(_weight_by_chance(expected)[rejected].sum())
         if rejected_weight - by_chance > doubted_share * (weight.sum() - by_chance):
             return Doubt.STRONG
     if rejected_share > _MOST:
@@ -108,13 +113,17 @@ def _pair_variance(pairs: AgreementPairs, noise: NoiseModel) -> np.ndarray:
     return np.asarray(np.maximum(pairs.steps, 0.5) * noise.step_variance + 2 * noise.closure_variance)
 
 
-def _weight_by_chance(pairs: AgreementPairs, noise: NoiseModel, num_closures: int) -> np.ndarray:
-    """``(C,)`` the weight that a closure has on average if it and all its neighbours are random."""
+def _supporters_by_chance(pairs: AgreementPairs, noise: NoiseModel, num_closures: int) -> np.ndarray:
+    """``(C,)`` how many neighbours agree with a closure on average if it and all of them are random."""
     k, variance = noise.components, _pair_variance(pairs, noise)
     evidence = -k / 2 * np.log(2 * np.pi * variance) - log_uniform_density(np.zeros(1), k)
     angle = np.minimum(np.sqrt(2 * variance * np.maximum(evidence, 0)), np.pi)
     chance = angle / np.pi if k == 1 else (angle - np.sin(angle)) / np.pi
-    expected = np.bincount(pairs.first, chance, num_closures)
+    return np.bincount(pairs.first, chance, num_closures)
+
+
+def _weight_by_chance(expected: np.ndarray) -> np.ndarray:
+    """``(C,)`` the weight that a closure has on average which so many neighbours confirm by chance."""
     # E[1 / (1 + n); n ≥ m] = P(n > m) / λ for n ~ Poisson(λ)
     return np.asarray(gammainc(1.0 + _MIN_SUPPORTERS, expected) / np.maximum(expected, 1e-12))
 
