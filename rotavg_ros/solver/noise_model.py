@@ -24,7 +24,7 @@ _PRIOR_OUTLIER_COUNTS = (1.0, 3.0)
 # Neighbours tell the noise of good closures, but not how many are false.
 _NEIGHBOURS_OUTLIER_SHARE = 0.3
 _EM_STARTS_STEP_DEG = (0.02, 0.1, 0.5, 2.0)
-_EM_STARTS_CLOSURE_DEG = (0.3, 2.0)
+_EM_STARTS_CLOSURE_DEG = (0.3, 2.0, 8.0)
 # False share of the odometry's discrepancies and of the neighbours' to start from.
 _EM_START_SHARES = (0.5, 0.7)
 # Of the false ones so many are taken for near misses, off by 10–30° as where the same place is seen from elsewhere. If

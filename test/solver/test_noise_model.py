@@ -70,22 +70,23 @@ def test_scales_are_found_again_where_robots_meet() -> None:
     np.testing.assert_array_equal(ends[pairs.first], ends[pairs.second])
 
 
-def test_near_misses_do_not_pass_for_noise() -> None:
-    """False closures that are off by 10–30°, not by anything."""
+@pytest.mark.parametrize(("closure_deg", "false_share"), [(1.0, 0.2), (8.0, 0.0)])
+def test_near_misses_and_noise_are_told_apart(closure_deg: float, false_share: float) -> None:
+    """False closures that are off by 10–30° only, and good ones that err by nearly as much."""
     config = SlamSimulationConfig(
         world=World.SPHERE,
         dimensions=3,
         num_keyframes=800,
-        odometry_noise_deg=1.7,
+        odometry_noise_deg=0.5 * np.sqrt(3),
         closures_per_keyframe=1.0,
-        closure_noise_deg=1.7,
-        false_share=0.3,
+        closure_noise_deg=np.sqrt(3) * closure_deg,
+        false_share=false_share,
         near_miss_share=1.0,
         in_place_share=1.0,
     )
-    model = prepare(simulate_slam_graph(config, np.random.default_rng(0)).graph).noise
-    assert 0.6 < np.degrees(np.sqrt(model.step_variance)) < 2
-    assert np.degrees(np.sqrt(model.closure_variance)) < 2
+    model = prepare(simulate_slam_graph(config, np.random.default_rng(1)).graph).noise
+    assert 0.5 < np.degrees(np.sqrt(model.step_variance)) / 0.5 < 2
+    assert 0.7 < np.degrees(np.sqrt(model.closure_variance)) / closure_deg < 1.5
 
 
 def test_without_closures_the_prior_stands() -> None:
