@@ -103,8 +103,9 @@ def _members(state: Passes, pairs: AgreementPairs, closure: np.ndarray) -> csc_a
 
 def _suspects(state: Passes, system: WholeSystem, groups: _Groups, closure: np.ndarray) -> np.ndarray:
     """Those that may be false, as far as samples tell: of what the members together do not know by themselves."""
-    root = np.sqrt(system.sampled_weight[closure, None])
+    # Drawing the samples is what tells under which weights they are.
     samples, graph = system.samples, state.graph
+    root = np.sqrt(system.sampled_weight[closure, None])
     difference = samples[graph.target[closure]] - samples[graph.source[closure]]
     unexplained = root * (root * difference - system.probes[closure])
     curvature = ((groups.member.T @ unexplained) ** 2).mean(axis=1)
