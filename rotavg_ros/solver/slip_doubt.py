@@ -44,11 +44,12 @@ _EXACT_CLOSURES = 0.15
 
 
 class Doubt(IntEnum):
-    """How much speaks for slips."""
+    """How much speaks for slips; at a step if that is where all closures speak against the odometry."""
 
     NONE = 0
     SOME = 1
-    STRONG = 2
+    AT_A_STEP = 2
+    STRONG = 3
 
 
 def measure_doubt(graph: ClosureGraph, pairs: AgreementPairs, estimate: SlamEstimate, by_chain: NoiseModel) -> Doubt:
@@ -76,6 +77,8 @@ def measure_doubt(graph: ClosureGraph, pairs: AgreementPairs, estimate: SlamEsti
             return Doubt.STRONG
     if rejected_share > _MOST:
         return Doubt.NONE
+    if _has_contradicted_step(graph, rejected, supporters >= _MIN_SUPPORTERS):
+        return Doubt.AT_A_STEP
     explains_more = by_chain.outlier_share - rejected_share > _DOUBTED_DIFFERENCE
     if explains_more or (rejected_share > _NOTABLE_SHARE and _drifts_farther(pairs, estimate, by_chain)):
         return Doubt.SOME

@@ -144,10 +144,13 @@ def _is_better(
 ) -> bool:
     """Whether corrections ``(K, 4)`` with slips are worth what they cost, beside all ``rivals``."""
     # As far as a descent gets without a search, nothing was found.
-    before = min((start for rival in rivals for start in (rival, cost.descend(rival))), key=cost.total)
+    starts = [start for rival in rivals for start in (rival, cost.descend(rival))]
+    before = min(starts, key=cost.total)
     gain = cost.total(before) - cost.total(found)
-    if_grouped = min(grouped_cost(cost, rival, pairs, is_agreed) for rival in rivals)
-    enough_if_grouped = -_MAX_LOST_SHARE * gain if doubt == Doubt.STRONG else _MIN_GAIN
+    # A group that all speaks against one step may be a false one that bends the map a little; a descent undoes that.
+    compared = starts if doubt == Doubt.AT_A_STEP else rivals
+    if_grouped = min(grouped_cost(cost, rival, pairs, is_agreed) for rival in compared)
+    enough_if_grouped = -_MAX_LOST_SHARE * gain if doubt >= Doubt.AT_A_STEP else _MIN_GAIN
     believed = [int((cost.log_odds(correction) > 0)[cost.graph.is_closure].sum()) for correction in (before, found)]
     return (
         gain >= _MIN_GAIN
