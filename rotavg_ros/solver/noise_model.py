@@ -24,7 +24,8 @@ _PRIOR_OUTLIER_COUNTS = (1.0, 3.0)
 # Neighbours tell the noise of good closures, but not how many are false.
 _NEIGHBOURS_OUTLIER_SHARE = 0.3
 _EM_STARTS_STEP_DEG = (0.02, 0.1, 0.5, 2.0)
-_EM_STARTS_CLOSURE_DEG = (0.3, 2.0, 8.0)
+# By components: about one axis, closures of 8° and anything are hard to tell apart, and the odometry decides.
+_EM_STARTS_CLOSURE_DEG = {1: (0.3, 2.0), 3: (0.3, 2.0, 8.0)}
 # False share of the odometry's discrepancies and of the neighbours' to start from.
 _EM_START_SHARES = (0.5, 0.7)
 # Of the false ones so many are taken for near misses, off by 10–30° as where the same place is seen from elsewhere. If
@@ -135,7 +136,7 @@ def _likeliest(data: Sequence[Discrepancies], few: MixtureFit, components: int) 
     """The likeliest of all models, chosen by a ``few`` of the data; None without data."""
     if not any(len(kind.steps) for kind in data):
         return None
-    starts = np.radians(list(product(_EM_STARTS_STEP_DEG, _EM_STARTS_CLOSURE_DEG))) ** 2
+    starts = np.radians(list(product(_EM_STARTS_STEP_DEG, _EM_STARTS_CLOSURE_DEG[components]))) ** 2
     models = Mixtures(starts[:, 0], starts[:, 1], np.tile(_EM_START_SHARES, (len(starts), 1)))
     for survivors, iterations in _EM_ROUNDS:
         models, log_likelihood = few.maximise(models, iterations)
