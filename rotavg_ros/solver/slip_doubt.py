@@ -23,7 +23,7 @@ from rotavg_ros.solver.slam_passes import SlamEstimate
 _DOUBTED_SHARE = 0.53
 _DOUBTED_SHARE_OF_MOST = 0.35
 _MIN_SUPPORTERS = 2
-# or if it rejects so many that neighbours confirm across one step, and believes at most such a share of those across
+# at a step if it rejects so many that neighbours confirm across one, and believes at most such a share of those across
 # it: a false closure, or a group, is contradicted by good ones across the same steps, where there are some. Where there
 # are none, two groups may look like a slip (and vain searches take ten times as long as the rest): more weight is due,
 _SPANNING, _BELIEVED_SHARE = 10, 0.05
@@ -65,10 +65,6 @@ def measure_doubt(graph: ClosureGraph, pairs: AgreementPairs, estimate: SlamEsti
     # A group of false closures agrees with itself; it must not outvote the rest by its size.
     weight = np.where(supporters >= _MIN_SUPPORTERS, 1 / (1 + supporters), 0.0)
     expected = _supporters_by_chance(pairs, by_chain, len(rejected))
-    # P(n ≥ m) for n ~ Poisson(λ)
-    is_confirmed = gammainc(np.maximum(supporters, 1), expected) < _CHANCE
-    if _has_contradicted_step(graph, rejected, np.where(is_confirmed, weight, 0.0)):
-        return Doubt.STRONG
     rejected_weight, rejected_share = float((weight * rejected).sum()), float(rejected.mean())
     doubted_share = _DOUBTED_SHARE_OF_MOST if rejected_share > _MOST else _DOUBTED_SHARE
     if rejected_weight > doubted_share * weight.sum():
@@ -77,7 +73,9 @@ def measure_doubt(graph: ClosureGraph, pairs: AgreementPairs, estimate: SlamEsti
             return Doubt.STRONG
     if rejected_share > _MOST:
         return Doubt.NONE
-    if _has_contradicted_step(graph, rejected, supporters >= _MIN_SUPPORTERS):
+    # P(n ≥ m) for n ~ Poisson(λ)
+    is_confirmed = gammainc(np.maximum(supporters, 1), expected) < _CHANCE
+    if _has_contradicted_step(graph, rejected, np.where(is_confirmed, weight, 0.0)):
         return Doubt.AT_A_STEP
     explains_more = by_chain.outlier_share - rejected_share > _DOUBTED_DIFFERENCE
     if explains_more or (rejected_share > _NOTABLE_SHARE and _drifts_farther(pairs, estimate, by_chain)):
