@@ -24,11 +24,9 @@ _DOUBTED_SHARE = 0.53
 _DOUBTED_SHARE_OF_MOST = 0.35
 _MIN_SUPPORTERS = 2
 # at a step if it rejects so many that neighbours confirm across one, and believes at most such a share of those across
-# it: a false closure, or a group, is contradicted by good ones across the same steps, where there are some. Where there
-# are none, two groups may look like a slip (and vain searches take ten times as long as the rest): more weight is due,
+# it: a false closure, or a group, is contradicted by good ones across the same steps, where there are some
 _SPANNING, _BELIEVED_SHARE = 10, 0.05
-_SPANNING_WEIGHT = 2.5
-# (as many neighbours would confirm one by chance less often than this)
+# (as many neighbours would confirm one by chance less often than this),
 _CHANCE = 0.05
 # in some if it explains most closures, but so much larger a share disagrees with the odometry,
 _MOST = 0.6
@@ -75,7 +73,7 @@ def measure_doubt(graph: ClosureGraph, pairs: AgreementPairs, estimate: SlamEsti
         return Doubt.NONE
     # P(n ≥ m) for n ~ Poisson(λ)
     is_confirmed = gammainc(np.maximum(supporters, 1), expected) < _CHANCE
-    if _has_contradicted_step(graph, rejected, np.where(is_confirmed, weight, 0.0)):
+    if _has_contradicted_step(graph, rejected, is_confirmed & (supporters >= _MIN_SUPPORTERS)):
         return Doubt.AT_A_STEP
     explains_more = by_chain.outlier_share - rejected_share > _DOUBTED_DIFFERENCE
     if explains_more or (rejected_share > _NOTABLE_SHARE and _drifts_farther(pairs, estimate, by_chain)):
@@ -83,26 +81,20 @@ def measure_doubt(graph: ClosureGraph, pairs: AgreementPairs, estimate: SlamEsti
     return Doubt.NONE
 
 
-def _has_contradicted_step(graph: ClosureGraph, rejected: np.ndarray, weight: np.ndarray) -> bool:
-    """Whether all that speaks of some step of the odometry speaks against it; closures ``(C,)`` each.
-
-    Args:
-        weight: of those that their neighbours confirm, together about one for a whole group; else 0.
-    """
+def _has_contradicted_step(graph: ClosureGraph, rejected: np.ndarray, is_confirmed: np.ndarray) -> bool:
+    """Whether all that speaks of some step of the odometry speaks against it; closures ``(C,)`` bool each."""
     closure = np.flatnonzero(graph.is_closure)
     on_chain = np.isfinite(graph.path_steps[closure])
     at, ends = np.unique(closure_ends(graph, closure[on_chain]), return_inverse=True)
     first, last = ends.reshape(-1, 2).T
 
-    def spanning(value: np.ndarray) -> np.ndarray:
-        """Sum of the values of the closures that span what follows each end of a closure."""
-        begin, end = (np.bincount(place, value[on_chain], len(at)) for place in (first, last))
+    def spanning(is_counted: np.ndarray) -> np.ndarray:
+        """How many of the closures that are counted span what follows each end of a closure."""
+        begin, end = (np.bincount(place, is_counted[on_chain], len(at)) for place in (first, last))
         return np.cumsum(begin - end)
 
-    speaks_against = rejected & (weight > 0)
-    against = spanning(speaks_against)
-    is_contradicted = (against >= _SPANNING) & (spanning(~rejected) <= _BELIEVED_SHARE * against)
-    return bool((is_contradicted & (spanning(speaks_against * weight) >= _SPANNING_WEIGHT)).any())
+    against = spanning(rejected & is_confirmed)
+    return bool(((against >= _SPANNING) & (spanning(~rejected) <= _BELIEVED_SHARE * against)).any())
 
 
 def agree(pairs: AgreementPairs, noise: NoiseModel) -> np.ndarray:
