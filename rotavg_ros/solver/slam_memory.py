@@ -30,7 +30,8 @@ from rotavg_ros.solver.noise_model import NoiseModel
 from rotavg_ros.solver.odometry_paths import OdometryPaths
 from rotavg_ros.solver.slam_clean_net import SlamCleanNet
 from rotavg_ros.solver.slam_passes import SlamEstimate, Verdicts
-from rotavg_ros.solver.slam_stages import CleanedClosures, Prepared, draw_together
+from rotavg_ros.solver.slam_preparation import Prepared, draw_together
+from rotavg_ros.solver.slam_stages import CleanedClosures
 from rotavg_ros.solver.slam_system import ITERATING_PAYS, GrownSystem, StaleFactorError
 from rotavg_ros.solver.slam_update import Start, follow, grown_variance, renew
 from rotavg_ros.solver.stated_precision import StatedTrust, believing

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver import slam_refinement, slam_stages
+from rotavg_ros.solver import slam_preparation, slam_refinement, slam_stages
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.methods import DEFAULT_METHOD, NETWORK_METHODS, Method
 from rotavg_ros.solver.profile import Estimate, Networks, Stopwatch
@@ -51,7 +51,7 @@ def _solve_once(
 ) -> Estimate:
     """The same for a graph without repetitions."""
     with watch.stage("contract"):
-        prepared = slam_stages.prepare(graph, scale_estimation=method.scale_estimation)
+        prepared = slam_preparation.prepare(graph, scale_estimation=method.scale_estimation)
     with watch.stage("clean"):
         network = networks.load("slam-clean-net") if method.clean else None
         cleaned = slam_stages.clean(network, prepared, graph.label)

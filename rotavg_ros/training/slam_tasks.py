@@ -13,7 +13,7 @@ from rotavg_ros.datasets.slam_simulation import random_slam_config, simulate_sla
 from rotavg_ros.evaluation.calibration import expected_calibration_error
 from rotavg_ros.solver.message_passing import DirectedEdges
 from rotavg_ros.solver.slam_clean_net import ClosureFeatures, SlamCleanNet, closure_features
-from rotavg_ros.solver.slam_stages import prepare
+from rotavg_ros.solver.slam_preparation import prepare
 from rotavg_ros.training.config import TrainingConfig
 
 

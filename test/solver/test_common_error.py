@@ -10,8 +10,9 @@ from rotavg_ros.datasets.slam_simulation import simulate_slam_graph
 from rotavg_ros.datasets.trajectories import World
 from rotavg_ros.solver.agreement import AgreementPairs
 from rotavg_ros.solver.common_error import closure_runs, common_share, variance_factor
+from rotavg_ros.solver.slam_preparation import prepare
 from rotavg_ros.solver.slam_refinement import refine
-from rotavg_ros.solver.slam_stages import bootstrap, clean, prepare
+from rotavg_ros.solver.slam_stages import bootstrap, clean
 
 
 def test_runs_link_near_good_closures() -> None:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 from rotavg_ros import EdgeKind
-from rotavg_ros.solver import slam_stages
+from rotavg_ros.solver import slam_preparation
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.drift_posterior import MAX_CLOSURES, expected_step_variance
 from test.solver.graphs import measured, random_truth
@@ -30,7 +30,9 @@ def drifting(step_deg: float, closure_deg: float, seed: int, backward: bool = Fa
     vector = np.array([0, 0, 1.0]) * (sigma * rng.normal(size=len(sigma)))[:, None]
     kind = np.repeat([EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE], [NUM_NODES - 1, len(LOW)])
     truth = random_truth(NUM_NODES, seed, planar=True)
-    return slam_stages.prepare(measured(truth, source, target, Rotation.from_rotvec(vector), kind=kind)).closure_graph
+    return slam_preparation.prepare(
+        measured(truth, source, target, Rotation.from_rotvec(vector), kind=kind)
+    ).closure_graph
 
 
 def test_the_likelihood_is_that_of_errors_with_steps_in_common() -> None:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros import EdgeKind, ViewGraph, rotations, solve
 from rotavg_ros.evaluation.metrics import orientation_errors
-from rotavg_ros.solver import slam_stages
+from rotavg_ros.solver import slam_preparation, slam_stages
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.group_verdicts import _if_turned
 from rotavg_ros.solver.noise_model import NoiseModel
@@ -56,7 +56,7 @@ def test_a_group_that_agrees_counts_as_one(planar: bool, monkeypatch: pytest.Mon
 
 def test_information_on_a_groups_turn_is_what_least_squares_with_it_has() -> None:
     graph = there_and_back(0, 0.0, planar=False)[0]
-    closure_graph, _ = slam_stages.draw_together(graph)
+    closure_graph, _ = slam_preparation.draw_together(graph)
     state, system, num_edges = settled(closure_graph)
     member = np.zeros((num_edges, 2))
     member[-12:-6, 0] = member[-3:, 1] = 1.0

@@ -14,7 +14,7 @@ from rotavg_ros.datasets.trajectories import World
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.grown_laplacian import GrownLaplacian, OlderFactor
 from rotavg_ros.solver.laplacian import LaplacianSystem
-from rotavg_ros.solver.slam_stages import draw_together
+from rotavg_ros.solver.slam_preparation import draw_together
 
 NUM_KEYFRAMES = 400
 

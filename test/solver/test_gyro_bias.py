@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros import EdgeKind, ViewGraph, solve
 from rotavg_ros.evaluation.metrics import orientation_errors
-from rotavg_ros.solver import slam_stages
+from rotavg_ros.solver import slam_preparation
 from rotavg_ros.solver.gyro_bias import without_bias
 from test.solver.graphs import as_quaternions, measured, small_noise
 
@@ -35,7 +35,7 @@ def biased_laps() -> tuple[ViewGraph, Rotation]:
 
 def test_a_bias_is_found_and_taken_out() -> None:
     graph, truth = biased_laps()
-    prepared = slam_stages.prepare(graph)
+    prepared = slam_preparation.prepare(graph)
     assert np.degrees(np.sqrt(prepared.noise.step_variance)) < 0.2
     assert prepared.noise.outlier_share == pytest.approx(0.3, abs=0.08)
     solution = solve(graph, profile="slam")
@@ -53,5 +53,5 @@ def test_it_does_not_matter_which_way_odometry_runs() -> None:
         torch.where(turned[:, None], inverse, graph.target_from_source),
         kind=graph.kind,
     )
-    straight, back = slam_stages.prepare(graph).noise, slam_stages.prepare(mixed).noise
+    straight, back = slam_preparation.prepare(graph).noise, slam_preparation.prepare(mixed).noise
     assert back.step_variance == pytest.approx(straight.step_variance, rel=1e-3)

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import EdgeKind, rotations
-from rotavg_ros.solver import slam_stages
+from rotavg_ros.solver import slam_preparation
 from rotavg_ros.solver.moved_slips import with_moved_slips
 from rotavg_ros.solver.noise_model import NoiseModel
 from rotavg_ros.solver.slip_search import no_slip_log_odds
@@ -19,7 +19,7 @@ NUM_NODES, SLIP = 41, np.radians(50.0)
 NOISE = NoiseModel(1, np.radians(0.1) ** 2, np.radians(0.5) ** 2, 0.3)
 
 
-def there_and_back(told_apart: bool) -> tuple[slam_stages.Prepared, torch.Tensor, np.ndarray]:
+def there_and_back(told_apart: bool) -> tuple[slam_preparation.Prepared, torch.Tensor, np.ndarray]:
     """Closures between the way out and the way back; a slip after keyframe 10, as found. Corrections, probabilities.
 
     The same closures span the step after keyframe 29. On request others, to where the robot turned, tell them apart.
@@ -34,7 +34,7 @@ def there_and_back(told_apart: bool) -> tuple[slam_stages.Prepared, torch.Tensor
     vector[10, 2] = SLIP
     kind = np.repeat([EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE], [NUM_NODES - 1, len(low)])
     truth = random_truth(NUM_NODES, 0, planar=True)
-    prepared = slam_stages.prepare(measured(truth, source, target, Rotation.from_rotvec(vector), kind=kind))
+    prepared = slam_preparation.prepare(measured(truth, source, target, Rotation.from_rotvec(vector), kind=kind))
     graph = prepared.closure_graph
     correction = graph.corrections(torch.from_numpy((truth * truth[0].inv()).as_quat()))
     first = rotations.inverse(correction[:1]).expand(len(correction), 4)

@@ -12,7 +12,7 @@ from rotavg_ros.datasets.trajectories import World
 from rotavg_ros.solver.agreement import agreement_pairs
 from rotavg_ros.solver.mixture import log_uniform_density
 from rotavg_ros.solver.noise_model import NoiseModel, discrepancies, estimate_noise
-from rotavg_ros.solver.slam_stages import prepare
+from rotavg_ros.solver.slam_preparation import prepare
 
 from .graphs import measured, random_truth, slam_edges, small_noise
 

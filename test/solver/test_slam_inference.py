@@ -11,7 +11,7 @@ from rotavg_ros.solver.closure_graph import contract
 from rotavg_ros.solver.network_store import load_network
 from rotavg_ros.solver.slam_clean_net import closure_features
 from rotavg_ros.solver.slam_inference import false_log_odds
-from rotavg_ros.solver.slam_stages import prepare
+from rotavg_ros.solver.slam_preparation import prepare
 from rotavg_ros.solver.spanning_tree import minimum_spanning_forest
 
 from .graphs import measured, random_truth, slam_edges, small_noise

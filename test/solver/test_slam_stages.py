@@ -16,7 +16,8 @@ from rotavg_ros.datasets.graph_file import read_graph
 from rotavg_ros.datasets.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.evaluation.metrics import orientation_errors
 from rotavg_ros.solver.slam_clean_net import SlamCleanNet
-from rotavg_ros.solver.slam_stages import Prepared, bootstrap, clean, prepare, refine
+from rotavg_ros.solver.slam_preparation import Prepared, prepare
+from rotavg_ros.solver.slam_stages import bootstrap, clean, refine
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 from .graphs import measured, random_truth, slam_edges, small_noise

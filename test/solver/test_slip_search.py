@@ -16,7 +16,7 @@ from rotavg_ros import EdgeKind, ViewGraph, rotations, solve
 from rotavg_ros.datasets.graph_file import read_graph
 from rotavg_ros.evaluation import slam_cases, slam_contenders, slam_scoring
 from rotavg_ros.evaluation.metrics import orientation_errors
-from rotavg_ros.solver import slam_stages
+from rotavg_ros.solver import slam_preparation
 from rotavg_ros.solver.cycle_votes import count_votes
 from rotavg_ros.solver.exceedance import exceedance
 from rotavg_ros.solver.jumps import _turns
@@ -153,7 +153,7 @@ def test_the_answer_depends_on_neither_order_nor_gauge() -> None:
 
 def test_closures_vote_without_the_odometry_between() -> None:
     graph, _, is_false, is_slip = laps(planar=True, false_share=0.3)
-    prepared = slam_stages.prepare(graph)
+    prepared = slam_preparation.prepare(graph)
     closures = prepared.closure_graph
     noise = noise_between_neighbours(prepared.pairs, 1)
     assert np.degrees(np.sqrt(noise.closure_variance)) == pytest.approx(0.5, rel=0.4)
@@ -183,7 +183,7 @@ def test_a_jump_takes_the_set_that_an_exhaustive_search_finds() -> None:
     kind = np.concatenate((np.full(num_nodes - 1, EdgeKind.ODOMETRY), kind))
     truth = Rotation.identity(num_nodes)
     graph = measured(truth, source, target, Rotation.from_rotvec(vector), kind=kind)
-    closures = slam_stages.prepare(graph).closure_graph
+    closures = slam_preparation.prepare(graph).closure_graph
     noise = NoiseModel(1, np.radians(1.0) ** 2, np.radians(1.0) ** 2, 0.3)
     cost = TruncatedCost.create(closures, noise, np.zeros(len(closures.source)))
     residual = cost.residual(rotations.identity(closures.num_nodes))
@@ -217,7 +217,7 @@ def test_a_stretch_that_slips_cut_in_two_is_turned_part_by_part(seed: int) -> No
     graph, truth, _, _ = laps(
         planar=True, false_share=0.0, seed=seed, num_laps=2, slips={20: 50.0, 22: -35.0, 24: -15.0}
     )
-    prepared = slam_stages.prepare(graph)
+    prepared = slam_preparation.prepare(graph)
     closures, pairs = prepared.closure_graph, prepared.pairs
     noise = NoiseModel(1, np.radians(0.1) ** 2, np.radians(0.5) ** 2, 0.3)
     prior = np.zeros(len(closures.source))
