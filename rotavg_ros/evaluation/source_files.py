@@ -31,7 +31,7 @@ def source_files(module: str) -> tuple[Path, ...]:
         file = _file(folder, waiting.pop())
         if file is not None and file not in found:
             found.add(file)
-            waiting += _names(file, package)
+            waiting += _names(file, folder)
     if not found:
         raise ModuleNotFoundError(f"no source file of a module named {module!r}", name=module)
     return tuple(sorted(found))
@@ -42,14 +42,17 @@ def _file(package_folder: Path, module: str) -> Path | None:
     return next((file for file in (path / "__init__.py", path.with_suffix(".py")) if file.is_file()), None)
 
 
-def _names(file: Path, package: str) -> Iterator[str]:
+def _names(file: Path, package_folder: Path) -> Iterator[str]:
     """Dotted names below the package that a file mentions: of modules, and of what is in them."""
+    package = package_folder.name
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         names: list[str] = []
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module is not None:
-            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            if not all(_file(package_folder, name) for name in names):
+                names.append(node.module)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             names = [node.value]
         yield from (name for name in names if re.fullmatch(rf"{package}(\.\w+)+", name))

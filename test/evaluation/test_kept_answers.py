@@ -117,7 +117,8 @@ def test_sources_behind_a_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         "part/__init__.py": "from some_package.part import unused",
         "part/unused.py": "",
         "start.py": "import json\nfrom some_package.part.used import thing\ndef later():\n    import some_package.lazy",
-        "part/used.py": "import some_package.start\nname = 'some_package.named'",
+        "part/used.py": "import some_package.start\nfrom some_package.part import also\nname = 'some_package.named'",
+        "part/also.py": "",
         "lazy.py": "",
         "named.py": "from .. import nothing\n'''some_package.part.unused is not used'''",
     }
@@ -125,7 +126,7 @@ def test_sources_behind_a_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         (package / name).write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     found = [str(path.relative_to(package)) for path in source_files("some_package.start")]
-    assert found == ["lazy.py", "named.py", "part/used.py", "start.py"]
+    assert found == ["lazy.py", "named.py", "part/also.py", "part/used.py", "start.py"]
     with pytest.raises(ModuleNotFoundError):
         source_files("some_package.missing")
 
