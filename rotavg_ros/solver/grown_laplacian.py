@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -19,7 +20,13 @@ from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
 
 from rotavg_ros.solver.closure_graph import ClosureGraph
-from rotavg_ros.solver.laplacian import FactorisedLaplacian, incidence_matrix, iterate, root_stiffness
+from rotavg_ros.solver.laplacian import (
+    FactorisedLaplacian,
+    incidence_matrix,
+    iterate,
+    root_stiffness,
+    solve_in_parts,
+)
 
 # Conjugate gradients end at a step that no orientation could be seen to take, or at a hundredth of the first one.
 _TOLERANCE, _RELATIVE_TOLERANCE = np.radians(0.002), 1e-2
@@ -137,7 +144,7 @@ class GrownLaplacian:
         columns = np.concatenate((number[others[inner]], np.arange(count)))
         values = np.concatenate((-weights[inner], diagonal))
         block = csc_array(coo_array((values, (rows, columns)), shape=(count, count)))
-        self._solve_new = splu(block).solve if count else np.asarray
+        self._solve_new = partial(solve_in_parts, splu(block)) if count else np.asarray
         coupling = -weights[~inner], (ends[~inner], others[~inner])
         self._coupling = csr_array(coo_array(coupling, shape=(count, graph.num_nodes)))
 

@@ -25,8 +25,8 @@ _DENSE_SHARE, _DENSE_EDGES_PER_NODE = 0.01, 8
 _DENSE_MAX_NODES = 5000
 # From eight columns on, SuperLU's many little products are large enough for OpenBLAS to spread each over the cores,
 # which costs more than it saves: 48 columns on 8600 nodes took 180 ms of CPU time at once and 28 ms in fours.
-# Products of six are still on one thread.
-_COLUMNS_AT_ONCE = 6
+# Six are on one thread only in smaller graphs: in ticks of 10 000 keyframes they took three times as much CPU time.
+_COLUMNS_AT_ONCE = 4
 _ENTRIES_AT_ONCE = 100_000
 # Conjugate gradients from a factorisation with other weights; after so many iterations another one is cheaper.
 _RELATIVE_TOLERANCE = 1e-3
@@ -131,10 +131,15 @@ class LaplacianPattern:
 
 def _solve_sparse(factor: SuperLU, node: np.ndarray, rank: np.ndarray, right_hand_side: np.ndarray) -> np.ndarray:
     """Solve ``(N, k)`` columns; the matrix has ``node[i]`` in row i, and node v in row ``rank[v]``."""
-    columns = np.asfortranarray(right_hand_side.take(node, axis=0))
+    return solve_in_parts(factor, right_hand_side.take(node, axis=0)).take(rank, axis=0)
+
+
+def solve_in_parts(factor: SuperLU, right_hand_side: np.ndarray) -> np.ndarray:
+    """Solve ``(N, k)`` columns, a few at a time."""
+    columns = np.asfortranarray(right_hand_side)
     starts = range(0, columns.shape[1], _COLUMNS_AT_ONCE)
     parts = [factor.solve(columns[:, start : start + _COLUMNS_AT_ONCE]) for start in starts]
-    return np.asarray(np.concatenate(parts, axis=1).take(rank, axis=0))
+    return np.concatenate(parts, axis=1) if parts else columns
 
 
 class _Iteration:
