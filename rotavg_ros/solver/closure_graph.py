@@ -163,7 +163,8 @@ def contract_along(graph: ViewGraph, paths: OdometryPaths) -> ClosureGraph:
     on_segment = segment_of_edge >= 0
     share_of_segment[on_segment] = steps[on_segment] / segment_steps[segment_of_edge[on_segment]]
     own_steps = np.concatenate((segment_steps, np.where(is_odometry, steps, 1.0)[other]))
-    stated_variance = np.where(is_odometry, np.nan, 1 / graph.precision.numpy())[other]
+    with np.errstate(over="ignore"):  # of a precision that is next to nothing
+        stated_variance = np.where(is_odometry, np.nan, 1 / graph.precision.numpy())[other]
     _, chain_number = np.unique(paths.chain, return_inverse=True)
     return ClosureGraph(
         nodes=nodes,

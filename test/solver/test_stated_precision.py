@@ -79,6 +79,7 @@ def with_precisions(graph: ViewGraph, stated: str, seed: int) -> ViewGraph:
     precision[closure] = {
         "right": precision[closure],
         "missing": torch.full((len(closure),), torch.nan, dtype=torch.float64),
+        "next to nothing": torch.full((len(closure),), 5e-324, dtype=torch.float64),
         "unit": torch.ones(len(closure), dtype=torch.float64),
         "permuted": precision[closure[torch.from_numpy(np.random.default_rng(seed).permutation(len(closure)))]],
     }[stated]
@@ -96,7 +97,8 @@ def mean_errors(stated: str, num_seeds: int = 4) -> np.ndarray:
 
 def test_right_precisions_help_and_wrong_ones_do_no_harm() -> None:
     missing = mean_errors("missing")
-    np.testing.assert_array_equal(mean_errors("unit", 1), missing[:1])
+    for uninformative in ("unit", "next to nothing"):
+        np.testing.assert_array_equal(mean_errors(uninformative, 1), missing[:1])
     assert np.exp(np.log(mean_errors("right") / missing).mean()) < 0.95
     assert np.abs(np.log(mean_errors("permuted") / missing)).max() < 0.02
 
