@@ -25,7 +25,7 @@ _DENSE_SHARE, _DENSE_EDGES_PER_NODE = 0.01, 8
 _DENSE_MAX_NODES = 5000
 # From eight columns on, SuperLU's many little products are large enough for OpenBLAS to spread each over the cores,
 # which costs more than it saves: 48 columns on 8600 nodes took 180 ms of CPU time at once and 28 ms in fours.
-# Six are on one thread only in smaller graphs: in ticks of 10 000 keyframes they took three times as much CPU time.
+# Six are on one thread only in smaller graphs: with them ticks of 10 000 keyframes took twice the CPU time.
 _COLUMNS_AT_ONCE = 4
 _ENTRIES_AT_ONCE = 100_000
 # Conjugate gradients from a factorisation with other weights; after so many iterations another one is cheaper.

@@ -1,7 +1,8 @@
-"""Quaternion algebra in numpy for small graphs: components in rows, ``(4, n)``, as few calls as can be.
+"""Quaternion algebra in numpy for small graphs: components in rows, ``(4, n)``.
 
-A SLAM solve of a few hundred edges spends more time in calling operations than in them: the dozens that
-``rotations.multiply`` and ``log`` take are two and eight here. The conventions are those of ``rotations.py``.
+A SLAM solve of a few hundred edges spends more time in calling operations than in them, and a call of numpy's takes
+half as long as one of torch's. For large graphs, and on GPUs, the same is in ``residuals.py`` for tensors. The
+conventions are those of ``rotations.py``.
 """
 
 from __future__ import annotations
