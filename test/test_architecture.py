@@ -1,57 +1,183 @@
-"""Arrows point inward: what may import what, read from the sources."""
+"""The house: who may import whom, from wing to wing and from room to room, read from the sources."""
 
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "rotavg_ros"
-# The parts that others build on, and the parts of this package that they may import themselves.
-INWARD = {
+TOP = PACKAGE.name
+# The wings that others build on, and those that they may import themselves.
+INWARD: dict[str, set[str]] = {
     "errors": set(),
     "view_graph": {"errors"},
     "rotations": set(),
-    "solver": {"errors", "rotations", "view_graph"},
+    "baselines": {"errors", "rotations", "solver", "view_graph"},
+    "solver": {"baselines", "errors", "rotations", "view_graph"},
     "datasets": {"errors", "rotations", "view_graph"},
     "online": {"errors", "rotations", "solver", "view_graph"},
     "inputs": {"online", "view_graph"},
     "settings": {"errors", "inputs", "online", "solver", "view_graph"},
 }
-# Others' packages that only one part may know.
+# Inside a wing, the rooms (modules and folders) that a room may import; "" is what the folder's own name gives.
+_ON_NEURORA = {"algebra", "estimate", "neurora"}
+ROOMS: dict[str, dict[str, set[str]]] = {
+    "solver": {
+        "algebra": set(),
+        "neurora": {"algebra"},
+        "estimate": {"neurora"},
+        "sfm": _ON_NEURORA,
+        "slam": _ON_NEURORA,
+        "networks": {"neurora", "slam"},
+        "devices": set(),
+        "methods": {"sfm", "slam"},
+        "solution": set(),
+        "pipeline": {"algebra", "devices", "estimate", "methods", "neurora", "sfm", "slam", "solution"},
+        "batch": {"methods", "pipeline", "solution"},
+        "": {"batch", "devices", "methods", "pipeline", "solution"},
+    },
+    "solver/neurora": {
+        "network_store": set(),
+        "message_passing": set(),
+        "clean_net": {"message_passing", "network_store"},
+        "fine_net": {"message_passing", "network_store"},
+        "tiled": {"clean_net", "fine_net", "message_passing"},
+        "cleaned": set(),
+        "scores": set(),
+        "tree": {"cleaned"},
+        "stages": {"clean_net", "cleaned", "fine_net", "tiled"},
+    },
+    "solver/slam": {
+        "options": set(),
+        "graph": set(),
+        "noise": {"graph"},
+        "network": {"graph", "noise"},
+        "passes": {"graph", "noise"},
+        "moves": {"graph", "noise", "passes"},
+        "preparation": {"graph", "noise"},
+        "refinement": {"graph", "moves", "noise", "passes"},
+        "stages": {"graph", "moves", "network", "noise", "passes", "preparation", "refinement"},
+        "update": {"graph", "network", "noise", "passes", "preparation", "refinement", "stages"},
+        "solve": {"graph", "network", "options", "passes", "preparation", "refinement", "stages", "update"},
+    },
+}
+# What those outside may import from the inside of a wing, besides its face.
+FACES = {"solver": {"batch", "devices", "methods", "networks", "pipeline", "solution"}}
+INSIDERS = {"baselines": {"algebra", "neurora"}, "training": {"algebra", "neurora"}}
+# Others' packages that only one wing may know.
 BORDERS = {"rclpy": "ros", "rosbags": "bags", "mcap": "bags"}
+MAX_ROOMS = 16
 
 
-def imported(part: str) -> Iterator[tuple[str, str]]:
-    """Modules that a part of the package imports, anywhere in it, and the file that does."""
-    files = (PACKAGE / part).rglob("*.py") if (PACKAGE / part).is_dir() else [PACKAGE / f"{part}.py"]
-    for file in files:
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Import):
-                yield from ((alias.name, file.name) for alias in node.names)
-            elif isinstance(node, ast.ImportFrom) and node.module == PACKAGE.name:
-                yield from ((f"{node.module}.{alias.name}", file.name) for alias in node.names)
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                yield node.module, file.name
+def files(folder: str = "") -> list[Path]:
+    """Modules below a folder of the package, or one module."""
+    path = PACKAGE / folder
+    return sorted(path.rglob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
 
 
-@pytest.mark.parametrize("part", INWARD)
-def test_nothing_imports_outward(part: str) -> None:
-    for module, file in imported(part):
-        top, *inner = module.split(".")
-        if top == PACKAGE.name:
-            assert inner[0] in {part, *INWARD[part]}, f"{part}/{file} imports {module}"
-        else:
-            assert top not in BORDERS and not top.endswith("_msgs"), f"{part}/{file} imports {module}"
+def module_name(file: Path) -> str:
+    """Dotted name below the package; a folder's own for its ``__init__``."""
+    return ".".join(file.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__").removesuffix("__init__")
+
+
+MODULES = {module_name(file): file for file in files()}
+
+
+def imported(file: Path) -> Iterator[str]:
+    """Full names of all modules that a file imports, anywhere in it, also for type checking only."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            inside = node.module.partition(".")[2] if node.module.split(".")[0] == TOP else None
+            for alias in node.names:
+                is_module = inside is not None and f"{inside}.{alias.name}".strip(".") in MODULES
+                yield f"{node.module}.{alias.name}" if is_module else node.module
+
+
+def imported_inside(file: Path) -> Iterator[str]:
+    """Names below the package of what a file imports from it."""
+    yield from (name.partition(".")[2] for name in imported(file) if name.split(".")[0] == TOP)
+
+
+@pytest.mark.parametrize("wing", INWARD)
+def test_no_wing_imports_outward(wing: str) -> None:
+    for file in files(wing):
+        for name in imported(file):
+            top, _, inner = name.partition(".")
+            if top == TOP:
+                assert inner.partition(".")[0] in {wing, *INWARD[wing]}, f"{file} imports {name}"
+            else:
+                assert top not in BORDERS and not top.endswith("_msgs"), f"{file} imports {name}"
 
 
 def test_borders() -> None:
-    parts = sorted({path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in PACKAGE.rglob("*.py")})
-    assert set(INWARD) < set(parts)
-    for part in parts:
-        for module, file in imported(part):
-            top = module.partition(".")[0]
-            owner = "ros" if top.endswith("_msgs") else BORDERS.get(top, part)
-            assert part == owner, f"{part}/{file} imports {module}, which only {owner} may know"
+    wings = {module_name(file).partition(".")[0] for file in files()}
+    assert set(INWARD) < wings
+    for file in files():
+        wing = module_name(file).partition(".")[0]
+        for name in imported(file):
+            top = name.partition(".")[0]
+            owner = "ros" if top.endswith("_msgs") else BORDERS.get(top, wing)
+            assert wing == owner, f"{file} imports {name}, which only {owner} may know"
+
+
+@pytest.mark.parametrize("folder", ROOMS)
+def test_no_room_imports_outward(folder: str) -> None:
+    rooms: Mapping[str, set[str]] = ROOMS[folder]
+    prefix = folder.replace("/", ".")
+    present = {module_name(file).removeprefix(prefix).strip(".").partition(".")[0] for file in files(folder)}
+    assert present - {""} == set(rooms) - {""}
+    for file in files(folder):
+        room = module_name(file).removeprefix(prefix).strip(".").partition(".")[0]
+        for name in imported_inside(file):
+            if name == prefix or name.startswith(f"{prefix}."):
+                other = name.removeprefix(prefix).strip(".").partition(".")[0]
+                assert other in {room, *rooms[room]}, f"{file} imports {name}"
+
+
+@pytest.mark.parametrize("wing", FACES)
+def test_others_import_from_the_face(wing: str) -> None:
+    for file in files():
+        own = module_name(file).partition(".")[0]
+        for name in imported_inside(file):
+            first, _, rest = name.partition(".")
+            if first == wing != own and rest:
+                allowed = FACES[wing] | (INSIDERS.get(own, set()) if wing == "solver" else set())
+                assert rest.partition(".")[0] in allowed, f"{file} imports {name}, which is no face of {wing}"
+
+
+def test_no_module_reaches_itself() -> None:
+    graph = {}
+    for name, file in MODULES.items():
+        if file.name != "__init__.py":  # what a folder gathers for others reaches all that it gathers
+            graph[name] = {other for other in imported_inside(file) if MODULES.get(other, file).name != "__init__.py"}
+    TopologicalSorter(graph).prepare()
+
+
+def test_profiles_do_not_reach_each_other() -> None:
+    """From the start of either profile's solve."""
+    for profile, other in (("sfm", "slam"), ("slam", "sfm")):
+        reached, waiting = set(), [f"solver.{profile}.solve"]
+        while waiting:
+            name = waiting.pop()
+            if name in MODULES and name not in reached and MODULES[name].name != "__init__.py":
+                reached.add(name)
+                waiting += imported_inside(MODULES[name])
+        assert not [name for name in reached if name.startswith(f"solver.{other}.")]
+
+
+def test_nothing_is_imported_by_its_name() -> None:
+    for file in files():
+        assert not re.search(r"\bimport_module\(|\b__import__\(", file.read_text(encoding="utf-8")), file
+
+
+def test_a_folder_holds_no_more_than_can_be_held_in_the_head() -> None:
+    for folder in {file.parent for file in files()} - {PACKAGE, PACKAGE / "cli"}:
+        rooms = [path for path in folder.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()]
+        assert len(rooms) - 1 <= MAX_ROOMS, f"{folder} has {len(rooms) - 1} rooms"

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.spanning_tree import (
+from rotavg_ros.solver.algebra.spanning_forest import (
     SpanningForest,
     compose_orientations,
     minimum_spanning_forest,

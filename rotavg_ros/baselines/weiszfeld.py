@@ -20,7 +20,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.baselines.start import start_orientations, usable_edges
-from rotavg_ros.solver.fine_net import edge_residual
+from rotavg_ros.solver.algebra.residuals import edge_residual
 from rotavg_ros.view_graph import ViewGraph
 
 _MAX_SWEEPS = 2000

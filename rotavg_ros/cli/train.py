@@ -19,8 +19,9 @@ from rotavg_ros.cli.arguments import thread_count
 from rotavg_ros.cli.progress import working
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.tables import make_folder
-from rotavg_ros.solver.clean_net import CleanNet
-from rotavg_ros.solver.network_store import WEIGHTS_FOLDER, read_network
+from rotavg_ros.solver.networks import NETWORKS
+from rotavg_ros.solver.neurora.clean_net import CleanNet
+from rotavg_ros.solver.neurora.network_store import WEIGHTS_FOLDER, read_network
 from rotavg_ros.training.config import TrainingConfig, TrainingConfigError
 from rotavg_ros.training.sfm_tasks import SfmCleanTask, SfmFineTask
 from rotavg_ros.training.slam_tasks import SlamCleanTask
@@ -122,7 +123,7 @@ def make_trainer(
         raise TrainCommandError("the SLAM profile's CleanNet trains on the CPU, where its graphs live")
     name = f"{config.family}-{network}"
     # What is wrong with any of the files shows before the minutes that drawing graphs takes.
-    given = None if start is None else read_network(name, start)
+    given = None if start is None else read_network(NETWORKS[name], start)
     make_folder(output)
     inputs: dict[str, str] = {}
     task: TrainingTask
@@ -150,9 +151,7 @@ def make_trainer(
 def _clean_net(output: Path, given: Path | None) -> CleanNet:
     trained = output / "sfm-clean-net.safetensors"
     path = given or (trained if trained.exists() else WEIGHTS_FOLDER / trained.name)
-    network = read_network("sfm-clean-net", path)
-    assert isinstance(network, CleanNet)
-    return network
+    return read_network(CleanNet, path)
 
 
 def _torch_device(name: str) -> torch.device:

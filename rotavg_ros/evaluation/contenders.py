@@ -17,10 +17,11 @@ from rotavg_ros.evaluation.kept_answers import kept
 from rotavg_ros.evaluation.metrics import true_edge_noise
 from rotavg_ros.evaluation.named_peers import peer_solver
 from rotavg_ros.evaluation.peers import PeerAnswer
-from rotavg_ros.solver import METHODS, sfm_refinement, solve
-from rotavg_ros.solver.refinement import refine
-from rotavg_ros.solver.sfm_stages import residual_score
-from rotavg_ros.solver.spanning_tree import shortest_path_forest
+from rotavg_ros.solver import METHODS, solve
+from rotavg_ros.solver.algebra.spanning_forest import shortest_path_forest
+from rotavg_ros.solver.neurora.scores import residual_score
+from rotavg_ros.solver.sfm import refinement as sfm_refinement
+from rotavg_ros.solver.sfm.round_refinement import refine
 from rotavg_ros.view_graph import ViewGraph
 
 FULL_PIPELINE = "neurora"

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from rotavg_ros.evaluation.source_files import source_files
 from rotavg_ros.evaluation.tables import ReportError
-from rotavg_ros.solver import network_store
+from rotavg_ros.solver.neurora import network_store
 
 QuestionT = TypeVar("QuestionT")
 AnswerT = TypeVar("AnswerT")

@@ -22,7 +22,7 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.baselines.start import solve_by_component, spanning_forest
 from rotavg_ros.errors import UserError
-from rotavg_ros.solver.spanning_tree import SpanningForest, accumulate_to_root, compose_orientations
+from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root, compose_orientations
 from rotavg_ros.view_graph import ViewGraph
 
 # An edge that states no precision counts as this good.

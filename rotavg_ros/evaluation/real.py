@@ -17,7 +17,7 @@ from rotavg_ros.evaluation.contenders import Answer, Case, Contender
 from rotavg_ros.evaluation.metrics import orientation_errors
 from rotavg_ros.evaluation.scoring import Scores
 from rotavg_ros.evaluation.tables import Cell, Column, Table
-from rotavg_ros.solver.fine_net import edge_residual
+from rotavg_ros.solver.algebra.residuals import edge_residual
 
 METHODS = (
     "chatterjee",

@@ -22,7 +22,7 @@ from rotavg_ros.evaluation.named_peers import peer_solver
 from rotavg_ros.evaluation.peers import PeerAnswer
 from rotavg_ros.evaluation.slam_cases import SlamCase
 from rotavg_ros.solver import METHODS, solve
-from rotavg_ros.solver.spanning_tree import compose_orientations
+from rotavg_ros.solver.algebra.spanning_forest import compose_orientations
 from rotavg_ros.view_graph import ViewGraph
 
 OURS = "neurora"

@@ -15,7 +15,7 @@ from rotavg_ros.evaluation.slam_cases import SlamCase
 from rotavg_ros.online.estimator import OnlineEstimator
 from rotavg_ros.online.measurements import EdgeMeasurement, KeyframeReference
 from rotavg_ros.online.options import EstimatorOptions
-from rotavg_ros.solver.spanning_tree import compose_orientations
+from rotavg_ros.solver.algebra.spanning_forest import compose_orientations
 
 KEYFRAMES_PER_TICK = 10
 # Early on a truth of few keyframes says little, and nothing can be known yet.

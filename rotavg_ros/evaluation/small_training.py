@@ -11,8 +11,9 @@ from pathlib import Path
 
 import torch
 
-from rotavg_ros.solver.clean_net import CleanNet
-from rotavg_ros.solver.network_store import load_network, read_network
+from rotavg_ros.solver.networks import NETWORKS
+from rotavg_ros.solver.neurora.clean_net import CleanNet
+from rotavg_ros.solver.neurora.network_store import load_network, read_network
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.sfm_tasks import GivenGraphs, SfmCleanTask, SfmFineTask
 from rotavg_ros.training.trainer import Trainer, TrainingTask
@@ -35,8 +36,7 @@ def train_networks(
     cpu = torch.device("cpu")
     make_clean = _maker("sfm-clean-net", partial(SfmCleanTask, config, cpu, graphs), from_package)
     _train("sfm-clean-net", make_clean, config, folder, seconds * _CLEAN_NET_SHARE)
-    clean_net = read_network("sfm-clean-net", folder / "sfm-clean-net.safetensors")
-    assert isinstance(clean_net, CleanNet)
+    clean_net = read_network(CleanNet, folder / "sfm-clean-net.safetensors")
     make_fine = _maker("sfm-fine-net", partial(SfmFineTask, config, cpu, clean_net, graphs), from_package)
     _train("sfm-fine-net", make_fine, config, folder, seconds * (1 - _CLEAN_NET_SHARE))
 
@@ -47,7 +47,7 @@ def _maker(name: str, make_task: Callable[[], TrainingTask], from_package: bool)
     def make() -> TrainingTask:
         task = make_task()
         if from_package:
-            task.network.load_state_dict(load_network(name).state_dict())
+            task.network.load_state_dict(load_network(NETWORKS[name]).state_dict())
         return task
 
     return make

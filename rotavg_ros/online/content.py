@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +16,6 @@ from rotavg_ros.online.problem import Problem
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.online.renumbering import Renumbering
 from rotavg_ros.online.time_jumps import BackwardJumps, LateMessage
-
-if TYPE_CHECKING:
-    from rotavg_ros.solver.slam_memory import SlamMemory
 
 
 @dataclass(frozen=True)
@@ -62,7 +58,7 @@ class Content:
         self.answered = answered
         self.first_version = self.version = version
         self._answered_component: Tensor | None = None
-        self._memory: SlamMemory | None = None
+        self._memory: object | None = None
         self._answered_revision = 0
         self._answer_was_cold = True
         self._ticked_revision = 0
@@ -139,7 +135,7 @@ class Content:
         outlier: NDArray[np.bool_],
         revision: int,
         was_cold: bool,
-        memory: SlamMemory | None,
+        memory: object | None,
     ) -> None:
         """Make the answer to the last problem the last answer.
 

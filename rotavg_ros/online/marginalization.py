@@ -1,9 +1,9 @@
 """Taking keyframes out of a pose graph without changing what it says of the others.
 
 A keyframe v between two odometry edges u → v → x and without a loop closure can be integrated out: rotations are
-composed, ``R_xu = R_xv R_vu``, variances are added. That is what :mod:`rotavg_ros.solver.closure_graph` does for
-every solve anyway, so the solution at all other keyframes stays what it was. Long runs of such keyframes vanish in a
-few vectorised rounds, each of which takes an independent set out of what is left (Luby 1986).
+composed, ``R_xu = R_xv R_vu``, variances are added. That is what :mod:`rotavg_ros.solver.slam.graph.closure_graph` does
+for every solve anyway, so the solution at all other keyframes stays what it was. Long runs of such keyframes vanish in
+a few vectorised rounds, each of which takes an independent set out of what is left (Luby 1986).
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.solver.laplacian import LaplacianPattern
+from rotavg_ros.solver.algebra.laplacian import LaplacianPattern
 
 # A closure is worth as much as this many typical steps of odometry in a row.
 _CLOSURE_STEPS = 30.0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +10,6 @@ from torch import Tensor
 
 from rotavg_ros.online.gauge import extend_along_edges, joins_components
 from rotavg_ros.online.growing_view_graph import GraphSnapshot
-
-if TYPE_CHECKING:
-    from rotavg_ros.solver.slam_memory import SlamMemory
 
 # While data flows, a flag changes only if the score passes the threshold by this share of the way to 0 or 1: on a
 # real robot's graph that halves the changes, and no more flags are wrong.
@@ -38,7 +34,7 @@ class Problem:
     answered: Tensor | None
     component: Tensor | None
     outlier: NDArray[np.bool_]
-    memory: SlamMemory | None
+    memory: object | None
 
     def warm_start(self) -> Tensor | None:
         """The last answer carried on to all keyframes ``(N, 4)``; None where it is no good start."""

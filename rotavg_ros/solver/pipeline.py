@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from rotavg_ros import rotations
+from rotavg_ros import baselines, rotations
 from rotavg_ros.errors import UserError
-from rotavg_ros.solver import devices, sfm_stages, slam_judging, slam_refinement
+from rotavg_ros.solver import devices
+from rotavg_ros.solver.algebra.threads import workers
 from rotavg_ros.solver.devices import DEVICES
+from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
 from rotavg_ros.solver.methods import BASELINES, DEFAULT_METHOD, METHODS, NETWORK_METHODS
-from rotavg_ros.solver.parallel import workers
-from rotavg_ros.solver.profile import Estimate, Networks, Stopwatch
-from rotavg_ros.solver.sfm_profile import solve_sfm
-from rotavg_ros.solver.slam_memory import SlamMemory
-from rotavg_ros.solver.slam_profile import solve_slam, update_slam
+from rotavg_ros.solver.neurora import scores
+from rotavg_ros.solver.neurora.network_store import Networks
+from rotavg_ros.solver.sfm.solve import solve_sfm
+from rotavg_ros.solver.slam import refinement
+from rotavg_ros.solver.slam.noise import judging
+from rotavg_ros.solver.slam.solve import solve_slam, update_slam
+from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
 
 PROFILES = ("auto", "slam", "sfm")
 # The noise that makes an edge an outlier, in radians.
-_OUTLIER_ANGLE = {"sfm": sfm_stages.OUTLIER_ANGLE, "slam": slam_judging.OUTLIER_ANGLE}
+_OUTLIER_ANGLE = {"sfm": scores.OUTLIER_ANGLE, "slam": judging.OUTLIER_ANGLE}
 
 
 @torch.no_grad()
@@ -37,7 +40,7 @@ def solve(
     device: str = "auto",
     refinement_steps: int | None = None,
     warm_start: Tensor | None = None,
-    memory: SlamMemory | None = None,
+    memory: object | None = None,
     weights: Path | None = None,
 ) -> Solution:
     """Absolute orientations and outlier scores of a view-graph; every connected component by itself.
@@ -74,15 +77,19 @@ def solve(
         profile = "slam" if bool(graph.is_odometry.any()) else "sfm"
     where = devices.choose(device) if profile == "sfm" and all(name in NETWORK_METHODS for name in names) else "cpu"
     graph = graph.to("cpu")
-    job = _Job(profile, names, refinement_steps, warm_start, graph.components(), memory)
+    job = _Job(graph, graph.components(), names, profile)
+    steps = refinement_steps
+    goes_on_from = memory if names == [DEFAULT_METHOD] and steps is None and isinstance(memory, SlamMemory) else None
+    watch = Stopwatch()
     try:
-        estimate, seconds = _run(job, graph, Networks(where, weights))
+        estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start), goes_on_from)
     except devices.GPU_ERRORS as error:
         if where == "cpu":
             raise
         devices.fall_back(error)
         where = "cpu"
-        estimate, seconds = _run(job, graph, Networks(where, weights))
+        watch = Stopwatch()
+        estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start), None)
     score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, estimate.outlier_score.cpu())
     score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
     return Solution(
@@ -90,7 +97,7 @@ def solve(
         score,
         job.component,
         estimate.variance.cpu().double().sqrt(),
-        seconds,
+        watch.seconds,
         method,
         profile,
         where,
@@ -100,74 +107,56 @@ def solve(
 
 @dataclass(frozen=True)
 class _Job:
-    """What to do with a graph, whose ``component`` ``(N,)`` of every node is known."""
+    """A graph with the ``component`` ``(N,)`` of every node, the links of a method, a profile."""
 
-    profile: str
-    names: list[str]
-    refinement_steps: int | None
-    warm_start: Tensor | None
+    graph: ViewGraph
     component: Tensor
-    memory: SlamMemory | None
-
-    @property
-    def may_update(self) -> bool:
-        """Whether an earlier solution's memory may be gone on from."""
-        return self.profile == "slam" and self.names == [DEFAULT_METHOD] and self.refinement_steps is None
-
-    @property
-    def last_steps(self) -> int | None:
-        """Refinement steps of the last link of the method; None: its own number."""
-        method = NETWORK_METHODS.get(self.names[-1])
-        refines = method is not None and method.refine
-        if self.refinement_steps is None and refines and self.profile == "slam" and self.warm_start is not None:
-            return slam_refinement.WARM_PASSES
-        return self.refinement_steps
+    names: list[str]
+    profile: str
 
 
-def _run(job: _Job, graph: ViewGraph, networks: Networks) -> tuple[Estimate, dict[str, float]]:
-    """Every link of the method; with the seconds of its stages."""
-    watch = Stopwatch()
-    graph, start = graph.to(networks.device), job.warm_start
-    component = job.component.to(networks.device)
+def _run(job: _Job, run: Run, memory: SlamMemory | None) -> Estimate:
+    """Every link of the method; the last may go on from what an earlier solve of the graph remembers."""
+    device, last_steps = run.networks.device, run.refinement_steps
+    if last_steps is None and run.warm_start is not None and _refines_slam(job):
+        last_steps = refinement.WARM_PASSES
+    job = replace(job, graph=job.graph.to(device), component=job.component.to(device))
     for name in job.names[:-1]:
-        start = _solve_once(graph, component, name, job.profile, None, start, networks, watch).body_from_world
-    last, steps = job.names[-1], job.last_steps
-    if job.memory is not None and start is not None and job.may_update:
-        estimate = update_slam(graph, job.memory, start, networks, watch)
+        before = _solve_once(job, name, replace(run, refinement_steps=None))
+        run = replace(run, warm_start=before.body_from_world)
+    if memory is not None and run.warm_start is not None and job.profile == "slam":
+        estimate = update_slam(job.graph, memory, run)
         if estimate is not None:
-            return estimate, watch.seconds
-    return _solve_once(graph, component, last, job.profile, steps, start, networks, watch), watch.seconds
+            return estimate
+    return _solve_once(job, job.names[-1], replace(run, refinement_steps=last_steps))
 
 
-def _solve_once(
-    graph: ViewGraph,
-    component: Tensor,
-    name: str,
-    profile: str,
-    refinement_steps: int | None,
-    warm_start: Tensor | None,
-    networks: Networks,
-    watch: Stopwatch,
-) -> Estimate:
+def _refines_slam(job: _Job) -> bool:
+    last = NETWORK_METHODS.get(job.names[-1])
+    return job.profile == "slam" and last is not None and last.slam.refine
+
+
+def _solve_once(job: _Job, name: str, run: Run) -> Estimate:
     """One method, or one link of a combination."""
+    graph = job.graph
     if graph.num_edges == 0:
         unknown = torch.full((graph.num_nodes,), torch.nan)
         return Estimate(rotations.identity(graph.num_nodes), torch.empty(0).double(), unknown)
     if name in BASELINES:
-        return _solve_baseline(graph, name, profile, warm_start, watch)
-    if profile == "slam":
-        return solve_slam(graph, NETWORK_METHODS[name], refinement_steps, warm_start, networks, watch)
-    return solve_sfm(graph, component, NETWORK_METHODS[name], refinement_steps, warm_start, networks, watch)
+        return _solve_baseline(job, name, run)
+    if job.profile == "slam":
+        return solve_slam(graph, NETWORK_METHODS[name].slam, run)
+    return solve_sfm(graph, job.component, NETWORK_METHODS[name].sfm, run)
 
 
-def _solve_baseline(graph: ViewGraph, name: str, profile: str, warm_start: Tensor | None, watch: Stopwatch) -> Estimate:
+def _solve_baseline(job: _Job, name: str, run: Run) -> Estimate:
     """One of the methods to compare with. It gives no scores, so the residuals it leaves must do."""
-    baseline = importlib.import_module("rotavg_ros.baselines").BASELINES[name]
-    if profile == "sfm":  # where an order of the nodes means nothing
+    graph = job.graph
+    if job.profile == "sfm":  # where an order of the nodes means nothing
         graph = replace(graph, kind=torch.full_like(graph.kind, EdgeKind.LOOP_CLOSURE))
-    with watch.stage(name):
-        orientations = baseline(graph, warm_start)
-    score = sfm_stages.residual_score(graph, orientations, _OUTLIER_ANGLE[profile])
+    with run.watch.stage(name):
+        orientations = baselines.BASELINES[name](graph, run.warm_start)
+    score = scores.residual_score(graph, orientations, _OUTLIER_ANGLE[job.profile])
     return Estimate(orientations, score, torch.full((graph.num_nodes,), torch.nan))
 
 

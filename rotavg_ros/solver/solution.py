@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from rotavg_ros.solver.slam_memory import SlamMemory
-
 
 @dataclass(frozen=True)
 class Solution:
@@ -21,7 +19,8 @@ class Solution:
             to the component's first node; NaN where the method gives none.
         stage_seconds: wall-clock seconds of each stage that ran.
         method, profile, device: what was run, with "auto" resolved.
-        memory: what makes the next solve of the same graph cheaper once it has grown a little; None if there is none.
+        memory: what makes the next solve of the same graph cheaper once it has grown a little, to be handed to it as it
+            is; None if there is none.
     """
 
     body_from_world: Tensor
@@ -32,4 +31,4 @@ class Solution:
     method: str
     profile: str
     device: str
-    memory: SlamMemory | None = None
+    memory: object | None = None

@@ -12,11 +12,14 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.datasets.synthetic import SyntheticGraph
 from rotavg_ros.evaluation.metrics import gauge_alignment
-from rotavg_ros.solver.clean_net import CleanNet
-from rotavg_ros.solver.fine_net import FineNet, edge_features, edge_residual
-from rotavg_ros.solver.message_passing import DirectedEdges
-from rotavg_ros.solver.sfm_inference import typical_size
-from rotavg_ros.solver.sfm_stages import Cleaned, bootstrap, clean
+from rotavg_ros.solver.algebra.residuals import edge_residual
+from rotavg_ros.solver.neurora.clean_net import CleanNet
+from rotavg_ros.solver.neurora.cleaned import Cleaned
+from rotavg_ros.solver.neurora.fine_net import FineNet, edge_features
+from rotavg_ros.solver.neurora.message_passing import DirectedEdges
+from rotavg_ros.solver.neurora.stages import clean
+from rotavg_ros.solver.neurora.tiled.networks import typical_size
+from rotavg_ros.solver.neurora.tree import bootstrap
 
 
 @dataclass(frozen=True)

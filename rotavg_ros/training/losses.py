@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.message_passing import DirectedEdges
+from rotavg_ros.solver.neurora.message_passing import DirectedEdges
 
 OUTLIER_LOSS_WEIGHT = 10.0
 NODE_LOSS_WEIGHT = 1.0

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rotavg_ros.evaluation.calibration import expected_calibration_error
 from rotavg_ros.solver import solve
-from rotavg_ros.solver.sfm_stages import OUTLIER_ANGLE, residual_and_uncertainty
+from rotavg_ros.solver.neurora.scores import OUTLIER_ANGLE, residual_and_uncertainty
 from rotavg_ros.training.sfm_data import sample_graph
 
 _SEED, _HELD_OUT_SEED = 70_001, 70_002

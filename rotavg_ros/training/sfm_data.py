@@ -12,7 +12,7 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe, SyntheticGraph
 from rotavg_ros.datasets.topology import ClusteredTopology
-from rotavg_ros.solver.message_passing import DirectedEdges
+from rotavg_ros.solver.neurora.message_passing import DirectedEdges
 
 
 @dataclass(frozen=True)

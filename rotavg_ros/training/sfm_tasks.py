@@ -12,9 +12,9 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.datasets.synthetic import SyntheticGraph
 from rotavg_ros.evaluation.metrics import orientation_errors
-from rotavg_ros.solver.clean_net import CleanNet
-from rotavg_ros.solver.fine_net import FineNet
-from rotavg_ros.solver.sfm_stages import fine_tune
+from rotavg_ros.solver.neurora.clean_net import CleanNet
+from rotavg_ros.solver.neurora.fine_net import FineNet
+from rotavg_ros.solver.neurora.stages import fine_tune
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.fine_data import FineBatch, StartedGraph
 from rotavg_ros.training.losses import clean_net_loss, fine_net_loss

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from rotavg_ros.datasets.slam_simulation import random_slam_config, simulate_slam_graph
 from rotavg_ros.evaluation.calibration import expected_calibration_error
-from rotavg_ros.solver.message_passing import DirectedEdges
-from rotavg_ros.solver.slam_clean_net import ClosureFeatures, SlamCleanNet, closure_features
-from rotavg_ros.solver.slam_preparation import prepare
+from rotavg_ros.solver.neurora.message_passing import DirectedEdges
+from rotavg_ros.solver.slam.network import ClosureFeatures, SlamCleanNet, closure_features
+from rotavg_ros.solver.slam.preparation import prepare
 from rotavg_ros.training.config import TrainingConfig
 
 

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.tables import commit, make_folder
-from rotavg_ros.solver.network_store import metadata
+from rotavg_ros.solver.neurora.network_store import metadata
 from rotavg_ros.training.checkpoint import load_checkpoint, save_checkpoint, save_tensors, save_text
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.version import __version__
@@ -71,7 +71,7 @@ class Trainer:
         task: network and data.
         config: the run's configuration.
         folder: created if missing; a checkpoint there is resumed, one of another run is refused.
-        name: of the network, as in :data:`rotavg_ros.solver.network_store.NETWORKS`.
+        name: of the network, as in :data:`rotavg_ros.solver.networks.NETWORKS`.
         inputs: what else decides the outcome (fingerprints of other networks), for card and checkpoint.
         command: how to repeat it, for the card.
     """

@@ -8,7 +8,8 @@ import torch
 from safetensors.torch import load_file
 
 from rotavg_ros.cli.main import main
-from rotavg_ros.solver.network_store import WEIGHTS_FOLDER, load_network
+from rotavg_ros.solver.networks import NETWORKS
+from rotavg_ros.solver.neurora.network_store import WEIGHTS_FOLDER, load_network
 from rotavg_ros.training.trainer import fingerprint
 
 CPU = ("--device", "cpu", "--threads", "1")
@@ -68,7 +69,7 @@ def test_training_goes_on_from_given_weights(config: Path, tmp_path: Path) -> No
     for key, value in before.items():
         torch.testing.assert_close(after[key], value, atol=1e-9, rtol=0)
     card = json.loads((tmp_path / "out" / "sfm-clean-net.json").read_text())
-    assert card["start_fingerprint"] == fingerprint(load_network("sfm-clean-net"))
+    assert card["start_fingerprint"] == fingerprint(load_network(NETWORKS["sfm-clean-net"]))
     # Without the start it would be another run.
     assert main([*command, "--output", str(tmp_path / "out")]) == 2
 

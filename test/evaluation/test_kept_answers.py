@@ -16,7 +16,7 @@ from rotavg_ros.evaluation.contenders import Answer, Case, contenders
 from rotavg_ros.evaluation.kept_answers import kept
 from rotavg_ros.evaluation.peers import PeerAnswer
 from rotavg_ros.evaluation.source_files import source_files
-from rotavg_ros.solver import network_store
+from rotavg_ros.solver.neurora import network_store
 from rotavg_ros.view_graph import ViewGraph
 
 MODULE = "rotavg_ros.evaluation.contenders"
@@ -133,9 +133,19 @@ def test_sources_behind_a_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_what_ours_and_the_peers_depend_on() -> None:
     ours, theirs = ({f"{path.parent.name}/{path.name}" for path in source_files(m)} for m in (MODULE, peers.__name__))
-    assert {"baselines/weiszfeld.py", "evaluation/metrics.py", "solver/slam_passes.py", "solver/tuning.py"} <= ours
-    assert {"baselines/start.py", "evaluation/peers.py", "solver/spanning_tree.py", "solver/residuals.py"} <= theirs
-    assert not {"solver/pipeline.py", "solver/slam_passes.py"} & theirs
+    assert {
+        "baselines/weiszfeld.py",
+        "evaluation/metrics.py",
+        "passes/alternation.py",
+        "tiled/tuning.py",
+    } <= ours
+    assert {
+        "baselines/start.py",
+        "evaluation/peers.py",
+        "algebra/spanning_forest.py",
+        "algebra/residuals.py",
+    } <= theirs
+    assert not {"solver/pipeline.py", "solver/slam/passes/passes.py"} & theirs
 
 
 @pytest.mark.parametrize("folder", ["file", "file/below", "/proc/nowhere"])

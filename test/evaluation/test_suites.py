@@ -13,7 +13,8 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation import real, rgbd, robustness, small_training, synthetic
 from rotavg_ros.evaluation.contenders import contenders
 from rotavg_ros.evaluation.noise_plot import edge_noise
-from rotavg_ros.solver.network_store import read_network
+from rotavg_ros.solver.networks import NETWORKS
+from rotavg_ros.solver.neurora.network_store import read_network
 
 
 def test_graphs_are_the_same_whatever_their_number(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,7 +61,7 @@ def test_networks_trained_on_given_graphs_can_be_used(tmp_path: Path, monkeypatc
     assert (len(graphs.training), len(graphs.validation)) == (3, 1)
     small_training.train_networks(tmp_path, graphs, seconds=0)
     for name in ("sfm-clean-net", "sfm-fine-net"):
-        read_network(name, tmp_path / f"{name}.safetensors")
+        read_network(NETWORKS[name], tmp_path / f"{name}.safetensors")
 
     case = next(synthetic.cases("released", 1, 0))
     ours = contenders(("neurora-paper",), tmp_path)["neurora-paper"](case)

@@ -15,7 +15,7 @@ from rotavg_ros.datasets.slam_simulation import SimulatedRun, SlamSimulationConf
 from rotavg_ros.datasets.trajectories import World
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator, graph_builder
 from rotavg_ros.online.fingerprints import Fingerprints
-from rotavg_ros.solver.fine_net import edge_residual
+from rotavg_ros.solver.algebra.residuals import edge_residual
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
 EVERY_MESSAGE = EstimatorOptions(keyframe_angle=0, keyframe_distance=0, max_turn_rate=0, max_speed=0)

@@ -11,8 +11,9 @@ from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_s
 from rotavg_ros.datasets.trajectories import World
 from rotavg_ros.online.marginalization import Columns, can_be_marginalized, marginalize
 from rotavg_ros.online.marginalized_keyframes import MarginalizedIndex, MarginalizedKeyframes
-from rotavg_ros.solver import slam_system, solve
-from rotavg_ros.solver.probes import probe_signs
+from rotavg_ros.solver import solve
+from rotavg_ros.solver.algebra.probes import probe_signs
+from rotavg_ros.solver.slam.passes import system as slam_system
 from rotavg_ros.view_graph import ViewGraph
 
 COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")

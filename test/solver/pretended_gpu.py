@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map_only
 
-from rotavg_ros.solver.network_store import load_network
+from rotavg_ros.solver.neurora.network_store import forget_networks
 
 _GPU, _CPU = torch.device("cuda", 0), torch.device("cpu")
 # What reads a number or a shape back from the GPU.
@@ -66,7 +66,7 @@ def pretended_gpu() -> Iterator[Traffic]:
     _traffic = Traffic()
     with _Factories():
         yield _traffic
-    load_network.cache_clear()  # of networks with pretended weights
+    forget_networks()  # those with pretended weights
 
 
 def _call(func: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from rotavg_ros import ViewGraph, rotations, solve, solve_batch
 from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.solver import devices
-from rotavg_ros.solver.relaxed_forest import hubs, relaxed_forest
+from rotavg_ros.solver.algebra.relaxed_forest import hubs, relaxed_forest
+from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
+from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root, shortest_path_forest
 from rotavg_ros.solver.solution import Solution
-from rotavg_ros.solver.sorted_edges import SortedEdges
-from rotavg_ros.solver.spanning_tree import accumulate_to_root, shortest_path_forest
 
 from .graphs import measured, random_truth, slam_edges
 

@@ -11,10 +11,11 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from rotavg_ros import UserError, rotations
-from rotavg_ros.solver.clean_net import CleanNet
-from rotavg_ros.solver.fine_net import EVEN_FEATURES, ODD_FEATURES, FineNet, edge_features
-from rotavg_ros.solver.message_passing import DirectedEdges, MessagePassingNetwork
-from rotavg_ros.solver.network_store import NETWORKS, WEIGHTS_FOLDER, load_network, metadata
+from rotavg_ros.solver.networks import NETWORKS
+from rotavg_ros.solver.neurora.clean_net import CleanNet
+from rotavg_ros.solver.neurora.fine_net import EVEN_FEATURES, ODD_FEATURES, FineNet, edge_features
+from rotavg_ros.solver.neurora.message_passing import DirectedEdges, MessagePassingNetwork
+from rotavg_ros.solver.neurora.network_store import WEIGHTS_FOLDER, load_network, metadata
 
 
 def _graph(num_nodes: int = 12, num_edges: int = 30, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
@@ -64,7 +65,7 @@ def test_both_networks_have_the_papers_size() -> None:
 
 def test_clean_net_does_not_care_for_an_edges_direction() -> None:
     source, target, quaternion = _graph()
-    network = load_network("sfm-clean-net")
+    network = load_network(NETWORKS["sfm-clean-net"])
     forward = network(quaternion, DirectedEdges.of(source, target, 12))
     backward = network(rotations.inverse(quaternion), DirectedEdges.of(target, source, 12))
     torch.testing.assert_close(forward.outlier_logit, backward.outlier_logit, atol=1e-4, rtol=1e-4)
@@ -77,11 +78,11 @@ def test_networks_do_not_care_for_the_order_of_nodes_and_edges() -> None:
     node_order, edge_order = torch.randperm(12), torch.randperm(30)
     new_index = torch.argsort(node_order)
     permuted = DirectedEdges.of(new_index[source[edge_order]], new_index[target[edge_order]], 12)
-    clean = load_network("sfm-clean-net")
+    clean = load_network(NETWORKS["sfm-clean-net"])
     plain = clean(quaternion, DirectedEdges.of(source, target, 12)).outlier_logit
     shuffled = clean(quaternion[edge_order], permuted).outlier_logit
     torch.testing.assert_close(shuffled, plain[edge_order], atol=1e-4, rtol=1e-4)
-    fine = load_network("sfm-fine-net")
+    fine = load_network(NETWORKS["sfm-fine-net"])
     start, features, scale = (
         rotations.random(12).float(),
         torch.randn(30, ODD_FEATURES + EVEN_FEATURES),
@@ -100,7 +101,7 @@ def test_fine_net_knows_no_unit_of_angle() -> None:
     angles = []
     for unit in (0.1, 0.05):
         scale = torch.full((1, 1), unit)
-        fine = load_network("sfm-fine-net")(
+        fine = load_network(NETWORKS["sfm-fine-net"])(
             start, edge_features(vectors * unit, vectors * unit, logit, scale[0]).t(), scale, edges
         )
         angles.append(torch.tan(rotations.angle_between(fine, start) / 2))
@@ -112,7 +113,7 @@ def test_shipped_weights_are_small_and_come_with_a_card(name: str) -> None:
     path = WEIGHTS_FOLDER / f"{name}.safetensors"
     assert path.stat().st_size < 500_000
     assert f'"network": "{name}"' in path.with_suffix(".json").read_text()
-    assert not load_network(name).training
+    assert not load_network(NETWORKS[name]).training
 
 
 def _damage(kind: str, path: Path) -> None:
@@ -145,5 +146,5 @@ def test_damaged_weights_are_refused_by_name(kind: str, tmp_path: Path) -> None:
     path.write_bytes((WEIGHTS_FOLDER / path.name).read_bytes())
     _damage(kind, path)
     with pytest.raises(UserError, match=r"sfm-clean-net\.safetensors: .*(reinstall)") as error:
-        load_network("sfm-clean-net", folder=tmp_path)
+        load_network(NETWORKS["sfm-clean-net"], folder=tmp_path)
     assert "\n" not in str(error.value)

@@ -13,8 +13,9 @@ import torch
 from safetensors.torch import load_file
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.solver.clean_net import CleanNet
-from rotavg_ros.solver.network_store import read_network
+from rotavg_ros.solver.networks import NETWORKS
+from rotavg_ros.solver.neurora.clean_net import CleanNet
+from rotavg_ros.solver.neurora.network_store import read_network
 from rotavg_ros.training import checkpoint
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.sfm_tasks import SfmCleanTask, SfmFineTask
@@ -111,7 +112,7 @@ def test_kill_while_saving_loses_nothing(interrupted: str, tmp_path: Path, monke
         patch.setattr(checkpoint.os, "replace", killed_before)
         with pytest.raises(KilledError):
             trainer.run()
-    read_network(name, tmp_path / "killed" / f"{name}.safetensors")  # still a whole file
+    read_network(NETWORKS[name], tmp_path / "killed" / f"{name}.safetensors")  # still a whole file
 
     make_trainer(name, tmp_path / "killed").run()
     expected, actual = tensors(tmp_path / "unbroken"), tensors(tmp_path / "killed")
@@ -128,7 +129,7 @@ def test_best_weights_and_their_card_are_kept(tmp_path: Path) -> None:
     best = fingerprint(task.network)
     trainer.run()
     assert fingerprint(task.network) != best
-    assert fingerprint(read_network("sfm-clean-net", trainer.weights_path)) == best
+    assert fingerprint(read_network(NETWORKS["sfm-clean-net"], trainer.weights_path)) == best
 
     card = json.loads(trainer.card_path.read_text())
     assert card["epoch"] == 2

@@ -1,0 +1,55 @@
+"""What the solve of either profile is given, and what it gives."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from rotavg_ros.solver.neurora.network_store import Networks
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a profile's solve gives: orientations in any gauge, scores, variance in rad² (NaN: unknown).
+
+    ``memory`` is what makes the profile's next solve of the same graph, grown a little, cheaper; nobody else reads it.
+    """
+
+    body_from_world: Tensor
+    outlier_score: Tensor
+    variance: Tensor
+    memory: object | None = None
+
+
+@dataclass
+class Stopwatch:
+    """Seconds of wall-clock time by stage; one that runs several times adds up."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a profile's solve is given besides the graph and the stages to run.
+
+    Attributes:
+        networks: where they come from and run.
+        watch: for the seconds of the stages.
+        refinement_steps: at most, 0 for none; None: as many as the stages like.
+        warm_start: ``(N, 4)`` body_from_world to begin with instead of the tree's.
+    """
+
+    networks: Networks
+    watch: Stopwatch
+    refinement_steps: int | None = None
+    warm_start: Tensor | None = None

@@ -1,0 +1,90 @@
+"""FineNet (NeuRoRA §4.3): corrects absolute orientations from the residuals of the edges around them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.neurora.message_passing import HIDDEN_WIDTH, DirectedEdges, MessagePassingNetwork
+from rotavg_ros.solver.neurora.network_store import StoredNetwork
+
+# Residuals are measured in units of their median, but of no less than this (half an angle in radians).
+MIN_SCALE = 1e-4
+# Of an edge: three vectors, which change their sign with its direction, and two numbers, which do not.
+ODD_FEATURES, EVEN_FEATURES = 9, 2
+# Of a node: its orientation and how many edges it has.
+NODE_FEATURES = 5
+_MAX_LOGIT, _LOGIT_UNIT, _LOG_DEGREE_UNIT = 12.0, 4.0, 4.0
+
+
+class FineNet(StoredNetwork):
+    """One correction of all orientations.
+
+    The state of a node begins as h_v = [R̃_v, log(1 + degree)/4], an edge's features are those of
+    :func:`edge_features`, made of its residuals e_uv; from the last state (``message_passing.py``) one linear head says
+    the tangent of half the correction's angle, along its axis, in units of the residuals' median σ:
+
+        t_v = σ (H h_v + b),        R̂_v = R̃_v · [t_v, 1] / ‖[t_v, 1]‖.
+
+    A solve runs the same formula in ``tiled/networks.py``: ``fine_tuned``.
+
+    Rectified measurements are precise, but their errors are alike throughout a neighbourhood; raw ones are noisy, but
+    each errs by itself, so that many of them say what the orientations of a whole region are off. FineNet sees the
+    residuals of both. All angles are in units of the median raw residual, so that it is the same at any level of noise.
+    """
+
+    NAME = "sfm-fine-net"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.network = MessagePassingNetwork(
+            NODE_FEATURES, ODD_FEATURES + EVEN_FEATURES, odd_width=ODD_FEATURES, accumulates=True
+        )
+        self.correction_head = nn.Linear(HIDDEN_WIDTH, 3)
+        # It begins as no correction at all.
+        nn.init.zeros_(self.correction_head.weight)
+        nn.init.zeros_(self.correction_head.bias)
+
+    def forward(self, body_from_world: Tensor, features: Tensor, scale: Tensor, edges: DirectedEdges) -> Tensor:
+        """Corrected orientations ``(N, 4)``.
+
+        Args:
+            body_from_world: ``(N, 4)`` current estimate R̃_v.
+            features: ``(M, ODD_FEATURES + EVEN_FEATURES)`` of the edges as given, from :func:`edge_features`.
+            scale: ``(N, 1)`` or ``(1, 1)``, what the features are measured in.
+        """
+        backward = torch.cat((-features[:, :ODD_FEATURES], features[:, ODD_FEATURES:]), dim=1)
+        states = node_features(body_from_world, 1 / edges.inverse_degree)
+        states, _ = self.network(states, torch.cat((features, backward)), edges)
+        return self.correct(body_from_world, states, scale)
+
+    def correct(self, body_from_world: Tensor, states: Tensor, scale: Tensor) -> Tensor:
+        """Orientations ``(N, 4)`` corrected by what the last node states ``(N, hidden)`` say."""
+        # The tangent of half the angle, along the axis.
+        tangent = self.correction_head(states) * scale
+        correction = nn.functional.normalize(torch.cat((tangent, torch.ones_like(tangent[:, :1])), dim=1), dim=1)
+        # Residuals are rotations of the world frame, and so is the correction: it goes on the right.
+        return rotations.canonical(rotations.multiply(body_from_world, correction))
+
+
+def edge_features(raw: Tensor, rectified: Tensor, outlier_logit: Tensor, scale: Tensor) -> Tensor:
+    """What FineNet sees of k edges, ``(ODD_FEATURES + EVEN_FEATURES, k)``.
+
+    Args:
+        raw, rectified: ``(3, k)`` x, y, z of the residual quaternions (w ≥ 0) of the measurements as they are and
+            after CleanNet.
+        outlier_logit: ``(k,)`` CleanNet's.
+        scale: ``(k,)`` or a number, what raw residuals typically measure.
+    """
+    raw, rectified = raw / scale, rectified / scale
+    # The weight of an edge under a loss that is square for small residuals and linear for large ones.
+    weight = (1 + (raw * raw).sum(dim=0, keepdim=True)).rsqrt()
+    logit = outlier_logit.clamp(-_MAX_LOGIT, _MAX_LOGIT) / _LOGIT_UNIT
+    return torch.cat((raw, raw * weight, rectified, weight, logit[None]))
+
+
+def node_features(body_from_world: Tensor, degree: Tensor) -> Tensor:
+    """``(N, NODE_FEATURES)``; ``degree`` ``(N, 1)`` is the number of edges, at nodes without any whatever it may be."""
+    known = torch.where(degree.isfinite(), degree, 0).to(body_from_world)
+    return torch.cat((body_from_world, known.log1p() / _LOG_DEGREE_UNIT), dim=1)

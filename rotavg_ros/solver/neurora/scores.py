@@ -1,0 +1,51 @@
+"""How likely an edge is an outlier, by the residual that orientations leave."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros.solver.algebra.medians import median_by_group
+from rotavg_ros.solver.algebra.residuals import EdgeResiduals
+from rotavg_ros.view_graph import ViewGraph
+
+# How fast the probability of noise beyond the outlier angle rises with the residual, in units of how far off the edge's
+# ends may be; fitted by `python -m rotavg_ros.training.score_fit`.
+SCORE_SCALE = 0.376
+_MIN_UNCERTAINTY = np.radians(0.01)
+# The noise that makes an edge an outlier.
+OUTLIER_ANGLE = np.radians(20.0)
+
+
+def residual_score(
+    graph: ViewGraph, body_from_world: Tensor, outlier_angle: float, component: Tensor | None = None
+) -> Tensor:
+    """Probability that an edge's noise exceeds ``outlier_angle`` (radians) as its residual has it, ``(M,)`` float64.
+
+    The residual is the noise but for the error of the orientations at the edge's ends: one half at the outlier angle,
+    and the closer to certainty on either side, the better the ends are known.
+    """
+    angle, uncertainty = residual_and_uncertainty(graph, body_from_world, component)
+    return torch.sigmoid((angle - outlier_angle) / (SCORE_SCALE * uncertainty)).double()
+
+
+def residual_and_uncertainty(
+    graph: ViewGraph, body_from_world: Tensor, component: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Residual angle of every edge and, up to a constant, the error of the orientations at its ends.
+
+    A node's error falls with the root of its number of edges d: median residual · √(1/d_source + 1/d_target), the
+    median of each ``component`` ``(N,)`` for itself; default: of all edges.
+
+    Returns:
+        Both ``(M,)`` float32 radians.
+    """
+    angle = EdgeResiduals(graph, body_from_world.float()).angles()
+    share = 1 / torch.bincount(torch.cat((graph.source, graph.target)), minlength=graph.num_nodes).float()
+    spread = share.index_select(0, graph.source).add_(share.index_select(0, graph.target)).sqrt_()
+    median = angle.median()
+    if component is not None and bool((component > 0).any()):
+        of_edge = component[graph.source]
+        median = median_by_group(angle, of_edge, int(component.max()) + 1)[of_edge]
+    return angle, (median * spread).clamp_(min=_MIN_UNCERTAINTY)

@@ -1,0 +1,68 @@
+"""The paper's stages on an SfM view-graph, as the pipeline runs them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
+from rotavg_ros.solver.neurora.clean_net import CleanNet
+from rotavg_ros.solver.neurora.cleaned import Cleaned
+from rotavg_ros.solver.neurora.fine_net import FineNet
+from rotavg_ros.solver.neurora.tiled.networks import clean_edges, fine_tuned
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+
+# An edge whose outlier probability exceeds this is no inlier (ε of the paper; uncritical in 0.35–0.8).
+OUTLIER_THRESHOLD = 0.75
+
+
+def clean(network: CleanNet, graph: ViewGraph) -> Cleaned:
+    """CleanNet, without gradients: rectify every measurement and score it.
+
+    The network may be on another device than the graph; what comes back is on the graph's.
+    """
+    device = next(network.parameters()).device
+    edges = SortedEdges.of(graph)
+    with torch.no_grad():
+        result = clean_edges(network, graph.target_from_source.float().to(device), edges.to(device))
+        probability = torch.sigmoid(result.outlier_logit).to(graph.device)
+    rectified = replace(graph, target_from_source=result.target_from_source.to(graph.device).double())
+    return Cleaned(rectified, graph, probability, probability < OUTLIER_THRESHOLD, edges)
+
+
+def trust_all(graph: ViewGraph) -> Cleaned:
+    """What stands in for CleanNet in methods without it: every measurement as it is."""
+    nobody = torch.zeros(graph.num_edges, device=graph.device)
+    return Cleaned(graph, graph, nobody, nobody < OUTLIER_THRESHOLD, SortedEdges.of(graph))
+
+
+def apply_labels(cleaned: Cleaned, label: Tensor) -> Cleaned:
+    """Verdicts from outside override the network's."""
+    probability = torch.where(label == EdgeLabel.ACCEPTED, 0.0, cleaned.outlier_probability)
+    probability = torch.where(label == EdgeLabel.REJECTED, 1.0, probability)
+    return replace(cleaned, outlier_probability=probability, is_inlier=probability < OUTLIER_THRESHOLD)
+
+
+@torch.no_grad()
+def fine_tune(network: FineNet, cleaned: Cleaned, body_from_world: Tensor, component: Tensor | None = None) -> Tensor:
+    """FineNet over the inlier edges, without gradients, ``(N, 4)`` float64.
+
+    The network may be on another device than the graph; what comes back is on the graph's.
+
+    Args:
+        component: ``(N,)`` the graph's connected components; default: computed.
+    """
+    component = cleaned.graph.components() if component is None else component
+    device = next(network.parameters()).device
+    fine = fine_tuned(
+        network,
+        cleaned.measured.to(device),
+        cleaned.graph.target_from_source.to(device),
+        cleaned.outlier_probability.logit().to(device),
+        body_from_world.float().to(device),
+        cleaned.edges.select(cleaned.is_inlier).to(device),
+        component.to(device),
+    )
+    return fine.double().to(cleaned.graph.device)

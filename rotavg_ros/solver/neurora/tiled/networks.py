@@ -1,0 +1,122 @@
+"""CleanNet and FineNet as solves run them: what their ``forward`` computes, by the tiled passes of ``inference.py``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from rotavg_ros.solver.algebra.medians import median_by_group
+from rotavg_ros.solver.algebra.residuals import SLICE_EDGES, EdgeResiduals, multiply_rows
+from rotavg_ros.solver.algebra.sorted_edges import SortedEdges, Tile
+from rotavg_ros.solver.algebra.threads import for_each, slices
+from rotavg_ros.solver.neurora.clean_net import CleanEdges, CleanNet
+from rotavg_ros.solver.neurora.fine_net import (
+    EVEN_FEATURES,
+    MIN_SCALE,
+    ODD_FEATURES,
+    FineNet,
+    edge_features,
+    node_features,
+)
+from rotavg_ros.solver.neurora.message_passing import MessagePassingLayer
+from rotavg_ros.solver.neurora.tiled.passes import node_states, visit_activations
+from rotavg_ros.view_graph import ViewGraph
+
+
+def clean_edges(network: CleanNet, target_from_source: Tensor, edges: SortedEdges) -> CleanEdges:
+    """What CleanNet says of the measurements ``(M, 4)`` float32; ``edges`` are all of the graph's."""
+    num_edges = len(target_from_source)
+    # Rows: predicted noise (4), outlier logit (1). Columns: as the edges are sorted.
+    opinion = target_from_source.new_empty(5, 2 * num_edges)
+    # The heads are linear in the message, and that is linear in the activation.
+    last = cast(MessagePassingLayer, network.network.layers[-1]).message_output
+    head = torch.cat((network.noise_head.weight, network.outlier_head.weight))
+    bias = head @ last.bias + torch.cat((network.noise_head.bias, network.outlier_head.bias))
+    weight = head @ last.weight
+
+    # In which column they are of an edge as it was given, then of the same edge reversed.
+    column = edges.edge.new_empty(2 * num_edges)
+
+    def collect(tile: Tile, activation: Tensor) -> None:
+        opinion[:, tile.edges] = torch.addmm(bias[:, None], weight, activation.t())
+        row = edges.edge[tile.edges] + num_edges * edges.is_reversed[tile.edges]
+        column.index_copy_(
+            0, row, torch.arange(tile.edges.start, tile.edges.stop, dtype=torch.int32, device=row.device)
+        )
+
+    no_states = target_from_source.new_zeros(edges.num_nodes, 0)
+    visit_activations(network.network, no_states, target_from_source, edges, collect)
+    clean = torch.empty_like(target_from_source)
+    logit = target_from_source.new_empty(num_edges)
+
+    def decide(part: slice) -> None:
+        measured = target_from_source[part].t().contiguous()
+        forward, backward = (opinion.index_select(1, direction[part]) for direction in column.view(2, -1))
+        # CleanNet.correct, multiplied out: R̃ (1 + (f + R̃⁻¹ b⁻¹ R̃) / 2) = R̃ + (R̃ f + b⁻¹ R̃) / 2.
+        inverse_backward = torch.cat((-backward[:3], backward[3:4]))
+        change = multiply_rows(measured, forward[:4]) + multiply_rows(inverse_backward, measured)
+        corrected = torch.add(measured, change, alpha=0.5)
+        # Unit length and w ≥ 0; torch's normalize takes twenty times as long over rows.
+        scale = (corrected * corrected).sum(dim=0).rsqrt_().mul_(1 - 2 * (corrected[3] < 0).to(corrected))
+        clean[part] = (corrected * scale).t()
+        logit[part] = (forward[4] + backward[4]) / 2
+
+    for_each(decide, slices(num_edges, SLICE_EDGES, logit.device))
+    return CleanEdges(clean, logit)
+
+
+def fine_tuned(
+    network: FineNet,
+    measured: ViewGraph,
+    rectified: Tensor,
+    outlier_logit: Tensor,
+    body_from_world: Tensor,
+    edges: SortedEdges,
+    component: Tensor,
+) -> Tensor:
+    """FineNet's correction of ``body_from_world`` ``(N, 4)`` float32.
+
+    Args:
+        rectified, outlier_logit: ``(M, 4)`` and ``(M,)``, what CleanNet says of the edges.
+        edges: those of them over which messages run.
+        component: ``(N,)`` connected components.
+    """
+    num_edges = measured.num_edges
+    residuals = [
+        EdgeResiduals(graph, body_from_world) for graph in (measured, replace(measured, target_from_source=rectified))
+    ]
+    raw, clean = (body_from_world.new_empty(3, num_edges) for _ in residuals)
+
+    def compare(part: slice) -> None:
+        for vectors, of_kind in zip((raw, clean), residuals, strict=True):
+            vectors[:, part] = of_kind.quaternions(part)[:3]
+
+    parts = slices(num_edges, SLICE_EDGES, raw.device)
+    for_each(compare, parts)
+    used = edges.edge[~edges.is_reversed]
+    scale = typical_size(raw.index_select(1, used), measured.source.index_select(0, used), component)
+    features = raw.new_empty(num_edges, ODD_FEATURES + EVEN_FEATURES)
+
+    def write(part: slice) -> None:
+        unit = scale[measured.source[part], 0] if len(scale) > 1 else scale[0]
+        features[part] = edge_features(raw[:, part], clean[:, part], outlier_logit[part], unit).t()
+
+    for_each(write, parts)
+    states = node_features(body_from_world, edges.degree[:, None])
+    return network.correct(body_from_world, node_states(network.network, states, features, edges), scale)
+
+
+def typical_size(vectors: Tensor, node: Tensor, group_of_node: Tensor) -> Tensor:
+    """Median length of the vectors ``(3, k)`` of a node's group, ``(N, 1)``, or ``(1, 1)`` where there is but one.
+
+    Args:
+        node: ``(k,)`` of every vector; group_of_node: ``(N,)``.
+    """
+    length = (vectors * vectors).sum(dim=0).sqrt_()
+    if not bool((group_of_node > 0).any()):
+        return (length.median() if len(length) else length.new_tensor(0.0)).clamp(min=MIN_SCALE).reshape(1, 1)
+    median = median_by_group(length, group_of_node[node], int(group_of_node.max()) + 1)
+    return torch.where(median.isfinite(), median, 0.0).clamp(min=MIN_SCALE)[group_of_node][:, None]

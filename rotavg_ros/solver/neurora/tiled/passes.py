@@ -1,0 +1,178 @@
+"""Message passing for solves: the formula of ``message_passing.py`` in tiles that fit a core's cache.
+
+Node states are projected before they are gathered. Directed edges are sorted by target and walked in tiles; what an
+edge remembers lies beside its features in one buffer and is overwritten in place, so that a layer is one matrix
+product per tile, and no copy of all edges is made. A tile has all edges of its nodes, so means are complete and workers
+never meet within a layer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import NamedTuple, cast
+
+import torch
+from torch import Tensor
+
+from rotavg_ros.solver.algebra.scratch import scratch
+from rotavg_ros.solver.algebra.sorted_edges import SortedEdges, Tile
+from rotavg_ros.solver.algebra.threads import for_each, stretches
+from rotavg_ros.solver.neurora.message_passing import MessagePassingLayer, MessagePassingNetwork
+
+
+class Tuning(NamedTuple):
+    """Edges of a tile, and threads at most; ``tuning.py`` measures what is best."""
+
+    tile_edges: int
+    threads: int
+
+
+_tuning = Tuning(tile_edges=8192, threads=1 << 10)
+
+# Gets a tile and the last layer's activations of its edges, ``(edges of the tile, hidden)``.
+Visit = Callable[[Tile, Tensor], None]
+
+
+def current_tuning() -> Tuning:
+    """What passes take now."""
+    return _tuning
+
+
+def set_tuning(tuning: Tuning) -> None:
+    """For all passes from now on."""
+    global _tuning
+    _tuning = tuning
+
+
+def node_states(network: MessagePassingNetwork, nodes: Tensor, features: Tensor, edges: SortedEdges) -> Tensor:
+    """The last node states ``(N, hidden)``.
+
+    Args:
+        nodes: ``(N, node_width)`` initial states.
+        features: ``(M, edge_width)`` float32 of the graph's edges as given; the first ``network.odd_width`` columns
+            change their sign where an edge is reversed.
+        edges: over which messages run.
+    """
+    with _walk(network, features, edges) as walk:
+        for layer in range(len(network.layers)):
+            nodes = walk.layer(layer, nodes)
+    return nodes
+
+
+def visit_activations(
+    network: MessagePassingNetwork, nodes: Tensor, features: Tensor, edges: SortedEdges, visit: Visit
+) -> None:
+    """Show the last layer's activations to ``visit``, tile by tile and on several threads; else as above."""
+    last = len(network.layers) - 1
+    with _walk(network, features, edges) as walk:
+        for layer in range(last):
+            nodes = walk.layer(layer, nodes)
+        walk.layer(last, nodes, visit)
+
+
+@contextmanager
+def _walk(network: MessagePassingNetwork, features: Tensor, edges: SortedEdges) -> Iterator[_Walk]:
+    layers = [cast(MessagePassingLayer, layer) for layer in network.layers]
+    with scratch(len(edges.source), layers[0].message_output.in_features + features.shape[1], features) as state:
+        yield _Walk(layers, network.odd_width, features, edges, state)
+
+
+class _Walk:
+    """One pass of a network over one graph.
+
+    Args:
+        state: ``(E, hidden + edge_width)`` working memory: the activation of the layer before, then the features.
+    """
+
+    def __init__(
+        self,
+        layers: list[MessagePassingLayer],
+        odd_width: int,
+        features: Tensor,
+        edges: SortedEdges,
+        state: Tensor,
+    ) -> None:
+        self.layers, self.features, self.edges, self.state = layers, features, edges, state
+        # Of the features of edges as given, and of edges reversed.
+        self.signs = features.new_ones(2, features.shape[1])
+        self.signs[1, :odd_width] = -1
+        self.hidden = layers[0].message_output.in_features
+        on_cpu = features.device.type == "cpu"
+        num_edges = len(edges.source)
+        tuning = current_tuning()
+        # An accelerator takes all edges at once.
+        tiles = edges.tiles(tuning.tile_edges if on_cpu else max(num_edges, 1))
+        self.threads = tuning.threads
+        self.stretches = stretches(tiles)
+        longest = max((tile.edges.stop - tile.edges.start for tile in tiles), default=0)
+        self.pair_offsets = torch.arange(0, 2 * longest + 1, 2, dtype=torch.int32, device=features.device)
+        self.row_numbers = torch.arange(longest, dtype=torch.int32, device=features.device)
+        # Rows of the two projections of the node states, one upon the other, that every edge adds up.
+        self.ends = torch.stack((edges.target(), edges.source + edges.num_nodes), dim=1)
+        self.is_connected = (edges.degree > 0)[:, None]
+
+    def layer(self, index: int, nodes: Tensor, visit: Visit | None = None) -> Tensor:
+        """One layer; returns the new node states, or ``nodes`` where ``visit`` takes the activations instead."""
+        layer = self.layers[index]
+        is_first, is_last = index == 0, index == len(self.layers) - 1
+        # The specification has features before activations.
+        width = self.features.shape[1]
+        projection = layer.edge_projection
+        weight = torch.cat((projection.weight[:, width:], projection.weight[:, :width]), dim=1).t().contiguous()
+        projected = None
+        if layer.node_width:
+            at_target = torch.addmm(projection.bias, nodes, layer.target_projection.weight.t())
+            projected = torch.cat((at_target, nodes @ layer.source_projection.weight.t()))
+        mean = nodes.new_zeros(len(nodes), self.hidden)
+        updated = torch.empty_like(mean)
+
+        def walk(tiles: Sequence[Tile]) -> None:
+            for tile in tiles:
+                state = self.state[tile.edges]
+                if is_first:
+                    self._write_features(tile, state)
+                inputs = state[:, self.hidden :] if is_first else state
+                if projected is None:
+                    activation = torch.addmm(projection.bias, inputs, weight)
+                else:
+                    activation = self._gather_sum(tile, projected).addmm_(inputs, weight)
+                activation.relu_()
+                if visit is not None:
+                    visit(tile, activation)
+                    continue
+                if not is_last:
+                    state[:, : self.hidden] = activation
+                if len(state):
+                    mean[tile.nodes] = self._mean_by_node(tile, activation)
+            if visit is None:
+                rows = slice(tiles[0].nodes.start, tiles[-1].nodes.stop)
+                updated[rows] = layer.update_nodes(nodes[rows], mean[rows], self.is_connected[rows])
+
+        for_each(walk, self.stretches, self.threads)
+        return nodes if visit is not None else updated
+
+    def _write_features(self, tile: Tile, state: Tensor) -> None:
+        # A row of signs for every edge, since torch is slow at spreading one sign over a few columns.
+        signs = self.signs.index_select(0, self.edges.is_reversed[tile.edges].int())
+        state[:, self.hidden :] = signs.mul_(self.features.index_select(0, self.edges.edge[tile.edges]))
+
+    def _gather_sum(self, tile: Tile, projected: Tensor) -> Tensor:
+        """Sum of the projections of both ends, ``(edges of the tile, hidden)``."""
+        ends = self.ends[tile.edges].flatten()
+        return _bags(projected, ends, self.pair_offsets[: len(ends) // 2 + 1], "sum")
+
+    def _mean_by_node(self, tile: Tile, activation: Tensor) -> Tensor:
+        first = self.edges.first[tile.nodes.start : tile.nodes.stop + 1]
+        return _bags(activation, self.row_numbers[: len(activation)], first - tile.edges.start, "mean")
+
+
+def _bags(table: Tensor, rows: Tensor, offsets: Tensor, mode: str) -> Tensor:
+    """Sum or mean of ``table[rows[offsets[i] : offsets[i + 1]]]`` for every i; zero where that is empty.
+
+    Measured against index_select, index_add, segment_reduce and numpy's reduceat, this is the fastest by 1.5 to 20.
+    """
+    result = torch.embedding_bag(
+        table, rows, offsets, False, {"sum": 0, "mean": 1}[mode], False, None, include_last_offset=True
+    )
+    return result[0]

@@ -1,0 +1,80 @@
+"""The bootstrap (NeuRoRA §4.2): orientations along a shortest-path tree that avoids outliers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rotavg_ros.solver.algebra.medians import median_by_group
+from rotavg_ros.solver.algebra.relaxed_forest import hubs, relaxed_forest
+from rotavg_ros.solver.algebra.residuals import EdgeResiduals
+from rotavg_ros.solver.algebra.spanning_forest import compose, shortest_path_forest
+from rotavg_ros.solver.neurora.cleaned import Cleaned
+
+# Cost of an edge in the tree, and what a certain outlier costs besides (the authors' released code, between the two).
+_EDGE_COST, _OUTLIER_COST = 0.1, 1.0
+# Divided by the edges of that end which has fewer: CleanNet rectifies well where an edge has company.
+_FRINGE_COST = 5.0
+# So many edges tell which of two trees fits better.
+_MISFIT_SAMPLE = 16_384
+
+
+class Bootstrapped(NamedTuple):
+    """Where FineNet begins.
+
+    Attributes:
+        body_from_world: ``(N, 4)`` float64.
+        roots: ``(C,)`` the trees' roots, in the order of the components.
+        cleaned: without CleanNet's corrections where the measurements as they are were better.
+    """
+
+    body_from_world: Tensor
+    roots: Tensor
+    cleaned: Cleaned
+
+
+def bootstrap(cleaned: Cleaned, component: Tensor | None = None) -> Bootstrapped:
+    """Orientations along a shortest-path tree that avoids outliers.
+
+    A tree is composed of rectified measurements or of those as they are, whichever fits the latter better: where noise
+    is far below what CleanNet was trained on, rectifying does harm.
+
+    Args:
+        component: ``(N,)`` the graph's connected components; default: computed.
+    """
+    component = cleaned.graph.components() if component is None else component
+    degree = cleaned.edges.degree
+    fewest = torch.minimum(degree[cleaned.graph.source], degree[cleaned.graph.target])
+    cost = _EDGE_COST + _OUTLIER_COST * cleaned.outlier_probability + _FRINGE_COST / fewest
+    if cleaned.graph.device.type == "cpu":
+        forest = shortest_path_forest(cleaned.graph, cost, edges=cleaned.edges, component=component)
+        parent, parent_edge = torch.from_numpy(forest.parent), torch.from_numpy(forest.parent_edge)
+        roots = torch.from_numpy(forest.roots)
+    else:
+        tree = relaxed_forest(cleaned.edges, cost, hubs(cleaned.edges, component))
+        parent, parent_edge, roots = tree.parent, tree.parent_edge, tree.roots
+    rectified, raw = (compose(parent, parent_edge, graph) for graph in (cleaned.graph, cleaned.measured))
+    rectified_misfit, raw_misfit = _misfits(cleaned, (rectified, raw), component)
+    raw_is_better = raw_misfit <= rectified_misfit
+    if not bool(raw_is_better.any()):
+        return Bootstrapped(rectified, roots, cleaned)
+    chosen = raw_is_better[component][:, None]
+    relative = torch.where(
+        chosen[cleaned.graph.source], cleaned.measured.target_from_source, cleaned.graph.target_from_source
+    )
+    cleaned = replace(cleaned, graph=replace(cleaned.graph, target_from_source=relative))
+    return Bootstrapped(torch.where(chosen, raw, rectified), roots, cleaned)
+
+
+def _misfits(cleaned: Cleaned, candidates: Sequence[Tensor], component: Tensor) -> list[Tensor]:
+    """Median angle between the inliers as measured and as each of ``candidates`` has them, per component."""
+    sample = cleaned.is_inlier.nonzero().squeeze(1)
+    sample = sample[:: 1 + len(sample) // _MISFIT_SAMPLE]
+    edges = cleaned.measured.select_edges(sample)
+    angles = [EdgeResiduals(edges, body_from_world.float()).angles() for body_from_world in candidates]
+    count = int(component.max()) + 1
+    return [median_by_group(angle, component[edges.source], count) for angle in angles]

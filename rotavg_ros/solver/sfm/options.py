@@ -1,0 +1,24 @@
+"""Which stages of the SfM profile run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class SfmStages:
+    """Every method has the bootstrap, a spanning tree.
+
+    Attributes:
+        clean: CleanNet rectifies and scores the edges.
+        fine_tunings: how often FineNet corrects the orientations.
+        refine: refinement ends the solve.
+        weighted: refinement begins by weighing the edges by CleanNet's scores.
+        shaped: refinement ends in steps that know the noise's shape; otherwise it is Chatterjee & Govindu's.
+    """
+
+    clean: bool = True
+    fine_tunings: int = 1
+    refine: bool = True
+    weighted: bool = True
+    shaped: bool = True

@@ -1,0 +1,1 @@
+"""The SLAM profile: odometry chains with loop closures."""

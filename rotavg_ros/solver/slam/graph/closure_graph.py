@@ -1,0 +1,189 @@
+"""The closure graph: a SLAM pose graph with its odometry chains drawn together.
+
+A keyframe between two odometry edges and without a closure carries no information of its own, so a run of k odometry
+steps is one *segment* with k times the variance, and what is left has as many nodes as closures have ends. All
+orientations are written as a correction of the odometry's,
+
+    R_v = R_v⁰ C_v        (R⁰: composed along the spanning forest; C: a rotation of the world frame),
+
+so a segment says C_b ≈ C_a, and any other edge says C_v ≈ e⁰_uv C_u with e⁰_uv its residual under R⁰. Inside a segment
+the least-squares solution turns in proportion to the variance passed, which makes the contraction exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.algebra.spanning_forest import SpanningForest
+from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths, follow
+from rotavg_ros.view_graph import ViewGraph
+
+
+@dataclass(frozen=True)
+class ClosureGraph:
+    """K key nodes and E edges: S segments first, then every other edge of the view-graph, sorted by its ends.
+
+    Attributes:
+        nodes: ``(K,)`` view-graph nodes, ascending.
+        position: ``(K,)`` odometry steps from the root of the node's chain; chains lie far apart from each other.
+        roots: ``(components,)`` key nodes whose correction stays the identity.
+        source, target: ``(E,)`` key nodes.
+        residual: ``(E, 4)`` float64 e⁰; the identity on segments.
+        is_odometry: ``(E,)`` bool; all segments, and odometry edges outside the forest.
+        own_steps: ``(E,)`` variance of each edge's own noise in units of one edge of its kind: odometry steps passed;
+            of closures 1, or what they state as far as that is believed.
+        steps: ``(E,)`` the variance by which it weighs, likewise; more where closures err together.
+        stated_variance: ``(E,)`` rad², what closures state; NaN where unknown, and of odometry.
+        path_steps: ``(E,)`` odometry steps between the edge's ends along the forest; inf where a bridge is passed.
+        view_graph_edge: ``(E - S,)`` the view-graph edge of each edge that is no segment.
+        segment_of_edge: ``(M,)`` the segment that holds each view-graph edge, -1 for those above.
+        share_of_segment: ``(M,)`` how much of its segment's steps a view-graph edge is; 1 for those above.
+        paths: what it was drawn together along, with R⁰.
+    """
+
+    nodes: np.ndarray
+    position: np.ndarray
+    roots: np.ndarray
+    source: np.ndarray
+    target: np.ndarray
+    residual: Tensor
+    is_odometry: np.ndarray
+    own_steps: np.ndarray
+    steps: np.ndarray
+    stated_variance: np.ndarray
+    path_steps: np.ndarray
+    view_graph_edge: np.ndarray
+    segment_of_edge: np.ndarray
+    share_of_segment: np.ndarray
+    paths: OdometryPaths
+    # Every view-graph node lies `fraction` of the way (in variance) from key node `above` to key node `below`.
+    above: np.ndarray
+    below: np.ndarray
+    fraction: np.ndarray
+    # Odometry steps between the two; 0 at a key node.
+    length: np.ndarray
+
+    @property
+    def odometry_orientation(self) -> Tensor:
+        """R⁰, body_from_world ``(N, 4)``."""
+        return self.paths.orientation
+
+    @property
+    def num_nodes(self) -> int:
+        return len(self.nodes)
+
+    @property
+    def num_segments(self) -> int:
+        return len(self.source) - len(self.view_graph_edge)
+
+    @property
+    def is_closure(self) -> np.ndarray:
+        return ~self.is_odometry
+
+    def orientations(self, correction: Tensor) -> Tensor:
+        """Corrections of the key nodes ``(K, 4)`` → orientations of all nodes, body_from_world ``(N, 4)``."""
+        rows = np.ascontiguousarray(correction.numpy().T)
+        above, below = rows.take(self.above, axis=1), rows.take(self.below, axis=1)
+        turn = quaternion_rows.log(quaternion_rows.multiply(quaternion_rows.inverse(above), below))
+        spread = quaternion_rows.multiply(above, quaternion_rows.exp(self.fraction * turn))
+        odometry = np.ascontiguousarray(self.odometry_orientation.numpy().T)
+        orientation = torch.from_numpy(quaternion_rows.multiply(odometry, spread).T.copy())
+        return rotations.normalize(orientation)
+
+    def variance(self, samples: np.ndarray, step_variance: float) -> np.ndarray:
+        """Variance of all nodes ``(N,)`` from samples of the key nodes' errors ``(K, k)``; rad².
+
+        Inside a segment the error is interpolated, plus that of a random walk that is tied down at both ends.
+        """
+        fraction = self.fraction[:, None]
+        interpolated = (1 - fraction) * samples[self.above] + fraction * samples[self.below]
+        bridge = self.fraction * (1 - self.fraction) * self.length * step_variance
+        return np.asarray((interpolated**2).mean(axis=1) + bridge)
+
+    def corrections(self, body_from_world: Tensor) -> Tensor:
+        """Orientations of all nodes ``(N, 4)`` → corrections of the key nodes ``(K, 4)`` that are nearest to them."""
+        nodes = torch.from_numpy(self.nodes)
+        relative = rotations.multiply(rotations.inverse(self.odometry_orientation[nodes]), body_from_world[nodes])
+        return rotations.normalize(relative)
+
+    def edge_values(self, value: np.ndarray) -> np.ndarray:
+        """Values of this graph's edges ``(E,)`` → values of the view-graph's edges ``(M,)``."""
+        out = np.empty(len(self.segment_of_edge))
+        on_segment = self.segment_of_edge >= 0
+        out[on_segment] = value[: self.num_segments][self.segment_of_edge[on_segment]]
+        out[self.view_graph_edge] = value[self.num_segments :]
+        return out
+
+
+def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
+    """Draw the odometry chains of ``graph`` (on the CPU) together along ``forest``."""
+    return contract_along(graph, OdometryPaths.along(graph, forest))
+
+
+def contract_along(graph: ViewGraph, paths: OdometryPaths) -> ClosureGraph:
+    """The same where what lies along the forest is known."""
+    num_nodes, num_edges = graph.num_nodes, graph.num_edges
+    source, target = graph.source.numpy(), graph.target.numpy()
+    is_odometry = graph.is_odometry.numpy()
+    steps = graph.steps.numpy()
+    parent, parent_edge = paths.forest.parent, paths.forest.parent_edge
+    hangs_on_odometry, depth, other = paths.hangs_on_odometry, paths.depth, paths.outside
+
+    children = np.bincount(parent[hangs_on_odometry], minlength=num_nodes)
+    is_key = ~hangs_on_odometry | (children != 1)
+    is_key[source[other]] = True
+    is_key[target[other]] = True
+    nodes = np.flatnonzero(is_key)
+    key_of_node = np.cumsum(is_key) - 1
+
+    above_node = follow(np.where(is_key, np.arange(num_nodes), parent))
+    only_child = np.arange(num_nodes)
+    only_child[parent[hangs_on_odometry]] = np.flatnonzero(hangs_on_odometry)
+    below_node = follow(np.where(is_key, np.arange(num_nodes), only_child))
+    length = depth[below_node] - depth[above_node]
+    fraction = np.divide(depth - depth[above_node], length, out=np.zeros(num_nodes), where=length > 0)
+
+    # A segment ends at a key node that hangs on odometry; it starts at the next key node above.
+    segment_end = nodes[hangs_on_odometry[nodes]]
+    segment_start = above_node[parent[segment_end]]
+    segment_of_key = np.full(num_nodes, -1, dtype=np.int64)
+    segment_of_key[segment_end] = np.arange(len(segment_end))
+    segment_of_edge = np.full(num_edges, -1, dtype=np.int64)
+    below_edge = np.flatnonzero(hangs_on_odometry)
+    segment_of_edge[parent_edge[below_edge]] = segment_of_key[below_node[below_edge]]
+
+    segment_steps = depth[segment_end] - depth[segment_start]
+    share_of_segment = np.ones(num_edges)
+    on_segment = segment_of_edge >= 0
+    share_of_segment[on_segment] = steps[on_segment] / segment_steps[segment_of_edge[on_segment]]
+    own_steps = np.concatenate((segment_steps, np.where(is_odometry, steps, 1.0)[other]))
+    with np.errstate(over="ignore"):  # of a precision that is next to nothing
+        stated_variance = np.where(is_odometry, np.nan, 1 / graph.precision.numpy())[other]
+    _, chain_number = np.unique(paths.chain, return_inverse=True)
+    return ClosureGraph(
+        nodes=nodes,
+        position=(depth + 4.0 * max(num_nodes, depth.max(initial=0.0)) * chain_number)[nodes],
+        roots=key_of_node[paths.forest.roots],
+        source=key_of_node[np.concatenate((segment_start, source[other]))],
+        target=key_of_node[np.concatenate((segment_end, target[other]))],
+        residual=torch.cat((rotations.identity(len(segment_end)), paths.residual)),
+        is_odometry=np.concatenate((np.ones(len(segment_end), dtype=bool), is_odometry[other])),
+        own_steps=own_steps,
+        steps=own_steps,
+        stated_variance=np.concatenate((np.full(len(segment_end), np.nan), stated_variance)),
+        path_steps=np.concatenate((segment_steps, paths.path_steps)),
+        view_graph_edge=other,
+        segment_of_edge=segment_of_edge,
+        share_of_segment=share_of_segment,
+        paths=paths,
+        above=key_of_node[above_node],
+        below=key_of_node[below_node],
+        fraction=fraction,
+        length=length,
+    )

@@ -1,0 +1,133 @@
+"""Turning whole parts of a closure graph at once, where no small step leads to a better solution.
+
+If odometry slipped, everything after the slip is turned by the same rotation. A *jump* takes the residual of one wrong
+edge and turns the best set of nodes by it: which nodes go along is a minimum cut, since every edge between those that
+do and those that do not pays or gains. (The expansion moves of Boykov, Veksler & Zabih 2001, with a rotation for a
+label; where such a move is not submodular, its cost is taken from above, so an accepted jump is an improvement.)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.minimum_cut import FlowNetwork, TwoLabels
+from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
+from rotavg_ros.solver.slam.moves.truncated_cost import TruncatedCost
+
+_MAX_ROUNDS = 3
+_MAX_CANDIDATES = 40
+# An improvement by less than this many nats is none.
+_MIN_GAIN = 0.5
+# Conductance of edges that are as wrong as can be, for an electrical flow that leaves them alone.
+_MIN_CARRIED = 1e-6
+
+
+def jump_to_optimum(
+    cost: TruncatedCost, correction: Tensor, pairs: AgreementPairs, is_agreed: np.ndarray, is_trusted: np.ndarray
+) -> Tensor:
+    """Jumps and descents in turn until neither helps; corrections ``(K, 4)``.
+
+    Args:
+        correction: ``(K, 4)`` start.
+        pairs: neighbouring closures; of those that agree one stands for all.
+        is_agreed: ``(P,)`` bool, the pairs that agree.
+        is_trusted: ``(C,)`` bool, closures whose residual is worth a jump.
+    """
+    hopeless = np.zeros(len(cost.cap))
+    network = FlowNetwork(cost.graph.num_nodes, cost.graph.source, cost.graph.target)
+    for _ in range(_MAX_ROUNDS):
+        jumped, gained = _round_of_jumps(cost, correction, pairs, is_agreed, is_trusted, hopeless, network)
+        if gained < _MIN_GAIN:
+            break
+        correction = min(jumped, cost.descend(jumped), key=cost.total)
+    return correction
+
+
+def _round_of_jumps(
+    cost: TruncatedCost,
+    correction: Tensor,
+    pairs: AgreementPairs,
+    is_agreed: np.ndarray,
+    is_trusted: np.ndarray,
+    hopeless: np.ndarray,
+    network: FlowNetwork,
+) -> tuple[Tensor, float]:
+    """One jump by each wrong edge that still is one when its turn comes; corrections and the cost saved.
+
+    Args:
+        hopeless: ``(E,)`` what an edge's jump might have gained when it gained nothing; brought up to date.
+    """
+    residual = cost.residual(correction)
+    costs = cost.of_edges(residual)
+    gained = 0.0
+    candidates = _candidates(cost, costs, pairs, is_agreed, is_trusted)
+    if len(candidates) == 0:
+        return correction, gained
+    # What an edge loses if one end turns is what it is yet short of its cap, or less if it turns but a little.
+    system = cost.pattern.factorize(np.maximum(cost.cap - costs, _MIN_CARRIED))
+    questions = _turns(cost, residual, residual[candidates], costs)
+    bounds = questions.gain_bounds(system)
+    for number in np.flatnonzero(bounds > hopeless[candidates] + _MIN_GAIN):
+        edge = candidates[number]
+        if costs[edge] < 0.5 * cost.cap[edge]:
+            continue
+        # Until something turns, all questions stand as they were put at first.
+        question, column, bound = questions, int(number), float(bounds[number])
+        if gained > 0:
+            question, column = _turns(cost, residual, residual[[edge]], costs), 0
+            bound = float(question.gain_bounds(system)[0])
+            if bound <= hopeless[edge] + _MIN_GAIN:
+                continue
+        hopeless[edge] = bound
+        moved = torch.from_numpy(np.flatnonzero(question.best_set(network, column)))
+        if len(moved) in (0, cost.graph.num_nodes):
+            continue
+        tried = correction.clone()
+        # Norms multiply with every jump; rounding errors would, too.
+        tried[moved] = rotations.normalize(rotations.multiply(correction[moved], residual[edge].expand(len(moved), 4)))
+        tried_residual = cost.residual(tried)
+        tried_costs = cost.of_edges(tried_residual)
+        gain = float(costs.sum() - tried_costs.sum())
+        if gain > _MIN_GAIN:
+            correction, residual, costs = tried, tried_residual, tried_costs
+            gained += gain
+            hopeless[edge] = 0.0
+    return correction, gained
+
+
+def _candidates(
+    cost: TruncatedCost, costs: np.ndarray, pairs: AgreementPairs, is_agreed: np.ndarray, is_trusted: np.ndarray
+) -> np.ndarray:
+    """Wrong segments, and of every group of wrong closures that agree with each other the best supported one."""
+    closure = np.flatnonzero(cost.graph.is_closure)
+    is_wrong = (costs > 0.5 * cost.cap) & (cost.cap > 0)
+    wrong = is_wrong[closure] & is_trusted
+    linked = is_agreed & wrong[pairs.first] & wrong[pairs.second]
+    links = coo_array(
+        (np.ones(int(linked.sum())), (pairs.first[linked], pairs.second[linked])), shape=(len(wrong),) * 2
+    )
+    group = connected_components(links, directed=False)[1]
+    support = np.bincount(pairs.first[linked], minlength=len(wrong))
+    members = np.flatnonzero(wrong)
+    members = members[np.lexsort((-support[members], group[members]))]
+    group_size = np.bincount(group[members], minlength=len(wrong) + 1)
+    leaders = members[np.unique(group[members], return_index=True)[1]]
+    leaders = leaders[np.argsort(-group_size[group[leaders]], kind="stable")][:_MAX_CANDIDATES]
+    segments = np.flatnonzero(is_wrong & cost.graph.is_odometry)
+    return np.concatenate((segments, closure[leaders]))
+
+
+def _turns(cost: TruncatedCost, residual: Tensor, turns: Tensor, costs: np.ndarray) -> TwoLabels:
+    """Which nodes to turn by each of ``turns`` ``(Q, 4)``; residuals ``(E, 4)`` and costs ``(E,)`` as they are now."""
+    graph = cost.graph
+    # Real parts of turn⁻¹ ∘ residual and of residual ∘ turn.
+    if_target = cost.of_cosines(residual @ turns.T)
+    if_target -= costs[:, None]
+    if_source = cost.of_cosines(residual @ rotations.inverse(turns).T)
+    if_source -= costs[:, None]
+    return TwoLabels.create(graph.num_nodes, graph.source, graph.target, if_target, if_source)

@@ -1,0 +1,1 @@
+"""How odometry and closures err, and how a closure is judged by that."""

@@ -1,0 +1,136 @@
+"""A constant bias of the odometry's gyroscope, estimated from loop closures that disagree with it.
+
+A bias β turns every step of the odometry a little further, ``M̃ = M exp(β)`` with β in the body's frame. Along a chain
+the errors ``R_k⁻¹ β`` add up in the world's frame to a rotation vector that is linear in β, so a closure's residual
+with the odometry is too, as long as it is small. Every closure alone proposes a bias; the one that most closures agree
+to is refined by expectation–maximisation, taken out of the odometry, and estimated again about the better chain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.special import expit
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root
+from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
+from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
+from rotavg_ros.solver.slam.noise.model import NoiseModel
+from rotavg_ros.view_graph import ViewGraph
+
+# Proposals come from so many closures, those that span the least odometry first: their angles have not wrapped around.
+_MAX_PROPOSALS = 60
+# More closures than this say no more of three numbers.
+_MAX_CLOSURES = 1500
+_EM_ITERATIONS = 10
+# Prior standard deviation of a component of the bias, rad per step.
+_PRIOR_BIAS = np.radians(1.0)
+
+
+class BiasEstimate(NamedTuple):
+    """A bias of the odometry.
+
+    Attributes:
+        bias: ``(3,)`` rad per step.
+        explained: share of the closures that are good with it, less the share that are good without.
+    """
+
+    bias: np.ndarray
+    explained: float
+
+
+def estimate_bias(
+    graph: ViewGraph, forest: SpanningForest, closure_graph: ClosureGraph, noise: NoiseModel
+) -> BiasEstimate:
+    """The bias that the closures speak of; zeros where none can be told.
+
+    Args:
+        graph: the view-graph.
+        forest: along which ``closure_graph`` was contracted.
+        noise: of steps and closures without the bias.
+    """
+    closure = np.flatnonzero(closure_graph.is_closure & np.isfinite(closure_graph.path_steps))
+    closure = closure[:: max(1, len(closure) // _MAX_CLOSURES)]
+    if len(closure) == 0:
+        return BiasEstimate(np.zeros(3), 0.0)
+    nodes = closure_graph.nodes
+    drift = _drift_per_bias(graph, forest, closure_graph)
+    ends = nodes[closure_graph.source[closure]], nodes[closure_graph.target[closure]]
+    design = drift[ends[0]] - drift[ends[1]]
+    measured = closure_graph.residual.numpy()[closure]
+    measured_rows = np.ascontiguousarray(measured.T)
+    steps = np.maximum(closure_graph.path_steps[closure], 1.0)
+    variance = steps * noise.step_variance + noise.closure_variance
+    highest = noise.prior_log_odds - noise.components / 2 * np.log(2 * np.pi * variance)
+
+    def log_odds(squared_angle: np.ndarray) -> np.ndarray:
+        uniform = log_uniform_density(np.sqrt(squared_angle).ravel(), noise.components)
+        return np.asarray(highest - squared_angle / (2 * variance) - uniform.reshape(squared_angle.shape))
+
+    proposed = np.argsort(steps, kind="stable")[:_MAX_PROPOSALS]
+    residual = quaternion_rows.log(measured_rows).T
+    inverse_variance = 1 / variance[proposed, None, None]
+    normal = np.swapaxes(design[proposed], 1, 2) * inverse_variance
+    proposals = np.linalg.solve(
+        normal @ design[proposed] + np.eye(3) / _PRIOR_BIAS**2, normal @ residual[proposed, :, None]
+    )[..., 0]
+    proposals = np.concatenate((np.zeros((1, 3)), proposals))
+    # To choose among proposals single precision will do.
+    single = (array.astype(np.float32) for array in (design, measured, proposals))
+    of_proposals = log_odds(_squared_angles(*single)).astype(np.float32)
+    softplus = np.maximum(of_proposals, 0) + np.log(1 + np.exp(-np.abs(of_proposals)))
+    bias = proposals[softplus.sum(axis=1, dtype=np.float64).argmax()]
+    for _ in range(_EM_ITERATIONS):
+        turned = quaternion_rows.multiply(quaternion_rows.exp(-(design @ bias).T), measured_rows)
+        rest = np.ascontiguousarray(quaternion_rows.log(turned).T)
+        weight = expit(log_odds((rest**2).sum(axis=1))) / variance
+        weighted = (design * weight[:, None, None]).reshape(-1, 3)
+        normal = weighted.T @ design.reshape(-1, 3) + np.eye(3) / _PRIOR_BIAS**2
+        bias = bias + np.linalg.solve(normal, weighted.T @ rest.ravel() - bias / _PRIOR_BIAS**2)
+    good = log_odds(_squared_angles(design, measured, bias[None])) > 0
+    return BiasEstimate(bias, float(good.mean() - (of_proposals[0] > 0).mean()))
+
+
+def _squared_angles(design: np.ndarray, measured: np.ndarray, biases: np.ndarray) -> np.ndarray:
+    """What is left of closures ``(C, 4)`` under each of B biases ``(B, 3)``, ``(B, C)`` rad²; design ``(C, 3, 3)``."""
+    by_bias = biases @ design.transpose(2, 1, 0).reshape(3, -1)
+    predicted = by_bias.reshape(len(biases), 3, len(design))
+    half = np.sqrt(np.einsum("bic,bic->bc", predicted, predicted)) / 2
+    along = np.einsum("bic,ci->bc", predicted, measured[:, :3]) / 2
+    # The real part of exp(-predicted) ∘ measured.
+    cosine = np.cos(half) * measured[:, 3] + np.sinc(half / np.pi) * along
+    return np.asarray((2 * np.arccos(np.minimum(np.abs(cosine), 1.0))) ** 2)
+
+
+def without_bias(graph: ViewGraph, bias: np.ndarray) -> ViewGraph:
+    """The graph with ``bias`` ``(3,)`` rad per step taken out of its odometry, whichever way an edge runs.
+
+    An edge of several steps is taken for one about the same axis throughout.
+    """
+    turn = rotations.exp(-graph.steps[:, None] * torch.from_numpy(bias))
+    measured = graph.target_from_source
+    forwards = rotations.multiply(measured, turn)
+    backwards = rotations.multiply(rotations.inverse(turn), measured)
+    corrected = torch.where((graph.source < graph.target)[:, None], forwards, backwards)
+    corrected = torch.where(graph.is_odometry[:, None], corrected, measured)
+    return replace(graph, target_from_source=rotations.canonical(rotations.normalize(corrected)))
+
+
+def _drift_per_bias(graph: ViewGraph, forest: SpanningForest, closure_graph: ClosureGraph) -> np.ndarray:
+    """``(N, 3, 3)``: world-frame rotation vector of each node's odometry error per bias, from its root on."""
+    child = np.flatnonzero(forest.parent_edge >= 0)
+    edge = forest.parent_edge[child]
+    source, target = graph.source.numpy()[edge], graph.target.numpy()[edge]
+    # A step turns about the body of its earlier node; forwards along the tree or backwards.
+    earlier = np.minimum(source, target)
+    steps = (graph.steps * graph.is_odometry).numpy()[edge]
+    sign = np.where(earlier == child, -1.0, 1.0) * steps
+    world_from_body = rotations.to_matrix(rotations.inverse(closure_graph.odometry_orientation)).numpy()
+    step = np.zeros((graph.num_nodes, 9))
+    step[child] = (sign[:, None, None] * world_from_body[earlier]).reshape(-1, 9)
+    return accumulate_to_root(forest, step).reshape(-1, 3, 3)

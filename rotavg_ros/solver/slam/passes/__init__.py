@@ -1,0 +1,1 @@
+"""The alternation of sparse solves and verdicts."""

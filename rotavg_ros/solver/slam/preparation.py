@@ -1,0 +1,144 @@
+"""What a SLAM solve begins with: the odometry drawn together, without its bias, and the scale of the noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, minimum_spanning_forest
+from rotavg_ros.solver.slam.graph.agreement import NO_PAIRS, AgreementPairs, agreement_pairs
+from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract
+from rotavg_ros.solver.slam.noise.gyro_bias import estimate_bias, without_bias
+from rotavg_ros.solver.slam.noise.model import (
+    NoiseModel,
+    agree,
+    discrepancies,
+    estimate_noise,
+    judge_by_chain,
+    noise_between_neighbours,
+)
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+
+# Odometry first: no number of steps is worth a closure.
+_CLOSURE_COST = 1e6
+# Odometry that this share of the closures disagrees with may be biased; it is if without the bias so many fewer do,
+# and with less drift.
+_BIASED_SHARE = 0.5
+_BIAS_GAIN = 0.2
+_BIAS_ROUNDS = 2
+# It is not looked for, or not any further, where a cheaper look promises less than such parts of that gain: at most the
+# closures that disagree and are confirmed by a neighbour, and what the first round explains.
+_BIAS_CONFIRMED, _BIAS_EXPLAINED = 0.75, 0.4
+# Rotations whose axes spread less than this (relative) are all about one axis.
+_PLANAR_SPREAD = 1e-10
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A SLAM graph drawn together, with the scale of its noise (C closures).
+
+    Attributes:
+        closure_graph: the graph of the closures' ends.
+        squared_angle: ``(C,)`` rad², discrepancy of each closure with the odometry.
+        path_steps: ``(C,)`` odometry steps between its ends; inf where odometry does not connect them.
+        pairs: which closures agree.
+        noise: estimated scales.
+        is_unbiased: whether a gyroscope bias was taken out of the odometry beforehand.
+    """
+
+    closure_graph: ClosureGraph
+    squared_angle: np.ndarray
+    path_steps: np.ndarray
+    pairs: AgreementPairs
+    noise: NoiseModel
+    is_unbiased: bool = False
+
+    @property
+    def num_segments(self) -> int:
+        return self.closure_graph.num_segments
+
+
+def prepare(graph: ViewGraph, *, scale_estimation: bool = True) -> Prepared:
+    """Contract the odometry chains and estimate the noise of steps and closures. Rejected edges take no part.
+
+    If most closures disagree with the odometry, a constant bias may be why; it is taken out if fewer do without it.
+
+    Args:
+        scale_estimation: if not, the noise is what edges of either kind state in the median.
+    """
+    prepared, forest = _contract(graph, scale_estimation)
+    if scale_estimation and prepared.noise.outlier_share > _BIASED_SHARE and _may_be_biased(prepared):
+        unbiased = _without_bias(graph, prepared, forest)
+        if unbiased is not None and unbiased.noise.step_variance < prepared.noise.step_variance:
+            return replace(unbiased, is_unbiased=True)
+    return prepared
+
+
+def _may_be_biased(prepared: Prepared) -> bool:
+    """Whether enough closures disagree with the odometry that neighbours confirm: others no bias will explain."""
+    is_agreed = agree(prepared.pairs, prepared.noise)
+    is_confirmed = np.bincount(prepared.pairs.first, is_agreed, len(prepared.squared_angle)) > 0
+    disagrees = judge_by_chain(prepared.noise, prepared.squared_angle, prepared.path_steps) < 0
+    return bool((disagrees & is_confirmed).mean() > _BIAS_CONFIRMED * _BIAS_GAIN)
+
+
+def _without_bias(graph: ViewGraph, prepared: Prepared, forest: SpanningForest) -> Prepared | None:
+    """The graph prepared with the likeliest bias taken out of its odometry; None if that explains too few closures."""
+    noise = noise_between_neighbours(prepared.pairs, prepared.noise.components)
+    corrected, closure_graph = graph, prepared.closure_graph
+    for number in range(_BIAS_ROUNDS):
+        if number > 0:
+            closure_graph, forest = draw_together(corrected)
+        estimate = estimate_bias(corrected, forest, closure_graph, noise)
+        if number == 0 and estimate.explained < _BIAS_EXPLAINED * _BIAS_GAIN:
+            return None
+        corrected = without_bias(corrected, estimate.bias)
+    unbiased, _ = _contract(corrected, scale_estimation=True)
+    fewer_disagree = unbiased.noise.outlier_share < prepared.noise.outlier_share - _BIAS_GAIN
+    return unbiased if fewer_disagree else None
+
+
+def _contract(graph: ViewGraph, scale_estimation: bool) -> tuple[Prepared, SpanningForest]:
+    """As :func:`prepare`, believing the odometry, and the forest along which the chains were drawn together."""
+    closure_graph, forest = draw_together(graph)
+    closure = closure_graph.is_closure
+    squared_angle = (rotations.log(closure_graph.residual) ** 2).sum(dim=1).numpy()[closure]
+    path_steps = closure_graph.path_steps[closure]
+    pairs = agreement_pairs(closure_graph)
+    components = rotation_components(graph)
+    if scale_estimation:
+        noise = estimate_noise(discrepancies(squared_angle, path_steps, pairs), components)
+    else:
+        noise = _stated_noise(graph, components)
+    return Prepared(closure_graph, squared_angle, path_steps, pairs, noise), forest
+
+
+def draw_together(graph: ViewGraph) -> tuple[ClosureGraph, SpanningForest]:
+    """The closure graph, and the forest along which the chains were drawn together; rejected edges take no part."""
+    usable = graph.label != EdgeLabel.REJECTED
+    cost = torch.where(graph.is_odometry, 1.0, _CLOSURE_COST)
+    # A rejected edge may only be used where nothing else connects.
+    forest = minimum_spanning_forest(graph, torch.where(usable, cost, _CLOSURE_COST**2))
+    return contract(graph, forest), forest
+
+
+def _stated_noise(graph: ViewGraph, components: int) -> NoiseModel:
+    """Medians of what the edges of either kind state; the prior where they state nothing."""
+    prior = estimate_noise(discrepancies(np.empty(0), np.empty(0), NO_PAIRS), components)
+    stated = {True: prior.step_variance, False: prior.closure_variance}
+    precision = graph.precision.numpy()
+    for kind in stated:
+        of_kind = precision[(graph.is_odometry.numpy() == kind) & np.isfinite(precision)]
+        if len(of_kind):
+            stated[kind] = float(1 / np.median(of_kind))
+    return replace(prior, step_variance=stated[True], closure_variance=stated[False])
+
+
+def rotation_components(graph: ViewGraph) -> int:
+    """1 if all measured rotations share one axis (planar motion), else 3."""
+    vectors = rotations.log(graph.target_from_source)
+    spread = torch.linalg.eigvalsh(vectors.T @ vectors)
+    return 1 if float(spread[1]) <= _PLANAR_SPREAD * float(spread[2]) else 3

@@ -1,0 +1,94 @@
+"""The SLAM profile: contract the odometry, clean, bootstrap, refine, expand; or go on from the last solve."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.estimate import Estimate, Run
+from rotavg_ros.solver.slam import refinement as slam_refinement
+from rotavg_ros.solver.slam import stages as slam_stages
+from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
+from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
+from rotavg_ros.solver.slam.network import SlamCleanNet
+from rotavg_ros.solver.slam.options import SlamStages
+from rotavg_ros.solver.slam.passes.alternation import Verdicts
+from rotavg_ros.solver.slam.preparation import prepare
+from rotavg_ros.solver.slam.update.memory import SlamMemory
+from rotavg_ros.view_graph import ViewGraph
+
+
+def solve_slam(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
+    """One method on a graph that lives on the CPU; what it states more than once counts once."""
+    repeats = first_of_each(graph)
+    if repeats is None:
+        return _solve_once(graph, stages, run)
+    first, says_as = (torch.from_numpy(edges) for edges in repeats)
+    estimate = _solve_once(graph.select_edges(first), stages, run)
+    return replace(estimate, outlier_score=estimate.outlier_score[says_as], memory=None)
+
+
+def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
+    """The same for a graph without repetitions."""
+    watch = run.watch
+    with watch.stage("contract"):
+        prepared = prepare(graph, scale_estimation=stages.scale_estimation)
+    with watch.stage("clean"):
+        network = run.networks.load(SlamCleanNet) if stages.clean else None
+        cleaned = slam_stages.clean(network, prepared, graph.label)
+    with watch.stage("bootstrap"):
+        if run.warm_start is not None:
+            correction = prepared.closure_graph.corrections(run.warm_start.double())
+        elif stages.tree_start:
+            correction = slam_stages.bootstrap(prepared, cleaned)
+        else:
+            correction = rotations.identity(prepared.closure_graph.num_nodes)
+    steps = run.refinement_steps
+    if steps is None:
+        steps = slam_refinement.MAX_PASSES if stages.refine else 0
+    if steps > 0:
+        with watch.stage("refine"):
+            estimate = slam_stages.refine(
+                prepared,
+                cleaned,
+                correction,
+                steps,
+                scale_estimation=stages.scale_estimation,
+                slip_search=stages.slip_search,
+            )
+        with watch.stage("expand"):
+            closure_graph = prepared.closure_graph
+            variance = closure_graph.variance(estimate.samples, estimate.stated_step_variance)
+            is_default = stages == SlamStages()
+            memory = SlamMemory.of(graph, prepared, cleaned, estimate, variance) if is_default else None
+            return _slam_estimate(closure_graph, estimate, variance, memory)
+    with watch.stage("expand"):
+        score = slam_stages.outlier_scores(prepared.closure_graph, 1 - cleaned.inlier_probability)
+        orientations = prepared.closure_graph.orientations(correction)
+    return Estimate(orientations, torch.from_numpy(score), torch.full((graph.num_nodes,), torch.nan))
+
+
+def _slam_estimate(
+    graph: ClosureGraph, verdicts: Verdicts, variance: np.ndarray, memory: SlamMemory | None
+) -> Estimate:
+    """From the closure graph's nodes and edges to the view-graph's, of whose nodes ``variance`` ``(N,)`` is."""
+    return Estimate(
+        graph.orientations(verdicts.correction),
+        torch.from_numpy(slam_stages.outlier_scores(graph, verdicts.outlier_probability)),
+        torch.from_numpy(variance),
+        memory,
+    )
+
+
+def update_slam(graph: ViewGraph, memory: SlamMemory, run: Run) -> Estimate | None:
+    """The solve of a graph that has grown by a few edges since ``memory``; None if the whole of it is due.
+
+    ``run`` has the warm start.
+    """
+    assert run.warm_start is not None
+    with run.watch.stage("update"):
+        updated = memory.updated(graph, run.networks.load(SlamCleanNet), run.warm_start.double())
+        return None if updated is None else _slam_estimate(*updated)

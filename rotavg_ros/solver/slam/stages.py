@@ -1,0 +1,150 @@
+"""The stages of a SLAM solve, as the pipeline runs them and as training sees them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.special import expit
+from torch import Tensor
+
+from rotavg_ros.solver.algebra.spanning_forest import compose_orientations, shortest_path_forest
+from rotavg_ros.solver.slam import refinement as slam_refinement
+from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
+from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
+from rotavg_ros.solver.slam.moves.group_search import without_false_groups
+from rotavg_ros.solver.slam.moves.slip_doubt import Doubt, measure_doubt
+from rotavg_ros.solver.slam.moves.slip_search import search_for_slips
+from rotavg_ros.solver.slam.network import SlamCleanNet, closure_features, false_log_odds
+from rotavg_ros.solver.slam.noise.model import NoiseModel, judge_by_chain
+from rotavg_ros.solver.slam.passes.alternation import SlamEstimate
+from rotavg_ros.solver.slam.preparation import Prepared
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+
+# What a closure's verdict counts for in the tree: nobody is trusted beyond this, and a false one is off by about this.
+_MIN_DISTRUST = 0.02
+_FALSE_SQUARE = np.pi**2 / 3 + 2
+# How much of the network's log-odds the refinement adds to its own: a part, since both have seen some of the same
+# evidence, and the less the more closures are false, since agreement by chance is then as common as by truth.
+_NETWORK_SHARE = 0.6
+_MAX_NETWORK_LOG_ODDS = 4.0
+
+
+@dataclass(frozen=True)
+class CleanedClosures:
+    """Verdicts on the E edges of a closure graph before the global solve.
+
+    Attributes:
+        inlier_probability: ``(E,)``; 1 for odometry.
+        prior_log_odds: ``(E,)`` log-odds of being good that the refinement adds to its own evidence; ±inf by label.
+    """
+
+    inlier_probability: np.ndarray
+    prior_log_odds: np.ndarray
+
+
+def clean(network: SlamCleanNet | None, prepared: Prepared, label: Tensor) -> CleanedClosures:
+    """Judge every closure by its discrepancy with the odometry and, with a network, by the company it keeps.
+
+    A closure starts as good only if both say so: a group of false closures agrees with itself, and odometry that has
+    drifted far believes anything. What the network says counts in the refinement's verdicts, too.
+
+    Args:
+        label: ``(M,)`` of the view-graph's edges.
+    """
+    graph, noise = prepared.closure_graph, prepared.noise
+    prior = np.zeros(len(graph.source))
+    good = np.full(len(graph.source), np.inf)
+    good[graph.is_closure], prior[graph.is_closure] = judge_closures(
+        network, noise, prepared.squared_angle, prepared.path_steps, prepared.pairs
+    )
+    edge_label = label.numpy()[graph.view_graph_edge]
+    verdict = np.select([edge_label == EdgeLabel.ACCEPTED, edge_label == EdgeLabel.REJECTED], [np.inf, -np.inf], 0.0)
+    good[graph.num_segments :] = np.where(verdict == 0, good[graph.num_segments :], verdict)
+    prior[graph.num_segments :] = np.where(verdict == 0, prior[graph.num_segments :], verdict)
+    return CleanedClosures(expit(good), prior)
+
+
+def judge_closures(
+    network: SlamCleanNet | None,
+    noise: NoiseModel,
+    squared_angle: np.ndarray,
+    path_steps: np.ndarray,
+    pairs: AgreementPairs,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log-odds ``(C,)`` of closures to be good before the global solve, and those that the refinement is to add."""
+    by_chain = judge_by_chain(noise, squared_angle, path_steps) + noise.prior_log_odds
+    if network is None or len(by_chain) == 0:
+        return by_chain, np.zeros(len(by_chain))
+    by_company = -false_log_odds(network, closure_features(noise, squared_angle, path_steps, pairs)).double().numpy()
+    bounded = np.clip(by_company, -_MAX_NETWORK_LOG_ODDS, _MAX_NETWORK_LOG_ODDS)
+    return np.minimum(by_chain, by_company), _NETWORK_SHARE * (1 - noise.outlier_share) * bounded
+
+
+def bootstrap(prepared: Prepared, cleaned: CleanedClosures) -> Tensor:
+    """Corrections ``(K, 4)`` along the tree of least expected squared error.
+
+    A step of odometry costs its variance; a closure costs its own and, as far as it is not trusted, what a false
+    one would do. So the tree follows the odometry until that has drifted farther than a trusted closure errs.
+    """
+    graph, noise = prepared.closure_graph, prepared.noise
+    distrust = np.maximum(1 - cleaned.inlier_probability, _MIN_DISTRUST)
+    cost = np.where(
+        graph.is_odometry, graph.steps * noise.step_variance, noise.closure_variance + distrust * _FALSE_SQUARE
+    )
+    closure_graph = ViewGraph.create(graph.source, graph.target, graph.residual, num_nodes=graph.num_nodes)
+    forest = shortest_path_forest(closure_graph, torch.from_numpy(cost), root="first")
+    return compose_orientations(forest, closure_graph)
+
+
+def refine(
+    prepared: Prepared,
+    cleaned: CleanedClosures,
+    correction: Tensor,
+    max_passes: int = slam_refinement.MAX_PASSES,
+    *,
+    scale_estimation: bool = True,
+    slip_search: bool = True,
+) -> SlamEstimate:
+    """Refine from corrections ``(K, 4)``; again where groups of closures are false that were believed.
+
+    If the outcome looks as if odometry had slipped, from a second start, too.
+    """
+    graph, pairs, prior = prepared.closure_graph, prepared.pairs, cleaned.prior_log_odds
+
+    def run(
+        start: Tensor,
+        inlier_probability: np.ndarray,
+        noise: NoiseModel,
+        log_odds: np.ndarray,
+        rank: np.ndarray | None = None,
+    ) -> SlamEstimate:
+        return slam_refinement.refine(
+            graph,
+            pairs,
+            start,
+            inlier_probability,
+            noise,
+            log_odds=log_odds,
+            max_passes=max_passes,
+            hold_noise=not scale_estimation,
+            rank=rank,
+        )
+
+    estimate = run(correction, cleaned.inlier_probability, prepared.noise, prior)
+    doubt = measure_doubt(graph, pairs, estimate, prepared.noise) if slip_search else Doubt.NONE
+    without = without_false_groups(run, estimate, graph, pairs, prepared.noise, prior, doubt)
+    rivals = [estimate.correction] if without is estimate else [estimate.correction, without.correction]
+    second = search_for_slips(graph, pairs, estimate, prepared.noise, prior, doubt, rivals)
+    if second is None:
+        return without
+    return run(second.correction, second.inlier_probability, second.noise, prior, estimate.rank)
+
+
+def outlier_scores(graph: ClosureGraph, outlier_probability: np.ndarray) -> np.ndarray:
+    """Probability of each edge of the view-graph to be wrong, ``(M,)``, from those of the closure graph's, ``(E,)``.
+
+    A slip in a segment is as likely in any of its steps.
+    """
+    return np.asarray(graph.edge_values(outlier_probability) * graph.share_of_segment)

@@ -1,0 +1,1 @@
+"""Live graphs: what a solve remembers, and the solve of a graph that has grown by a few edges."""

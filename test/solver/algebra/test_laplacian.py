@@ -1,0 +1,86 @@
+"""Weighted least squares on graphs, against numpy's least squares."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rotavg_ros.solver.algebra import laplacian
+from rotavg_ros.solver.algebra.laplacian import LaplacianPattern, LaplacianSystem
+from rotavg_ros.solver.algebra.probes import likeliest_leverage, probe_signs
+
+
+def random_graph(num_nodes: int, num_edges: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A chain through all nodes and random edges besides."""
+    chain, random = np.arange(num_nodes - 1), rng.integers(0, num_nodes, num_edges)
+    source = np.concatenate((chain, random))
+    target = np.concatenate((chain + 1, (random + rng.integers(1, num_nodes, num_edges)) % num_nodes))
+    return source, target
+
+
+@pytest.mark.parametrize("dense_share", [0.0, np.inf], ids=["dense", "sparse"])
+def test_fit_is_the_least_squares_solution(monkeypatch: pytest.MonkeyPatch, dense_share: float) -> None:
+    monkeypatch.setattr(laplacian, "_DENSE_SHARE", dense_share)
+    monkeypatch.setattr(laplacian, "_DENSE_EDGES_PER_NODE", dense_share)
+    rng = np.random.default_rng(0)
+    source, target = random_graph(20, 60, rng)
+    weight, difference = rng.uniform(0.1, 10, len(source)), rng.standard_normal((len(source), 3))
+    pattern = LaplacianPattern(20, source, target, np.array([3]))
+    pattern.factorize(rng.uniform(0.1, 10, len(source)))  # from then on the order of elimination is known
+    fitted = [system.fit(difference) for system in (pattern.factorize(weight), pattern.factorize(weight))]
+    fitted.append(LaplacianSystem(20, source, target, weight, np.array([3])).fit(difference))
+    incidence = np.zeros((len(source), 20))
+    incidence[np.arange(len(source)), target] = 1
+    incidence[np.arange(len(source)), source] = -1
+    root_weight = np.sqrt(weight)[:, None]
+    expected, *_ = np.linalg.lstsq(root_weight * incidence, root_weight * difference)
+    for found in fitted:
+        np.testing.assert_allclose(found, expected - expected[3], atol=1e-8)
+
+
+def test_weights_over_the_whole_range_of_doubles_stay_finite() -> None:
+    source, target = np.arange(9), np.arange(1, 10)
+    weight = 10.0 ** np.array([-200, 200, -30, 30, -300, 0, 300, 5, -5])
+    fitted = LaplacianSystem(10, source, target, weight, np.array([0])).fit(np.ones((9, 1)))
+    assert np.isfinite(fitted).all()
+
+
+def test_other_weights_and_a_known_order_give_the_same_solution() -> None:
+    rng = np.random.default_rng(1)
+    source, target = random_graph(400, 300, rng)
+    weight, difference = rng.uniform(0.1, 10, len(source)), rng.standard_normal((len(source), 3))
+    pattern = LaplacianPattern(400, source, target, np.array([0]))
+    factorised = pattern.factorize(weight)
+    again = LaplacianPattern(400, source, target, np.array([0]), pattern.rank).factorize(weight)
+    np.testing.assert_allclose(again.fit(difference), factorised.fit(difference), rtol=1e-9, atol=1e-9)
+    # A little iteration is enough for the first, and not for the second.
+    for spread in (0.1, 3.0):
+        changed = weight * np.exp(spread * rng.standard_normal(len(weight)))
+        exact = pattern.factorize(changed).fit(difference)
+        error = np.abs(pattern.near(changed, factorised).fit(difference) - exact).max()
+        assert error < 1e-2 * np.abs(exact).max()
+
+
+def test_leverage_is_told_from_a_few_probes_however_large_it_is() -> None:
+    rng = np.random.default_rng(2)
+    source, target = random_graph(300, 120, rng)
+    weight = 10.0 ** rng.uniform(-2, 2, len(source))
+    system = LaplacianSystem(300, source, target, weight, np.array([0]))
+    incidence = np.zeros((300, len(source)))
+    incidence[target, np.arange(len(source))], incidence[source, np.arange(len(source))] = 1.0, -1.0
+    exact = weight * np.einsum("ne,ne->e", incidence, system.solve(incidence))
+    assert (exact > 0.9).sum() > 50
+    signs = probe_signs(source, target, 48)
+    samples = system.samples(signs)
+    scaled = np.sqrt(weight)[:, None] * (samples[target] - samples[source])
+    leverage = likeliest_leverage((scaled**2).mean(axis=1), (scaled * signs).mean(axis=1))
+    judged = (exact > 0.5) & (exact < 0.999)
+    # By how much an edge is less certain without itself; from the mean square alone: 1.6 in the mean.
+    error = np.log((1 - leverage[judged]) / (1 - exact[judged]))
+    assert np.sqrt((error**2).mean()) < 0.3
+
+
+def test_a_node_without_edges_stays_where_it_is() -> None:
+    nothing = np.empty(0, dtype=np.int64)
+    pattern = LaplacianPattern(1, nothing, nothing, np.array([0]))
+    np.testing.assert_array_equal(pattern.factorize(np.empty(0)).fit(np.empty((0, 3))), np.zeros((1, 3)))

@@ -1,0 +1,145 @@
+"""The contraction of odometry chains against the whole graph, and its bookkeeping against networkx."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import networkx
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rotavg_ros import EdgeKind, ViewGraph, rotations
+from rotavg_ros.solver.algebra.laplacian import LaplacianSystem
+from rotavg_ros.solver.algebra.residuals import edge_residual
+from rotavg_ros.solver.algebra.spanning_forest import minimum_spanning_forest
+from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract
+from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths
+from test.solver.graphs import measured, random_truth, slam_edges, small_noise
+
+
+def _contract(graph: ViewGraph) -> ClosureGraph:
+    return contract(graph, minimum_spanning_forest(graph, torch.where(graph.is_odometry, 1.0, 1e6)))
+
+
+def _slam_graph(num_nodes: int, num_closures: int, seed: int, noise_deg: float = 0.5) -> ViewGraph:
+    source, target, kind = slam_edges(num_nodes, num_closures, seed)
+    noise = small_noise(len(source), noise_deg, seed)
+    return measured(random_truth(num_nodes, seed), source, target, noise, kind=kind)
+
+
+@given(st.integers(6, 60), st.integers(0, 12), st.integers(0, 10**6))
+def test_every_edge_lies_in_one_place(num_nodes: int, num_closures: int, seed: int) -> None:
+    graph = _slam_graph(num_nodes, num_closures, seed)
+    contracted = _contract(graph)
+    on_segment = contracted.segment_of_edge >= 0
+    assert sorted(np.flatnonzero(~on_segment)) == sorted(contracted.view_graph_edge)
+    assert graph.is_odometry.numpy()[on_segment].all()
+    counts = np.bincount(contracted.segment_of_edge[on_segment], minlength=contracted.num_segments)
+    assert np.array_equal(counts, contracted.steps[: contracted.num_segments])
+    ends = set(graph.source[num_nodes - 1 :].tolist()) | set(graph.target[num_nodes - 1 :].tolist())
+    assert set(contracted.nodes.tolist()) == ends | {0, num_nodes - 1}
+
+
+@given(st.integers(6, 60), st.integers(1, 12), st.integers(0, 10**6))
+def test_path_steps_are_networkxs(num_nodes: int, num_closures: int, seed: int) -> None:
+    """On a branching odometry: each node hangs on a random earlier one."""
+    rng = np.random.default_rng(seed)
+    parent = np.array([rng.integers(max(0, node - 4), node) for node in range(1, num_nodes)])
+    backward = rng.random(num_nodes - 1) < 0.5
+    source = np.where(backward, np.arange(1, num_nodes), parent)
+    target = np.where(backward, parent, np.arange(1, num_nodes))
+    start = rng.integers(0, num_nodes, num_closures)
+    end = (start + rng.integers(1, num_nodes, num_closures)) % num_nodes
+    kind = np.repeat([EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE], [num_nodes - 1, num_closures])
+    graph = measured(random_truth(num_nodes, seed), np.r_[source, start], np.r_[target, end], kind=kind)
+    contracted = _contract(graph)
+    tree = networkx.Graph(list(zip(source.tolist(), target.tolist(), strict=True)))
+    for edge, steps in zip(contracted.view_graph_edge, contracted.path_steps[contracted.num_segments :], strict=True):
+        expected = networkx.shortest_path_length(tree, int(graph.source[edge]), int(graph.target[edge]))
+        assert steps == expected
+
+
+def test_path_steps_are_infinite_where_odometry_does_not_connect() -> None:
+    """Two robots, two closures between them."""
+    source, target = np.array([0, 1, 3, 4, 0, 2]), np.array([1, 2, 4, 5, 3, 5])
+    kind = [0, 0, 0, 0, 1, 1]
+    contracted = _contract(measured(random_truth(6, 0), source, target, kind=kind))
+    assert np.isinf(contracted.path_steps[contracted.num_segments :]).all()
+    assert len(contracted.roots) == 1
+    # Positions along the odometry keep the robots far apart.
+    position = dict(zip(contracted.nodes.tolist(), contracted.position.tolist(), strict=True))
+    assert abs(position[0] - position[3]) > 6
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_least_squares_on_the_contraction_is_least_squares_on_the_graph(seed: int) -> None:
+    """One linear step on all nodes, against one on the key nodes spread over the chains."""
+    graph = _slam_graph(80, 9, seed, noise_deg=1e-3)
+    contracted = _contract(graph)
+    variance = np.where(graph.is_odometry.numpy(), 2.0, 5.0)
+    start = contracted.odometry_orientation
+    residual = rotations.log(edge_residual(start, graph.target_from_source, graph.source, graph.target)).numpy()
+    whole = LaplacianSystem(80, graph.source.numpy(), graph.target.numpy(), 1 / variance, np.array([0]))
+    expected = rotations.multiply(start, rotations.exp(torch.from_numpy(whole.fit(residual))))
+
+    weight = 1 / (contracted.steps * np.where(contracted.is_odometry, 2.0, 5.0))
+    small = LaplacianSystem(contracted.num_nodes, contracted.source, contracted.target, weight, contracted.roots)
+    step = small.fit(rotations.log(contracted.residual).numpy())
+    actual = contracted.orientations(rotations.exp(torch.from_numpy(step)))
+    assert float(rotations.angle_between(actual, expected).max()) < 1e-8
+
+
+def test_corrections_invert_orientations_at_key_nodes() -> None:
+    contracted = _contract(_slam_graph(50, 6, 3))
+    correction = rotations.random(contracted.num_nodes, generator=torch.Generator().manual_seed(0))
+    recovered = contracted.corrections(contracted.orientations(correction))
+    assert float(rotations.angle_between(recovered, correction).max()) < 1e-7
+
+
+def test_graphs_without_closures_or_without_odometry() -> None:
+    chain = _contract(_slam_graph(30, 0, 0))
+    assert chain.num_nodes == 2 and chain.num_segments == 1 and chain.steps.tolist() == [29]
+    loops = measured(random_truth(3, 0), np.array([0, 1, 2]), np.array([1, 2, 0]))
+    contracted = _contract(loops)
+    assert contracted.num_segments == 0 and contracted.num_nodes == 3
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_paths_that_grow_are_those_of_the_grown_graph(seed: int) -> None:
+    graph = _slam_graph(60, 20, seed)
+    arrival = torch.maximum(graph.source, graph.target)
+    graph = graph.select_edges(torch.argsort(arrival, stable=True))
+    arrival = arrival.sort().values
+    paths: OdometryPaths | None = None
+    for num_nodes in (30, 31, 45, 45, 60):
+        part = replace(graph.select_edges(arrival < num_nodes), num_nodes=num_nodes)
+        forest = minimum_spanning_forest(part, torch.where(part.is_odometry, 1.0, 1e6))
+        whole = OdometryPaths.along(part, forest)
+        paths = whole if paths is None else paths.grown(part)
+        assert paths is not None
+        for name in ("hangs_on_odometry", "depth", "level", "chain", "outside", "path_steps"):
+            np.testing.assert_array_equal(getattr(paths, name), getattr(whole, name), err_msg=name)
+        for name in ("parent", "parent_edge", "component"):
+            np.testing.assert_array_equal(getattr(paths.forest, name), getattr(whole.forest, name), err_msg=name)
+        torch.testing.assert_close(paths.orientation, whole.orientation, rtol=0, atol=1e-12)
+        torch.testing.assert_close(paths.residual, whole.residual, rtol=0, atol=1e-12)
+
+
+def test_paths_that_would_have_to_be_laid_anew_do_not_grow() -> None:
+    graph = _slam_graph(30, 8, 2)
+    early = replace(graph.select_edges(torch.maximum(graph.source, graph.target) < 20), num_nodes=20)
+    paths = OdometryPaths.along(early, minimum_spanning_forest(early, torch.where(early.is_odometry, 1.0, 1e6)))
+
+    def with_edge(source: int, target: int, kind: EdgeKind, num_nodes: int = 20) -> ViewGraph:
+        ends = [*early.source.tolist(), source], [*early.target.tolist(), target]
+        measured_too = torch.cat((early.target_from_source, rotations.identity(1)))
+        kinds = torch.cat((early.kind, torch.tensor([int(kind)])))
+        return ViewGraph.create(*ends, measured_too, kind=kinds, num_nodes=num_nodes)
+
+    assert paths.grown(with_edge(19, 20, EdgeKind.ODOMETRY, 21)) is not None
+    assert paths.grown(with_edge(2, 12, EdgeKind.LOOP_CLOSURE)) is not None
+    assert paths.grown(with_edge(2, 12, EdgeKind.ODOMETRY)) is None  # another way along odometry
+    assert paths.grown(with_edge(2, 20, EdgeKind.LOOP_CLOSURE, 21)) is None  # a chain of its own

@@ -1,0 +1,241 @@
+"""Odometry that slips: votes of closures, jumps, and solves on small graphs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import networkx
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from scipy.stats import ncx2
+
+from rotavg_ros import EdgeKind, ViewGraph, rotations, solve
+from rotavg_ros.datasets.graph_file import read_graph
+from rotavg_ros.evaluation import slam_cases, slam_contenders, slam_scoring
+from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.solver.algebra.minimum_cut import FlowNetwork
+from rotavg_ros.solver.slam import preparation as slam_preparation
+from rotavg_ros.solver.slam.moves.cycle_votes import count_votes
+from rotavg_ros.solver.slam.moves.jumps import _turns
+from rotavg_ros.solver.slam.moves.slip_search import _jump, prior_log_odds
+from rotavg_ros.solver.slam.moves.truncated_cost import TruncatedCost
+from rotavg_ros.solver.slam.noise.exceedance import exceedance
+from rotavg_ros.solver.slam.noise.model import NoiseModel, agree, noise_between_neighbours
+from test.solver.graphs import as_quaternions, measured, random_truth, small_noise
+
+LAP, LAPS = 40, 4
+SLIPS = {25: 50.0, 90: -35.0}  # after these nodes, degrees
+
+
+def laps(
+    planar: bool, false_share: float, seed: int = 0, num_laps: int = LAPS, slips: dict[int, float] = SLIPS
+) -> tuple[ViewGraph, Rotation, np.ndarray, np.ndarray]:
+    """Laps with a closure to every earlier lap at each node; odometry slips. Truth, false closures, slips."""
+    rng = np.random.default_rng(seed)
+    num_nodes = LAP * num_laps
+    truth = random_truth(num_nodes, seed, planar)
+    first, second = np.triu_indices(num_laps, 1)
+    place = np.arange(LAP)[:, None]
+    source, target = (place + LAP * first).ravel(), (place + LAP * second).ravel()
+    num_closures = len(source)
+    source = np.concatenate((np.arange(num_nodes - 1), source))
+    target = np.concatenate((np.arange(1, num_nodes), target))
+    sigma = np.repeat([0.1, 0.5], [num_nodes - 1, num_closures])
+    noise = small_noise(len(source), sigma, seed, planar)
+    is_false = np.zeros(len(source), dtype=bool)
+    is_false[num_nodes - 1 + rng.permutation(num_closures)[: round(false_share * num_closures)]] = True
+    wrong = Rotation.random(int(is_false.sum()), random_state=seed).as_rotvec()
+    vector = noise.as_rotvec()
+    vector[is_false] = [0, 0, 1] * rng.uniform(-np.pi, np.pi, (len(wrong), 1)) if planar else wrong
+    for step, angle in slips.items():
+        vector[step] = np.radians(angle) * np.array([0, 0, 1.0] if planar else [0.6, 0, 0.8])
+    kind = np.repeat([EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE], [num_nodes - 1, num_closures])
+    graph = measured(truth, source, target, Rotation.from_rotvec(vector), kind=kind)
+    return graph, truth, is_false, np.isin(np.arange(len(source)), list(slips))
+
+
+@pytest.mark.parametrize("planar", [True, False])
+@pytest.mark.parametrize("false_share", [0.0, 0.3])
+def test_slips_and_false_closures_are_told_apart(planar: bool, false_share: float) -> None:
+    graph, truth, is_false, is_slip = laps(planar, false_share)
+    solution = solve(graph, profile="slam")
+    errors = orientation_errors(solution.body_from_world, as_quaternions(truth), graph.components())
+    assert np.degrees(float(errors.mean())) < 0.5
+    flagged = (solution.outlier_score > 0.5).numpy()
+    assert (flagged[is_slip]).all()
+    assert not flagged[~is_false & ~is_slip].any()
+    without = solve(graph, profile="slam", method="neurora-without-slip-search")
+    errors = orientation_errors(without.body_from_world, as_quaternions(truth), graph.components())
+    assert np.degrees(float(errors.mean())) > 5
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_slips_that_nearly_cancel_do_not_pass_for_drift(seed: int) -> None:
+    graph, truth, is_false, is_slip = laps(
+        planar=True, false_share=0.3, seed=seed, num_laps=3, slips={25: 50.0, 29: -40.0, 90: -35.0, 100: 30.0}
+    )
+    solution = solve(graph, profile="slam")
+    errors = orientation_errors(solution.body_from_world, as_quaternions(truth), graph.components())
+    assert np.degrees(float(errors.mean())) < 0.5
+    flagged = (solution.outlier_score > 0.5).numpy()
+    assert flagged[is_slip].all()
+    assert not flagged[~is_false & ~is_slip].any()
+
+
+@pytest.mark.parametrize("planar", [True, False])
+def test_a_slip_that_few_closures_span_is_found(planar: bool) -> None:
+    """Near the end of the run one closure in nine spans it; each of those speaks against the odometry there."""
+    graph, truth, _, is_slip = laps(planar, false_share=0.0, slips={150: 40.0})
+    solution = solve(graph, profile="slam")
+    errors = orientation_errors(solution.body_from_world, as_quaternions(truth), graph.components())
+    assert np.degrees(float(errors.mean())) < 0.5
+    np.testing.assert_array_equal((solution.outlier_score > 0.5).numpy(), is_slip)
+
+
+def test_groups_of_false_closures_do_not_pass_for_slips() -> None:
+    """A stretch of the second lap that all its closures turn alike could be two slips, at a lower cost one by one."""
+    graph = laps(planar=True, false_share=0.0, num_laps=3, slips={})[0]
+    source, target = graph.source.numpy(), graph.target.numpy()
+    in_group = (graph.kind == EdgeKind.LOOP_CLOSURE).numpy() & (source % LAP >= 10) & (source % LAP < 18)
+    in_group &= (source < LAP) & (target < 2 * LAP)
+    turn = rotations.exp(torch.tensor([0.0, 0.0, np.radians(40.0)]).double()).expand(graph.num_edges, 4)
+    turned = rotations.multiply(graph.target_from_source, turn)
+    wrong = torch.where(torch.from_numpy(in_group)[:, None], turned, graph.target_from_source)
+    solution = solve(replace(graph, target_from_source=wrong), profile="slam")
+    np.testing.assert_array_equal((solution.outlier_score > 0.5).numpy(), in_group)
+
+
+@pytest.mark.parametrize(
+    ("graph_name", "condition", "share", "seed", "bound"),
+    [
+        # Odometry drifts unevenly; calling good closures false for that tripled the error.
+        pytest.param("FR079", "10 % random", 0.1, 5, 1.5, id="a closure alone ties a loop"),
+        # What the rest predicts of a closure, of passes before: 4.6 times the oracle's error.
+        pytest.param("manhattan", "80 % random", 0.8, 2, 2.5, id="verdicts change much"),
+        # Slips that made a solution reject five of eight closures were not searched for: 300 times.
+        pytest.param("intel", slam_cases.SLIPS, 0.3, 4, 10.0, id="some agreeing closures rejected, of most"),
+        # A false group that no good closure crosses passed for a slip: 3.3 times.
+        pytest.param("KITTI_06", slam_cases.GROUPED, 0.3, 18, 1.5, id="a step that a group contradicts"),
+        # A slip that one bundle of closures spans was not searched for: 3.8 times.
+        pytest.param("KITTI_05", slam_cases.SLIPS, 0.3, 42, 1.5, id="a step that all closures contradict"),
+    ],
+)
+def test_graphs_that_once_went_astray(
+    shared_data: Path, graph_name: str, condition: str, share: float, seed: int, bound: float
+) -> None:
+    cases = slam_cases.cases(shared_data, [graph_name], [share], [seed], hard="random" not in condition)
+    case = next(case for case in cases if case.condition == condition)
+    scores = slam_scoring.score_all([case], slam_contenders.contenders(["neurora", "oracle"]))
+    (ratio,) = scores.ratios("neurora", [graph_name]).values()
+    assert ratio < bound
+
+
+def test_a_group_on_a_real_robot_is_no_slip(shared_data: Path) -> None:
+    """Twelve of the first 37 closures agree on a half turn; believed, with a slip for it, they bent the map by 50°."""
+    graph = read_graph(shared_data / "slam" / "b25b" / "B25b_0.000.g2o").graph
+    early = graph.select_edges((graph.source < 1690) & (graph.target < 1690))
+    by_odometry = solve(early.select_edges(early.is_odometry)).body_from_world[:1690]
+    turned = rotations.angle_between(solve(early).body_from_world[:1690], by_odometry)
+    assert np.degrees(float(turned.max())) < 5
+
+
+def test_the_answer_depends_on_neither_order_nor_gauge() -> None:
+    graph, _, _, _ = laps(planar=False, false_share=0.3)
+    before = solve(graph, profile="slam")
+    order = torch.from_numpy(np.random.default_rng(1).permutation(graph.num_edges))
+    shuffled = ViewGraph.create(
+        graph.source[order], graph.target[order], graph.target_from_source[order], kind=graph.kind[order]
+    )
+    after = solve(shuffled, profile="slam")
+    torch.testing.assert_close(after.outlier_score, before.outlier_score[order], atol=1e-6, rtol=0)
+    torch.testing.assert_close(after.body_from_world, before.body_from_world, atol=1e-6, rtol=0)
+
+
+def test_closures_vote_without_the_odometry_between() -> None:
+    graph, _, is_false, is_slip = laps(planar=True, false_share=0.3)
+    prepared = slam_preparation.prepare(graph)
+    closures = prepared.closure_graph
+    noise = noise_between_neighbours(prepared.pairs, 1)
+    assert np.degrees(np.sqrt(noise.closure_variance)) == pytest.approx(0.5, rel=0.4)
+    votes = count_votes(
+        closures,
+        prepared.pairs,
+        noise,
+        np.full(int(closures.is_closure.sum()), noise.prior_log_odds),
+        np.full(closures.num_segments, 6.0),
+    )
+    good = ~is_false[closures.view_graph_edge]
+    assert ((votes.closure > 0) == good).mean() > 0.95
+    assert (votes.segment[closures.segment_of_edge[is_slip]] < 6.0).all()
+
+
+def test_a_jump_takes_the_set_that_an_exhaustive_search_finds() -> None:
+    """Against all 2⁸ labellings of a small graph, their costs from above as in the cut."""
+    rng = np.random.default_rng(0)
+    num_nodes = 8
+    ends = np.array(list(networkx.gnm_random_graph(num_nodes, 16, seed=3).edges)).T
+    kind = np.full(ends.shape[1], EdgeKind.LOOP_CLOSURE)
+    chain = np.arange(num_nodes - 1)
+    source = np.concatenate((chain, ends[0]))
+    target = np.concatenate((chain + 1, ends[1]))
+    turned = np.where(rng.random(len(source)) < 0.4, np.radians(40.0), 0.0)
+    vector = turned[:, None] * np.array([0, 0, 1.0])
+    kind = np.concatenate((np.full(num_nodes - 1, EdgeKind.ODOMETRY), kind))
+    truth = Rotation.identity(num_nodes)
+    graph = measured(truth, source, target, Rotation.from_rotvec(vector), kind=kind)
+    closures = slam_preparation.prepare(graph).closure_graph
+    noise = NoiseModel(1, np.radians(1.0) ** 2, np.radians(1.0) ** 2, 0.3)
+    cost = TruncatedCost.create(closures, noise, np.zeros(len(closures.source)))
+    residual = cost.residual(rotations.identity(closures.num_nodes))
+    costs = cost.of_edges(residual)
+    turn = rotations.exp(torch.tensor([0.0, 0.0, np.radians(40.0)]).double())
+    alone_target = cost.of_edges(rotations.multiply(rotations.inverse(turn).expand(len(residual), 4), residual))
+    alone_source = cost.of_edges(rotations.multiply(residual, turn.expand(len(residual), 4)))
+    smaller_target = alone_target < alone_source
+    source_cost = np.where(smaller_target, np.maximum(alone_source, 2 * costs - alone_target), alone_source)
+    target_cost = np.where(smaller_target, alone_target, np.maximum(alone_target, 2 * costs - alone_source))
+
+    def energy(turns: np.ndarray) -> float:
+        u, v = turns[closures.source], turns[closures.target]
+        return float(np.where(u == v, costs, np.where(u, source_cost, target_cost)).sum())
+
+    bits = (np.arange(2**closures.num_nodes)[:, None] >> np.arange(closures.num_nodes)) & 1 == 1
+    least = min(energy(turns) for turns in bits)
+    assert least < costs.sum() - 1
+    question = _turns(cost, residual, turn[None], costs)
+    network = FlowNetwork(closures.num_nodes, closures.source, closures.target)
+    assert energy(question.best_set(network)) == pytest.approx(least, abs=0.05)
+    gained = float(costs.sum()) - least
+    for weight in (np.ones(len(costs)), 1e-6 + cost.cap - costs):
+        (bound,) = question.gain_bounds(cost.pattern.factorize(weight))
+        assert gained <= bound + 1e-6
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_stretch_that_slips_cut_in_two_is_turned_part_by_part(seed: int) -> None:
+    """Two closures want either part turned: less than the slips that a first jump adds, more than all of them."""
+    graph, truth, _, _ = laps(
+        planar=True, false_share=0.0, seed=seed, num_laps=2, slips={20: 50.0, 22: -35.0, 24: -15.0}
+    )
+    prepared = slam_preparation.prepare(graph)
+    closures, pairs = prepared.closure_graph, prepared.pairs
+    noise = NoiseModel(1, np.radians(0.1) ** 2, np.radians(0.5) ** 2, 0.3)
+    prior = np.zeros(len(closures.source))
+    costs = [TruncatedCost.create(closures, noise, prior_log_odds(closures, noise, prior, p)) for p in (0.5, 0.01)]
+    start = rotations.identity(closures.num_nodes)
+    everyone = np.ones(int(closures.is_closure.sum()), dtype=bool)
+    found = _jump(costs, start, pairs, agree(pairs, noise), everyone)
+    at_truth = costs[-1].descend(closures.corrections(as_quaternions(truth)))
+    assert costs[-1].total(found) < costs[-1].total(at_truth) + 0.1
+    assert costs[-1].total(_jump(costs[-1:], start, pairs, agree(pairs, noise), everyone)) > costs[-1].total(found) + 10
+
+
+def test_exceedance_is_the_noncentral_chi_distribution() -> None:
+    length, sigma = np.radians([0.0, 5.0, 9.9, 30.0]), np.radians([1.0, 3.0, 8.0, 2.0])
+    angle = np.radians(10.0)
+    for components in (1, 3):
+        expected = ncx2.sf((angle / sigma) ** 2, components, (length / sigma) ** 2)
+        np.testing.assert_allclose(exceedance(length, sigma**2, angle, components), expected, atol=1e-7)
