@@ -10,6 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from rotavg_ros.hamilton import hamilton_product
+
 # Below this squared angle (rad²) the series of sin(x)/x is exact to double precision.
 _SMALL_ANGLE_SQUARED = 1e-8
 
@@ -23,17 +25,7 @@ def identity(*shape: int, dtype: torch.dtype = torch.float64, device: torch.devi
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product ``a ∘ b``, shapes ``(..., 4)``."""
-    ax, ay, az, aw = a.unbind(-1)
-    bx, by, bz, bw = b.unbind(-1)
-    return torch.stack(
-        (
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-            aw * bw - ax * bx - ay * by - az * bz,
-        ),
-        dim=-1,
-    )
+    return torch.stack(hamilton_product(a.unbind(-1), b.unbind(-1)), dim=-1)
 
 
 def inverse(a: Tensor) -> Tensor:

@@ -1,13 +1,14 @@
-"""Quaternion algebra in numpy for small graphs: components in rows, ``(4, n)``.
+"""The row-wise twin of ``rotations.py``: the same algebra in numpy, components in rows, ``(4, n)``.
 
 A SLAM solve of a few hundred edges spends more time in calling operations than in them, and a call of numpy's takes
-half as long as one of torch's. For large graphs, and on GPUs, the same is in ``residuals.py`` for tensors. The
-conventions are those of ``rotations.py``.
+half as long as one of torch's. The conventions are those of ``rotations.py``; the tests compare the two.
 """
 
 from __future__ import annotations
 
 import numpy as np
+
+from rotavg_ros.hamilton import hamilton_product
 
 # So small a squared sine or angle counts as this, which makes angle / sine what it is in the limit instead of 0/0.
 _MIN_SQUARE = 1e-30
@@ -16,12 +17,8 @@ _MIN_SQUARE = 1e-30
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Hamilton product ``a ∘ b``, ``(4, n)``; either may be one rotation for all, ``(4, 1)``."""
     # A matrix product would wake all threads of BLAS for this: twice the CPU time of a whole tick.
-    (ax, ay, az, aw), (bx, by, bz, bw) = a, b
     product = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    product[0] = aw * bx + ax * bw + ay * bz - az * by
-    product[1] = aw * by - ax * bz + ay * bw + az * bx
-    product[2] = aw * bz + ax * by - ay * bx + az * bw
-    product[3] = aw * bw - ax * bx - ay * by - az * bz
+    product[0], product[1], product[2], product[3] = hamilton_product(a, b)
     return product
 
 
@@ -57,7 +54,7 @@ def exp(vector: np.ndarray) -> np.ndarray:
 
 
 def residual(correction: np.ndarray, measured: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """``(4, E)`` of either sign, what ``fine_net.edge_residual`` computes, from ``(4, K)`` and ``(4, E)``."""
+    """``(4, E)`` of either sign, what ``residuals.edge_residual`` computes, from ``(4, K)`` and ``(4, E)``."""
     at_target = correction.take(target, axis=1)
     np.negative(at_target[:3], out=at_target[:3])
     return multiply(at_target, multiply(measured, correction.take(source, axis=1)))

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.algebra.pointer_jumping import doublings
 from rotavg_ros.solver.algebra.residuals import multiply_rows
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.view_graph import ViewGraph
@@ -104,14 +105,10 @@ def compose_orientations(forest: SpanningForest, graph: ViewGraph) -> Tensor:
     rows[:, child] = graph.target_from_source.numpy().take(edge, axis=0).T
     leaves_child = graph.target.numpy().take(edge) != child
     rows[:3, child[leaves_child]] *= -1.0
-    ancestor = forest.parent
-    while True:
-        farther = ancestor.take(ancestor)
-        if np.array_equal(farther, ancestor):
-            unit = quaternion_rows.normalize(rows) * np.where(rows[3] < 0, -1.0, 1.0)
-            return torch.from_numpy(np.ascontiguousarray(unit.T))
+    for ancestor, _ in doublings(forest.parent):
         rows = quaternion_rows.multiply(rows, rows.take(ancestor, axis=1))
-        ancestor = farther
+    unit = quaternion_rows.normalize(rows) * np.where(rows[3] < 0, -1.0, 1.0)
+    return torch.from_numpy(np.ascontiguousarray(unit.T))
 
 
 def compose(parent: Tensor, parent_edge: Tensor, graph: ViewGraph) -> Tensor:
@@ -125,25 +122,17 @@ def compose(parent: Tensor, parent_edge: Tensor, graph: ViewGraph) -> Tensor:
     node_from_ancestor = rotations.identity(len(parent), device=parent.device)
     node_from_ancestor[child] = child_from_parent
     rows = node_from_ancestor.t().contiguous()
-    ancestor = parent
-    while True:
-        farther = ancestor[ancestor]
-        if torch.equal(farther, ancestor):
-            return rotations.normalize(rows.t().contiguous())
+    for ancestor, _ in doublings(parent):
         rows = multiply_rows(rows, rows.index_select(1, ancestor))
-        ancestor = farther
+    return rotations.normalize(rows.t().contiguous())
 
 
 def accumulate_to_root(forest: SpanningForest, value: np.ndarray) -> np.ndarray:
     """Sum of ``value`` ``(N, …)`` over each node's way to its root; a node's value belongs to its parent edge."""
     total = value * (forest.parent_edge >= 0).reshape(-1, *(1,) * (value.ndim - 1))
-    ancestor = forest.parent
-    while True:
-        farther = ancestor[ancestor]
-        if np.array_equal(farther, ancestor):
-            return total
+    for ancestor, _ in doublings(forest.parent):
         total = total + total[ancestor]
-        ancestor = farther
+    return total
 
 
 @dataclass(frozen=True)

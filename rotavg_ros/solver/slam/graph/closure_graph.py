@@ -20,8 +20,9 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.algebra.pointer_jumping import follow
 from rotavg_ros.solver.algebra.spanning_forest import SpanningForest
-from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths, follow
+from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths
 from rotavg_ros.view_graph import ViewGraph
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.pointer_jumping import doublings, follow
 from rotavg_ros.solver.algebra.residuals import edge_residual
 from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root, compose_orientations
 from rotavg_ros.view_graph import ViewGraph
@@ -137,15 +138,6 @@ class OdometryPaths:
         )
 
 
-def follow(pointer: np.ndarray) -> np.ndarray:
-    """The fixed point that each chain of pointers ends in."""
-    while True:
-        farther = pointer[pointer]
-        if np.array_equal(farther, pointer):
-            return pointer
-        pointer = farther
-
-
 def _canonical_order(graph: ViewGraph, edges: np.ndarray) -> np.ndarray:
     """By their ends, parallels by angle."""
     source, target = graph.source.numpy()[edges], graph.target.numpy()[edges]
@@ -156,9 +148,7 @@ def _canonical_order(graph: ViewGraph, edges: np.ndarray) -> np.ndarray:
 def _path_length(paths: OdometryPaths, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Length of the ways between nodes of the same tree, by lifting both to their lowest common ancestor."""
     parent, depth, level = paths.forest.parent, paths.depth, paths.level
-    jumps = [parent]
-    while not np.array_equal(jumps[-1][jumps[-1]], jumps[-1]):
-        jumps.append(jumps[-1][jumps[-1]])
+    jumps = [parent, *(farther for _, farther in doublings(parent))]
     low, high = np.where(level[a] >= level[b], a, b), np.where(level[a] >= level[b], b, a)
     excess = level[low] - level[high]
     for power, jump in enumerate(jumps):
