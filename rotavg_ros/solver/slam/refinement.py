@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from torch import Tensor
 
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.moves.moved_slips import with_moved_slips
-from rotavg_ros.solver.slam.noise.common_error import closure_runs, common_share, variance_factor
+from rotavg_ros.solver.slam.noise.common_error import RunErrors, closure_runs, common_share, variance_factor
 from rotavg_ros.solver.slam.noise.drift_posterior import expected_step_variance
-from rotavg_ros.solver.slam.noise.model import NoiseModel
 from rotavg_ros.solver.slam.noise.stated_precision import NO_TRUST, StatedTrust, believing, estimate_trust
-from rotavg_ros.solver.slam.passes.alternation import Passes, SlamEstimate
+from rotavg_ros.solver.slam.passes.alternation import Passes, SlamEstimate, Start
 from rotavg_ros.solver.slam.passes.group_verdicts import false_groups
 from rotavg_ros.solver.slam.passes.system import WholeSystem
 
@@ -33,13 +31,9 @@ _MAX_NODES_TO_DRAW_AGAIN = 2000
 
 
 def refine(
-    graph: ClosureGraph,
+    start: Start,
     pairs: AgreementPairs,
-    correction: Tensor,
-    inlier_probability: np.ndarray,
-    noise: NoiseModel,
     *,
-    log_odds: np.ndarray | None = None,
     max_passes: int = MAX_PASSES,
     hold_noise: bool = False,
     rank: np.ndarray | None = None,
@@ -48,17 +42,13 @@ def refine(
 
     Args:
         pairs: the graph's neighbouring closures.
-        correction: ``(K, 4)`` start; identities for the odometry itself.
-        inlier_probability: ``(E,)`` start; that of odometry is kept.
-        noise: start.
-        log_odds: ``(E,)`` prior log-odds of each edge to be good, beyond the common outlier share; ±inf decide it.
         max_passes: sparse solves at most, at least 1.
         hold_noise: keep both variances as given.
         rank: ``(K,)`` where each key node stands in the order of elimination, if that is known.
     """
-    prior = np.zeros(len(graph.source)) if log_odds is None else log_odds
+    graph, noise = start.graph, start.noise
     system = WholeSystem(graph, rank)
-    state = Passes(graph, correction, inlier_probability, noise, prior, hold_noise, system)
+    state = Passes(start, system, hold_noise)
     max_step_variance = _MAX_STEP_VARIANCE_GAIN * noise.step_variance
     state.alternate(max_step_variance, (max_passes + 1) // 2)
     share, trust = 0.0, NO_TRUST
@@ -71,13 +61,13 @@ def refine(
         trust = NO_TRUST if hold_noise or not state.has_predictions else _estimate_trust(state, run, share)
         is_believed = trust.exponent > 0
         if is_believed:
-            state.graph = believing(graph, trust)
+            state.weigh_anew(believing(graph, trust))
             state.alternate(max_step_variance, min(state.passes + _BELIEVING_PASSES, max_passes))
             run = _runs(state, pairs)
             share = _common_share(state, system, run)
         if share > _MIN_COMMON_SHARE:
-            state.graph = _with_common_errors(state, run, share)
-            state.noise = replace(state.noise, step_variance=min(noise.step_variance, state.noise.step_variance))
+            bounded = replace(state.noise, step_variance=min(noise.step_variance, state.noise.step_variance))
+            state.weigh_anew(_with_common_errors(state, run, share), bounded)
             max_step_variance = noise.step_variance
         if (share > _MIN_COMMON_SHARE or is_believed) and state.passes < max_passes:
             state.alternate(max_step_variance, max_passes)
@@ -116,15 +106,14 @@ def _common_share(state: Passes, system: WholeSystem, run: np.ndarray) -> float:
     closure = np.flatnonzero(graph.is_closure)
     # Closures run old → new and new → old; their errors compare in one direction only.
     direction = np.where(graph.position[graph.source] < graph.position[graph.target], 1.0, -1.0)[closure, None]
-    return common_share(
+    errors = RunErrors(
         run,
         state.inlier_probability[closure],
         direction * state.residual[closure],
         graph.own_steps[closure],
         direction * state.difference(system.samples)[closure],
-        state.noise.closure_variance,
-        state.noise.components,
     )
+    return common_share(errors, state.noise.closure_variance, state.noise.components)
 
 
 def estimate(

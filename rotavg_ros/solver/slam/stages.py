@@ -18,7 +18,7 @@ from rotavg_ros.solver.slam.moves.slip_doubt import Doubt, measure_doubt
 from rotavg_ros.solver.slam.moves.slip_search import search_for_slips
 from rotavg_ros.solver.slam.network import SlamCleanNet, closure_features, false_log_odds
 from rotavg_ros.solver.slam.noise.model import NoiseModel, judge_by_chain
-from rotavg_ros.solver.slam.passes.alternation import SlamEstimate
+from rotavg_ros.solver.slam.passes.alternation import SlamEstimate, Start
 from rotavg_ros.solver.slam.preparation import Prepared
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
@@ -111,35 +111,19 @@ def refine(
 
     If the outcome looks as if odometry had slipped, from a second start, too.
     """
-    graph, pairs, prior = prepared.closure_graph, prepared.pairs, cleaned.prior_log_odds
 
-    def run(
-        start: Tensor,
-        inlier_probability: np.ndarray,
-        noise: NoiseModel,
-        log_odds: np.ndarray,
-        rank: np.ndarray | None = None,
-    ) -> SlamEstimate:
+    def run(start: Start, rank: np.ndarray | None = None) -> SlamEstimate:
         return slam_refinement.refine(
-            graph,
-            pairs,
-            start,
-            inlier_probability,
-            noise,
-            log_odds=log_odds,
-            max_passes=max_passes,
-            hold_noise=not scale_estimation,
-            rank=rank,
+            start, prepared.pairs, max_passes=max_passes, hold_noise=not scale_estimation, rank=rank
         )
 
-    estimate = run(correction, cleaned.inlier_probability, prepared.noise, prior)
-    doubt = measure_doubt(graph, pairs, estimate, prepared.noise) if slip_search else Doubt.NONE
-    without = without_false_groups(run, estimate, graph, pairs, prepared.noise, prior, doubt)
+    prior = cleaned.prior_log_odds
+    estimate = run(Start(prepared.closure_graph, correction, cleaned.inlier_probability, prepared.noise, prior))
+    doubt = measure_doubt(prepared, estimate) if slip_search else Doubt.NONE
+    without = without_false_groups(run, estimate, prepared, prior, doubt)
     rivals = [estimate.correction] if without is estimate else [estimate.correction, without.correction]
-    second = search_for_slips(graph, pairs, estimate, prepared.noise, prior, doubt, rivals)
-    if second is None:
-        return without
-    return run(second.correction, second.inlier_probability, second.noise, prior, estimate.rank)
+    second = search_for_slips(prepared, estimate, prior, doubt, rivals)
+    return without if second is None else run(second, estimate.rank)
 
 
 def outlier_scores(graph: ClosureGraph, outlier_probability: np.ndarray) -> np.ndarray:

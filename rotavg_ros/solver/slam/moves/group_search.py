@@ -7,13 +7,12 @@ from typing import Protocol
 import numpy as np
 from torch import Tensor
 
-from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
-from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.moves.slip_doubt import Doubt
 from rotavg_ros.solver.slam.moves.slip_search import grouped_cost, prior_log_odds
 from rotavg_ros.solver.slam.moves.truncated_cost import TruncatedCost
-from rotavg_ros.solver.slam.noise.model import NoiseModel, agree, noise_between_neighbours
-from rotavg_ros.solver.slam.passes.alternation import SlamEstimate
+from rotavg_ros.solver.slam.noise.model import agree, noise_between_neighbours
+from rotavg_ros.solver.slam.passes.alternation import SlamEstimate, Start
+from rotavg_ros.solver.slam.preparation import Prepared
 
 # So often are false groups looked for; where there are some, others may show only without them.
 _MAX_ROUNDS = 4
@@ -22,39 +21,27 @@ _TIE = 1.0
 
 
 class Refinement(Protocol):
-    """Refines from corrections ``(K, 4)``, probabilities ``(E,)`` of being good, noise, and prior log-odds ``(E,)``.
+    """Refines from a start; the order of elimination, ``(K,)``, is given where it is known."""
 
-    The order of elimination, ``(K,)``, is given where it is known.
-    """
-
-    def __call__(
-        self,
-        start: Tensor,
-        inlier_probability: np.ndarray,
-        noise: NoiseModel,
-        log_odds: np.ndarray,
-        rank: np.ndarray | None = None,
-    ) -> SlamEstimate: ...
+    def __call__(self, start: Start, rank: np.ndarray | None = None) -> SlamEstimate: ...
 
 
 def without_false_groups(
     refine: Refinement,
     estimate: SlamEstimate,
-    graph: ClosureGraph,
-    pairs: AgreementPairs,
-    by_chain: NoiseModel,
+    prepared: Prepared,
     log_odds: np.ndarray,
     doubt: Doubt,
 ) -> SlamEstimate:
     """``estimate`` refined without false groups as long as there are some and it is worth it, else as it is.
 
     Args:
-        by_chain: the noise to begin with.
         log_odds: ``(E,)`` prior log-odds of each edge to be good, beyond the common outlier share; ±inf decide it.
         doubt: in ``estimate``.
     """
     if not estimate.in_false_group.any():
         return estimate
+    graph, pairs, by_chain = prepared.closure_graph, prepared.pairs, prepared.noise
     noise = noise_between_neighbours(pairs, by_chain.components)
     is_agreed = agree(pairs, noise)
     cost = TruncatedCost.create(graph, noise, prior_log_odds(graph, noise, log_odds), estimate.rank)
@@ -76,7 +63,7 @@ def without_false_groups(
         # What the network said for them goes by their agreement.
         log_odds = np.where(false, np.minimum(log_odds, 0.0), log_odds)
         probability = np.where(false, 0.0, estimate.inlier_probability)
-        without = refine(estimate.correction, probability, by_chain, log_odds, estimate.rank)
+        without = refine(Start(graph, estimate.correction, probability, by_chain, log_odds), estimate.rank)
         if not is_better(without.correction, estimate.correction):
             break
         estimate = without

@@ -38,66 +38,67 @@ def jump_to_optimum(
         is_agreed: ``(P,)`` bool, the pairs that agree.
         is_trusted: ``(C,)`` bool, closures whose residual is worth a jump.
     """
-    hopeless = np.zeros(len(cost.cap))
-    network = FlowNetwork(cost.graph.num_nodes, cost.graph.source, cost.graph.target)
+    jumps = _Jumps(cost, pairs, is_agreed, is_trusted)
     for _ in range(_MAX_ROUNDS):
-        jumped, gained = _round_of_jumps(cost, correction, pairs, is_agreed, is_trusted, hopeless, network)
+        jumped, gained = jumps.one_round(correction)
         if gained < _MIN_GAIN:
             break
         correction = min(jumped, cost.descend(jumped), key=cost.total)
     return correction
 
 
-def _round_of_jumps(
-    cost: TruncatedCost,
-    correction: Tensor,
-    pairs: AgreementPairs,
-    is_agreed: np.ndarray,
-    is_trusted: np.ndarray,
-    hopeless: np.ndarray,
-    network: FlowNetwork,
-) -> tuple[Tensor, float]:
-    """One jump by each wrong edge that still is one when its turn comes; corrections and the cost saved.
+class _Jumps:
+    """Rounds of jumps under one cost; the arguments are those of :func:`jump_to_optimum`."""
 
-    Args:
-        hopeless: ``(E,)`` what an edge's jump might have gained when it gained nothing; brought up to date.
-    """
-    residual = cost.residual(correction)
-    costs = cost.of_edges(residual)
-    gained = 0.0
-    candidates = _candidates(cost, costs, pairs, is_agreed, is_trusted)
-    if len(candidates) == 0:
-        return correction, gained
-    # What an edge loses if one end turns is what it is yet short of its cap, or less if it turns but a little.
-    system = cost.pattern.factorize(np.maximum(cost.cap - costs, _MIN_CARRIED))
-    questions = _turns(cost, residual, residual[candidates], costs)
-    bounds = questions.gain_bounds(system)
-    for number in np.flatnonzero(bounds > hopeless[candidates] + _MIN_GAIN):
-        edge = candidates[number]
-        if costs[edge] < 0.5 * cost.cap[edge]:
-            continue
-        # Until something turns, all questions stand as they were put at first.
-        question, column, bound = questions, int(number), float(bounds[number])
-        if gained > 0:
-            question, column = _turns(cost, residual, residual[[edge]], costs), 0
-            bound = float(question.gain_bounds(system)[0])
-            if bound <= hopeless[edge] + _MIN_GAIN:
+    def __init__(
+        self, cost: TruncatedCost, pairs: AgreementPairs, is_agreed: np.ndarray, is_trusted: np.ndarray
+    ) -> None:
+        self._cost, self._pairs, self._is_agreed, self._is_trusted = cost, pairs, is_agreed, is_trusted
+        # Of every edge, what its jump might have gained when it gained nothing.
+        self._hopeless = np.zeros(len(cost.cap))
+        self._network = FlowNetwork(cost.graph.num_nodes, cost.graph.source, cost.graph.target)
+
+    def one_round(self, correction: Tensor) -> tuple[Tensor, float]:
+        """One jump by each wrong edge that still is one when its turn comes; corrections and the cost saved."""
+        cost, hopeless = self._cost, self._hopeless
+        residual = cost.residual(correction)
+        costs = cost.of_edges(residual)
+        gained = 0.0
+        candidates = _candidates(cost, costs, self._pairs, self._is_agreed, self._is_trusted)
+        if len(candidates) == 0:
+            return correction, gained
+        # What an edge loses if one end turns is what it is yet short of its cap, or less if it turns but a little.
+        system = cost.pattern.factorize(np.maximum(cost.cap - costs, _MIN_CARRIED))
+        questions = _turns(cost, residual, residual[candidates], costs)
+        bounds = questions.gain_bounds(system)
+        for number in np.flatnonzero(bounds > hopeless[candidates] + _MIN_GAIN):
+            edge = candidates[number]
+            if costs[edge] < 0.5 * cost.cap[edge]:
                 continue
-        hopeless[edge] = bound
-        moved = torch.from_numpy(np.flatnonzero(question.best_set(network, column)))
-        if len(moved) in (0, cost.graph.num_nodes):
-            continue
-        tried = correction.clone()
-        # Norms multiply with every jump; rounding errors would, too.
-        tried[moved] = rotations.normalize(rotations.multiply(correction[moved], residual[edge].expand(len(moved), 4)))
-        tried_residual = cost.residual(tried)
-        tried_costs = cost.of_edges(tried_residual)
-        gain = float(costs.sum() - tried_costs.sum())
-        if gain > _MIN_GAIN:
-            correction, residual, costs = tried, tried_residual, tried_costs
-            gained += gain
-            hopeless[edge] = 0.0
-    return correction, gained
+            # Until something turns, all questions stand as they were put at first.
+            question, column, bound = questions, int(number), float(bounds[number])
+            if gained > 0:
+                question, column = _turns(cost, residual, residual[[edge]], costs), 0
+                bound = float(question.gain_bounds(system)[0])
+                if bound <= hopeless[edge] + _MIN_GAIN:
+                    continue
+            hopeless[edge] = bound
+            moved = torch.from_numpy(np.flatnonzero(question.best_set(self._network, column)))
+            if len(moved) in (0, cost.graph.num_nodes):
+                continue
+            tried = correction.clone()
+            # Norms multiply with every jump; rounding errors would, too.
+            tried[moved] = rotations.normalize(
+                rotations.multiply(correction[moved], residual[edge].expand(len(moved), 4))
+            )
+            tried_residual = cost.residual(tried)
+            tried_costs = cost.of_edges(tried_residual)
+            gain = float(costs.sum() - tried_costs.sum())
+            if gain > _MIN_GAIN:
+                correction, residual, costs = tried, tried_residual, tried_costs
+                gained += gain
+                hopeless[edge] = 0.0
+        return correction, gained
 
 
 def _candidates(

@@ -17,6 +17,7 @@ from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
 from rotavg_ros.solver.slam.noise.model import NoiseModel, agree, noise_between_neighbours, pair_variance
 from rotavg_ros.solver.slam.passes.alternation import SlamEstimate
+from rotavg_ros.solver.slam.preparation import Prepared
 
 # The solution is in strong doubt if this share of what at least so many neighbours agree upon is rejected by it (the
 # second, where it rejects most closures: groups of false ones would have to be most, and lone ones do not agree),
@@ -50,12 +51,9 @@ class Doubt(IntEnum):
     STRONG = 3
 
 
-def measure_doubt(graph: ClosureGraph, pairs: AgreementPairs, estimate: SlamEstimate, by_chain: NoiseModel) -> Doubt:
-    """Doubt in ``estimate``.
-
-    Args:
-        by_chain: the noise as it looks if odometry never slips.
-    """
+def measure_doubt(prepared: Prepared, estimate: SlamEstimate) -> Doubt:
+    """Doubt in ``estimate``."""
+    graph, pairs, by_chain = prepared.closure_graph, prepared.pairs, prepared.noise
     if len(pairs.first) == 0:
         return Doubt.NONE
     rejected = estimate.inlier_probability[graph.is_closure] < 0.5

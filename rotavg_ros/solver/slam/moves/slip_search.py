@@ -9,7 +9,7 @@ neighbouring closures, which do not care how far apart their ends are along the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -32,7 +32,8 @@ from rotavg_ros.solver.slam.noise.model import (
     estimate_noise,
     noise_between_neighbours,
 )
-from rotavg_ros.solver.slam.passes.alternation import SlamEstimate
+from rotavg_ros.solver.slam.passes.alternation import SlamEstimate, Start
+from rotavg_ros.solver.slam.preparation import Prepared
 from rotavg_ros.view_graph import ViewGraph
 
 # A step of odometry slips with this probability. Of a long segment only so many count: what is left of it after a slip
@@ -55,35 +56,20 @@ _MIN_REGAINED = 2
 _FALSE_SQUARE = np.pi**2 / 3 + 2
 
 
-@dataclass(frozen=True)
-class SlipStart:
-    """Where to refine from: corrections ``(K, 4)``, probabilities of being good ``(E,)``, and noise."""
-
-    correction: Tensor
-    inlier_probability: np.ndarray
-    noise: NoiseModel
-
-
 def search_for_slips(
-    graph: ClosureGraph,
-    pairs: AgreementPairs,
-    estimate: SlamEstimate,
-    by_chain: NoiseModel,
-    log_odds: np.ndarray,
-    doubt: Doubt,
-    rivals: Sequence[Tensor],
-) -> SlipStart | None:
+    prepared: Prepared, estimate: SlamEstimate, log_odds: np.ndarray, doubt: Doubt, rivals: Sequence[Tensor]
+) -> Start | None:
     """A better start than ``estimate``, or None if there is none to be found or no reason to look for one.
 
     Args:
-        by_chain: the noise as it looks if odometry never slips.
         log_odds: ``(E,)`` prior log-odds of each edge to be good, beyond the common outlier share; ±inf decide it.
         doubt: in ``estimate``.
         rivals: corrections ``(K, 4)`` of ``estimate`` and other solutions, all of which slips have to outdo.
     """
     if doubt == Doubt.NONE:
         return None
-    noise = noise_between_neighbours(pairs, by_chain.components)
+    graph, pairs = prepared.closure_graph, prepared.pairs
+    noise = noise_between_neighbours(pairs, prepared.noise.components)
     is_agreed = agree(pairs, noise)
     priors = [prior_log_odds(graph, noise, log_odds, probability) for probability in _ANNEALED]
     finite = np.clip(priors[-1], -50, 50)
@@ -106,7 +92,7 @@ def search_for_slips(
     if num_edges <= _MAX_EDGES_TO_JUMP:
         everyone = np.ones(len(votes.closure), dtype=bool)
         correction = _jump(costs, cost.descend(correction), pairs, is_agreed, everyone)
-    return SlipStart(correction, expit(cost.log_odds(correction)), noise)
+    return Start(graph, correction, expit(cost.log_odds(correction)), noise, log_odds)
 
 
 def _costs(

@@ -7,6 +7,8 @@ that shows in its residuals: within a run they scatter less than the estimated n
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -43,38 +45,44 @@ def closure_runs(pairs: AgreementPairs, good: np.ndarray, position: np.ndarray) 
     return np.asarray(np.unique(stretch, axis=0, return_inverse=True)[1]).reshape(-1)
 
 
-def common_share(
-    run: np.ndarray,
-    inlier_probability: np.ndarray,
-    residual: np.ndarray,
-    own_steps: np.ndarray,
-    samples: np.ndarray,
-    closure_variance: float,
-    components: int,
-) -> float:
+class RunErrors(NamedTuple):
+    """How the closures of a graph err (C closures, k samples).
+
+    Attributes:
+        run: ``(C,)`` of :func:`closure_runs`.
+        inlier_probability: ``(C,)``.
+        residual: ``(C, 3)`` rad, all from older to newer end.
+        own_steps: ``(C,)`` variance of each closure's own noise in units of that of all.
+        samples: ``(C, k)`` differences of the fit's samples over the closures, in the same direction.
+    """
+
+    run: np.ndarray
+    inlier_probability: np.ndarray
+    residual: np.ndarray
+    own_steps: np.ndarray
+    samples: np.ndarray
+
+
+def common_share(errors: RunErrors, closure_variance: float, components: int) -> float:
     """Share of the closures' error variance that a run has in common, in [0, 0.9].
 
     Analysis of variance: independent errors of variance σ² leave residuals that scatter within a run by σ² (n − 1) less
     what the fit takes up, which samples of the fit tell.
 
     Args:
-        run: ``(C,)``.
-        inlier_probability: ``(C,)``.
-        residual: ``(C, 3)`` rad, all from older to newer end.
-        own_steps: ``(C,)`` variance of each closure's own noise in units of σ².
-        samples: ``(C, K)`` differences of the fit's samples over the closures, in the same direction.
         closure_variance: σ², rad².
         components: 1 for planar graphs, else 3.
     """
-    size = np.bincount(run, inlier_probability)
-    weight = inlier_probability / own_steps
+    run, samples = errors.run, errors.samples
+    size = np.bincount(run, errors.inlier_probability)
+    weight = errors.inlier_probability / errors.own_steps
     total = np.maximum(np.bincount(run, weight), 1e-9)
 
     def scatter(values: np.ndarray) -> float:
         mean = np.stack([np.bincount(run, weight * column) / total for column in values.T], axis=1)
         return float((weight[:, None] * (values - mean[run]) ** 2).sum())
 
-    observed = scatter(residual) / components
+    observed = scatter(errors.residual) / components
     expected = closure_variance * np.maximum(size - 1, 0).sum() - scatter(samples) / samples.shape[1]
     prior = _PRIOR_OBSERVATIONS * closure_variance
     return float(np.clip(1 - (observed + prior) / (max(expected, 0.0) + prior), 0.0, _MAX_SHARE))

@@ -101,32 +101,63 @@ class SlamEstimate(Verdicts):
     in_false_group: np.ndarray
 
 
-class Passes:
-    """The unknowns of a SLAM graph's refinement, and what the last pass saw of them."""
+@dataclass(frozen=True)
+class Start:
+    """Where passes begin (K key nodes, E edges).
 
-    def __init__(
-        self,
-        graph: ClosureGraph,
-        correction: Tensor,
-        inlier_probability: np.ndarray,
-        noise: NoiseModel,
-        prior_log_odds: np.ndarray,
-        hold_noise: bool,
-        system: System,
-        is_new: np.ndarray | None = None,
-    ) -> None:
-        self.graph, self.noise, self.hold_noise = graph, noise, hold_noise
-        self.inlier_probability, self.prior_log_odds = inlier_probability, prior_log_odds
+    Attributes:
+        graph: the closure graph.
+        correction: ``(K, 4)``; identities for the odometry itself.
+        inlier_probability: ``(E,)``; that of odometry is kept.
+        noise: to begin with.
+        prior_log_odds: ``(E,)`` of each edge to be good, beyond the common outlier share; ±inf decide it.
+        exact_share: ``(E,)`` probability of a good closure to err no more than most; default: 1.
+        is_new: ``(E,)`` bool, in an update the closures that have just come; None: this is no update.
+    """
+
+    graph: ClosureGraph
+    correction: Tensor
+    inlier_probability: np.ndarray
+    noise: NoiseModel
+    prior_log_odds: np.ndarray
+    exact_share: np.ndarray | None = None
+    is_new: np.ndarray | None = None
+
+    @property
+    def exactness(self) -> np.ndarray:
+        """What every edge weighs for erring no more than most, ``(E,)``."""
+        if self.exact_share is None:
+            return np.ones(len(self.graph.source))
+        return exactness_of(self.exact_share, tail_ratio(self.noise.closure_variance * self.graph.own_steps))
+
+    @property
+    def weight(self) -> np.ndarray:
+        """Of every edge, ``(E,)`` rad⁻²."""
+        return edge_weight(self.inlier_probability * self.exactness, edge_variance(self.graph, self.noise))
+
+
+class Passes:
+    """The unknowns of a SLAM graph's refinement, and what the last pass saw of them.
+
+    Args:
+        hold_noise: keep both variances as given.
+    """
+
+    def __init__(self, start: Start, system: System, hold_noise: bool) -> None:
+        graph = start.graph
+        self.graph, self.noise, self.hold_noise = graph, start.noise, hold_noise
+        self.inlier_probability, self.prior_log_odds = start.inlier_probability, start.prior_log_odds
         self.system = system
         # In an update few edges are new, so that few weights change much from pass to pass.
-        self._is_new = is_new
+        self._is_new = start.is_new
         self._closure = np.flatnonzero(graph.is_closure)
         # Components in rows.
-        self._correction = np.ascontiguousarray(correction.numpy().T)
+        self._correction = np.ascontiguousarray(start.correction.numpy().T)
         self._measured = np.ascontiguousarray(graph.residual.numpy().T)
         self.residual = self._residual_vectors()
         # Of every edge if it is good: that it is no worse than most, and by how much less it weighs for that.
-        self.exact_share, self.exactness = np.ones(len(graph.source)), np.ones(len(graph.source))
+        self.exact_share = np.ones(len(graph.source)) if start.exact_share is None else start.exact_share.copy()
+        self.exactness = start.exactness
         self.passes = 0
         self._changed = 1.0
         self._prediction_pass, self._changed_since_prediction = -_PASSES_PER_PREDICTION, 0.0
@@ -160,6 +191,10 @@ class Passes:
     def weight(self, noise: NoiseModel) -> np.ndarray:
         """Of every edge, ``(E,)`` rad⁻²."""
         return edge_weight(self.inlier_probability * self.exactness, edge_variance(self.graph, noise))
+
+    def weigh_anew(self, graph: ClosureGraph, noise: NoiseModel | None = None) -> None:
+        """Go on with other variances of the same edges, and another noise where one is given."""
+        self.graph, self.noise = graph, self.noise if noise is None else noise
 
     def verdicts(self) -> Verdicts:
         """What there is to say after the last pass."""

@@ -35,7 +35,7 @@ from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over
 from rotavg_ros.solver.slam.update.grown_laplacian import GrownLaplacian, OlderFactor
 from rotavg_ros.solver.slam.update.grown_system import GrownSystem
 from rotavg_ros.solver.slam.update.new_closures import judge_new_closures
-from rotavg_ros.solver.slam.update.passes import Start, follow, grown_variance, renew
+from rotavg_ros.solver.slam.update.passes import GrownStart, follow, grown_variance, renew
 from rotavg_ros.view_graph import ViewGraph
 
 # The whole solve runs again after so many updates, or once there are so many more closures. Of few closures that is
@@ -153,7 +153,7 @@ class SlamMemory:
         turned[start.is_new] = False
         return None if turned.sum() > max(_MAX_TURNED, _MAX_SHARE_TURNED * num_closures) else updated
 
-    def _extend(self, graph: ViewGraph, start: Start) -> Updated:
+    def _extend(self, graph: ViewGraph, start: GrownStart) -> Updated:
         """With odometry alone, which says nothing of what was there."""
         closure_graph = start.graph
         outlier_probability = carried_over(self.outlier_probability, closure_graph, 0.0)
@@ -168,7 +168,7 @@ class SlamMemory:
         )
         return self._updated(graph, start, verdicts, self.factor)
 
-    def _follow(self, graph: ViewGraph, start: Start) -> Updated | None:
+    def _follow(self, graph: ViewGraph, start: GrownStart) -> Updated | None:
         """With noise and predictions of before; None where they are not for that, or no longer serve."""
         if start.graph.num_nodes < ITERATING_PAYS:
             return None
@@ -182,14 +182,14 @@ class SlamMemory:
             return None
         return self._updated(graph, start, verdicts, _if_small(laplacian.factor, graph))
 
-    def _updated(self, graph: ViewGraph, start: Start, verdicts: Verdicts, factor: OlderFactor | None) -> Updated:
+    def _updated(self, graph: ViewGraph, start: GrownStart, verdicts: Verdicts, factor: OlderFactor | None) -> Updated:
         """With the noise and predictions of before."""
         variance = grown_variance(self.variance, start.graph, start.weight)
         by_edge = _by_edge(start.graph, verdicts, start.prior_log_odds)
         memory = replace(self, **by_edge, graph=graph, variance=variance, factor=factor, updates=self.updates + 1)
         return Updated(start.graph, verdicts, variance, memory)
 
-    def _factors(self, start: Start, weight: np.ndarray) -> Iterator[OlderFactor]:
+    def _factors(self, start: GrownStart, weight: np.ndarray) -> Iterator[OlderFactor]:
         """What may be solved from: the factor there is, as long as not too much is new, and another one."""
         graph, older = start.graph, self.factor
         if older is not None and older.fits(graph) and (graph.view_graph_edge >= older.num_edges).sum() <= _MAX_COLUMNS:
@@ -199,7 +199,7 @@ class SlamMemory:
         factorised = pattern.factorize(np.where(self._came_later(graph), _NEXT_TO_NOTHING * weight, weight))
         yield replace(OlderFactor.of(graph, factorised), num_edges=self.graph.num_edges)
 
-    def _renew(self, graph: ViewGraph, start: Start) -> Updated | None:
+    def _renew(self, graph: ViewGraph, start: GrownStart) -> Updated | None:
         """Factorised and estimated anew; None if orientations turn by too much."""
         closure_graph = start.graph
         estimate = renew(start, self._rank(closure_graph), self.trust, self.max_step_variance)
@@ -216,7 +216,7 @@ class SlamMemory:
         )
         return Updated(closure_graph, estimate, variance, memory)
 
-    def _start(self, graph: ClosureGraph, network: SlamCleanNet | None, body_from_world: torch.Tensor) -> Start:
+    def _start(self, graph: ClosureGraph, network: SlamCleanNet | None, body_from_world: torch.Tensor) -> GrownStart:
         """What is known of all edges, and of new closures what those around them say."""
         closure = np.flatnonzero(graph.is_closure)
         is_new = graph.is_closure & self._came_later(graph)
@@ -232,15 +232,15 @@ class SlamMemory:
         if len(new):
             judged = judge_new_closures(network, self.chain_noise, graph, closure, new, factor)
             inlier_probability[new], prior[new], factor[new] = judged
-        return Start(
+        return GrownStart(
             replace(graph, steps=factor * graph.own_steps),
             graph.corrections(body_from_world),
             inlier_probability,
             self.noise,
             prior,
-            carried_over(self.exact_share, graph, 1.0),
-            carried_over(self.prediction_variance, graph, 0.0),
-            is_new,
+            exact_share=carried_over(self.exact_share, graph, 1.0),
+            is_new=is_new,
+            prediction_variance=carried_over(self.prediction_variance, graph, 0.0),
         )
 
     def _came_later(self, graph: ClosureGraph) -> np.ndarray:

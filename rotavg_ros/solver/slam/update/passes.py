@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from torch import Tensor
 
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
-from rotavg_ros.solver.slam.noise.judging import exactness_of, tail_ratio
-from rotavg_ros.solver.slam.noise.model import NoiseModel
 from rotavg_ros.solver.slam.noise.stated_precision import StatedTrust
-from rotavg_ros.solver.slam.passes.alternation import Passes, SlamEstimate, Verdicts, edge_variance, edge_weight
+from rotavg_ros.solver.slam.passes.alternation import Passes, SlamEstimate, Start, Verdicts
 from rotavg_ros.solver.slam.passes.system import System, WholeSystem
 from rotavg_ros.solver.slam.refinement import estimate
 
@@ -25,58 +22,22 @@ _CONVERGED_PROBABILITY = 0.02
 _MAX_STEP = np.radians(20.0)
 
 
-@dataclass(frozen=True)
-class Start:
-    """What is known of a graph before its update (K key nodes, E edges).
+@dataclass(frozen=True, kw_only=True)
+class GrownStart(Start):
+    """What is known of a graph before its update (K key nodes, E edges), of all edges.
 
     Attributes:
-        graph: with steps as :class:`~rotavg_ros.solver.slam.passes.alternation.Verdicts` has them.
-        correction: ``(K, 4)``.
-        inlier_probability: ``(E,)``.
-        noise: as it was.
-        prior_log_odds: ``(E,)`` of being good, beyond the common outlier share; ±inf decide it.
-        exact_share: ``(E,)`` probability of a good closure to err no more than most.
         prediction_variance: ``(E,)`` rad², of what the rest of the graph predicts of each edge.
-        is_new: ``(E,)`` bool, closures that have just come.
     """
 
-    graph: ClosureGraph
-    correction: Tensor
-    inlier_probability: np.ndarray
-    noise: NoiseModel
-    prior_log_odds: np.ndarray
     exact_share: np.ndarray
-    prediction_variance: np.ndarray
     is_new: np.ndarray
-
-    @property
-    def exactness(self) -> np.ndarray:
-        """What every edge weighs for erring no more than most, ``(E,)``."""
-        return exactness_of(self.exact_share, tail_ratio(self.noise.closure_variance * self.graph.own_steps))
-
-    @property
-    def weight(self) -> np.ndarray:
-        """Of every edge, ``(E,)`` rad⁻²."""
-        return edge_weight(self.inlier_probability * self.exactness, edge_variance(self.graph, self.noise))
-
-    def passes(self, system: System, hold_noise: bool) -> Passes:
-        """Ready for the first pass."""
-        state = Passes(
-            self.graph,
-            self.correction,
-            self.inlier_probability,
-            self.noise,
-            self.prior_log_odds,
-            hold_noise,
-            system,
-            is_new=self.is_new,
-        )
-        state.exact_share = self.exact_share.copy()
-        state.exactness = self.exactness
-        return state
+    prediction_variance: np.ndarray
 
 
-def renew(start: Start, rank: np.ndarray | None, trust: StatedTrust, max_step_variance: float) -> SlamEstimate | None:
+def renew(
+    start: GrownStart, rank: np.ndarray | None, trust: StatedTrust, max_step_variance: float
+) -> SlamEstimate | None:
     """Factorise, estimate the noise and every edge's prediction anew.
 
     Args:
@@ -88,18 +49,18 @@ def renew(start: Start, rank: np.ndarray | None, trust: StatedTrust, max_step_va
         None if orientations turn by so much that all has to be judged anew.
     """
     system = WholeSystem(start.graph, rank)
-    state = start.passes(system, hold_noise=False)
+    state = Passes(start, system, hold_noise=False)
     settled = _alternate(state, max_step_variance, _MAX_PASSES)
     return estimate(state, system, 0.0, trust, max_step_variance) if settled else None
 
 
-def follow(start: Start, system: System) -> Verdicts | None:
+def follow(start: GrownStart, system: System) -> Verdicts | None:
     """The same with noise and predictions as they are known; None likewise.
 
     Raises:
         StaleFactorError: from the system.
     """
-    state = start.passes(system, hold_noise=True)
+    state = Passes(start, system, hold_noise=True)
     return state.verdicts() if _alternate(state, np.inf, _MAX_FOLLOWING_PASSES) else None
 
 

@@ -9,10 +9,9 @@ from rotavg_ros.datasets.slam_config import SlamSimulationConfig
 from rotavg_ros.datasets.slam_simulation import simulate_slam_graph
 from rotavg_ros.datasets.trajectories import World
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
-from rotavg_ros.solver.slam.noise.common_error import closure_runs, common_share, variance_factor
+from rotavg_ros.solver.slam.noise.common_error import RunErrors, closure_runs, common_share, variance_factor
 from rotavg_ros.solver.slam.preparation import prepare
-from rotavg_ros.solver.slam.refinement import refine
-from rotavg_ros.solver.slam.stages import bootstrap, clean
+from rotavg_ros.solver.slam.stages import bootstrap, clean, refine
 
 
 def test_runs_link_near_good_closures() -> None:
@@ -34,7 +33,7 @@ def test_the_share_of_a_common_error_is_estimated(share: float, spread: float) -
     own = np.sqrt(1 - share) * rng.standard_normal((480, 3))
     deviation = np.exp(spread * rng.standard_normal(480))
     residual = np.sqrt(share) * rng.standard_normal((60, 3))[run] + deviation[:, None] * own
-    estimate = common_share(run, np.ones(480), residual, deviation**2, np.zeros((480, 4)), 1.0, 3)
+    estimate = common_share(RunErrors(run, np.ones(480), residual, deviation**2, np.zeros((480, 4))), 1.0, 3)
     assert estimate == pytest.approx(share, abs=0.06)
 
 
@@ -61,12 +60,6 @@ def test_a_front_end_that_repeats_its_errors_is_recognised(planted: float, low: 
         run = simulate_slam_graph(config, np.random.default_rng(seed))
         prepared = prepare(run.graph)
         cleaned = clean(None, prepared, run.graph.label)
-        estimate = refine(
-            prepared.closure_graph,
-            prepared.pairs,
-            bootstrap(prepared, cleaned),
-            cleaned.inlier_probability,
-            prepared.noise,
-        )
+        estimate = refine(prepared, cleaned, bootstrap(prepared, cleaned), slip_search=False)
         shares.append(estimate.common_share)
     assert low <= np.median(shares) <= high

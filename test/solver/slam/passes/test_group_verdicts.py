@@ -13,7 +13,7 @@ from rotavg_ros.solver.slam import preparation as slam_preparation
 from rotavg_ros.solver.slam import stages as slam_stages
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.noise.model import NoiseModel
-from rotavg_ros.solver.slam.passes.alternation import Passes
+from rotavg_ros.solver.slam.passes.alternation import Passes, Start
 from rotavg_ros.solver.slam.passes.group_verdicts import _if_turned
 from rotavg_ros.solver.slam.passes.system import WholeSystem
 from test.solver.graphs import as_quaternions, measured, random_truth, small_noise
@@ -77,6 +77,6 @@ def settled(graph: ClosureGraph) -> tuple[Passes, WholeSystem, int]:
     noise = NoiseModel(3, np.radians(0.3) ** 2, np.radians(0.4) ** 2, 0.1)
     system, num_edges = WholeSystem(graph), len(graph.source)
     start = rotations.identity(graph.num_nodes)
-    state = Passes(graph, start, np.ones(num_edges), noise, np.zeros(num_edges), True, system)
+    state = Passes(Start(graph, start, np.ones(num_edges), noise, np.zeros(num_edges)), system, hold_noise=True)
     state.alternate(noise.step_variance, 5)
     return state, system, num_edges
