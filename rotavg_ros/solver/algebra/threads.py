@@ -21,7 +21,12 @@ _STRETCHES_PER_WORKER = 4
 
 
 class _Crew:
-    """The workers of the solves that run at the moment."""
+    """The workers of the solves that run at the moment.
+
+    Torch keeps its number of threads twice: each thread has one of its own, which its operations obey, and the process
+    has one, which a thread takes over when it first meets torch. Setting either sets both. So a thread that solves gets
+    its own number back when it leaves, and the last one to leave gives the process what the first one found.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -35,8 +40,12 @@ class _Crew:
         if self._here.depth > 1:
             return
         with self._lock:
+            before = torch.get_num_threads()
             if self._active == 0:
-                self.size = torch.get_num_threads()
+                self.size = before
+            elif before == 1:  # a thread that meets torch while others solve has taken over their one thread
+                before = self.size
+            self._here.before = before
             self._active += 1
             torch.set_num_threads(1)
 
@@ -45,13 +54,18 @@ class _Crew:
         if self._here.depth > 0:  # what is around this goes on with one thread for each operation
             return
         with self._lock:
-            torch.set_num_threads(self.size)
             self._active -= 1
-            if self._active == 0:
-                self.size = 1
-                if self._pool is not None:
-                    self._pool.shutdown()
-                    self._pool = None
+            torch.set_num_threads(self._here.before)
+            if self._active > 0:
+                return
+            if self.size != self._here.before:  # the process's own number, which this thread's has just replaced
+                setter = threading.Thread(target=torch.set_num_threads, args=(self.size,))
+                setter.start()
+                setter.join()
+            self.size = 1
+            if self._pool is not None:
+                self._pool.shutdown()
+                self._pool = None
 
     def _depth(self) -> int:
         """How often this thread is inside."""
@@ -60,8 +74,15 @@ class _Crew:
     def pool(self) -> ThreadPoolExecutor:
         with self._lock:
             if self._pool is None:
-                self._pool = ThreadPoolExecutor(self.size, thread_name_prefix="rotavg")
+                # One that is first needed after another solve has ended would find the process's own number.
+                self._pool = ThreadPoolExecutor(self.size, thread_name_prefix="rotavg", initializer=_keep_to_one_thread)
             return self._pool
+
+
+def _keep_to_one_thread() -> None:
+    """In the calling thread; asked first, for torch's first look at its number would take over the process's."""
+    torch.get_num_threads()
+    torch.set_num_threads(1)
 
 
 _crew = _Crew()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 
 import numpy as np
@@ -18,7 +17,7 @@ from rotavg_ros import ViewGraph, rotations
 from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.solver.algebra.residuals import EdgeResiduals, edge_residual
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
-from rotavg_ros.solver.algebra.threads import for_each, num_workers, workers
+from rotavg_ros.solver.algebra.threads import workers
 from rotavg_ros.solver.networks import NETWORKS
 from rotavg_ros.solver.neurora.fine_net import MIN_SCALE, edge_features
 from rotavg_ros.solver.neurora.message_passing import DirectedEdges, MessagePassingNetwork
@@ -169,34 +168,6 @@ def test_exact_measurements_leave_exactly_nothing() -> None:
     graph = ViewGraph.create([0], [1], [[0.0, 0.0, 0.0, 1.0]])
     residuals = EdgeResiduals(graph, rotations.identity(2))
     assert residuals.vectors(slice(0, 1)).tolist() == [[0.0]] * 3
-
-
-def test_what_a_worker_raises_arrives_and_threads_are_given_back() -> None:
-    def fail(item: int) -> None:
-        raise ValueError(f"item {item}")
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        with workers():
-            with workers():
-                pass
-            assert (num_workers(), torch.get_num_threads()) == (2, 1)
-            with pytest.raises(ValueError, match="item 0"):
-                for_each(fail, range(8))
-        assert (num_workers(), torch.get_num_threads()) == (1, 2)
-        with ThreadPoolExecutor(2) as pool:  # two solves at once share the workers
-            assert set(pool.map(_one_more, range(20))) == {True}
-        assert num_workers() == 1
-    finally:
-        torch.set_num_threads(before)
-
-
-def _one_more(number: int) -> bool:
-    done: list[int] = []
-    with workers():
-        for_each(done.append, range(number))
-    return sorted(done) == list(range(number))
 
 
 def test_tuning_takes_one_of_its_choices(monkeypatch: pytest.MonkeyPatch) -> None:
