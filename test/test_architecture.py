@@ -16,11 +16,12 @@ TOP = PACKAGE.name
 INWARD: dict[str, set[str]] = {
     "errors": set(),
     "view_graph": {"errors"},
-    "rotations": set(),
+    "hamilton": set(),
+    "rotations": {"hamilton"},
     "baselines": {"errors", "rotations", "solver", "view_graph"},
-    "solver": {"baselines", "errors", "rotations", "view_graph"},
+    "solver": {"baselines", "errors", "hamilton", "rotations", "view_graph"},
     "datasets": {"errors", "rotations", "view_graph"},
-    "online": {"errors", "rotations", "solver", "view_graph"},
+    "online": {"errors", "hamilton", "rotations", "solver", "view_graph"},
     "inputs": {"online", "view_graph"},
     "settings": {"errors", "inputs", "online", "solver", "view_graph"},
 }
@@ -34,6 +35,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "sfm": _ON_NEURORA,
         "slam": _ON_NEURORA,
         "networks": {"neurora", "slam"},
+        "closures": {"slam"},
         "devices": set(),
         "methods": {"sfm", "slam"},
         "solution": set(),
@@ -43,13 +45,14 @@ ROOMS: dict[str, dict[str, set[str]]] = {
     },
     "solver/neurora": {
         "network_store": set(),
+        "numbers": set(),
         "message_passing": set(),
         "clean_net": {"message_passing", "network_store"},
-        "fine_net": {"message_passing", "network_store"},
-        "tiled": {"clean_net", "fine_net", "message_passing"},
-        "cleaned": set(),
-        "scores": set(),
-        "tree": {"cleaned"},
+        "fine_net": {"message_passing", "network_store", "numbers"},
+        "tiled": {"clean_net", "cleaned", "fine_net", "message_passing", "numbers"},
+        "cleaned": {"numbers"},
+        "scores": {"numbers"},
+        "tree": {"cleaned", "numbers"},
         "stages": {"clean_net", "cleaned", "fine_net", "tiled"},
     },
     "solver/slam": {
@@ -58,7 +61,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "noise": {"graph"},
         "network": {"graph", "noise"},
         "passes": {"graph", "noise"},
-        "moves": {"graph", "noise", "passes"},
+        "moves": {"graph", "noise", "passes", "preparation"},
         "preparation": {"graph", "noise"},
         "refinement": {"graph", "moves", "noise", "passes"},
         "stages": {"graph", "moves", "network", "noise", "passes", "preparation", "refinement"},
@@ -67,7 +70,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
     },
 }
 # What those outside may import from the inside of a wing, besides its face.
-FACES = {"solver": {"batch", "devices", "methods", "networks", "pipeline", "solution"}}
+FACES = {"solver": {"batch", "closures", "devices", "methods", "networks", "pipeline", "solution"}}
 INSIDERS = {"baselines": {"algebra", "neurora"}, "training": {"algebra", "neurora"}}
 # Others' packages that only one wing may know.
 BORDERS = {"rclpy": "ros", "rosbags": "bags", "mcap": "bags"}

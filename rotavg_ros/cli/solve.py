@@ -31,7 +31,7 @@ from rotavg_ros.datasets.graph_file import GraphFile, read_graph
 from rotavg_ros.errors import UserError
 from rotavg_ros.rotations import canonical, inverse
 from rotavg_ros.solver import DEVICES, METHODS, PROFILES, Solution, solve
-from rotavg_ros.solver.neurora.network_store import WEIGHTS_FOLDER
+from rotavg_ros.solver.networks import WEIGHTS_FOLDER
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
 

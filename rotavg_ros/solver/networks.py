@@ -1,11 +1,18 @@
-"""All networks of the package by name."""
+"""All networks of the package by name, and how to read those of others."""
 
 from __future__ import annotations
 
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.fine_net import FineNet
-from rotavg_ros.solver.neurora.network_store import StoredNetwork
+from rotavg_ros.solver.neurora.network_store import (
+    WEIGHTS_FOLDER,
+    StoredNetwork,
+    forget_networks,
+    load_network,
+    read_network,
+)
 from rotavg_ros.solver.slam.network import SlamCleanNet
 
-# Folder of the weights that come with the package.
+__all__ = ["NETWORKS", "WEIGHTS_FOLDER", "CleanNet", "FineNet", "forget_networks", "load_network", "read_network"]
+
 NETWORKS: dict[str, type[StoredNetwork]] = {kind.NAME: kind for kind in (CleanNet, FineNet, SlamCleanNet)}

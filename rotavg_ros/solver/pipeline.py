@@ -17,6 +17,7 @@ from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
 from rotavg_ros.solver.methods import BASELINES, DEFAULT_METHOD, METHODS, NETWORK_METHODS
 from rotavg_ros.solver.neurora import scores
 from rotavg_ros.solver.neurora.network_store import Networks
+from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.solve import solve_sfm
 from rotavg_ros.solver.slam import refinement
 from rotavg_ros.solver.slam.noise import judging
@@ -27,7 +28,7 @@ from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
 
 PROFILES = ("auto", "slam", "sfm")
 # The noise that makes an edge an outlier, in radians.
-_OUTLIER_ANGLE = {"sfm": scores.OUTLIER_ANGLE, "slam": judging.OUTLIER_ANGLE}
+_OUTLIER_ANGLE = {"sfm": NUMBERS.outlier_angle, "slam": judging.OUTLIER_ANGLE}
 
 
 @torch.no_grad()

@@ -1,7 +1,8 @@
 """Fit the one constant of the SfM profile's outlier score, so that the score is a probability.
 
 `python -m rotavg_ros.training.score_fit` solves graphs of the training family, small and large, of seeds that nothing
-else uses; it fits ``sfm_stages.SCORE_SCALE`` by maximum likelihood and prints the calibration error on further graphs.
+else uses; it fits ``NeuroraNumbers.score_scale`` by maximum likelihood and prints the calibration error on further
+graphs.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from torch import Tensor
 
 from rotavg_ros.evaluation.calibration import expected_calibration_error
 from rotavg_ros.solver import solve
-from rotavg_ros.solver.neurora.scores import OUTLIER_ANGLE, residual_and_uncertainty
+from rotavg_ros.solver.neurora.numbers import NUMBERS
+from rotavg_ros.solver.neurora.scores import residual_and_uncertainty
 from rotavg_ros.training.sfm_data import sample_graph
 
 _SEED, _HELD_OUT_SEED = 70_001, 70_002
@@ -53,7 +55,7 @@ def draw(seed: int, graphs_by_nodes: dict[tuple[int, int], int]) -> list[ScoreSa
                 sample = sample_graph(recipe, nodes, rng)
                 solution = solve(sample.graph, profile="sfm")
                 angle, uncertainty = residual_and_uncertainty(sample.graph, solution.body_from_world)
-                rows.append(((angle - OUTLIER_ANGLE) / uncertainty, sample.is_outlier))
+                rows.append(((angle - NUMBERS.outlier_angle) / uncertainty, sample.is_outlier))
             excess, is_outlier = (torch.cat(column) for column in zip(*rows, strict=True))
             samples.append(ScoreSample(f"{recipe}, {nodes[0]}–{nodes[1]} cameras", excess, is_outlier))
     return samples
@@ -78,7 +80,7 @@ def fit(samples: Sequence[ScoreSample]) -> float:
 def main() -> None:
     """Fit, and check on graphs that took no part."""
     scale = fit(draw(_SEED, _GRAPHS_BY_NODES))
-    print(f"SCORE_SCALE = {scale:.3f}")
+    print(f"score_scale = {scale:.3f}")
     for sample in draw(_HELD_OUT_SEED, _GRAPHS_BY_NODES):
         error = expected_calibration_error(torch.sigmoid(sample.excess / scale), sample.is_outlier)
         print(f"{sample.kind}: expected calibration error {error:.4f}")

@@ -11,9 +11,8 @@ from torch import Tensor, nn
 
 from rotavg_ros.datasets.slam_simulation import random_slam_config, simulate_slam_graph
 from rotavg_ros.evaluation.calibration import expected_calibration_error
+from rotavg_ros.solver.closures import ClosureFeatures, SlamCleanNet, closure_inputs
 from rotavg_ros.solver.neurora.message_passing import DirectedEdges
-from rotavg_ros.solver.slam.network import ClosureFeatures, SlamCleanNet, closure_features
-from rotavg_ros.solver.slam.preparation import prepare
 from rotavg_ros.training.config import TrainingConfig
 
 
@@ -34,11 +33,10 @@ def sample_run(nodes: tuple[int, int], rng: np.random.Generator) -> SlamSample |
     """One graph of the wide family; None if it has fewer than two closures."""
     keyframes = round(float(np.exp(rng.uniform(*np.log(nodes)))))
     run = simulate_slam_graph(random_slam_config(rng, keyframes), rng)
-    prepared = prepare(run.graph)
-    closures = prepared.closure_graph.view_graph_edge[prepared.closure_graph.is_closure[prepared.num_segments :]]
-    if len(closures) < 2:
+    inputs = closure_inputs(run.graph)
+    if inputs is None:
         return None
-    features = closure_features(prepared.noise, prepared.squared_angle, prepared.path_steps, prepared.pairs)
+    features, closures = inputs
     return SlamSample(features, torch.from_numpy(run.closure_is_false[closures]))
 
 

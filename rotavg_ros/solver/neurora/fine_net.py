@@ -8,14 +8,12 @@ from torch import Tensor, nn
 from rotavg_ros import rotations
 from rotavg_ros.solver.neurora.message_passing import HIDDEN_WIDTH, DirectedEdges, MessagePassingNetwork
 from rotavg_ros.solver.neurora.network_store import StoredNetwork
+from rotavg_ros.solver.neurora.numbers import NUMBERS
 
-# Residuals are measured in units of their median, but of no less than this (half an angle in radians).
-MIN_SCALE = 1e-4
 # Of an edge: three vectors, which change their sign with its direction, and two numbers, which do not.
 ODD_FEATURES, EVEN_FEATURES = 9, 2
 # Of a node: its orientation and how many edges it has.
 NODE_FEATURES = 5
-_MAX_LOGIT, _LOGIT_UNIT, _LOG_DEGREE_UNIT = 12.0, 4.0, 4.0
 
 
 class FineNet(StoredNetwork):
@@ -80,11 +78,11 @@ def edge_features(raw: Tensor, rectified: Tensor, outlier_logit: Tensor, scale: 
     raw, rectified = raw / scale, rectified / scale
     # The weight of an edge under a loss that is square for small residuals and linear for large ones.
     weight = (1 + (raw * raw).sum(dim=0, keepdim=True)).rsqrt()
-    logit = outlier_logit.clamp(-_MAX_LOGIT, _MAX_LOGIT) / _LOGIT_UNIT
+    logit = outlier_logit.clamp(-NUMBERS.max_logit, NUMBERS.max_logit) / NUMBERS.logit_unit
     return torch.cat((raw, raw * weight, rectified, weight, logit[None]))
 
 
 def node_features(body_from_world: Tensor, degree: Tensor) -> Tensor:
     """``(N, NODE_FEATURES)``; ``degree`` ``(N, 1)`` is the number of edges, at nodes without any whatever it may be."""
     known = torch.where(degree.isfinite(), degree, 0).to(body_from_world)
-    return torch.cat((body_from_world, known.log1p() / _LOG_DEGREE_UNIT), dim=1)
+    return torch.cat((body_from_world, known.log1p() / NUMBERS.log_degree_unit), dim=1)

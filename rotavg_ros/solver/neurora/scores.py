@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from rotavg_ros.solver.algebra.medians import median_by_group
 from rotavg_ros.solver.algebra.residuals import EdgeResiduals
+from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.view_graph import ViewGraph
-
-# How fast the probability of noise beyond the outlier angle rises with the residual, in units of how far off the edge's
-# ends may be; fitted by `python -m rotavg_ros.training.score_fit`.
-SCORE_SCALE = 0.376
-_MIN_UNCERTAINTY = np.radians(0.01)
-# The noise that makes an edge an outlier.
-OUTLIER_ANGLE = np.radians(20.0)
 
 
 def residual_score(
@@ -27,7 +20,7 @@ def residual_score(
     and the closer to certainty on either side, the better the ends are known.
     """
     angle, uncertainty = residual_and_uncertainty(graph, body_from_world, component)
-    return torch.sigmoid((angle - outlier_angle) / (SCORE_SCALE * uncertainty)).double()
+    return torch.sigmoid((angle - outlier_angle) / (NUMBERS.score_scale * uncertainty)).double()
 
 
 def residual_and_uncertainty(
@@ -48,4 +41,4 @@ def residual_and_uncertainty(
     if component is not None and bool((component > 0).any()):
         of_edge = component[graph.source]
         median = median_by_group(angle, of_edge, int(component.max()) + 1)[of_edge]
-    return angle, (median * spread).clamp_(min=_MIN_UNCERTAINTY)
+    return angle, (median * spread).clamp_(min=NUMBERS.min_uncertainty)

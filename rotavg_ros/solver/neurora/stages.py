@@ -14,9 +14,6 @@ from rotavg_ros.solver.neurora.fine_net import FineNet
 from rotavg_ros.solver.neurora.tiled.networks import clean_edges, fine_tuned
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-# An edge whose outlier probability exceeds this is no inlier (ε of the paper; uncritical in 0.35–0.8).
-OUTLIER_THRESHOLD = 0.75
-
 
 def clean(network: CleanNet, graph: ViewGraph) -> Cleaned:
     """CleanNet, without gradients: rectify every measurement and score it.
@@ -29,20 +26,20 @@ def clean(network: CleanNet, graph: ViewGraph) -> Cleaned:
         result = clean_edges(network, graph.target_from_source.float().to(device), edges.to(device))
         probability = torch.sigmoid(result.outlier_logit).to(graph.device)
     rectified = replace(graph, target_from_source=result.target_from_source.to(graph.device).double())
-    return Cleaned(rectified, graph, probability, probability < OUTLIER_THRESHOLD, edges)
+    return Cleaned(rectified, graph, probability, edges)
 
 
 def trust_all(graph: ViewGraph) -> Cleaned:
     """What stands in for CleanNet in methods without it: every measurement as it is."""
     nobody = torch.zeros(graph.num_edges, device=graph.device)
-    return Cleaned(graph, graph, nobody, nobody < OUTLIER_THRESHOLD, SortedEdges.of(graph))
+    return Cleaned(graph, graph, nobody, SortedEdges.of(graph))
 
 
 def apply_labels(cleaned: Cleaned, label: Tensor) -> Cleaned:
     """Verdicts from outside override the network's."""
     probability = torch.where(label == EdgeLabel.ACCEPTED, 0.0, cleaned.outlier_probability)
     probability = torch.where(label == EdgeLabel.REJECTED, 1.0, probability)
-    return replace(cleaned, outlier_probability=probability, is_inlier=probability < OUTLIER_THRESHOLD)
+    return replace(cleaned, outlier_probability=probability)
 
 
 @torch.no_grad()
@@ -56,13 +53,5 @@ def fine_tune(network: FineNet, cleaned: Cleaned, body_from_world: Tensor, compo
     """
     component = cleaned.graph.components() if component is None else component
     device = next(network.parameters()).device
-    fine = fine_tuned(
-        network,
-        cleaned.measured.to(device),
-        cleaned.graph.target_from_source.to(device),
-        cleaned.outlier_probability.logit().to(device),
-        body_from_world.float().to(device),
-        cleaned.edges.select(cleaned.is_inlier).to(device),
-        component.to(device),
-    )
+    fine = fine_tuned(network, cleaned.to(device), body_from_world.float().to(device), component.to(device))
     return fine.double().to(cleaned.graph.device)

@@ -14,11 +14,8 @@ from rotavg_ros.solver.algebra.relaxed_forest import hubs, relaxed_forest
 from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.algebra.spanning_forest import compose, shortest_path_forest
 from rotavg_ros.solver.neurora.cleaned import Cleaned
+from rotavg_ros.solver.neurora.numbers import NUMBERS
 
-# Cost of an edge in the tree, and what a certain outlier costs besides (the authors' released code, between the two).
-_EDGE_COST, _OUTLIER_COST = 0.1, 1.0
-# Divided by the edges of that end which has fewer: CleanNet rectifies well where an edge has company.
-_FRINGE_COST = 5.0
 # So many edges tell which of two trees fits better.
 _MISFIT_SAMPLE = 16_384
 
@@ -49,7 +46,7 @@ def bootstrap(cleaned: Cleaned, component: Tensor | None = None) -> Bootstrapped
     component = cleaned.graph.components() if component is None else component
     degree = cleaned.edges.degree
     fewest = torch.minimum(degree[cleaned.graph.source], degree[cleaned.graph.target])
-    cost = _EDGE_COST + _OUTLIER_COST * cleaned.outlier_probability + _FRINGE_COST / fewest
+    cost = NUMBERS.edge_cost + NUMBERS.outlier_cost * cleaned.outlier_probability + NUMBERS.fringe_cost / fewest
     if cleaned.graph.device.type == "cpu":
         forest = shortest_path_forest(cleaned.graph, cost, edges=cleaned.edges, component=component)
         parent, parent_edge = torch.from_numpy(forest.parent), torch.from_numpy(forest.parent_edge)

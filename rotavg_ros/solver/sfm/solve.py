@@ -8,7 +8,8 @@ from torch import Tensor
 from rotavg_ros.solver.estimate import Estimate, Run
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.fine_net import FineNet
-from rotavg_ros.solver.neurora.scores import OUTLIER_ANGLE, residual_score
+from rotavg_ros.solver.neurora.numbers import NUMBERS
+from rotavg_ros.solver.neurora.scores import residual_score
 from rotavg_ros.solver.neurora.stages import apply_labels, clean, fine_tune, trust_all
 from rotavg_ros.solver.neurora.tiled.tuning import tune
 from rotavg_ros.solver.neurora.tree import bootstrap
@@ -63,5 +64,5 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     fits = steps > 0 or stages.fine_tunings > 0
     # Where there is but a tree, CleanNet's own score; else a residual is the noise but for the orientations' error.
     probability = cleaned.outlier_probability.double()
-    score = residual_score(graph, orientations, OUTLIER_ANGLE, component) if fits else probability
+    score = residual_score(graph, orientations, NUMBERS.outlier_angle, component) if fits else probability
     return Estimate(orientations, score, torch.full((graph.num_nodes,), torch.nan))

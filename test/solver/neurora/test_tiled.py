@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,9 +20,11 @@ from rotavg_ros.solver.algebra.residuals import EdgeResiduals, edge_residual
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.algebra.threads import workers
 from rotavg_ros.solver.networks import NETWORKS
-from rotavg_ros.solver.neurora.fine_net import MIN_SCALE, edge_features
+from rotavg_ros.solver.neurora.cleaned import Cleaned
+from rotavg_ros.solver.neurora.fine_net import edge_features
 from rotavg_ros.solver.neurora.message_passing import DirectedEdges, MessagePassingNetwork
 from rotavg_ros.solver.neurora.network_store import load_network
+from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.neurora.tiled import passes as inference
 from rotavg_ros.solver.neurora.tiled import tuning
 from rotavg_ros.solver.neurora.tiled.networks import clean_edges, fine_tuned
@@ -80,16 +83,21 @@ def _differences(graph: ViewGraph, start: Tensor, dtype: torch.dtype) -> tuple[f
     directed = DirectedEdges.of(graph.source, graph.target, graph.num_nodes, dtype)
     expected = clean_net(measured, directed)
     rectified, logit = expected.target_from_source, expected.outlier_logit
+    edges = SortedEdges.of(graph)
+    after = replace(graph, target_from_source=rectified)
+    cleaned = Cleaned(after, replace(graph, target_from_source=measured), logit.sigmoid(), edges)
+    inliers = graph.select_edges(cleaned.is_inlier.nonzero().squeeze(1))
     raw, clean = (
-        rotations.canonical(edge_residual(start, relative, graph.source, graph.target)).t()[:3]
+        rotations.canonical(edge_residual(start, relative[cleaned.is_inlier], inliers.source, inliers.target)).t()[:3]
         for relative in (measured, rectified)
     )
-    scale = torch.stack([_median_length(raw, component[graph.source] == number) for number in component])[:, None]
-    features = edge_features(raw, clean, logit, scale[graph.source, 0]).t()
+    scale = torch.stack([_median_length(raw, component[inliers.source] == number) for number in component])[:, None]
+    of_inliers = cleaned.outlier_probability[cleaned.is_inlier].logit()
+    features = edge_features(raw, clean, of_inliers, scale[inliers.source, 0]).t()
+    directed = DirectedEdges.of(inliers.source, inliers.target, graph.num_nodes, dtype)
     with workers():
-        edges = SortedEdges.of(graph)
         found = clean_edges(clean_net, measured, edges)
-        fine = fine_tuned(fine_net, graph, rectified, logit, start, edges, component)
+        fine = fine_tuned(fine_net, cleaned, start, component)
     return (
         float((found.outlier_logit.sigmoid() - logit.sigmoid()).abs().max()),
         _apart(found.target_from_source, rectified),
@@ -100,7 +108,7 @@ def _differences(graph: ViewGraph, start: Tensor, dtype: torch.dtype) -> tuple[f
 def _median_length(vectors: Tensor, chosen: Tensor) -> Tensor:
     """Of the chosen columns of ``(3, k)``; as little as it may be where none is chosen."""
     length = vectors[:, chosen].norm(dim=0)
-    return length.median().clamp(min=MIN_SCALE) if len(length) else length.new_tensor(MIN_SCALE)
+    return length.median().clamp(min=NUMBERS.min_residual) if len(length) else length.new_tensor(NUMBERS.min_residual)
 
 
 def _apart(found: Tensor, expected: Tensor) -> float:

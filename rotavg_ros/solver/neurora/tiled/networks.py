@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import cast
 
 import torch
@@ -13,17 +12,17 @@ from rotavg_ros.solver.algebra.residuals import SLICE_EDGES, EdgeResiduals, mult
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges, Tile
 from rotavg_ros.solver.algebra.threads import for_each, slices
 from rotavg_ros.solver.neurora.clean_net import CleanEdges, CleanNet
+from rotavg_ros.solver.neurora.cleaned import Cleaned
 from rotavg_ros.solver.neurora.fine_net import (
     EVEN_FEATURES,
-    MIN_SCALE,
     ODD_FEATURES,
     FineNet,
     edge_features,
     node_features,
 )
 from rotavg_ros.solver.neurora.message_passing import MessagePassingLayer
+from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.neurora.tiled.passes import node_states, visit_activations
-from rotavg_ros.view_graph import ViewGraph
 
 
 def clean_edges(network: CleanNet, target_from_source: Tensor, edges: SortedEdges) -> CleanEdges:
@@ -68,26 +67,16 @@ def clean_edges(network: CleanNet, target_from_source: Tensor, edges: SortedEdge
     return CleanEdges(clean, logit)
 
 
-def fine_tuned(
-    network: FineNet,
-    measured: ViewGraph,
-    rectified: Tensor,
-    outlier_logit: Tensor,
-    body_from_world: Tensor,
-    edges: SortedEdges,
-    component: Tensor,
-) -> Tensor:
-    """FineNet's correction of ``body_from_world`` ``(N, 4)`` float32.
+def fine_tuned(network: FineNet, cleaned: Cleaned, body_from_world: Tensor, component: Tensor) -> Tensor:
+    """FineNet's correction of ``body_from_world`` ``(N, 4)`` float32; messages run over the inliers.
 
     Args:
-        rectified, outlier_logit: ``(M, 4)`` and ``(M,)``, what CleanNet says of the edges.
-        edges: those of them over which messages run.
         component: ``(N,)`` connected components.
     """
+    measured, edges = cleaned.measured, cleaned.edges.select(cleaned.is_inlier)
+    outlier_logit = cleaned.outlier_probability.logit()
     num_edges = measured.num_edges
-    residuals = [
-        EdgeResiduals(graph, body_from_world) for graph in (measured, replace(measured, target_from_source=rectified))
-    ]
+    residuals = [EdgeResiduals(graph, body_from_world) for graph in (measured, cleaned.graph)]
     raw, clean = (body_from_world.new_empty(3, num_edges) for _ in residuals)
 
     def compare(part: slice) -> None:
@@ -117,6 +106,8 @@ def typical_size(vectors: Tensor, node: Tensor, group_of_node: Tensor) -> Tensor
     """
     length = (vectors * vectors).sum(dim=0).sqrt_()
     if not bool((group_of_node > 0).any()):
-        return (length.median() if len(length) else length.new_tensor(0.0)).clamp(min=MIN_SCALE).reshape(1, 1)
+        return (
+            (length.median() if len(length) else length.new_tensor(0.0)).clamp(min=NUMBERS.min_residual).reshape(1, 1)
+        )
     median = median_by_group(length, group_of_node[node], int(group_of_node.max()) + 1)
-    return torch.where(median.isfinite(), median, 0.0).clamp(min=MIN_SCALE)[group_of_node][:, None]
+    return torch.where(median.isfinite(), median, 0.0).clamp(min=NUMBERS.min_residual)[group_of_node][:, None]
