@@ -64,7 +64,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "moves": {"graph", "noise", "passes", "preparation"},
         "preparation": {"graph", "noise"},
         "refinement": {"graph", "moves", "noise", "passes"},
-        "stages": {"graph", "moves", "network", "noise", "passes", "preparation", "refinement"},
+        "stages": {"graph", "moves", "network", "noise", "options", "passes", "preparation", "refinement"},
         "update": {"graph", "network", "noise", "passes", "preparation", "refinement", "stages"},
         "solve": {"graph", "network", "options", "passes", "preparation", "refinement", "stages", "update"},
     },

@@ -14,6 +14,7 @@ class SlamStages:
         refine: the refinement ends the solve.
         tree_start: it starts from the tree of least expected error; otherwise from the odometry.
         scale_estimation: it estimates the noise; otherwise it believes the precisions that edges state.
+        group_search: it looks for groups of closures that are false though each by itself looks good.
         slip_search: it looks for slips in the odometry where closures speak of them.
     """
 
@@ -21,4 +22,5 @@ class SlamStages:
     refine: bool = True
     tree_start: bool = True
     scale_estimation: bool = True
+    group_search: bool = True
     slip_search: bool = True

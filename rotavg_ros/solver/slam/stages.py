@@ -18,6 +18,7 @@ from rotavg_ros.solver.slam.moves.slip_doubt import Doubt, measure_doubt
 from rotavg_ros.solver.slam.moves.slip_search import search_for_slips
 from rotavg_ros.solver.slam.network import SlamCleanNet, closure_features, false_log_odds
 from rotavg_ros.solver.slam.noise.model import NoiseModel, judge_by_chain
+from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.passes.alternation import SlamEstimate, Start
 from rotavg_ros.solver.slam.preparation import Prepared
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
@@ -104,23 +105,23 @@ def refine(
     correction: Tensor,
     max_passes: int = slam_refinement.MAX_PASSES,
     *,
-    scale_estimation: bool = True,
-    slip_search: bool = True,
+    stages: SlamStages | None = None,
 ) -> SlamEstimate:
     """Refine from corrections ``(K, 4)``; again where groups of closures are false that were believed.
 
     If the outcome looks as if odometry had slipped, from a second start, too.
     """
+    stages = SlamStages() if stages is None else stages
 
     def run(start: Start, rank: np.ndarray | None = None) -> SlamEstimate:
         return slam_refinement.refine(
-            start, prepared.pairs, max_passes=max_passes, hold_noise=not scale_estimation, rank=rank
+            start, prepared.pairs, max_passes=max_passes, hold_noise=not stages.scale_estimation, rank=rank
         )
 
     prior = cleaned.prior_log_odds
     estimate = run(Start(prepared.closure_graph, correction, cleaned.inlier_probability, prepared.noise, prior))
-    doubt = measure_doubt(prepared, estimate) if slip_search else Doubt.NONE
-    without = without_false_groups(run, estimate, prepared, prior, doubt)
+    doubt = measure_doubt(prepared, estimate) if stages.slip_search else Doubt.NONE
+    without = without_false_groups(run, estimate, prepared, prior, doubt) if stages.group_search else estimate
     rivals = [estimate.correction] if without is estimate else [estimate.correction, without.correction]
     second = search_for_slips(prepared, estimate, prior, doubt, rivals)
     return without if second is None else run(second, estimate.rank)

@@ -28,17 +28,18 @@ def tune() -> Tuning:
     global _tuned
     with _lock, workers():
         if not _tuned:
-            inference.set_tuning(_measure())
+            inference.set_tuning(measure())
             _tuned = True
     return inference.current_tuning()
 
 
 @torch.no_grad()
-def _measure() -> Tuning:
+def measure(num_edges: int = _EDGES) -> Tuning:
+    """What is fastest on a random graph of so many edges, inside of the workers; passes take what was tried last."""
     generator = torch.Generator().manual_seed(0)
-    source = torch.randint(_NODES, (_EDGES,), generator=generator)
-    target = (source + torch.randint(1, _NODES, (_EDGES,), generator=generator)) % _NODES
-    features = rotations.random(_EDGES, dtype=torch.float32, generator=generator)
+    source = torch.randint(_NODES, (num_edges,), generator=generator)
+    target = (source + torch.randint(1, _NODES, (num_edges,), generator=generator)) % _NODES
+    features = rotations.random(num_edges, dtype=torch.float32, generator=generator)
     edges = SortedEdges.of(ViewGraph.create(source, target, features, num_nodes=_NODES))
     nodes = torch.zeros(_NODES, HIDDEN_WIDTH)
     network = MessagePassingNetwork(HIDDEN_WIDTH, features.shape[1], num_layers=_LAYERS)

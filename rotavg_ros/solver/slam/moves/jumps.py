@@ -69,7 +69,7 @@ class _Jumps:
             return correction, gained
         # What an edge loses if one end turns is what it is yet short of its cap, or less if it turns but a little.
         system = cost.pattern.factorize(np.maximum(cost.cap - costs, _MIN_CARRIED))
-        questions = _turns(cost, residual, residual[candidates], costs)
+        questions = turns(cost, residual, residual[candidates], costs)
         bounds = questions.gain_bounds(system)
         for number in np.flatnonzero(bounds > hopeless[candidates] + _MIN_GAIN):
             edge = candidates[number]
@@ -78,7 +78,7 @@ class _Jumps:
             # Until something turns, all questions stand as they were put at first.
             question, column, bound = questions, int(number), float(bounds[number])
             if gained > 0:
-                question, column = _turns(cost, residual, residual[[edge]], costs), 0
+                question, column = turns(cost, residual, residual[[edge]], costs), 0
                 bound = float(question.gain_bounds(system)[0])
                 if bound <= hopeless[edge] + _MIN_GAIN:
                     continue
@@ -123,7 +123,7 @@ def _candidates(
     return np.concatenate((segments, closure[leaders]))
 
 
-def _turns(cost: TruncatedCost, residual: Tensor, turns: Tensor, costs: np.ndarray) -> TwoLabels:
+def turns(cost: TruncatedCost, residual: Tensor, turns: Tensor, costs: np.ndarray) -> TwoLabels:
     """Which nodes to turn by each of ``turns`` ``(Q, 4)``; residuals ``(E, 4)`` and costs ``(E,)`` as they are now."""
     graph = cost.graph
     # Real parts of turn⁻¹ ∘ residual and of residual ∘ turn.

@@ -82,7 +82,7 @@ def search_for_slips(
     num_edges = len(graph.source)
     if num_edges <= _MAX_EDGES_TO_JUMP:
         first = costs if num_edges <= _MAX_EDGES_TO_ANNEAL_TWICE else costs[-1:]
-        correction = _jump(first, correction, pairs, is_agreed, votes.closure > 0)
+        correction = jump_through(first, correction, pairs, is_agreed, votes.closure > 0)
     if not _is_better(cost, correction, rivals, pairs, is_agreed, doubt):
         return None
     # Without the slips, the odometry tells how it drifts.
@@ -91,7 +91,7 @@ def search_for_slips(
     cost = costs[-1]
     if num_edges <= _MAX_EDGES_TO_JUMP:
         everyone = np.ones(len(votes.closure), dtype=bool)
-        correction = _jump(costs, cost.descend(correction), pairs, is_agreed, everyone)
+        correction = jump_through(costs, cost.descend(correction), pairs, is_agreed, everyone)
     return Start(graph, correction, expit(cost.log_odds(correction)), noise, log_odds)
 
 
@@ -102,7 +102,7 @@ def _costs(
     return [TruncatedCost.create(graph, noise, prior, rank) for prior in priors]
 
 
-def _jump(
+def jump_through(
     costs: Sequence[TruncatedCost],
     correction: Tensor,
     pairs: AgreementPairs,

@@ -130,7 +130,7 @@ def _log_odds(
     return judge(state.noise, square, own_variance, prediction_variance, tail_ratio(own_variance)).log_odds
 
 
-def _if_turned(state: Passes, system: WholeSystem, member: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def if_turned(state: Passes, system: WholeSystem, member: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What the edges give way ``(E, G)`` if groups ``(E, G)`` are turned by one, and the information on all turns.
 
     The information ``(G, G)``, rad⁻², is what is left of it when everything else has given way.
@@ -144,7 +144,7 @@ def _false_ones(state: Passes, system: WholeSystem, groups: _Groups, closure: np
     odometry, weight = state.graph.is_odometry, system.factorised.weight
     member = np.zeros((len(weight), len(groups.information)))
     member[closure] = groups.member.toarray()
-    gives_way, curvature = _if_turned(state, system, member)
+    gives_way, curvature = if_turned(state, system, member)
     overlaps = abs(member).T @ abs(member) > 0
     size = abs(member).sum(axis=0)
     root = np.sqrt(weight[odometry])[:, None]

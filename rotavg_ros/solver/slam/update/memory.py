@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,18 +38,31 @@ from rotavg_ros.solver.slam.update.new_closures import judge_new_closures
 from rotavg_ros.solver.slam.update.passes import GrownStart, follow, grown_variance, renew
 from rotavg_ros.view_graph import ViewGraph
 
-# The whole solve runs again after so many updates, or once there are so many more closures. Of few closures that is
-# none: while little is known, each new one may change what is believed of the others.
-_MAX_UPDATES = 60
-_MAX_GROWTH = 0.05
-# Closures whose verdict may turn in an update, and what share of all.
-_MAX_TURNED, _MAX_SHARE_TURNED = 2, 0.002
-# New closures that an update solves for from an older factorisation; with more, another one is cheaper. If so many are
-# new at once, the whole solve runs.
-_MAX_COLUMNS = 128
-# A factorisation with more entries per node and edge, of 12 bytes at least, takes more memory than it is worth.
-_MAX_ENTRIES = 24
 _NEXT_TO_NOTHING = 1e-9
+
+
+@dataclass(frozen=True)
+class UpdateLimits:
+    """How far updates go before the whole solve runs again, and what they may cost.
+
+    Attributes:
+        updates: the whole solve runs again after so many.
+        growth: … or once there are more closures by this share. Of few closures that is none: while little is known,
+            each new one may change what is believed of the others.
+        turned, share_turned: … or when more verdicts turn in an update than either.
+        columns: new closures that an update solves for from an older factorisation; with more, another one is cheaper.
+            If so many are new at once, the whole solve runs.
+        large_graph: key nodes; a graph of fewer is factorised anew in each update.
+        entries: a factorisation with more entries of 12 bytes per node and edge is not kept.
+    """
+
+    updates: int = 60
+    growth: float = 0.05
+    turned: int = 2
+    share_turned: float = 0.002
+    columns: int = 128
+    large_graph: int = ITERATING_PAYS
+    entries: int = 24
 
 
 class Updated(NamedTuple):
@@ -84,6 +97,7 @@ class SlamMemory:
         factor: what the next update may solve from; None where it factorises anew.
         closures: how many there were when the whole solve ran.
         updates: how many there have been since.
+        limits: of the updates.
     """
 
     graph: ViewGraph
@@ -103,6 +117,7 @@ class SlamMemory:
     factor: OlderFactor | None
     closures: int
     updates: int = 0
+    limits: UpdateLimits = field(default_factory=UpdateLimits)
 
     @classmethod
     def of(
@@ -120,7 +135,7 @@ class SlamMemory:
             return None
         return cls(
             **_by_edge(closure_graph, estimate, cleaned.prior_log_odds),
-            **_of_estimate(graph, closure_graph, estimate),
+            **_of_estimate(graph, closure_graph, estimate, UpdateLimits()),
             graph=graph,
             variance=variance,
             trust=estimate.trust,
@@ -135,11 +150,11 @@ class SlamMemory:
         Args:
             body_from_world: ``(N, 4)`` start.
         """
-        if self.updates >= _MAX_UPDATES or not begins_with(graph, self.graph):
+        if self.updates >= self.limits.updates or not begins_with(graph, self.graph):
             return None
         num_closures = int((~graph.is_odometry).sum())
         num_new = num_closures - int((~self.graph.is_odometry).sum())
-        if num_closures > (1 + _MAX_GROWTH) * self.closures or num_new > _MAX_COLUMNS:
+        if num_closures > (1 + self.limits.growth) * self.closures or num_new > self.limits.columns:
             return None
         paths = self.paths.grown(graph)
         closure_graph = draw_together(graph)[0] if paths is None else contract_along(graph, paths)
@@ -151,7 +166,7 @@ class SlamMemory:
             return None
         turned = np.abs(updated.verdicts.inlier_probability - start.inlier_probability) > 0.5
         turned[start.is_new] = False
-        return None if turned.sum() > max(_MAX_TURNED, _MAX_SHARE_TURNED * num_closures) else updated
+        return None if turned.sum() > max(self.limits.turned, self.limits.share_turned * num_closures) else updated
 
     def _extend(self, graph: ViewGraph, start: GrownStart) -> Updated:
         """With odometry alone, which says nothing of what was there."""
@@ -170,7 +185,7 @@ class SlamMemory:
 
     def _follow(self, graph: ViewGraph, start: GrownStart) -> Updated | None:
         """With noise and predictions of before; None where they are not for that, or no longer serve."""
-        if start.graph.num_nodes < ITERATING_PAYS:
+        if start.graph.num_nodes < self.limits.large_graph:
             return None
         closure_graph, weight, verdicts = start.graph, start.weight, None
         for older in self._factors(start, weight):
@@ -180,7 +195,7 @@ class SlamMemory:
                 break
         if verdicts is None:
             return None
-        return self._updated(graph, start, verdicts, _if_small(laplacian.factor, graph))
+        return self._updated(graph, start, verdicts, _if_small(laplacian.factor, graph, self.limits))
 
     def _updated(self, graph: ViewGraph, start: GrownStart, verdicts: Verdicts, factor: OlderFactor | None) -> Updated:
         """With the noise and predictions of before."""
@@ -192,7 +207,11 @@ class SlamMemory:
     def _factors(self, start: GrownStart, weight: np.ndarray) -> Iterator[OlderFactor]:
         """What may be solved from: the factor there is, as long as not too much is new, and another one."""
         graph, older = start.graph, self.factor
-        if older is not None and older.fits(graph) and (graph.view_graph_edge >= older.num_edges).sum() <= _MAX_COLUMNS:
+        if (
+            older is not None
+            and older.fits(graph)
+            and (graph.view_graph_edge >= older.num_edges).sum() <= self.limits.columns
+        ):
             yield older
         pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots, self._rank(graph))
         # Without what has just come, so that predictions of it are exact.
@@ -209,7 +228,7 @@ class SlamMemory:
         memory = replace(
             self,
             **_by_edge(closure_graph, estimate, start.prior_log_odds),
-            **_of_estimate(graph, closure_graph, estimate),
+            **_of_estimate(graph, closure_graph, estimate, self.limits),
             graph=graph,
             variance=variance,
             updates=self.updates + 1,
@@ -271,17 +290,19 @@ def _by_edge(graph: ClosureGraph, verdicts: Verdicts, prior_log_odds: np.ndarray
     }
 
 
-def _of_estimate(graph: ViewGraph, closure_graph: ClosureGraph, estimate: SlamEstimate) -> dict[str, Any]:
+def _of_estimate(
+    graph: ViewGraph, closure_graph: ClosureGraph, estimate: SlamEstimate, limits: UpdateLimits
+) -> dict[str, Any]:
     """What is remembered of the passes."""
-    is_large = closure_graph.num_nodes >= ITERATING_PAYS
+    is_large = closure_graph.num_nodes >= limits.large_graph
     factor = OlderFactor.of(closure_graph, estimate.factorised) if is_large else None
     return {
         "noise": estimate.noise,
         "elimination": None if estimate.rank is None else closure_graph.nodes[np.argsort(estimate.rank)],
-        "factor": None if factor is None else _if_small(factor, graph),
+        "factor": None if factor is None else _if_small(factor, graph, limits),
     }
 
 
-def _if_small(factor: OlderFactor, graph: ViewGraph) -> OlderFactor | None:
+def _if_small(factor: OlderFactor, graph: ViewGraph, limits: UpdateLimits) -> OlderFactor | None:
     """What is worth its memory."""
-    return factor if factor.num_entries <= _MAX_ENTRIES * (graph.num_nodes + graph.num_edges) else None
+    return factor if factor.num_entries <= limits.entries * (graph.num_nodes + graph.num_edges) else None

@@ -19,8 +19,8 @@ from rotavg_ros.evaluation.metrics import orientation_errors
 from rotavg_ros.solver.algebra.minimum_cut import FlowNetwork
 from rotavg_ros.solver.slam import preparation as slam_preparation
 from rotavg_ros.solver.slam.moves.cycle_votes import count_votes
-from rotavg_ros.solver.slam.moves.jumps import _turns
-from rotavg_ros.solver.slam.moves.slip_search import _jump, prior_log_odds
+from rotavg_ros.solver.slam.moves.jumps import turns
+from rotavg_ros.solver.slam.moves.slip_search import jump_through, prior_log_odds
 from rotavg_ros.solver.slam.moves.truncated_cost import TruncatedCost
 from rotavg_ros.solver.slam.noise.exceedance import exceedance
 from rotavg_ros.solver.slam.noise.model import NoiseModel, agree, noise_between_neighbours
@@ -205,7 +205,7 @@ def test_a_jump_takes_the_set_that_an_exhaustive_search_finds() -> None:
     bits = (np.arange(2**closures.num_nodes)[:, None] >> np.arange(closures.num_nodes)) & 1 == 1
     least = min(energy(turns) for turns in bits)
     assert least < costs.sum() - 1
-    question = _turns(cost, residual, turn[None], costs)
+    question = turns(cost, residual, turn[None], costs)
     network = FlowNetwork(closures.num_nodes, closures.source, closures.target)
     assert energy(question.best_set(network)) == pytest.approx(least, abs=0.05)
     gained = float(costs.sum()) - least
@@ -227,10 +227,13 @@ def test_a_stretch_that_slips_cut_in_two_is_turned_part_by_part(seed: int) -> No
     costs = [TruncatedCost.create(closures, noise, prior_log_odds(closures, noise, prior, p)) for p in (0.5, 0.01)]
     start = rotations.identity(closures.num_nodes)
     everyone = np.ones(int(closures.is_closure.sum()), dtype=bool)
-    found = _jump(costs, start, pairs, agree(pairs, noise), everyone)
+    found = jump_through(costs, start, pairs, agree(pairs, noise), everyone)
     at_truth = costs[-1].descend(closures.corrections(as_quaternions(truth)))
     assert costs[-1].total(found) < costs[-1].total(at_truth) + 0.1
-    assert costs[-1].total(_jump(costs[-1:], start, pairs, agree(pairs, noise), everyone)) > costs[-1].total(found) + 10
+    assert (
+        costs[-1].total(jump_through(costs[-1:], start, pairs, agree(pairs, noise), everyone))
+        > costs[-1].total(found) + 10
+    )
 
 
 def test_exceedance_is_the_noncentral_chi_distribution() -> None:

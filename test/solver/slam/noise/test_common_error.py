@@ -10,6 +10,7 @@ from rotavg_ros.datasets.slam_simulation import simulate_slam_graph
 from rotavg_ros.datasets.trajectories import World
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
 from rotavg_ros.solver.slam.noise.common_error import RunErrors, closure_runs, common_share, variance_factor
+from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.preparation import prepare
 from rotavg_ros.solver.slam.stages import bootstrap, clean, refine
 
@@ -60,6 +61,6 @@ def test_a_front_end_that_repeats_its_errors_is_recognised(planted: float, low: 
         run = simulate_slam_graph(config, np.random.default_rng(seed))
         prepared = prepare(run.graph)
         cleaned = clean(None, prepared, run.graph.label)
-        estimate = refine(prepared, cleaned, bootstrap(prepared, cleaned), slip_search=False)
+        estimate = refine(prepared, cleaned, bootstrap(prepared, cleaned), stages=SlamStages(slip_search=False))
         shares.append(estimate.common_share)
     assert low <= np.median(shares) <= high

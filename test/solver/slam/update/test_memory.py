@@ -12,7 +12,7 @@ from rotavg_ros import ViewGraph, rotations, solve
 from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.datasets.trajectories import World
 from rotavg_ros.online.gauge import extend_along_edges
-from rotavg_ros.solver.slam.update import memory as slam_memory
+from rotavg_ros.solver.slam.update.memory import SlamMemory, UpdateLimits
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
@@ -40,26 +40,27 @@ def grown(solution: Solution, graph: ViewGraph) -> Solution:
     return solve(graph, warm_start=start, memory=solution.memory)
 
 
+def limited(solution: Solution, limits: UpdateLimits) -> Solution:
+    """The solution, whose memory goes on within other limits."""
+    assert isinstance(solution.memory, SlamMemory)
+    return replace(solution, memory=replace(solution.memory, limits=limits))
+
+
 @pytest.mark.parametrize(
     ("is_large", "max_entries"), [(False, 24), (True, 24), (True, 0)], ids=["renewed", "followed", "factorised anew"]
 )
-def test_updates_end_where_a_whole_solve_does(
-    city: ViewGraph, monkeypatch: pytest.MonkeyPatch, is_large: bool, max_entries: int
-) -> None:
-    if is_large:
-        monkeypatch.setattr(slam_memory, "ITERATING_PAYS", 0)
-        monkeypatch.setattr(slam_memory, "_MAX_ENTRIES", max_entries)
-    solution = solve(until(city, 500))
+def test_updates_end_where_a_whole_solve_does(city: ViewGraph, is_large: bool, max_entries: int) -> None:
+    limits = UpdateLimits(large_graph=0, entries=max_entries) if is_large else UpdateLimits()
+    solution = limited(solve(until(city, 500)), limits)
     updates = followed = 0
     for num_keyframes in range(508, NUM_KEYFRAMES + 1, 4):
         solution = grown(solution, until(city, num_keyframes))
         updates += "update" in solution.stage_seconds and "refine" not in solution.stage_seconds
-        assert solution.memory is not None
-        factor = solution.memory.factor
-        followed += factor is not None and len(factor.closures) > 0
-        assert (
-            solution.memory.prediction_variance[solution.memory.graph.kind.numpy() == EdgeKind.LOOP_CLOSURE] > 0
-        ).all()
+        memory = limited(solution, limits).memory
+        assert isinstance(memory, SlamMemory)
+        solution = replace(solution, memory=memory)
+        followed += memory.factor is not None and len(memory.factor.closures) > 0
+        assert (memory.prediction_variance[memory.graph.kind.numpy() == EdgeKind.LOOP_CLOSURE] > 0).all()
     assert followed >= 10 if is_large and max_entries else followed == 0
     assert updates >= 15  # of 24; the others have seen the whole graph
     whole = solve(city)
@@ -90,12 +91,8 @@ def test_odometry_alone_says_nothing_of_what_was_there(city: ViewGraph) -> None:
 
 @pytest.mark.parametrize("is_large", [False, True], ids=["factorised anew", "followed"])
 @pytest.mark.parametrize("has_closure", [False, True])
-def test_a_second_robot_begins(
-    city: ViewGraph, monkeypatch: pytest.MonkeyPatch, has_closure: bool, is_large: bool
-) -> None:
-    if is_large:
-        monkeypatch.setattr(slam_memory, "ITERATING_PAYS", 0)
-    before = solve(until(city, 500))
+def test_a_second_robot_begins(city: ViewGraph, has_closure: bool, is_large: bool) -> None:
+    before = limited(solve(until(city, 500)), UpdateLimits(large_graph=0) if is_large else UpdateLimits())
     first = 504 if has_closure else 500
     chain = until(city, 4)
     chain = chain.select_edges(chain.is_odometry)
@@ -116,7 +113,7 @@ def test_a_second_robot_begins(
 def test_a_wrong_verdict_is_put_right_in_an_update(city: ViewGraph, was_good: bool) -> None:
     graph = until(city, 500)
     before = solve(graph)
-    assert before.memory is not None
+    assert isinstance(before.memory, SlamMemory)
     is_closure, score = graph.kind == EdgeKind.LOOP_CLOSURE, before.outlier_score
     edge = int(torch.where(is_closure, score if was_good else 1 - score, torch.inf).argmin())
     mistaken = before.memory.inlier_probability.copy()
@@ -127,9 +124,8 @@ def test_a_wrong_verdict_is_put_right_in_an_update(city: ViewGraph, was_good: bo
     assert bool(after.outlier_score[edge] < 0.5) is was_good
 
 
-def test_much_that_is_new_is_judged_as_a_whole(city: ViewGraph, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(slam_memory, "_MAX_COLUMNS", 3)
-    solution = solve(until(city, 500))
+def test_much_that_is_new_is_judged_as_a_whole(city: ViewGraph) -> None:
+    solution = limited(solve(until(city, 500)), UpdateLimits(columns=3))
     for num_keyframes, is_whole in ((502, False), (520, True)):
         solution = grown(solution, until(city, num_keyframes))
         assert ("refine" in solution.stage_seconds) is is_whole
@@ -152,11 +148,10 @@ def test_what_has_not_only_grown_is_solved_as_a_whole(city: ViewGraph, change: s
     torch.testing.assert_close(with_memory.outlier_score, without.outlier_score, rtol=0, atol=0)
 
 
-def test_the_whole_solve_comes_round(city: ViewGraph, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(slam_memory, "_MAX_UPDATES", 2)
-    solution, counts = solve(until(city, 560)), []
-    for num_keyframes in range(561, 566):
+def test_the_whole_solve_comes_round(city: ViewGraph) -> None:
+    solution, counts = limited(solve(until(city, 560)), UpdateLimits(updates=2)), []
+    for num_keyframes in range(561, 564):
         solution = grown(solution, until(city, num_keyframes))
-        assert solution.memory is not None
+        assert isinstance(solution.memory, SlamMemory)
         counts.append(solution.memory.updates)
-    assert counts == [1, 2, 0, 1, 2]
+    assert counts == [1, 2, 0]
