@@ -1,10 +1,4 @@
-"""Solve view-graph files: absolute orientations and an outlier score for every edge.
-
-Reads g2o, TORO, iSAM, 1DSfM EGs.txt and npz. Writes to DIR, or to DIR/<stem> for several graphs:
-  orientations.csv  id,qx,qy,qz,qw,component   world_from_body, ascending by id
-  edges.csv         source,target,outlier_score,outlier   in the order of the file (or edges.npz)
-  summary.json      counts, seconds, memory, device, method, version
-"""
+"""What ``rotavg solve`` does: every graph solved and written, one after the other."""
 
 from __future__ import annotations
 
@@ -22,22 +16,21 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from rotavg_ros.cli.arguments import whole_number
 from rotavg_ros.cli.main import EXIT_USER_ERROR, print_error
+from rotavg_ros.cli.options.solve import EDGE_FORMATS
 from rotavg_ros.cli.poses import POSE_FILES, write_corrected_poses
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.csv_writer import Column, write_csv
 from rotavg_ros.datasets.graph_file import GraphFile, read_graph
 from rotavg_ros.errors import UserError
 from rotavg_ros.rotations import canonical, inverse
-from rotavg_ros.solver import DEVICES, METHODS, PROFILES, Solution, solve
+from rotavg_ros.solver import Solution, solve
 from rotavg_ros.solver.network_store import WEIGHTS_FOLDER
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
 
 OUTLIER_THRESHOLD = 0.5
 _ORIENTATIONS, _EDGES, _SUMMARY = "orientations.csv", "edges", "summary.json"
-_EDGE_FORMATS = ("csv", "npz")
 
 
 class SolveError(UserError):
@@ -50,32 +43,6 @@ class Job:
 
     graph: Path
     output: Path
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``rotavg solve``."""
-    parser.add_argument("graphs", nargs="+", type=Path, metavar="GRAPH", help="view-graph file")
-    parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for the answer")
-    methods = f"{', '.join(METHODS)}, or A+B: B starts from A's answer (default: neurora)"
-    parser.add_argument("--method", default="neurora", metavar="NAME", help=methods)
-    parser.add_argument(
-        "--profile", default="auto", choices=PROFILES, help="auto (default): slam if any edge is odometry"
-    )
-    parser.add_argument("--device", default="auto", choices=DEVICES, help="default: auto")
-    parser.add_argument(
-        "--refine", type=whole_number, metavar="N", help="at most N refinement steps; 0 skips (default: the method's)"
-    )
-    parser.add_argument(
-        "--weights", type=Path, metavar="DIR", help="networks of `rotavg train`; what DIR lacks comes from the package"
-    )
-    parser.add_argument(
-        "--poses",
-        action="store_true",
-        help="also write the corrected graph.g2o and trajectory.kitti (.tum with stamps)",
-    )
-    parser.add_argument(
-        "--edges", default="csv", choices=(*_EDGE_FORMATS, "none"), help="format of the edges' file (default: csv)"
-    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -155,7 +122,7 @@ def plan(graphs: list[Path], output: Path, *, poses: bool = False) -> list[Job]:
         if other is not job.graph:
             raise SolveError(f"{other} and {job.graph} would both go to {job.output}; solve them one by one")
         _check_writable(job.output)
-        edge_files = (f"{_EDGES}.{suffix}" for suffix in _EDGE_FORMATS)
+        edge_files = (f"{_EDGES}.{suffix}" for suffix in EDGE_FORMATS)
         for name in (_ORIENTATIONS, _SUMMARY, *edge_files, *(POSE_FILES if poses else ())):
             for graph in graphs:
                 if graph.resolve() == (job.output / name).resolve():
@@ -218,7 +185,7 @@ def write_answer(output: Path, graph_file: GraphFile, solution: Solution, summar
                 write(file)
         for name in writers:
             os.replace(temporary[name], output / name)
-        for suffix in _EDGE_FORMATS:
+        for suffix in EDGE_FORMATS:
             if f"{_EDGES}.{suffix}" not in writers:
                 (output / f"{_EDGES}.{suffix}").unlink(missing_ok=True)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The methods by name, and what each of them runs."""
+"""The methods by name, and what each of them runs; the profiles and devices to choose from. Imports no torch."""
 
 from __future__ import annotations
 
@@ -52,3 +52,5 @@ NETWORK_METHODS = {
 # By name only: they build on the solver, so that they are imported when one of them runs.
 BASELINES = ("chatterjee", "weiszfeld", "arrigoni", "wang")
 METHODS = (*NETWORK_METHODS, *BASELINES)
+PROFILES = ("auto", "slam", "sfm")
+DEVICES = ("auto", "cpu", "cuda")

@@ -12,8 +12,7 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.errors import UserError
 from rotavg_ros.solver import devices, sfm_stages, slam_judging, slam_refinement
-from rotavg_ros.solver.devices import DEVICES
-from rotavg_ros.solver.methods import BASELINES, DEFAULT_METHOD, METHODS, NETWORK_METHODS
+from rotavg_ros.solver.methods import BASELINES, DEFAULT_METHOD, DEVICES, METHODS, NETWORK_METHODS, PROFILES
 from rotavg_ros.solver.parallel import workers
 from rotavg_ros.solver.profile import Estimate, Networks, Stopwatch
 from rotavg_ros.solver.sfm_profile import solve_sfm
@@ -22,7 +21,6 @@ from rotavg_ros.solver.slam_profile import solve_slam, update_slam
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
 
-PROFILES = ("auto", "slam", "sfm")
 # The noise that makes an edge an outlier, in radians.
 _OUTLIER_ANGLE = {"sfm": sfm_stages.OUTLIER_ANGLE, "slam": slam_judging.OUTLIER_ANGLE}
 
