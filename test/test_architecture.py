@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "rotavg_ros"
 # The parts that others build on, and the parts of this package that they may import themselves.
 INWARD = {
     "errors": set(),
-    "view_graph": {"errors"},
+    "view_graph": {"errors", "rotations"},
     "rotations": set(),
     "solver": {"errors", "rotations", "view_graph"},
     "datasets": {"errors", "rotations", "view_graph"},

@@ -19,7 +19,7 @@ from rotavg_ros.solver.sfm_profile import solve_sfm
 from rotavg_ros.solver.slam_memory import SlamMemory
 from rotavg_ros.solver.slam_profile import solve_slam, update_slam
 from rotavg_ros.solver.solution import Solution
-from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel, HoldsViewGraph, ViewGraph, view_graph_of
 
 # The noise that makes an edge an outlier, in radians.
 _OUTLIER_ANGLE = {"sfm": sfm_stages.OUTLIER_ANGLE, "slam": slam_judging.OUTLIER_ANGLE}
@@ -28,7 +28,7 @@ _OUTLIER_ANGLE = {"sfm": sfm_stages.OUTLIER_ANGLE, "slam": slam_judging.OUTLIER_
 @torch.no_grad()
 @workers()
 def solve(
-    graph: ViewGraph,
+    graph: ViewGraph | HoldsViewGraph,
     *,
     method: str = DEFAULT_METHOD,
     profile: str = "auto",
@@ -41,6 +41,7 @@ def solve(
     """Absolute orientations and outlier scores of a view-graph; every connected component by itself.
 
     Args:
+        graph: N nodes, M edges; or what has it as its ``graph``, as the result of ``read_graph`` does.
         method: one of :data:`METHODS`, or several joined by "+", of which each starts from the answer of the one
             before.
         profile: "slam" for odometry chains with loop closures, "sfm" for unordered view-graphs, "auto": "slam" if any
@@ -56,9 +57,15 @@ def solve(
             much has changed, everything is judged anew.
         weights: folder of networks trained with ``rotavg train``; what it lacks comes from the package.
 
+    Returns:
+        :class:`~rotavg_ros.solver.solution.Solution`: ``body_from_world`` ``(N, 4)`` xyzw, the inverse of what ROS
+        publishes (``world_from_body`` is that); ``outlier_score`` ``(M,)``, the probability that an edge is wrong;
+        ``component`` and ``uncertainty`` ``(N,)``; and what was run.
+
     Raises:
-        UserError: an option outside its choices, or a start of the wrong shape.
+        UserError: no view-graph, an option outside its choices, or a start of the wrong shape.
     """
+    graph = view_graph_of(graph)
     names = method.split("+")
     for name in names:
         _check_choice("method", name, METHODS)
