@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from rotavg_ros.cli.progress import working
-from rotavg_ros.datasets.graph_file import read_graph
+from rotavg_ros.datasets.graph_file import read_graph, stem_of
 from rotavg_ros.datasets.ground_truth import attach_truth
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.noise_plot import draw, edge_noise
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     if outlier_angle_deg is None:
         outlier_angle_deg = 10.0 if bool(graph.is_odometry.any()) else 20.0
     knows_truth = truth is not None and bool(np.isfinite(truth).all(axis=1).any())
-    output = arguments.output or Path(f"{arguments.graph.stem}-statistics")
+    output = arguments.output or Path(f"{stem_of(arguments.graph)}-statistics")
     if not output.suffix:
         output = output.with_name(f"{output.name}.png")
     with working("solving and drawing"):
