@@ -129,7 +129,8 @@ def _contenders(
 ) -> dict[str, Contender]:
     """Those asked for, or what can run here of the default."""
     chosen = names if names is not None else [name for name in default if is_available(name)]
-    warm_up(tuple(contenders(chosen, weights).values()))
+    with working("warming up"):
+        warm_up(tuple(contenders(chosen, weights).values()))
     return contenders(chosen, weights, keep)
 
 

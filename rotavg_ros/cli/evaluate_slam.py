@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from rotavg_ros.cli.data_folder import data_folder
-from rotavg_ros.cli.progress import progress
+from rotavg_ros.cli.progress import progress, working
 from rotavg_ros.datasets.graph_file import read_graph
 from rotavg_ros.evaluation import slam_cases, slam_contenders, slam_incremental, slam_report, slam_uncertainty
 from rotavg_ros.evaluation.named_peers import is_available
@@ -24,7 +24,8 @@ def run(arguments: argparse.Namespace) -> Path:
     # What the last table needs shows before the hours that the others take.
     more = [_uncertainty_file(name) for name in _UNCERTAINTY_GRAPHS] if arguments.uncertainty else []
     data = data_folder(arguments, ("slam", *more))
-    slam_contenders.warm_up(tuple(slam_contenders.contenders(names).values()))
+    with working("warming up"):
+        slam_contenders.warm_up(tuple(slam_contenders.contenders(names).values()))
 
     def watch(steps: Iterable[Step]) -> Iterable[Step]:
         return progress(steps, description="solving", unit="solve")
