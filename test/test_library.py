@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -88,3 +90,14 @@ def test_a_closure_as_ros_states_it() -> None:
     edge = EdgeMeasurement.from_ros(1, source, target, left.as_quat(), (1.0, 2.0, 3.0), 25.0)
     np.testing.assert_allclose(edge.target_from_source, left.inv().as_quat())
     assert (edge.source, edge.target, edge.translation, edge.precision) == (source, target, (1.0, 2.0, 3.0), 25.0)
+
+
+def test_the_online_example(capsys: pytest.CaptureFixture[str]) -> None:
+    names = runpy.run_path(str(ROOT / "examples" / "online_in_python.py"))
+    odometry, corrected, false = capsys.readouterr().out.splitlines()
+    assert odometry == "odometry: 9.0° off in the mean"
+    degrees = re.fullmatch(r"corrected: (.*)° off in the mean", corrected)
+    assert degrees is not None and float(degrees[1]) < 1
+    assert false == f"false closures: {' '.join(map(str, range(60, 300, 20)))}"
+    last = Rotation.from_quat(names["latest"]) * names["true"][290].inv()
+    assert last.magnitude() < np.radians(2)
