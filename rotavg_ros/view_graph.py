@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -15,11 +15,18 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from rotavg_ros.errors import UserError
+from rotavg_ros.rotations import from_matrix, inverse
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 
-# A quaternion whose norm is farther than this from one is refused rather than normalised.
+# A quaternion whose norm is farther than this from one is refused rather than normalised, and so is a matrix R of whose
+# R Rᵀ an entry is farther than this from the identity's.
 UNIT_NORM_TOLERANCE = 1e-3
+# scipy's graph routines count nodes in 32 bits.
+_MAX_NODES = 2**31 - 1
+# Nodes without an edge that the largest index alone may imply: more are ids taken for indices, or `num_nodes` says that
+# they are meant. One costs a solve 1.5–2.3 kB and 20 µs (measured), these together 0.2 GB and 2 s.
+_MAX_IMPLIED_LONE_NODES = 100_000
 
 
 class EdgeKind(IntEnum):
@@ -71,8 +78,9 @@ class ViewGraph:
         cls,
         source: ArrayLike,
         target: ArrayLike,
-        target_from_source: ArrayLike,
+        target_from_source: ArrayLike | None = None,
         *,
+        source_from_target: ArrayLike | None = None,
         num_nodes: int | None = None,
         kind: ArrayLike | None = None,
         precision: ArrayLike | None = None,
@@ -81,47 +89,42 @@ class ViewGraph:
     ) -> ViewGraph:
         """Check the arrays and bring them into the graph's types.
 
+        Exactly one of ``target_from_source`` and ``source_from_target`` is given, as ``(M, 4)`` quaternions xyzw or as
+        ``(M, 3, 3)`` rotation matrices. Of two keyframes of which the target looks 30° to the left of the source,
+        ``source_from_target`` is (0, 0, 0.2588, 0.9659) and ``target_from_source`` is (0, 0, -0.2588, 0.9659).
+
         Args:
-            source, target: ``(M,)`` node indices from 0.
-            target_from_source: ``(M, 4)`` xyzw.
+            source, target: ``(M,)`` integers, node indices from 0.
+            target_from_source: ``R_target R_source⁻¹`` of the body-from-world orientations: takes coordinates from the
+                source's frame to the target's.
+            source_from_target: its inverse, the target's orientation in the source's frame: what a ROS message, a g2o
+                edge or a gtsam BetweenFactor states.
             num_nodes: default: the largest index that occurs plus one.
-            kind: default: every edge is a loop closure (an SfM view-graph).
+            kind: :class:`EdgeKind` codes; default: every edge is a loop closure (an SfM view-graph).
             precision: rad⁻²; default: unknown. Values that are not positive and finite count as unknown.
-            label: default: automatic.
+            label: :class:`EdgeLabel` codes; default: automatic.
             steps: default: 1.
 
         Raises:
-            ViewGraphError: shapes that do not fit, an index out of range, a self-edge, steps that are not positive and
-                finite, or a quaternion that is not finite or is farther than 1e-3 from unit length.
+            ViewGraphError: none or both of the two rotations, arrays that are not numbers or whose shapes do not fit,
+                an index out of range or far beyond the number of edges, a self-edge, an unknown code, steps that are
+                not positive and finite, a quaternion that is not finite or is farther than 1e-3 from unit length, or a
+                matrix that is no rotation.
         """
-        source = _as_tensor(source, torch.int64)
-        target = _as_tensor(target, torch.int64)
+        source = _column("source", source, torch.int64)
         num_edges = len(source)
-        quaternions = _as_tensor(target_from_source, torch.float64).reshape(-1, 4)
-        kind = _default(kind, torch.int64, num_edges, EdgeKind.LOOP_CLOSURE)
-        precision = _default(precision, torch.float64, num_edges, float("nan"))
-        label = _default(label, torch.int64, num_edges, EdgeLabel.AUTOMATIC)
-        steps = _default(steps, torch.float64, num_edges, 1.0)
-        for name, values in (
-            ("target", target),
-            ("target_from_source", quaternions),
-            ("kind", kind),
-            ("precision", precision),
-            ("label", label),
-            ("steps", steps),
-        ):
-            if len(values) != num_edges:
-                raise ViewGraphError(f"{name} has {len(values)} rows, source has {num_edges}; they must agree")
-        if num_nodes is None:
-            num_nodes = int(torch.maximum(source.max(), target.max())) + 1 if num_edges else 0
-        ends = torch.stack((source, target))
-        _refuse((ends < 0) | (ends >= num_nodes), f"a node index outside 0 … {num_nodes - 1}")
-        _refuse((source == target)[None], "the same source and target")
-        _refuse(~(torch.isfinite(steps) & (steps > 0))[None], "steps that are not positive and finite")
-        norm = quaternions.norm(dim=1)
-        _refuse(~((norm - 1).abs() <= UNIT_NORM_TOLERANCE)[None], "a quaternion that is not of unit length")
-        # One product, one new array: at millions of edges its pages cost more than the arithmetic.
-        quaternions = quaternions * torch.where(quaternions[:, 3] < 0, -1 / norm, 1 / norm)[:, None]
+        target = _column("target", target, torch.int64, num_edges)
+        quaternions = _quaternions(target_from_source, source_from_target, num_edges)
+        kind = _column("kind", kind, torch.int64, num_edges, EdgeKind.LOOP_CLOSURE)
+        precision = _column("precision", precision, torch.float64, num_edges, torch.nan)
+        label = _column("label", label, torch.int64, num_edges, EdgeLabel.AUTOMATIC)
+        steps = _column("steps", steps, torch.float64, num_edges, 1.0)
+        num_nodes = _num_nodes(torch.stack((source, target)), num_nodes)
+        _refuse(source == target, "the same source and target", source)
+        _refuse((kind < 0) | (kind >= len(EdgeKind)), "kind {}; 0 is odometry, 1 a loop closure", kind)
+        unknown_label = (label < 0) | (label >= len(EdgeLabel))
+        _refuse(unknown_label, "label {}; 0 is automatic, 1 accepted, 2 rejected", label)
+        _refuse(~(torch.isfinite(steps) & (steps > 0)), "{:g} steps; they must be positive and finite", steps)
         precision = torch.where(torch.isfinite(precision) & (precision > 0), precision, torch.nan)
         return cls(num_nodes, source, target, quaternions, kind, precision, label, steps)
 
@@ -177,18 +180,119 @@ class ViewGraph:
         return torch.from_numpy(rank[inverse]).to(self.device)
 
 
-def _as_tensor(values: ArrayLike, dtype: torch.dtype) -> Tensor:
-    if isinstance(values, Tensor):
-        return values.to(dtype)
-    return torch.from_numpy(np.array(values, dtype=str(dtype).removeprefix("torch.")))
+class HoldsViewGraph(Protocol):
+    """What has a view-graph as its ``graph``, as the content of a file does."""
+
+    @property
+    def graph(self) -> ViewGraph: ...
 
 
-def _default(values: ArrayLike | None, dtype: torch.dtype, length: int, fill: float) -> Tensor:
-    return torch.full((length,), fill, dtype=dtype) if values is None else _as_tensor(values, dtype)
+def view_graph_of(holder: ViewGraph | HoldsViewGraph) -> ViewGraph:
+    """The view-graph itself, or the one that a file's content holds.
+
+    Raises:
+        ViewGraphError: neither.
+    """
+    graph = holder if isinstance(holder, ViewGraph) else getattr(holder, "graph", None)
+    if not isinstance(graph, ViewGraph):
+        what = type(holder).__name__
+        raise ViewGraphError(f"a {what} is no view-graph; make one with ViewGraph.create or read one with read_graph")
+    return graph
 
 
-def _refuse(bad: Tensor, what: str) -> None:
-    """Raise for the first edge (second dimension of ``bad``) that is marked."""
-    bad_edges = bad.any(dim=0)
-    if bool(bad_edges.any()):
-        raise ViewGraphError(f"edge {int(bad_edges.nonzero()[0])} has {what}")
+def _quaternions(target_from_source: ArrayLike | None, source_from_target: ArrayLike | None, num_edges: int) -> Tensor:
+    """``(M, 4)`` target_from_source of unit length with w ≥ 0, from the one that is given."""
+    if (target_from_source is None) == (source_from_target is None):
+        raise ViewGraphError(
+            "give either target_from_source or source_from_target (its inverse, as ROS and g2o state it), and not both"
+        )
+    is_inverse = target_from_source is None
+    name = "source_from_target" if is_inverse else "target_from_source"
+    values = _as_tensor(name, source_from_target if is_inverse else target_from_source, torch.float64)
+    if values.ndim == 3 and values.shape[1:] == (3, 3):
+        identity = torch.eye(3, dtype=values.dtype, device=values.device)
+        defect = (values @ values.mT - identity).abs().amax(dim=(1, 2))
+        is_rotation = (defect <= UNIT_NORM_TOLERANCE) & (torch.linalg.det(values) > 0)
+        _refuse(~is_rotation, f"a matrix in {name} that is not a rotation (orthonormal, determinant 1)", defect)
+        values = from_matrix(values)
+    elif values.ndim == 2 and values.shape[1] == 4:
+        norm = values.norm(dim=1)
+        _refuse(~torch.isfinite(norm), f"a quaternion in {name} that is not finite", norm)
+        far = (norm - 1).abs() > UNIT_NORM_TOLERANCE
+        _refuse(far, f"a quaternion of length {{:.6g}} in {name}; it must be of unit length", norm)
+        # One product, one new array: at millions of edges its pages cost more than the arithmetic.
+        values = values * torch.where(values[:, 3] < 0, -1 / norm, 1 / norm)[:, None]
+    elif values.numel() == 0:
+        values = values.reshape(0, 4)
+    else:
+        raise ViewGraphError(
+            f"{name} has shape {tuple(values.shape)}; it must be (M, 4), quaternions xyzw, or (M, 3, 3), matrices"
+        )
+    _check_rows(name, values, num_edges)
+    return inverse(values) if is_inverse else values
+
+
+def _num_nodes(ends: Tensor, given: int | None) -> int:
+    """How many nodes a graph has whose edges join ``ends`` ``(2, M)``; refuses ends beyond them."""
+    smallest, largest = ends.amin(dim=0), ends.amax(dim=0)
+    _refuse(smallest < 0, "node {}; node indices count from 0", smallest)
+    if given is not None and not 0 <= given <= _MAX_NODES:
+        raise ViewGraphError(f"num_nodes is {given}; it must be 0 … {_MAX_NODES}")
+    if given is not None:
+        _refuse(largest >= given, f"node {{}}; with num_nodes {given} indices are 0 … {given - 1}", largest)
+        return given
+    num_nodes = int(largest.max()) + 1 if len(largest) else 0
+    if num_nodes > _MAX_NODES or num_nodes - 2 * len(largest) > _MAX_IMPLIED_LONE_NODES:
+        raise ViewGraphError(
+            f"the largest index is {num_nodes - 1}, but there are only {len(largest)} edges; number the nodes 0 … N-1 "
+            "(GraphFile.from_ids does, or numpy.unique with return_inverse), or give num_nodes"
+        )
+    return num_nodes
+
+
+def _as_tensor(name: str, values: ArrayLike | None, dtype: torch.dtype) -> Tensor:
+    """The values in that dtype, float64 or int64; copied unless they are a tensor of it already."""
+    if not isinstance(values, Tensor):
+        try:
+            array = np.asarray(values)
+        except (TypeError, ValueError):  # rows of different lengths
+            raise ViewGraphError(f"{name} is not an array; its rows must have the same length") from None
+        if array.size and array.dtype.kind not in "biuf":
+            raise ViewGraphError(f"{name} holds {array.dtype}; it must hold numbers")
+        if array.dtype == np.uint64 and array.size and array.max() > np.iinfo(np.int64).max:
+            raise ViewGraphError(f"{name} holds {array.max()}, which is too large")
+        values = torch.from_numpy(array.astype(np.float64 if array.dtype.kind == "f" else np.int64))
+    elif values.is_complex():
+        raise ViewGraphError(f"{name} holds complex numbers; it must hold real ones")
+    converted = values.to(dtype)
+    if dtype == torch.int64 and values.is_floating_point():
+        broken = values[converted != values]
+        if len(broken):
+            raise ViewGraphError(f"{name} holds {broken[0].item():g}; it must hold whole numbers")
+    return converted
+
+
+def _column(
+    name: str, values: ArrayLike | None, dtype: torch.dtype, num_edges: int | None = None, default: float = 0.0
+) -> Tensor:
+    """One entry per edge, ``(M,)``."""
+    if values is None:
+        return torch.full((num_edges or 0,), default, dtype=dtype)
+    column = _as_tensor(name, values, dtype)
+    if column.ndim != 1:
+        raise ViewGraphError(f"{name} has shape {tuple(column.shape)}; it must be (M,), one entry per edge")
+    if num_edges is not None:
+        _check_rows(name, column, num_edges)
+    return column
+
+
+def _check_rows(name: str, values: Tensor, num_edges: int) -> None:
+    if len(values) != num_edges:
+        raise ViewGraphError(f"{name} has {len(values)} rows, source has {num_edges}; they must agree")
+
+
+def _refuse(bad: Tensor, what: str, values: Tensor) -> None:
+    """Raise for the first edge marked in ``bad`` ``(M,)``; ``{}`` in ``what`` stands for its entry of ``values``."""
+    if bool(bad.any()):
+        edge = int(bad.nonzero()[0])
+        raise ViewGraphError(f"edge {edge} has {what.format(values[edge].item())}")

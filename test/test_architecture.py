@@ -15,7 +15,7 @@ TOP = PACKAGE.name
 # The wings that others build on, and those that they may import themselves.
 INWARD: dict[str, set[str]] = {
     "errors": set(),
-    "view_graph": {"errors"},
+    "view_graph": {"errors", "rotations"},
     "hamilton": set(),
     "rotations": {"hamilton"},
     "baselines": {"errors", "rotations", "solver", "view_graph"},

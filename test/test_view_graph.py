@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import networkx
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from rotavg_ros import EdgeKind, ViewGraph, ViewGraphError
 
@@ -32,17 +36,103 @@ def test_no_edges_and_no_nodes() -> None:
     ("source", "target", "quaternion", "message"),
     [
         ([0, 1], [1, 1], [_UNIT, _UNIT], "edge 1 has the same source and target"),
-        ([0, -1], [1, 0], [_UNIT, _UNIT], "edge 1 has a node index outside"),
-        ([0], [5], [_UNIT], "edge 0 has a node index outside 0 … 2"),
-        ([0], [1], [[0, 0, 0, 0]], "edge 0 has a quaternion that is not of unit length"),
-        ([0], [1], [[0, 0, np.nan, 1]], "edge 0 has a quaternion that is not of unit length"),
-        ([0], [1], [[0, 0, 0, 1.01]], "edge 0 has a quaternion that is not of unit length"),
-        ([0, 1], [1], [_UNIT], "target has 1 rows, source has 2"),
+        ([0, -1], [1, 0], [_UNIT, _UNIT], "edge 1 has node -1; node indices count from 0"),
+        ([0], [5], [_UNIT], "edge 0 has node 5; with num_nodes 3 indices are 0 … 2"),
+        (
+            [0],
+            [1],
+            [[0, 0, 0, 0]],
+            "edge 0 has a quaternion of length 0 in target_from_source; it must be of",
+        ),
+        (
+            [0, 1],
+            [1, 2],
+            [_UNIT, [0, 0, np.nan, 1]],
+            "edge 1 has a quaternion in target_from_source that is not fin",
+        ),
+        ([0], [1], [[0, 0, 0, np.inf]], "edge 0 has a quaternion in target_from_source that is not finite"),
+        ([0], [1], [[0, 0, 0, 1.01]], "edge 0 has a quaternion of length 1.01 in target_from_source"),
+        ([0, 1], [1], [_UNIT], "target has 1 rows, source has 2; they must agree"),
+        ([0, 1], [1, 2], [_UNIT], "target_from_source has 1 rows, source has 2; they must agree"),
+        ([0.0, 1.5], [1, 2], [_UNIT] * 2, "source holds 1.5; it must hold whole numbers"),
+        ([0, np.nan], [1, 2], [_UNIT] * 2, "source holds nan; it must hold whole numbers"),
+        ([0], torch.tensor([1e30]), [_UNIT], "target holds 1e+30; it must hold whole numbers"),
+        (torch.tensor([1j]), [1], [_UNIT], "source holds complex numbers; it must hold real ones"),
+        ([0], [2**63], [_UNIT], "target holds 9223372036854775808, which is too large"),
+        ([[0]], [1], [_UNIT], "source has shape (1, 1); it must be (M,), one entry per edge"),
+        (0, 1, [_UNIT], "source has shape (); it must be (M,), one entry per edge"),
+        ([0], [1], _UNIT, "target_from_source has shape (4,); it must be (M, 4), quaternions xyzw, or (M, 3, 3)"),
+        ([0, 1], [1, 2], [_UNIT, [0, 0, 1]], "target_from_source is not an array; its rows must have the same length"),
+        ([0], [1], [["a", "b", "c", "d"]], "target_from_source holds <U1; it must hold numbers"),
+        ([0], [1], [np.diag([1.0, 1, -1])], "edge 0 has a matrix in target_from_source that is not a rotation"),
+        ([0], [1], [1.01 * np.eye(3)], "edge 0 has a matrix in target_from_source that is not a rotation"),
+        ([0], [1], [np.full((3, 3), np.nan)], "edge 0 has a matrix in target_from_source that is not a rotation"),
     ],
 )
-def test_refuses(source: list[int], target: list[int], quaternion: list[list[float]], message: str) -> None:
-    with pytest.raises(ViewGraphError, match=message):
+def test_refuses_what_makes_no_graph(source: Any, target: Any, quaternion: Any, message: str) -> None:
+    with pytest.raises(ViewGraphError) as caught:
         ViewGraph.create(source, target, quaternion, num_nodes=3)
+    assert str(caught.value).startswith(message)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"kind": [5]}, "edge 0 has kind 5; 0 is odometry, 1 a loop closure"),
+        ({"kind": [-1]}, "edge 0 has kind -1"),
+        ({"kind": [0, 1]}, "kind has 2 rows, source has 1"),
+        ({"kind": ["closure"]}, "kind holds <U7; it must hold numbers"),
+        ({"label": [3]}, "edge 0 has label 3; 0 is automatic, 1 accepted, 2 rejected"),
+        ({"precision": [[1.0]]}, "precision has shape (1, 1)"),
+        ({"precision": ["much"]}, "precision holds <U4; it must hold numbers"),
+        ({"steps": [0]}, "edge 0 has 0 steps; they must be positive and finite"),
+        ({"num_nodes": -1}, "num_nodes is -1"),
+        ({"num_nodes": 2**31}, "num_nodes is 2147483648; it must be 0 … 2147483647"),
+    ],
+)
+def test_refuses_what_is_said_of_an_edge(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ViewGraphError) as caught:
+        ViewGraph.create([0], [1], [_UNIT], **given)
+    assert str(caught.value).startswith(message)
+
+
+def test_ids_are_no_indices() -> None:
+    for largest in (10**12, 2**31, 10**6):
+        with pytest.raises(ViewGraphError, match=f"largest index is {largest}, but there are only 1 edges; number the"):
+            ViewGraph.create([0], [largest], [_UNIT])
+    # What is said to be meant is meant, and gaps of a thousand are nothing.
+    assert ViewGraph.create([0], [10**6], [_UNIT], num_nodes=10**6 + 1).num_nodes == 10**6 + 1
+    assert ViewGraph.create([3], [1000], [_UNIT]).num_nodes == 1001
+
+
+@pytest.mark.parametrize("form", [list, np.array, torch.tensor, lambda values: np.array(values, dtype=np.float32)])
+def test_rotations_in_every_form_and_direction(form: Callable[[Any], Any]) -> None:
+    """The 30° to the left of the README's example, beside a turn about another axis and the largest one."""
+    source_from_target = Rotation.from_rotvec([[0, 0, np.pi / 6], [1.2, -0.3, 0.8], [0, np.pi, 0]])
+    target_from_source = source_from_target.inv()
+    for rotations in (
+        {"target_from_source": form(target_from_source.as_quat().tolist())},
+        {"source_from_target": form(source_from_target.as_quat().tolist())},
+        {"target_from_source": form(target_from_source.as_matrix().tolist())},
+        {"source_from_target": form(source_from_target.as_matrix().tolist())},
+    ):
+        graph = ViewGraph.create(np.array([0, 1, 2], dtype=np.int32), [1, 2, 3], **rotations)
+        found = Rotation.from_quat(graph.target_from_source.numpy())
+        assert (found * source_from_target).magnitude().max() < 1e-6
+        assert graph.target_from_source.dtype == torch.float64 and (graph.target_from_source[:, 3] >= 0).all()
+
+
+def test_whole_numbers_may_come_as_floats() -> None:
+    """As columns that numpy.loadtxt has read do."""
+    graph = ViewGraph.create(np.array([0.0, 1.0]), torch.tensor([1.0, 2.0]), [_UNIT] * 2, kind=np.zeros(2))
+    assert graph.source.tolist() == [0, 1] and graph.target.tolist() == [1, 2] and graph.kind.tolist() == [0, 0]
+
+
+def test_exactly_one_direction() -> None:
+    for rotations in ({}, {"target_from_source": [_UNIT], "source_from_target": [_UNIT]}):
+        with pytest.raises(ViewGraphError, match=r"give either target_from_source or source_from_target .* not both"):
+            ViewGraph.create([0], [1], **rotations)
 
 
 def test_normalises_within_tolerance_and_forgets_impossible_precisions() -> None:

@@ -1,11 +1,4 @@
-"""Time the solver beside COLMAP and GTSAM on the same graphs; write tables (Markdown, CSV) and scaling pictures.
-
-Every contender runs in a process of its own, after a tiny graph that pays what a process pays once. Errors count
-against the truth. Contenders that would take too long of the given minutes are left out, and the report says so. One
-size by itself: --families sfm-dense --min-pairs 7000000 --max-pairs 9000000 --contenders neurora.
-With --soak, a live node holds a graph of 10 000 keyframes while odometry arrives over DDS; with --soak --hours, the
-estimator drives for so long in this process, as fast as it goes.
-"""
+"""What ``rotavg benchmark`` does: it measures and writes reports."""
 
 from __future__ import annotations
 
@@ -14,15 +7,13 @@ from pathlib import Path
 
 import torch
 
-from rotavg_ros.cli.arguments import positive_number, positive_whole_number, thread_count
+from rotavg_ros.cli.options.benchmark import SOAK_KEYFRAMES, SOAK_SECONDS
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation import long_run
 from rotavg_ros.evaluation.benchmark import report, schedule
-from rotavg_ros.evaluation.benchmark.cases import FAMILIES
-from rotavg_ros.evaluation.benchmark.measure import ENOUGH_S, LABELS
+from rotavg_ros.evaluation.benchmark.measure import ENOUGH_S
 from rotavg_ros.evaluation.tables import Table, make_folder, write_report
 
-_SOAK_KEYFRAMES, _SOAK_SECONDS = 10_000, 60.0
 # The load average below which nothing else ran to speak of.
 _QUIET_LOAD = 0.5
 _QUIET = ": nothing else ran to speak of."
@@ -64,62 +55,6 @@ truth. The load average was {load} before the run.
 
 class BenchmarkUsageError(UserError):
     """Options that do not fit together."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``rotavg benchmark``."""
-    parser.add_argument(
-        "--output",
-        type=Path,
-        default=Path("docs/results"),
-        metavar="DIR",
-        help="folder for the report (default: docs/results)",
-    )
-    parser.add_argument(
-        "--families",
-        nargs="+",
-        choices=tuple(FAMILIES),
-        default=list(FAMILIES),
-        metavar="NAME",
-        help=f"of {', '.join(FAMILIES)} (default: all)",
-    )
-    parser.add_argument(
-        "--minutes", type=positive_number, default=20.0, metavar="M", help="about how long in all (default: 20)"
-    )
-    parser.add_argument(
-        "--min-pairs", type=positive_whole_number, default=1, metavar="N", help="edges at least (default: 1)"
-    )
-    parser.add_argument(
-        "--max-pairs", type=positive_whole_number, default=8_000_000, metavar="N", help="edges at most (default: 8e6)"
-    )
-    parser.add_argument(
-        "--contenders",
-        nargs="+",
-        choices=tuple(LABELS),
-        default=list(LABELS),
-        metavar="NAME",
-        help=f"of {', '.join(LABELS)} (default: all)",
-    )
-    parser.add_argument(
-        "--repeats", type=positive_whole_number, default=5, metavar="N", help="solves by each, at most (default: 5)"
-    )
-    parser.add_argument("--threads", type=thread_count, metavar="N", help="CPU threads (default: torch's)")
-    parser.add_argument("--soak", action="store_true", help="the node under load instead of the solvers")
-    parser.add_argument(
-        "--seconds", type=positive_number, metavar="S", help=f"of a soak, for each rate (default: {_SOAK_SECONDS:g})"
-    )
-    parser.add_argument(
-        "--keyframes", type=positive_whole_number, metavar="N", help=f"of a soak (default: {_SOAK_KEYFRAMES})"
-    )
-    parser.add_argument(
-        "--hours",
-        type=positive_number,
-        metavar="H",
-        help="of a soak: so long a drive through the estimator, without DDS, for memory",
-    )
-    parser.add_argument(
-        "--max-keyframes", type=positive_whole_number, metavar="N", help="of such a drive (default: the node's)"
-    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -187,7 +122,7 @@ def _soak(arguments: argparse.Namespace) -> Path:
     from rotavg_ros.ros import soak  # needs ROS 2, which the rest does not
 
     load = _load()
-    rows = soak.run(arguments.keyframes or _SOAK_KEYFRAMES, arguments.seconds or _SOAK_SECONDS)
+    rows = soak.run(arguments.keyframes or SOAK_KEYFRAMES, arguments.seconds or SOAK_SECONDS)
     introduction = _SOAK_INTRODUCTION.format(load=load, command=arguments.command_line)
     return write_report(
         arguments.output,

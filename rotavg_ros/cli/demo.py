@@ -1,9 +1,4 @@
-"""Watch the node correct a robot's orientations.
-
-Simulates a run (or takes your own graph), plays it to the installed node over ROS 2, and shows what came out in a table
-and a picture. Everything goes into a new folder: the bag, the node's log, summary.json and demo.png. Nothing leaves
-this machine.
-"""
+"""What ``rotavg demo`` does: it prepares a bag, plays it to the node, and shows what came out."""
 
 from __future__ import annotations
 
@@ -21,9 +16,8 @@ from rotavg_ros.bags.graph_to_bag import write_graph_bag
 from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.bags.topics import EDGE_TOPIC, ODOM_TOPIC
-from rotavg_ros.cli.arguments import non_negative_number
 from rotavg_ros.cli.progress import working
-from rotavg_ros.cli.simulate import add_run_arguments, describe, simulate
+from rotavg_ros.cli.simulate import describe, simulate
 from rotavg_ros.datasets.dead_reckoning import chain_poses
 from rotavg_ros.datasets.graph_file import GraphFile, read_graph
 from rotavg_ros.datasets.ground_truth import attach_stamps, attach_truth
@@ -49,23 +43,6 @@ class _Scene:
     run: PlayedRun
     is_closure: NDArray[np.bool_]
     node_parameters: dict[str, str]
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``rotavg demo``."""
-    parser.add_argument("--graph", type=Path, metavar="FILE", help="your own graph (g2o, npz) instead of a simulation")
-    parser.add_argument("--truth", type=Path, metavar="CSV", help="ground truth of --graph, as for `rotavg convert`")
-    parser.add_argument("--stamps", type=Path, metavar="TXT", help="stamps of --graph, as for `rotavg convert`")
-    parser.add_argument(
-        "--output", type=Path, metavar="DIR", help="new folder (default: rotavg_demo, rotavg_demo_2, …)"
-    )
-    parser.add_argument(
-        "--rate",
-        type=non_negative_number,
-        metavar="R",
-        help="times real time; 0: as fast as possible (default: in about 12 s)",
-    )
-    add_run_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:

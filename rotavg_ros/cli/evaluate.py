@@ -1,4 +1,4 @@
-"""Compare the methods; write tables (Markdown, CSV) and pictures (PNG) of what comes out."""
+"""What ``rotavg evaluate`` does: it runs one suite and writes its report."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import argparse
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 
 from rotavg_ros.cli import evaluate_slam
-from rotavg_ros.cli.arguments import positive_number, positive_whole_number, thread_count, whole_number
-from rotavg_ros.cli.data_folder import add_data_argument, data_folder
+from rotavg_ros.cli.data_folder import data_folder
+from rotavg_ros.cli.options.evaluate import ROBUSTNESS_METHODS
 from rotavg_ros.cli.progress import progress, working
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation import real, rgbd, robustness, synthetic
@@ -27,39 +26,6 @@ class EvaluateError(UserError):
     """Options that an evaluation cannot work with."""
 
 
-class _Suite(NamedTuple):
-    """A table of the evaluation: its options, and what runs it and returns the report."""
-
-    name: str
-    help: str
-    add_arguments: Callable[[argparse.ArgumentParser], None]
-    run: Callable[[argparse.Namespace], Path]
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``rotavg evaluate``."""
-    suites = parser.add_subparsers(dest="suite", metavar="SUITE", required=True)
-    for suite in _SUITES:
-        suite_parser = suites.add_parser(suite.name, help=suite.help, description=suite.help)
-        suite_parser.add_argument(
-            "--output",
-            type=Path,
-            default=Path("docs/results"),
-            metavar="DIR",
-            help="folder for the report (default: docs/results)",
-        )
-        suite_parser.add_argument(
-            "--threads", type=thread_count, metavar="N", help="CPU threads (default: torch's choice)"
-        )
-        suite_parser.add_argument(
-            "--keep",
-            type=Path,
-            metavar="DIR",
-            help="keep answers here: a run that was interrupted goes on, and only what has changed is solved again",
-        )
-        suite.add_arguments(suite_parser)
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Run one suite."""
     if arguments.threads is not None:
@@ -67,29 +33,8 @@ def run(arguments: argparse.Namespace) -> int:
     make_folder(arguments.output)
     if arguments.keep is not None:
         make_folder(arguments.keep)
-    suite = next(suite for suite in _SUITES if suite.name == arguments.suite)
-    print(suite.run(arguments))
+    print(_RUN[arguments.suite](arguments))
     return 0
-
-
-def _add_synthetic(parser: argparse.ArgumentParser) -> None:
-    _add_drawing(parser, 100)
-    _add_methods(parser, "all rows of the table")
-    parser.add_argument(
-        "--recipes",
-        nargs="+",
-        choices=tuple(synthetic.RECIPES),
-        default=["released", "paper"],
-        metavar="NAME",
-        help=f"generators of the graphs, of {', '.join(synthetic.RECIPES)} (default: released paper)",
-    )
-    parser.add_argument(
-        "--few-graphs",
-        type=whole_number,
-        default=5,
-        metavar="N",
-        help=f"so many graphs for other rows than {' '.join(synthetic.CORE)}, unless --methods names them (default: 5)",
-    )
 
 
 def _run_synthetic(arguments: argparse.Namespace) -> Path:
@@ -108,22 +53,8 @@ def _run_synthetic(arguments: argparse.Namespace) -> Path:
     return synthetic.report(arguments.output, scores, tuple(core), scores_of_few, tuple(more), arguments.command_line)
 
 
-def _add_robustness(parser: argparse.ArgumentParser) -> None:
-    _add_drawing(parser, 10)
-    _add_methods(parser, " ".join(_ROBUSTNESS_METHODS))
-    parser.add_argument(
-        "--settings",
-        nargs="+",
-        choices=tuple(robustness.SETTINGS),
-        metavar="NAME",
-        default=list(robustness.SETTINGS),
-        help=f"rows of the table (default: {' '.join(robustness.SETTINGS)})",
-    )
-    _add_minutes(parser)
-
-
 def _run_robustness(arguments: argparse.Namespace) -> Path:
-    names = tuple(arguments.methods or _ROBUSTNESS_METHODS)
+    names = tuple(arguments.methods or ROBUSTNESS_METHODS)
     contenders(names)  # mistakes show before any training
     scores = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -139,14 +70,6 @@ def _run_robustness(arguments: argparse.Namespace) -> Path:
             count = robustness.num_graphs(setting, arguments.graphs)
             scores[setting] = _score(robustness.cases(setting, count, arguments.seed), chosen, count, setting)
     return robustness.report(arguments.output, scores, names, arguments.command_line)
-
-
-def _add_real(parser: argparse.ArgumentParser) -> None:
-    add_data_argument(parser)
-    _add_methods(parser, " ".join(real.METHODS))
-    parser.add_argument(
-        "--seed", type=whole_number, default=0, metavar="S", help="of the noise on real topologies (default: 0)"
-    )
 
 
 def _run_real(arguments: argparse.Namespace) -> Path:
@@ -177,23 +100,6 @@ def _run_real(arguments: argparse.Namespace) -> Path:
     return write_report(arguments.output, "real", "Real view-graphs", introduction, tables, {}, graphs)
 
 
-def _add_rgbd(parser: argparse.ArgumentParser) -> None:
-    add_data_argument(parser)
-    parser.add_argument(
-        "--sets",
-        nargs="+",
-        choices=rgbd.SETS,
-        default=list(rgbd.SETS),
-        metavar="NAME",
-        help=f"of {', '.join(rgbd.SETS)} (default: all)",
-    )
-    parser.add_argument(
-        "--folds", type=positive_whole_number, default=4, metavar="K", help="of the cross-validation (default: 4)"
-    )
-    parser.add_argument("--scenes", type=positive_whole_number, metavar="N", help="of each set, at most (default: all)")
-    _add_minutes(parser)
-
-
 def _run_rgbd(arguments: argparse.Namespace) -> Path:
     data = data_folder(arguments, [f"rgbd/{name}" for name in arguments.sets])
     if arguments.folds < 2:
@@ -218,36 +124,13 @@ def _run_rgbd(arguments: argparse.Namespace) -> Path:
     return write_report(arguments.output, "rgbd", "RGB-D scans", introduction, tables, {})
 
 
-def _add_minutes(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--minutes",
-        type=positive_number,
-        default=10.0,
-        metavar="M",
-        help="training time of each pair of networks (default: 10)",
-    )
-
-
-def _add_drawing(parser: argparse.ArgumentParser, graphs: int) -> None:
-    parser.add_argument("--graphs", type=positive_whole_number, default=graphs, metavar="N", help=f"default: {graphs}")
-    parser.add_argument("--seed", type=whole_number, default=0, metavar="S", help="same seed, same graphs (default: 0)")
-
-
-def _add_methods(parser: argparse.ArgumentParser, default: str) -> None:
-    parser.add_argument(
-        "--methods",
-        nargs="+",
-        metavar="NAME",
-        help=f"methods of `rotavg solve`, combinations A+B, colmap, shonan, oracle (default: {default})",
-    )
-
-
 def _contenders(
     names: Sequence[str] | None, default: Iterable[str], weights: Path | None = None, keep: Path | None = None
 ) -> dict[str, Contender]:
     """Those asked for, or what can run here of the default."""
     chosen = names if names is not None else [name for name in default if is_available(name)]
-    warm_up(tuple(contenders(chosen, weights).values()))
+    with working("warming up"):
+        warm_up(tuple(contenders(chosen, weights).values()))
     return contenders(chosen, weights, keep)
 
 
@@ -258,16 +141,10 @@ def _score(cases: Iterable[Case], chosen: dict[str, Contender], count: int, desc
     return score_all(cases, chosen, watch)
 
 
-_ROBUSTNESS_METHODS = ("chatterjee", "neurora-paper", "neurora")
-_SUITES = (
-    _Suite("synthetic", "the paper's synthetic table, and how well outliers are told", _add_synthetic, _run_synthetic),
-    _Suite("robustness", "trained on one kind of graph, tested on another", _add_robustness, _run_robustness),
-    _Suite("real", "Lund with ground truth, Madrid without, real topologies", _add_real, _run_real),
-    _Suite("rgbd", "RGB-D scans, networks cross-validated over the scenes", _add_rgbd, _run_rgbd),
-    _Suite(
-        "slam",
-        "pose graphs with false closures, in one go and edge by edge",
-        evaluate_slam.add_arguments,
-        evaluate_slam.run,
-    ),
-)
+_RUN: dict[str, Callable[[argparse.Namespace], Path]] = {
+    "synthetic": _run_synthetic,
+    "robustness": _run_robustness,
+    "real": _run_real,
+    "rgbd": _run_rgbd,
+    "slam": evaluate_slam.run,
+}

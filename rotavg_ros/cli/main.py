@@ -1,4 +1,4 @@
-"""The `rotavg` command. Subcommands are imported only when chosen, so that help and errors come at once."""
+"""The `rotavg` command. What a subcommand does is imported when it runs, so that help and mistakes come at once."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from collections.abc import Sequence
 from typing import NamedTuple, NoReturn
 
 from rotavg_ros.cli.command_line import command_line
+from rotavg_ros.cli.progress import working
 from rotavg_ros.errors import UserError
 from rotavg_ros.version import __version__
 
 
 class Command(NamedTuple):
-    """A subcommand; its module has ``add_arguments(parser)`` and ``run(arguments) -> exit code``.
+    """A subcommand.
 
-    Besides its options, ``arguments`` has ``command_line``, the whole command as it may be typed again, for reports.
+    Its options are in the module of :mod:`rotavg_ros.cli.options` of the same name: a docstring for ``--help``, and
+    ``add_arguments(parser)``. ``module`` has ``run(arguments) -> exit code``; besides the options, ``arguments`` has
+    ``command_line``, the whole command as it may be typed again, for reports.
     """
 
     name: str
@@ -69,7 +72,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")  # a terminal without UTF-8, a file name without encoding
     try:
         parsed = parse(arguments)
-        exit_code: int = parsed.run(parsed)
+        module = next(command.module for command in COMMANDS if command.name == parsed.command)
+        with working("loading"):
+            run = importlib.import_module(module).run
+        exit_code: int = run(parsed)
         return exit_code
     except UserError as error:
         print_error(error)
@@ -89,7 +95,7 @@ def print_error(error: UserError) -> None:
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
-    """What the words after ``rotavg`` say; besides options, ``run`` and ``command_line`` (see :class:`Command`).
+    """What the words after ``rotavg`` say; besides options, ``command`` and ``command_line`` (see :class:`Command`).
 
     Raises:
         UsageError: they make no command.
@@ -104,11 +110,10 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     for command in COMMANDS:
         subparser = subparsers.add_parser(command.name, help=command.help)
         if command.name == chosen:
-            module = importlib.import_module(command.module)
-            subparser.description = (module.__doc__ or command.help).strip()
+            options = importlib.import_module(f"rotavg_ros.cli.options.{command.name}")
+            subparser.description = (options.__doc__ or command.help).strip()
             subparser.formatter_class = argparse.RawDescriptionHelpFormatter
-            module.add_arguments(subparser)
-            subparser.set_defaults(run=module.run)
+            options.add_arguments(subparser)
     parsed = parser.parse_args(arguments)
     parsed.command_line = command_line(parser, parsed)
     return parsed

@@ -1,8 +1,4 @@
-"""Draw pictures (PNG) of a view-graph.
-
-statistics: histograms of the angles and axes of the edges' noise against the truth; where the truth is unknown, of
-their residuals against the solution.
-"""
+"""What ``rotavg plot`` does: it reads a graph and draws."""
 
 from __future__ import annotations
 
@@ -12,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from rotavg_ros.cli.arguments import positive_number
 from rotavg_ros.cli.progress import working
-from rotavg_ros.datasets.graph_file import read_graph
+from rotavg_ros.datasets.graph_file import read_graph, stem_of
 from rotavg_ros.datasets.ground_truth import attach_truth
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.noise_plot import draw, edge_noise
@@ -22,22 +17,6 @@ from rotavg_ros.evaluation.noise_plot import draw, edge_noise
 
 class PlotError(UserError):
     """A picture that cannot be drawn or written."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``rotavg plot``."""
-    kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True)
-    about = "histograms of the noise's angles and axes"
-    statistics = kinds.add_parser("statistics", help=about, description=about)
-    statistics.add_argument("graph", type=Path, metavar="GRAPH", help="view-graph file")
-    statistics.add_argument("--truth", type=Path, metavar="FILE", help="ground truth, for graphs without their own")
-    statistics.add_argument("--output", type=Path, metavar="PNG", help="default: <graph>-statistics.png, here")
-    statistics.add_argument(
-        "--outlier-angle",
-        type=positive_number,
-        metavar="DEG",
-        help="noise of an outlier (default: 20, or 10 if the graph has odometry)",
-    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -53,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     if outlier_angle_deg is None:
         outlier_angle_deg = 10.0 if bool(graph.is_odometry.any()) else 20.0
     knows_truth = truth is not None and bool(np.isfinite(truth).all(axis=1).any())
-    output = arguments.output or Path(f"{arguments.graph.stem}-statistics")
+    output = arguments.output or Path(f"{stem_of(arguments.graph)}-statistics")
     if not output.suffix:
         output = output.with_name(f"{output.name}.png")
     with working("solving and drawing"):

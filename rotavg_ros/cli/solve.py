@@ -1,10 +1,4 @@
-"""Solve view-graph files: absolute orientations and an outlier score for every edge.
-
-Reads g2o, TORO, iSAM, 1DSfM EGs.txt and npz. Writes to DIR, or to DIR/<stem> for several graphs:
-  orientations.csv  id,qx,qy,qz,qw,component   world_from_body, ascending by id
-  edges.csv         source,target,outlier_score,outlier   in the order of the file (or edges.npz)
-  summary.json      counts, seconds, memory, device, method, version
-"""
+"""What ``rotavg solve`` does: every graph solved and written, one after the other."""
 
 from __future__ import annotations
 
@@ -22,22 +16,20 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from rotavg_ros.cli.arguments import whole_number
 from rotavg_ros.cli.main import EXIT_USER_ERROR, print_error
+from rotavg_ros.cli.options.solve import EDGE_FORMATS
 from rotavg_ros.cli.poses import POSE_FILES, write_corrected_poses
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.csv_writer import Column, write_csv
-from rotavg_ros.datasets.graph_file import GraphFile, read_graph
+from rotavg_ros.datasets.graph_file import GraphFile, read_graph, stem_of
 from rotavg_ros.errors import UserError
-from rotavg_ros.rotations import canonical, inverse
-from rotavg_ros.solver import DEVICES, METHODS, PROFILES, Solution, solve
+from rotavg_ros.solver import Solution, solve
 from rotavg_ros.solver.networks import WEIGHTS_FOLDER
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
 
 OUTLIER_THRESHOLD = 0.5
 _ORIENTATIONS, _EDGES, _SUMMARY = "orientations.csv", "edges", "summary.json"
-_EDGE_FORMATS = ("csv", "npz")
 
 
 class SolveError(UserError):
@@ -50,32 +42,6 @@ class Job:
 
     graph: Path
     output: Path
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``rotavg solve``."""
-    parser.add_argument("graphs", nargs="+", type=Path, metavar="GRAPH", help="view-graph file")
-    parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for the answer")
-    methods = f"{', '.join(METHODS)}, or A+B: B starts from A's answer (default: neurora)"
-    parser.add_argument("--method", default="neurora", metavar="NAME", help=methods)
-    parser.add_argument(
-        "--profile", default="auto", choices=PROFILES, help="auto (default): slam if any edge is odometry"
-    )
-    parser.add_argument("--device", default="auto", choices=DEVICES, help="default: auto")
-    parser.add_argument(
-        "--refine", type=whole_number, metavar="N", help="at most N refinement steps; 0 skips (default: the method's)"
-    )
-    parser.add_argument(
-        "--weights", type=Path, metavar="DIR", help="networks of `rotavg train`; what DIR lacks comes from the package"
-    )
-    parser.add_argument(
-        "--poses",
-        action="store_true",
-        help="also write the corrected graph.g2o and trajectory.kitti (.tum with stamps)",
-    )
-    parser.add_argument(
-        "--edges", default="csv", choices=(*_EDGE_FORMATS, "none"), help="format of the edges' file (default: csv)"
-    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -100,15 +66,21 @@ def run(arguments: argparse.Namespace) -> int:
         except UserError as mistake:
             errors.append(mistake)
         else:
-            components = "1 component" if summary["components"] == 1 else f"{summary['components']} components"
-            print(
-                f"{job.graph}: {summary['nodes']} nodes, {summary['edges']} edges, {summary['outliers']} outliers, "
-                f"{components}, {summary['solve_seconds']:.2f} s → {job.output}",
-                flush=True,
-            )
+            print(f"{job.graph}: {_told(summary)} → {job.output}", flush=True)
     for error in errors:
         print_error(error)
     return EXIT_USER_ERROR if errors else 0
+
+
+def _told(summary: dict[str, Any]) -> str:
+    """The summary in a line. Edges of a graph without odometry are called just that."""
+    edges, closures, flagged = (summary[name] for name in ("edges", "loop_closures", "flagged_closures"))
+    odometry, slips = edges - closures, summary["outliers"] - flagged
+    verdicts = f"{flagged} of {closures} {'closures' if odometry else 'edges'} flagged" if closures else "no closures"
+    if slips:
+        verdicts += f", {slips} of {odometry} odometry edges as well"
+    components = "1 component" if summary["components"] == 1 else f"{summary['components']} components"
+    return f"{summary['nodes']} nodes, {edges} edges, {verdicts}, {components}, {summary['solve_seconds']:.2f} s"
 
 
 def solve_file(
@@ -136,7 +108,7 @@ def solve_file(
     summary = summarize(job.graph, graph_file, solution, read_seconds, solve_seconds)
     write_answer(job.output, graph_file, solution, summary, edges)
     if poses:
-        world_from_body = canonical(inverse(solution.body_from_world)).cpu().numpy()
+        world_from_body = solution.world_from_body.cpu().numpy()
         write_corrected_poses(job.output, graph_file, world_from_body, solution.outlier_score.cpu().numpy())
     return summary
 
@@ -148,14 +120,14 @@ def plan(graphs: list[Path], output: Path, *, poses: bool = False) -> list[Job]:
         SolveError: two graphs with one stem, an output folder that cannot be written, or a graph that an
             output would overwrite.
     """
-    jobs = [Job(graph, output if len(graphs) == 1 else output / graph.stem) for graph in graphs]
+    jobs = [Job(graph, output if len(graphs) == 1 else output / stem_of(graph)) for graph in graphs]
     first_of: dict[Path, Path] = {}
     for job in jobs:
         other = first_of.setdefault(job.output, job.graph)
         if other is not job.graph:
             raise SolveError(f"{other} and {job.graph} would both go to {job.output}; solve them one by one")
         _check_writable(job.output)
-        edge_files = (f"{_EDGES}.{suffix}" for suffix in _EDGE_FORMATS)
+        edge_files = (f"{_EDGES}.{suffix}" for suffix in EDGE_FORMATS)
         for name in (_ORIENTATIONS, _SUMMARY, *edge_files, *(POSE_FILES if poses else ())):
             for graph in graphs:
                 if graph.resolve() == (job.output / name).resolve():
@@ -176,12 +148,16 @@ def summarize(
     path: Path, graph_file: GraphFile, solution: Solution, read_seconds: float, solve_seconds: float
 ) -> dict[str, Any]:
     """The content of ``summary.json``."""
+    outlier = solution.outlier_score > OUTLIER_THRESHOLD
+    is_closure = ~graph_file.graph.is_odometry
     return {
         "graph": str(path),
         "nodes": graph_file.graph.num_nodes,
         "edges": graph_file.graph.num_edges,
         "components": int(solution.component.max()) + 1,
-        "outliers": int((solution.outlier_score > OUTLIER_THRESHOLD).sum()),
+        "loop_closures": int(is_closure.sum()),
+        "outliers": int(outlier.sum()),
+        "flagged_closures": int((outlier & is_closure).sum()),
         "skipped": graph_file.skipped,
         "stage_seconds": solution.stage_seconds,
         "read_seconds": read_seconds,
@@ -218,7 +194,7 @@ def write_answer(output: Path, graph_file: GraphFile, solution: Solution, summar
                 write(file)
         for name in writers:
             os.replace(temporary[name], output / name)
-        for suffix in _EDGE_FORMATS:
+        for suffix in EDGE_FORMATS:
             if f"{_EDGES}.{suffix}" not in writers:
                 (output / f"{_EDGES}.{suffix}").unlink(missing_ok=True)
     except OSError as error:
@@ -229,7 +205,7 @@ def write_answer(output: Path, graph_file: GraphFile, solution: Solution, summar
 
 
 def _orientation_columns(graph_file: GraphFile, solution: Solution) -> list[Column]:
-    world_from_body = canonical(inverse(solution.body_from_world)).cpu().numpy()
+    world_from_body = solution.world_from_body.cpu().numpy()
     quaternion = [Column(name, world_from_body[:, i], decimals=12) for i, name in enumerate(("qx", "qy", "qz", "qw"))]
     return [Column("id", graph_file.node_ids), *quaternion, Column("component", solution.component.cpu().numpy())]
 

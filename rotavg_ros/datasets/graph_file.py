@@ -6,10 +6,14 @@
 
 from __future__ import annotations
 
+import codecs
+import gzip
 import importlib
+import io
 import os
+import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -22,6 +26,7 @@ from rotavg_ros.view_graph import ViewGraph
 # Ids are non-negative so that they fit the unsigned 64-bit ids of the messages and of gtsam's keys.
 MAX_NODE_ID = np.iinfo(np.int64).max
 
+_GZIP = b"\x1f\x8b"
 _NUMBER_STARTS = frozenset(bytes([character]) for character in b"0123456789+-.")
 
 # Format modules by suffix; imported when used, since they import this module.
@@ -141,13 +146,18 @@ class GraphFile:
 def read_graph(path: str | Path) -> GraphFile:
     """Read a view-graph in g2o or TORO dialect, 1DSfM ``EGs.txt``, npz or Lund's MATLAB form; the content decides.
 
+    Texts may begin with UTF-8's byte order mark and may be compressed by gzip.
+
+    Returns:
+        a graph of indices with the file's ids beside it; :func:`rotavg_ros.solve` takes it as it is.
+
     Raises:
         GraphFileError: anything that keeps the file from being read whole.
     """
     path = Path(path)
     if path.exists() and not path.is_file() and not path.is_dir():
         raise GraphFileError.at(path, None, "is not a regular file (a pipe or a device); save the graph to one first")
-    with reading(path), path.open("rb") as file:
+    with open_text(path) as file:
         head = file.read(4096)
     if not head:
         raise GraphFileError.at(path, None, "the file is empty; expected a view-graph (g2o, EGs.txt or npz)")
@@ -172,6 +182,11 @@ def not_stored(path: str | Path, graph_file: GraphFile) -> list[str]:
     return _format(_format_of_suffix(Path(path))).not_stored(graph_file)  # type: ignore[no-any-return]
 
 
+def stem_of(path: Path) -> str:
+    """The file's name without its suffix, nor that of gzip."""
+    return Path(path.stem).stem if path.suffix.lower() == ".gz" else path.stem
+
+
 def _format_of_suffix(path: Path) -> str:
     name = _FORMAT_OF_SUFFIX.get(path.suffix.lower())
     if name is None:
@@ -192,6 +207,29 @@ def _format_of_content(path: Path, head: bytes) -> str:
 
 def _format(name: str) -> ModuleType:
     return importlib.import_module(f"rotavg_ros.datasets.{name}")
+
+
+@contextmanager
+def open_text(path: Path) -> Iterator[io.BufferedReader]:
+    """A text's bytes from the first character on: unpacked where it is gzipped, a byte order mark left out.
+
+    Raises:
+        GraphFileError: the file cannot be read, is UTF-16, or is a damaged gzip file.
+    """
+    with reading(path), ExitStack() as stack:
+        file = stack.enter_context(path.open("rb"))
+        if file.peek(len(_GZIP)).startswith(_GZIP):
+            file = io.BufferedReader(stack.enter_context(gzip.GzipFile(fileobj=file)))
+        try:
+            start = file.peek(len(codecs.BOM_UTF8))
+            if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+                what = "is UTF-16 text; save it as UTF-8 (iconv -f UTF-16 -t UTF-8)"
+                raise GraphFileError.at(path, None, what)
+            if start.startswith(codecs.BOM_UTF8):
+                file.read(len(codecs.BOM_UTF8))
+            yield file
+        except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+            raise GraphFileError.at(path, None, f"is a damaged gzip file: {error}; get or pack it again") from None
 
 
 @contextmanager

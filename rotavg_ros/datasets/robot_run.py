@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rotavg_ros.datasets.slam_config import SlamSimulationConfig, SlamSimulationError
-from rotavg_ros.datasets.trajectories import World
+from rotavg_ros.datasets.worlds import ROBOT_WORLDS, World
 
 SAMPLE_PERIOD_S = 0.1
 
@@ -25,8 +25,6 @@ _SURROUNDINGS = {
     World.BUILDING: _Surroundings(speed_mps=0.8, lap_m=120, turn_radius_m=0.6, closure_radius_m=1.0, tilt_deg=6),
     World.CITY: _Surroundings(speed_mps=6, lap_m=900, turn_radius_m=5, closure_radius_m=5, tilt_deg=4),
 }
-
-ROBOT_WORLDS = tuple(world.value for world in _SURROUNDINGS)
 
 
 def robot_run_config(

@@ -10,7 +10,7 @@ from typing import TextIO
 import numpy as np
 import numpy.typing as npt
 
-from rotavg_ros.datasets.graph_file import MAX_NODE_ID, GraphFileError, reading
+from rotavg_ros.datasets.graph_file import MAX_NODE_ID, GraphFileError, open_text
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE
 
 # Bytes read, and rows written, at a time. Many live token lists make Python's garbage collector walk them again and
@@ -22,9 +22,9 @@ Row = list[bytes]
 
 
 def read_blocks(path: Path) -> Iterator[list[tuple[int, Row]]]:
-    """Blocks of ``(line number from 1, tokens)``; blank lines and ``#`` comments are left out."""
+    """Blocks of ``(line number from 1, tokens)`` of a text, gzipped or not, without blank lines and comments."""
     first_line = 1
-    with reading(path), path.open("rb") as file:
+    with open_text(path) as file:
         while lines := file.readlines(_BLOCK_BYTES):
             tokens = enumerate((line.split() for line in lines), start=first_line)
             yield [(number, row) for number, row in tokens if row and not row[0].startswith(b"#")]

@@ -7,7 +7,6 @@ parking garage are truly three-dimensional. Every world leads the robot back to 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 import torch
@@ -17,23 +16,8 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros import rotations
 from rotavg_ros.datasets import plane_paths
 from rotavg_ros.datasets.plane_paths import FloatArray, direction, fold, smooth_noise, walk_along
-
-
-class World(str, Enum):
-    """Where the robot drives."""
-
-    CORRIDOR = "corridor"  # one bent corridor, up and down
-    BUILDING = "building"  # laps of a rectangular corridor with rooms to look into
-    GRID = "grid"  # a random walk on a lattice, as in the Manhattan datasets
-    CITY = "city"  # rectangles of city blocks, all through one home crossing
-    LAPS = "laps"  # one smooth closed track, again and again
-    ROAM = "roam"  # aimless driving in a square
-    SPHERE = "sphere"  # a spiral over a sphere
-    TORUS = "torus"  # a coil around a torus
-    GARAGE = "garage"  # up the ramps of a parking garage and down again
-
-
-PLANAR_WORLDS = (World.CORRIDOR, World.BUILDING, World.GRID, World.CITY, World.LAPS, World.ROAM)
+from rotavg_ros.datasets.worlds import PLANAR_WORLDS as PLANAR_WORLDS
+from rotavg_ros.datasets.worlds import World as World
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from rotavg_ros.evaluation.scoring import Scores
 from rotavg_ros.evaluation.tables import Cell, Column, Table
 from rotavg_ros.training.sfm_tasks import GivenGraphs
 
-SETS = ("scannet_fgr", "scannet_super4pcs", "redwood_fgr", "redwood_super4pcs")
 # Methods without networks, and those that are trained in every fold.
 UNTRAINED = ("chatterjee", "weiszfeld")
 TRAINED = ("cleannet-spt", "neurora-paper", "neurora")

@@ -128,7 +128,6 @@ _SOURCES: dict[str, _Source] = {
     **{f"KITTI_{number}": _Source(partial(_kitti, number), is_redrawn=True) for number in ("00", "02", "05", "06")},
 }
 GRAPHS = tuple(_SOURCES)
-SHARES = (0.0, 0.1, 0.3, 0.5, 0.8)
 
 
 def share_condition(share: float) -> str:

@@ -85,7 +85,8 @@ class EdgeMeasurement:
     Attributes:
         edge_id: the sender's, echoed with the flags; 0 … 2⁶⁴-1.
         source, target: the ends.
-        target_from_source: xyzw, ``R_target R_source⁻¹`` of the body-from-world orientations.
+        target_from_source: xyzw, ``R_target R_source⁻¹`` of the body-from-world orientations; :meth:`from_ros` takes
+            its inverse, which ROS and g2o state.
         kind: an :class:`EdgeKind` value.
         precision: rad⁻²; 0 is unknown; negative or not finite refuses the edge (a sender that gets its own
             covariance wrong is not to be trusted with the rotation).
@@ -100,6 +101,30 @@ class EdgeMeasurement:
     kind: int = EdgeKind.LOOP_CLOSURE
     precision: float = 0.0
     translation: Sequence[float] | None = None
+
+    @classmethod
+    def from_ros(
+        cls,
+        edge_id: int,
+        source: KeyframeReference,
+        target: KeyframeReference,
+        source_from_target: Sequence[float],
+        translation: Sequence[float] | None = None,
+        precision: float = 0.0,
+    ) -> EdgeMeasurement:
+        """A loop closure as ROS, g2o and gtsam state one: by the target's pose in the source's frame.
+
+        Where the target looks 30° to the left of the source, ``source_from_target`` is (0, 0, 0.2588, 0.9659); the
+        attribute ``target_from_source`` is its inverse. For odometry: ``dataclasses.replace(edge, kind=…)``.
+
+        Args:
+            source_from_target: xyzw, orientation of the target in the source's frame.
+            translation: position of the target in the source's frame, metres.
+            precision: rad⁻², 0 unknown.
+        """
+        x, y, z, w = source_from_target
+        target_from_source = quaternion.inverse((x, y, z, w))
+        return cls(edge_id, source, target, target_from_source, precision=precision, translation=translation)
 
     def fingerprint(self) -> int:
         """64 bits that agree for a retransmission (same id, ends and rotation) and for nothing else in practice."""

@@ -1,9 +1,36 @@
-"""NeuRoRA and its relatives: ``solve`` a :class:`~rotavg_ros.view_graph.ViewGraph`, or ``solve_batch`` of many."""
+"""NeuRoRA and its relatives: ``solve`` a :class:`~rotavg_ros.view_graph.ViewGraph`, or ``solve_batch`` of many.
 
-from rotavg_ros.solver.batch import solve_batch
-from rotavg_ros.solver.devices import DEVICES
-from rotavg_ros.solver.methods import METHODS
-from rotavg_ros.solver.pipeline import PROFILES, solve
-from rotavg_ros.solver.solution import Solution
+What is named here is imported when it is first used: the methods' names cost no torch.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rotavg_ros.solver.batch import solve_batch
+    from rotavg_ros.solver.methods import DEVICES, METHODS, PROFILES
+    from rotavg_ros.solver.pipeline import solve
+    from rotavg_ros.solver.solution import Solution
 
 __all__ = ["DEVICES", "METHODS", "PROFILES", "Solution", "solve", "solve_batch"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in {"DEVICES", "METHODS", "PROFILES"}:
+        from rotavg_ros.solver import methods
+
+        return getattr(methods, name)
+    if name == "Solution":
+        from rotavg_ros.solver import solution
+
+        return getattr(solution, name)
+    if name in __all__:  # how to solve
+        from rotavg_ros.solver import batch, pipeline
+
+        return {"solve": pipeline.solve, "solve_batch": batch.solve_batch}[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -12,11 +12,11 @@ import torch
 from rotavg_ros.solver.methods import NETWORK_METHODS
 from rotavg_ros.solver.pipeline import solve
 from rotavg_ros.solver.solution import Solution
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import HoldsViewGraph, ViewGraph, view_graph_of
 
 
 def solve_batch(
-    graphs: Sequence[ViewGraph],
+    graphs: Sequence[ViewGraph | HoldsViewGraph],
     *,
     method: str = "neurora",
     profile: str = "auto",
@@ -28,17 +28,24 @@ def solve_batch(
 
     SfM graphs are solved together as one graph of that many components, and ``stage_seconds`` are those of all.
     SLAM graphs, and methods that are not ours, go one by one.
+
+    Returns:
+        a solution per graph, in their order.
+
+    Raises:
+        UserError: as :func:`~rotavg_ros.solver.solve`.
     """
+    given = [view_graph_of(graph) for graph in graphs]
 
     def solve_alone(graph: ViewGraph) -> Solution:
         return solve(
             graph, method=method, profile=profile, device=device, refinement_steps=refinement_steps, weights=weights
         )
 
-    is_sfm = [profile == "sfm" or (profile == "auto" and not bool(graph.is_odometry.any())) for graph in graphs]
+    is_sfm = [profile == "sfm" or (profile == "auto" and not bool(graph.is_odometry.any())) for graph in given]
     if not set(method.split("+")) <= set(NETWORK_METHODS) or sum(is_sfm) < 2:
-        return [solve_alone(graph) for graph in graphs]
-    together = [graph for graph, joins in zip(graphs, is_sfm, strict=True) if joins]
+        return [solve_alone(graph) for graph in given]
+    together = [graph for graph, joins in zip(given, is_sfm, strict=True) if joins]
     joint = solve(
         _union(together),
         method=method,
@@ -48,7 +55,7 @@ def solve_batch(
         weights=weights,
     )
     parts = iter(_split(joint, together))
-    return [next(parts) if joins else solve_alone(graph) for graph, joins in zip(graphs, is_sfm, strict=True)]
+    return [next(parts) if joins else solve_alone(graph) for graph, joins in zip(given, is_sfm, strict=True)]
 
 
 def _union(graphs: Sequence[ViewGraph]) -> ViewGraph:

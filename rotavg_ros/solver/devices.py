@@ -8,7 +8,6 @@ import warnings
 
 import torch
 
-DEVICES = ("auto", "cpu", "cuda")
 # What a GPU fails with while it is at work: out of memory, or an error of the driver.
 GPU_ERRORS: tuple[type[Exception], ...] = (
     torch.OutOfMemoryError,
@@ -20,7 +19,7 @@ _said: set[str] = set()
 
 
 def choose(device: str) -> str:
-    """What one of :data:`DEVICES` comes to, "cpu" or "cuda"; that a GPU was asked for and cannot be had is logged."""
+    """What "auto", "cpu" or "cuda" comes to, "cpu" or "cuda"; that a GPU was asked for and cannot be had is logged."""
     if device == "cpu":
         return "cpu"
     problem = gpu_problem()

@@ -1,4 +1,4 @@
-"""The methods by name, and what each of them runs in either profile."""
+"""The methods by name, what each runs in either profile; profiles and devices to choose from. Imports no torch."""
 
 from __future__ import annotations
 
@@ -41,3 +41,5 @@ NETWORK_METHODS = {
 # Others' methods, to compare with.
 BASELINES = ("chatterjee", "weiszfeld", "arrigoni", "wang")
 METHODS = (*NETWORK_METHODS, *BASELINES)
+PROFILES = ("auto", "slam", "sfm")
+DEVICES = ("auto", "cpu", "cuda")

@@ -12,9 +12,8 @@ from rotavg_ros import baselines, rotations
 from rotavg_ros.errors import UserError
 from rotavg_ros.solver import devices
 from rotavg_ros.solver.algebra.threads import workers
-from rotavg_ros.solver.devices import DEVICES
 from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
-from rotavg_ros.solver.methods import BASELINES, DEFAULT_METHOD, METHODS, NETWORK_METHODS
+from rotavg_ros.solver.methods import BASELINES, DEFAULT_METHOD, DEVICES, METHODS, NETWORK_METHODS, PROFILES
 from rotavg_ros.solver.neurora import scores
 from rotavg_ros.solver.neurora.network_store import Networks
 from rotavg_ros.solver.neurora.numbers import NUMBERS
@@ -24,9 +23,8 @@ from rotavg_ros.solver.slam.noise import judging
 from rotavg_ros.solver.slam.solve import solve_slam, update_slam
 from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.solver.solution import Solution
-from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel, HoldsViewGraph, ViewGraph, view_graph_of
 
-PROFILES = ("auto", "slam", "sfm")
 # The noise that makes an edge an outlier, in radians.
 _OUTLIER_ANGLE = {"sfm": NUMBERS.outlier_angle, "slam": judging.OUTLIER_ANGLE}
 
@@ -34,7 +32,7 @@ _OUTLIER_ANGLE = {"sfm": NUMBERS.outlier_angle, "slam": judging.OUTLIER_ANGLE}
 @torch.no_grad()
 @workers()
 def solve(
-    graph: ViewGraph,
+    graph: ViewGraph | HoldsViewGraph,
     *,
     method: str = DEFAULT_METHOD,
     profile: str = "auto",
@@ -47,6 +45,7 @@ def solve(
     """Absolute orientations and outlier scores of a view-graph; every connected component by itself.
 
     Args:
+        graph: N nodes, M edges; or what has it as its ``graph``, as the result of ``read_graph`` does.
         method: one of :data:`METHODS`, or several joined by "+", of which each starts from the answer of the one
             before.
         profile: "slam" for odometry chains with loop closures, "sfm" for unordered view-graphs, "auto": "slam" if any
@@ -62,9 +61,15 @@ def solve(
             much has changed, everything is judged anew.
         weights: folder of networks trained with ``rotavg train``; what it lacks comes from the package.
 
+    Returns:
+        :class:`~rotavg_ros.solver.solution.Solution`: ``body_from_world`` ``(N, 4)`` xyzw, the inverse of what ROS
+        publishes (``world_from_body`` is that); ``outlier_score`` ``(M,)``, the probability that an edge is wrong;
+        ``component`` and ``uncertainty`` ``(N,)``; and what was run.
+
     Raises:
-        UserError: an option outside its choices, or a start of the wrong shape.
+        UserError: no view-graph, an option outside its choices, or a start of the wrong shape.
     """
+    graph = view_graph_of(graph)
     names = method.split("+")
     for name in names:
         _check_choice("method", name, METHODS)

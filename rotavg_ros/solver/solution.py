@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from rotavg_ros.rotations import canonical, inverse
+
 
 @dataclass(frozen=True)
 class Solution:
@@ -32,3 +34,8 @@ class Solution:
     profile: str
     device: str
     memory: object | None = None
+
+    @property
+    def world_from_body(self) -> Tensor:
+        """``(N, 4)`` float64 xyzw, w ≥ 0: the orientations as ROS states them."""
+        return canonical(inverse(self.body_from_world))

@@ -74,20 +74,28 @@ def test_help(capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
     assert output == f"rotavg {__version__}\n" if words == ["--version"] else "usage: rotavg" in output
 
 
+HEAVY = ("torch", "numpy", "scipy", "matplotlib", "rosbags", "rclpy", "pandas", "yaml", "tqdm")
+
+
 @pytest.mark.parametrize(
-    ("words", "heavy"),
+    "words",
     [
-        (["--help"], ["torch", "scipy", "matplotlib", "rosbags", "rclpy"]),
-        (["frobnicate"], ["torch", "scipy", "matplotlib", "rosbags", "rclpy"]),
-        (["solve", "--help"], ["matplotlib", "rosbags", "rclpy", "pandas"]),
+        ["--help"],
+        ["--version"],
+        ["frobnicate"],
+        ["solve", "my.g2o", "--output", "out", "--profile", "magic"],
+        ["evaluate", "slam", "--help"],
+        ["evaluate", "synthetic", "--recipes", "magic"],
+        *([command.name, "--help"] for command in COMMANDS),
     ],
+    ids=" ".join,
 )
-def test_only_the_chosen_command_is_imported(words: list[str], heavy: list[str]) -> None:
+def test_help_and_mistakes_wait_for_nothing_heavy(words: list[str]) -> None:
     program = (
         "import sys; from rotavg_ros.cli.main import main\n"
         f"try: main({words!r})\n"
         f"except SystemExit: pass\n"
-        f"print([name for name in {heavy!r} if name in sys.modules])"
+        f"print([name for name in {HEAVY!r} if name in sys.modules])"
     )
     assert python(program).stdout.splitlines()[-1] == "[]"
 

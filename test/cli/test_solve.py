@@ -55,7 +55,7 @@ def test_answer(graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert main(["solve", str(graph_path), "--output", str(tmp_path / "out")]) == 0
     captured = capsys.readouterr()
     assert captured.err == ""
-    assert "30 nodes, 43 edges, " in captured.out
+    assert "30 nodes, 43 edges, 1 of 15 closures flagged, 1 component, " in captured.out
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "edges.csv",
         "orientations.csv",
@@ -88,6 +88,7 @@ def test_answer(graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
         "nodes": 30, "edges": 43, "components": 1, "skipped": {}, "profile": "slam", "version": __version__,
     }  # fmt: skip
     assert summary["outliers"] == int((solution.outlier_score > 0.5).sum())
+    assert (summary["loop_closures"], summary["flagged_closures"]) == (15, 1)
     assert summary["method"] == "neurora"
     assert summary["device"] in ("cpu", "cuda")
     assert 0 < max(summary["stage_seconds"].values()) <= summary["solve_seconds"]
@@ -104,6 +105,19 @@ def test_components_lone_nodes_and_skipped_lines(tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["components"] == 4
     assert summary["skipped"] == {"FIX": 1, "self-edge": 1}
+
+
+def test_what_was_flagged_is_told_with_what_there_was(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    chain = pose_graph()
+    is_odometry = chain.graph.is_odometry
+    graphs = {
+        "odometry.npz": (GraphFile(chain.graph.select_edges(is_odometry), chain.node_ids), "no closures, 2 components"),
+        "sfm.npz": (GraphFile(chain.graph.select_edges(~is_odometry), chain.node_ids), " of 15 edges flagged, "),
+    }
+    for name, (graph_file, told) in graphs.items():
+        write_graph(tmp_path / name, graph_file)
+        assert main(["solve", str(tmp_path / name), "--output", str(tmp_path / "out")]) == 0
+        assert told in capsys.readouterr().out
 
 
 def test_edges_as_npz_or_not_at_all(graph_path: Path, tmp_path: Path) -> None:

@@ -33,7 +33,8 @@ class NeuroraNumbers:
         score_scale: by how many times the uncertainty of the ends a residual has to pass the outlier angle for the
             log-odds of an outlier to rise by one. Fitted: `python -m rotavg_ros.training.score_fit`. Orientations do
             not depend on it; the calibration error is 0.003 at half, 0.004 as it is, 0.017 at twice the value.
-        min_uncertainty: rad; the uncertainty of the ends is at least this, so that exact measurements have scores. Nothing.
+        min_uncertainty: rad; the uncertainty of the ends is at least this, so that exact measurements have scores.
+            Nothing depends on it else.
     """
 
     outlier_angle: float = math.radians(20.0)

@@ -1,0 +1,28 @@
+"""Draw pictures (PNG) of a view-graph.
+
+statistics: histograms of the angles and axes of the edges' noise against the truth; where the truth is unknown, of
+their residuals against the solution.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from rotavg_ros.cli.arguments import positive_number
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``rotavg plot``."""
+    kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True)
+    about = "histograms of the noise's angles and axes"
+    statistics = kinds.add_parser("statistics", help=about, description=about)
+    statistics.add_argument("graph", type=Path, metavar="GRAPH", help="view-graph file")
+    statistics.add_argument("--truth", type=Path, metavar="FILE", help="ground truth, for graphs without their own")
+    statistics.add_argument("--output", type=Path, metavar="PNG", help="default: <graph>-statistics.png, here")
+    statistics.add_argument(
+        "--outlier-angle",
+        type=positive_number,
+        metavar="DEG",
+        help="noise of an outlier (default: 20, or 10 if the graph has odometry)",
+    )

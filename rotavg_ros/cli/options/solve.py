@@ -1,0 +1,43 @@
+"""Solve view-graph files: absolute orientations and an outlier score for every edge.
+
+Reads g2o, TORO, iSAM, 1DSfM EGs.txt (gzipped, too) and npz. Writes to DIR, or to DIR/<stem> for several graphs:
+  orientations.csv  id,qx,qy,qz,qw,component   world_from_body, ascending by id
+  edges.csv         source,target,outlier_score,outlier   in the order of the file (or edges.npz)
+  summary.json      counts, seconds, memory, device, method, version
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from rotavg_ros.cli.arguments import whole_number
+from rotavg_ros.solver.methods import DEVICES, METHODS, PROFILES
+
+EDGE_FORMATS = ("csv", "npz")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``rotavg solve``."""
+    parser.add_argument("graphs", nargs="+", type=Path, metavar="GRAPH", help="view-graph file")
+    parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for the answer")
+    methods = f"{', '.join(METHODS)}, or A+B: B starts from A's answer (default: neurora)"
+    parser.add_argument("--method", default="neurora", metavar="NAME", help=methods)
+    parser.add_argument(
+        "--profile", default="auto", choices=PROFILES, help="auto (default): slam if any edge is odometry"
+    )
+    parser.add_argument("--device", default="auto", choices=DEVICES, help="default: auto")
+    parser.add_argument(
+        "--refine", type=whole_number, metavar="N", help="at most N refinement steps; 0 skips (default: the method's)"
+    )
+    parser.add_argument(
+        "--weights", type=Path, metavar="DIR", help="networks of `rotavg train`; what DIR lacks comes from the package"
+    )
+    parser.add_argument(
+        "--poses",
+        action="store_true",
+        help="also write the corrected graph.g2o and trajectory.kitti (.tum with stamps)",
+    )
+    parser.add_argument(
+        "--edges", default="csv", choices=(*EDGE_FORMATS, "none"), help="format of the edges' file (default: csv)"
+    )

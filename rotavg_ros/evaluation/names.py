@@ -1,0 +1,40 @@
+"""Names that the options of ``rotavg evaluate`` and ``rotavg benchmark`` choose from.
+
+They stand here without what they name, so that ``--help`` needs no torch; a test compares them with what runs.
+"""
+
+from __future__ import annotations
+
+SYNTHETIC_RECIPES = ("released", "released-spatial", "paper")
+ROBUSTNESS_SETTINGS = (
+    "paper",
+    "small",
+    "easy",
+    "hard",
+    "easy-easy",
+    "easy-hard",
+    "hard-easy",
+    "hard-hard",
+    "5000",
+    "25000",
+)
+RGBD_SETS = ("scannet_fgr", "scannet_super4pcs", "redwood_fgr", "redwood_super4pcs")
+SLAM_GRAPHS = (
+    "B25b_0.000",
+    "B25b_0.250",
+    "B25b_0.500",
+    "intel",
+    "CSAIL",
+    "FR079",
+    "manhattan",
+    "parking-garage",
+    "sphere2500",
+    "KITTI_00",
+    "KITTI_02",
+    "KITTI_05",
+    "KITTI_06",
+)
+# Shares of random false closures.
+SLAM_SHARES = (0.0, 0.1, 0.3, 0.5, 0.8)
+BENCHMARK_FAMILIES = ("recipe", "sfm-sparse", "slam", "sfm-dense")
+BENCHMARK_CONTENDERS = ("neurora", "neurora-paper", "neurora-cuda", "colmap", "shonan", "gnc")
