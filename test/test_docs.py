@@ -14,9 +14,9 @@ import pytest
 
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.cli.main import COMMANDS, main
-from rotavg_ros.datasets.graph_file import write_graph
-from rotavg_ros.datasets.robot_run import robot_run_config
-from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.files.graph_file import write_graph
+from rotavg_ros.datasets.simulation.robot_run import robot_run_config
+from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.ros import diagnostics
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -25,9 +25,9 @@ from rotavg_ros.cli.arguments import non_negative_number
 from rotavg_ros.cli.progress import working
 from rotavg_ros.cli.simulate import add_run_arguments, describe, simulate
 from rotavg_ros.datasets.dead_reckoning import chain_poses
-from rotavg_ros.datasets.graph_file import GraphFile, read_graph
-from rotavg_ros.datasets.ground_truth import attach_stamps, attach_truth
-from rotavg_ros.datasets.slam_simulation import SimulatedRun
+from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph
+from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.live_report import LiveReport, PlayedRun, edge_is_false, judge
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from rotavg_ros.cli.arguments import share, whole_number
 from rotavg_ros.cli.data_folder import add_data_argument, data_folder
 from rotavg_ros.cli.progress import progress
-from rotavg_ros.datasets.graph_file import read_graph
+from rotavg_ros.datasets.files.graph_file import read_graph
 from rotavg_ros.evaluation import slam_cases, slam_contenders, slam_incremental, slam_report, slam_uncertainty
 from rotavg_ros.evaluation.named_peers import is_available
 from rotavg_ros.evaluation.slam_scoring import REFERENCE, Step, score_all

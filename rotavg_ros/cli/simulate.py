@@ -15,9 +15,9 @@ from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.bags.writer import refuse_existing
 from rotavg_ros.cli.arguments import finite_number, non_negative_number, positive_number, share, whole_number
 from rotavg_ros.cli.progress import working
-from rotavg_ros.datasets.graph_file import write_graph
-from rotavg_ros.datasets.robot_run import ROBOT_WORLDS, robot_run_config
-from rotavg_ros.datasets.slam_simulation import SimulatedRun, simulate_slam_graph
+from rotavg_ros.datasets.files.graph_file import write_graph
+from rotavg_ros.datasets.simulation.robot_run import ROBOT_WORLDS, robot_run_config
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, simulate_slam_graph
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -26,8 +26,8 @@ from rotavg_ros.cli.arguments import whole_number
 from rotavg_ros.cli.main import EXIT_USER_ERROR, print_error
 from rotavg_ros.cli.poses import POSE_FILES, write_corrected_poses
 from rotavg_ros.cli.progress import working
-from rotavg_ros.datasets.csv_writer import Column, write_csv
-from rotavg_ros.datasets.graph_file import GraphFile, read_graph
+from rotavg_ros.datasets.files.csv_writer import Column, write_csv
+from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph
 from rotavg_ros.errors import UserError
 from rotavg_ros.rotations import canonical, inverse
 from rotavg_ros.solver import DEVICES, METHODS, PROFILES, Solution, solve

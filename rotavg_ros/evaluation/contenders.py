@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from rotavg_ros.datasets.synthetic import SFM_OUTLIER_ANGLE
+from rotavg_ros.datasets.simulation.synthetic import SFM_OUTLIER_ANGLE
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.kept_answers import kept
 from rotavg_ros.evaluation.metrics import true_edge_noise

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.false_closures import FALSE_CLOSURE_DEG
+from rotavg_ros.datasets.simulation.false_closures import FALSE_CLOSURE_DEG
 from rotavg_ros.evaluation.metrics import OutlierCounts, gauge_alignment, orientation_errors, true_edge_noise
 from rotavg_ros.evaluation.node_answer import NodeAnswer
 from rotavg_ros.view_graph import EdgeKind, ViewGraph

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.graph_file import read_graph
-from rotavg_ros.datasets.synthetic import ReleasedRecipe
-from rotavg_ros.datasets.topology import read_topology
+from rotavg_ros.datasets.files.graph_file import read_graph
+from rotavg_ros.datasets.simulation.synthetic import ReleasedRecipe
+from rotavg_ros.datasets.simulation.topology import read_topology
 from rotavg_ros.evaluation.contenders import Answer, Case, Contender
 from rotavg_ros.evaluation.metrics import orientation_errors
 from rotavg_ros.evaluation.scoring import Scores

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from rotavg_ros.datasets.rgbd import read_scene
-from rotavg_ros.datasets.synthetic import SyntheticGraph
+from rotavg_ros.datasets.files.rgbd import read_scene
+from rotavg_ros.datasets.simulation.synthetic import SyntheticGraph
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.contenders import Case
 from rotavg_ros.evaluation.scoring import Scores

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rotavg_ros.datasets.synthetic import PaperRecipe, SyntheticGraph
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, SyntheticGraph
 from rotavg_ros.evaluation.contenders import Case
 from rotavg_ros.evaluation.scoring import Scores
 from rotavg_ros.evaluation.tables import Cell, Column, Table, write_report

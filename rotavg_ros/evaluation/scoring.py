@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from scipy.stats import rankdata
 
-from rotavg_ros.datasets.synthetic import SFM_OUTLIER_ANGLE
+from rotavg_ros.datasets.simulation.synthetic import SFM_OUTLIER_ANGLE
 from rotavg_ros.evaluation.calibration import CalibrationBins
 from rotavg_ros.evaluation.contenders import Answer, Case, Contender
 from rotavg_ros.evaluation.metrics import OutlierCounts, orientation_errors

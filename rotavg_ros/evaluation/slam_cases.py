@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rotavg_ros.datasets import kitti
-from rotavg_ros.datasets.false_closures import FALSE_CLOSURE_DEG, insert_slips, replace_closures
-from rotavg_ros.datasets.graph_file import GraphFile, read_graph
-from rotavg_ros.datasets.ground_truth import attach_stamps, attach_truth
-from rotavg_ros.datasets.slip_places import CROSSED, LOCATABLE
+from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph
+from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
+from rotavg_ros.datasets.simulation.false_closures import FALSE_CLOSURE_DEG, insert_slips, replace_closures
+from rotavg_ros.datasets.simulation.slip_places import CROSSED, LOCATABLE
+from rotavg_ros.datasets.simulation.visual_odometry import odometry_graph
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.least_squares import least_squares
 from rotavg_ros.evaluation.metrics import true_edge_noise
@@ -115,7 +115,7 @@ def _b25b(threshold: str, folder: Path, _: np.random.Generator) -> GraphFile:
 
 def _kitti(sequence: str, folder: Path, rng: np.random.Generator) -> GraphFile:
     folder = folder / "kitti_mono_vo"
-    return kitti.odometry_graph(folder / f"{sequence}_pred.txt", folder / f"{sequence}_gt.txt", rng)
+    return odometry_graph(folder / f"{sequence}_pred.txt", folder / f"{sequence}_gt.txt", rng)
 
 
 _CLASSIC = ("intel", "CSAIL", "FR079", "manhattan", "parking-garage", "sphere2500")

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros.baselines.start import spanning_forest
-from rotavg_ros.datasets.false_closures import FALSE_CLOSURE_DEG
+from rotavg_ros.datasets.simulation.false_closures import FALSE_CLOSURE_DEG
 from rotavg_ros.evaluation.contenders import ContenderError
 from rotavg_ros.evaluation.kept_answers import kept
 from rotavg_ros.evaluation.least_squares import least_squares

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.graph_file import GraphFile
+from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.evaluation.least_squares import least_squares
 from rotavg_ros.solver import solve
 from rotavg_ros.view_graph import ViewGraph

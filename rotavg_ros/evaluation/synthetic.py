@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.evaluation import plots
 from rotavg_ros.evaluation.contenders import FULL_PIPELINE, Case
 from rotavg_ros.evaluation.published import SYNTHETIC

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from rotavg_ros.bags.message_types import RELATIVE_ROTATION
 from rotavg_ros.bags.reader import RECORDING_SUFFIXES, BagReader
-from rotavg_ros.datasets.pose_files import read_pose_file
+from rotavg_ros.datasets.files.pose_files import read_pose_file
 from rotavg_ros.errors import UserError
 from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
 from rotavg_ros.replay.record import TopicUse

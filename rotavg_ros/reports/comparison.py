@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.ground_truth import MAX_STAMP_DISTANCE_NS
+from rotavg_ros.datasets.files.ground_truth import MAX_STAMP_DISTANCE_NS
 from rotavg_ros.evaluation.metrics import gauge_alignment, orientation_errors
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.synthetic import SyntheticGraph
+from rotavg_ros.datasets.simulation.synthetic import SyntheticGraph
 from rotavg_ros.evaluation.metrics import gauge_alignment
 from rotavg_ros.solver.clean_net import CleanNet
 from rotavg_ros.solver.fine_net import FineNet, edge_features, edge_residual

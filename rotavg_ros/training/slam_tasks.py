@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rotavg_ros.datasets.slam_simulation import random_slam_config, simulate_slam_graph
+from rotavg_ros.datasets.simulation.slam_simulation import random_slam_config, simulate_slam_graph
 from rotavg_ros.evaluation.calibration import expected_calibration_error
 from rotavg_ros.solver.message_passing import DirectedEdges
 from rotavg_ros.solver.slam_clean_net import ClosureFeatures, SlamCleanNet, closure_features

@@ -16,11 +16,11 @@ from rotavg_ros.bags.reader import BagReader, BagReadError
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.bags.topics import EDGE_TOPIC, ODOM_TOPIC, TRANSLATION_TOPIC, TRUTH_TOPIC
 from rotavg_ros.bags.writer import BagWriter
-from rotavg_ros.datasets.graph_file import GraphFile, read_graph
-from rotavg_ros.datasets.ground_truth import attach_stamps, attach_truth
-from rotavg_ros.datasets.robot_run import robot_run_config
-from rotavg_ros.datasets.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
-from rotavg_ros.datasets.trajectories import World
+from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph
+from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
+from rotavg_ros.datasets.simulation.robot_run import robot_run_config
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.simulation.trajectories import World
 
 
 def simulated(seed: int = 0, **changes: object) -> SimulatedRun:

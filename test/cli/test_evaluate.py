@@ -10,8 +10,8 @@ from scipy.io import savemat
 
 from rotavg_ros import rotations
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.graph_file import GraphFile, write_graph
-from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe
+from rotavg_ros.datasets.files.graph_file import GraphFile, write_graph
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.evaluation import robustness, synthetic
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.synthetic import ReleasedRecipe
+from rotavg_ros.datasets.simulation.synthetic import ReleasedRecipe
 from rotavg_ros.evaluation import kept_answers, peers
 from rotavg_ros.evaluation.contenders import Answer, Case, contenders
 from rotavg_ros.evaluation.kept_answers import kept

@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.datasets.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
-from rotavg_ros.datasets.trajectories import World
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.simulation.trajectories import World
 from rotavg_ros.evaluation.live_report import PlayedRun, edge_is_false, judge
 from rotavg_ros.evaluation.node_answer import NodeAnswer
 from rotavg_ros.reports.live_picture import draw

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.synthetic import ReleasedRecipe
+from rotavg_ros.datasets.simulation.synthetic import ReleasedRecipe
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.calibration import CalibrationBins, expected_calibration_error
 from rotavg_ros.evaluation.contenders import Answer, Case, contenders, warm_up

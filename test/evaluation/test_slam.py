@@ -10,7 +10,7 @@ import torch
 from scipy.stats import norm
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.graph_file import GraphFile, write_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile, write_graph
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation import slam_cases, slam_contenders, slam_incremental, slam_report, slam_uncertainty
 from rotavg_ros.evaluation.least_squares import least_squares

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation import real, rgbd, robustness, small_training, synthetic
 from rotavg_ros.evaluation.contenders import contenders

@@ -8,8 +8,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import lsqr
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.datasets.robot_run import robot_run_config
-from rotavg_ros.datasets.slam_simulation import SimulatedRun, simulate_slam_graph
+from rotavg_ros.datasets.simulation.robot_run import robot_run_config
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, simulate_slam_graph
 from rotavg_ros.online.positions import fit_positions
 from rotavg_ros.online.trajectory import dead_reckoning
 

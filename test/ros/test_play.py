@@ -17,8 +17,8 @@ from rosgraph_msgs.msg import Clock
 from rotavg_msgs.msg import RelativeRotation
 
 from rotavg_ros.bags.run_bag import write_run_bag
-from rotavg_ros.datasets.robot_run import robot_run_config
-from rotavg_ros.datasets.slam_simulation import SimulatedRun, simulate_slam_graph
+from rotavg_ros.datasets.simulation.robot_run import robot_run_config
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, simulate_slam_graph
 
 pytestmark = pytest.mark.ros
 

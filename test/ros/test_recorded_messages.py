@@ -13,8 +13,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from rotavg_ros.bags import answer_messages as recorded
 from rotavg_ros.bags.message_types import typestore
-from rotavg_ros.datasets.robot_run import robot_run_config
-from rotavg_ros.datasets.slam_simulation import simulate_slam_graph
+from rotavg_ros.datasets.simulation.robot_run import robot_run_config
+from rotavg_ros.datasets.simulation.slam_simulation import simulate_slam_graph
 from rotavg_ros.online import Answer, EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
 from rotavg_ros.online.drawing import draw
 from rotavg_ros.online.trajectory import Trajectory

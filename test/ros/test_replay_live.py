@@ -16,8 +16,8 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` instal
 
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.robot_run import robot_run_config
-from rotavg_ros.datasets.slam_simulation import simulate_slam_graph
+from rotavg_ros.datasets.simulation.robot_run import robot_run_config
+from rotavg_ros.datasets.simulation.slam_simulation import simulate_slam_graph
 
 ROTAVG = Path(sys.executable).with_name("rotavg")
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rotavg_ros.datasets.slam_config import SlamSimulationConfig
-from rotavg_ros.datasets.slam_simulation import simulate_slam_graph
-from rotavg_ros.datasets.trajectories import World
+from rotavg_ros.datasets.simulation.slam_config import SlamSimulationConfig
+from rotavg_ros.datasets.simulation.slam_simulation import simulate_slam_graph
+from rotavg_ros.datasets.simulation.trajectories import World
 from rotavg_ros.solver.agreement import AgreementPairs
 from rotavg_ros.solver.common_error import closure_runs, common_share, variance_factor
 from rotavg_ros.solver.slam_preparation import prepare

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from rotavg_ros import ViewGraph
-from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
-from rotavg_ros.datasets.trajectories import World
+from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.simulation.trajectories import World
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.grown_laplacian import GrownLaplacian, OlderFactor
 from rotavg_ros.solver.laplacian import LaplacianSystem

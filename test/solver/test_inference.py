@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from rotavg_ros import ViewGraph, rotations
-from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.solver import inference, tuning
 from rotavg_ros.solver.fine_net import MIN_SCALE, edge_features, edge_residual
 from rotavg_ros.solver.inference import Tuning

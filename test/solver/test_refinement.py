@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import ViewGraph, rotations
-from rotavg_ros.datasets.synthetic import PaperRecipe
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe
 from rotavg_ros.solver import refinement
 from rotavg_ros.solver.conjugate_gradients import NotConvergedError, WeightedAdjacency, solve_laplacian
 from rotavg_ros.solver.laplacian import LaplacianSystem

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import ViewGraph, rotations, solve
-from rotavg_ros.datasets.synthetic import PaperRecipe
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe
 from rotavg_ros.evaluation.metrics import orientation_errors
 from rotavg_ros.solver import refinement, sfm_refinement
 from rotavg_ros.solver.block_laplacian import Arrivals, BlockLaplacian, factorised

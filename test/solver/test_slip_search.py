@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import ncx2
 
 from rotavg_ros import EdgeKind, ViewGraph, rotations, solve
-from rotavg_ros.datasets.graph_file import read_graph
+from rotavg_ros.datasets.files.graph_file import read_graph
 from rotavg_ros.evaluation import slam_cases, slam_contenders, slam_scoring
 from rotavg_ros.evaluation.metrics import orientation_errors
 from rotavg_ros.solver import slam_preparation

@@ -10,8 +10,13 @@ import pytest
 import torch
 
 from rotavg_ros import ViewGraph, solve
-from rotavg_ros.datasets.slam_simulation import Precisions, SimulatedRun, SlamSimulationConfig, simulate_slam_graph
-from rotavg_ros.datasets.trajectories import World
+from rotavg_ros.datasets.simulation.slam_simulation import (
+    Precisions,
+    SimulatedRun,
+    SlamSimulationConfig,
+    simulate_slam_graph,
+)
+from rotavg_ros.datasets.simulation.trajectories import World
 from rotavg_ros.evaluation.metrics import orientation_errors
 from rotavg_ros.online.gauge import extend_along_edges
 from rotavg_ros.solver.noise_model import NoiseModel

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
-from rotavg_ros.datasets.synthetic import PaperRecipe
-from rotavg_ros.datasets.trajectories import World
+from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe
+from rotavg_ros.datasets.simulation.trajectories import World
 from rotavg_ros.view_graph import ViewGraph
 
 _COLUMNS = ("source", "target", "target_from_source", "kind", "precision")
