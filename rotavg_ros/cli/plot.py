@@ -17,7 +17,7 @@ from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.files.graph_file import read_graph
 from rotavg_ros.datasets.files.ground_truth import attach_truth
 from rotavg_ros.errors import UserError
-from rotavg_ros.evaluation.noise_plot import draw, edge_noise
+from rotavg_ros.evaluation.common.noise_plot import draw, edge_noise
 
 
 class PlotError(UserError):

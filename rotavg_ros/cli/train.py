@@ -18,7 +18,7 @@ import torch
 from rotavg_ros.cli.arguments import thread_count
 from rotavg_ros.cli.progress import working
 from rotavg_ros.errors import UserError
-from rotavg_ros.evaluation.tables import make_folder
+from rotavg_ros.results import make_folder
 from rotavg_ros.solver.clean_net import CleanNet
 from rotavg_ros.solver.network_store import WEIGHTS_FOLDER, read_network
 from rotavg_ros.training.config import TrainingConfig, TrainingConfigError

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.datasets.simulation.synthetic import SyntheticGraph
-from rotavg_ros.evaluation.metrics import gauge_alignment
+from rotavg_ros.metrics import gauge_alignment
 from rotavg_ros.solver.clean_net import CleanNet
 from rotavg_ros.solver.fine_net import FineNet, edge_features, edge_residual
 from rotavg_ros.solver.message_passing import DirectedEdges

@@ -14,7 +14,7 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
-from rotavg_ros.evaluation.calibration import expected_calibration_error
+from rotavg_ros.metrics import expected_calibration_error
 from rotavg_ros.solver import solve
 from rotavg_ros.solver.sfm_stages import OUTLIER_ANGLE, residual_and_uncertainty
 from rotavg_ros.training.sfm_data import sample_graph

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.datasets.simulation.synthetic import SyntheticGraph
-from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver.clean_net import CleanNet
 from rotavg_ros.solver.fine_net import FineNet
 from rotavg_ros.solver.sfm_stages import fine_tune

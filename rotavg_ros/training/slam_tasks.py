@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from rotavg_ros.datasets.simulation.slam_simulation import random_slam_config, simulate_slam_graph
-from rotavg_ros.evaluation.calibration import expected_calibration_error
+from rotavg_ros.metrics import expected_calibration_error
 from rotavg_ros.solver.message_passing import DirectedEdges
 from rotavg_ros.solver.slam_clean_net import ClosureFeatures, SlamCleanNet, closure_features
 from rotavg_ros.solver.slam_preparation import prepare

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import EdgeKind, ViewGraph, rotations, solve
-from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver import slam_preparation, slam_stages
 from rotavg_ros.solver.closure_graph import ClosureGraph
 from rotavg_ros.solver.group_verdicts import _if_turned

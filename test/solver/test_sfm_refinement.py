@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros import ViewGraph, rotations, solve
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe
-from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver import refinement, sfm_refinement
 from rotavg_ros.solver.block_laplacian import Arrivals, BlockLaplacian, factorised
 from rotavg_ros.solver.noise_shape import NoiseShape, scatter

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from rotavg_ros import solve
 from rotavg_ros.datasets.files.graph_file import read_graph
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
-from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver.slam_clean_net import SlamCleanNet
 from rotavg_ros.solver.slam_preparation import Prepared, prepare
 from rotavg_ros.solver.slam_stages import bootstrap, clean, refine

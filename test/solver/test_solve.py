@@ -17,7 +17,7 @@ from rotavg_ros.datasets.files.graph_file import read_graph
 from rotavg_ros.datasets.files.ground_truth import attach_truth
 from rotavg_ros.datasets.simulation.false_closures import replace_closures
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
-from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.metrics import orientation_errors
 
 from .graphs import as_quaternions, measured, random_truth, slam_edges, small_noise
 

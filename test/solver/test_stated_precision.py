@@ -17,7 +17,7 @@ from rotavg_ros.datasets.simulation.slam_simulation import (
     simulate_slam_graph,
 )
 from rotavg_ros.datasets.simulation.trajectories import World
-from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.online.gauge import extend_along_edges
 from rotavg_ros.solver.noise_model import NoiseModel
 from rotavg_ros.solver.stated_precision import StatedTrust, estimate_trust

@@ -12,7 +12,7 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.datasets.files.graph_file import GraphFileError, read_graph
-from rotavg_ros.evaluation.metrics import true_edge_noise
+from rotavg_ros.metrics import true_edge_noise
 
 TRUTH = Rotation.random(4, random_state=0)
 EDGES = ((0, 1), (1, 2), (0, 2))
@@ -40,7 +40,7 @@ def test_edges_agree_with_the_truth(tmp_path: Path) -> None:
     assert graph_file.node_ids.tolist() == [0, 1, 2, 3]  # camera 3 has no edge
     assert sorted(zip(graph.source.tolist(), graph.target.tolist(), strict=True)) == sorted(EDGES)
     truth = torch.from_numpy(graph_file.body_from_world_gt)
-    assert float(true_edge_noise(graph.target_from_source, graph.source, graph.target, truth).max()) < 1e-7
+    assert float(true_edge_noise(graph, truth).max()) < 1e-7
     assert graph_file.edge_information is not None
     np.testing.assert_array_equal(graph_file.edge_information[:, 15:], [[1, 0, 0, 2, 0, 3]] * 3)
 
@@ -81,6 +81,6 @@ def test_sphinx(shared_data: Path) -> None:
     graph = graph_file.graph
     assert (graph.num_nodes, graph.num_edges) == (70, 1207)
     truth = torch.from_numpy(graph_file.body_from_world_gt)
-    error = torch.rad2deg(true_edge_noise(graph.target_from_source, graph.source, graph.target, truth))
+    error = torch.rad2deg(true_edge_noise(graph, truth))
     assert float(error.mean()) == pytest.approx(0.57, abs=0.01)
     assert float(error.median()) == pytest.approx(0.30, abs=0.01)

@@ -10,7 +10,7 @@ import torch
 
 from rotavg_ros.datasets.files.graph_file import GraphFileError
 from rotavg_ros.datasets.files.rgbd import read_scene
-from rotavg_ros.evaluation.metrics import true_edge_noise
+from rotavg_ros.metrics import true_edge_noise
 
 IDENTITY = [0.0, 0.0, 0.0, 1.0]
 
@@ -37,6 +37,6 @@ def test_real_scenes(shared_data: Path, folder: str, num_nodes: int) -> None:
     assert (graph.num_nodes, graph.num_edges) == (num_nodes, num_nodes * (num_nodes - 1) // 2)
     assert scene.registration_rms.shape == (graph.num_edges,)
     truth = torch.from_numpy(scene.graph_file.body_from_world_gt)
-    error = true_edge_noise(graph.target_from_source, graph.source, graph.target, truth)
+    error = true_edge_noise(graph, truth)
     good_share = float((torch.rad2deg(error) < 15).double().mean())
     assert 0.1 < good_share < 0.9  # a wrong direction would leave about 1 %

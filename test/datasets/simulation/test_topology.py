@@ -12,7 +12,7 @@ import pytest
 from rotavg_ros.datasets.files.graph_file import GraphFileError
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.datasets.simulation.topology import ClusteredTopology, Topology, read_topology
-from rotavg_ros.evaluation.metrics import true_edge_noise
+from rotavg_ros.metrics import true_edge_noise
 
 
 @pytest.mark.parametrize("recipe", [ReleasedRecipe(), PaperRecipe()], ids=["released", "paper"])
@@ -23,7 +23,7 @@ def test_the_topology_is_kept(recipe: ReleasedRecipe | PaperRecipe) -> None:
     assert graph.num_nodes == 5
     assert graph.source.tolist() == [0, 1, 4]
     assert graph.target.tolist() == [1, 2, 3]
-    noise = true_edge_noise(graph.target_from_source, graph.source, graph.target, drawn.body_from_world)
+    noise = true_edge_noise(graph, drawn.body_from_world)
     np.testing.assert_allclose(noise, drawn.noise_angle, atol=1e-7)
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros.datasets.files.graph_file import GraphFileError
 from rotavg_ros.datasets.simulation.visual_odometry import odometry_graph
-from rotavg_ros.evaluation.metrics import true_edge_noise
+from rotavg_ros.metrics import true_edge_noise
 
 LAP, FRAMES = 150, 400
 
@@ -43,9 +43,7 @@ def test_the_graph_fits_its_truth(tmp_path: Path) -> None:
     assert (closures.target - closures.source >= 100).all()
     # Every fifth frame of the later laps, and what the circle's 5 m before its end see of its start.
     assert len(range(LAP, FRAMES, 5)) <= closures.num_edges <= len(range(LAP - 6, FRAMES, 5))
-    noise = true_edge_noise(
-        graph.target_from_source, graph.source, graph.target, torch.from_numpy(graph_file.body_from_world_gt)
-    )
+    noise = true_edge_noise(graph, torch.from_numpy(graph_file.body_from_world_gt))
     assert float(torch.rad2deg(noise[~is_odometry]).max()) < 6
     for kind in (is_odometry, ~is_odometry):  # what is stated is what there is
         per_component = float((noise[kind] ** 2).mean() / 3)
