@@ -19,7 +19,33 @@ INWARD = {
     "online": {"errors", "rotations", "solver", "view_graph"},
     "inputs": {"online", "view_graph"},
     "settings": {"errors", "inputs", "online", "solver", "view_graph"},
+    "metrics": {"rotations", "view_graph"},
+    "results": {"errors", "version"},
+    "training": {"datasets", "errors", "metrics", "results", "rotations", "solver", "version", "view_graph"},
+    "reports": {"errors", "metrics", "online", "replay", "version", "view_graph"},
+    "evaluation": {
+        *("baselines", "datasets", "errors", "metrics", "online", "reports", "results"),
+        *("rotations", "solver", "training", "view_graph"),
+    },
 }
+# Parts whose rooms (or modules beside them) have arrows among each other.
+ROOMS = {
+    "datasets": {
+        "dead_reckoning": set(),
+        "planar": set(),
+        "files": {"dead_reckoning", "planar"},
+        "simulation": {"files"},
+    },
+    "evaluation": {
+        "common": set(),
+        "benchmark": {"common"},
+        "live": {"common"},
+        "sfm": {"common"},
+        "slam": {"common", "live"},
+    },
+}
+# Imports from these name a part or a room after the word import.
+PARTS = {PACKAGE.name, *(f"{PACKAGE.name}.{part}" for part in ROOMS)}
 # Others' packages that only one part may know.
 BORDERS = {"rclpy": "ros", "rosbags": "bags", "mcap": "bags"}
 
@@ -31,7 +57,7 @@ def imported(part: str) -> Iterator[tuple[str, str]]:
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 yield from ((alias.name, file.name) for alias in node.names)
-            elif isinstance(node, ast.ImportFrom) and node.module == PACKAGE.name:
+            elif isinstance(node, ast.ImportFrom) and node.module in PARTS:
                 yield from ((f"{node.module}.{alias.name}", file.name) for alias in node.names)
             elif isinstance(node, ast.ImportFrom) and node.module:
                 yield node.module, file.name
@@ -45,6 +71,19 @@ def test_nothing_imports_outward(part: str) -> None:
             assert inner[0] in {part, *INWARD[part]}, f"{part}/{file} imports {module}"
         else:
             assert top not in BORDERS and not top.endswith("_msgs"), f"{part}/{file} imports {module}"
+
+
+@pytest.mark.parametrize(("part", "room"), [(part, room) for part, rooms in ROOMS.items() for room in rooms])
+def test_rooms_import_inward(part: str, room: str) -> None:
+    for module, file in imported(f"{part}/{room}"):
+        if module.startswith(f"{PACKAGE.name}.{part}."):
+            assert module.split(".")[2] in {room, *ROOMS[part][room]}, f"{part}/{room}/{file} imports {module}"
+
+
+@pytest.mark.parametrize("part", ROOMS)
+def test_all_rooms_are_known(part: str) -> None:
+    inside = {path.stem for path in (PACKAGE / part).iterdir() if not path.name.startswith("__")}
+    assert inside == set(ROOMS[part])
 
 
 def test_borders() -> None:

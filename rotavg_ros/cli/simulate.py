@@ -16,7 +16,7 @@ from rotavg_ros.bags.writer import refuse_existing
 from rotavg_ros.cli.arguments import finite_number, non_negative_number, positive_number, share, whole_number
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.files.graph_file import write_graph
-from rotavg_ros.datasets.simulation.robot_run import ROBOT_WORLDS, robot_run_config
+from rotavg_ros.datasets.simulation.robot_run import ROBOT_WORLDS, RobotRun
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, simulate_slam_graph
 
 
@@ -66,7 +66,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 def simulate(arguments: argparse.Namespace) -> SimulatedRun:
     """The run that the arguments of :func:`add_run_arguments` describe."""
-    config = robot_run_config(
+    config = RobotRun(
         arguments.world,
         dimensions=arguments.dimensions,
         laps=arguments.laps,
@@ -76,7 +76,7 @@ def simulate(arguments: argparse.Namespace) -> SimulatedRun:
         odometry_noise_deg=arguments.odometry_noise_deg,
         odometry_bias_deg_per_min=arguments.odometry_bias_deg_per_min,
         closure_noise_deg=arguments.closure_noise_deg,
-    )
+    ).config()
     return simulate_slam_graph(config, np.random.default_rng(arguments.seed))
 
 

@@ -69,8 +69,7 @@ def replace_closures(
     Raises:
         FalseClosureError: a share outside [0, 1], or a reference of another size than the graph.
     """
-    if not 0 <= share <= 1:
-        raise FalseClosureError(f"the share of false closures is {share}; it lies in [0, 1]")
+    _check_share(share, "false closures")
     world_from_body = _reference(graph_file, body_from_world)
     graph = graph_file.graph
     closures = np.flatnonzero(graph.kind.numpy() == EdgeKind.LOOP_CLOSURE)
@@ -114,8 +113,7 @@ def insert_slips(
     Raises:
         FalseClosureError: a share outside [0, 1], or a reference of another size than the graph.
     """
-    if not 0 <= share <= 1:
-        raise FalseClosureError(f"the share of slipping odometry edges is {share}; it lies in [0, 1]")
+    _check_share(share, "slipping odometry edges")
     world_from_body = _reference(graph_file, body_from_world)
     graph = graph_file.graph
     kind, source, target = graph.kind.numpy(), graph.source.numpy(), graph.target.numpy()
@@ -150,6 +148,11 @@ def random_turns(count: int, angle_deg: tuple[float, float], planar: bool, rng: 
         axis[:, :2] = 0
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     return Rotation.from_rotvec(axis * np.radians(rng.uniform(*angle_deg, size=(count, 1))))
+
+
+def _check_share(share: float, what: str) -> None:
+    if not 0 <= share <= 1:
+        raise FalseClosureError(f"the share of {what} is {share}; it lies in [0, 1]")
 
 
 def _random_runs(length: int, count: int, rng: np.random.Generator) -> NDArray[np.int64]:

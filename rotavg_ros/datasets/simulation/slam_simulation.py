@@ -23,7 +23,7 @@ from rotavg_ros.datasets.simulation.slam_config import (
     SlamSimulationError,
     random_slam_config,
 )
-from rotavg_ros.datasets.simulation.trajectories import drive
+from rotavg_ros.datasets.simulation.trajectories import Way, drive
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
 
 __all__ = [
@@ -89,16 +89,16 @@ def simulate_slam_graph(config: SlamSimulationConfig, rng: np.random.Generator) 
     Raises:
         SlamSimulationError: see :class:`SlamSimulationConfig`.
     """
-    truth = drive(
+    way = Way(
         config.world,
         config.num_keyframes,
-        rng,
         step_m=config.keyframe_distance_m,
         laps=config.laps,
         turn_radius_m=config.turn_radius_m,
         tilt_deg=config.terrain_tilt_deg,
         sway_deg=config.sway_deg,
     )
+    truth = drive(way, rng)
     world_from_body = Rotation.from_quat(truth.world_from_body)
     odometry = measure_odometry(config, truth.position, world_from_body, rng)
     closures = measure_closures(config, truth.position, world_from_body, rng)

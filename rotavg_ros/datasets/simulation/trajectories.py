@@ -49,23 +49,13 @@ class Trajectory:
     world_from_body: FloatArray
 
 
-def drive(
-    world: World,
-    num_poses: int,
-    rng: np.random.Generator,
-    *,
-    step_m: float,
-    laps: float,
-    turn_radius_m: float,
-    tilt_deg: float = 0.0,
-    sway_deg: float = 0.0,
-) -> Trajectory:
-    """A robot's way through a world.
+@dataclass(frozen=True)
+class Way:
+    """How a robot moves through a world.
 
-    Args:
+    Attributes:
         world: where.
         num_poses: N.
-        rng: source of every random choice.
         step_m: distance between consecutive poses.
         laps: about how often every place is visited.
         turn_radius_m: scale on which corners of the path are rounded.
@@ -73,19 +63,32 @@ def drive(
         sway_deg: standard deviation of a smooth roll, pitch and yaw on top (a hand-held or walking carrier); yaw only
             in a plane world without tilt.
     """
-    if world in PLANAR_WORLDS:
-        path = _PATHS[world](num_poses, rng, step_m, laps)
-        lane = np.stack([smooth_noise(num_poses, 12, rng) for _ in range(2)], axis=1) * 0.2 * step_m
-        if world is World.GRID:
-            trajectory = _on_terrain(path, np.zeros(0), 0.0, tilt_deg, rng)
+
+    world: World
+    num_poses: int
+    step_m: float
+    laps: float
+    turn_radius_m: float
+    tilt_deg: float = 0.0
+    sway_deg: float = 0.0
+
+
+def drive(way: Way, rng: np.random.Generator) -> Trajectory:
+    """The poses of a way; ``rng`` is the source of every random choice."""
+    is_planar = way.world in PLANAR_WORLDS
+    if is_planar:
+        path = _PATHS[way.world](way.num_poses, rng, way.step_m, way.laps)
+        lane = np.stack([smooth_noise(way.num_poses, 12, rng) for _ in range(2)], axis=1) * 0.2 * way.step_m
+        if way.world is World.GRID:
+            trajectory = _on_terrain(path, np.zeros(0), 0.0, way.tilt_deg, rng)
         else:
-            trajectory = _on_terrain(path, lane, turn_radius_m / step_m, tilt_deg, rng)
+            trajectory = _on_terrain(path, lane, way.turn_radius_m / way.step_m, way.tilt_deg, rng)
     else:
-        trajectory = _SPATIAL[world](num_poses, rng, step_m, laps)
-    if sway_deg == 0:
+        trajectory = _SPATIAL[way.world](way.num_poses, rng, way.step_m, way.laps)
+    if way.sway_deg == 0:
         return trajectory
-    sway = np.stack([smooth_noise(num_poses, 6, rng) for _ in range(3)], axis=1) * np.radians(sway_deg)
-    if world in PLANAR_WORLDS and tilt_deg == 0:
+    sway = np.stack([smooth_noise(way.num_poses, 6, rng) for _ in range(3)], axis=1) * np.radians(way.sway_deg)
+    if is_planar and way.tilt_deg == 0:
         sway[:, :2] = 0
     swayed = Rotation.from_quat(trajectory.world_from_body) * Rotation.from_rotvec(sway)
     return Trajectory(trajectory.position, swayed.as_quat(canonical=True))

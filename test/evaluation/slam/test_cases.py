@@ -16,7 +16,7 @@ from rotavg_ros.evaluation.common.cases import drawings
 from rotavg_ros.evaluation.common.scoring import score
 from rotavg_ros.evaluation.slam import cases
 
-from .laps import answer_of, laps, spoiled
+from ..laps import answer_of, laps, spoiled
 
 
 def test_the_same_seed_draws_the_same_case() -> None:

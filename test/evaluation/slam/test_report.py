@@ -11,7 +11,7 @@ from rotavg_ros.evaluation.slam import cases, report
 from rotavg_ros.evaluation.slam.contenders import ROSTER
 from rotavg_ros.evaluation.slam.uncertainty import UncertaintyCheck
 
-from .laps import spoiled
+from ..laps import spoiled
 
 
 def test_report(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from rotavg_ros import Solution, ViewGraph, rotations
 from rotavg_ros.evaluation.slam import uncertainty
 from rotavg_ros.evaluation.slam.least_squares import least_squares
 
-from .laps import NUM_NODES, laps
+from ..laps import NUM_NODES, laps
 
 
 @pytest.mark.parametrize("factor", [1.0, 2.0])

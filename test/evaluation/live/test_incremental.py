@@ -8,7 +8,7 @@ import pytest
 from rotavg_ros.evaluation.common.scoring import score
 from rotavg_ros.evaluation.live import incremental
 
-from .laps import NUM_NODES, answer_of, spoiled
+from ..laps import NUM_NODES, answer_of, spoiled
 
 
 def test_incremental_run_ends_like_the_batch_solve() -> None:
