@@ -126,10 +126,11 @@ class Scores:
         values = [row.figure(figure) for row in self.of(contender).values()]
         return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
 
-    def ratios(self, contender: str, reference: str, figure: str) -> dict[CaseKey, float]:
-        """A figure over the reference's, by case that both solved."""
+    def ratios(self, contender: str, reference: str, figure: str, kind: str | None = None) -> dict[CaseKey, float]:
+        """A figure over the reference's, by case (of one kind) that both solved."""
         ours, theirs = self.of(contender), self.of(reference)
-        return {case: ours[case].figure(figure) / theirs[case].figure(figure) for case in ours if case in theirs}
+        both = [case for case in ours if case in theirs and kind in (None, case.kind)]
+        return {case: ours[case].figure(figure) / theirs[case].figure(figure) for case in both}
 
     def ratio(self, contender: str, reference: str, figure: str) -> float:
         """Mean of a figure over that of the reference, on the cases that both solved."""

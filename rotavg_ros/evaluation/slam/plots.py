@@ -27,18 +27,20 @@ def ratios(path: Path, scores: Scores, rows: dict[str, str], title: str) -> None
     Args:
         rows: what to call each contender.
     """
-    conditions = [kind for kind in scores.kinds if _ratios(scores, OURS, kind)]
+    conditions = [kind for kind in scores.kinds if scores.ratios(OURS, ORACLE, "floored_deg", kind)]
     figure = Figure(figsize=(10, 5.6), dpi=150, facecolor="white", layout="constrained")
     axes = figure.add_subplot()
     position = np.arange(len(conditions), dtype=np.float64)
     by_share = np.array([condition.endswith(RANDOM) for condition in conditions])
     for x, condition in enumerate(conditions):
-        cases = _ratios(scores, OURS, condition)
+        cases = list(scores.ratios(OURS, ORACLE, "floored_deg", condition).values())
         axes.plot(np.full(len(cases), x), cases, ".", color=BLUE, alpha=0.35, markersize=6, zorder=2)
     others = [name for name in rows if name not in (ORACLE, OURS, *_LIKE_ODOMETRY)]
     colours = [colour for colour in PALETTE if colour != BLUE]
     for number, name in enumerate((*others, OURS)):
-        values = [geometric_mean(_ratios(scores, name, condition)) for condition in conditions]
+        values = [
+            geometric_mean(scores.ratios(name, ORACLE, "floored_deg", condition).values()) for condition in conditions
+        ]
         is_ours = name == OURS
         # A line along the shares; the other conditions stand apart.
         between = int(by_share.sum())
@@ -61,7 +63,3 @@ def ratios(path: Path, scores: Scores, rows: dict[str, str], title: str) -> None
     style(axes, title)
     axes.set_xlabel("loop closures that are false", fontsize=9, color=MUTED)
     figure.savefig(path)
-
-
-def _ratios(scores: Scores, name: str, kind: str) -> list[float]:
-    return list(scores.where(kind=kind).ratios(name, ORACLE, "floored_deg").values())

@@ -92,7 +92,7 @@ def _ratios(title: str, scores: Scores, names: Sequence[str]) -> Table:
     for name in names:
         cells: list[Cell] = [ROWS.get(name, name)]
         for kind in ours.kinds:
-            ratios = scores.where(kind=kind).ratios(name, ORACLE, "floored_deg").values()
+            ratios = scores.ratios(name, ORACLE, "floored_deg", kind).values()
             cells += [geometric_mean(ratios), max(ratios, default=float("nan"))]
         rows.append(tuple(cells))
     columns = [Column("method")]
