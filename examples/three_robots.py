@@ -25,7 +25,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rotavg_msgs.msg import AbsoluteOrientations, KeyframeReference, RelativeRotation
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.datasets.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
 
 ROBOTS = ("a", "b", "c")
 POSES = 200  # of each robot

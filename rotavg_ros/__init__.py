@@ -13,7 +13,7 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.version import __version__
 
 if TYPE_CHECKING:
-    from rotavg_ros.datasets.graph_file import GraphFile, read_graph, write_graph
+    from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph, write_graph
     from rotavg_ros.online import (
         Answer,
         EdgeMeasurement,
@@ -59,7 +59,7 @@ def __getattr__(name: str) -> Any:
 
         return getattr(view_graph, name)
     if name in {"GraphFile", "read_graph", "write_graph"}:
-        from rotavg_ros.datasets import graph_file
+        from rotavg_ros.datasets.files import graph_file
 
         return getattr(graph_file, name)
     if name in __all__:

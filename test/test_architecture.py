@@ -24,6 +24,14 @@ INWARD: dict[str, set[str]] = {
     "online": {"errors", "hamilton", "rotations", "solver", "view_graph"},
     "inputs": {"online", "view_graph"},
     "settings": {"errors", "inputs", "online", "solver", "view_graph"},
+    "metrics": {"rotations", "view_graph"},
+    "results": {"errors", "version"},
+    "training": {"datasets", "errors", "metrics", "results", "rotations", "solver", "version", "view_graph"},
+    "reports": {"errors", "metrics", "online", "replay", "version", "view_graph"},
+    "evaluation": {
+        *("baselines", "datasets", "errors", "metrics", "online", "reports", "results"),
+        *("rotations", "solver", "training", "view_graph"),
+    },
 }
 # Inside a wing, the rooms (modules and folders) that a room may import; "" is what the folder's own name gives.
 _ON_NEURORA = {"algebra", "estimate", "neurora"}
@@ -117,6 +125,19 @@ def test_no_wing_imports_outward(wing: str) -> None:
                 assert inner.partition(".")[0] in {wing, *INWARD[wing]}, f"{file} imports {name}"
             else:
                 assert top not in BORDERS and not top.endswith("_msgs"), f"{file} imports {name}"
+
+
+@pytest.mark.parametrize(("part", "room"), [(part, room) for part, rooms in ROOMS.items() for room in rooms])
+def test_rooms_import_inward(part: str, room: str) -> None:
+    for module, file in imported(f"{part}/{room}"):
+        if module.startswith(f"{PACKAGE.name}.{part}."):
+            assert module.split(".")[2] in {room, *ROOMS[part][room]}, f"{part}/{room}/{file} imports {module}"
+
+
+@pytest.mark.parametrize("part", ROOMS)
+def test_all_rooms_are_known(part: str) -> None:
+    inside = {path.stem for path in (PACKAGE / part).iterdir() if not path.name.startswith("__")}
+    assert inside == set(ROOMS[part])
 
 
 def test_borders() -> None:

@@ -14,9 +14,9 @@ import pytest
 
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.cli.main import COMMANDS, main
-from rotavg_ros.datasets.graph_file import write_graph
-from rotavg_ros.datasets.robot_run import robot_run_config
-from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.files.graph_file import write_graph
+from rotavg_ros.datasets.simulation.robot_run import RobotRun
+from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.ros import diagnostics
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -123,7 +123,7 @@ def belongings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "half.g2o").write_text("".join(lines[:268]) + " ".join(lines[268].split()[:4]))
     (folder / "nan.g2o").write_text("".join([*lines[:299], "EDGE_SE2 0 1 nan 0 0.1 1 0 0 1 0 1\n", *lines[300:]]))
     (folder / "foreign.g2o").write_text("".join(lines).replace("EDGE_SE2", "EDGE_FOO"))
-    write_run_bag(folder / "my_bag", simulate_slam_graph(robot_run_config(laps=2), np.random.default_rng(0)))
+    write_run_bag(folder / "my_bag", simulate_slam_graph(RobotRun(laps=2).config(), np.random.default_rng(0)))
     (recording,) = (folder / "my_bag").glob("*.mcap")
     (folder / "half.mcap").write_bytes(recording.read_bytes()[:60_000])
     (folder / "my-robot.yaml").write_text(TINY_TRAINING)

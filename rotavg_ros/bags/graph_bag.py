@@ -1,4 +1,4 @@
-"""Bags as a format of view-graphs, beside the files of :mod:`rotavg_ros.datasets.graph_file`."""
+"""Bags as a format of view-graphs, beside the files of :mod:`rotavg_ros.datasets.files.graph_file`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rotavg_ros.bags.graph_from_bag import read_graph_bag
 from rotavg_ros.bags.graph_to_bag import write_graph_bag
-from rotavg_ros.datasets.graph_file import GraphFile
+from rotavg_ros.datasets.files.graph_file import GraphFile
 
 
 def read_graph(path: str | Path) -> GraphFile:

@@ -15,7 +15,7 @@ from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION
 from rotavg_ros.bags.messages import Edge, Keyframe, read_edge, read_odometry
 from rotavg_ros.bags.reader import BagReader, BagReadError
 from rotavg_ros.bags.topics import EDGE_TOPIC, GRAPH_NOTE, ODOM_TOPIC, TRANSLATION_TOPIC, TRUTH_TOPIC
-from rotavg_ros.datasets.graph_file import MAX_NODE_ID, GraphFile
+from rotavg_ros.datasets.files.graph_file import MAX_NODE_ID, GraphFile
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, ViewGraphError
 
 # A stamp that names a keyframe may be this far from the odometry message that is meant.

@@ -26,7 +26,7 @@ from rotavg_ros.bags.messages import (
 from rotavg_ros.bags.topics import EDGE_TOPIC, GRAPH_NOTE, ODOM_TOPIC, TRANSLATION_TOPIC, TRUTH_TOPIC
 from rotavg_ros.bags.writer import BagWriter
 from rotavg_ros.datasets.dead_reckoning import chain_poses
-from rotavg_ros.datasets.graph_file import GraphFile
+from rotavg_ros.datasets.files.graph_file import GraphFile
 
 # Stamps of a graph that has none: as if a keyframe had been taken every 0.1 s.
 START_STAMP_NS = 1_700_000_000_000_000_000

@@ -10,7 +10,7 @@ from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION, VECTOR
 from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_message, vector_message
 from rotavg_ros.bags.topics import EDGE_TOPIC, ODOM_TOPIC, TRANSLATION_TOPIC, TRUTH_TOPIC
 from rotavg_ros.bags.writer import BagWriter
-from rotavg_ros.datasets.slam_simulation import SimulatedRun
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 
 
 def write_run_bag(path: str | Path, run: SimulatedRun, *, overwrite: bool = False) -> None:

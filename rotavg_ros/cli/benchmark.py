@@ -9,10 +9,11 @@ import torch
 
 from rotavg_ros.cli.options.benchmark import SOAK_KEYFRAMES, SOAK_SECONDS
 from rotavg_ros.errors import UserError
-from rotavg_ros.evaluation import long_run
 from rotavg_ros.evaluation.benchmark import report, schedule
 from rotavg_ros.evaluation.benchmark.measure import ENOUGH_S
-from rotavg_ros.evaluation.tables import Table, make_folder, write_report
+from rotavg_ros.evaluation.common.tables import Report, Table
+from rotavg_ros.evaluation.live import long_run
+from rotavg_ros.results import make_folder
 
 # The load average below which nothing else ran to speak of.
 _QUIET_LOAD = 0.5
@@ -21,7 +22,7 @@ _BUSY = """:
 other work ran besides, so wall-clock times say little, CPU times are inflated by shared caches, and several threads
 by waiting for each other. Ratios with a peer in the same run are what counts."""
 _INTRODUCTION = """\
-Medians over the solves of a process, {repeats} or as many as begin within {enough:g} s, after a warm-up on a triangle;
+Medians over the solves of a process, {repeats} or as many as begin within {enough:g} s, after one of a tiny graph;
 graph in memory → orientations in memory; {threads} for every solver. CPU seconds are those of all threads. Peak
 memory is the whole process's, with interpreter, libraries and the graph; beside it what it was before the first
 solve. Errors are against the truth after one rotation of the world. GNC gets the odometry as known inliers and as its
@@ -89,13 +90,11 @@ def _check(arguments: argparse.Namespace) -> None:
 
 def _benchmark(arguments: argparse.Namespace) -> Path:
     load = _load()
-    results = schedule.run(
-        arguments.families,
-        arguments.minutes,
-        (arguments.min_pairs, arguments.max_pairs),
-        arguments.repeats,
-        arguments.contenders,
+    pairs = arguments.min_pairs, arguments.max_pairs
+    wishes = schedule.Wishes(
+        arguments.families, arguments.minutes, pairs, arguments.repeats, tuple(arguments.contenders)
     )
+    results = schedule.run(wishes)
     tables: dict[str, Table] = {}
     results = {family: of_family for family, of_family in results.items() if of_family}
     for family, of_family in results.items():
@@ -115,7 +114,7 @@ def _benchmark(arguments: argparse.Namespace) -> Path:
     )
     introduction += "".join(f"\n- {line}" for line in report.summary(results))
     pictures = {picture: "Time, error and memory over the number of edges"}
-    return write_report(arguments.output, "benchmark", "Speed and memory", introduction, tables, pictures)
+    return Report("benchmark", "Speed and memory", introduction, tables, pictures).write(arguments.output)
 
 
 def _soak(arguments: argparse.Namespace) -> Path:
@@ -124,28 +123,17 @@ def _soak(arguments: argparse.Namespace) -> Path:
     load = _load()
     rows = soak.run(arguments.keyframes or SOAK_KEYFRAMES, arguments.seconds or SOAK_SECONDS)
     introduction = _SOAK_INTRODUCTION.format(load=load, command=arguments.command_line)
-    return write_report(
-        arguments.output,
-        "benchmark-soak",
-        "The node under load",
-        introduction,
-        {"benchmark-soak": soak.table(rows)},
-        {},
-    )
+    tables = {"benchmark-soak": soak.table(rows)}
+    return Report("benchmark-soak", "The node under load", introduction, tables).write(arguments.output)
 
 
 def _long_run(arguments: argparse.Namespace) -> Path:
     load = _load()
     rows = long_run.run(arguments.hours, arguments.max_keyframes)
     name = "benchmark-hours" if arguments.max_keyframes is None else f"benchmark-hours-{arguments.max_keyframes}"
-    return write_report(
-        arguments.output,
-        name,
-        "Hours of driving",
-        _HOURS_INTRODUCTION.format(load=load, command=arguments.command_line),
-        {name: long_run.table("Memory and accuracy", rows)},
-        {},
-    )
+    introduction = _HOURS_INTRODUCTION.format(load=load, command=arguments.command_line)
+    tables = {name: long_run.table("Memory and accuracy", rows)}
+    return Report(name, "Hours of driving", introduction, tables).write(arguments.output)
 
 
 def _load() -> str:

@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 from rotavg_ros.cli.progress import working
-from rotavg_ros.datasets.ground_truth import attach_stamps, attach_truth
+from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.errors import UserError
 
 
@@ -33,7 +33,9 @@ class Format(NamedTuple):
 FORMATS = (
     Format(("", ".mcap", ".db3", ".bag"), is_folder=True, module="rotavg_ros.bags.graph_bag"),
     Format(
-        (".g2o", ".graph", ".toro", ".isam", ".npz", ".txt"), is_folder=False, module="rotavg_ros.datasets.graph_file"
+        (".g2o", ".graph", ".toro", ".isam", ".npz", ".txt"),
+        is_folder=False,
+        module="rotavg_ros.datasets.files.graph_file",
     ),
 )
 

@@ -19,11 +19,11 @@ from rotavg_ros.bags.topics import EDGE_TOPIC, ODOM_TOPIC
 from rotavg_ros.cli.progress import working
 from rotavg_ros.cli.simulate import describe, simulate
 from rotavg_ros.datasets.dead_reckoning import chain_poses
-from rotavg_ros.datasets.graph_file import GraphFile, read_graph
-from rotavg_ros.datasets.ground_truth import attach_stamps, attach_truth
-from rotavg_ros.datasets.slam_simulation import SimulatedRun
+from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph
+from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 from rotavg_ros.errors import UserError
-from rotavg_ros.evaluation.live_report import LiveReport, PlayedRun, edge_is_false, judge
+from rotavg_ros.evaluation.live.played_run import LiveReport, PlayedRun, edge_is_false, judge
 
 # Playing is paced so that the node works as it would live, and a visitor still stays.
 _PLAY_SECONDS = 12.0
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     report = judge(answer, scene.run, scene.is_closure)
     with working("drawing"):
-        from rotavg_ros.reports.live_picture import draw
+        from rotavg_ros.evaluation.live.picture import draw
 
         draw(report, output / "demo.png", scene.title)
     (output / "summary.json").write_text(json.dumps(_summary(report), indent=2) + "\n", encoding="utf-8")

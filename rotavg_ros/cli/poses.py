@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rotavg_ros.datasets.corrected_graph import write_corrected_graph
-from rotavg_ros.datasets.graph_file import GraphFile
-from rotavg_ros.datasets.pose_files import write_kitti, write_tum
+from rotavg_ros.datasets.files.corrected_graph import write_corrected_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile
+from rotavg_ros.datasets.files.pose_files import write_kitti, write_tum
 from rotavg_ros.online.positions import fit_positions
 
 POSE_FILES = ("graph.g2o", "trajectory.kitti", "trajectory.tum")

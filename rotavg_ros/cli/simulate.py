@@ -9,14 +9,14 @@ import numpy as np
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.bags.writer import refuse_existing
 from rotavg_ros.cli.progress import working
-from rotavg_ros.datasets.graph_file import write_graph
-from rotavg_ros.datasets.robot_run import robot_run_config
-from rotavg_ros.datasets.slam_simulation import SimulatedRun, simulate_slam_graph
+from rotavg_ros.datasets.files.graph_file import write_graph
+from rotavg_ros.datasets.simulation.robot_run import RobotRun
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, simulate_slam_graph
 
 
 def simulate(arguments: argparse.Namespace) -> SimulatedRun:
     """The run that the arguments of :func:`rotavg_ros.cli.options.simulate.add_run_arguments` describe."""
-    config = robot_run_config(
+    config = RobotRun(
         arguments.world,
         dimensions=arguments.dimensions,
         laps=arguments.laps,
@@ -26,7 +26,7 @@ def simulate(arguments: argparse.Namespace) -> SimulatedRun:
         odometry_noise_deg=arguments.odometry_noise_deg,
         odometry_bias_deg_per_min=arguments.odometry_bias_deg_per_min,
         closure_noise_deg=arguments.closure_noise_deg,
-    )
+    ).config()
     return simulate_slam_graph(config, np.random.default_rng(arguments.seed))
 
 

@@ -2,7 +2,7 @@
 
 With the orientations fixed, translations are linear in the positions and their three axes share one scalar Laplacian.
 What odometry steps and closures are worth against each other, and where a closure's translation is too far off to
-be one, was settled on simulated runs (:mod:`rotavg_ros.datasets.slam_simulation`), never on the robots reported.
+be one, was settled on simulated runs, never on the robots reported.
 """
 
 from __future__ import annotations

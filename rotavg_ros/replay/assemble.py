@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rotavg_ros.bags.reader import BagReader
-from rotavg_ros.datasets.graph_file import GraphFileError
-from rotavg_ros.datasets.pose_files import read_pose_file
+from rotavg_ros.datasets.files.graph_file import GraphFileError
+from rotavg_ros.datasets.files.pose_files import read_pose_file
 from rotavg_ros.online import Answer
 from rotavg_ros.online.trajectory import Trajectory
 from rotavg_ros.replay.feed import read_references

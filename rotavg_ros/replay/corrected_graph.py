@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rotavg_ros.datasets.corrected_graph import write_corrected_graph
-from rotavg_ros.datasets.graph_file import GraphFile
+from rotavg_ros.datasets.files.corrected_graph import write_corrected_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.online import Answer
 from rotavg_ros.replay.record import RunRecord
 

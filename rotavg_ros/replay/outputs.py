@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from rotavg_ros.datasets.csv_writer import Column, write_csv
-from rotavg_ros.datasets.pose_files import write_kitti, write_tum
+from rotavg_ros.datasets.files.csv_writer import Column, write_csv
+from rotavg_ros.datasets.files.pose_files import write_kitti, write_tum
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import Answer
 from rotavg_ros.replay.corrected_graph import keyframe_ids, write_graph_of_run

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rotavg_ros.bags.message_types import RELATIVE_ROTATION
 from rotavg_ros.bags.reader import RECORDING_SUFFIXES, BagReader
-from rotavg_ros.datasets.pose_files import read_pose_file
+from rotavg_ros.datasets.files.pose_files import read_pose_file
 from rotavg_ros.errors import UserError
 from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
 from rotavg_ros.replay.record import TopicUse
@@ -108,8 +108,8 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
     parameters = NodeParameters().changed(settings)
     references = _references(bag, found, wishes.references, parameters.robots, odometry)
     translations = _translations(found, edges)
-    topics = _uses(bag, found, parameters, odometry, edges, translations, references)
-    return Plan(parameters, odometry, edges, translations, references, topics)
+    plan = Plan(parameters, odometry, edges, translations, references, topics=())
+    return replace(plan, topics=_uses(bag, found, plan))
 
 
 def _without_absent_topics(bag: BagReader, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -218,24 +218,18 @@ def _translations(found: Candidates, edges: Sequence[Input]) -> tuple[str, str] 
     return None
 
 
-def _uses(
-    bag: BagReader,
-    found: Candidates,
-    parameters: NodeParameters,
-    odometry: Sequence[Input],
-    edges: Sequence[Input],
-    translations: tuple[str, str] | None,
-    references: Mapping[str, Input | Path],
-) -> tuple[TopicUse, ...]:
+def _uses(bag: BagReader, found: Candidates, plan: Plan) -> tuple[TopicUse, ...]:
+    """Every topic of the bag, and its part in the plan."""
     roles: dict[str, list[str]] = {}
-    for robot, source in zip(parameters.robots, odometry, strict=False):
+    for robot, source in zip(plan.parameters.robots, plan.odometry, strict=False):
         roles.setdefault(source.topic, []).append(f"odometry of {robot}")
-    for source in edges:
-        brings = parameters.keyframe_source == "edges"
+    for source in plan.edges:
+        brings = plan.parameters.keyframe_source == "edges"
         roles.setdefault(source.topic, []).append("keyframes and loop closures" if brings else "loop closures")
-    if translations:
-        roles.setdefault(translations[0], []).append(f"translations of {translations[1]}")
-    for robot, reference in references.items():
+    if plan.translations:
+        translations, edges = plan.translations
+        roles.setdefault(translations, []).append(f"translations of {edges}")
+    for robot, reference in plan.references.items():
         if isinstance(reference, Input):
             roles.setdefault(reference.topic, []).append(f"reference for {robot}")
     could_be = {candidate.topic: "could be a reference: --reference" for candidate in found.references}

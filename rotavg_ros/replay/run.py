@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,14 +72,21 @@ class ReplayError(UserError):
     """A bag of which nothing came; the message says why."""
 
 
+@dataclass(frozen=True)
+class Onlooker:
+    """Who follows a replay.
+
+    Attributes:
+        progress: called with the seconds of bag time that have passed since the last call.
+        stop: asked between messages whether the user wants it to end.
+    """
+
+    progress: Callable[[float], object]
+    stop: Callable[[], bool]
+
+
 def replay(
-    bag: BagReader,
-    plan: Plan,
-    window: Window,
-    recording: Path | None,
-    answer_period_ns: int,
-    progress: Callable[[float], object],
-    stop: Callable[[], bool],
+    bag: BagReader, plan: Plan, window: Window, recording: Path, answer_period_ns: int, onlooker: Onlooker
 ) -> Outcome:
     """Replay.
 
@@ -90,8 +96,7 @@ def replay(
         window: which part.
         recording: file for what the node would have published.
         answer_period_ns: see :class:`Recording`.
-        progress: called with the seconds of bag time that have passed since the last call.
-        stop: asked between messages whether the user wants it to end.
+        onlooker: who follows it.
 
     Raises:
         BagReadError: a bag that is damaged before anything could be made of it.
@@ -101,10 +106,7 @@ def replay(
     start_ns, stop_ns = _bounds(bag, window)
     torch.set_num_threads(plan.parameters.solver_threads or max(1, torch.get_num_threads() - 1))  # as in the node
     estimator = OnlineEstimator(plan.parameters.estimator_options())
-    with ExitStack() as stack:
-        recorder = None
-        if recording is not None:
-            recorder = stack.enter_context(Recording(recording, plan.parameters, estimator, answer_period_ns))
+    with Recording(recording, plan.parameters, estimator, answer_period_ns) as recorder:
         loop = _Loop(estimator, plan.parameters.solve_period_s, recorder)
         feed = Feed(estimator, plan, read_translations(bag, plan, start_ns, stop_ns), loop.on_odometry)
         end_ns, interrupted = start_ns, False
@@ -112,12 +114,12 @@ def replay(
         records = Sound(bag.decoded(feed.topics, *((None, None) if is_whole else (start_ns, stop_ns))))
         for topic, time_ns, message in records:
             if window.rate > 0:
-                _wait_until(started + (time_ns - start_ns) / _NANOSECONDS / window.rate, stop)
-            if interrupted := stop():
+                _wait_until(started + (time_ns - start_ns) / _NANOSECONDS / window.rate, onlooker.stop)
+            if interrupted := onlooker.stop():
                 break
             loop.advance(time_ns)
             feed(topic, message)
-            progress((time_ns - end_ns) / _NANOSECONDS)
+            onlooker.progress((time_ns - end_ns) / _NANOSECONDS)
             end_ns = time_ns
         damage = records.damage
         answer = loop.finish()
@@ -144,7 +146,7 @@ def replay(
 class _Loop:
     """The clock, and what happens when it strikes."""
 
-    def __init__(self, estimator: OnlineEstimator, period_s: float, recorder: Recording | None) -> None:
+    def __init__(self, estimator: OnlineEstimator, period_s: float, recorder: Recording) -> None:
         self._estimator, self._recorder = estimator, recorder
         self._period_ns = round(period_s * _NANOSECONDS)
         self._now_ns = self._next_tick_ns = 0
@@ -166,14 +168,12 @@ class _Loop:
                 skipped = max(0, time_ns - self._next_tick_ns) // self._period_ns
                 self._next_tick_ns += skipped * self._period_ns
         self._now_ns = time_ns
-        if self._recorder is not None:
-            self._recorder.diagnostics(time_ns)
+        self._recorder.diagnostics(time_ns)
 
     def on_odometry(self, robot: str, record: OdometryRecord) -> None:
         """Note an odometry message that was taken."""
         self.odometry_stamps_ns.setdefault(robot, []).append(record.stamp_ns)
-        if self._recorder is not None:
-            self._recorder.orientation(self._now_ns, robot, record)
+        self._recorder.orientation(self._now_ns, robot, record)
 
     def finish(self) -> Answer | None:
         """Silence: the last answer is a cold solve, as the node's; None if there is nothing to solve.
@@ -183,7 +183,7 @@ class _Loop:
         """
         if self._estimator.counts().keyframes:
             self._note(self._estimator.tick(force_cold=True))
-        if self._recorder is not None and self._last is not None:
+        if self._last is not None:
             self._recorder.answer(self._now_ns, self._last, is_last=True)
         return self._last
 
@@ -193,7 +193,7 @@ class _Loop:
         except UserError:  # as in the node: the next tick tries again
             self.failures += 1
             return False
-        if answer is not None and self._recorder is not None:
+        if answer is not None:
             self._recorder.answer(self._now_ns, answer)
         return self._note(answer)
 

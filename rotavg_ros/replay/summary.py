@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rotavg_ros.replay.comparison import compare
 from rotavg_ros.replay.record import RobotRecord, RunRecord
 from rotavg_ros.replay.run import Outcome
-from rotavg_ros.reports.comparison import compare
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind
 

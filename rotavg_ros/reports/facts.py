@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online.measurements import OWN_EDGE_ID
-from rotavg_ros.reports.comparison import RobotComparison, compare
+from rotavg_ros.replay.comparison import RobotComparison, compare
+from rotavg_ros.replay.record import RobotRecord, RunRecord
 from rotavg_ros.reports.panels import Clock
 from rotavg_ros.view_graph import EdgeKind
-
-if TYPE_CHECKING:
-    from rotavg_ros.replay.record import RobotRecord, RunRecord
 
 FloatArray = NDArray[np.float64]
 

@@ -9,20 +9,18 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from rotavg_ros.errors import UserError
+from rotavg_ros.replay.record import RunRecord
 from rotavg_ros.reports import closure_pictures, map_pictures, time_pictures
 from rotavg_ros.reports.facts import RunFacts
 from rotavg_ros.reports.page import page_of
 from rotavg_ros.reports.theme import DARK, LIGHT, Theme
 from rotavg_ros.version import __version__
-
-if TYPE_CHECKING:
-    from rotavg_ros.replay.record import RunRecord
 
 
 class ReportError(UserError):

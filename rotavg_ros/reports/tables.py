@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rotavg_ros.online.measurements import RejectReason
+from rotavg_ros.replay.record import TopicUse
 from rotavg_ros.reports.facts import Closure, RunFacts
-
-if TYPE_CHECKING:
-    from rotavg_ros.replay.record import TopicUse
 
 WHY_REFUSED = {
     RejectReason.NAN_ROTATION: "the rotation holds NaN or infinity",

@@ -8,8 +8,6 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-from rotavg_ros.evaluation.plots import style
-
 WIDTH = 5.6  # inches of every picture: its text can be read on a phone as well
 _PIXELS_PER_INCH = 170
 _LONGEST_LABEL = 20
@@ -79,6 +77,16 @@ class Theme:
             )
         axes.set_xlabel(x, fontsize=9, color=self.muted)
         axes.set_ylabel(y, fontsize=9, color=self.muted)
+
+
+def style(axes: Axes, title: str, *, ink: str, muted: str, grid: str) -> None:
+    """What all pictures look like, whatever their colours."""
+    axes.set_title(title, loc="left", fontsize=11, color=ink, pad=8)
+    axes.grid(color=grid, linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(which="both", colors=muted, labelsize=9, length=0)
+    for side in axes.spines.values():
+        side.set_visible(False)
 
 
 def plain(name: str) -> str:

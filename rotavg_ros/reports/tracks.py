@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.reports.comparison import RigidFit, RobotComparison, fit_onto
+from rotavg_ros.metrics import RigidFit, fit_onto
+from rotavg_ros.replay.comparison import RobotComparison
+from rotavg_ros.replay.record import RobotRecord
 from rotavg_ros.reports.facts import RunFacts
-
-if TYPE_CHECKING:
-    from rotavg_ros.replay.record import RobotRecord
 
 FloatArray = NDArray[np.float64]
 

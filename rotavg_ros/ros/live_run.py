@@ -16,7 +16,7 @@ from typing import BinaryIO
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.evaluation.node_answer import NodeAnswer
+from rotavg_ros.evaluation.live.node_answer import NodeAnswer
 from rotavg_ros.ros.domain import free_domain_id
 from rotavg_ros.ros.recorder import Recorder
 

@@ -14,7 +14,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rotavg_msgs.msg import AbsoluteOrientations, OutlierFlags
 
-from rotavg_ros.evaluation.node_answer import NodeAnswer
+from rotavg_ros.evaluation.live.node_answer import NodeAnswer
 
 _LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _SENSOR = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -19,9 +19,9 @@ from rclpy.signals import SignalHandlerOptions
 from rotavg_msgs.msg import KeyframeReference, RelativeRotation, RelativeRotationArray
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
-from rotavg_ros.datasets.trajectories import World
-from rotavg_ros.evaluation.tables import Column, Table
+from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.simulation.trajectories import World
+from rotavg_ros.evaluation.common.tables import Column, Table
 from rotavg_ros.ros.conversions import to_quaternion_message
 from rotavg_ros.ros.live_run import LiveRunError, installed_node, keep_to_this_machine, stop_process
 from rotavg_ros.ros.recorder import Recorder

@@ -15,7 +15,7 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
-from rotavg_ros.evaluation.calibration import expected_calibration_error
+from rotavg_ros.metrics import expected_calibration_error
 from rotavg_ros.solver import solve
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.neurora.scores import residual_and_uncertainty

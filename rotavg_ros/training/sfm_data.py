@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe, SyntheticGraph
-from rotavg_ros.datasets.topology import ClusteredTopology
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe, SyntheticGraph
+from rotavg_ros.datasets.simulation.topology import ClusteredTopology
 from rotavg_ros.solver.neurora.message_passing import DirectedEdges
 
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.synthetic import SyntheticGraph
-from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.datasets.simulation.synthetic import SyntheticGraph
+from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.fine_net import FineNet
 from rotavg_ros.solver.neurora.stages import fine_tune

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.evaluation.tables import commit, make_folder
+from rotavg_ros.results import commit, make_folder
 from rotavg_ros.solver.neurora.network_store import metadata
 from rotavg_ros.training.checkpoint import load_checkpoint, save_checkpoint, save_tensors, save_text
 from rotavg_ros.training.config import TrainingConfig

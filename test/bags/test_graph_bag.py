@@ -16,11 +16,11 @@ from rotavg_ros.bags.reader import BagReader, BagReadError
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.bags.topics import EDGE_TOPIC, ODOM_TOPIC, TRANSLATION_TOPIC, TRUTH_TOPIC
 from rotavg_ros.bags.writer import BagWriter
-from rotavg_ros.datasets.graph_file import GraphFile, read_graph
-from rotavg_ros.datasets.ground_truth import attach_stamps, attach_truth
-from rotavg_ros.datasets.robot_run import robot_run_config
-from rotavg_ros.datasets.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
-from rotavg_ros.datasets.trajectories import World
+from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph
+from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
+from rotavg_ros.datasets.simulation.robot_run import RobotRun
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.simulation.trajectories import World
 
 
 def simulated(seed: int = 0, **changes: object) -> SimulatedRun:
@@ -129,7 +129,7 @@ def test_ros_conventions_in_the_bag(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("dimensions", [2, 3])
 def test_a_robots_run_reads_back_as_its_graph(tmp_path: Path, dimensions: int) -> None:
-    config = robot_run_config("building", dimensions=dimensions, laps=2)
+    config = RobotRun("building", dimensions=dimensions, laps=2).config()
     run = simulate_slam_graph(config, np.random.default_rng(1))
     write_run_bag(tmp_path / "bag", run)
     with BagReader(tmp_path / "bag") as bag:

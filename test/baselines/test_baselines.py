@@ -14,7 +14,7 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.baselines import BASELINES, Baseline, blocks
 from rotavg_ros.errors import UserError
-from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
 
 METHODS = [pytest.param(method, id=name) for name, method in BASELINES.items()]

@@ -5,14 +5,9 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
 
 from rotavg_ros.cli.main import main
-from rotavg_ros.evaluation.benchmark import report, schedule
-from rotavg_ros.evaluation.benchmark.cases import FAMILIES, Case, load, save
-from rotavg_ros.evaluation.benchmark.measure import Measurement
 
 
 def test_a_tiny_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -34,54 +29,6 @@ def test_a_tiny_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert all(float(row["mean error °"]) < 10 for row in rows)
     assert (tmp_path / "benchmark-scaling.png").stat().st_size > 0
     assert "## Our stages" in (tmp_path / "benchmark.md").read_text()
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-def test_graphs_are_as_large_as_they_say_and_survive_the_file(tmp_path: Path, family: str) -> None:
-    case = min(FAMILIES[family].cases, key=lambda case: case.expected_edges)
-    drawn = case.draw()
-    if family != "recipe":  # which draws its size
-        assert drawn.graph.num_nodes == case.nodes
-        assert drawn.graph.num_edges == pytest.approx(case.expected_edges, rel=0.1)
-    save(tmp_path / "graph.npz", drawn)
-    loaded, again = load(tmp_path / "graph.npz"), case.draw()
-    for name in ("source", "target", "target_from_source", "kind", "precision"):
-        for other in (getattr(loaded.graph, name), getattr(again.graph, name)):
-            torch.testing.assert_close(other, getattr(drawn.graph, name), rtol=0, atol=0, equal_nan=True)
-    torch.testing.assert_close(loaded.truth, drawn.truth, rtol=0, atol=0)
-
-
-def test_what_takes_too_long_is_left_out_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = [0.0]
-
-    def measured(path: Path, contender: str, case: Case, budget: object) -> Measurement | str:
-        assert load(path).graph.num_nodes == case.nodes
-        solving = (1e-3 if contender.startswith("neurora") else 0.1) * case.expected_edges
-        clock[0] += 1 + solving
-        if contender == "shonan":
-            return "failed with exit code 1: no reason"
-        return Measurement(contender, case.nodes, case.expected_edges, [solving], [solving], 0.5, 0.4, 2 * 10**6, 10**6)
-
-    monkeypatch.setattr(schedule, "_measure", measured)
-    monkeypatch.setattr(schedule.time, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(schedule, "is_available", lambda _: True)
-    said: list[str] = []
-    results = schedule.run(["sfm-sparse"], 60, (1, 10_000), 3, say=said.append)["sfm-sparse"]
-    assert [result.case.nodes for result in results] == [100, 250, 1000]
-    assert all("neurora" in result.measured for result in results)
-    assert results[0].missing["shonan"].startswith("failed")
-    assert results[1].missing["shonan"] == "failed on a smaller graph"
-    assert "colmap" in results[1].measured
-    assert results[2].missing["colmap"].startswith("not run: about ")
-    assert len(said) == sum(len(result.measured) for result in results)
-    table = report.time_table("sfm-sparse", results)
-    assert "COLMAP: 1000 nodes and about 10000 edges: not run" in table.to_markdown()
-    assert np.isclose(float(str(table.rows[0][8])), 1.0)
-    (said_of_colmap,) = report.summary({"sfm-sparse": results})
-    assert (
-        "COLMAP: on the largest graph that both solved (250 nodes, 2500 edges) it takes 100.0 times" in said_of_colmap
-    )
-    assert said_of_colmap.endswith("nowhere is it faster or more exact.")
 
 
 def test_hours_of_driving_with_a_limit(tmp_path: Path) -> None:

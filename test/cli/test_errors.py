@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rotavg_ros.cli.main import COMMANDS, main
-from rotavg_ros.datasets.graph_file import GraphFile, read_graph, write_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph, write_graph
 from rotavg_ros.version import __version__
 
 EDGES = "".join(f"EDGE_SE2 {i} {i + 1} 1 0 0.1 1 0 0 1 0 100\n" for i in range(5))
@@ -193,7 +193,7 @@ def test_full_disk_leaves_the_old_answer(tmp_path: Path) -> None:
 
 def test_interrupt(graph_path: Path, tmp_path: Path) -> None:
     """Ctrl-C while a graph is being read."""
-    stuck = "import os, signal, time; from rotavg_ros.datasets import g2o"
+    stuck = "import os, signal, time; from rotavg_ros.datasets.files import g2o"
     press = "g2o.read = lambda path: (os.kill(os.getpid(), signal.SIGINT), time.sleep(60))"
     result = python(f"{stuck}; {press}; {ROTAVG}", "solve", graph_path, "--output", tmp_path / "out")
     assert (result.returncode, result.stdout, result.stderr) == (128 + signal.SIGINT, "", "rotavg: interrupted\n")

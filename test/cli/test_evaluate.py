@@ -10,9 +10,9 @@ from scipy.io import savemat
 
 from rotavg_ros import rotations
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.graph_file import GraphFile, write_graph
-from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe
-from rotavg_ros.evaluation import robustness, synthetic
+from rotavg_ros.datasets.files.graph_file import GraphFile, write_graph
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
+from rotavg_ros.evaluation.sfm import robustness, synthetic
 
 
 def test_synthetic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -55,8 +55,6 @@ def test_few_graphs_do_for_what_is_slow(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_robustness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny = PaperRecipe(cameras=(20, 30), pair_share=(0.3, 0.5))
-    monkeypatch.setattr(robustness, "_TRAINING_GRAPHS", 2)
-    monkeypatch.setattr(robustness, "_VALIDATION_GRAPHS", 1)
     monkeypatch.setitem(robustness.TRAINING_RECIPES, "easy", tiny)
     for name in ("easy", "easy-easy"):
         setting = robustness.SETTINGS[name]

@@ -7,8 +7,8 @@ import pytest
 
 from rotavg_ros.bags.graph_from_bag import read_graph_bag
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.graph_file import GraphFile, read_graph
-from rotavg_ros.evaluation.metrics import true_edge_noise
+from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph
+from rotavg_ros.metrics import true_edge_noise
 
 
 def simulate(folder: Path, *options: str) -> GraphFile:
@@ -21,7 +21,7 @@ def share_of_false_closures(graph_file: GraphFile) -> float:
 
     graph = graph_file.graph
     truth = torch.from_numpy(graph_file.body_from_world_gt)
-    noise = true_edge_noise(graph.target_from_source, graph.source, graph.target, truth).numpy()
+    noise = true_edge_noise(graph, truth).numpy()
     return float((noise[~graph.is_odometry.numpy()] > np.radians(10)).mean())
 
 

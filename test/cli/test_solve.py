@@ -18,7 +18,7 @@ from safetensors.torch import load_file, save_file
 
 from rotavg_ros import rotations, solve
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.graph_file import GraphFile, read_graph, write_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph, write_graph
 from rotavg_ros.solver.neurora.network_store import WEIGHTS_FOLDER
 from rotavg_ros.version import __version__
 

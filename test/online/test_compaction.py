@@ -11,8 +11,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
-from rotavg_ros.datasets.trajectories import World
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.simulation.trajectories import World
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator, graph_builder
 from rotavg_ros.online.fingerprints import Fingerprints
 from rotavg_ros.solver.algebra.residuals import edge_residual

@@ -8,8 +8,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import lsqr
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.datasets.robot_run import robot_run_config
-from rotavg_ros.datasets.slam_simulation import SimulatedRun, simulate_slam_graph
+from rotavg_ros.datasets.simulation.robot_run import RobotRun
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, simulate_slam_graph
 from rotavg_ros.online.positions import fit_positions
 from rotavg_ros.online.trajectory import dead_reckoning
 
@@ -17,7 +17,7 @@ from rotavg_ros.online.trajectory import dead_reckoning
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
     """Four laps of city streets; three closures in ten are false."""
-    return simulate_slam_graph(robot_run_config("city", false_share=0.3), np.random.default_rng(4))
+    return simulate_slam_graph(RobotRun("city", false_share=0.3).config(), np.random.default_rng(4))
 
 
 def fit(run: SimulatedRun, translation: np.ndarray, score: np.ndarray) -> np.ndarray:

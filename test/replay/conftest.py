@@ -9,8 +9,8 @@ import pytest
 
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.robot_run import robot_run_config
-from rotavg_ros.datasets.slam_simulation import SimulatedRun, simulate_slam_graph
+from rotavg_ros.datasets.simulation.robot_run import RobotRun
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, simulate_slam_graph
 
 # Few ticks: their number is not what these tests are about.
 SELDOM = ["-p", "solve_period_s:=10.0"]
@@ -19,7 +19,7 @@ SELDOM = ["-p", "solve_period_s:=10.0"]
 @pytest.fixture(scope="session")
 def run() -> SimulatedRun:
     """Two laps of a building, three closures in ten false."""
-    return simulate_slam_graph(robot_run_config(laps=2), np.random.default_rng(2))
+    return simulate_slam_graph(RobotRun(laps=2).config(), np.random.default_rng(2))
 
 
 @pytest.fixture(scope="session")

@@ -219,6 +219,7 @@ def test_no_space_left(tmp_path: Path, small: Path, monkeypatch: pytest.MonkeyPa
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
+    # A limit on sizes would hit run.mcap, which is written first.
     monkeypatch.setattr("rotavg_ros.replay.outputs.write_csv", full)
     assert main(["replay", str(small), "--output", str(tmp_path / "out"), "--no-report"]) == 2
     assert "cannot be written: No space left on device" in capsys.readouterr().err

@@ -16,7 +16,7 @@ from evo.tools import file_interface
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from rotavg_ros.datasets.slam_simulation import SimulatedRun
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 
 EVERYTHING = {
     "/abs_orientations": "rotavg_msgs/msg/AbsoluteOrientations",

@@ -17,8 +17,8 @@ from rosgraph_msgs.msg import Clock
 from rotavg_msgs.msg import RelativeRotation
 
 from rotavg_ros.bags.run_bag import write_run_bag
-from rotavg_ros.datasets.robot_run import robot_run_config
-from rotavg_ros.datasets.slam_simulation import SimulatedRun, simulate_slam_graph
+from rotavg_ros.datasets.simulation.robot_run import RobotRun
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, simulate_slam_graph
 
 pytestmark = pytest.mark.ros
 
@@ -27,7 +27,7 @@ ROTAVG = [sys.executable, "-m", "rotavg_ros.cli.main"]
 
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
-    return simulate_slam_graph(robot_run_config(laps=1), np.random.default_rng(0))
+    return simulate_slam_graph(RobotRun(laps=1).config(), np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from rotavg_ros.bags import answer_messages as recorded
 from rotavg_ros.bags.message_types import typestore
-from rotavg_ros.datasets.robot_run import robot_run_config
-from rotavg_ros.datasets.slam_simulation import simulate_slam_graph
+from rotavg_ros.datasets.simulation.robot_run import RobotRun
+from rotavg_ros.datasets.simulation.slam_simulation import simulate_slam_graph
 from rotavg_ros.online import Answer, EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
 from rotavg_ros.online.drawing import draw
 from rotavg_ros.online.trajectory import Trajectory
@@ -26,7 +26,7 @@ FRAME = "map"
 @pytest.fixture(scope="module")
 def answered() -> tuple[Answer, Trajectory]:
     """A short run with closures by stamp, and a keyframe of another robot of which nothing is known."""
-    run = simulate_slam_graph(robot_run_config(laps=1.5), np.random.default_rng(0))
+    run = simulate_slam_graph(RobotRun(laps=1.5).config(), np.random.default_rng(0))
     estimator = OnlineEstimator(EstimatorOptions())
     poses = zip(
         run.stamps_ns.tolist(), run.odometry_world_from_body.tolist(), run.odometry_position.tolist(), strict=True

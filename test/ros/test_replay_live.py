@@ -16,8 +16,8 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` instal
 
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.robot_run import robot_run_config
-from rotavg_ros.datasets.slam_simulation import simulate_slam_graph
+from rotavg_ros.datasets.simulation.robot_run import RobotRun
+from rotavg_ros.datasets.simulation.slam_simulation import simulate_slam_graph
 
 ROTAVG = Path(sys.executable).with_name("rotavg")
 
@@ -32,7 +32,7 @@ def by_edge(flags: Any, values: Sequence[float]) -> dict[tuple[int, ...], float]
 @pytest.mark.ros
 @pytest.mark.slow
 def test_a_replay_says_what_the_live_node_says(tmp_path: Path, live_node, start_process) -> None:
-    run = simulate_slam_graph(robot_run_config(laps=1.5, false_share=0.4, dimensions=3), np.random.default_rng(11))
+    run = simulate_slam_graph(RobotRun(laps=1.5, false_share=0.4, dimensions=3).config(), np.random.default_rng(11))
     write_run_bag(tmp_path / "bag", run)
     settings = ["keyframe_distance_m:=0.3", "keyframe_angle_deg:=8.0"]
     live_node.start(*settings)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rotavg_ros import ViewGraph, rotations, solve, solve_batch
-from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.solver import devices
 from rotavg_ros.solver.algebra.relaxed_forest import hubs, relaxed_forest
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges

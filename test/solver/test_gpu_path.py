@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from rotavg_ros import rotations, solve, solve_batch
-from rotavg_ros.datasets.synthetic import PaperRecipe
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe
 from rotavg_ros.solver import devices
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import METHODS, EdgeKind, EdgeLabel, UserError, ViewGraph, rotations, solve
-from rotavg_ros.datasets.false_closures import replace_closures
-from rotavg_ros.datasets.graph_file import read_graph
-from rotavg_ros.datasets.ground_truth import attach_truth
-from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe
-from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.datasets.files.graph_file import read_graph
+from rotavg_ros.datasets.files.ground_truth import attach_truth
+from rotavg_ros.datasets.simulation.false_closures import replace_closures
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
+from rotavg_ros.metrics import orientation_errors
 
 from .graphs import as_quaternions, measured, random_truth, slam_edges, small_noise
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from rotavg_ros.datasets.synthetic import PaperRecipe, ReleasedRecipe
-from rotavg_ros.evaluation.calibration import expected_calibration_error
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
+from rotavg_ros.metrics import expected_calibration_error
 from rotavg_ros.solver import solve
 from rotavg_ros.training.score_fit import ScoreSample, draw, fit
 

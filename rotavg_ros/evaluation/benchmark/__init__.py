@@ -1,1 +1,1 @@
-"""Speed and memory beside COLMAP and GTSAM: the same graphs, in one run, each solver in a process of its own."""
+"""Time and memory beside the peers, every contender in a process of its own."""

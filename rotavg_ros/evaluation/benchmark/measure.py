@@ -10,19 +10,20 @@ import json
 import os
 import resource
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
-from rotavg_ros.evaluation.benchmark.cases import load
-from rotavg_ros.evaluation.metrics import orientation_errors
-from rotavg_ros.evaluation.named_peers import PEERS
+from rotavg_ros.evaluation.benchmark.plans import load
+from rotavg_ros.evaluation.common.answers import Answer, Clock
+from rotavg_ros.evaluation.common.cases import warm_up_case
+from rotavg_ros.evaluation.common.named_peers import PEERS
+from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver import solve
-from rotavg_ros.view_graph import EdgeKind, ViewGraph
+from rotavg_ros.view_graph import ViewGraph
 
 # Contenders by name, and what reports call them.
 LABELS = {
@@ -64,11 +65,10 @@ class Measurement:
     stage_seconds: dict[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class _Run:
-    body_from_world: Tensor
-    wall: float
-    cpu: float
+class _Run(NamedTuple):
+    """One solve, and the wall-clock seconds of its stages where it tells them."""
+
+    answer: Answer
     stages: dict[str, float]
 
 
@@ -78,22 +78,22 @@ def measure(path: Path, contender: str, repeats: int) -> Measurement:
     Args:
         repeats: solves at most; there are fewer where they take more than :data:`ENOUGH_S`.
     """
-    drawn = load(path)
+    case = load(path)
     run = _ours(contender) if contender in OURS else _peer(contender)
-    run(_triangle(odometry=bool(drawn.graph.is_odometry.any())))
+    run(warm_up_case(case.family).graph)
     before = _peak_bytes()
-    runs = [run(drawn.graph)]
-    while len(runs) < repeats and sum(one.wall for one in runs) < ENOUGH_S:
-        runs.append(run(drawn.graph))
-    typical = sorted(runs, key=lambda one: one.wall)[len(runs) // 2]
+    runs = [run(case.graph)]
+    while len(runs) < repeats and sum(one.answer.seconds for one in runs) < ENOUGH_S:
+        runs.append(run(case.graph))
+    typical = sorted(runs, key=lambda one: one.answer.seconds)[len(runs) // 2]
     peak = _peak_bytes()
-    error = torch.rad2deg(orientation_errors(typical.body_from_world, drawn.truth))
+    error = torch.rad2deg(orientation_errors(typical.answer.body_from_world, case.truth))
     return Measurement(
         contender,
-        drawn.graph.num_nodes,
-        drawn.graph.num_edges,
-        [one.wall for one in runs],
-        [one.cpu for one in runs],
+        case.graph.num_nodes,
+        case.graph.num_edges,
+        [one.answer.seconds for one in runs],
+        [one.answer.cpu_seconds for one in runs],
         float(error.mean()),
         float(error.median()),
         peak,
@@ -108,25 +108,20 @@ def _ours(contender: str) -> Callable[[ViewGraph], _Run]:
 
     def run(graph: ViewGraph) -> _Run:
         graph = replace(graph)  # a graph remembers its components; every repeat is to find them anew
-        wall, cpu = time.perf_counter(), time.process_time()
-        solution = solve(graph, method=method, device=device)
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        return _Run(solution.body_from_world, wall, cpu, solution.stage_seconds)
+        clock = Clock()
+        with clock.running():
+            solution = solve(graph, method=method, device=device)
+        answer = Answer(solution.body_from_world, clock.seconds, clock.cpu_seconds, solution.outlier_score)
+        return _Run(answer, solution.stage_seconds)
 
     return run
 
 
 def _peer(contender: str) -> Callable[[ViewGraph], _Run]:
     def run(graph: ViewGraph) -> _Run:
-        answer = PEERS[contender].solve(graph)
-        return _Run(answer.body_from_world, answer.seconds, answer.cpu_seconds, {})
+        return _Run(PEERS[contender].solve(graph), {})
 
     return run
-
-
-def _triangle(odometry: bool) -> ViewGraph:
-    kind = [EdgeKind.ODOMETRY if odometry else EdgeKind.LOOP_CLOSURE] * 2 + [EdgeKind.LOOP_CLOSURE]
-    return ViewGraph.create([0, 1, 0], [1, 2, 2], [[0.0, 0.0, 0.0, 1.0]] * 3, kind=kind)
 
 
 def _peak_bytes() -> int:

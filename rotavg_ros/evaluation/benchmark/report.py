@@ -10,11 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from rotavg_ros.evaluation.benchmark.cases import FAMILIES
 from rotavg_ros.evaluation.benchmark.measure import LABELS, OURS, Measurement
+from rotavg_ros.evaluation.benchmark.plans import FAMILIES
 from rotavg_ros.evaluation.benchmark.schedule import NO_GPU, Result
-from rotavg_ros.evaluation.plots import MUTED, PALETTE, style
-from rotavg_ros.evaluation.tables import Cell, Column, Table
+from rotavg_ros.evaluation.common.plots import MUTED, PALETTE, style
+from rotavg_ros.evaluation.common.tables import Cell, Column, Table
 
 _REFERENCE = "neurora"
 # On an axis that spans less than this factor, 2 and 5 are labelled, too.
@@ -170,7 +170,7 @@ def _missing(results: Sequence[Result]) -> tuple[str, ...]:
     for result in results:
         for contender, reason in result.missing.items():
             where = (
-                "" if reason == NO_GPU else f"{result.case.nodes} nodes and about {result.case.expected_edges} edges: "
+                "" if reason == NO_GPU else f"{result.plan.nodes} nodes and about {result.plan.expected_edges} edges: "
             )
             reasons.setdefault(contender, []).append(where + reason)
     return tuple(f"{LABELS[name]}: {'; '.join(dict.fromkeys(of_name))}." for name, of_name in reasons.items())

@@ -10,8 +10,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import ViewGraph, rotations, solve
-from rotavg_ros.datasets.synthetic import PaperRecipe
-from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe
+from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.sfm import refinement as sfm_refinement
 from rotavg_ros.solver.sfm import round_refinement as refinement

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import ViewGraph, rotations
-from rotavg_ros.datasets.synthetic import PaperRecipe
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe
 from rotavg_ros.solver.algebra.conjugate_gradients import NotConvergedError, WeightedAdjacency, solve_laplacian
 from rotavg_ros.solver.algebra.laplacian import LaplacianSystem
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges

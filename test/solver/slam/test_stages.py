@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from rotavg_ros import solve
-from rotavg_ros.datasets.graph_file import read_graph
-from rotavg_ros.datasets.ground_truth import attach_stamps, attach_truth
-from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.datasets.files.graph_file import read_graph
+from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
+from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.preparation import Prepared, prepare
 from rotavg_ros.solver.slam.stages import bootstrap, clean, refine

@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rotavg_ros.datasets.slam_config import SlamSimulationConfig
-from rotavg_ros.datasets.slam_simulation import simulate_slam_graph
-from rotavg_ros.datasets.trajectories import World
+from rotavg_ros.datasets.simulation.slam_config import SlamSimulationConfig
+from rotavg_ros.datasets.simulation.slam_simulation import simulate_slam_graph
+from rotavg_ros.datasets.simulation.trajectories import World
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
 from rotavg_ros.solver.slam.noise.common_error import RunErrors, closure_runs, common_share, variance_factor
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.preparation import prepare
-from rotavg_ros.solver.slam.stages import bootstrap, clean, refine
+from rotavg_ros.solver.slam.refinement import refine
+from rotavg_ros.solver.slam.stages import bootstrap, clean
 
 
 def test_runs_link_near_good_closures() -> None:

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import EdgeKind, ViewGraph, solve
-from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.solver.slam import preparation as slam_preparation
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from test.solver.graphs import as_quaternions, measured, small_noise

@@ -10,9 +10,14 @@ import pytest
 import torch
 
 from rotavg_ros import ViewGraph, solve
-from rotavg_ros.datasets.slam_simulation import Precisions, SimulatedRun, SlamSimulationConfig, simulate_slam_graph
-from rotavg_ros.datasets.trajectories import World
-from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.datasets.simulation.slam_simulation import (
+    Precisions,
+    SimulatedRun,
+    SlamSimulationConfig,
+    simulate_slam_graph,
+)
+from rotavg_ros.datasets.simulation.trajectories import World
+from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.online.gauge import extend_along_edges
 from rotavg_ros.solver.slam.noise.model import NoiseModel
 from rotavg_ros.solver.slam.noise.stated_precision import StatedTrust, estimate_trust

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import EdgeKind, ViewGraph, rotations, solve
-from rotavg_ros.evaluation.metrics import orientation_errors
+from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.solver.slam import preparation as slam_preparation
 from rotavg_ros.solver.slam import stages as slam_stages
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph

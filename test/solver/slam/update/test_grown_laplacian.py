@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from rotavg_ros import ViewGraph
-from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
-from rotavg_ros.datasets.trajectories import World
+from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.simulation.trajectories import World
 from rotavg_ros.solver.algebra.laplacian import LaplacianSystem
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.preparation import draw_together

@@ -1,0 +1,1 @@
+"""Readers and writers of view-graphs, of what comes with them, and of poses."""

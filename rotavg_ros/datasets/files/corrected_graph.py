@@ -1,0 +1,56 @@
+"""A solved pose graph in g2o: corrected vertices, and no outliers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from rotavg_ros.datasets.files import g2o
+from rotavg_ros.datasets.files.graph_file import GraphFile
+from rotavg_ros.datasets.files.pose_graph_rows import ANGULAR_DIAGONAL, POSITION_DIAGONAL
+
+# Of a position that is not known: as good as none, but the matrix can still be inverted.
+_NO_INFORMATION = 1e-9
+
+
+def write_corrected_graph(
+    path: Path, graph_file: GraphFile, world_from_body: np.ndarray, position: np.ndarray, outlier: np.ndarray
+) -> None:
+    """Write corrected vertices and the edges that are not outliers, so that plain least squares can go on from there.
+
+    Unknown precisions become a typical one of those that are known, since the format has no other word for them; for
+    an odometry edge that several were drawn together into, as much less.
+
+    Args:
+        path: of the g2o file.
+        graph_file: N nodes, M edges; translations that are NaN are not known.
+        world_from_body, position: ``(N, 4)`` xyzw and ``(N, 3)`` metres.
+        outlier: ``(M,)`` bool.
+
+    Raises:
+        GraphFileError: the file cannot be written.
+    """
+    kept = np.flatnonzero(~outlier)
+    graph = graph_file.graph.select_edges(torch.from_numpy(kept).to(graph_file.graph.device))
+    translation = graph_file.edge_translation
+    translation = np.full((len(kept), 3), np.nan) if translation is None else translation[kept]
+    stated = graph_file.edge_information
+    information = np.zeros((len(kept), 21)) if stated is None else stated[kept]
+    unstated = ~np.any(information, axis=1, keepdims=True)
+    known = np.isfinite(translation).all(axis=1)
+    defaults = np.zeros_like(information)
+    precision = graph.precision.cpu().numpy()
+    typical = np.nanmedian(precision) if np.isfinite(precision).any() else 1.0
+    typical = typical / graph.steps.cpu().numpy()
+    defaults[:, ANGULAR_DIAGONAL] = np.where(np.isnan(precision), typical, precision)[:, None]
+    defaults[:, POSITION_DIAGONAL] = np.where(known, 1.0, _NO_INFORMATION)[:, None]
+    chosen = replace(
+        graph_file,
+        graph=graph,
+        edge_translation=np.nan_to_num(translation),
+        edge_information=np.where(unstated, defaults, information),
+    )
+    g2o.write(path, chosen, world_from_body * [-1.0, -1.0, -1.0, 1.0], position)

@@ -1,0 +1,210 @@
+"""g2o pose graphs and their TORO and iSAM dialects.
+
+An edge line stores the pose of the target in the source frame, so its rotation is the inverse of
+``target_from_source``. Edges between consecutive ids, in either direction, are odometry.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, writing
+from rotavg_ros.datasets.files.pose_graph_rows import ANGULAR_DIAGONAL, lay_out
+from rotavg_ros.datasets.files.text_rows import Row, parse_rows, read_blocks, shown, unit_quaternions, write_rows
+from rotavg_ros.datasets.planar import quaternion_of_heading
+from rotavg_ros.rotations import inverse
+from rotavg_ros.view_graph import EdgeKind
+
+# Where the entries of a planar information matrix, in the order xx xy xθ yy yθ θθ, are in the 21 of a spatial one.
+_PLANAR_ENTRIES = (0, 1, 5, 6, 10, 20)
+
+
+@dataclass(frozen=True)
+class EdgeTag:
+    """How the numbers after an edge's two ids are laid out."""
+
+    translation: int  # how many numbers: x y, or x y z
+    rotation: int  # θ, roll pitch yaw, or qx qy qz qw
+    information: tuple[int, ...]  # which of the 21 entries of the upper triangle, row by row, each number is
+    is_square_root: bool = False
+
+    @property
+    def planar(self) -> bool:
+        return self.rotation == 1
+
+
+EDGE_TAGS = {
+    b"EDGE_SE2": EdgeTag(2, 1, _PLANAR_ENTRIES),
+    b"EDGE2": EdgeTag(2, 1, (0, 1, 6, 20, 5, 10)),  # TORO: xx xy yy θθ xθ yθ
+    b"ODOMETRY": EdgeTag(2, 1, _PLANAR_ENTRIES, is_square_root=True),  # iSAM
+    b"EDGE_SE3:QUAT": EdgeTag(3, 4, tuple(range(21))),
+    b"EDGE3": EdgeTag(3, 3, tuple(range(21))),  # TORO
+}
+# Numbers after the id. Only the id counts: poses in a file are somebody's estimate, not a measurement.
+VERTEX_TAGS = {b"VERTEX_SE2": 3, b"VERTEX2": 3, b"VERTEX_SE3:QUAT": 7, b"VERTEX3": 6}
+# What tells nothing about relative rotations between poses.
+SKIPPED_TAGS = frozenset(
+    b"FIX LANDMARK VERTEX_XY VERTEX_XYZ VERTEX_TRACKXYZ VERTEX_POINT_XYZ VERTEX_TAG "
+    b"EDGE_XY EDGE_SE2_XY EDGE_SE2_XY_CALIB EDGE_BEARING_SE2_XY EDGE_SE3_XYZ EDGE_SE3_TRACKXYZ EDGE_POINT_XYZ "
+    b"EDGE_PRIOR_SE2 EDGE_PRIOR_SE2_XY EDGE_SE2_PRIOR EDGE_PRIOR_SE3 EDGE_SE3_PRIOR ROBOTLASER1 RAWLASER1".split()
+)
+
+
+def read(path: Path) -> GraphFile:
+    """Read a pose graph of EDGE_SE2, EDGE_SE3:QUAT, TORO's EDGE2 and EDGE3 and iSAM's ODOMETRY edges.
+
+    Landmarks, priors, parameters and self-edges are skipped and counted. Precision is Iθθ, or the mean of the
+    three angular diagonal entries.
+
+    Raises:
+        GraphFileError: naming the line that is at fault.
+    """
+    skipped: Counter[str] = Counter()
+    lone_ids: list[np.ndarray] = []
+    edges: list[_Edges] = []
+    edge_tags: set[bytes] = set()
+    for block in read_blocks(path):
+        by_tag: dict[bytes, tuple[list[int], list[Row]]] = {}
+        for line, (tag, *row) in block:
+            lines, rows = by_tag.setdefault(tag, ([], []))
+            lines.append(line)
+            rows.append(row)
+        for tag, (lines, rows) in by_tag.items():
+            if tag in EDGE_TAGS:
+                edge_tags.add(tag)
+                edges.append(_parse_edges(path, EDGE_TAGS[tag], lines, rows))
+            elif tag in VERTEX_TAGS:
+                lone_ids.append(_parse_vertices(path, VERTEX_TAGS[tag], lines, rows))
+            elif tag in SKIPPED_TAGS or tag.startswith(b"PARAMS"):
+                skipped[tag.decode()] += len(lines)
+            else:
+                known = ", ".join(sorted(known.decode() for known in EDGE_TAGS))
+                what = f"unknown tag {shown(tag)}; is this a g2o file? Edges may be {known}"
+                raise GraphFileError.at(path, lines[0], what)
+    if not edges:
+        raise GraphFileError.at(path, None, "no edges between poses; there is nothing to solve")
+    every = _Edges.concatenate(edges)
+    self_edge = every.ids[:, 0] == every.ids[:, 1]
+    if self_edge.any():
+        skipped["self-edge"] = int(self_edge.sum())
+        lone_ids.append(every.ids[self_edge, 0])
+        every = every.select(~self_edge)
+        if not len(every.line):
+            raise GraphFileError.at(path, None, "every edge joins a pose with itself; there is nothing to solve")
+    consecutive = np.abs(every.ids[:, 0] - every.ids[:, 1]) == 1
+    return GraphFile.from_ids(
+        every.ids[:, 0],
+        every.ids[:, 1],
+        inverse(torch.from_numpy(every.source_from_target)).numpy(),
+        lone_ids=np.concatenate(lone_ids) if lone_ids else None,
+        kind=np.where(consecutive, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE),
+        precision=every.precision,
+        planar=all(EDGE_TAGS[tag].planar for tag in edge_tags),
+        edge_translation=every.translation,
+        edge_information=every.information,
+        skipped=dict(skipped),
+    )
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """Parsed edge lines, K rows each."""
+
+    line: np.ndarray
+    ids: np.ndarray
+    source_from_target: np.ndarray
+    translation: np.ndarray
+    information: np.ndarray
+    precision: np.ndarray
+
+    @classmethod
+    def concatenate(cls, parts: list[_Edges]) -> _Edges:
+        """All edges in the order of their lines."""
+        together = cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
+        return together.select(np.argsort(together.line))
+
+    def select(self, rows: np.ndarray) -> _Edges:
+        return _Edges(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+
+def _parse_edges(path: Path, tag: EdgeTag, lines: list[int], rows: list[Row]) -> _Edges:
+    num_pose = tag.translation + tag.rotation
+    ids, numbers = parse_rows(path, lines, rows, 2, num_pose + len(tag.information))
+    translation, rotation, stated = np.split(numbers, [tag.translation, num_pose], axis=1)
+    if tag.planar:
+        source_from_target = quaternion_of_heading(rotation[:, 0])
+        translation = np.pad(translation, ((0, 0), (0, 1)))
+    elif tag.rotation == 4:
+        source_from_target = unit_quaternions(path, lines, rotation)
+    else:
+        source_from_target = Rotation.from_euler("xyz", rotation).as_quat()
+    with np.errstate(over="ignore"):  # absurdly large entries become inf, which counts as unknown
+        information = np.zeros((len(rows), 21))
+        information[:, tag.information] = _squared(stated) if tag.is_square_root else stated
+        precision = information[:, 20] if tag.planar else information[:, ANGULAR_DIAGONAL].mean(axis=1)
+    return _Edges(np.array(lines), ids, source_from_target, translation, information, precision)
+
+
+def _squared(root: np.ndarray) -> np.ndarray:
+    """``RᵀR`` of upper triangular 3 × 3 matrices, both as ``(K, 6)`` upper triangles, row by row.
+
+    Zero where Rθθ is: the entries are then in some other program's order, and mean we do not know what.
+    """
+    xx, xy, xt, yy, yt, tt = root.T
+    information = (xx * xx, xx * xy, xx * xt, xy * xy + yy * yy, xy * xt + yy * yt, xt * xt + yt * yt + tt * tt)
+    return np.asarray(np.where(tt > 0, information, 0).T)
+
+
+def _parse_vertices(path: Path, num_values: int, lines: list[int], rows: list[Row]) -> np.ndarray:
+    """Ids of the vertices. Their poses may be anything: a diverged estimate does not spoil the measurements."""
+    for line, row in zip(lines, rows, strict=True):
+        if len(row) != 1 + num_values:
+            what = f"{len(row)} numbers where {1 + num_values} belong; the line is malformed or the file truncated"
+            raise GraphFileError.at(path, line, what)
+    return parse_rows(path, lines, [row[:1] for row in rows], 1, 0)[0][:, 0]
+
+
+def write(
+    path: Path,
+    graph_file: GraphFile,
+    body_from_world: np.ndarray | None = None,
+    position: np.ndarray | None = None,
+) -> None:
+    """Write EDGE_SE2 or EDGE_SE3:QUAT lines, after VERTEX lines that chain the edges' translations.
+
+    The format knows no unknown precision (written as 1) and no edge kind (consecutive ids are odometry).
+
+    Args:
+        body_from_world: ``(N, 4)`` xyzw orientations of the vertices; default: those a breadth-first tree of
+            the edges, odometry first, gives.
+        position: ``(N, 3)`` metres, of the vertices; default: chained likewise.
+    """
+    poses = lay_out(graph_file, body_from_world, position)
+    with writing(path) as temporary, temporary.open("w", encoding="ascii") as file:
+        if graph_file.planar:
+            write_rows(file, f"VERTEX_SE2 %d{' %.15g' * 3}\n", [poses.ids, *poses.planar_vertices])
+            columns = [*poses.ends, *poses.planar_edges, poses.information[:, _PLANAR_ENTRIES]]
+            write_rows(file, f"EDGE_SE2 %d %d{' %.15g' * 9}\n", columns)
+        else:
+            columns = [poses.ids, poses.position, poses.world_from_body]
+            write_rows(file, f"VERTEX_SE3:QUAT %d{' %.15g' * 7}\n", columns)
+            columns = [*poses.ends, poses.translation, poses.source_from_target, poses.information]
+            write_rows(file, f"EDGE_SE3:QUAT %d %d{' %.15g' * 28}\n", columns)
+
+
+def not_stored(graph_file: GraphFile) -> list[str]:
+    """What of this graph the format has no room for, in words."""
+    graph = graph_file.graph
+    lost = {
+        "which edges are odometry (consecutive ids will be)": bool(
+            (graph.is_odometry.cpu().numpy() != graph_file.consecutive).any()
+        ),
+        "that precisions are unknown (written as 1)": bool(graph.precision.isnan().any()),
+    }
+    return [name for name, is_lost in lost.items() if is_lost] + graph_file.extras

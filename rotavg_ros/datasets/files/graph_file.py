@@ -1,0 +1,268 @@
+"""A view-graph as files know it: with the ids, stamps, translations and ground truth that the solver does not need.
+
+:func:`read_graph` and :func:`write_graph` choose the format; the formats themselves are modules with a
+``read(path)``, a ``write(path, graph_file)`` and a ``not_stored(graph_file)`` each.
+"""
+
+from __future__ import annotations
+
+import codecs
+import gzip
+import io
+import os
+import zlib
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from rotavg_ros.errors import UserError
+from rotavg_ros.view_graph import ViewGraph
+
+# Ids are non-negative so that they fit the unsigned 64-bit ids of the messages and of gtsam's keys.
+MAX_NODE_ID = np.iinfo(np.int64).max
+
+_GZIP = b"\x1f\x8b"
+_NUMBER_STARTS = frozenset(bytes([character]) for character in b"0123456789+-.")
+
+# Format modules by suffix; imported when used, since they import this module.
+_FORMAT_OF_SUFFIX = {
+    ".g2o": "g2o",
+    ".graph": "toro",
+    ".toro": "toro",
+    ".isam": "isam",
+    ".npz": "npz",
+    ".txt": "onedsfm",
+}
+
+
+class GraphFileError(UserError):
+    """A file that cannot be read or written as what it should be.
+
+    The message names the file, the line where there is one, what is wrong and what to do.
+    """
+
+    @classmethod
+    def at(cls, path: str | Path, line: int | None, what: str) -> GraphFileError:
+        """``path:line: what``, or ``path: what`` where no line is to blame."""
+        return cls(f"{path}:{line}: {what}" if line is not None else f"{path}: {what}")
+
+
+@dataclass(frozen=True)
+class GraphFile:
+    """A view-graph as read from or written to a file (N nodes, M edges).
+
+    Attributes:
+        graph: the edges; nodes are indices into ``node_ids``.
+        node_ids: ``(N,)`` int64, ascending, non-negative: index → id in the file.
+        planar: every rotation is about z (an SE(2) graph).
+        edge_translation: ``(M, 3)`` position of the target in the source frame, metres (SfM: of unknown scale).
+        edge_information: ``(M, 21)`` upper triangle, row by row, of the 6 × 6 information matrix of x, y, z and the
+            rotation, as stated by formats that have one. Planar edges have zeros for z, roll and pitch.
+        body_from_world_gt: ``(N, 4)`` xyzw ground truth; NaN rows where unknown.
+        stamps_ns: ``(N,)`` int64 nanoseconds.
+        position_gt: ``(N, 3)`` ground truth in the world frame, metres; NaN rows where unknown.
+        skipped: number of lines that were left out on reading, by kind.
+    """
+
+    graph: ViewGraph
+    node_ids: np.ndarray
+    planar: bool = False
+    edge_translation: np.ndarray | None = None
+    body_from_world_gt: np.ndarray | None = None
+    stamps_ns: np.ndarray | None = None
+    position_gt: np.ndarray | None = None
+    skipped: dict[str, int] = field(default_factory=dict)
+    edge_information: np.ndarray | None = None
+
+    @property
+    def consecutive(self) -> np.ndarray:
+        """``(M,)`` bool: the edge joins two consecutive ids, which makes it odometry in formats without kinds."""
+        source, target = (self.node_ids[end.cpu().numpy()] for end in (self.graph.source, self.graph.target))
+        return np.asarray(np.abs(source - target) == 1)
+
+    @property
+    def extras(self) -> list[str]:
+        """What is known of the nodes besides their ids, in words."""
+        known = {
+            "stamps": self.stamps_ns,
+            "ground-truth orientations": self.body_from_world_gt,
+            "ground-truth positions": self.position_gt,
+        }
+        return [name for name, values in known.items() if values is not None]
+
+    @classmethod
+    def from_ids(
+        cls,
+        source_ids: np.ndarray,
+        target_ids: np.ndarray,
+        target_from_source: np.ndarray,
+        *,
+        lone_ids: np.ndarray | None = None,
+        kind: np.ndarray | None = None,
+        precision: np.ndarray | None = None,
+        planar: bool = False,
+        edge_translation: np.ndarray | None = None,
+        edge_information: np.ndarray | None = None,
+        steps: np.ndarray | None = None,
+        skipped: dict[str, int] | None = None,
+    ) -> GraphFile:
+        """Build from edges between ids instead of indices.
+
+        Args:
+            source_ids, target_ids: ``(M,)`` int64.
+            target_from_source: ``(M, 4)`` xyzw.
+            lone_ids: ids that are nodes even if no edge names them.
+
+        Raises:
+            ViewGraphError: as :meth:`ViewGraph.create`.
+        """
+        num_edges = len(source_ids)
+        lone_ids = np.empty(0, dtype=np.int64) if lone_ids is None else lone_ids
+        node_ids, index = np.unique(np.concatenate((source_ids, target_ids, lone_ids)), return_inverse=True)
+        graph = ViewGraph.create(
+            index[:num_edges],
+            index[num_edges : 2 * num_edges],
+            target_from_source,
+            num_nodes=len(node_ids),
+            kind=kind,
+            precision=precision,
+            steps=steps,
+        )
+        return cls(
+            graph,
+            node_ids.astype(np.int64),
+            planar,
+            edge_translation=edge_translation,
+            edge_information=edge_information,
+            skipped=dict(skipped or {}),
+        )
+
+
+def read_graph(path: str | Path) -> GraphFile:
+    """Read a view-graph in g2o or TORO dialect, 1DSfM ``EGs.txt``, npz or Lund's MATLAB form; the content decides.
+
+    Texts may begin with UTF-8's byte order mark and may be compressed by gzip.
+
+    Returns:
+        a graph of indices with the file's ids beside it; :func:`rotavg_ros.solve` takes it as it is.
+
+    Raises:
+        GraphFileError: anything that keeps the file from being read whole.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise GraphFileError.at(path, None, "is not a regular file (a pipe or a device); save the graph to one first")
+    with open_text(path) as file:
+        head = file.read(4096)
+    if not head:
+        raise GraphFileError.at(path, None, "the file is empty; expected a view-graph (g2o, EGs.txt or npz)")
+    return _format(_format_of_content(path, head)).read(path)  # type: ignore[no-any-return]
+
+
+def write_graph(path: str | Path, graph_file: GraphFile) -> None:
+    """Write a view-graph; the suffix decides.
+
+    ``.g2o``, ``.toro`` or ``.graph`` (TORO), ``.isam``, ``.npz``, or ``.txt`` (1DSfM).
+    The file appears under its name only when it is complete.
+
+    Raises:
+        GraphFileError: an unknown suffix, or a place that cannot be written.
+    """
+    path = Path(path)
+    _format(_format_of_suffix(path)).write(path, graph_file)
+
+
+def not_stored(path: str | Path, graph_file: GraphFile) -> list[str]:
+    """What of this graph the format that ``path`` stands for has no room for, in words."""
+    return _format(_format_of_suffix(Path(path))).not_stored(graph_file)  # type: ignore[no-any-return]
+
+
+def stem_of(path: Path) -> str:
+    """The file's name without its suffix, nor that of gzip."""
+    return Path(path.stem).stem if path.suffix.lower() == ".gz" else path.stem
+
+
+def _format_of_suffix(path: Path) -> str:
+    name = _FORMAT_OF_SUFFIX.get(path.suffix.lower())
+    if name is None:
+        raise GraphFileError.at(
+            path, None, f"unknown suffix {path.suffix!r}; use .g2o, .toro, .isam, .npz or .txt (1DSfM EGs.txt)"
+        )
+    return name
+
+
+def _format_of_content(path: Path, head: bytes) -> str:
+    if head.startswith(b"PK") or path.suffix.lower() == ".npz":  # npz files are zip archives
+        return "npz"
+    if head.startswith(b"MATLAB ") or path.suffix.lower() == ".mat":
+        return "lund"
+    first_line = next((line for line in head.splitlines() if line.strip() and not line.lstrip().startswith(b"#")), b"")
+    return "onedsfm" if first_line.lstrip()[:1] in _NUMBER_STARTS else "g2o"
+
+
+def _format(name: str) -> ModuleType:
+    from rotavg_ros.datasets.files import g2o, isam, lund, npz, onedsfm, toro  # each of which imports this module
+
+    return {"g2o": g2o, "isam": isam, "lund": lund, "npz": npz, "onedsfm": onedsfm, "toro": toro}[name]
+
+
+@contextmanager
+def open_text(path: Path) -> Iterator[io.BufferedReader]:
+    """A text's bytes from the first character on: unpacked where it is gzipped, a byte order mark left out.
+
+    Raises:
+        GraphFileError: the file cannot be read, is UTF-16, or is a damaged gzip file.
+    """
+    with reading(path), ExitStack() as stack:
+        file = stack.enter_context(path.open("rb"))
+        if file.peek(len(_GZIP)).startswith(_GZIP):
+            file = io.BufferedReader(stack.enter_context(gzip.GzipFile(fileobj=file)))
+        try:
+            start = file.peek(len(codecs.BOM_UTF8))
+            if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+                what = "is UTF-16 text; save it as UTF-8 (iconv -f UTF-16 -t UTF-8)"
+                raise GraphFileError.at(path, None, what)
+            if start.startswith(codecs.BOM_UTF8):
+                file.read(len(codecs.BOM_UTF8))
+            yield file
+        except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+            raise GraphFileError.at(path, None, f"is a damaged gzip file: {error}; get or pack it again") from None
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn what the operating system says about ``path`` into a :class:`GraphFileError`."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise GraphFileError.at(path, None, "no such file; check the path") from None
+    except IsADirectoryError:
+        raise GraphFileError.at(
+            path, None, "is a directory; give a file (`rotavg convert` makes a view-graph file of a bag)"
+        ) from None
+    except PermissionError:
+        raise GraphFileError.at(path, None, "permission denied; check the file's rights") from None
+    except OSError as error:
+        raise GraphFileError.at(path, None, f"cannot be read: {error.strerror or error}") from None
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[Path]:
+    """A temporary name next to ``path`` that takes its place on success and vanishes on failure.
+
+    Raises:
+        GraphFileError: the place cannot be written (missing folder, rights, full disk).
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise GraphFileError.at(path, None, f"cannot be written: {error.strerror or error}") from None
+    finally:
+        with suppress(OSError):  # below a file there is nothing to remove
+            temporary.unlink()

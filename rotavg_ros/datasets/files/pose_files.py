@@ -1,0 +1,105 @@
+"""Trajectories in text files: TUM, KITTI and EuRoC's csv, as evo and others know them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.datasets.files.graph_file import GraphFileError, writing
+from rotavg_ros.datasets.files.ground_truth import nanoseconds
+from rotavg_ros.datasets.files.kitti import read_poses
+from rotavg_ros.datasets.files.text_rows import Row, parse_rows, read_blocks, refuse, unit_quaternions, write_rows
+from rotavg_ros.datasets.planar import quaternion_of_heading
+
+_EXPECTED = (
+    "expected TUM (stamp x y z qx qy qz qw), KITTI (12 numbers a row), EuRoC csv (stamp in ns, x, y, z, qw, qx, qy, "
+    "qz, …) or csv rows of stamp, x, y, heading"
+)
+
+
+@dataclass(frozen=True)
+class PoseFile:
+    """The poses of a file (K rows).
+
+    Attributes:
+        stamps_ns: ``(K,)`` int64, ascending; None for KITTI's, which has one row per frame instead.
+        position: ``(K, 3)`` metres.
+        world_from_body: ``(K, 4)`` xyzw.
+    """
+
+    stamps_ns: np.ndarray | None
+    position: np.ndarray
+    world_from_body: np.ndarray
+
+
+def read_pose_file(path: str | Path) -> PoseFile:
+    """Read a trajectory; commas and the number of columns decide what it is.
+
+    Raises:
+        GraphFileError: another format, a malformed line, or stamps that do not ascend.
+    """
+    path = Path(path)
+    rows = [numbered for block in read_blocks(path) for numbered in block]
+    is_csv = any(b"," in b"".join(row) for _, row in rows[:2])
+    if is_csv:
+        rows = [(line, b" ".join(row).replace(b",", b" ").split()) for line, row in rows]
+        if rows and not rows[0][1][0][:1].isdigit():
+            rows = rows[1:]  # the header
+    if not rows:
+        raise GraphFileError.at(path, None, f"the file has no rows; {_EXPECTED}")
+    lines, cells = [line for line, _ in rows], [row for _, row in rows]
+    columns = len(cells[0])
+    if columns == 12 and not is_csv:
+        world_from_body, position = read_poses(path)
+        return PoseFile(None, position, world_from_body.as_quat(canonical=True))
+    if columns == 8 and not is_csv:
+        stamps_ns, numbers = _by_stamp(path, lines, cells)
+        return PoseFile(stamps_ns, numbers[:, :3], unit_quaternions(path, lines, numbers[:, 3:]))
+    if columns >= 8 and is_csv:
+        stamps_ns, numbers = _by_stamp(path, lines, [row[:8] for row in cells], in_ns=True)
+        return PoseFile(stamps_ns, numbers[:, :3], unit_quaternions(path, lines, numbers[:, [4, 5, 6, 3]]))
+    if columns == 4 and is_csv:
+        stamps_ns, numbers = _by_stamp(path, lines, cells)
+        position = np.pad(numbers[:, :2], ((0, 0), (0, 1)))
+        return PoseFile(stamps_ns, position, quaternion_of_heading(numbers[:, 2]))
+    raise GraphFileError.at(path, lines[0], f"{columns} columns; {_EXPECTED}")
+
+
+def _by_stamp(path: Path, lines: list[int], cells: list[Row], *, in_ns: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """``(K,)`` ascending stamps in nanoseconds and ``(K, …)`` the numbers after them."""
+    _, numbers = parse_rows(path, lines, cells, 0, len(cells[0]))
+    if in_ns:
+        stamps = [int(row[0]) if row[0].isdigit() else round(float(row[0])) for row in cells]
+    else:
+        stamps = [nanoseconds(path, line, row[0]) for line, row in zip(lines, cells, strict=True)]
+    stamps_ns = np.array(stamps, dtype=np.int64)
+    backward = np.concatenate(([False], np.diff(stamps_ns) <= 0))
+    refuse(path, lines, backward, "a stamp that is not after the one before; sort the rows by time")
+    return stamps_ns, numbers[:, 1:]
+
+
+def write_tum(path: Path, stamps_ns: np.ndarray, position: np.ndarray, world_from_body: np.ndarray) -> None:
+    """Rows ``stamp x y z qx qy qz qw``, the stamp in seconds.
+
+    Raises:
+        GraphFileError: the place cannot be written.
+    """
+    seconds, rest = np.divmod(stamps_ns, 10**9)
+    with writing(path) as temporary, temporary.open("w", encoding="ascii") as file:
+        write_rows(file, f"%d.%09d{' %.9f' * 7}\n", [seconds, rest, position, world_from_body])
+
+
+def write_kitti(path: Path, position: np.ndarray, world_from_body: np.ndarray) -> None:
+    """Rows of the upper three of a 4 × 4 pose matrix.
+
+    Raises:
+        GraphFileError: the place cannot be written.
+    """
+    matrix = np.empty((len(position), 3, 4))
+    matrix[:, :, :3] = Rotation.from_quat(world_from_body).as_matrix()
+    matrix[:, :, 3] = position
+    with writing(path) as temporary, temporary.open("w", encoding="ascii") as file:
+        write_rows(file, f"%.12g{' %.12g' * 11}\n", [matrix.reshape(-1, 12)])

@@ -1,0 +1,79 @@
+"""A pose graph as vertices and edges, the way g2o's, TORO's and iSAM's files write them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rotavg_ros.datasets.dead_reckoning import chain_poses
+from rotavg_ros.datasets.files.graph_file import GraphFile
+from rotavg_ros.datasets.planar import heading_of_quaternion
+from rotavg_ros.rotations import inverse
+
+# Where the diagonal of a 6 × 6 matrix over x, y, z and the rotation is in the 21 of its upper triangle, row by row.
+POSITION_DIAGONAL = [0, 6, 11]
+ANGULAR_DIAGONAL = [15, 18, 20]
+
+
+@dataclass(frozen=True)
+class PoseGraphRows:
+    """What the dialects of pose-graph files write, each in its own words (N vertices, M edges).
+
+    Attributes:
+        ids: ``(N,)``.
+        position, world_from_body: ``(N, 3)`` metres and ``(N, 4)`` xyzw.
+        ends: ids of the edges' sources and targets, ``(M,)`` each.
+        translation, source_from_target: ``(M, 3)`` metres and ``(M, 4)`` xyzw.
+        information: ``(M, 21)``, see :class:`GraphFile`.
+    """
+
+    ids: np.ndarray
+    position: np.ndarray
+    world_from_body: np.ndarray
+    ends: tuple[np.ndarray, np.ndarray]
+    translation: np.ndarray
+    source_from_target: np.ndarray
+    information: np.ndarray
+
+    @property
+    def planar_vertices(self) -> tuple[np.ndarray, np.ndarray]:
+        """x, y and heading of the vertices."""
+        return self.position[:, :2], heading_of_quaternion(self.world_from_body)
+
+    @property
+    def planar_edges(self) -> tuple[np.ndarray, np.ndarray]:
+        """x, y and θ of the edges."""
+        return self.translation[:, :2], heading_of_quaternion(self.source_from_target)
+
+
+def lay_out(
+    graph_file: GraphFile, body_from_world: np.ndarray | None = None, position: np.ndarray | None = None
+) -> PoseGraphRows:
+    """Vertices and edges as they are written; see :func:`rotavg_ros.datasets.files.g2o.write` for the arguments."""
+    graph, ids = graph_file.graph, graph_file.node_ids
+    translation = graph_file.edge_translation
+    if translation is None:
+        translation = np.zeros((graph.num_edges, 3))
+    chained, world_from_body = chain_poses(graph, translation, body_from_world)
+    return PoseGraphRows(
+        ids,
+        chained if position is None else position,
+        world_from_body,
+        (ids[graph.source.cpu().numpy()], ids[graph.target.cpu().numpy()]),
+        translation,
+        inverse(graph.target_from_source).cpu().numpy(),
+        _information(graph_file),
+    )
+
+
+def _information(graph_file: GraphFile) -> np.ndarray:
+    """``(M, 21)`` as stated; where nothing is, 1 for positions and the edge's precision for rotations."""
+    precision = np.nan_to_num(graph_file.graph.precision.cpu().numpy(), nan=1.0)
+    information = np.zeros((len(precision), 21))
+    information[:, POSITION_DIAGONAL] = 1
+    information[:, ANGULAR_DIAGONAL] = precision[:, None]
+    stated = graph_file.edge_information
+    if stated is None:
+        return information
+    return np.where(stated.any(axis=1, keepdims=True), stated, information)

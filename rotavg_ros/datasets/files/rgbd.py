@@ -1,0 +1,47 @@
+"""Pairwise registrations of RGB-D scans: an npz view-graph with ground truth and a residual per registration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, read_graph
+
+
+@dataclass(frozen=True)
+class RgbdScene:
+    """A scene of N scans and M registrations.
+
+    Attributes:
+        graph_file: the view-graph with ground truth.
+        registration_rms: ``(M,)`` metres, the root mean square distance of matched points; inf where it failed.
+    """
+
+    graph_file: GraphFile
+    registration_rms: np.ndarray
+
+
+# The registrations' own mark of failure, in metres.
+_FAILED_RMS = 1e6
+
+
+def read_scene(path: str | Path) -> RgbdScene:
+    """Read a scene.
+
+    Raises:
+        GraphFileError: no readable view-graph, or one without ground truth or ``registration_rms``.
+    """
+    path = Path(path)
+    graph_file = read_graph(path)
+    if graph_file.body_from_world_gt is None:
+        raise GraphFileError.at(path, None, "lacks body_from_world_gt; an RGB-D scene has ground truth")
+    with np.load(path, allow_pickle=False) as archive:
+        if "registration_rms" not in archive.files:
+            raise GraphFileError.at(path, None, "lacks registration_rms; an RGB-D scene has one per edge")
+        rms = archive["registration_rms"].astype(np.float64)
+        proper = archive["source"] != archive["target"]  # self-edges are no part of the graph
+    if rms.shape != proper.shape:
+        raise GraphFileError.at(path, None, f"registration_rms has shape {rms.shape}, source has {proper.shape}")
+    return RgbdScene(graph_file, np.where(rms < _FAILED_RMS, rms, np.inf)[proper])

@@ -1,0 +1,141 @@
+"""What is solved: a case, and the kinds of cases that a suite draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros.datasets.simulation.false_closures import FALSE_CLOSURE_DEG
+from rotavg_ros.datasets.simulation.synthetic import SFM_OUTLIER_ANGLE
+from rotavg_ros.metrics import true_edge_noise
+from rotavg_ros.view_graph import ViewGraph
+
+
+@dataclass(frozen=True)
+class Family:
+    """What differs between photo collections and robots' graphs.
+
+    Attributes:
+        profile: of :func:`rotavg_ros.solver.solve`.
+        outlier_angle: rad; an edge of more noise is an outlier.
+        undecided: rad; edges whose noise lies between the two do not count in verdicts.
+        trusts_odometry: odometry is known to be good and is not judged; else a kind of edge means nothing.
+    """
+
+    profile: str
+    outlier_angle: float
+    undecided: tuple[float, float]
+    trusts_odometry: bool
+
+
+SFM = Family("sfm", float(SFM_OUTLIER_ANGLE), (float(SFM_OUTLIER_ANGLE),) * 2, trusts_odometry=False)
+# Closures within 2° of the border between good and false do not count.
+SLAM = Family(
+    "slam",
+    float(np.radians(FALSE_CLOSURE_DEG)),
+    (float(np.radians(8.0)), float(np.radians(12.0))),
+    trusts_odometry=True,
+)
+
+
+class CaseKey(NamedTuple):
+    """What a case is called; no two cases of a run share it.
+
+    Attributes:
+        name: of the graph: a data set's, or that of one drawing.
+        kind: what was drawn: a recipe, or what was done to the graph; empty where there is only one.
+        seed: of the drawing.
+    """
+
+    name: str
+    kind: str = ""
+    seed: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.name}, {self.kind}, seed {self.seed}" if self.kind else self.name
+
+
+@dataclass(frozen=True)
+class Case:
+    """A view-graph to be solved, and what is known of it (N nodes, M edges).
+
+    Attributes:
+        key: its name, kind and seed.
+        graph: the edges.
+        truth: body_from_world ``(N, 4)`` that errors count against; NaN rows where unknown.
+        family: of photo collections or of robots' graphs.
+        intact: ``(M,)`` bool, edges that whoever spoiled the graph left as they were; None: nobody did.
+        floor: rad; in ratios of errors smaller ones count as this, since the truth is no better.
+    """
+
+    key: CaseKey
+    graph: ViewGraph
+    truth: Tensor
+    family: Family = SFM
+    intact: Tensor | None = None
+    floor: float = 0.0
+
+    @cached_property
+    def noise(self) -> Tensor:
+        """``(M,)`` rad, true noise of every edge; NaN where unknown."""
+        return true_edge_noise(self.graph, self.truth)
+
+    @property
+    def is_inlier(self) -> Tensor:
+        """``(M,)`` bool, the edges that an oracle knows to be good: intact ones, or those of little noise."""
+        if self.intact is not None:
+            return self.intact
+        return ~self.is_closure | (self.noise <= self.family.outlier_angle)
+
+    @property
+    def is_closure(self) -> Tensor:
+        """``(M,)`` bool: the edges that may be false, all but odometry where that is trusted."""
+        return ~self.graph.is_odometry | (not self.family.trusts_odometry)
+
+    @property
+    def is_false(self) -> Tensor:
+        """``(M,)`` bool: edges that are clearly outliers."""
+        return self.is_closure & (self.noise > self.family.undecided[1])
+
+    @property
+    def is_good(self) -> Tensor:
+        """``(M,)`` bool: edges that are clearly none, and not because a random one happens to fit."""
+        return self.is_closure & self.is_inlier & (self.noise <= self.family.undecided[0])
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of cases.
+
+    Attributes:
+        name: of the kind.
+        draw: seed → case, the same at every call; None where this seed's graph has no place for it.
+        is_random: seeds differ; else one drawing tells all.
+    """
+
+    name: str
+    draw: Callable[[int], Case | None]
+    is_random: bool = True
+
+
+def drawings(kinds: Iterable[Kind], seeds: Sequence[int]) -> Iterator[Case]:
+    """Every kind with every seed, drawn when it is its turn."""
+    for kind in kinds:
+        for seed in seeds if kind.is_random else seeds[:1]:
+            case = kind.draw(seed)
+            if case is not None:
+                yield case
+
+
+def warm_up_case(family: Family) -> Case:
+    """A tiny graph without noise, on which one-time costs (imports, weights, first kernels) are paid."""
+    identity = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64).expand(4, 4)
+    kind = [0, 0, 0, 1] if family is SLAM else None
+    graph = ViewGraph.create([0, 1, 2, 0], [1, 2, 3, 3], identity, kind=kind)
+    return Case(CaseKey("warm-up"), graph, identity, family)

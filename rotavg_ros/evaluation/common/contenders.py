@@ -1,0 +1,117 @@
+"""Who is compared: the solver's methods and combinations, the peers, and references that are told something."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+from torch import Tensor
+
+from rotavg_ros.errors import UserError
+from rotavg_ros.evaluation.common.answers import Answer, Clock
+from rotavg_ros.evaluation.common.cases import Case, Family, warm_up_case
+from rotavg_ros.evaluation.common.kept_answers import KeptAnswers
+from rotavg_ros.evaluation.common.named_peers import peer_solver
+from rotavg_ros.solver import METHODS, solve
+from rotavg_ros.solver.neurora.scores import residual_score
+from rotavg_ros.view_graph import ViewGraph
+
+# None: the case is too large for it, or it gives up.
+Contender = Callable[[Case], Answer | None]
+Reference = Callable[[Case], Tensor]
+
+
+class ContenderError(UserError):
+    """An unknown contender; the message lists the choices."""
+
+
+@dataclass(frozen=True)
+class Roster:
+    """Who may take part in a suite besides the solver's methods.
+
+    Attributes:
+        family: of the suite's cases.
+        peers: of :data:`rotavg_ros.evaluation.common.named_peers.PEERS`.
+        references: case → body_from_world ``(N, 4)``, by name.
+        max_edges: of the largest graph that a peer is given, by name.
+    """
+
+    family: Family
+    peers: tuple[str, ...]
+    references: Mapping[str, Reference]
+    max_edges: Mapping[str, int] = field(default_factory=dict)
+
+
+def contenders(
+    names: Sequence[str], roster: Roster, weights: Path | None = None, keep: KeptAnswers | None = None
+) -> dict[str, Contender]:
+    """Contenders by name: a method of the solver, several joined by "+", or one of the roster.
+
+    A contender returns None for a case that is too large for it or on which it gives up. Those who judge no edges
+    are given scores by their residuals.
+
+    Args:
+        weights: folder of networks to use in place of the package's.
+        keep: answers, but for those of such networks, to be found again by a later run.
+
+    Raises:
+        ContenderError: an unknown name.
+        PeerError: a peer that is not installed.
+    """
+    return {name: _contender(name, roster, weights, keep) for name in names}
+
+
+def warm_up(chosen: Collection[Contender], roster: Roster) -> None:
+    """Let every contender pay its one-time costs on a tiny graph."""
+    case = warm_up_case(roster.family)
+    for contender in chosen:
+        contender(case)
+
+
+def _contender(name: str, roster: Roster, weights: Path | None, keep: KeptAnswers | None) -> Contender:
+    if name in roster.peers:
+        return partial(_run_peer, peer_solver(name, keep), roster.max_edges.get(name))
+    if name in roster.references:
+        reference = roster.references[name]
+        run = partial(_run_reference, reference)
+        return run if keep is None else keep.keeping(run, name, (__name__, reference.__module__))
+    unknown = [part for part in name.split("+") if part not in METHODS]
+    if unknown:
+        choices = ", ".join((*METHODS, *roster.peers, *roster.references))
+        raise ContenderError(f"unknown method {unknown[0]!r}; choose from {choices}, or combine: A+B")
+    run = partial(_run_method, name, weights)
+    # Networks of a folder are those of one run, and nobody asks for their answers again.
+    return run if keep is None or weights is not None else keep.keeping(run, name, (__name__,))
+
+
+def _run_method(name: str, weights: Path | None, case: Case) -> Answer:
+    clock = Clock()
+    with clock.running():
+        solution = solve(case.graph, method=name, profile=case.family.profile, weights=weights)
+    return Answer(
+        solution.body_from_world, clock.seconds, clock.cpu_seconds, solution.outlier_score, solution.uncertainty
+    )
+
+
+def _run_reference(reference: Reference, case: Case) -> Answer:
+    clock = Clock()
+    with clock.running():
+        orientations = reference(case)
+    return _judged(Answer(orientations, clock.seconds, clock.cpu_seconds), case)
+
+
+def _run_peer(solver: Callable[[ViewGraph], Answer | None], max_edges: int | None, case: Case) -> Answer | None:
+    if max_edges is not None and case.graph.num_edges > max_edges:
+        return None
+    answer = solver(case.graph)
+    return None if answer is None else _judged(answer, case)
+
+
+def _judged(answer: Answer, case: Case) -> Answer:
+    """With scores: its own, or what the residuals say."""
+    if answer.outlier_score is not None:
+        return answer
+    score = residual_score(case.graph, answer.body_from_world, case.family.outlier_angle)
+    return replace(answer, outlier_score=score)

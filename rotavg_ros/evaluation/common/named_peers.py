@@ -1,0 +1,55 @@
+"""The peers by name: what each needs installed, and its answers, new or kept from an earlier run."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from typing import NamedTuple
+
+from rotavg_ros.evaluation.common import peers
+from rotavg_ros.evaluation.common.answers import Answer
+from rotavg_ros.evaluation.common.kept_answers import KeptAnswers
+from rotavg_ros.evaluation.common.peers import PeerError
+from rotavg_ros.view_graph import ViewGraph
+
+
+class Peer(NamedTuple):
+    """An independent implementation and the package on PyPI that has it."""
+
+    package: str
+    solve: Callable[[ViewGraph], Answer]
+
+
+PEERS = {
+    "colmap": Peer("pycolmap", peers.colmap),
+    "shonan": Peer("gtsam", peers.shonan),
+    "gnc": Peer("gtsam", peers.gnc),
+    "isam2": Peer("gtsam", peers.isam2_huber),
+}
+
+
+def is_available(name: str) -> bool:
+    """Whether what a contender needs is installed; what is no peer needs nothing."""
+    return name not in PEERS or importlib.util.find_spec(PEERS[name].package) is not None
+
+
+def peer_solver(name: str, keep: KeptAnswers | None = None) -> Callable[[ViewGraph], Answer | None]:
+    """Solves a view-graph as the peer does; None where the peer gives up.
+
+    Args:
+        keep: answers, to be found again by a later run.
+
+    Raises:
+        PeerError: the peer is not installed.
+    """
+    package, solve = PEERS[name]
+    if not is_available(name):
+        raise PeerError(f"method {name!r} needs {package}, which is not installed; run: pip install {package}")
+
+    def attempt(graph: ViewGraph) -> Answer | None:
+        try:
+            return solve(graph)
+        except PeerError:
+            return None
+
+    return attempt if keep is None else keep.keeping(attempt, name, (peers.__name__,), library=package)

@@ -1,0 +1,52 @@
+"""Tables of scores: averages by contender, and a row for every case."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from operator import attrgetter
+from typing import NamedTuple
+
+from rotavg_ros.evaluation.common.scoring import Scores
+from rotavg_ros.evaluation.common.tables import Cell, Column, Table
+
+
+class Figure(NamedTuple):
+    """A figure of :class:`rotavg_ros.evaluation.common.scoring.Score`, its heading and its number format."""
+
+    path: str
+    heading: str
+    format: str = ""
+
+
+def columns(figures: Iterable[Figure]) -> tuple[Column, ...]:
+    """A column a figure."""
+    return tuple(Column(figure.heading, figure.format) for figure in figures)
+
+
+def average_rows(scores: Scores, names: Iterable[str], figures: Sequence[Figure]) -> list[tuple[Cell, ...]]:
+    """A row a contender: its name, and its averages over the cases that it solved."""
+    return [(name, *(scores.mean(name, figure.path) for figure in figures)) for name in names]
+
+
+def averages(title: str, scores: Scores, names: Iterable[str], figures: Sequence[Figure], *notes: str) -> Table:
+    """Averages of every contender."""
+    return Table(title, (Column("method"), *columns(figures)), tuple(average_rows(scores, names, figures)), notes)
+
+
+def per_case(title: str, scores: Scores, figures: Sequence[Figure], key: Mapping[str, str] | None = None) -> Table:
+    """A row for every case and method.
+
+    Args:
+        key: columns that tell the case: attribute of :class:`~rotavg_ros.evaluation.common.cases.CaseKey` by heading;
+            default: the graph's name alone.
+    """
+    key = key or {"graph": "name"}
+    rows = tuple(
+        (
+            *(getattr(row.case, attribute) for attribute in key.values()),
+            row.contender,
+            *(attrgetter(figure.path)(row) for figure in figures),
+        )
+        for row in scores.rows
+    )
+    return Table(title, (*map(Column, key), Column("method"), *columns(figures)), rows)

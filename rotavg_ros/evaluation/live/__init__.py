@@ -1,0 +1,1 @@
+"""Runs of the estimator and of the node, as a robot lives them."""

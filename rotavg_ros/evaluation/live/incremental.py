@@ -1,0 +1,134 @@
+"""A pose graph as a robot lives it: edges in time order, an answer every few keyframes, each judged as it comes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from rotavg_ros import rotations
+from rotavg_ros.baselines.start import start_orientations
+from rotavg_ros.evaluation.common.cases import Case
+from rotavg_ros.metrics.orientations import orientation_errors
+from rotavg_ros.online.estimator import OnlineEstimator
+from rotavg_ros.online.measurements import EdgeMeasurement, KeyframeReference
+from rotavg_ros.online.options import EstimatorOptions
+
+KEYFRAMES_PER_TICK = 10
+# Early on a truth of few keyframes says little, and nothing can be known yet.
+SETTLED_KEYFRAMES = 2000
+_ROBOT = "robot"
+
+
+@dataclass(frozen=True)
+class IncrementalRun:
+    """What every tick said (T ticks).
+
+    Attributes:
+        case: what was played.
+        keyframes: ``(T,)`` how many there were.
+        error_deg, odometry_error_deg: ``(T,)`` mean error of all keyframes so far, of the answer and of odometry
+            alone; NaN before the first keyframe of known orientation.
+        flips: ``(T,)`` closures whose flag changed since the tick before.
+        false_flagged, good_flagged, false_seen, good_seen: ``(T,)`` counts of closures so far.
+        jump_deg: ``(T,)`` largest turn of a keyframe that the tick before knew, too.
+        seconds: ``(T,)`` of every tick.
+    """
+
+    case: Case
+    keyframes: np.ndarray
+    error_deg: np.ndarray
+    odometry_error_deg: np.ndarray
+    flips: np.ndarray
+    false_flagged: np.ndarray
+    good_flagged: np.ndarray
+    false_seen: np.ndarray
+    good_seen: np.ndarray
+    jump_deg: np.ndarray
+    seconds: np.ndarray
+
+    @property
+    def worst_excess_deg(self) -> float:
+        """By how much an answer after the first 2000 keyframes was at worst less right than odometry alone."""
+        excess = (self.error_deg - self.odometry_error_deg)[self.keyframes > SETTLED_KEYFRAMES]
+        excess = excess[np.isfinite(excess)]
+        return float(excess.max()) if len(excess) else float("nan")
+
+
+def play(
+    case: Case,
+    options: EstimatorOptions | None = None,
+    watch: Callable[[Iterable[int]], Iterable[int]] = lambda ticks: ticks,
+) -> IncrementalRun:
+    """Give the edges of a case to the estimator, each when its later end exists, and tick every 10 keyframes.
+
+    Args:
+        options: of the estimator; its keyframes come from the edges.
+        watch: passes the ticks through and may show how far they are.
+    """
+    graph = case.graph
+    is_closure, is_false, is_good = (mask.numpy() for mask in (case.is_closure, case.is_false, case.is_good))
+    options = options or EstimatorOptions(keyframe_source="edges", gauge="identity")
+    estimator = OnlineEstimator(options)
+    arrival = torch.maximum(graph.source, graph.target).numpy()
+    # Odometry makes the keyframes that closures of the same moment refer to.
+    order = np.lexsort((is_closure, arrival))
+    odometry = start_orientations(graph, None)[0]
+    source, target = graph.source.tolist(), graph.target.tolist()
+    rotation, kind = graph.target_from_source.tolist(), graph.kind.tolist()
+    precision = torch.nan_to_num(graph.precision).tolist()
+    flags, orientations = np.zeros(graph.num_edges, dtype=bool), rotations.identity(0)
+    given, rows = 0, []
+    ends = [*range(KEYFRAMES_PER_TICK, graph.num_nodes, KEYFRAMES_PER_TICK), graph.num_nodes]
+    for end in watch(ends):
+        for edge in order[given : np.searchsorted(arrival[order], end)].tolist():
+            estimator.add_edge(
+                EdgeMeasurement(
+                    edge,
+                    KeyframeReference(_ROBOT, source[edge]),
+                    KeyframeReference(_ROBOT, target[edge]),
+                    rotation[edge],
+                    kind[edge],
+                    precision[edge],
+                )
+            )
+            given += 1
+        answer = estimator.tick()
+        if answer is None:
+            continue
+        node = torch.from_numpy(answer.keyframe_id.astype(np.int64))
+        now = rotations.identity(end)
+        now[node] = rotations.inverse(torch.from_numpy(answer.world_from_body))
+        known = min(len(orientations), end)
+        turned = rotations.angle_between(now[:known], orientations[:known])
+        edges = answer.edge_id.astype(np.int64)
+        closures = edges[is_closure[edges]]
+        before = flags.copy()
+        flags[edges] = answer.outlier
+        is_old = arrival[closures] < len(orientations)
+        rows.append(
+            (
+                end,
+                _mean_error_deg(now, case, end),
+                _mean_error_deg(odometry[:end], case, end),
+                int((flags != before)[closures[is_old]].sum()),
+                int((flags & is_false)[closures].sum()),
+                int((flags & is_good)[closures].sum()),
+                int(is_false[closures].sum()),
+                int(is_good[closures].sum()),
+                float(torch.rad2deg(turned.max())) if known else 0.0,
+                answer.seconds,
+            )
+        )
+        orientations = now
+    return IncrementalRun(case, *np.array(rows).T)
+
+
+def _mean_error_deg(estimate: torch.Tensor, case: Case, end: int) -> float:
+    truth = case.truth[:end]
+    known = torch.isfinite(truth).all(dim=1)
+    if not bool(known.any()):
+        return float("nan")
+    return float(torch.rad2deg(orientation_errors(estimate[known], truth[known]).mean()))

@@ -1,0 +1,51 @@
+"""Who is compared on robots' graphs: odometry alone, least squares, the oracle, and what tables call everyone."""
+
+from __future__ import annotations
+
+import numpy as np
+from torch import Tensor
+
+from rotavg_ros.baselines.start import start_orientations
+from rotavg_ros.evaluation.common.cases import SLAM, Case
+from rotavg_ros.evaluation.common.contenders import Roster
+from rotavg_ros.evaluation.slam.least_squares import least_squares
+
+OURS, ORACLE, GNC = "neurora", "oracle", "gnc"
+
+
+def odometry(case: Case) -> Tensor:
+    """Orientations along the odometry; closures only where nothing else connects."""
+    return start_orientations(case.graph, None)[0]
+
+
+def all_edges(case: Case) -> Tensor:
+    """Least squares on all edges."""
+    return least_squares(case.graph, np.ones(case.graph.num_edges, dtype=bool))
+
+
+def oracle(case: Case) -> Tensor:
+    """Least squares on the true inliers."""
+    return least_squares(case.graph, case.is_inlier.numpy())
+
+
+ROSTER = Roster(
+    SLAM,
+    peers=(GNC, "isam2", "colmap"),
+    references={"odometry": odometry, "least-squares": all_edges, ORACLE: oracle},
+)
+ROWS: dict[str, str] = {
+    OURS: "**ours** (NeuRoRA for SLAM)",
+    "neurora-without-cleannet": "· without CleanNet",
+    "neurora-odometry-start": "· without the weighted tree",
+    "neurora-stated-precisions": "· without scale estimation",
+    "neurora-without-slip-search": "· without the slip search",
+    "cleannet-spt": "· without refinement",
+    "spt": "· tree alone",
+    "gnc": "GNC (GTSAM), told that odometry is right",
+    "isam2": "iSAM2 with Huber's loss (GTSAM), incremental",
+    "colmap": "COLMAP's rotation averaging",
+    "chatterjee": "Chatterjee & Govindu (ℓ1 → ℓ½) from odometry",
+    "least-squares": "least squares on all edges",
+    "odometry": "odometry alone",
+    "oracle": "oracle: least squares on the true inliers",
+}

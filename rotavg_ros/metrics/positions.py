@@ -1,0 +1,59 @@
+"""Errors of positions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RigidFit:
+    """A rotation and a shift, ``x ↦ turn x + shift``."""
+
+    turn: Rotation
+    shift: FloatArray
+
+    def __call__(self, position: FloatArray) -> FloatArray:
+        """Both ``(n, 3)``."""
+        return np.asarray(self.turn.apply(position)).reshape(-1, 3) + self.shift
+
+
+def fit_onto(position: FloatArray, reference: FloatArray) -> RigidFit | None:
+    """The rotation and shift that lay n positions onto the reference, least squares without scale (Umeyama 1991).
+
+    Args:
+        position, reference: ``(n, 3)`` metres; NaN rows are left out.
+
+    Returns:
+        None with fewer than two common positions.
+    """
+    known = _finite(position) & _finite(reference)
+    if known.sum() < 2:
+        return None
+    estimate, target = position[known], reference[known]
+    middle, target_middle = estimate.mean(axis=0), target.mean(axis=0)
+    u, _, vt = np.linalg.svd((target - target_middle).T @ (estimate - middle))
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
+    return RigidFit(Rotation.from_matrix(turn), target_middle - turn @ middle)
+
+
+def position_errors(position: FloatArray, reference: FloatArray) -> FloatArray:
+    """Distance of n positions to the reference after :func:`fit_onto`, ``(n,)`` metres, NaN where unknown.
+
+    Args:
+        position, reference: ``(n, 3)`` metres; NaN rows are unknown.
+    """
+    fit = fit_onto(position, reference)
+    if fit is None:
+        return np.full(len(position), np.nan)
+    distance: FloatArray = np.linalg.norm(fit(position) - reference, axis=1)
+    return distance
+
+
+def _finite(rows: FloatArray) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(rows).all(axis=1))

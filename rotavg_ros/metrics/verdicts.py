@@ -1,0 +1,70 @@
+"""Verdicts on edges, and scores to tell them by, against the truth."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+
+import numpy as np
+from scipy.stats import rankdata
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class OutlierCounts:
+    """How verdicts on edges compare with the truth."""
+
+    true_positives: int
+    false_positives: int
+    false_negatives: int
+    true_negatives: int
+
+    @classmethod
+    def of(cls, flagged: Tensor, is_outlier: Tensor) -> OutlierCounts:
+        """Both ``(M,)`` bool."""
+        return cls(
+            int((flagged & is_outlier).sum()),
+            int((flagged & ~is_outlier).sum()),
+            int((~flagged & is_outlier).sum()),
+            int((~flagged & ~is_outlier).sum()),
+        )
+
+    def __add__(self, other: OutlierCounts) -> OutlierCounts:
+        """Verdicts of both together."""
+        return OutlierCounts(*(ours + theirs for ours, theirs in zip(astuple(self), astuple(other), strict=True)))
+
+    @property
+    def precision(self) -> float:
+        """Share of the flagged edges that are outliers; 1 if none is flagged."""
+        flagged = self.true_positives + self.false_positives
+        return self.true_positives / flagged if flagged else 1.0
+
+    @property
+    def recall(self) -> float:
+        """Share of the outliers that are flagged; 1 if there is none."""
+        outliers = self.true_positives + self.false_negatives
+        return self.true_positives / outliers if outliers else 1.0
+
+    @property
+    def accuracy(self) -> float:
+        total = self.true_positives + self.false_positives + self.false_negatives + self.true_negatives
+        return (self.true_positives + self.true_negatives) / total if total else 1.0
+
+    @property
+    def false_alarm_rate(self) -> float:
+        """Share of the inliers that are flagged; 0 if there is none."""
+        inliers = self.false_positives + self.true_negatives
+        return self.false_positives / inliers if inliers else 0.0
+
+
+def roc_area(value: np.ndarray, is_positive: np.ndarray) -> float:
+    """Probability that a positive's value exceeds a negative's, ties counting half (Mann–Whitney).
+
+    Args:
+        value: ``(M,)``; is_positive: ``(M,)`` bool.
+    """
+    positives = int(is_positive.sum())
+    negatives = len(is_positive) - positives
+    if positives == 0 or negatives == 0:
+        return float("nan")
+    rank_sum = rankdata(value)[is_positive].sum()
+    return float((rank_sum - positives * (positives + 1) / 2) / (positives * negatives))

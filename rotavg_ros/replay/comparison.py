@@ -1,0 +1,154 @@
+"""A robot's run against its reference: orientation, heading and position errors before and after the correction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from rotavg_ros import rotations
+from rotavg_ros.datasets.files.ground_truth import MAX_STAMP_DISTANCE_NS
+from rotavg_ros.metrics import gauge_alignment, orientation_errors, position_errors
+from rotavg_ros.replay.record import Reference, RobotRecord
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The reference at a robot's n keyframes, NaN rows where it has nothing within 0.15 s.
+
+    Attributes:
+        world_from_body: ``(n, 4)`` xyzw.
+        position: ``(n, 3)`` metres; None if the reference has no positions.
+    """
+
+    world_from_body: FloatArray
+    position: FloatArray | None
+
+
+@dataclass(frozen=True)
+class OrientationErrors:
+    """Angles to the reference after one robust rotation per component, n keyframes, radians, NaN where unknown.
+
+    Attributes:
+        angle: ``(n,)``.
+        heading: ``(n,)``, signed, about the reference's z axis.
+    """
+
+    angle: FloatArray
+    heading: FloatArray
+
+
+def truth_at_keyframes(reference: Reference, stamp_ns: NDArray[np.int64]) -> Truth:
+    """The reference between its two samples around each stamp, both at most 0.15 s away (at the ends: one)."""
+    order = np.argsort(reference.stamp_ns, kind="stable")
+    stamps, first = np.unique(reference.stamp_ns[order], return_index=True)
+    order = order[first]
+    count = len(stamp_ns)
+    orientation = np.full((count, 4), np.nan)
+    position = None if reference.position is None else np.full((count, 3), np.nan)
+    if len(stamps) == 0:
+        return Truth(orientation, position)
+    after = np.searchsorted(stamps, stamp_ns).clip(0, len(stamps) - 1)
+    before = np.where(stamps[after] > stamp_ns, np.maximum(after - 1, 0), after)
+    known = (np.abs(stamps[before] - stamp_ns) <= MAX_STAMP_DISTANCE_NS) & (
+        np.abs(stamps[after] - stamp_ns) <= MAX_STAMP_DISTANCE_NS
+    )
+    # Seconds from the first sample, for nanoseconds since 1970 do not fit into a float.
+    seconds = (stamps - stamps[0]) / 1e9
+    at = ((stamp_ns[known] - stamps[0]) / 1e9).clip(0, seconds[-1])
+    if known.any():
+        samples = reference.world_from_body[order]
+        if len(stamps) == 1:
+            orientation[known] = samples
+        else:
+            orientation[known] = Slerp(seconds, Rotation.from_quat(samples))(at).as_quat(canonical=True)
+        if position is not None and reference.position is not None:
+            ordered = reference.position[order]
+            position[known] = np.stack([np.interp(at, seconds, ordered[:, axis]) for axis in range(3)], axis=1)
+    return Truth(orientation, position)
+
+
+def errors_of_orientations(
+    world_from_body: FloatArray, truth: Truth, component: NDArray[np.int64] | None = None
+) -> OrientationErrors:
+    """Errors of n orientations.
+
+    Args:
+        world_from_body: ``(n, 4)`` xyzw; NaN rows are unknown.
+        component: ``(n,)``; each is turned onto the reference by itself. Default: one component.
+    """
+    component = np.zeros(len(world_from_body), dtype=np.int64) if component is None else component
+    known = _finite(truth.world_from_body) & _finite(world_from_body)
+    reference = np.where(known[:, None], truth.world_from_body, np.nan)
+    estimate = np.where(known[:, None], world_from_body, [0.0, 0.0, 0.0, 1.0])
+    angle = orientation_errors(_inverse(estimate), _inverse(reference), torch.from_numpy(component)).numpy()
+    heading = np.full(len(estimate), np.nan)
+    for number in np.unique(component[known]):
+        members = known & (component == number)
+        true = Rotation.from_quat(reference[members])
+        gauge = gauge_alignment(_inverse(estimate[members]), _inverse(reference[members])).numpy()
+        off = Rotation.from_quat(gauge) * Rotation.from_quat(estimate[members]) * true.inv()
+        z, w = off.as_quat().T[2:]
+        # The twist about z of the rotation from the true to the estimated orientation.
+        heading[members] = 2 * np.arctan2(np.sign(w) * z, np.abs(w))
+    return OrientationErrors(angle, heading)
+
+
+@dataclass(frozen=True)
+class RobotComparison:
+    """How a robot's odometry and the answer differ from its reference, n keyframes; NaN where unknown.
+
+    Attributes:
+        truth: the reference at the keyframes.
+        odometry, corrected: orientation errors.
+        odometry_distance: ``(n,)`` position error of odometry, metres.
+        dead_reckoned_distance: of odometry's steps along corrected orientations.
+        corrected_distance: of the corrected positions.
+    """
+
+    truth: Truth
+    odometry: OrientationErrors
+    corrected: OrientationErrors
+    odometry_distance: FloatArray
+    dead_reckoned_distance: FloatArray
+    corrected_distance: FloatArray
+
+
+def compare(robot: RobotRecord, component: NDArray[np.int64]) -> RobotComparison | None:
+    """A robot's run against its reference; None where there is none, or none of it at a keyframe's time.
+
+    Args:
+        component: ``(n,)`` the components of the robot's keyframes.
+    """
+    if robot.reference is None:
+        return None
+    truth = truth_at_keyframes(robot.reference, robot.stamp_ns)
+    if not _finite(truth.world_from_body).any():
+        return None
+
+    def distance(position: FloatArray | None) -> FloatArray:
+        if position is None or truth.position is None:
+            return np.full(len(robot.stamp_ns), np.nan)
+        return position_errors(position, truth.position)
+
+    return RobotComparison(
+        truth=truth,
+        odometry=errors_of_orientations(robot.odometry_world_from_body, truth),
+        corrected=errors_of_orientations(robot.world_from_body, truth, component),
+        odometry_distance=distance(robot.odometry_position),
+        dead_reckoned_distance=distance(robot.position_dead_reckoned),
+        corrected_distance=distance(robot.position),
+    )
+
+
+def _finite(rows: FloatArray) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(rows).all(axis=1))
+
+
+def _inverse(quaternions: FloatArray) -> torch.Tensor:
+    return rotations.inverse(torch.from_numpy(quaternions))

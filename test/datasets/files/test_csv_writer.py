@@ -1,0 +1,38 @@
+"""The column-wise csv writer against Python's own formatting."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rotavg_ros.datasets.files import csv_writer
+from rotavg_ros.datasets.files.csv_writer import Column, write_csv
+
+INTEGERS = st.integers(-(2**62), 2**63 - 1)
+REALS = st.floats(-1000, 1000)
+
+
+@given(st.lists(st.tuples(INTEGERS, REALS, st.integers(0, 1)), max_size=30), st.integers(1, 12), st.integers(1, 5))
+def test_rows(rows: list[tuple[int, float, int]], decimals: int, block: int) -> None:
+    columns = [np.array([row[i] for row in rows], dtype=[np.int64, np.float64, np.int64][i]) for i in range(3)]
+    file = io.BytesIO()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(csv_writer, "_BLOCK_ROWS", block)
+        write_csv(file, [Column("a", columns[0]), Column("b", columns[1], decimals), Column("c", columns[2])])
+    header, *lines = file.getvalue().decode().splitlines()
+    assert header == "a,b,c"
+    assert len(lines) == len(rows)
+    for line, (integer, real, flag) in zip(lines, rows, strict=True):
+        cells = line.split(",")
+        assert (int(cells[0]), int(cells[2])) == (integer, flag)
+        assert len(cells[1].split(".")[1]) == decimals
+        assert float(cells[1]) == pytest.approx(real, abs=0.5 * 10**-decimals + 1e-12)
+
+
+def test_refuses_what_is_not_finite() -> None:
+    with pytest.raises(ValueError, match="not finite"):
+        write_csv(io.BytesIO(), [Column("a", np.array([np.nan]), decimals=3)])

@@ -1,0 +1,203 @@
+"""What g2o, TORO and iSAM lines mean, and what becomes of bad ones."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rotavg_ros import rotations
+from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, read_graph
+from rotavg_ros.view_graph import EdgeKind
+
+SE2 = "EDGE_SE2 {} {} 1 2 {} 500 0 0 500 0 {}"
+SE3 = "EDGE_SE3:QUAT {} {} 1 2 3 {} 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 10 0 0 20 0 60"
+
+
+def read_text(folder: Path, text: str, name: str = "graph.g2o") -> GraphFile:
+    path = folder / name
+    path.write_text(text)
+    return read_graph(path)
+
+
+def test_se2(tmp_path: Path) -> None:
+    graph_file = read_text(tmp_path, SE2.format(3, 7, 0.5, 90))
+    graph = graph_file.graph
+    assert graph_file.node_ids.tolist() == [3, 7]
+    assert graph_file.planar
+    # The edge states the target in the source frame: target_from_source turns back.
+    np.testing.assert_allclose(rotations.log(graph.target_from_source).numpy(), [[0, 0, -0.5]], atol=1e-12)
+    np.testing.assert_allclose(graph_file.edge_translation, [[1, 2, 0]])
+    assert graph.precision.tolist() == [90]
+    assert graph.kind.tolist() == [EdgeKind.LOOP_CLOSURE]
+
+
+def test_se3(tmp_path: Path) -> None:
+    graph_file = read_text(tmp_path, SE3.format(0, 1, "0.6 0 0 0.8"))
+    np.testing.assert_allclose(graph_file.graph.target_from_source.numpy(), [[-0.6, 0, 0, 0.8]], atol=1e-12)
+    assert graph_file.graph.precision.tolist() == [30]
+    assert not graph_file.planar
+
+
+def test_toro(tmp_path: Path) -> None:
+    planar = read_text(tmp_path, "VERTEX2 0 0 0 0\nEDGE2 0 1 1 2 0.5 11 12 13 44 15 16")
+    np.testing.assert_allclose(rotations.log(planar.graph.target_from_source).numpy(), [[0, 0, -0.5]], atol=1e-12)
+    assert planar.graph.precision.tolist() == [44]
+
+    information = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 10 0 0 20 0 60"
+    text = f"VERTEX3 0 0 0 0 0 0 0\nVERTEX3 1 0 0 0 0 0 0\nEDGE3 0 1 1 2 3 0.1 -0.2 0.3 {information}\n"
+    spatial = read_text(tmp_path, text, "graph.txt")
+    source_from_target = gtsam.load3D(str(tmp_path / "graph.txt"))[0].at(0).measured().rotation().matrix()
+    ours = rotations.to_matrix(spatial.graph.target_from_source[0]).numpy()
+    np.testing.assert_allclose(ours, source_from_target.T, atol=1e-9)
+    assert spatial.graph.precision.tolist() == [30]
+
+
+def test_isam_odometry_states_a_square_root(tmp_path: Path) -> None:
+    root = np.array([[5.0, 1, 2], [0, 6, 3], [0, 0, 7]])
+    entries = " ".join(str(value) for value in root[np.triu_indices(3)])
+    graph_file = read_text(tmp_path, f"ODOMETRY 0 1 1 2 0.5 {entries}\nLANDMARK 0 1 1 2 3 4 5")
+    assert graph_file.graph.precision.tolist() == [(root.T @ root)[2, 2]]
+    assert graph_file.skipped == {"LANDMARK": 1}
+
+
+def test_consecutive_ids_are_odometry_in_either_direction(tmp_path: Path) -> None:
+    pairs = [(0, 1), (2, 1), (0, 2), (5, 2), (2**62, 2**62 + 1)]
+    graph_file = read_text(tmp_path, "\n".join(SE2.format(*pair, 0, 1) for pair in pairs))
+    assert graph_file.graph.is_odometry.tolist() == [True, True, False, False, True]
+    graph = graph_file.graph
+    assert list(zip(graph_file.node_ids[graph.source], graph_file.node_ids[graph.target], strict=True)) == pairs
+
+
+def test_skipped_and_kept(tmp_path: Path) -> None:
+    text = f"""# a comment
+
+PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1
+VERTEX_SE2 0 nan 0 0
+VERTEX_SE2 9 0 0 0
+VERTEX_XY 100 1 2
+FIX 0
+{SE2.format(0, 1, 0.1, 1)}
+{SE2.format(0, 1, 0.1, 1)}
+{SE2.format(5, 5, 0.1, 1)}
+EDGE_SE2_XY 0 100 1 2 1 0 1
+EDGE_SE2_XY 1 100 1 2 1 0 1
+"""
+    graph_file = read_text(tmp_path, text.replace("\n", "\r\n"))
+    assert graph_file.graph.num_edges == 2
+    assert graph_file.node_ids.tolist() == [0, 1, 5, 9]
+    assert graph_file.skipped == {"PARAMS_SE3OFFSET": 1, "VERTEX_XY": 1, "FIX": 1, "EDGE_SE2_XY": 2, "self-edge": 1}
+
+
+def test_mixed_dimensions_stay_in_order(tmp_path: Path) -> None:
+    lines = [SE3.format(0, 1, "0 0 0 1"), SE2.format(1, 2, 0.1, 1), SE3.format(2, 3, "0 0 0 1")]
+    graph_file = read_text(tmp_path, "\n".join(lines))
+    assert graph_file.graph.source.tolist() == [0, 1, 2]
+    assert not graph_file.planar
+
+
+def test_nearly_unit_quaternions_are_normalised(tmp_path: Path) -> None:
+    graph = read_text(tmp_path, SE3.format(0, 1, "0 0 0 1.0009")).graph
+    assert graph.target_from_source.norm().item() == pytest.approx(1, abs=1e-15)
+
+
+GOOD = SE2.format(0, 1, 0.1, 1)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (SE2.format(1, 2, "nan", 1), "not finite"),
+        (SE2.format(1, 2, "inf", 1), "not finite"),
+        (SE2.format(1, 2, "0.1x", 1), "'0.1x' is not a number"),
+        (SE2.format(1, 2.5, 0, 1), "'2.5' is not an integer id"),
+        (SE2.format(1, "x7", 0, 1), "'x7' is not an integer id"),
+        (SE2.format(1, 2**63, 0, 1), "too large"),
+        (SE2.format(1, -2, 0, 1), "negative id"),
+        (SE3.format(1, 2, "0 0 0 0"), "quaternion of length 0"),
+        (SE3.format(1, 2, "0 0 0 1.01"), "quaternion of length 1.01"),
+        (SE3.format(1, 2, "0 0 0 1e200"), "quaternion of length"),
+        ("EDGE_SE2 1 2 0.1 0.2", "4 numbers where 11 belong"),
+        ("VERTEX_SE2 1 2", "2 numbers where 4 belong"),
+        ("VERTEX_SE2 one 0 0 0", "'one' is not an integer id"),
+        ("EDGE_SE9 1 2 0.1", "unknown tag 'EDGE_SE9'"),
+        ("\x00\x01\x02\x03", "unknown tag"),
+    ],
+)
+def test_bad_lines_are_named(tmp_path: Path, line: str, message: str) -> None:
+    with pytest.raises(GraphFileError) as caught:
+        read_text(tmp_path, f"# comment\n{GOOD}\n\n{line}\n{GOOD}\n")
+    assert str(caught.value).startswith(f"{tmp_path}/graph.g2o:4: ")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_line_numbers_beyond_the_first_block(tmp_path: Path) -> None:
+    lines = [SE2.format(i, i + 1, 0.1, 1) for i in range(150_000)]
+    lines[149_000] = SE2.format(0, 1, "nan", 1)
+    with pytest.raises(GraphFileError, match=r"graph\.g2o:149001: "):
+        read_text(tmp_path, "\n".join(lines))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "empty"),
+        ("# nothing\n", "no edges"),
+        ("VERTEX_SE2 0 0 0 0\n", "no edges"),
+        (SE2.format(4, 4, 0, 1), "joins a pose with itself"),
+    ],
+)
+def test_nothing_to_solve(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(GraphFileError, match=message):
+        read_text(tmp_path, text)
+
+
+def test_what_is_no_file(tmp_path: Path) -> None:
+    with pytest.raises(GraphFileError, match="no such file"):
+        read_graph(tmp_path / "missing.g2o")
+    with pytest.raises(GraphFileError, match="is a directory"):
+        read_graph(tmp_path)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(GraphFileError, match="not a regular file"):
+        read_graph(tmp_path / "pipe")
+    secret = tmp_path / "secret.g2o"
+    secret.write_text(GOOD)
+    secret.chmod(0)
+    if os.access(secret, os.R_OK):
+        pytest.skip("this user may read everything, so permission cannot be denied")
+    with pytest.raises(GraphFileError, match="permission denied"):
+        read_graph(secret)
+
+
+@given(st.data())
+def test_damaged_text_is_read_or_refused_by_name(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    lines = [SE2.format(0, 1, 0.1, 1), SE3.format(1, 2, "0.6 0 0 0.8"), "VERTEX_SE2 3 0 0 0", "FIX 0"]
+    rotation = "1 2 1 0 0 0 1 0 0 0 1 0 0 0"
+    text = "\n".join(data.draw(st.permutations(lines)) if data.draw(st.booleans()) else [rotation] * 3).encode()
+    if data.draw(st.booleans()):
+        text = text[: data.draw(st.integers(0, len(text)))]
+    for _ in range(data.draw(st.integers(0, 3))):
+        where = data.draw(st.integers(0, len(text)))
+        length = data.draw(st.integers(0, 3))
+        junk = data.draw(
+            st.one_of(st.binary(max_size=6), st.sampled_from([b"nan", b"-", b"1e999", b"\n", b" 9", b"_"]))
+        )
+        text = text[:where] + junk + text[where + length :]
+    path = tmp_path_factory.getbasetemp() / "damaged.g2o"
+    path.write_bytes(text)
+    try:
+        graph_file = read_graph(path)
+    except GraphFileError as refusal:
+        message = str(refusal)
+    else:
+        assert graph_file.graph.num_edges > 0
+        assert bool(graph_file.graph.target_from_source.isfinite().all())
+        return
+    assert message.startswith(str(path))
+    assert "\n" not in message

@@ -1,0 +1,99 @@
+"""Trajectory files, written by us and read by evo, and the other way round."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evo.core.trajectory import PosePath3D, PoseTrajectory3D
+from evo.tools import file_interface
+
+from rotavg_ros import rotations
+from rotavg_ros.datasets.files.graph_file import GraphFileError
+from rotavg_ros.datasets.files.pose_files import read_pose_file, write_kitti, write_tum
+
+COUNT = 20
+
+
+@pytest.fixture
+def poses() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stamps of today to the nanosecond, positions, orientations xyzw."""
+    rng = np.random.default_rng(0)
+    stamps_ns = 1_700_000_000_123_456_789 + np.cumsum(rng.integers(1, 10**9, COUNT))
+    return stamps_ns, rng.normal(scale=100, size=(COUNT, 3)), rotations.random(COUNT).numpy()
+
+
+def test_tum(tmp_path: Path, poses) -> None:
+    stamps_ns, position, orientation = poses
+    write_tum(tmp_path / "ours.tum", *poses)
+    read = file_interface.read_tum_trajectory_file(str(tmp_path / "ours.tum"))
+    np.testing.assert_allclose(read.timestamps, stamps_ns / 1e9, atol=1e-6)
+    np.testing.assert_allclose(read.positions_xyz, position, atol=1e-8)
+    same = np.abs((np.roll(read.orientations_quat_wxyz, -1, axis=1) * orientation).sum(axis=1))
+    np.testing.assert_allclose(same, 1, atol=1e-8)
+    back = read_pose_file(tmp_path / "ours.tum")
+    np.testing.assert_array_equal(back.stamps_ns, stamps_ns)  # which seconds in a float could not hold
+
+
+def test_tum_of_evo(tmp_path: Path, poses) -> None:
+    stamps_ns, position, orientation = poses
+    theirs = PoseTrajectory3D(position, np.roll(orientation, 1, axis=1), stamps_ns / 1e9)
+    file_interface.write_tum_trajectory_file(str(tmp_path / "theirs.tum"), theirs)
+    read = read_pose_file(tmp_path / "theirs.tum")
+    assert read.stamps_ns is not None
+    np.testing.assert_allclose(read.stamps_ns, stamps_ns, atol=1000)
+    np.testing.assert_allclose(read.position, position, atol=1e-8)
+
+
+def test_kitti(tmp_path: Path, poses) -> None:
+    _, position, orientation = poses
+    write_kitti(tmp_path / "ours.txt", position, orientation)
+    path: PosePath3D = file_interface.read_kitti_poses_file(str(tmp_path / "ours.txt"))
+    np.testing.assert_allclose(path.positions_xyz, position, rtol=1e-9)
+    back = read_pose_file(tmp_path / "ours.txt")
+    assert back.stamps_ns is None
+    np.testing.assert_allclose(np.abs((back.world_from_body * orientation).sum(axis=1)), 1, atol=1e-9)
+
+
+def test_euroc(tmp_path: Path, poses) -> None:
+    """evo reads the same file the same way; its columns beyond the pose are velocities and biases."""
+    stamps_ns, position, orientation = poses
+    rows = np.hstack((position, np.roll(orientation, 1, axis=1), np.ones((COUNT, 9))))
+    text = ["#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], ..."]
+    text += [
+        f"{stamp}," + ",".join(map(repr, row)) for stamp, row in zip(stamps_ns.tolist(), rows.tolist(), strict=True)
+    ]
+    path = tmp_path / "data.csv"
+    path.write_text("\n".join(text))
+    read, by_evo = read_pose_file(path), file_interface.read_euroc_csv_trajectory(str(path))
+    np.testing.assert_array_equal(read.stamps_ns, stamps_ns)
+    np.testing.assert_allclose(read.position, by_evo.positions_xyz)
+    np.testing.assert_allclose(read.world_from_body, np.roll(by_evo.orientations_quat_wxyz, -1, axis=1), atol=1e-12)
+
+
+def test_headings_in_the_plane(tmp_path: Path) -> None:
+    (tmp_path / "truth.csv").write_text("1.5, 2, 3, 1.5707963267948966\n2.5, 2, 4, 0\n")
+    read = read_pose_file(tmp_path / "truth.csv")
+    np.testing.assert_array_equal(read.stamps_ns, [1_500_000_000, 2_500_000_000])
+    np.testing.assert_allclose(read.position, [[2, 3, 0], [2, 4, 0]])
+    np.testing.assert_allclose(read.world_from_body[0], [0, 0, np.sqrt(0.5), np.sqrt(0.5)])
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("# nothing\n", "no rows; expected TUM"),
+        ("1 2 3 4 5\n", ":1: 5 columns; expected TUM"),
+        ("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 1\n", ":2: "),
+        ("1 0 0 0 0 0 0 1\n2 0 0 nan 0 0 0 1\n", ":2: a number that is not finite"),
+        ("1,a,0,0\n", ":1: 'a' is not a number"),
+        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", ":2: a stamp that is not after the one before"),
+        ("2 0 0 0 0 1 0 0 0 0 1 0\n", ":1: a matrix that is not a rotation"),
+    ],
+)
+def test_what_is_no_trajectory(tmp_path: Path, content: str, says: str) -> None:
+    (tmp_path / "bad.txt").write_text(content)
+    with pytest.raises(GraphFileError) as caught:
+        read_pose_file(tmp_path / "bad.txt")
+    assert says in str(caught.value)

@@ -1,0 +1,36 @@
+"""Scores as tables."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rotavg_ros.evaluation.common.cases import CaseKey
+from rotavg_ros.evaluation.common.score_tables import Figure, averages, per_case
+from rotavg_ros.evaluation.common.scoring import Score, Scores
+from rotavg_ros.metrics import OutlierCounts
+
+FIGURES = (Figure("mean_deg", "mean °", ".2f"), Figure("counts.recall", "recall"))
+
+
+def row(seed: int, contender: str, mean_deg: float) -> Score:
+    counts = OutlierCounts(1, 0, seed, 1)
+    return Score(CaseKey("graph", "kind", seed), contender, mean_deg, mean_deg, mean_deg, counts, 1.0, 0, 0.1)
+
+
+SCORES = Scores([row(0, "a", 1.0), row(0, "b", 5.0), row(1, "a", 3.0)])
+
+
+def test_averages() -> None:
+    table = averages("Title", SCORES, ["a", "b"], FIGURES, "A note.")
+    assert table.rows == (("a", 2.0, 0.75), ("b", 5.0, 1.0))
+    assert table.to_markdown().splitlines()[4:] == ["| a | 2.00 | 0.75 |", "| b | 5.00 | 1.0 |", "", "A note."]
+    (nobody,) = averages("Title", SCORES, ["nobody"], FIGURES).rows
+    assert np.isnan(nobody[1])
+
+
+def test_a_row_for_every_case() -> None:
+    key = {"graph": "name", "condition": "kind", "seed": "seed"}
+    lines = per_case("Title", SCORES, FIGURES, key).to_csv().splitlines()
+    assert lines[0] == "graph,condition,seed,method,mean °,recall"
+    assert lines[1:] == ["graph,kind,0,a,1.0,1.0", "graph,kind,0,b,5.0,1.0", "graph,kind,1,a,3.0,0.5"]
+    assert per_case("Title", SCORES, FIGURES).to_csv().startswith("graph,method,mean °,recall\ngraph,a,1.0,1.0\n")

@@ -1,0 +1,80 @@
+"""The cases of the evaluation's suites."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
+from rotavg_ros.errors import UserError
+from rotavg_ros.evaluation.common.cases import drawings
+from rotavg_ros.evaluation.common.contenders import contenders
+from rotavg_ros.evaluation.sfm import real, rgbd, robustness, small_training, synthetic
+from rotavg_ros.evaluation.sfm.contenders import ROSTER
+from rotavg_ros.solver.networks import NETWORKS
+from rotavg_ros.solver.neurora.network_store import read_network
+
+
+def test_graphs_are_the_same_whatever_their_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(synthetic.RECIPES, "released", ReleasedRecipe(cameras=(20, 30)))
+    few, many = (list(drawings(synthetic.kinds(["released"], 1), range(count))) for count in (2, 3))
+    for one, other in zip(few, many, strict=False):
+        assert torch.equal(one.graph.target_from_source, other.graph.target_from_source)
+    other_seed = next(drawings(synthetic.kinds(["released"], 2), [0]))
+    assert other_seed.graph.num_edges != few[0].graph.num_edges or not torch.equal(other_seed.truth, few[0].truth)
+    assert len({case.key for case in (*many, other_seed)}) == 4
+
+
+def test_rows_can_all_run() -> None:
+    contenders([name for name in synthetic.ROWS if name not in ROSTER.peers], ROSTER)
+
+
+def test_settings_that_differ_in_training_alone_share_their_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
+    tiny = PaperRecipe(cameras=(20, 30))
+    for name in ("easy", "easy-easy"):
+        monkeypatch.setitem(robustness.SETTINGS, name, robustness.Setting("", robustness.SETTINGS[name].training, tiny))
+    one, other = (next(drawings([robustness.kind(name, 0)], [0])) for name in ("easy", "easy-easy"))
+    assert torch.equal(one.graph.target_from_source, other.graph.target_from_source)
+    assert robustness.num_graphs("25000", 10) == 1
+    assert robustness.num_graphs("paper", 10) == 10
+
+
+def test_networks_trained_on_given_graphs_can_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(robustness.TRAINING_RECIPES, "easy", PaperRecipe(cameras=(12, 16), pair_share=(0.5, 0.5)))
+    graphs = robustness.training_graphs("easy", 0, count=3)
+    assert (len(graphs.training), len(graphs.validation)) == (3, 1)
+    small_training.train_networks(tmp_path, graphs, seconds=0)
+    for name in ("sfm-clean-net", "sfm-fine-net"):
+        read_network(NETWORKS[name], tmp_path / f"{name}.safetensors")
+
+    case = next(drawings(synthetic.kinds(["released"], 0), [0]))
+    ours = contenders(("neurora-paper",), ROSTER, tmp_path)["neurora-paper"](case)
+    packages = contenders(("neurora-paper",), ROSTER)["neurora-paper"](case)
+    assert ours is not None and ours.outlier_score is not None
+    assert packages is not None and packages.outlier_score is not None
+    assert not torch.allclose(ours.outlier_score, packages.outlier_score)
+
+
+def test_no_scene_is_tested_by_networks_that_saw_it(shared_data: Path) -> None:
+    folds = list(rgbd.folds(shared_data / "rgbd" / "redwood_fgr", 3, max_scenes=7))
+    tested = [case.key.name for fold in folds for case in fold.test]
+    assert len(tested) == len(set(tested)) == 7
+    for fold in folds:
+        learned = [*fold.training.training, *fold.training.validation]
+        assert len(learned) == 7 - len(fold.test)
+        seen = [graph.graph.target_from_source for graph in learned]
+        for case in fold.test:
+            assert not any(torch.equal(case.graph.target_from_source, quaternions) for quaternions in seen)
+    with pytest.raises(UserError, match="too few"):
+        list(rgbd.folds(shared_data / "rgbd" / "redwood_fgr", 4, max_scenes=7))
+
+
+def test_madrid_agreement(shared_data: Path) -> None:
+    case = real.madrid_case(shared_data)
+    found = real.agreement(case, contenders(("spt", "chatterjee", "neurora"), ROSTER))
+    np.testing.assert_allclose(np.diag(found.difference_deg), 0, atol=1e-4)
+    assert found.difference_deg[1, 2] < found.difference_deg[0, 1]
+    assert len(real.residual_table("", found).rows) == len(real.agreement_table("", found).rows) == 3
