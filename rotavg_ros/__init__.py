@@ -13,7 +13,8 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.version import __version__
 
 if TYPE_CHECKING:
-    from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph, write_graph
+    from rotavg_ros.datasets.files.formats import read_graph, write_graph
+    from rotavg_ros.datasets.files.graph_file import GraphFile
     from rotavg_ros.online import (
         Answer,
         EdgeMeasurement,
@@ -59,9 +60,9 @@ def __getattr__(name: str) -> Any:
 
         return getattr(view_graph, name)
     if name in {"GraphFile", "read_graph", "write_graph"}:
-        from rotavg_ros.datasets.files import graph_file
+        from rotavg_ros.datasets.files import formats
 
-        return getattr(graph_file, name)
+        return getattr(formats, name)
     if name in __all__:
         from rotavg_ros import online
 

@@ -14,7 +14,7 @@ import pytest
 
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.cli.main import COMMANDS, main
-from rotavg_ros.datasets.files.graph_file import write_graph
+from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.simulation.robot_run import RobotRun
 from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.ros import diagnostics

@@ -11,7 +11,7 @@ import numpy as np
 
 from rotavg_ros import solve
 from rotavg_ros.cli.main import COMMANDS
-from rotavg_ros.datasets.files.graph_file import read_graph
+from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.settings.text import to_markdown
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")

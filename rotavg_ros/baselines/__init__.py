@@ -1,4 +1,7 @@
-"""The methods that NeuRoRA is compared with, each written from its own paper, behind one signature."""
+"""The methods that NeuRoRA is compared with, each written from its own paper, behind one signature.
+
+None of them scores edges; ``residual_score`` makes a score of the residuals that they leave.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from rotavg_ros.baselines.arrigoni import arrigoni
 from rotavg_ros.baselines.chatterjee import chatterjee
 from rotavg_ros.baselines.wang import wang
 from rotavg_ros.baselines.weiszfeld import weiszfeld
+from rotavg_ros.solver.neurora.scores import residual_score
 from rotavg_ros.view_graph import ViewGraph
 
 # A graph on the CPU and, for a warm start, the body_from_world (N, 4) of another method → body_from_world (N, 4)
@@ -23,4 +27,4 @@ BASELINES: dict[str, Baseline] = {
     "wang": wang,
 }
 
-__all__ = ["BASELINES", "Baseline", "arrigoni", "chatterjee", "wang", "weiszfeld"]
+__all__ = ["BASELINES", "Baseline", "arrigoni", "chatterjee", "residual_score", "wang", "weiszfeld"]

@@ -11,6 +11,7 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.spanning_forest import (
     SpanningForest,
+    accumulate_to_root,
     compose_orientations,
     minimum_spanning_forest,
     shortest_path_forest,
@@ -30,7 +31,12 @@ def spanning_forest(graph: ViewGraph) -> SpanningForest:
     return shortest_path_forest(graph, _cost(graph, torch.ones(graph.num_edges, dtype=torch.float64)))
 
 
-def start_orientations(graph: ViewGraph, start: Tensor | None) -> tuple[Tensor, np.ndarray]:
+def depths(forest: SpanningForest) -> np.ndarray:
+    """Edges between each node and its root, ``(N,)``."""
+    return accumulate_to_root(forest, np.ones(len(forest.parent)))
+
+
+def start_orientations(graph: ViewGraph, start: Tensor | None = None) -> tuple[Tensor, np.ndarray]:
     """Orientations ``(N, 4)`` float64 to start from, ``start`` if it is given, and a root for every component."""
     forest = spanning_forest(graph)
     orientations = compose_orientations(forest, graph) if start is None else rotations.normalize(start.double())

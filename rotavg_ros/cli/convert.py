@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
+from rotavg_ros.bags import graph_bag
 from rotavg_ros.cli.progress import working
+from rotavg_ros.datasets.files import formats
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.errors import UserError
 
@@ -20,22 +21,22 @@ class ConvertError(UserError):
 class Format(NamedTuple):
     """What holds a view-graph.
 
-    The module is imported when used and has ``read_graph(path) -> GraphFile``, ``write_graph(path, graph_file)``
+    The module has ``read_graph(path) -> GraphFile``, ``write_graph(path, graph_file)``
     and ``not_stored(path, graph_file) -> list[str]``: what of this graph the format has no room for.
     """
 
     suffixes: tuple[str, ...]
     is_folder: bool
-    module: str
+    module: ModuleType
 
 
 # The last one also gets the suffixes that nobody knows: it can tell by content, and what it cannot it explains.
 FORMATS = (
-    Format(("", ".mcap", ".db3", ".bag"), is_folder=True, module="rotavg_ros.bags.graph_bag"),
+    Format(("", ".mcap", ".db3", ".bag"), is_folder=True, module=graph_bag),
     Format(
         (".g2o", ".graph", ".toro", ".isam", ".npz", ".txt"),
         is_folder=False,
-        module="rotavg_ros.datasets.files.graph_file",
+        module=formats,
     ),
 )
 
@@ -81,4 +82,4 @@ def format_of(path: Path) -> ModuleType:
         chosen = FORMATS[-1]
     else:
         chosen = next((known for known in FORMATS if path.suffix.lower() in known.suffixes), FORMATS[-1])
-    return importlib.import_module(chosen.module)
+    return chosen.module

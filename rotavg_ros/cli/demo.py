@@ -19,7 +19,8 @@ from rotavg_ros.bags.topics import EDGE_TOPIC, ODOM_TOPIC
 from rotavg_ros.cli.progress import working
 from rotavg_ros.cli.simulate import describe, simulate
 from rotavg_ros.datasets.dead_reckoning import chain_poses
-from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph
+from rotavg_ros.datasets.files.formats import read_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 from rotavg_ros.errors import UserError

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rotavg_ros.cli.data_folder import data_folder
 from rotavg_ros.cli.progress import progress, working
-from rotavg_ros.datasets.files.graph_file import read_graph
+from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.evaluation.common.cases import drawings
 from rotavg_ros.evaluation.common.contenders import contenders, warm_up
 from rotavg_ros.evaluation.common.named_peers import is_available

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from rotavg_ros.cli.progress import working
-from rotavg_ros.datasets.files.graph_file import read_graph, stem_of
+from rotavg_ros.datasets.files.formats import read_graph, stem_of
 from rotavg_ros.datasets.files.ground_truth import attach_truth
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.common.noise_plot import draw, edge_noise

@@ -9,7 +9,7 @@ import numpy as np
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.bags.writer import refuse_existing
 from rotavg_ros.cli.progress import working
-from rotavg_ros.datasets.files.graph_file import write_graph
+from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.simulation.robot_run import RobotRun
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, simulate_slam_graph
 

@@ -21,10 +21,11 @@ from rotavg_ros.cli.options.solve import EDGE_FORMATS
 from rotavg_ros.cli.poses import POSE_FILES, write_corrected_poses
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.files.csv_writer import Column, write_csv
-from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph, stem_of
+from rotavg_ros.datasets.files.formats import read_graph, stem_of
+from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.errors import UserError
 from rotavg_ros.solver import Solution, solve
-from rotavg_ros.solver.neurora.network_store import WEIGHTS_FOLDER
+from rotavg_ros.solver.networks import WEIGHTS_FOLDER
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
 

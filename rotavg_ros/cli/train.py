@@ -11,9 +11,7 @@ import torch
 from rotavg_ros.cli.progress import working
 from rotavg_ros.errors import UserError
 from rotavg_ros.results import make_folder
-from rotavg_ros.solver.networks import NETWORKS
-from rotavg_ros.solver.neurora.clean_net import CleanNet
-from rotavg_ros.solver.neurora.network_store import WEIGHTS_FOLDER, read_network
+from rotavg_ros.solver.networks import NETWORKS, WEIGHTS_FOLDER, CleanNet, read_network
 from rotavg_ros.training.config import TrainingConfig, TrainingConfigError
 from rotavg_ros.training.sfm_tasks import SfmCleanTask, SfmFineTask
 from rotavg_ros.training.slam_tasks import SlamCleanTask

@@ -14,7 +14,6 @@ from rotavg_ros.solver import devices
 from rotavg_ros.solver.algebra.threads import workers
 from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
 from rotavg_ros.solver.methods import BASELINES, DEFAULT_METHOD, DEVICES, METHODS, NETWORK_METHODS, PROFILES
-from rotavg_ros.solver.neurora import scores
 from rotavg_ros.solver.neurora.network_store import Networks
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.solve import solve_sfm
@@ -162,7 +161,7 @@ def _solve_baseline(job: _Job, name: str, run: Run) -> Estimate:
         graph = replace(graph, kind=torch.full_like(graph.kind, EdgeKind.LOOP_CLOSURE))
     with run.watch.stage(name):
         orientations = baselines.BASELINES[name](graph, run.warm_start)
-    score = scores.residual_score(graph, orientations, _OUTLIER_ANGLE[job.profile])
+    score = baselines.residual_score(graph, orientations, _OUTLIER_ANGLE[job.profile])
     return Estimate(orientations, score, torch.full((graph.num_nodes,), torch.nan))
 
 

@@ -16,7 +16,8 @@ from rotavg_ros.bags.reader import BagReader, BagReadError
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.bags.topics import EDGE_TOPIC, ODOM_TOPIC, TRANSLATION_TOPIC, TRUTH_TOPIC
 from rotavg_ros.bags.writer import BagWriter
-from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph
+from rotavg_ros.datasets.files.formats import read_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.datasets.simulation.robot_run import RobotRun
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.files.graph_file import read_graph
+from rotavg_ros.datasets.files.formats import read_graph
 
 EDGES = (
     "".join(f"EDGE_SE2 {i} {i + 1} 1 0 0.1 1 0 0 1 0 100\n" for i in range(3)) + "EDGE_SE2 3 0 1 0 0.2 1 0 0 1 0 5\n"

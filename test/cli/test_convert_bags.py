@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.files.graph_file import read_graph, write_graph
+from rotavg_ros.datasets.files.formats import read_graph, write_graph
 from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.datasets.simulation.trajectories import World
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from rotavg_ros.cli.main import COMMANDS, main
-from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph, write_graph
+from rotavg_ros.datasets.files.formats import read_graph, write_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.version import __version__
 
 EDGES = "".join(f"EDGE_SE2 {i} {i + 1} 1 0 0.1 1 0 0 1 0 100\n" for i in range(5))

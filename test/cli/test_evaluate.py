@@ -10,7 +10,8 @@ from scipy.io import savemat
 
 from rotavg_ros import rotations
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.files.graph_file import GraphFile, write_graph
+from rotavg_ros.datasets.files.formats import write_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.evaluation.sfm import robustness, synthetic
 

@@ -11,7 +11,8 @@ import torch
 
 from rotavg_ros import rotations
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.files.graph_file import GraphFile, write_graph
+from rotavg_ros.datasets.files.formats import write_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile
 
 
 @pytest.fixture

@@ -7,7 +7,8 @@ import pytest
 
 from rotavg_ros.bags.graph_from_bag import read_graph_bag
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph
+from rotavg_ros.datasets.files.formats import read_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.metrics import true_edge_noise
 
 

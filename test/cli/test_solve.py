@@ -18,7 +18,8 @@ from safetensors.torch import load_file, save_file
 
 from rotavg_ros import rotations, solve
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph, write_graph
+from rotavg_ros.datasets.files.formats import read_graph, write_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.solver.neurora.network_store import WEIGHTS_FOLDER
 from rotavg_ros.version import __version__
 

@@ -13,7 +13,7 @@ from evo.core.trajectory import PosePath3D
 from evo.tools import file_interface
 
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.files.graph_file import write_graph
+from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.datasets.simulation.trajectories import World
 

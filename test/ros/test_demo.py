@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rotavg_ros.datasets.files.graph_file import write_graph
+from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import METHODS, EdgeKind, EdgeLabel, UserError, ViewGraph, rotations, solve
-from rotavg_ros.datasets.files.graph_file import read_graph
+from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.datasets.files.ground_truth import attach_truth
 from rotavg_ros.datasets.simulation.false_closures import replace_closures
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe

@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 
@@ -26,17 +25,6 @@ from rotavg_ros.view_graph import ViewGraph
 MAX_NODE_ID = np.iinfo(np.int64).max
 
 _GZIP = b"\x1f\x8b"
-_NUMBER_STARTS = frozenset(bytes([character]) for character in b"0123456789+-.")
-
-# Format modules by suffix; imported when used, since they import this module.
-_FORMAT_OF_SUFFIX = {
-    ".g2o": "g2o",
-    ".graph": "toro",
-    ".toro": "toro",
-    ".isam": "isam",
-    ".npz": "npz",
-    ".txt": "onedsfm",
-}
 
 
 class GraphFileError(UserError):
@@ -140,74 +128,6 @@ class GraphFile:
             edge_information=edge_information,
             skipped=dict(skipped or {}),
         )
-
-
-def read_graph(path: str | Path) -> GraphFile:
-    """Read a view-graph in g2o or TORO dialect, 1DSfM ``EGs.txt``, npz or Lund's MATLAB form; the content decides.
-
-    Texts may begin with UTF-8's byte order mark and may be compressed by gzip.
-
-    Returns:
-        a graph of indices with the file's ids beside it; :func:`rotavg_ros.solve` takes it as it is.
-
-    Raises:
-        GraphFileError: anything that keeps the file from being read whole.
-    """
-    path = Path(path)
-    if path.exists() and not path.is_file() and not path.is_dir():
-        raise GraphFileError.at(path, None, "is not a regular file (a pipe or a device); save the graph to one first")
-    with open_text(path) as file:
-        head = file.read(4096)
-    if not head:
-        raise GraphFileError.at(path, None, "the file is empty; expected a view-graph (g2o, EGs.txt or npz)")
-    return _format(_format_of_content(path, head)).read(path)  # type: ignore[no-any-return]
-
-
-def write_graph(path: str | Path, graph_file: GraphFile) -> None:
-    """Write a view-graph; the suffix decides.
-
-    ``.g2o``, ``.toro`` or ``.graph`` (TORO), ``.isam``, ``.npz``, or ``.txt`` (1DSfM).
-    The file appears under its name only when it is complete.
-
-    Raises:
-        GraphFileError: an unknown suffix, or a place that cannot be written.
-    """
-    path = Path(path)
-    _format(_format_of_suffix(path)).write(path, graph_file)
-
-
-def not_stored(path: str | Path, graph_file: GraphFile) -> list[str]:
-    """What of this graph the format that ``path`` stands for has no room for, in words."""
-    return _format(_format_of_suffix(Path(path))).not_stored(graph_file)  # type: ignore[no-any-return]
-
-
-def stem_of(path: Path) -> str:
-    """The file's name without its suffix, nor that of gzip."""
-    return Path(path.stem).stem if path.suffix.lower() == ".gz" else path.stem
-
-
-def _format_of_suffix(path: Path) -> str:
-    name = _FORMAT_OF_SUFFIX.get(path.suffix.lower())
-    if name is None:
-        raise GraphFileError.at(
-            path, None, f"unknown suffix {path.suffix!r}; use .g2o, .toro, .isam, .npz or .txt (1DSfM EGs.txt)"
-        )
-    return name
-
-
-def _format_of_content(path: Path, head: bytes) -> str:
-    if head.startswith(b"PK") or path.suffix.lower() == ".npz":  # npz files are zip archives
-        return "npz"
-    if head.startswith(b"MATLAB ") or path.suffix.lower() == ".mat":
-        return "lund"
-    first_line = next((line for line in head.splitlines() if line.strip() and not line.lstrip().startswith(b"#")), b"")
-    return "onedsfm" if first_line.lstrip()[:1] in _NUMBER_STARTS else "g2o"
-
-
-def _format(name: str) -> ModuleType:
-    from rotavg_ros.datasets.files import g2o, isam, lund, npz, onedsfm, toro  # each of which imports this module
-
-    return {"g2o": g2o, "isam": isam, "lund": lund, "npz": npz, "onedsfm": onedsfm, "toro": toro}[name]
 
 
 @contextmanager

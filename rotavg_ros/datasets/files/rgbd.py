@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, read_graph
+from rotavg_ros.datasets.files.formats import read_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError
 
 
 @dataclass(frozen=True)

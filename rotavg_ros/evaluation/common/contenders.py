@@ -9,13 +9,13 @@ from pathlib import Path
 
 from torch import Tensor
 
+from rotavg_ros.baselines import residual_score
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.common.answers import Answer, Clock
 from rotavg_ros.evaluation.common.cases import Case, Family, warm_up_case
 from rotavg_ros.evaluation.common.kept_answers import KeptAnswers
 from rotavg_ros.evaluation.common.named_peers import peer_solver
 from rotavg_ros.solver import METHODS, solve
-from rotavg_ros.solver.neurora.scores import residual_score
 from rotavg_ros.view_graph import ViewGraph
 
 # None: the case is too large for it, or it gives up.

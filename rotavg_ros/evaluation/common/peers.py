@@ -18,10 +18,9 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.baselines.start import solve_by_component, spanning_forest
+from rotavg_ros.baselines.start import depths, solve_by_component, spanning_forest, start_orientations
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.common.answers import Answer, Clock
-from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root, compose_orientations
 from rotavg_ros.view_graph import ViewGraph
 
 # An edge that states no precision counts as this good.
@@ -106,7 +105,7 @@ def gnc(graph: ViewGraph) -> Answer:
     parameters.setLossType(gtsam.GncLossType.TLS)
     anchors = range(graph.num_edges, graph.num_edges + len(forest.roots))
     parameters.setKnownInliers([*torch.nonzero(graph.is_odometry).flatten().tolist(), *anchors])
-    optimizer = gtsam.GncLMOptimizer(factors, _start_values(gtsam, graph, forest), parameters)
+    optimizer = gtsam.GncLMOptimizer(factors, _start_values(gtsam, graph), parameters)
     optimizer.setInlierCostThresholdsAtProbability(_GNC_INLIER_PROBABILITY)
     clock = Clock()
     with _timed(clock):
@@ -120,7 +119,7 @@ def isam2_huber(graph: ViewGraph) -> Answer:
     """GTSAM's iSAM2, one update per node in the order of the odometry, Huber's loss on closures."""
     gtsam = _load("gtsam")
     forest = spanning_forest(graph)
-    depth = accumulate_to_root(forest, np.ones(graph.num_nodes))
+    depth = depths(forest)
     order = np.argsort(depth, kind="stable")
     rank = np.empty_like(order)
     rank[order] = np.arange(graph.num_nodes)
@@ -129,7 +128,7 @@ def isam2_huber(graph: ViewGraph) -> Answer:
     edges_by_arrival = np.argsort(arrival, kind="stable")
     bounds = np.searchsorted(arrival[edges_by_arrival], np.arange(graph.num_nodes + 1))
     factors = _between_factors(gtsam, graph, huber_on_closures=True)
-    start = _start_values(gtsam, graph, forest)
+    start = _start_values(gtsam, graph)
     isam = gtsam.ISAM2(gtsam.ISAM2Params())
     clock = Clock()
     for step, node in enumerate(order.tolist()):
@@ -201,10 +200,10 @@ def _anchor(gtsam: Any, node: int) -> Any:
     return gtsam.PriorFactorRot3(node, gtsam.Rot3(), gtsam.noiseModel.Isotropic.Sigma(3, _ANCHOR_SIGMA))
 
 
-def _start_values(gtsam: Any, graph: ViewGraph, forest: SpanningForest) -> Any:
+def _start_values(gtsam: Any, graph: ViewGraph) -> Any:
     """Orientations along the odometry; roots are at the identity, where they are anchored."""
     values = gtsam.Values()
-    orientations = rotations.inverse(compose_orientations(forest, graph))
+    orientations = rotations.inverse(start_orientations(graph)[0])
     for node, orientation in enumerate(_rot3(gtsam, orientations)):
         values.insert(node, orientation)
     return values

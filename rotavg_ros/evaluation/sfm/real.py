@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from rotavg_ros.datasets.files.graph_file import read_graph
+from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.datasets.simulation.synthetic import ReleasedRecipe
 from rotavg_ros.datasets.simulation.topology import read_topology
 from rotavg_ros.evaluation.common.answers import Answer

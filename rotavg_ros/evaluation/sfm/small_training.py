@@ -11,9 +11,7 @@ from pathlib import Path
 
 import torch
 
-from rotavg_ros.solver.networks import NETWORKS
-from rotavg_ros.solver.neurora.clean_net import CleanNet
-from rotavg_ros.solver.neurora.network_store import load_network, read_network
+from rotavg_ros.solver.networks import NETWORKS, CleanNet, load_network, read_network
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.sfm_tasks import GivenGraphs, SfmCleanTask, SfmFineTask
 from rotavg_ros.training.trainer import Trainer, TrainingTask

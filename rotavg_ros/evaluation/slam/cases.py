@@ -11,14 +11,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from rotavg_ros.datasets.files.graph_file import GraphFile, read_graph
+from rotavg_ros.baselines.least_squares import least_squares
+from rotavg_ros.datasets.files.formats import read_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.datasets.simulation.false_closures import insert_slips, replace_closures
 from rotavg_ros.datasets.simulation.slip_places import CROSSED, LOCATABLE
 from rotavg_ros.datasets.simulation.visual_odometry import odometry_graph
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.common.cases import SLAM, Case, CaseKey, Kind
-from rotavg_ros.evaluation.slam.least_squares import least_squares
 
 # Errors below the floor count as the floor: with ground truth, and where clean least squares stands in for it.
 _TRUTH_FLOOR = np.radians(0.1)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from torch import Tensor
 
+from rotavg_ros.baselines.least_squares import least_squares
 from rotavg_ros.baselines.start import start_orientations
 from rotavg_ros.evaluation.common.cases import SLAM, Case
 from rotavg_ros.evaluation.common.contenders import Roster
-from rotavg_ros.evaluation.slam.least_squares import least_squares
 
 OURS, ORACLE, GNC = "neurora", "oracle", "gnc"
 

@@ -10,9 +10,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import rotations
+from rotavg_ros.baselines.least_squares import least_squares
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.evaluation.common.tables import Column, Table
-from rotavg_ros.evaluation.slam.least_squares import least_squares
 from rotavg_ros.solver import Solution, solve
 from rotavg_ros.view_graph import ViewGraph
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from rotavg_ros.datasets.files.graph_file import GraphFileError, read_graph
+from rotavg_ros.datasets.files.formats import read_graph
+from rotavg_ros.datasets.files.graph_file import GraphFileError
 
 
 def assert_refused(path: Path, message: str, line: int | None = None) -> None:

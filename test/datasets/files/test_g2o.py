@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, read_graph
+from rotavg_ros.datasets.files.formats import read_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError
 from rotavg_ros.view_graph import EdgeKind
 
 SE2 = "EDGE_SE2 {} {} 1 2 {} 500 0 0 500 0 {}"

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, read_graph
+from rotavg_ros.datasets.files.formats import read_graph
+from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
 
 

@@ -11,7 +11,8 @@ import torch
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.datasets.files.graph_file import GraphFileError, read_graph
+from rotavg_ros.datasets.files.formats import read_graph
+from rotavg_ros.datasets.files.graph_file import GraphFileError
 from rotavg_ros.metrics import true_edge_noise
 
 from .refusals import assert_refused

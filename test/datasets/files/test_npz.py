@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rotavg_ros.datasets.files.graph_file import GraphFileError, read_graph
+from rotavg_ros.datasets.files.formats import read_graph
+from rotavg_ros.datasets.files.graph_file import GraphFileError
 
 from .refusals import assert_refused
 

@@ -16,14 +16,8 @@ from hypothesis import strategies as st
 
 from rotavg_ros import rotations
 from rotavg_ros.datasets.files import g2o
-from rotavg_ros.datasets.files.graph_file import (
-    MAX_NODE_ID,
-    GraphFile,
-    GraphFileError,
-    not_stored,
-    read_graph,
-    write_graph,
-)
+from rotavg_ros.datasets.files.formats import not_stored, read_graph, write_graph
+from rotavg_ros.datasets.files.graph_file import MAX_NODE_ID, GraphFile, GraphFileError
 from rotavg_ros.datasets.planar import quaternion_of_heading
 
 

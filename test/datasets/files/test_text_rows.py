@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.files.graph_file import GraphFileError, read_graph
+from rotavg_ros.datasets.files.formats import read_graph
+from rotavg_ros.datasets.files.graph_file import GraphFileError
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.datasets.files.pose_files import read_pose_file
 

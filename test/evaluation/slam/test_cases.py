@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.files.graph_file import write_graph
+from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.common.answers import Answer
 from rotavg_ros.evaluation.common.cases import drawings

@@ -8,8 +8,8 @@ import torch
 from scipy.stats import norm
 
 from rotavg_ros import Solution, ViewGraph, rotations
+from rotavg_ros.baselines.least_squares import least_squares
 from rotavg_ros.evaluation.slam import uncertainty
-from rotavg_ros.evaluation.slam.least_squares import least_squares
 
 from ..laps import NUM_NODES, laps
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from rotavg_ros import solve
-from rotavg_ros.datasets.files.graph_file import read_graph
+from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.solver.slam.network import SlamCleanNet

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import ncx2
 
 from rotavg_ros import EdgeKind, ViewGraph, rotations, solve
-from rotavg_ros.datasets.files.graph_file import read_graph
+from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.evaluation.common.contenders import contenders
 from rotavg_ros.evaluation.common.scoring import score_all
 from rotavg_ros.evaluation.slam import cases as slam_cases

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from rotavg_ros import rotations
-from rotavg_ros.evaluation.slam.least_squares import chordal_orientations, least_squares
+from rotavg_ros.baselines.least_squares import chordal_orientations, least_squares
 from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.view_graph import ViewGraph
 
