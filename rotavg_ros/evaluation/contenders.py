@@ -123,17 +123,11 @@ def _oracle(is_shaped: bool, case: Case) -> Answer:
     """Our refinement from the truth to convergence, every true inlier weighing one and every outlier nothing."""
     start = time.process_time()
     is_inlier = (case.noise_angle <= SFM_OUTLIER_ANGLE).double()
-    roots = shortest_path_forest(case.graph).roots
     if is_shaped:
-        orientations = sfm_refinement.refine(
-            case.graph,
-            case.truth,
-            torch.from_numpy(roots),
-            _ORACLE_STEPS,
-            prior_weight=is_inlier,
-            shaped_steps=_ORACLE_STEPS,
-        )
+        weights = sfm_refinement.EdgeWeights(is_inlier, is_inlier)
+        orientations = sfm_refinement.refine(case.graph, case.truth, _ORACLE_STEPS, weights=weights)
     else:
+        roots = shortest_path_forest(case.graph).roots
         orientations = refine(case.graph, case.truth, is_inlier, roots, _ORACLE_STEPS)
     seconds = time.process_time() - start
     return Answer(orientations, _residual_score(case, orientations), seconds)

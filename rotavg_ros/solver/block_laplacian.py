@@ -62,6 +62,9 @@ class BlockLaplacian:
         weight: ``(M,)`` positive.
         shape: what the ends say, S and T.
         component: ``(N,)``; each of the C components is solved by itself.
+
+    Attributes:
+        weight_sum: ``(N,)`` the weights of each node's edges, added up.
     """
 
     def __init__(self, arrivals: Arrivals, weight: Tensor, shape: NoiseShape, component: Tensor) -> None:
@@ -76,9 +79,11 @@ class BlockLaplacian:
         self._far, self._near = (at_source, at_target), (at_target, at_source)
         one = weight.new_ones(1, arrivals.num_nodes)
         self._diagonal = torch.zeros_like(at_source)
+        self.weight_sum = weight.new_zeros(arrivals.num_nodes)
         for matrix, near, far in zip(self._matrices, self._near, self._far, strict=True):
             arriving = _arriving(matrix, torch.cat((far.flatten(0, 1), one)))
             self._diagonal += arriving[:9].view_as(far) + arriving[9] * near
+            self.weight_sum += arriving[9]
 
     def product(self, x: Tensor) -> Tensor:
         """``L x`` ``(3, N)``."""

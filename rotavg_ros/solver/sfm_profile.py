@@ -46,23 +46,16 @@ def solve_sfm(
     for _ in range(method.fine_tunings):
         with watch.stage("fine-tune"):
             orientations = sfm_stages.fine_tune(networks.load("sfm-fine-net"), cleaned, orientations, component)
-    default_steps = sfm_refinement.MAX_STEPS if method.shaped else refinement.DEFAULT_STEPS
+    default_steps = sfm_refinement.PRIORS.max_steps if method.shaped else refinement.DEFAULT_STEPS
     steps = (default_steps if method.refine else 0) if refinement_steps is None else refinement_steps
     if steps > 0:
         with watch.stage("refine"):
             allowed = (graph.label != EdgeLabel.REJECTED).double()
             weight = 1 - cleaned.outlier_probability if method.weighted else allowed
             if method.shaped:
-                orientations = sfm_refinement.refine(
-                    graph,
-                    orientations,
-                    roots,
-                    steps,
-                    prior_weight=allowed,
-                    coarse_weight=weight,
-                    component=component,
-                    edges=cleaned.edges,
-                )
+                structure = sfm_refinement.Structure(component, roots, cleaned.edges)
+                weights = sfm_refinement.EdgeWeights(allowed, allowed * weight)
+                orientations = sfm_refinement.refine(graph, orientations, steps, structure=structure, weights=weights)
             else:
                 orientations = refinement.refine(
                     graph, orientations, weight, roots, steps, component=component, edges=cleaned.edges

@@ -1,59 +1,299 @@
 """Refinement of an SfM view-graph: robust Gauss–Newton steps on the tangent space, coarse ones and then shaped ones.
 
 Coarse steps (ℓ1, round noise; Chatterjee & Govindu 2013) bring the orientations to within the noise, however wrong they
-were in places. Then the noise's shape in the cameras' frames is estimated from the residuals, and the last steps (ℓ½,
-Chatterjee & Govindu 2018) measure residuals by it: what an edge says about the exact axes counts for more than the
-rest. Its scale comes along, so nothing is tuned to a graph's noise.
+were in places. Then the noise's shape in the cameras' frames is estimated from the residuals, and shaped steps (ℓ½,
+Chatterjee & Govindu 2018) measure residuals by it, until they have converged. Shape Ω and size come from the graph's
+own residuals.
+
+A shaped step weighs an edge by its expected squared residual, not by the squared residual alone: its ends are uncertain
+themselves, so that an edge that happens to fit is not exact. With r the residual, v_u the variance of node u and p the
+edge's prior weight,
+
+    w_uv = p_uv (rᵀ Ω r + v_u + v_v)^(−3/4),     v_u = φ / Σ w over the edges of u,     φ = Σ w² rᵀ Ω r / Σ w.
+
+φ / Σ w is the sandwich estimate of a mean's variance (Huber 1967), its numerator pooled over the graph. With Ω and φ
+held, the three lower F(R, v) = Σ_uv 4 p_uv (rᵀ Ω r + v_u + v_v)^(1/4) − φ Σ_u log v_u: ρ(q) = 4 q^(1/4) is concave in q, so
+that its tangents bound it (majorise and minimise), and a step along the bound's gradient may be taken up to twice as
+long as to the bound's minimum.
+
+A step's length λ is measured in standard errors, λ² = xᵀ L x / (φ N): the decrement of Newton's method over what chance
+alone makes of it. It does not depend on the frames of world and cameras, nor on the noise's size.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.block_laplacian import Arrivals, BlockLaplacian, factorised
-from rotavg_ros.solver.noise_shape import NoiseShape
+from rotavg_ros.solver.noise_shape import NoiseShape, ResidualSample, ShapeEstimator
 from rotavg_ros.solver.parallel import for_each, slices, stretches
 from rotavg_ros.solver.residuals import SLICE_EDGES, EdgeResiduals, measured_rows
+from rotavg_ros.solver.sfm_priors import RefinementPriors
 from rotavg_ros.solver.sorted_edges import SortedEdges
 from rotavg_ros.view_graph import ViewGraph
 
-# Coarse steps end early where they are settled; the last ones are shaped.
-MAX_STEPS = 11
-_SHAPED_STEPS = 3
-# Coarse steps are settled once they turn nodes by less than this share of the typical residual, on average.
-_SETTLED = 0.2
-_CONVERGED_STEP = np.radians(0.001)
-_MIN_PRIOR = 1e-6
-# Single precision leaves a residual exact to 10⁻⁷ rad. Where residuals typically are ten thousand times as large, no
-# answer shows it. Double precision is for more exact measurements, and for graphs so loose that errors add up.
-_COARSE_NOISE = 1e-3
-_MIN_RESIDUAL = np.radians(0.001)
-# A graph with fewer neighbours than this is no case for conjugate gradients alone.
-_WELL_KNIT_DEGREE = 12
-# Edges of a component whose residuals tell the noise's shape and size: more would change nothing.
-_MAX_SAMPLE = 8_000
+PRIORS = RefinementPriors()
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What is known of a graph's connections (N nodes in C components).
+
+    Attributes:
+        component: ``(N,)`` connected components.
+        roots: ``(C,)`` a node of each, in the components' order; they are held fixed.
+        edges: the graph's edges sorted.
+    """
+
+    component: Tensor
+    roots: Tensor
+    edges: SortedEdges
+
+    @classmethod
+    def of(cls, graph: ViewGraph) -> Structure:
+        """Computed; a component's root is its first node."""
+        component = graph.components()
+        nodes = torch.arange(graph.num_nodes, device=graph.device)
+        roots = nodes.new_full((int(component.max()) + 1,), graph.num_nodes)
+        return cls(component, roots.scatter_reduce(0, component, nodes, "amin"), SortedEdges.of(graph))
+
+
+class EdgeWeights(NamedTuple):
+    """Prior weights ``(M,)`` in [0, 1], multiplied to the robust ones.
+
+    Attributes:
+        shaped: in shaped steps.
+        coarse: in coarse steps. CleanNet's scores belong here alone: after these, residuals know more.
+    """
+
+    shaped: Tensor
+    coarse: Tensor
+
+
+def refine(
+    graph: ViewGraph,
+    body_from_world: Tensor,
+    max_steps: int = PRIORS.max_steps,
+    *,
+    structure: Structure | None = None,
+    weights: EdgeWeights | None = None,
+    priors: RefinementPriors = PRIORS,
+) -> Tensor:
+    """Reweighted least-squares steps until they have converged, at most ``max_steps``; every component by itself.
+
+    Args:
+        body_from_world: ``(N, 4)`` start.
+        structure: default: computed.
+        weights: default: ones.
+
+    Returns:
+        ``(N, 4)`` float64 orientations.
+    """
+    structure = Structure.of(graph) if structure is None else structure
+    if weights is None:
+        ones = torch.ones_like(graph.precision)
+        weights = EdgeWeights(ones, ones)
+    problem = _Problem(graph, structure, priors)
+    coarse_steps = min(priors.max_coarse_steps, max_steps - priors.least_shaped_steps)
+    orientations, taken = _coarse(problem, body_from_world.double(), weights.coarse, coarse_steps)
+    return _shaped(problem, orientations, weights.shaped, max_steps - taken)
+
+
+def _coarse(problem: _Problem, orientations: Tensor, prior: Tensor, max_steps: int) -> tuple[Tensor, int]:
+    """ℓ1 steps until they are settled; with their number."""
+    priors = problem.priors
+    measure = _Measure(problem.round, problem.evenly(priors.coarse_smoothing**2 / 2), _l1, torch.float32)
+    is_open = torch.ones_like(problem.roots, dtype=torch.bool)
+    for number in range(max_steps):
+        typical = problem.typical(problem.sample(orientations))
+        step = problem.step(orientations, measure, prior, is_open)
+        orientations = _turned(orientations, step.turn)
+        is_open = is_open & (problem.mean(step.turn.norm(dim=0)) >= priors.coarse_settled * typical)
+        if not bool(is_open.any()):
+            return orientations, number + 1
+    return orientations, max(max_steps, 0)
+
+
+def _shaped(problem: _Problem, orientations: Tensor, prior: Tensor, max_steps: int) -> Tensor:
+    """ℓ½ steps that know the noise's shape and size, until they have converged."""
+    priors = problem.priors
+    noise = problem.round
+    variance = problem.variance_of_means()
+    dispersion = torch.ones_like(problem.roots, dtype=orientations.dtype)
+    dtype = torch.float32
+    is_open, is_held = (
+        torch.ones_like(problem.roots, dtype=torch.bool),
+        torch.zeros_like(problem.roots, dtype=torch.bool),
+    )
+    for _ in range(max_steps):
+        if not bool(is_held.all()):
+            sample = problem.sample(orientations)
+            is_noisy = problem.is_well_knit and bool((problem.typical(sample) > priors.coarse_noise).all())
+            dtype = torch.float32 if is_noisy else torch.float64
+        noise = problem.shapes.estimate(sample, orientations, noise, is_held)
+        measure = _Measure(noise, variance, _l_half, dtype)
+        if not bool(is_held.all()):
+            dispersion = torch.where(is_held, dispersion, problem.dispersion(sample, measure, prior))
+        step = problem.step(orientations, measure, prior, is_open)
+        variance = (dispersion[problem.component] / step.weight).clamp(min=priors.least_square / 2)
+        orientations = _turned(orientations, priors.relaxation * step.turn)
+        length = (step.decrement / (dispersion * problem.num_nodes)).sqrt()
+        is_held = is_held | (length < priors.held)
+        is_open = is_open & (length >= priors.converged)
+        is_open = is_open & (problem.largest(step.turn.norm(dim=0)) >= priors.converged_angle)
+        if not bool(is_open.any()):
+            break
+    return orientations
+
+
+class _Measure(NamedTuple):
+    """How residuals are measured and weighed.
+
+    Attributes:
+        shape: of the noise.
+        variance: ``(N,)`` of the nodes, in units of the shape; numerical floors apart.
+        weigh: expected squared residuals → robust weights.
+        dtype: how exactly residuals and systems are computed.
+    """
+
+    shape: NoiseShape
+    variance: Tensor
+    weigh: Callable[[Tensor], Tensor]
+    dtype: torch.dtype
+
+    def at_ends(self, dtype: torch.dtype) -> list[Tensor]:
+        """What is said of an edge at its source and at its target: six entries of the shape, variance; ``(7, N)``."""
+        ends = (self.shape.at_source, self.shape.at_target)
+        return [torch.cat((_distinct_entries(end), self.variance[None])).to(dtype) for end in ends]
 
 
 class _Step(NamedTuple):
-    """ρ(r), and how exactly a step is solved.
+    """One step.
 
     Attributes:
-        weigh: robust weights ρ'(r)/r from squared residuals.
-        smoothing: residuals below it count as this: radians, or standard deviations of the noise.
-        tolerance: of conjugate gradients, radians.
-        relative_tolerance: the same as a share of the step; the next step corrects what this one lacks.
+        turn: ``(3, N)`` radians, world's frame.
+        weight: ``(N,)`` of all edges of each node.
+        decrement: ``(C,)`` xᵀ L x.
     """
 
-    weigh: Callable[[Tensor], Tensor]
-    smoothing: float
-    tolerance: float
-    relative_tolerance: float
+    turn: Tensor
+    weight: Tensor
+    decrement: Tensor
+
+
+class _Problem:
+    """What stays the same from step to step, of a graph of C components."""
+
+    def __init__(self, graph: ViewGraph, structure: Structure, priors: RefinementPriors) -> None:
+        self.graph, self.priors = graph, priors
+        self.roots, self.component = structure.roots, structure.component
+        self.degree = structure.edges.degree
+        self.arrivals = Arrivals(structure.edges)
+        self.round = NoiseShape.round(graph.num_nodes, graph.device)
+        self.is_well_knit = 2 * graph.num_edges >= priors.well_knit_degree * graph.num_nodes
+        self.num_nodes = torch.bincount(self.component, minlength=len(self.roots))
+        of_edge = self.component[graph.source]
+        redundancy = torch.bincount(of_edge, minlength=len(self.roots)) - self.num_nodes + 1
+        self.shapes = ShapeEstimator(self.component, redundancy, priors.shape)
+        self._chosen = _evenly_spread(of_edge, len(self.roots), priors.max_sample)
+        self._some = graph.select_edges(self._chosen)
+        self._component_of_some = self.component[self._some.source]
+        self._count_of_some = torch.bincount(self._component_of_some, minlength=len(self.roots)).clamp(min=1)
+        self._measured = measured_rows(graph.target_from_source, torch.float32)
+
+    def mean(self, value: Tensor) -> Tensor:
+        """Means ``(C,)`` of the nodes' values ``(N,)``."""
+        return self.sum(value) / self.num_nodes
+
+    def sum(self, value: Tensor) -> Tensor:
+        """Sums ``(C,)`` of the nodes' values ``(N,)``."""
+        return value.new_zeros(len(self.roots)).index_add_(0, self.component, value)
+
+    def largest(self, value: Tensor) -> Tensor:
+        """Maxima ``(C,)`` of the nodes' values ``(N,)``, which are not negative."""
+        return value.new_zeros(len(self.roots)).scatter_reduce(0, self.component, value, "amax")
+
+    def evenly(self, value: float) -> Tensor:
+        """The value for every node, ``(N,)``."""
+        return torch.full((self.graph.num_nodes,), value, dtype=torch.float64, device=self.graph.device)
+
+    def variance_of_means(self) -> Tensor:
+        """Variances ``(N,)`` of nodes whose edges all weigh one: three axes of unit variance each over the degree."""
+        return 3 / self.degree.clamp(min=1).double()
+
+    def sample(self, orientations: Tensor) -> ResidualSample:
+        """Residuals of some edges."""
+        vector = EdgeResiduals(self._some, orientations).vectors(slice(0, self._some.num_edges))
+        return ResidualSample(vector, self._some.source, self._some.target)
+
+    def typical(self, sample: ResidualSample) -> Tensor:
+        """Geometric mean of some residuals' lengths in each component, ``(C,)`` rad."""
+        least = self.priors.least_residual
+        logarithm = (sample.vector * sample.vector).sum(dim=0).clamp(min=least**2).log() / 2
+        return torch.exp(self._sum_of_some(logarithm) / self._count_of_some)
+
+    def dispersion(self, sample: ResidualSample, measure: _Measure, prior: Tensor) -> Tensor:
+        """φ of each component, ``(C,)``, as some residuals have it."""
+        at_source, at_target = measure.at_ends(torch.float64)
+        both = at_source.index_select(1, sample.source) + at_target.index_select(1, sample.target)
+        square = (sample.vector * _times(both[:6], sample.vector)).sum(dim=0)
+        weight = measure.weigh(square + both[6]) * prior[self._chosen].clamp(min=self.priors.least_prior)
+        return self._sum_of_some(weight * weight * square) / self._sum_of_some(weight)
+
+    def _sum_of_some(self, value: Tensor) -> Tensor:
+        """Sums ``(C,)`` of some edges' values ``(K,)``."""
+        return value.new_zeros(len(self.roots)).index_add_(0, self._component_of_some, value)
+
+    def step(self, orientations: Tensor, measure: _Measure, prior: Tensor, is_open: Tensor) -> _Step:
+        """The least-squares step of the components ``(C,)`` that are open; the others' is zero."""
+        weight, force = self._weights_and_forces(orientations, measure, prior)
+        force *= is_open[self.component]
+        system = BlockLaplacian(self.arrivals, weight, measure.shape, self.component)
+        tolerances = self.priors.least_angle, self.priors.step_tolerance
+        turn, is_solved = force, False
+        if self.is_well_knit:
+            turn, is_solved = system.solve(force, system.diagonal_solve(), *tolerances)
+            self.is_well_knit = is_solved
+        if not is_solved:
+            approximate = factorised(self.graph, weight, measure.shape, self.roots)
+            turn, _ = system.solve(force, approximate, *tolerances)
+        decrement = (force * turn).sum(dim=0).double()
+        turn = (turn - turn[:, self.roots[self.component]]).double()
+        return _Step(turn, system.weight_sum.double(), self.sum(decrement))
+
+    def _weights_and_forces(self, orientations: Tensor, measure: _Measure, prior: Tensor) -> tuple[Tensor, Tensor]:
+        """Every edge's robust weight ``(M,)``, and the weighted residuals that pull at each node, summed ``(3, N)``."""
+        graph, dtype = self.graph, measure.dtype
+        measured = self._measured if dtype == self._measured.dtype else None
+        residuals = EdgeResiduals(graph, orientations.to(dtype), measured)
+        at_source, at_target = measure.at_ends(dtype)
+        least_prior = self.priors.least_prior
+        weight = torch.empty_like(prior, dtype=dtype)
+        parts = stretches(slices(graph.num_edges, SLICE_EDGES, graph.device))
+        # Components in rows: adding columns up by node is a dozen times as fast as adding up rows.
+        forces = [at_source.new_zeros(3, graph.num_nodes) for _ in parts]
+
+        def walk(part: int) -> None:
+            for edges in parts[part]:
+                source, target = graph.source[edges], graph.target[edges]
+                vector = residuals.vectors(edges)
+                both = at_source.index_select(1, source).add_(at_target.index_select(1, target))
+                pull = _times(both[:6], vector)
+                square = (vector * pull).sum(dim=0).add_(both[6])
+                robust = measure.weigh(square).mul_(prior[edges].clamp(min=least_prior))
+                weight[edges] = robust
+                pull *= robust
+                forces[part].index_add_(1, target, pull)
+                forces[part].index_add_(1, source, pull.neg_())  # with alpha = -1 it takes six times as long
+
+        for_each(walk, range(len(parts)))
+        return weight, torch.stack(forces).sum(dim=0)
 
 
 def _l1(square: Tensor) -> Tensor:
@@ -66,155 +306,9 @@ def _l_half(square: Tensor) -> Tensor:
     return (square * square.sqrt()).rsqrt_()
 
 
-_COARSE = _Step(_l1, np.radians(1.0), 1e-6, 1e-3)
-_SHAPED = _Step(_l_half, 0.1, 1e-6, 1e-3)
-
-
-def refine(
-    graph: ViewGraph,
-    body_from_world: Tensor,
-    roots: Tensor,
-    max_steps: int = MAX_STEPS,
-    *,
-    shaped_steps: int = _SHAPED_STEPS,
-    prior_weight: Tensor | None = None,
-    coarse_weight: Tensor | None = None,
-    component: Tensor | None = None,
-    edges: SortedEdges | None = None,
-) -> Tensor:
-    """At most ``max_steps`` reweighted least-squares steps; every component by itself.
-
-    Of few steps, all are shaped. CleanNet's scores belong into the coarse ones alone: after these, residuals know more.
-
-    Args:
-        body_from_world: ``(N, 4)`` start.
-        roots: ``(C,)`` a node of each connected component, in the components' order; they are held fixed.
-        shaped_steps: how many of them are shaped at most.
-        prior_weight: ``(M,)`` in [0, 1], multiplied to every robust weight; default 1.
-        coarse_weight: the same for the coarse steps only.
-        component: ``(N,)`` connected components; default: computed.
-        edges: the graph's edges sorted; default: computed.
-
-    Returns:
-        ``(N, 4)`` float64 orientations.
-    """
-    component = graph.components() if component is None else component
-    edges = SortedEdges.of(graph) if edges is None else edges
-    problem = _Problem(graph, roots, component, edges)
-    prior = torch.ones_like(graph.precision) if prior_weight is None else prior_weight
-    coarse_prior = prior if coarse_weight is None else prior * coarse_weight
-    orientations = body_from_world.double()
-    moving = torch.ones_like(roots, dtype=torch.bool)
-    for _ in range(max_steps - shaped_steps):
-        typical = problem.typical(problem.some_residuals(orientations))
-        orientations, turned = problem.step(orientations, problem.round, coarse_prior, _COARSE, moving, torch.float32)
-        moving = moving & (problem.mean(turned) >= _SETTLED * typical)
-        if not bool(moving.any()):
-            break
-    moving = torch.ones_like(moving)
-    shape = problem.round
-    for _ in range(min(max_steps, shaped_steps)):
-        residual = problem.some_residuals(orientations)
-        is_noisy = problem.is_well_knit and bool((problem.typical(residual) > _COARSE_NOISE).all())
-        dtype = torch.float32 if is_noisy else torch.float64
-        shape = problem.shape(residual, orientations, shape)
-        orientations, turned = problem.step(orientations, shape, prior, _SHAPED, moving, dtype)
-        moving = moving & (problem.largest(turned) >= _CONVERGED_STEP)
-        if not bool(moving.any()):
-            break
-    return orientations
-
-
-class _Problem:
-    """What stays the same from step to step, of a graph of C components."""
-
-    def __init__(self, graph: ViewGraph, roots: Tensor, component: Tensor, edges: SortedEdges) -> None:
-        self.graph, self.roots, self.component = graph, roots, component
-        self.arrivals = Arrivals(edges)
-        self.round = NoiseShape.round(graph.num_nodes, graph.device)
-        self.is_well_knit = 2 * graph.num_edges >= _WELL_KNIT_DEGREE * graph.num_nodes
-        self.num_nodes = torch.bincount(component, minlength=len(roots))
-        of_edge = component[graph.source]
-        self.redundancy = torch.bincount(of_edge, minlength=len(roots)) - self.num_nodes + 1
-        self.some = graph.select_edges(_evenly_spread(of_edge, len(roots)))
-        self.component_of_some = component[self.some.source]
-        self.count_of_some = torch.bincount(self.component_of_some, minlength=len(roots)).clamp(min=1)
-        self.measured = measured_rows(graph.target_from_source, torch.float32)
-
-    def mean(self, value: Tensor) -> Tensor:
-        """Means ``(C,)`` of the nodes' values ``(N,)``."""
-        return value.new_zeros(len(self.roots)).index_add_(0, self.component, value) / self.num_nodes
-
-    def largest(self, value: Tensor) -> Tensor:
-        """Maxima ``(C,)`` of the nodes' values ``(N,)``, which are not negative."""
-        return value.new_zeros(len(self.roots)).scatter_reduce(0, self.component, value, "amax")
-
-    def some_residuals(self, orientations: Tensor) -> Tensor:
-        """Rotation vectors ``(3, K)``."""
-        return EdgeResiduals(self.some, orientations).vectors(slice(0, self.some.num_edges))
-
-    def typical(self, residual: Tensor) -> Tensor:
-        """Geometric mean of some residuals' lengths in each component, ``(C,)`` rad."""
-        logarithm = (residual * residual).sum(dim=0).clamp(min=_MIN_RESIDUAL**2).log() / 2
-        total = logarithm.new_zeros(len(self.roots)).index_add_(0, self.component_of_some, logarithm)
-        return torch.exp(total / self.count_of_some)
-
-    def shape(self, residual: Tensor, orientations: Tensor, before: NoiseShape) -> NoiseShape:
-        """The noise's shape as some residuals have it."""
-        ends = self.some.source, self.some.target
-        return NoiseShape.estimate(residual.t(), *ends, orientations, self.component, self.redundancy, before)
-
-    def step(
-        self,
-        orientations: Tensor,
-        shape: NoiseShape,
-        prior: Tensor,
-        settings: _Step,
-        moving: Tensor,
-        dtype: torch.dtype,
-    ) -> tuple[Tensor, Tensor]:
-        """One step of the components ``(C,)`` that are ``moving``; orientations, and how far each node turned, rad."""
-        weight, force = self._weights_and_forces(orientations, shape, prior, settings, dtype)
-        force *= moving[self.component]
-        system = BlockLaplacian(self.arrivals, weight, shape, self.component)
-        tolerances = settings.tolerance, settings.relative_tolerance
-        step, is_solved = force, False
-        if self.is_well_knit:
-            step, is_solved = system.solve(force, system.diagonal_solve(), *tolerances)
-        if not is_solved:
-            approximate = factorised(self.graph, weight, shape, self.roots)
-            step, _ = system.solve(force, approximate, *tolerances)
-        step = (step - step[:, self.roots[self.component]]).t().double()
-        turned = rotations.normalize(rotations.multiply(orientations, rotations.exp(step)))
-        return turned, step.norm(dim=1)
-
-    def _weights_and_forces(
-        self, orientations: Tensor, shape: NoiseShape, prior: Tensor, settings: _Step, dtype: torch.dtype
-    ) -> tuple[Tensor, Tensor]:
-        """Every edge's robust weight ``(M,)``, and the weighted residuals that pull at each node, summed ``(3, N)``."""
-        graph = self.graph
-        measured = self.measured if dtype == self.measured.dtype else None
-        residuals = EdgeResiduals(graph, orientations.to(dtype), measured)
-        at_source, at_target = (_distinct_entries(end).to(dtype) for end in (shape.at_source, shape.at_target))
-        weight = torch.empty_like(prior, dtype=dtype)
-        parts = stretches(slices(graph.num_edges, SLICE_EDGES, graph.device))
-        # Components in rows: adding columns up by node is a dozen times as fast as adding up rows.
-        forces = [at_source.new_zeros(3, graph.num_nodes) for _ in parts]
-
-        def walk(part: int) -> None:
-            for edges in parts[part]:
-                source, target = graph.source[edges], graph.target[edges]
-                vector = residuals.vectors(edges)
-                pull = _times(at_source.index_select(1, source).add_(at_target.index_select(1, target)), vector)
-                square = (vector * pull).sum(dim=0).add_(settings.smoothing**2)
-                robust = settings.weigh(square).mul_(prior[edges].clamp(min=_MIN_PRIOR))
-                weight[edges] = robust
-                pull *= robust
-                forces[part].index_add_(1, target, pull)
-                forces[part].index_add_(1, source, pull.neg_())  # with alpha = -1 it takes six times as long
-
-        for_each(walk, range(len(parts)))
-        return weight, torch.stack(forces).sum(dim=0)
+def _turned(orientations: Tensor, turn: Tensor) -> Tensor:
+    """The orientations ``(N, 4)`` after turns of the world's frame ``(3, N)`` radians."""
+    return rotations.normalize(rotations.multiply(orientations, rotations.exp(turn.t())))
 
 
 def _distinct_entries(matrices: Tensor) -> Tensor:
@@ -233,13 +327,13 @@ def _times(entries: Tensor, vector: Tensor) -> Tensor:
     return product
 
 
-def _evenly_spread(group: Tensor, num_groups: int) -> Tensor:
-    """Indices of members, evenly spread, at most about :data:`_MAX_SAMPLE` of each group ``(M,)``."""
+def _evenly_spread(group: Tensor, num_groups: int, largest: int) -> Tensor:
+    """Indices of members, evenly spread, at most about ``largest`` of each group ``(M,)``."""
     if num_groups == 1:
-        return torch.arange(0, len(group), 1 + (len(group) - 1) // _MAX_SAMPLE, device=group.device)
+        return torch.arange(0, len(group), 1 + (len(group) - 1) // largest, device=group.device)
     order = group.sort(stable=True).indices
     count = torch.bincount(group, minlength=num_groups)
     ordered = group[order]
     rank = torch.arange(len(group), device=group.device) - (count.cumsum(0) - count)[ordered]
-    stride = (count + _MAX_SAMPLE - 1).div(_MAX_SAMPLE, rounding_mode="floor")[ordered]
+    stride = (count + largest - 1).div(largest, rounding_mode="floor")[ordered]
     return order[rank % stride == 0]
