@@ -73,9 +73,7 @@ class BlockLaplacian:
         self._component = component
         self._num_components = int(component.max()) + 1
         # (3, 3, N): what is said of an edge at the end that it comes from, and at the one where it arrives.
-        at_source, at_target = (
-            end.to(weight).permute(1, 2, 0).contiguous() for end in (shape.at_source, shape.at_target)
-        )
+        at_source, at_target = (end.to(weight).contiguous() for end in (shape.at_source, shape.at_target))
         self._far, self._near = (at_source, at_target), (at_target, at_source)
         one = weight.new_ones(1, arrivals.num_nodes)
         self._diagonal = torch.zeros_like(at_source)
@@ -154,7 +152,8 @@ class BlockLaplacian:
 
 def factorised(graph: ViewGraph, weight: Tensor, shape: NoiseShape, roots: Tensor) -> Preconditioner:
     """A preconditioner for graphs that are not well knit: the same Laplacian with round weights, factorised."""
-    trace = (shape.at_source[graph.source] + shape.at_target[graph.target]).diagonal(dim1=1, dim2=2).sum(dim=1)
+    at_source, at_target = (end.diagonal().sum(dim=1) for end in (shape.at_source, shape.at_target))
+    trace = at_source[graph.source] + at_target[graph.target]
     ends = graph.source.cpu().numpy(), graph.target.cpu().numpy()
     system = LaplacianSystem(graph.num_nodes, *ends, (weight * trace / 3).cpu().numpy(), roots.cpu().numpy())
     return lambda x: torch.from_numpy(system.solve(x.t().cpu().double().numpy())).t().to(x)

@@ -34,10 +34,10 @@ class ResidualSample(NamedTuple):
 
 @dataclass(frozen=True)
 class NoiseShape:
-    """Information matrices in the world's frame (N nodes): edge u→v has ``at_source[u] + at_target[v]``.
+    """Information matrices in the world's frame (N nodes): edge u→v has ``at_source[..., u] + at_target[..., v]``.
 
     Attributes:
-        at_source, at_target: ``(N, 3, 3)`` rad⁻², symmetric.
+        at_source, at_target: ``(3, 3, N)`` rad⁻², symmetric; a matrix's entries lie N apart, for sums over the nodes.
         scatter: covariances in the cameras' frames at either end, ``(C, 3, 3)`` rad²; None: nothing was estimated.
     """
 
@@ -48,7 +48,7 @@ class NoiseShape:
     @classmethod
     def round(cls, num_nodes: int, device: torch.device) -> NoiseShape:
         """Every edge has the unit matrix."""
-        half = torch.eye(3, dtype=torch.float64, device=device).expand(num_nodes, 3, 3) / 2
+        half = torch.eye(3, dtype=torch.float64, device=device)[:, :, None].expand(3, 3, num_nodes) / 2
         return cls(half, half)
 
 
@@ -73,30 +73,36 @@ class ShapeEstimator:
             before: what was estimated a step ago.
             is_held: ``(C,)`` components that keep in their cameras' frames what was estimated a step ago.
         """
+        matrix = rotations.to_matrix(body_from_world).permute(1, 2, 0).contiguous()
         if before.scatter is not None and bool(is_held.all()):
-            return self._placed(before.scatter, body_from_world)
-        matrix = rotations.to_matrix(body_from_world)
+            return self._placed(before.scatter, matrix)
         ends, starts = (sample.source, sample.target), before.scatter or (None, None)
         scatters = [matrix] * 2
 
         def estimate(number: int) -> None:
             end, start = ends[number], starts[number]
-            in_camera = (matrix[end] @ sample.vector.t()[:, :, None]).squeeze(-1)
+            at_end = matrix.flatten(0, 1).index_select(1, end).view(3, 3, -1)
+            in_camera = (at_end * sample.vector).sum(dim=1)
             found = scatter(in_camera, self._component[end], len(self._redundancy), start, self._priors)
             scatters[number] = found if start is None else torch.where(is_held[:, None, None], start, found)
 
         for_each(estimate, (0, 1), threads_on(matrix.device))
-        return self._placed((scatters[0], scatters[1]), body_from_world)
+        return self._placed((scatters[0], scatters[1]), matrix)
 
-    def _placed(self, scatters: tuple[Tensor, Tensor], body_from_world: Tensor) -> NoiseShape:
-        """Covariances in the cameras' frames → information in the world's."""
-        matrix = rotations.to_matrix(body_from_world)
+    def _placed(self, scatters: tuple[Tensor, Tensor], matrix: Tensor) -> NoiseShape:
+        """Covariances in the cameras' frames → information in the world's, given body_from_world ``(3, 3, N)``."""
         at_ends = []
         for covariance in scatters:
             supported = _as_far_as_supported(covariance, self._redundancy, self._priors)
-            information = torch.linalg.inv_ex(supported).inverse[self._component] / 2
-            at_ends.append(matrix.transpose(1, 2) @ information @ matrix)
+            information = torch.linalg.inv_ex(supported).inverse.permute(1, 2, 0) / 2
+            if len(supported) > 1:
+                information = information[:, :, self._component]
+            turned = (information[:, :, None] * matrix).sum(dim=1)
+            at_ends.append((matrix[:, :, None] * turned[:, None]).sum(dim=0))
         return NoiseShape(at_ends[0], at_ends[1], scatters)
+
+
+_PRIORS = NoiseShapePriors()
 
 
 def scatter(
@@ -104,34 +110,35 @@ def scatter(
     group: Tensor,
     num_groups: int,
     start: Tensor | None = None,
-    priors: NoiseShapePriors = NoiseShapePriors(),
+    priors: NoiseShapePriors = _PRIORS,
 ) -> Tensor:
-    """Robust covariance ``(G, 3, 3)`` about zero of the vectors ``(K, 3)`` of each group ``(K,)``, up to its scale.
+    """Robust covariance ``(G, 3, 3)`` about zero of the vectors ``(3, K)`` of each group ``(K,)``, up to its scale.
 
     The maximum likelihood estimate for Student's t with one degree of freedom (Kent & Tyler 1991), sought from
     ``start``, an estimate from much the same vectors.
     """
-    rows = vectors.t().contiguous()
     count = torch.bincount(group, minlength=num_groups).clamp(min=1)[:, None, None]
     unit = torch.eye(3, dtype=vectors.dtype, device=vectors.device)
 
     def second_moment(weight: Tensor) -> Tensor:
         if num_groups == 1:  # a matrix product adds up many times as fast
-            total = ((weight * rows) @ rows.t()).flatten()[:, None]
+            total = ((weight * vectors) @ vectors.t()).flatten()[:, None]
         else:
-            products = ((weight * rows)[:, None] * rows[None]).flatten(0, 1)
+            products = ((weight * vectors)[:, None] * vectors[None]).flatten(0, 1)
             total = products.new_zeros(9, num_groups).index_add_(1, group, products)
         moment: Tensor = priors.least_deviation**2 * unit + total.t().reshape(-1, 3, 3) / count
         return moment
 
     def squared_lengths(covariance: Tensor) -> Tensor:
         inverse = torch.linalg.inv_ex(covariance).inverse
-        turned = inverse[0] @ rows if num_groups == 1 else (inverse.permute(1, 2, 0)[:, :, group] * rows).sum(dim=1)
-        squares: Tensor = (rows * turned).sum(dim=0)
+        turned = (
+            inverse[0] @ vectors if num_groups == 1 else (inverse.permute(1, 2, 0)[:, :, group] * vectors).sum(dim=1)
+        )
+        squares: Tensor = (vectors * turned).sum(dim=0)
         return squares
 
     if start is None:
-        mean_square = second_moment(torch.ones_like(rows[0])).diagonal(dim1=1, dim2=2).mean(dim=1)
+        mean_square = second_moment(torch.ones_like(vectors[0])).diagonal(dim1=1, dim2=2).mean(dim=1)
         covariance, iterations = mean_square[:, None, None] * unit, priors.iterations
     else:
         covariance, iterations = start, priors.further_iterations

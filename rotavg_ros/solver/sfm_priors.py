@@ -40,6 +40,7 @@ class RefinementPriors:
         coarse_smoothing: radians: shorter residuals weigh as this one in coarse steps.
         coarse_settled: coarse steps end once they turn cameras by less than this share of the typical residual.
         relaxation: how many times its length a shaped step is taken; any factor below 2 lowers the cost.
+        stretched: standard errors: of steps shorter than this.
         held: standard errors: the noise is not estimated again after a shaped step of less than this.
         converged: standard errors: a shaped step of less than this is the last.
         converged_angle: radians: so is a step that turns no camera by more.
@@ -59,10 +60,11 @@ class RefinementPriors:
     coarse_smoothing: float = float(np.radians(1.0))
     coarse_settled: float = 0.2
     relaxation: float = 1.5
+    stretched: float = 1.0
     held: float = 0.3
-    converged: float = 0.03
+    converged: float = 0.05
     converged_angle: float = float(np.radians(0.001))
-    step_tolerance: float = 0.01
+    step_tolerance: float = 0.03
     least_angle: float = 1e-6
     least_square: float = 1e-6
     least_prior: float = 1e-6

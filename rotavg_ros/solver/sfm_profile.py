@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from rotavg_ros.solver import refinement, sfm_refinement, sfm_stages
+from rotavg_ros.solver import refinement, sfm_refinement, sfm_stages, sfm_step
 from rotavg_ros.solver.methods import Method
 from rotavg_ros.solver.profile import Estimate, Networks, Stopwatch
 from rotavg_ros.solver.tuning import tune
@@ -53,7 +53,7 @@ def solve_sfm(
             allowed = (graph.label != EdgeLabel.REJECTED).double()
             weight = 1 - cleaned.outlier_probability if method.weighted else allowed
             if method.shaped:
-                structure = sfm_refinement.Structure(component, roots, cleaned.edges)
+                structure = sfm_step.Structure(component, roots, cleaned.edges)
                 weights = sfm_refinement.EdgeWeights(allowed, allowed * weight)
                 orientations = sfm_refinement.refine(graph, orientations, steps, structure=structure, weights=weights)
             else:
