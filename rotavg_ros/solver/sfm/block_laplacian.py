@@ -62,6 +62,9 @@ class BlockLaplacian:
         weight: ``(M,)`` positive.
         shape: what the ends say, S and T.
         component: ``(N,)``; each of the C components is solved by itself.
+
+    Attributes:
+        weight_sum: ``(N,)`` the weights of each node's edges, added up.
     """
 
     def __init__(self, arrivals: Arrivals, weight: Tensor, shape: NoiseShape, component: Tensor) -> None:
@@ -70,15 +73,15 @@ class BlockLaplacian:
         self._component = component
         self._num_components = int(component.max()) + 1
         # (3, 3, N): what is said of an edge at the end that it comes from, and at the one where it arrives.
-        at_source, at_target = (
-            end.to(weight).permute(1, 2, 0).contiguous() for end in (shape.at_source, shape.at_target)
-        )
+        at_source, at_target = (end.to(weight).contiguous() for end in (shape.at_source, shape.at_target))
         self._far, self._near = (at_source, at_target), (at_target, at_source)
         one = weight.new_ones(1, arrivals.num_nodes)
         self._diagonal = torch.zeros_like(at_source)
+        self.weight_sum = weight.new_zeros(arrivals.num_nodes)
         for matrix, near, far in zip(self._matrices, self._near, self._far, strict=True):
             arriving = _arriving(matrix, torch.cat((far.flatten(0, 1), one)))
             self._diagonal += arriving[:9].view_as(far) + arriving[9] * near
+            self.weight_sum += arriving[9]
 
     def product(self, x: Tensor) -> Tensor:
         """``L x`` ``(3, N)``."""
@@ -149,7 +152,8 @@ class BlockLaplacian:
 
 def factorised(graph: ViewGraph, weight: Tensor, shape: NoiseShape, roots: Tensor) -> Preconditioner:
     """A preconditioner for graphs that are not well knit: the same Laplacian with round weights, factorised."""
-    trace = (shape.at_source[graph.source] + shape.at_target[graph.target]).diagonal(dim1=1, dim2=2).sum(dim=1)
+    at_source, at_target = (end.diagonal().sum(dim=1) for end in (shape.at_source, shape.at_target))
+    trace = at_source[graph.source] + at_target[graph.target]
     ends = graph.source.cpu().numpy(), graph.target.cpu().numpy()
     system = LaplacianSystem(graph.num_nodes, *ends, (weight * trace / 3).cpu().numpy(), roots.cpu().numpy())
     return lambda x: torch.from_numpy(system.solve(x.t().cpu().double().numpy())).t().to(x)

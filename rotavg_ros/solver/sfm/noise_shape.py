@@ -9,30 +9,36 @@ belong to either end's frame, so each end has a shape of its own; that of the wr
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.threads import for_each, threads_on
+from rotavg_ros.solver.sfm.priors import NoiseShapePriors
 
-# From nothing, and from what the last step's residuals said.
-_ITERATIONS, _FURTHER_ITERATIONS = 10, 3
-# No axis is believed to be more exact than this share of the worst; none is more exact than this angle.
-_MIN_RATIO = 0.1
-_MIN_SCALE = np.radians(1e-4)
-# The shape of so many further residuals is taken to be round: what few residuals say is chance.
-_ROUND_RESIDUALS = 20
+
+class ResidualSample(NamedTuple):
+    """Residuals of some edges, K of them.
+
+    Attributes:
+        vector: ``(3, K)`` rotation vectors in the world's frame, radians.
+        source, target: ``(K,)`` the edges' ends.
+    """
+
+    vector: Tensor
+    source: Tensor
+    target: Tensor
 
 
 @dataclass(frozen=True)
 class NoiseShape:
-    """Information matrices in the world's frame (N nodes): edge u→v has ``at_source[u] + at_target[v]``.
+    """Information matrices in the world's frame (N nodes): edge u→v has ``at_source[..., u] + at_target[..., v]``.
 
     Attributes:
-        at_source, at_target: ``(N, 3, 3)`` rad⁻², symmetric.
-        scatter: what they were estimated as in the cameras' frames, ``(C, 3, 3)`` at either end; None: nothing was.
+        at_source, at_target: ``(3, 3, N)`` rad⁻², symmetric; a matrix's entries lie N apart, for sums over the nodes.
+        scatter: covariances in the cameras' frames at either end, ``(C, 3, 3)`` rad²; None: nothing was estimated.
     """
 
     at_source: Tensor
@@ -42,87 +48,110 @@ class NoiseShape:
     @classmethod
     def round(cls, num_nodes: int, device: torch.device) -> NoiseShape:
         """Every edge has the unit matrix."""
-        half = torch.eye(3, dtype=torch.float64, device=device).expand(num_nodes, 3, 3) / 2
+        half = torch.eye(3, dtype=torch.float64, device=device)[:, :, None].expand(3, 3, num_nodes) / 2
         return cls(half, half)
 
-    @classmethod
+
+class ShapeEstimator:
+    """Estimates noise shapes of the C components of a graph.
+
+    Args:
+        component: ``(N,)``.
+        redundancy: ``(C,)`` how many edges each component has beyond a spanning tree.
+    """
+
+    def __init__(self, component: Tensor, redundancy: Tensor, priors: NoiseShapePriors) -> None:
+        self._component, self._redundancy, self._priors = component, redundancy, priors
+
     def estimate(
-        cls,
-        residual: Tensor,
-        source: Tensor,
-        target: Tensor,
-        body_from_world: Tensor,
-        component: Tensor,
-        redundancy: Tensor,
-        before: NoiseShape | None = None,
+        self, sample: ResidualSample, body_from_world: Tensor, before: NoiseShape, is_held: Tensor
     ) -> NoiseShape:
-        """From the residuals at given orientations, every component for itself.
+        """The shape that the residuals at given orientations have, every component for itself.
 
         Args:
-            residual: ``(K, 3)`` rotation vectors of some edges in the world's frame, radians.
-            source, target: ``(K,)`` ends of these edges.
             body_from_world: ``(N, 4)``.
-            component: ``(N,)``.
-            redundancy: ``(C,)`` how many edges each component has beyond a spanning tree.
             before: what was estimated a step ago.
+            is_held: ``(C,)`` components that keep in their cameras' frames what was estimated a step ago.
         """
-        matrix = rotations.to_matrix(body_from_world)
-        starts = (None, None) if before is None or before.scatter is None else before.scatter
-        ends = (source, target)
-        shapes, scatters = [matrix] * 2, [matrix] * 2
+        matrix = rotations.to_matrix(body_from_world).permute(1, 2, 0).contiguous()
+        if before.scatter is not None and bool(is_held.all()):
+            return self._placed(before.scatter, matrix)
+        ends, starts = (sample.source, sample.target), before.scatter or (None, None)
+        scatters = [matrix] * 2
 
         def estimate(number: int) -> None:
-            end = ends[number]
-            in_camera = (matrix[end] @ residual[:, :, None]).squeeze(-1)
-            scatters[number] = scatter(in_camera, component[end], len(redundancy), starts[number])
-            covariance = _as_far_as_supported(scatters[number], redundancy)
-            information = torch.linalg.inv_ex(covariance).inverse[component] / 2
-            shapes[number] = matrix.transpose(1, 2) @ information @ matrix
+            end, start = ends[number], starts[number]
+            at_end = matrix.flatten(0, 1).index_select(1, end).view(3, 3, -1)
+            in_camera = (at_end * sample.vector).sum(dim=1)
+            found = scatter(in_camera, self._component[end], len(self._redundancy), start, self._priors)
+            scatters[number] = found if start is None else torch.where(is_held[:, None, None], start, found)
 
-        for_each(estimate, (0, 1), threads_on(residual.device))
-        return cls(shapes[0], shapes[1], (scatters[0], scatters[1]))
+        for_each(estimate, (0, 1), threads_on(matrix.device))
+        return self._placed((scatters[0], scatters[1]), matrix)
+
+    def _placed(self, scatters: tuple[Tensor, Tensor], matrix: Tensor) -> NoiseShape:
+        """Covariances in the cameras' frames → information in the world's, given body_from_world ``(3, 3, N)``."""
+        at_ends = []
+        for covariance in scatters:
+            supported = _as_far_as_supported(covariance, self._redundancy, self._priors)
+            information = torch.linalg.inv_ex(supported).inverse.permute(1, 2, 0) / 2
+            if len(supported) > 1:
+                information = information[:, :, self._component]
+            turned = (information[:, :, None] * matrix).sum(dim=1)
+            at_ends.append((matrix[:, :, None] * turned[:, None]).sum(dim=0))
+        return NoiseShape(at_ends[0], at_ends[1], scatters)
 
 
-def scatter(vectors: Tensor, group: Tensor, num_groups: int, start: Tensor | None = None) -> Tensor:
-    """Robust covariance ``(G, 3, 3)`` about zero of the vectors ``(K, 3)`` of each group ``(K,)``, up to its scale.
+_PRIORS = NoiseShapePriors()
+
+
+def scatter(
+    vectors: Tensor,
+    group: Tensor,
+    num_groups: int,
+    start: Tensor | None = None,
+    priors: NoiseShapePriors = _PRIORS,
+) -> Tensor:
+    """Robust covariance ``(G, 3, 3)`` about zero of the vectors ``(3, K)`` of each group ``(K,)``, up to its scale.
 
     The maximum likelihood estimate for Student's t with one degree of freedom (Kent & Tyler 1991), sought from
     ``start``, an estimate from much the same vectors.
     """
-    rows = vectors.t().contiguous()
     count = torch.bincount(group, minlength=num_groups).clamp(min=1)[:, None, None]
     unit = torch.eye(3, dtype=vectors.dtype, device=vectors.device)
 
     def second_moment(weight: Tensor) -> Tensor:
         if num_groups == 1:  # a matrix product adds up many times as fast
-            total = ((weight * rows) @ rows.t()).flatten()[:, None]
+            total = ((weight * vectors) @ vectors.t()).flatten()[:, None]
         else:
-            products = ((weight * rows)[:, None] * rows[None]).flatten(0, 1)
+            products = ((weight * vectors)[:, None] * vectors[None]).flatten(0, 1)
             total = products.new_zeros(9, num_groups).index_add_(1, group, products)
-        moment: Tensor = _MIN_SCALE**2 * unit + total.t().reshape(-1, 3, 3) / count
+        moment: Tensor = priors.least_deviation**2 * unit + total.t().reshape(-1, 3, 3) / count
         return moment
 
     def squared_lengths(covariance: Tensor) -> Tensor:
         inverse = torch.linalg.inv_ex(covariance).inverse
-        turned = inverse[0] @ rows if num_groups == 1 else (inverse.permute(1, 2, 0)[:, :, group] * rows).sum(dim=1)
-        squares: Tensor = (rows * turned).sum(dim=0)
+        turned = (
+            inverse[0] @ vectors if num_groups == 1 else (inverse.permute(1, 2, 0)[:, :, group] * vectors).sum(dim=1)
+        )
+        squares: Tensor = (vectors * turned).sum(dim=0)
         return squares
 
     if start is None:
-        mean_square = second_moment(torch.ones_like(rows[0])).diagonal(dim1=1, dim2=2).mean(dim=1)
-        covariance, iterations = mean_square[:, None, None] * unit, _ITERATIONS
+        mean_square = second_moment(torch.ones_like(vectors[0])).diagonal(dim1=1, dim2=2).mean(dim=1)
+        covariance, iterations = mean_square[:, None, None] * unit, priors.iterations
     else:
-        covariance, iterations = start, _FURTHER_ITERATIONS
+        covariance, iterations = start, priors.further_iterations
     for _ in range(iterations):
         covariance = second_moment(4 / (1 + squared_lengths(covariance)))
     return covariance
 
 
-def _as_far_as_supported(covariance: Tensor, redundancy: Tensor) -> Tensor:
+def _as_far_as_supported(covariance: Tensor, redundancy: Tensor, priors: NoiseShapePriors) -> Tensor:
     """The covariances ``(G, 3, 3)``, rounder the fewer residuals ``(G,)`` speak for them, and not too flat."""
     unit = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
     mean_variance = covariance.diagonal(dim1=1, dim2=2).mean(dim=1)
-    support = (redundancy / (redundancy + _ROUND_RESIDUALS))[:, None, None]
+    support = (redundancy / (redundancy + priors.round_residuals))[:, None, None]
     variance, axes = torch.linalg.eigh(support * covariance + (1 - support) * mean_variance[:, None, None] * unit)
-    bounded = torch.maximum(variance, _MIN_RATIO**2 * variance[:, -1:])
+    bounded = torch.maximum(variance, priors.least_ratio**2 * variance[:, -1:])
     return torch.matmul(axes, bounded[:, :, None] * axes.transpose(1, 2))

@@ -14,7 +14,7 @@ class SfmStages:
         fine_tunings: how often FineNet corrects the orientations.
         refine: refinement ends the solve.
         weighted: refinement begins by weighing the edges by CleanNet's scores.
-        shaped: refinement ends in steps that know the noise's shape; otherwise it is Chatterjee & Govindu's.
+        shaped: the refinement estimates the noise's shape; otherwise noise is taken to be round.
     """
 
     clean: bool = True

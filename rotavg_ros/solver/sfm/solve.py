@@ -13,8 +13,9 @@ from rotavg_ros.solver.neurora.scores import residual_score
 from rotavg_ros.solver.neurora.stages import apply_labels, clean, fine_tune, trust_all
 from rotavg_ros.solver.neurora.tiled.tuning import tune
 from rotavg_ros.solver.neurora.tree import bootstrap
-from rotavg_ros.solver.sfm import refinement, round_refinement
 from rotavg_ros.solver.sfm.options import SfmStages
+from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
+from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # A graph of more edges is worth measuring what tiles this machine likes.
@@ -40,27 +41,17 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     for _ in range(stages.fine_tunings):
         with watch.stage("fine-tune"):
             orientations = fine_tune(networks.load(FineNet), cleaned, orientations, component)
-    default_steps = refinement.MAX_STEPS if stages.shaped else round_refinement.DEFAULT_STEPS
-    steps = (default_steps if stages.refine else 0) if run.refinement_steps is None else run.refinement_steps
+    steps = run.refinement_steps
+    if steps is None:
+        steps = PRIORS.max_steps if stages.refine else 0
     if steps > 0:
         with watch.stage("refine"):
             allowed = (graph.label != EdgeLabel.REJECTED).double()
-            weight = 1 - cleaned.outlier_probability if stages.weighted else allowed
-            if stages.shaped:
-                orientations = refinement.refine(
-                    graph,
-                    orientations,
-                    roots,
-                    steps,
-                    prior_weight=allowed,
-                    coarse_weight=weight,
-                    component=component,
-                    edges=cleaned.edges,
-                )
-            else:
-                orientations = round_refinement.refine(
-                    graph, orientations, weight, roots, steps, component=component, edges=cleaned.edges
-                )
+            coarse = 1 - cleaned.outlier_probability if stages.weighted else torch.ones_like(allowed)
+            structure = Structure(component, roots, cleaned.edges)
+            weights = EdgeWeights(allowed, allowed * coarse)
+            priors = PRIORS if stages.shaped else ROUND
+            orientations = refine(graph, orientations, steps, structure=structure, weights=weights, priors=priors)
     fits = steps > 0 or stages.fine_tunings > 0
     # Where there is but a tree, CleanNet's own score; else a residual is the noise but for the orientations' error.
     probability = cleaned.outlier_probability.double()

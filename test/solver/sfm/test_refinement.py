@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros import ViewGraph, rotations, solve
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe
-from rotavg_ros.metrics.orientations import orientation_errors
+from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
-from rotavg_ros.solver.sfm import refinement as sfm_refinement
-from rotavg_ros.solver.sfm import round_refinement as refinement
+from rotavg_ros.solver.sfm import refinement
 from rotavg_ros.solver.sfm.block_laplacian import Arrivals, BlockLaplacian, factorised
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape, scatter
 from rotavg_ros.view_graph import EdgeLabel
@@ -57,11 +56,12 @@ def test_block_systems_are_numpys_least_squares(is_factorised: bool) -> None:
     rng = np.random.default_rng(2)
     weight = torch.from_numpy(rng.uniform(0.1, 10, graph.num_edges))
     factors = rng.standard_normal((2, 41, 3, 3))
-    shape = NoiseShape(*(torch.from_numpy(f @ f.transpose(0, 2, 1) + 0.1 * np.eye(3)) for f in factors))
+    at_ends = [torch.from_numpy(f @ f.transpose(0, 2, 1) + 0.1 * np.eye(3)).permute(1, 2, 0) for f in factors]
+    shape = NoiseShape(*at_ends)
     dense = np.zeros((41, 3, 41, 3))
     for edge in range(graph.num_edges):
         u, v = int(graph.source[edge]), int(graph.target[edge])
-        block = float(weight[edge]) * (shape.at_source[u] + shape.at_target[v]).numpy()
+        block = float(weight[edge]) * (shape.at_source[..., u] + shape.at_target[..., v]).numpy()
         for row, column, sign in ((u, u, 1), (v, v, 1), (u, v, -1), (v, u, -1)):
             dense[row, :, column] += sign * block
     system = BlockLaplacian(Arrivals(SortedEdges.of(graph)), weight, shape, graph.components())
@@ -84,7 +84,7 @@ def test_scatter_finds_each_groups_shape_among_outliers() -> None:
     vectors = np.einsum("kij,kj->ki", np.linalg.cholesky(covariance)[group], rng.standard_normal((len(group), 3)))
     wrong = rng.random(len(group)) < 0.1
     vectors[wrong] = Rotation.random(int(wrong.sum()), rng).as_rotvec()
-    found = scatter(torch.from_numpy(vectors), group, 3).numpy()
+    found = scatter(torch.from_numpy(vectors.T.copy()), group, 3).numpy()
     for number in range(2):
         expected = covariance[number] / np.trace(covariance[number])
         np.testing.assert_allclose(found[number] / np.trace(found[number]), expected, atol=0.05)
@@ -94,16 +94,16 @@ def test_scatter_finds_each_groups_shape_among_outliers() -> None:
 def test_noise_that_is_exact_about_one_axis_is_made_use_of() -> None:
     graph, truth = _crowd(3)
     start = as_quaternions(Rotation.from_rotvec(0.1 * np.random.default_rng(0).standard_normal((80, 3))) * truth)
-    shaped = sfm_refinement.refine(graph, start, _roots(graph))
-    round_noise = refinement.refine(graph, start, None, _roots(graph), 20)
+    shaped = refinement.refine(graph, start)
+    round_noise = refinement.refine(graph, start, priors=refinement.ROUND)
     assert _mean_error_deg(shaped, truth) < 0.6 * _mean_error_deg(round_noise, truth)
 
 
 def test_round_noise_costs_nothing() -> None:
     graph, truth = _crowd(4, sd_deg=(6, 6, 6))
     start = as_quaternions(truth)
-    shaped = sfm_refinement.refine(graph, start, _roots(graph))
-    round_noise = refinement.refine(graph, start, None, _roots(graph), 20)
+    shaped = refinement.refine(graph, start)
+    round_noise = refinement.refine(graph, start, priors=refinement.ROUND)
     assert _mean_error_deg(shaped, truth) < 1.05 * _mean_error_deg(round_noise, truth)
 
 
@@ -111,14 +111,14 @@ def test_exact_measurements_give_exact_orientations() -> None:
     """Although a tenth of the edges is wrong."""
     graph, truth = _crowd(9, sd_deg=(0, 0, 0))
     start = as_quaternions(Rotation.from_rotvec(0.05 * np.random.default_rng(0).standard_normal((80, 3))) * truth)
-    assert _mean_error_deg(sfm_refinement.refine(graph, start, _roots(graph)), truth) < 1e-4
+    assert _mean_error_deg(refinement.refine(graph, start), truth) < 1e-4
 
 
 def test_a_bad_start_takes_more_coarse_steps() -> None:
     graph, truth = _crowd(5)
     lost = Rotation.from_rotvec(0.7 * np.random.default_rng(1).standard_normal((80, 3)))
-    near = sfm_refinement.refine(graph, as_quaternions(truth), _roots(graph))
-    far = sfm_refinement.refine(graph, as_quaternions(lost * truth), _roots(graph))
+    near = refinement.refine(graph, as_quaternions(truth))
+    far = refinement.refine(graph, as_quaternions(lost * truth))
     assert _mean_error_deg(far, truth) < 1.25 * _mean_error_deg(near, truth)
 
 
@@ -126,7 +126,7 @@ def test_directions_and_order_of_edges_do_not_matter() -> None:
     graph, truth = _crowd(6)
     rng = np.random.default_rng(0)
     start = as_quaternions(Rotation.from_rotvec(0.05 * rng.standard_normal((80, 3))) * truth)
-    expected = sfm_refinement.refine(graph, start, _roots(graph))
+    expected = refinement.refine(graph, start)
     backwards = replace(
         graph,
         source=graph.target,
@@ -134,14 +134,14 @@ def test_directions_and_order_of_edges_do_not_matter() -> None:
         target_from_source=rotations.inverse(graph.target_from_source),
     )
     shuffled = backwards.select_edges(torch.from_numpy(rng.permutation(graph.num_edges)))
-    assert float(rotations.angle_between(sfm_refinement.refine(shuffled, start, _roots(graph)), expected).max()) < 1e-4
+    assert float(rotations.angle_between(refinement.refine(shuffled, start), expected).max()) < 1e-4
 
 
 def test_components_are_refined_as_if_alone() -> None:
     graphs = [_crowd(7, 60)[0], _crowd(8, 40, (1, 1, 0.2))[0]]
     starts = [as_quaternions(_crowd(7, 60)[1]), rotations.random(40, generator=torch.Generator().manual_seed(0))]
-    together = sfm_refinement.refine(_side_by_side(*graphs), torch.cat(starts), torch.tensor([0, 60]))
-    alone = [sfm_refinement.refine(graph, start, _roots(graph)) for graph, start in zip(graphs, starts, strict=True)]
+    together = refinement.refine(_side_by_side(*graphs), torch.cat(starts))
+    alone = [refinement.refine(graph, start) for graph, start in zip(graphs, starts, strict=True)]
     assert float(rotations.angle_between(together, torch.cat(alone)).max()) < 1e-6
 
 
@@ -152,7 +152,7 @@ def test_a_street_takes_a_factorisation() -> None:
     source = np.repeat(np.arange(598), 2)
     graph = measured(truth, source, source + np.tile([1, 2], 598))
     turned = Rotation.from_rotvec(0.02 * rng.standard_normal((600, 3))) * truth
-    refined = sfm_refinement.refine(graph, as_quaternions(turned), _roots(graph))
+    refined = refinement.refine(graph, as_quaternions(turned))
     assert _mean_error_deg(refined, truth) < 0.01
 
 
@@ -165,3 +165,87 @@ def test_rejected_edges_have_no_say() -> None:
     without = solve(sample.graph.select_edges(~sample.is_outlier), profile="sfm")
     errors = [_mean_error_deg(x.body_from_world, Rotation.from_quat(sample.body_from_world)) for x in (told, without)]
     assert errors[0] < 1.2 * errors[1]
+
+
+def _scan(seed: int) -> tuple[ViewGraph, torch.Tensor]:
+    """A graph of the paper's recipe, and its true orientations."""
+    sample = PaperRecipe(cameras=(120, 120), noise_deg=(10, 10), outlier_share=(0.2, 0.2)).sample(
+        np.random.default_rng(seed)
+    )
+    return sample.graph, sample.body_from_world
+
+
+def _root_mean_square_deg(angles: torch.Tensor) -> float:
+    return float(torch.rad2deg(angles).square().mean().sqrt())
+
+
+def _disturbed(truth: torch.Tensor, sd_deg: float, seed: int) -> torch.Tensor:
+    noise = np.radians(sd_deg) * np.random.default_rng(seed).standard_normal((len(truth), 3))
+    return rotations.multiply(truth, rotations.exp(torch.from_numpy(noise)))
+
+
+@pytest.mark.parametrize("seed", [10, 11, 12])
+def test_what_lies_ahead_of_the_last_step_is_little(seed: int) -> None:
+    """A tenth of the error; three shaped steps used to leave a third."""
+    graph, truth = _scan(seed)
+    start = _disturbed(truth, 5, seed)
+    refined = refinement.refine(graph, start)
+    tight = replace(refinement.PRIORS, converged=1e-3, converged_angle=1e-9)
+    limit = refinement.refine(graph, start, 300, priors=tight)
+    ahead, error = orientation_errors(refined, limit), orientation_errors(limit, truth)
+    assert _root_mean_square_deg(ahead) < 0.2 * _root_mean_square_deg(error)
+    too_early = refinement.refine(graph, start, 4)
+    assert _root_mean_square_deg(orientation_errors(too_early, limit)) > 1.5 * _root_mean_square_deg(ahead)
+
+
+def test_steps_are_bounded_and_more_than_needed_are_not_taken() -> None:
+    graph, truth = _scan(13)
+    start = _disturbed(truth, 5, 13)
+    assert torch.equal(refinement.refine(graph, start, 0), start)
+    answers = [refinement.refine(graph, start, steps) for steps in (1, 2, 3, 60, 120)]
+    for number in range(3):
+        assert float(rotations.angle_between(answers[number], answers[number + 1]).max()) > 1e-4
+    assert torch.equal(answers[3], answers[4])
+
+
+def test_neither_the_worlds_nor_the_cameras_frame_matters() -> None:
+    """The cameras' frames: rel → A rel A⁻¹ and R → A R; the world's: R → R G."""
+    graph, truth = _scan(14)
+    start = _disturbed(truth, 5, 14)
+    expected = refinement.refine(graph, start)
+    axes, gauge = rotations.random(2, generator=torch.Generator().manual_seed(0))
+    turned = rotations.multiply(rotations.multiply(axes, graph.target_from_source), rotations.inverse(axes))
+    found = refinement.refine(
+        replace(graph, target_from_source=turned), rotations.multiply(rotations.multiply(axes, start), gauge)
+    )
+    back = rotations.multiply(rotations.multiply(rotations.inverse(axes), found), rotations.inverse(gauge))
+    assert float(rotations.angle_between(back, expected).max()) < 1e-4
+
+
+def test_the_networks_liking_for_a_frame_is_gone_in_the_end() -> None:
+    """They know the axes of their generators' noise, and start far off in another frame."""
+    graph, truth = _scan(15)
+    quarter = rotations.exp(torch.tensor([[0.0, 0.0, np.pi / 2]], dtype=torch.float64))
+    turned = rotations.multiply(rotations.multiply(quarter, graph.target_from_source), rotations.inverse(quarter))
+    as_it_is = solve(graph, profile="sfm").body_from_world
+    other = solve(replace(graph, target_from_source=turned), profile="sfm").body_from_world
+    difference = orientation_errors(rotations.multiply(rotations.inverse(quarter), other), as_it_is)
+    assert _root_mean_square_deg(difference) < 0.3 * _root_mean_square_deg(orientation_errors(as_it_is, truth))
+
+
+def test_a_camera_of_few_edges_does_not_follow_the_one_that_happens_to_fit() -> None:
+    """Of three edges that disagree by their noise, none is exact, so that the camera comes to lie between them."""
+    graph, truth = _crowd(16, sd_deg=(4, 4, 4))
+    known = as_quaternions(truth)
+    rng = np.random.default_rng(16)
+    lonely = 79
+    touches = (graph.source == lonely) | (graph.target == lonely)
+    kept = torch.ones(graph.num_edges, dtype=torch.bool)
+    kept[touches.nonzero().squeeze(1)[3:]] = False
+    few = graph.select_edges(kept)
+    answers = [
+        refinement.refine(few, rotations.multiply(known, rotations.exp(torch.from_numpy(noise))))[lonely]
+        for noise in np.radians(4) * rng.standard_normal((5, 80, 3)) * (np.arange(80) == lonely)[:, None]
+    ]
+    spread = rotations.angle_between(torch.stack(answers[1:]), answers[0].expand(4, 4))
+    assert float(torch.rad2deg(spread).max()) < 0.5
