@@ -1,4 +1,4 @@
-"""Every command in the README and in docs/ is run as it stands there, or is listed here with a reason; links lead on."""
+"""Every command in the README and in docs/ is run as it stands, or is listed here with a reason; links lead on."""
 
 from __future__ import annotations
 

@@ -20,7 +20,8 @@ PARAMETERS = (ROOT / "docs" / "parameters.md").read_text(encoding="utf-8")
 
 
 def test_the_parameter_table_is_the_nodes_own() -> None:
-    table = re.search(r"^<!-- parameters: .*-->\n(.*?)^<!-- end of parameters -->$", PARAMETERS, re.MULTILINE | re.DOTALL)
+    marked = r"^<!-- parameters: .*-->\n(.*?)^<!-- end of parameters -->$"
+    table = re.search(marked, PARAMETERS, re.MULTILINE | re.DOTALL)
     assert table is not None
     assert table[1] == to_markdown(), "paste the output of rotavg_ros.settings.text.to_markdown()"
 
