@@ -1,7 +1,8 @@
-"""Every command in the README and in docs/ is run as it stands there, or is listed here with a reason."""
+"""Every command in the README and in docs/ is run as it stands, or is listed here with a reason; links lead on."""
 
 from __future__ import annotations
 
+import ast
 import re
 import shlex
 import shutil
@@ -21,16 +22,25 @@ from rotavg_ros.ros import diagnostics
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+# Those that a program has written say so in their own way.
+WRITTEN = [page for page in PAGES if "results" not in page.parts or page.name == "README.md"]
+LINKED = [*PAGES, ROOT / "CONTRIBUTING.md"]
 PROGRAMS = ("rotavg", "rotavg_node", "make", "ros2", "pip", "rosdep", "colcon", "python", "python3", "cd", ".", "git")
 
 # What is not run here, by its first words, and why.
 NOT_RUN = {
     "make demo": "minutes; test/ros/test_demo.py runs what it calls",
     ". .venv/bin/activate": "a shell's own",
+    "git clone": "the network",
+    "cd rotavg_ros": "a clone",
+    "python3 -m venv venv": "minutes and a gigabyte",
+    ". venv/bin/activate": "a shell's own",
+    "pip install .": "minutes and a gigabyte",
     ". install/setup.sh": "a shell's own, on a machine with ROS 2 from apt",
     "cd ~/ws": "a workspace with ROS 2 from apt",
     "rosdep install": "ROS 2 from apt",
-    "pip install": "ROS 2 from apt",
+    "pip install torch": "the network",
+    "pip install safetensors": "ROS 2 from apt",
     "colcon build": "ROS 2 from apt; `make setup` builds the same folders",
     "ros2 run rotavg_ros": "ros2cli is not on PyPI; test/ros starts the same node with the same parameters",
     "rotavg_node": "runs until it is stopped; test/ros starts it",
@@ -187,10 +197,13 @@ def test_command_that_is_not_run_can_be_read(command: Command, monkeypatch: pyte
         assert main(words) == 0
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def links(page: Path) -> list[str]:
+    return re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("page", LINKED, ids=name_of)
 def test_links_lead_somewhere(page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
-    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+    for target in links(page):
         path, _, anchor = target.partition("#")
         assert not target.startswith("http")
         found = (page.parent / path) if path else page
@@ -198,6 +211,36 @@ def test_links_lead_somewhere(page: Path) -> None:
         if anchor:
             headings = re.findall(r"^#+ (.+)$", found.read_text(encoding="utf-8"), re.MULTILINE)
             assert anchor in {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_every_page_is_linked() -> None:
+    """From the README on."""
+    reached, waiting = set(), [ROOT / "README.md"]
+    while waiting:
+        page = waiting.pop()
+        if page not in reached:
+            reached.add(page)
+            targets = [(page.parent / target.partition("#")[0]).resolve() for target in links(page)]
+            waiting += [target for target in targets if target in PAGES]
+    assert not [name_of(page) for page in PAGES if page not in reached]
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=name_of)
+def test_a_page_says_first_whom_it_is_for(page: Path) -> None:
+    title, blank, first = page.read_text(encoding="utf-8").splitlines()[:3]
+    assert title.startswith("# ") and not blank and first.startswith("For "), first
+
+
+def test_where_is_what() -> None:
+    """Every name in the method's table is defined in the file that is linked beside it."""
+    page = ROOT / "docs" / "method.md"
+    table = page.read_text(encoding="utf-8").partition("## Where is what")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| .* \| \[[^\]]*\]\((\S+)\) \| (.*) \|$", table, re.MULTILINE)
+    assert len(rows) > 30
+    for path, names in rows:
+        tree = ast.parse((page.parent / path).read_text(encoding="utf-8"))
+        defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+        assert set(re.findall(r"`(\w+)`", names)) <= defined, f"{path}: {names}"
 
 
 def test_diagnostics_that_troubleshooting_quotes() -> None:

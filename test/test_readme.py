@@ -1,4 +1,4 @@
-"""What the README says is so: its table of parameters, its examples. (Its commands: test_docs.py.)"""
+"""What the README and the page of parameters say is so: tables, examples. (Their commands: test_docs.py.)"""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from rotavg_ros.cli.main import COMMANDS
 from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.settings.text import to_markdown
 
-README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PARAMETERS = (ROOT / "docs" / "parameters.md").read_text(encoding="utf-8")
 
 
 def test_the_parameter_table_is_the_nodes_own() -> None:
-    table = re.search(r"^<!-- parameters: .*-->\n(.*?)^<!-- end of parameters -->$", README, re.MULTILINE | re.DOTALL)
+    marked = r"^<!-- parameters: .*-->\n(.*?)^<!-- end of parameters -->$"
+    table = re.search(marked, PARAMETERS, re.MULTILINE | re.DOTALL)
     assert table is not None
     assert table[1] == to_markdown(), "paste the output of rotavg_ros.settings.text.to_markdown()"
 
@@ -30,7 +33,7 @@ def test_every_command_is_in_the_table() -> None:
 
 
 def test_the_library_example() -> None:
-    section = README.partition("In Python")[2]
+    section = README.partition("## In Python")[2]
     example = re.search(r"(?:^(?:    .*)?\n)+", section[section.index("    from") :], re.MULTILINE)
     assert example is not None
     names: dict[str, Any] = {}
@@ -40,6 +43,14 @@ def test_the_library_example() -> None:
     assert solution.outlier_score.shape == (4,)
     np.testing.assert_allclose(solution.body_from_world[0], [0, 0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(solution.body_from_world[3], [0, 0, 0.296, 0.9552], atol=1e-3)
+
+
+def test_the_online_example_is_the_one_that_is_run() -> None:
+    """That of examples/, which a test runs."""
+    section = README.partition("## Online in Python")[2].partition("\n## ")[0]
+    (shown,) = re.findall(r"^```python\n(.*?)^```$", section, re.MULTILINE | re.DOTALL)
+    example = (ROOT / "examples" / "online_in_python.py").read_text(encoding="utf-8")
+    assert example.endswith(f"\n\n{shown}")
 
 
 def test_the_example_of_direction(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """Shortest-path forests by rounds over all edges (Bellman 1958): an accelerator's way, where a CPU takes Dijkstra's.
 
 A round costs one pass over the edges, and there are as many rounds as the deepest path has edges: three or four on the
-dense view-graphs that are worth an accelerator.
+view-graphs that are dense enough for an accelerator.
 """
 
 from __future__ import annotations

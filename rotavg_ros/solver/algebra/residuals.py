@@ -1,7 +1,7 @@
 """Residuals of all edges at given orientations, in slices that stay in a core's cache.
 
 Inside a slice, a quaternion's four components are four contiguous rows: one component of many edges lies together,
-which makes the algebra three times as fast as on rows of four. ``fine_net.edge_residual`` is the same formula, to be
+which makes the algebra three times as fast as on rows of four. :func:`edge_residual` is the same formula, to be
 read.
 """
 

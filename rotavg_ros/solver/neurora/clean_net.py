@@ -62,7 +62,7 @@ class CleanNet(StoredNetwork):
 def correct(target_from_source: Tensor, forward: Tensor, backward: Tensor) -> Tensor:
     """Measurements ``(M, 4)`` without the noise that the messages of their two directions predict, ``(M, 4)`` each."""
     # R̃_uv = clean · noise holds for the edge as given; the reversed edge's noise is seen from the other end,
-    # so it is carried over by the measurement before the two opinions are averaged.
+    # so it is carried over by the measurement before the two predictions are averaged.
     carried = rotations.multiply(
         rotations.multiply(rotations.inverse(target_from_source), rotations.inverse(backward)), target_from_source
     )

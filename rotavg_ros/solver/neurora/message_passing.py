@@ -9,7 +9,7 @@ so a message ``m_uv = D a_uv + d`` is linear, ReLU, linear. Node states are proj
 and D commutes with the mean, so it is applied to nodes, not to edges. That edges remember is the authors' released code
 rather than the paper's text; on equal training it lifts CleanNet's accuracy from 94.1 to 95.8 %.
 
-This is the specification, and what training differentiates; solves run the same formula through ``inference.py``.
+This is the specification, and what training differentiates; solves run the same formula through ``tiled/passes.py``.
 """
 
 from __future__ import annotations

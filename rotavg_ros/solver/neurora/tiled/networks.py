@@ -1,4 +1,4 @@
-"""CleanNet and FineNet as solves run them: what their ``forward`` computes, by the tiled passes of ``inference.py``."""
+"""CleanNet and FineNet as solves run them: what their ``forward`` computes, by the tiled passes of ``passes.py``."""
 
 from __future__ import annotations
 
