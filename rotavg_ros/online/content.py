@@ -110,9 +110,14 @@ class Content:
         return quaternion.normalize(quaternion.multiply(self.correction(robot), track.latest.world_from_body))
 
     @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to solve: no keyframe yet."""
+        return self.builder.graph.num_keyframes == 0
+
+    @property
     def is_behind(self) -> bool:
-        """Whether the graph has changed since the last answer."""
-        return self.builder.graph.revision != self._answered_revision
+        """Whether the graph has changed since the last answer; an empty one has no answer to wait for."""
+        return not self.is_empty and self.builder.graph.revision != self._answered_revision
 
     def solve_anew(self) -> None:
         """Let the next tick solve though the graph is the same."""
@@ -124,7 +129,7 @@ class Content:
         idle = self.builder.graph.revision == self._ticked_revision
         if idle or force_cold:
             self.builder.settle()
-        if not self.is_behind and self._answer_was_cold:
+        if self.is_empty or (not self.is_behind and self._answer_was_cold):
             return None
         snapshot = self.builder.graph.snapshot()
         self._ticked_revision = snapshot.revision
