@@ -1,10 +1,11 @@
-"""The node's services. Slow ones are done by the worker; none blocks the executor."""
+"""The node's services. Slow ones are done by workers; none blocks the executor."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
 
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rotavg_msgs.srv import LabelEdge
 from std_srvs.srv import SetBool, Trigger
@@ -31,14 +32,18 @@ class Services:
     ) -> None:
         self._estimator = estimator
         self._health = health
+        self._solving = solving
+        self._worker = worker
         self._default_robot = default_robot
         for name, job, thread in (
-            ("reset", solving.reset, worker),
             ("solve_now", solving.solve_now, worker),
             ("save", solving.save, saver),
-            ("load", solving.load, worker),
+            ("load", self._load, saver),
         ):
-            node.create_service(Trigger, f"~/{name}", partial(self._on_trigger, job, thread))
+            # The default group runs one callback at a time, and would run nothing while one of these is awaited.
+            on_trigger = partial(self._on_trigger, job, thread)
+            node.create_service(Trigger, f"~/{name}", on_trigger, callback_group=ReentrantCallbackGroup())
+        node.create_service(Trigger, "~/reset", self._on_reset)
         node.create_service(SetBool, "~/pause", self._on_pause)
         node.create_service(LabelEdge, "~/label_edge", self._on_label_edge)
 
@@ -52,6 +57,16 @@ class Services:
         except Exception as error:
             response.message = str(error)
             response.success = False
+        return response
+
+    def _load(self) -> str:
+        message = self._solving.load()
+        self._worker.submit_once(self._solving.tick_quietly)
+        return message
+
+    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.message = self._solving.reset()
+        response.success = True
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:

@@ -1,10 +1,12 @@
-"""Everything slow: ticks and their answers, loading, drawing on one worker's thread; saving on another's.
+"""Everything slow: ticks and their answers, and drawing, on one worker's thread; the state file on another's.
 
-A solve may take longer than the time between two autosaves, and a save must not wait for it.
+A solve may take longer than the time between two autosaves, and a save must not wait for it; nor does a load, or a
+reset on the executor's thread, which give the running solve up.
 """
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +15,7 @@ from rclpy.node import Node
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import Answer, OnlineEstimator
+from rotavg_ros.online.estimator import TickAbandonedError
 from rotavg_ros.online.joins import joins
 from rotavg_ros.online.state_file import remove_leftovers
 from rotavg_ros.ros.diagnostics import Health
@@ -23,7 +26,9 @@ _LOG_PERIOD_S = 5.0
 
 
 class Solving:
-    """Jobs for the workers. Those that a service asks for return what to tell the caller, or raise.
+    """Jobs for the workers, and :meth:`reset`, which takes milliseconds.
+
+    Those that a service asks for return what to tell the caller, or raise.
 
     Raises:
         UserError: the state file cannot be read or written.
@@ -37,6 +42,7 @@ class Solving:
         self._health = health
         self._outputs = outputs
         self._state_file = state_file
+        self._publishing = threading.Lock()  # an answer goes out before it is forgotten, or not at all
         if state_file is not None:
             self._resume(state_file)
         self._saved = self._content()
@@ -48,6 +54,8 @@ class Solving:
             health.unsolved_since = time.monotonic()
         try:
             answer = self._estimator.tick(force_cold)
+        except TickAbandonedError:
+            raise
         except Exception as error:
             health.solve_failures += 1
             health.failure = str(error)
@@ -55,12 +63,14 @@ class Solving:
         health.failure = None
         if answer is not None:
             self._publish(answer)
+            self._outputs.draw(answer)
         return answer
 
     def solve_now(self) -> str:
         answer = self.tick(force_cold=True)
         if answer is None:
-            return "nothing has changed since the last answer"
+            empty = self._estimator.counts().keyframes == 0
+            return "there are no keyframes: nothing to solve" if empty else "nothing has changed since the last answer"
         return f"answer {answer.version}: {len(answer.keyframe_id)} keyframes, {int(answer.outlier.sum())} outliers"
 
     def reset(self) -> str:
@@ -78,7 +88,6 @@ class Solving:
         state_file = self._named_state_file()
         self._estimator.load(state_file)
         self._forget_answer()
-        self.tick()
         return f"loaded {state_file}"
 
     def tick_quietly(self) -> None:
@@ -109,29 +118,38 @@ class Solving:
     def _quietly(self, what: str, job: Callable[[], object]) -> None:
         try:
             job()
+        except TickAbandonedError:
+            pass
         except Exception as error:  # a correction node that dies takes the robot with it
             self._node.get_logger().error(f"{what}{error}", throttle_duration_sec=_LOG_PERIOD_S)
 
     def _publish(self, answer: Answer) -> None:
+        health = self._health
+        with self._publishing:
+            if answer.version <= self._estimator.first_version:
+                raise TickAbandonedError("abandoned: everything was forgotten or replaced meanwhile")
+            self._tell_of_joins(answer)
+            self._outputs.publish_answer(answer)
+            health.ticks.add(answer.seconds)
+            health.answer, health.answered, health.unsolved_since = answer, time.monotonic(), None
+
+    def _tell_of_joins(self, answer: Answer) -> None:
         health = self._health
         if health.answer is not None and health.answer.version > self._estimator.first_version:
             for join in joins(health.answer, answer):
                 health.joins += 1
                 left = f"the graph is in {answer.num_components} components" if answer.num_components > 1 else "all one"
                 self._node.get_logger().info(f"{join} ({left})")
-        self._outputs.publish_answer(answer)
-        health.ticks.add(answer.seconds)
-        health.answer, health.answered, health.unsolved_since = answer, time.monotonic(), None
-        self._outputs.draw(answer)
 
     def _forget_answer(self) -> None:
         """The published answers belong to what was forgotten: latch empty ones."""
-        answer = self._health.answer
-        self._health.unsolved_since = None
-        self._health.ticks = Durations()
-        if answer is not None and answer.version <= self._estimator.first_version:
-            self._outputs.publish_answer(answer.without_content())
-            self._health.answer = None
+        with self._publishing:
+            answer = self._health.answer
+            self._health.unsolved_since = None
+            self._health.ticks = Durations()
+            if answer is not None and answer.version <= self._estimator.first_version:
+                self._outputs.publish_answer(answer.without_content())
+                self._health.answer = None
 
     def _content(self) -> tuple[int, int]:
         """Differs when the graph does."""
