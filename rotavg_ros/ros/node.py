@@ -22,12 +22,14 @@ Keeps a robot's orientations right: odometry and relative rotations in, absolute
 
 
 def main() -> int:
-    """Run the node until SIGINT or SIGTERM; returns the exit code, 2 for a mistake of the user."""
+    """Run the node until SIGINT, SIGTERM or SIGHUP; returns the exit code, 2 for a mistake of the user."""
     stop = _StopSignal()  # before the imports below, which take seconds
-    import rclpy
-    from rclpy.signals import SignalHandlerOptions
-    from rclpy.utilities import remove_ros_args, try_shutdown
-
+    try:
+        import rclpy
+        from rclpy.signals import SignalHandlerOptions
+        from rclpy.utilities import remove_ros_args, try_shutdown
+    except ModuleNotFoundError as error:
+        return _fail_without(error)
     try:
         arguments = remove_ros_args(sys.argv)[1:]
         if arguments:
@@ -42,13 +44,17 @@ def main() -> int:
 
 
 class _StopSignal:
-    """SIGINT and SIGTERM end the process at once while it starts; later they ask for the end."""
+    """SIGINT, SIGTERM and SIGHUP end the process at once while it starts; later they ask for the end.
+
+    SIGHUP comes when the terminal closes; whoever started the node with ``nohup`` has it ignored.
+    """
 
     def __init__(self) -> None:
         self.requested = False
         self.starting = True
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._request)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                signal.signal(number, self._request)
 
     def _request(self, _number: int, _frame: FrameType | None) -> None:
         if self.starting:
@@ -57,10 +63,12 @@ class _StopSignal:
 
 
 def _run(stop: _StopSignal) -> int:
-    from rclpy.executors import SingleThreadedExecutor
+    try:
+        from rclpy.executors import SingleThreadedExecutor
 
-    from rotavg_ros.ros.estimator_node import RotavgNode
-
+        from rotavg_ros.ros.estimator_node import RotavgNode
+    except ModuleNotFoundError as error:
+        return _fail_without(error)
     executor = SingleThreadedExecutor()
     try:
         node = RotavgNode(executor)
@@ -94,6 +102,15 @@ def _answer_arguments(arguments: list[str]) -> int:
         print(USAGE)
         return 0
     return _fail(f"unknown argument {arguments[0]}; see rotavg_node --help")
+
+
+def _fail_without(error: ModuleNotFoundError) -> int:
+    """A package is missing that ROS 2, or the build of this workspace, brings."""
+    package = (error.name or "").partition(".")[0]
+    return _fail(
+        f"there is no Python package {package}; source ROS 2's setup.sh and this workspace's install/setup.sh, or "
+        "run `make setup`, which installs what it needs without ROS 2"
+    )
 
 
 def _fail(message: str) -> int:

@@ -21,6 +21,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion
 from nav_msgs.msg import Odometry
 from rotavg_msgs.msg import KeyframeReference, RelativeRotation, RelativeRotationArray
+from std_srvs.srv import SetBool
 
 import rotavg_ros
 from rotavg_ros.inputs import Source
@@ -281,6 +282,7 @@ def test_a_flood_is_survived_and_every_loss_counted(live_node) -> None:
         ("odometry_topics:=[]", "odometry_topics is empty"),
         ("use_sim_time:=perhaps", "use_sim_time"),
         ("state_file:=/no/such/folder/state", "there is no folder /no/such/folder"),
+        ("world_frame:=''", "world_frame is ''; name the frame"),
     ],
 )
 def test_a_mistake_at_the_start_is_one_line_and_exit_code_2(parameter: str, message: str) -> None:
@@ -328,6 +330,36 @@ def test_a_clean_end_during_a_long_solve(live_node) -> None:
     assert live_node.stop() == 0
     assert time.monotonic() - started < 30  # the promise is two seconds; a loaded machine must not fail the test
     assert "Traceback" not in live_node.process.output
+
+
+@pytest.mark.parametrize("package", ["rclpy", "rotavg_msgs"])
+def test_without_ros_it_is_one_line(package: str) -> None:
+    hidden = f"import sys; sys.modules[{package!r}] = None; from rotavg_ros.ros.node import main; sys.exit(main())"
+    ended = subprocess.run([sys.executable, "-c", hidden], capture_output=True, text=True, timeout=300, check=False)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr.startswith(f"rotavg_node: error: there is no Python package {package}; source ROS 2's setup.sh")
+    assert ended.stderr.count("\n") == 1
+
+
+def test_a_huge_array_silences_nothing(live_node) -> None:
+    """Reports come, odometry is answered and services are served while it is taken, and single edges stay behind it."""
+    live_node.start("keyframe_source:=edges", "solve_period_s:=3600.0", "odometry_timeout_s:=1000.0")
+    length, single = 100_000, 150
+    ends = [KeyframeReference(id=index) for index in range(2)]
+    repeated = RelativeRotation(source=ends[0], target=ends[1], rotation=message_of(rotation(1)))
+    live_node.arrays.publish(RelativeRotationArray(edges=[repeated] * length))
+    for index in range(single):
+        live_node.edges.publish(closure(index, 0, 0))
+    live_node.spin_until(lambda: int(live_node.status.get("dropped duplicate_edge", 0)) > 0)
+    reports, seen = live_node.reports, []
+    while int(live_node.status["dropped duplicate_edge"]) < length - 1:
+        live_node.odometry.publish(odometry(len(seen)))
+        live_node.spin_until(lambda: live_node.reports > reports + len(seen))
+        seen.append(int(live_node.status["dropped duplicate_edge"]))
+        assert len(live_node.orientations) >= len(seen) - 1
+    assert len(seen) > 2 and live_node.call("pause", SetBool, data=True).success
+    live_node.spin_until(lambda: live_node.status.get("dropped self_edge") == str(single))
+    assert live_node.status["lost messages"] == "0"
 
 
 @pytest.mark.parametrize("damage", ["truncated", "another version"])

@@ -176,7 +176,7 @@ def test_autosave_says_once_that_it_cannot_and_catches_up(live_node, tmp_path) -
     assert live_node.process.output.count("cannot write the state file") == 1
     feed(live_node, 20, 25)
     wait_for(live_node, "keyframes", 25)
-    assert live_node.stop() == 0  # saves once more
+    assert live_node.stop(signal.SIGHUP) == 0  # saves once more, as after SIGINT and SIGTERM
     assert os.listdir(path.parent) == [path.name]
     assert len(np.load(path)["keyframe_id"]) == 25
 
