@@ -17,7 +17,7 @@ from rotavg_ros.cli.main import COMMANDS, main
 from rotavg_ros.datasets.graph_file import write_graph
 from rotavg_ros.datasets.robot_run import robot_run_config
 from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
-from rotavg_ros.ros import diagnostics
+from rotavg_ros.ros import diagnostics, frame_correction, parameter_server, wiring
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -40,6 +40,8 @@ NOT_RUN = {
     "rotavg convert B25b_0.000.g2o": "data that is no part of the repository; test/ros/test_node_b25b.py",
     "python examples/three_robots.py": "test/ros runs it",
 }
+# Where the lines of the diagnostics come from.
+WARNING = (diagnostics, wiring, frame_correction, parameter_server)
 # What makes a command take seconds instead of minutes or hours.
 SMALLER = {"--laps 4": "--laps 1", "replay my_bag --output": "replay my_bag --duration 10 --no-report --output"}
 
@@ -203,7 +205,8 @@ def test_links_lead_somewhere(page: Path) -> None:
 def test_diagnostics_that_troubleshooting_quotes() -> None:
     page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
     table = page[page.index("| diagnostics say") : page.index("**Nothing at all arrives.**")]
-    source = " ".join(Path(diagnostics.__file__).read_text(encoding="utf-8").split())
+    sources = [Path(module.__file__).read_text(encoding="utf-8") for module in WARNING]
+    source = re.sub(r'"\s+f?"', "", " ".join(" ".join(sources).split()))  # strings over several lines as one
     quotes = re.findall(r"^\| `([^`]+)` \|", table, re.MULTILINE)
     assert len(quotes) >= 5
     for quote in quotes:

@@ -12,6 +12,7 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS, EdgeConverter, OdometryConverter, Source
 
 DEFAULT_EDGE_TYPE = "rotavg_msgs/msg/RelativeRotation"
+_EDGE_ARRAY_TYPE = "rotavg_msgs/msg/RelativeRotationArray"
 DEFAULT_ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 
 
@@ -24,8 +25,14 @@ class EdgeTopic:
     """An entry of the parameter ``edge_topics``, ready to subscribe to."""
 
     topic: str
+    type_name: str
     message_type: type
     convert: EdgeConverter
+
+    @property
+    def is_array(self) -> bool:
+        """Whether messages may have very many edges: to be taken as bytes, for :class:`SerializedArray`."""
+        return self.type_name == _EDGE_ARRAY_TYPE
 
 
 @dataclass(frozen=True)
@@ -33,6 +40,7 @@ class OdometryTopic:
     """An entry of the parameter ``odometry_topics``, ready to subscribe to."""
 
     topic: str
+    type_name: str
     message_type: type
     convert: OdometryConverter
 
@@ -46,7 +54,7 @@ def edge_topic(entry: str, source: Source) -> EdgeTopic:
     topic, type_name = split(entry, DEFAULT_EDGE_TYPE)
     if type_name not in EDGE_CONVERTERS:
         raise _unknown("edge", entry, type_name, list(EDGE_CONVERTERS))
-    return EdgeTopic(topic, _message_type("edge", entry, type_name), EDGE_CONVERTERS[type_name](source))
+    return EdgeTopic(topic, type_name, _message_type("edge", entry, type_name), EDGE_CONVERTERS[type_name](source))
 
 
 def odometry_topic(entry: str) -> OdometryTopic:
@@ -58,7 +66,8 @@ def odometry_topic(entry: str) -> OdometryTopic:
     topic, type_name = split(entry, DEFAULT_ODOMETRY_TYPE)
     if type_name not in ODOMETRY_CONVERTERS:
         raise _unknown("odometry", entry, type_name, list(ODOMETRY_CONVERTERS))
-    return OdometryTopic(topic, _message_type("odometry", entry, type_name), ODOMETRY_CONVERTERS[type_name])
+    message_type = _message_type("odometry", entry, type_name)
+    return OdometryTopic(topic, type_name, message_type, ODOMETRY_CONVERTERS[type_name])
 
 
 def split(entry: str, default_type: str) -> tuple[str, str]:

@@ -21,6 +21,8 @@ _STALE_PERIODS = 10
 # Ticks longer ago than this say nothing about the load now.
 _RECENT_S = 60.0
 _SUSPICIOUS_OUTLIER_SHARE = 0.5
+# Robots' names come from messages and may be anything; a few are told.
+_MOST_NAMES = 3
 # Refusals that a healthy system produces: a sender that repeats itself.
 _HARMLESS = {"duplicate_edge", "marginalized_keyframe"}
 
@@ -33,6 +35,8 @@ class Health:
         odometry, edges: counters per topic name.
         ticks, odometry_callback, odometry_latency: durations; latency from sending to ``orientation``.
         answer: the last one published, and when.
+        last_odometry: when a message was last taken, per topic name.
+        mistakes: in the wiring and the parameters, a line each.
         joins: how often components became one.
         unsolved_since: since when the graph has been ahead of the answer; None if it is not.
         solve_failures: how many ticks failed in all; ``failure`` is the last one's message, None after a good tick.
@@ -45,7 +49,8 @@ class Health:
     odometry_callback: Durations = field(default_factory=Durations)
     odometry_latency: Durations = field(default_factory=Durations)
     started: float = field(default_factory=time.monotonic)
-    last_odometry: float | None = None
+    last_odometry: dict[str, float] = field(default_factory=dict)
+    mistakes: list[str] = field(default_factory=list)
     answer: Answer | None = None
     joins: int = 0
     answered: float | None = None
@@ -85,7 +90,7 @@ class Reporter:
         errors = _errors(health, parameters, paused, now)
         if counts.time_is_back:
             errors.append("time went back and odometry is refused since; call ~/reset to begin anew")
-        warnings = _warnings(health, parameters, paused, now)
+        warnings = [*health.mistakes, *_of_waiting(counts, parameters), *_warnings(health, parameters, now)]
         if counts.is_full:
             warnings.append("the graph is full and nothing can be spared: no new keyframes (max_keyframes)")
         if health.lost > self._lost:
@@ -116,12 +121,16 @@ def _errors(health: Health, parameters: NodeParameters, paused: bool, now: float
     return errors
 
 
-def _warnings(health: Health, parameters: NodeParameters, paused: bool, now: float) -> list[str]:
+def _warnings(health: Health, parameters: NodeParameters, now: float) -> list[str]:
     warnings = [] if health.save_failure is None else [health.save_failure]
-    silent = now - (health.started if health.last_odometry is None else health.last_odometry)
     needed = parameters.keyframe_source == "odometry" and parameters.unknown_keyframes == "wait"
-    if silent > parameters.odometry_timeout_s and (needed or health.last_odometry is not None):
-        warnings.append("no odometry yet" if health.last_odometry is None else f"no odometry for {silent:.0f} s")
+    for topic in health.odometry:
+        last = health.last_odometry.get(topic)
+        silent = now - (health.started if last is None else last)
+        if silent > parameters.odometry_timeout_s and (needed or last is not None):
+            warnings.append(
+                f"no odometry yet on {topic}" if last is None else f"no odometry for {silent:.0f} s on {topic}"
+            )
     median = health.ticks.median_ms(_RECENT_S)
     if median > 1e3 * parameters.solve_period_s:
         warnings.append(f"a solve takes longer ({median:.0f} ms) than solve_period_s")
@@ -135,6 +144,30 @@ def _warnings(health: Health, parameters: NodeParameters, paused: bool, now: flo
         if parameters.device == "cuda" and answer.device == "cpu":
             warnings.append("device cuda was asked for, cpu is used")
     return warnings
+
+
+def _of_waiting(counts: Counts, parameters: NodeParameters) -> list[str]:
+    """Edges that wait for what will hardly come."""
+    known = {*parameters.robots, *counts.robots}
+    unknown = {robot: number for robot, number in counts.pending_by_robot.items() if robot not in known}
+    if unknown:
+        names = ", ".join(repr(robot) for robot in sorted(unknown)[:_MOST_NAMES])
+        return [
+            f"{sum(unknown.values())} edges are about robots that are not known ({names}); known are "
+            f"{', '.join(sorted(known))}: use these names, or add the robot to robots and odometry_topics"
+        ]
+    waits_for = counts.longest_pending
+    if waits_for is None or counts.longest_pending_s <= parameters.odometry_timeout_s:
+        return []
+    if waits_for.keyframe_id is not None:
+        return [
+            f"{counts.pending} edges wait for keyframes, such as {waits_for.keyframe_id} of {waits_for.robot}: who "
+            "numbers keyframes needs keyframe_source edges; else name the ends of edges by stamp"
+        ]
+    return [
+        f"{counts.pending} edges wait for odometry of {waits_for.robot} as new as they are: their stamps and the "
+        "odometry's must come from one clock (use_sim_time)"
+    ]
 
 
 def _values(health: Health, counts: Counts, paused: bool, now: float) -> dict[str, str]:

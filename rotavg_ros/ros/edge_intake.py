@@ -1,4 +1,4 @@
-"""Edges of messages, long ones a slice at a time, so that odometry and signals get their turn in between."""
+"""Edges of messages, long ones a slice at a time, so that odometry, services and signals get their turn in between."""
 
 from __future__ import annotations
 
@@ -7,28 +7,47 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 from rclpy.node import Node
 
 from rotavg_ros.inputs import EdgeConverter, EdgeRecord, EdgeVerdict
 from rotavg_ros.online import OnlineEstimator, RejectReason
 from rotavg_ros.ros.message_counting import TopicCounter
+from rotavg_ros.ros.wiring import Input
 
 _SLICE_S = 0.005
 _BREAK_S = 0.001
-# With more messages than this under way the sender is too fast for us; then its queue shall know.
+# With so many messages under way no more are taken: they wait in the middleware's queue, which is bounded, and what it
+# loses is counted.
 _MOST_MESSAGES = 100
 
 
+class _WhileThereIsRoom(MutuallyExclusiveCallbackGroup):
+    """Callbacks run one at a time, and only while there is room for what they bring."""
+
+    def __init__(self, has_room: Callable[[], bool]) -> None:
+        super().__init__()
+        self._has_room = has_room
+
+    def can_execute(self, entity: Any) -> bool:
+        return self._has_room() and bool(super().can_execute(entity))
+
+
 class EdgeIntake:
-    """Takes edges in the order in which their messages came. Runs on the executor's thread."""
+    """Takes edges in the order in which their messages came. Runs on the executor's thread.
+
+    Attributes:
+        callback_group: for the subscriptions to edges; it holds them back while too many messages are under way.
+    """
 
     def __init__(self, node: Node, estimator: OnlineEstimator, on_refusal: Callable[[RejectReason], None]) -> None:
         self._estimator = estimator
         self._on_refusal = on_refusal
+        self.callback_group = _WhileThereIsRoom(lambda: len(self._under_way) < _MOST_MESSAGES)
         self._generation = estimator.generation
         self._converters: list[EdgeConverter] = []
-        self._under_way: deque[tuple[TopicCounter, Iterator[EdgeRecord | EdgeVerdict]]] = deque()
+        self._under_way: deque[tuple[Input, TopicCounter, Iterator[EdgeRecord | EdgeVerdict]]] = deque()
         self._timer = node.create_timer(_BREAK_S, self._go_on, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._timer.cancel()
 
@@ -36,32 +55,33 @@ class EdgeIntake:
         """Have a converter forget what it remembers whenever the estimator does."""
         self._converters.append(convert)
 
-    def take(self, convert: EdgeConverter, counter: TopicCounter, message: Any) -> None:
-        """Take a message's edges, now or in a while."""
+    def take(self, topic: Input, counter: TopicCounter, records: Iterator[EdgeRecord | EdgeVerdict]) -> None:
+        """Take what a message says, now or in a while."""
         self._forget_with_the_estimator()
-        self._under_way.append((counter, iter(convert(message))))
-        self._take_some(float("inf") if len(self._under_way) > _MOST_MESSAGES else _SLICE_S)
+        self._under_way.append((topic, counter, records))
+        self._take_some()
 
     def _go_on(self) -> None:
         self._forget_with_the_estimator()
-        self._take_some(_SLICE_S)
+        self._take_some()
 
-    def _take_some(self, seconds: float) -> None:
-        deadline = time.perf_counter() + seconds
+    def _take_some(self) -> None:
+        deadline = time.perf_counter() + _SLICE_S
         while self._under_way:
-            counter, records = self._under_way[0]
+            topic, counter, records = self._under_way[0]
             for record in records:
-                self._take(record, counter)
+                self._take(record, topic, counter)
                 if time.perf_counter() > deadline:
                     self._timer.reset()
                     return
             self._under_way.popleft()
         self._timer.cancel()
 
-    def _take(self, record: EdgeRecord | EdgeVerdict, counter: TopicCounter) -> None:
+    def _take(self, record: EdgeRecord | EdgeVerdict, topic: Input, counter: TopicCounter) -> None:
         if isinstance(record, EdgeVerdict):
             self._estimator.label_edge(record.source_robot, record.edge_id, record.label)
             return
+        topic.note_frames(record.frame_id)
         counter.by_sequence.observe(record.sender, record.sequence)
         if isinstance(record.edge, RejectReason):
             reason: RejectReason | None = record.edge

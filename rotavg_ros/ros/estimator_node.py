@@ -22,6 +22,7 @@ from rotavg_ros.ros.services import Services
 from rotavg_ros.ros.solving import Solving
 from rotavg_ros.ros.subscriptions import Subscriptions
 from rotavg_ros.ros.warm_up import warm_up
+from rotavg_ros.ros.wiring import Wiring
 from rotavg_ros.ros.worker import Worker
 from rotavg_ros.settings.parameters import NODE_NAME, NodeParameters
 from rotavg_ros.version import __version__
@@ -54,7 +55,7 @@ class RotavgNode(Node):
         self._outputs = Outputs(self, parameters, self._estimator)
         state_file = Path(parameters.state_file) if parameters.state_file else None
         self._solving = Solving(self, self._estimator, self._health, self._outputs, state_file)
-        Subscriptions(self, parameters, self._estimator, self._health, self._outputs, self._on_time_jump)
+        listening = Subscriptions(self, parameters, self._estimator, self._health, self._outputs, self._on_time_jump)
         Services(self, self._estimator, self._health, self._solving, self._worker, self._saver, parameters.robots[0])
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # ticks though /clock is paused or absent
@@ -71,7 +72,10 @@ class RotavgNode(Node):
         self.get_logger().info(f"rotavg {__version__} on {device}, listening to {topics}")
         if parameters.device == "cuda" and device == "cpu":
             self.get_logger().warning("there is no CUDA device; the networks run on the CPU")
-        for line in parameter_server.unknown(self):
+        given = frozenset(parameter_server.given(self))
+        self._wiring = Wiring(self, listening.inputs, self._outputs.exclusive_topics, given)
+        self._mistaken_parameters, other_parameters = parameter_server.unknown(self)
+        for line in [*self._mistaken_parameters, *other_parameters, *self._outputs.warnings()]:
             self.get_logger().warning(line)
 
     def close(self, timeout_s: float) -> bool:
@@ -121,6 +125,11 @@ class RotavgNode(Node):
             self.get_logger().warning("time went back: odometry is refused until it is ahead again (on_time_jump)")
 
     def _on_diagnostics_timer(self) -> None:
+        self._health.mistakes = [
+            *self._mistaken_parameters,
+            *self._wiring.warnings(self._settings),
+            *self._outputs.warnings(),
+        ]
         status = self._reporter.report(self._health, self._estimator.counts(), self._settings, self._estimator.paused)
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()

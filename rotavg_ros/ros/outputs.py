@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from functools import partial
 
-from geometry_msgs.msg import QuaternionStamped, TransformStamped
+from geometry_msgs.msg import QuaternionStamped
 from nav_msgs.msg import Path
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -14,9 +14,9 @@ from rotavg_msgs.msg import AbsoluteOrientations, OutlierFlags
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
-from rotavg_ros.errors import UserError
 from rotavg_ros.online import Answer, OnlineEstimator
 from rotavg_ros.ros.conversions import flags_message, orientations_message, to_quaternion_message
+from rotavg_ros.ros.frame_correction import FrameCorrection
 from rotavg_ros.ros.topics import LATCHED, publisher
 from rotavg_ros.ros.visualization import markers_message, path_message
 from rotavg_ros.settings.parameters import NodeParameters
@@ -47,14 +47,16 @@ class Outputs:
             robot: publisher(node, QuaternionStamped, f"{prefix[robot]}orientation", QoSProfile(depth=10))
             for robot in self._robots
         }
-        self._tf: Publisher | None = None
-        if parameters.publish_tf:
-            try:
-                from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
-            except ImportError as error:
-                raise UserError("publish_tf needs tf2_msgs: install that package or leave publish_tf off") from error
-            self._tf_message = TFMessage
-            self._tf = publisher(node, TFMessage, "/tf", QoSProfile(depth=100))
+        self._tf = FrameCorrection(node, self._frame_id) if parameters.publish_tf else None
+
+    @property
+    def exclusive_topics(self) -> list[str]:
+        """Full names of topics that only one node should publish."""
+        return [self._orientations.topic_name, *(each.topic_name for each in self._orientation.values())]
+
+    def warnings(self) -> list[str]:
+        """What is not as it should be, a line each."""
+        return [] if self._tf is None else self._tf.warnings()
 
     def publish_answer(self, answer: Answer) -> None:
         """Latch the answer's keyframes and edges."""
@@ -88,8 +90,14 @@ class Outputs:
         self._drawn[picture] = answer.version, watchers
         return watchers > 0 and (version != answer.version or watchers > watchers_then)
 
-    def publish_orientation(self, robot: str, odometry: Header) -> None:
-        """The robot's corrected orientation at the moment of its newest odometry message, which has this header."""
+    def publish_orientation(self, robot: str, topic: str, odometry: Header) -> None:
+        """The robot's corrected orientation at the moment of its newest odometry message.
+
+        Args:
+            robot: whose.
+            topic: that the message came on.
+            odometry: the message's header.
+        """
         orientation = self._estimator.current_orientation(robot)
         if orientation is None:
             return
@@ -99,6 +107,4 @@ class Outputs:
         self._orientation[robot].publish(stamped)
         correction = self._estimator.world_from_odometry(robot) if self._tf is not None else None
         if self._tf is not None and correction is not None:
-            transform = TransformStamped(header=stamped.header, child_frame_id=odometry.frame_id)
-            transform.transform.rotation = to_quaternion_message(correction)
-            self._tf.publish(self._tf_message(transforms=[transform]))
+            self._tf.publish(robot, topic, odometry, correction)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -20,6 +20,9 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.settings.fields import ParameterError, default
 from rotavg_ros.settings.parameters import NodeParameters
 
+# How rclpy names the parameters that change a topic's quality of service.
+_QOS = "qos_overrides"
+
 
 def declare(node: Node) -> NodeParameters:
     """Declare all parameters on a node and read what it was started with.
@@ -30,7 +33,7 @@ def declare(node: Node) -> NodeParameters:
     values = {}
     for parameter in fields(NodeParameters):
         try:
-            declared = node.declare_parameter(parameter.name, default(parameter), _descriptor(parameter.metadata))
+            declared = _declare(node, parameter.name, default(parameter), _descriptor(parameter.metadata))
         except (InvalidParameterTypeException, ParameterUninitializedException) as error:
             expected = Parameter.Type.from_parameter_value(default(parameter)).name.lower().replace("_", " ")
             raise ParameterError(f"parameter {parameter.name} has the wrong type; it must be {expected}") from error
@@ -43,17 +46,46 @@ def declare(node: Node) -> NodeParameters:
     return NodeParameters().changed(values)
 
 
-def unknown(node: Node) -> list[str]:
-    """One line for every parameter the node was given that it does not have."""
-    given = getattr(node, "_parameter_overrides", {})
-    ours = [parameter.name for parameter in fields(NodeParameters)]
-    lines = []
-    for name in given:
-        if node.has_parameter(name) or name.startswith("qos_overrides."):
-            continue
-        close = difflib.get_close_matches(name, ours, n=1)
-        lines.append(f"unknown parameter {name} is ignored" + (f"; did you mean {close[0]}?" if close else ""))
-    return lines
+def given(node: Node) -> Mapping[str, Parameter]:
+    """What a node was started with, by name, its own parameters and others."""
+    overrides: Mapping[str, Parameter] = getattr(node, "_parameter_overrides", {})
+    return overrides
+
+
+def unknown(node: Node) -> tuple[list[str], list[str]]:
+    """One line for every parameter the node was given that it does not have; to be asked once all topics are there.
+
+    Returns:
+        those that are surely meant for this node, and those that a file for many nodes may hold for another one.
+    """
+    qos = [f"{_QOS}.{name}" for name in node.get_parameters_by_prefix(_QOS)]
+    ours = [*(parameter.name for parameter in fields(NodeParameters)), *qos]
+    mistaken: list[str] = []
+    others: list[str] = []
+    for name in given(node):
+        if not node.has_parameter(name):
+            close = difflib.get_close_matches(name, ours, n=1)
+            line = f"unknown parameter {name} is ignored" + (f"; did you mean {close[0]}?" if close else "")
+            (mistaken if close or name.startswith(_QOS) else others).append(line)
+    return mistaken, others
+
+
+def _declare(node: Node, name: str, value: Any, descriptor: ParameterDescriptor) -> Parameter:
+    """Declare one; 5 is taken for 5.0 where a number with a fraction is wanted."""
+    override = given(node).get(name)
+    wanted = None if override is None else _as_wanted(override, value)
+    if wanted is None or wanted is override:
+        return node.declare_parameter(name, value, descriptor)
+    return node.declare_parameter(name, wanted.value, descriptor, ignore_override=True)
+
+
+def _as_wanted(parameter: Parameter, like: Any) -> Parameter:
+    """Whole numbers as floating-point ones where ``like``, a good value, is one or a list of them."""
+    if parameter.type_ is Parameter.Type.INTEGER and isinstance(like, float):
+        return Parameter(parameter.name, value=float(parameter.value))
+    if parameter.type_ is Parameter.Type.INTEGER_ARRAY and isinstance(like, list) and isinstance(like[0], float):
+        return Parameter(parameter.name, value=[float(number) for number in parameter.value])
+    return parameter
 
 
 def watch(node: Node, current: Callable[[], NodeParameters], apply: Callable[[NodeParameters], None]) -> None:
@@ -66,7 +98,13 @@ def watch(node: Node, current: Callable[[], NodeParameters], apply: Callable[[No
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
+    def as_wanted(changes: list[Parameter]) -> list[Parameter]:
+        defaults = {parameter.name: default(parameter) for parameter in fields(NodeParameters)}
+        return [_as_wanted(change, defaults.get(change.name)) for change in changes]
+
     node.add_on_set_parameters_callback(on_set)
+    if hasattr(node, "add_pre_set_parameters_callback"):  # not before Iron
+        node.add_pre_set_parameters_callback(as_wanted)
 
 
 def _descriptor(about: Any) -> ParameterDescriptor:

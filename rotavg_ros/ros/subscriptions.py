@@ -11,16 +11,20 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from rotavg_ros.inputs import EdgeConverter, OdometryConverter
+from rotavg_ros.errors import UserError
+from rotavg_ros.inputs import OdometryConverter
 from rotavg_ros.online import OnlineEstimator, RejectReason
 from rotavg_ros.online.measurements import RejectedInputError
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.ros import adapters
+from rotavg_ros.ros.adapters import EdgeTopic, OdometryTopic
 from rotavg_ros.ros.diagnostics import Health
 from rotavg_ros.ros.edge_intake import EdgeIntake
 from rotavg_ros.ros.message_counting import TopicCounter
 from rotavg_ros.ros.outputs import Outputs
+from rotavg_ros.ros.serialized_array import SerializedArray
 from rotavg_ros.ros.topics import overrides, user_error_about
+from rotavg_ros.ros.wiring import Input
 from rotavg_ros.settings.parameters import NodeParameters
 
 _LOG_PERIOD_S = 5.0
@@ -28,6 +32,9 @@ _LOG_PERIOD_S = 5.0
 
 class Subscriptions:
     """Odometry and edges. Callbacks run on the executor's thread and stay short.
+
+    Attributes:
+        inputs: the topics that are listened to.
 
     Raises:
         UserError: a topic's name, type or ``qos_overrides`` cannot be.
@@ -47,32 +54,47 @@ class Subscriptions:
         self._estimator = estimator
         self._health = health
         self._outputs = outputs
+        self.inputs: list[Input] = []
         self._intake = EdgeIntake(node, estimator, partial(self._warn_of_refusal, "an edge"))
         best_effort = QoSProfile(depth=parameters.odometry_queue_depth, reliability=ReliabilityPolicy.BEST_EFFORT)
         sources = zip(parameters.robots, parameters.odometry_topics, parameters.odometry_sensors(), strict=True)
         for robot, entry, body_from_sensor in sources:
             odometry = adapters.odometry_topic(entry)
-            counter = health.odometry.setdefault(odometry.topic, TopicCounter())
-            on_odometry = partial(self._on_odometry, robot, odometry.convert, body_from_sensor)
-            self._subscribe(odometry.message_type, odometry.topic, on_odometry, counter, best_effort)
+            topic = Input(self._full_name(odometry.topic), odometry.type_name, "odometry_topics", robot, best_effort)
+            counter = health.odometry.setdefault(topic.name, TopicCounter())
+            on_odometry = partial(self._on_odometry, topic, odometry.convert, body_from_sensor)
+            self._subscribe(topic, odometry, on_odometry, counter)
         reliable = QoSProfile(depth=parameters.edge_queue_depth, reliability=ReliabilityPolicy.RELIABLE)
         for entry, source in zip(parameters.edge_topics, parameters.edge_sources(), strict=True):
             edges = adapters.edge_topic(entry, source)
             self._intake.add_source(edges.convert)
-            counter = health.edges.setdefault(edges.topic, TopicCounter())
-            on_edges = partial(self._on_edges, edges.convert, counter)
-            self._subscribe(edges.message_type, edges.topic, on_edges, counter, reliable)
+            topic = Input(self._full_name(edges.topic), edges.type_name, "edge_topics", "", reliable)
+            counter = health.edges.setdefault(topic.name, TopicCounter())
+            on_edges = partial(self._on_edges, topic, edges, counter)
+            self._subscribe(topic, edges, on_edges, counter)
+
+    def _full_name(self, topic: str) -> str:
+        """With the namespace and remappings.
+
+        Raises:
+            UserError: no topic can be called that, or another entry means the same one.
+        """
+        with user_error_about(topic):
+            name: str = self._node.resolve_topic_name(topic)
+        if any(each.name == name for each in self.inputs):
+            raise UserError(f"topic {topic} is {name}, which is listened to already; name it once")
+        return name
 
     def _subscribe(
         self,
-        message_type: type,
-        topic: str,
+        topic: Input,
+        entry: OdometryTopic | EdgeTopic,
         handle: Callable[[Any, dict[str, Any] | None], None],
         counter: TopicCounter,
-        qos: QoSProfile,
     ) -> None:
         """Subscribe and count; ``handle`` gets the message, and its info where this rclpy hands it out."""
         subscription: Subscription
+        self.inputs.append(topic)
 
         def with_info(message: Any, info: dict[str, Any] | None) -> None:
             counter.observe(info, subscription.get_publisher_count() if info else 0)
@@ -83,14 +105,20 @@ class Subscriptions:
 
         # Humble's callbacks take the message alone.
         callback: Any = with_info if hasattr(Subscription, "CallbackType") else without_info
-        with user_error_about(topic):
+        with user_error_about(topic.name):
             subscription = self._node.create_subscription(
-                message_type, topic, callback, qos, qos_overriding_options=overrides()
+                entry.message_type,
+                entry.topic,
+                callback,
+                topic.qos,
+                callback_group=None if topic.is_odometry else self._intake.callback_group,
+                qos_overriding_options=overrides(),
+                raw=isinstance(entry, EdgeTopic) and entry.is_array,
             )
 
     def _on_odometry(
         self,
-        robot: str,
+        topic: Input,
         convert: OdometryConverter,
         body_from_sensor: Quaternion,
         message: Any,
@@ -104,12 +132,13 @@ class Subscriptions:
             reason: RejectReason | None = rejection.reason
             self._estimator.reject(rejection.reason)
         else:
-            reason = self._estimator.add_odometry(robot, record.stamp_ns, record.world_from_body, record.position)
+            topic.note_frames(record.frame_id, record.child_frame_id)
+            reason = self._estimator.add_odometry(topic.robot, record.stamp_ns, record.world_from_body, record.position)
         if reason is None:
-            self._health.last_odometry = time.monotonic()
-            self._outputs.publish_orientation(robot, message.header)
+            self._health.last_odometry[topic.name] = time.monotonic()
+            self._outputs.publish_orientation(topic.robot, topic.name, message.header)
         else:
-            self._warn_of_refusal(f"odometry of {robot}", reason)
+            self._warn_of_refusal(f"odometry of {topic.robot}", reason)
         if self._estimator.time_jumps != time_jumps:
             self._on_time_jump()
         self._health.odometry_callback.add(time.perf_counter() - started)
@@ -117,9 +146,10 @@ class Subscriptions:
             self._health.odometry_latency.add(1e-9 * (time.time_ns() - info["source_timestamp"]))
 
     def _on_edges(
-        self, convert: EdgeConverter, counter: TopicCounter, message: Any, _info: dict[str, Any] | None
+        self, topic: Input, edges: EdgeTopic, counter: TopicCounter, message: Any, _info: dict[str, Any] | None
     ) -> None:
-        self._intake.take(convert, counter, message)
+        unpacked = SerializedArray(message, edges.message_type) if edges.is_array else message
+        self._intake.take(topic, counter, edges.convert(unpacked))
 
     def _warn_of_refusal(self, what: str, reason: RejectReason) -> None:
         self._node.get_logger().warning(

@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
 
+from rotavg_ros.online import KeyframeReference
 from rotavg_ros.online.content import Counts
 from rotavg_ros.ros.diagnostics import Health, Reporter
 from rotavg_ros.ros.message_counting import TopicCounter
@@ -35,8 +36,8 @@ def answer(**changes: object) -> SimpleNamespace:
 @pytest.fixture
 def health() -> Health:
     now = time.monotonic()
-    healthy = Health(last_odometry=now, answer=answer(), answered=now)
-    healthy.odometry["odom"] = TopicCounter()
+    healthy = Health(last_odometry={"/odom": now}, answer=answer(), answered=now)
+    healthy.odometry["/odom"] = TopicCounter()
     healthy.ticks.add(0.1)
     return healthy
 
@@ -58,8 +59,7 @@ def test_all_is_well(health: Health) -> None:
 @pytest.mark.parametrize(
     ("changes", "level", "message"),
     [
-        ({"last_odometry": None, "started": -100.0}, WARN, "no odometry yet"),
-        ({"last_odometry": -100.0}, WARN, "no odometry for"),
+        ({"mistakes": ["nobody publishes /odom"]}, WARN, "nobody publishes /odom"),
         ({"answer": answer(num_components=2)}, WARN, "2 components"),
         ({"answer": answer(outlier=np.ones(4, bool))}, WARN, "100 % of the loop closures"),
         ({"failure": "no memory"}, ERROR, "solving fails: no memory"),
@@ -73,17 +73,42 @@ def test_what_is_wrong_is_said(health: Health, changes: dict[str, object], level
     assert status.level == level and message in status.message
 
 
+def test_silence_is_told_of_each_topic(health: Health) -> None:
+    health.odometry["/b/odom"] = TopicCounter()
+    health.started = time.monotonic() - 100
+    assert report(health).message == "no odometry yet on /b/odom"
+    health.last_odometry = {"/odom": health.started, "/b/odom": time.monotonic()}
+    assert report(health).message == "no odometry for 100 s on /odom"
+
+
+def test_edges_that_wait_for_what_hardly_comes(health: Health) -> None:
+    def of(**counts: object) -> str:
+        reporter = Reporter("rotavg: estimator")
+        return reporter.report(
+            health, Counts(10, 12, 7, {}, robots=("robot",), **counts), NodeParameters(), False
+        ).message
+
+    assert of() == of(pending_by_robot={"robot": 7}) == "ok"
+    unknown = of(pending_by_robot={"robot": 3, "roboter": 4})
+    assert unknown.startswith("4 edges are about robots that are not known ('roboter'); known are robot: ")
+    by_id = KeyframeReference("robot", 900)
+    assert of(longest_pending=by_id, longest_pending_s=1.0) == "ok"
+    assert "such as 900 of robot" in of(longest_pending=by_id, longest_pending_s=100.0)
+    assert "one clock" in of(longest_pending=KeyframeReference("robot", None, 5), longest_pending_s=100.0)
+
+
 def test_slow_solves_losses_and_refusals_warn(health: Health) -> None:
     health.ticks.add(20.0)
     assert "longer" in report(health).message
     assert "2 inputs refused" in report(health, nan_rotation=2).message
     for number in (1, 4):
-        health.odometry["odom"].by_sequence.observe("", number)
+        health.odometry["/odom"].by_sequence.observe("", number)
     assert "2 messages lost" in report(health).message
 
 
 def test_a_graph_without_odometry_does_not_miss_it(health: Health) -> None:
-    health.last_odometry, health.started = None, time.monotonic() - 100
+    health.last_odometry.clear()
+    health.started = time.monotonic() - 100
     assert report(health, NodeParameters(keyframe_source="edges")).level == OK
     assert report(health, NodeParameters(unknown_keyframes="create")).level == OK
 

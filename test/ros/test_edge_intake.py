@@ -8,11 +8,13 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
 
 from rotavg_ros.inputs import EdgeRecord
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
 from rotavg_ros.ros.edge_intake import EdgeIntake
 from rotavg_ros.ros.message_counting import TopicCounter
+from rotavg_ros.ros.wiring import Input
 
 LENGTH = 3000
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
@@ -51,9 +53,14 @@ def test_a_long_message_lets_others_have_their_turn(executor: SingleThreadedExec
     intake = EdgeIntake(executor.get_nodes()[0], online, lambda reason: None)
     convert, counter = Chain(), TopicCounter()
     intake.add_source(convert)
-    intake.take(convert, counter, ("long", LENGTH))
+    topic = Input("/edges", "any", "edge_topics", "", QoSProfile(depth=1))
+
+    def take(robot: str, length: int) -> None:
+        intake.take(topic, counter, convert((robot, length)))
+
+    take("long", LENGTH)
     assert 0 < online.counts().edges < LENGTH
-    intake.take(convert, counter, ("short", 1))
+    take("short", 1)
     for _ in range(100 * LENGTH):
         if online.counts().edges == LENGTH + 1:
             break
@@ -61,7 +68,7 @@ def test_a_long_message_lets_others_have_their_turn(executor: SingleThreadedExec
     assert online.snapshot().edge_id.tolist() == [*range(LENGTH), 0]
     assert online.snapshot().robots == ("long", "short") and counter.lost == 0
 
-    intake.take(convert, counter, ("other", LENGTH))
+    take("other", LENGTH)
     online.reset()
     for _ in range(20):
         executor.spin_once(timeout_sec=0.01)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -19,8 +18,6 @@ from sensor_msgs.msg import Imu
 
 pytestmark = pytest.mark.ros
 
-ROOT = Path(__file__).resolve().parents[2]
-INTERFACES = ROOT / "build" / "test_interfaces" / "install"
 PUBLISHER = Path(__file__).with_name("foreign_publisher.py")
 NODE = Path(sys.executable).with_name("rotavg_node")
 BODY_FROM_SENSOR = Rotation.from_euler("zyx", [-90, 0, -90], degrees=True)
@@ -39,22 +36,6 @@ EDGE_TOPICS = {
 
 def strings(values) -> str:
     return "[" + ", ".join(f"'{value}'" for value in values) + "]"
-
-
-@pytest.fixture
-def foreign_packages(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lets processes that are started from now on see others' message packages."""
-    if not INTERFACES.is_dir():
-        pytest.skip("others' messages are not built; `make test` or `tools/setup_environment.py --for-tests` does it")
-    python = next(INTERFACES.glob("lib/python3.*/site-packages"))
-    for variable, folder in (
-        ("AMENT_PREFIX_PATH", INTERFACES),
-        ("LD_LIBRARY_PATH", INTERFACES / "lib"),
-        ("PYTHONPATH", python),
-    ):
-        monkeypatch.setenv(variable, str(folder), prepend=os.pathsep)
-    # The ROS wheels restart Python once to set library paths; they must do so with these.
-    monkeypatch.delenv("_ROS_WHEELS_BOOTSTRAP_COMPLETE", raising=False)
 
 
 def world_from_body(corner: int, turned_deg: float = 0.0) -> Rotation:

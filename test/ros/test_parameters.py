@@ -49,7 +49,11 @@ def test_the_defaults_are_good_and_declared_with_descriptions_and_ranges(make_no
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        ({"keyframe_angle_deg": 5}, "keyframe_angle_deg has the wrong type; it must be double"),
+        ({"keyframe_angle_deg": "5"}, "keyframe_angle_deg has the wrong type; it must be double"),
+        ({"keyframe_angle_deg": 500}, "keyframe_angle_deg must be between 0 and 360"),
+        ({"world_frame": ""}, "world_frame is ''; name the frame"),
+        ({"world_frame": "/map"}, "world_frame is '/map'; name the frame"),
+        ({"publish_tf": True, "odometry_topics": ["imu:sensor_msgs/msg/Imu"]}, "imu:sensor_msgs/msg/Imu has none"),
         ({"odometry_topics": None}, "odometry_topics is empty"),
         ({"robots": "a"}, "robots has the wrong type; it must be string array"),
         ({"pending_capacity": 0}, "pending_capacity must be between 1 and"),
@@ -74,10 +78,25 @@ def test_mistakes_are_one_clear_line(make_node, overrides: dict[str, object], me
 
 
 def test_unknown_parameters_are_named_with_a_suggestion(make_node) -> None:
-    node = make_node(keyframe_angel_deg=3.0, **{"qos_overrides./odom.subscription.depth": 5})
+    node = make_node(keyframe_angel_deg=3.0, planner_frequency=1, **{"qos_overrides./odom.subscription.depth": 5})
     parameter_server.declare(node)
-    (line,) = parameter_server.unknown(node)
-    assert "keyframe_angel_deg" in line and "did you mean keyframe_angle_deg?" in line
+    mistaken, others = parameter_server.unknown(node)
+    assert mistaken == [
+        "unknown parameter keyframe_angel_deg is ignored; did you mean keyframe_angle_deg?",
+        "unknown parameter qos_overrides./odom.subscription.depth is ignored",
+    ]
+    assert others == ["unknown parameter planner_frequency is ignored"]
+
+
+def test_whole_numbers_are_taken_where_fractions_may_be(make_node) -> None:
+    node = make_node(keyframe_angle_deg=5, edge_sensor_orientations=[0, 0, 0, 1])
+    found = parameter_server.declare(node)
+    assert (found.keyframe_angle_deg, found.edge_sensor_orientations) == (5.0, (0.0, 0.0, 0.0, 1.0))
+    now = [found]
+    parameter_server.watch(node, lambda: now[0], lambda parameters: now.__setitem__(0, parameters))
+    (result,) = node.set_parameters([Parameter("keyframe_angle_deg", value=7)])
+    assert result.successful and now[0].keyframe_angle_deg == 7.0
+    assert node.get_parameter("keyframe_angle_deg").value == 7.0
 
 
 def test_the_yaml_is_what_a_node_reads(make_node) -> None:
