@@ -20,6 +20,19 @@ INWARD = {
     "inputs": {"online", "view_graph"},
     "settings": {"errors", "inputs", "online", "solver", "view_graph"},
 }
+# What a robot runs needs no more.
+NODE_MAY_USE = {
+    "errors",
+    "version",
+    "view_graph",
+    "solve",
+    "ViewGraph",
+    "solver",
+    "online",
+    "inputs",
+    "settings",
+    "ros",
+}
 # Others' packages that only one part may know.
 BORDERS = {"rclpy": "ros", "rosbags": "bags", "mcap": "bags"}
 
@@ -35,6 +48,15 @@ def imported(part: str) -> Iterator[tuple[str, str]]:
                 yield from ((f"{node.module}.{alias.name}", file.name) for alias in node.names)
             elif isinstance(node, ast.ImportFrom) and node.module:
                 yield node.module, file.name
+
+
+def test_the_node_knows_nothing_of_the_harness() -> None:
+    """What a robot runs stands by itself; what demonstrates and measures it may use its parts."""
+    for module, file in imported("ros/node"):
+        top, *inner = module.split(".")
+        if top == PACKAGE.name:
+            assert inner[0] in NODE_MAY_USE and module.split(".")[1:3] != ["ros", "harness"], f"{file} imports {module}"
+    assert {path.name for path in (PACKAGE / "ros").iterdir() if path.is_dir()} - {"__pycache__"} == {"node", "harness"}
 
 
 @pytest.mark.parametrize("part", INWARD)

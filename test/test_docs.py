@@ -11,13 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from rotavg_ros.ros.node.main.intake import wiring
+from rotavg_ros.ros.node.main.output import frame_correction
 
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.cli.main import COMMANDS, main
 from rotavg_ros.datasets.graph_file import write_graph
 from rotavg_ros.datasets.robot_run import robot_run_config
 from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
-from rotavg_ros.ros import diagnostics, frame_correction, parameter_server, wiring
+from rotavg_ros.ros.node import diagnostics, parameter_server
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -25,7 +27,7 @@ PROGRAMS = ("rotavg", "rotavg_node", "make", "ros2", "pip", "rosdep", "colcon", 
 
 # What is not run here, by its first words, and why.
 NOT_RUN = {
-    "make demo": "minutes; test/ros/test_demo.py runs what it calls",
+    "make demo": "minutes; test/ros/harness/test_demo.py runs what it calls",
     ". .venv/bin/activate": "a shell's own",
     ". install/setup.sh": "a shell's own, on a machine with ROS 2 from apt",
     "cd ~/ws": "a workspace with ROS 2 from apt",
@@ -34,10 +36,10 @@ NOT_RUN = {
     "colcon build": "ROS 2 from apt; `make setup` builds the same folders",
     "ros2 run rotavg_ros": "ros2cli is not on PyPI; test/ros starts the same node with the same parameters",
     "rotavg_node": "runs until it is stopped; test/ros starts it",
-    "rotavg play run": "ends only when a subscriber has everything; test/ros/test_play.py",
+    "rotavg play run": "ends only when a subscriber has everything; test/ros/harness/test_play.py",
     "rotavg play b25b": "the same",
-    "rotavg demo": "starts a node and plays for 12 s; test/ros/test_demo.py",
-    "rotavg convert B25b_0.000.g2o": "data that is no part of the repository; test/ros/test_node_b25b.py",
+    "rotavg demo": "starts a node and plays for 12 s; test/ros/harness/test_demo.py",
+    "rotavg convert B25b_0.000.g2o": "data that is no part of the repository; test/ros/node/test_node_b25b.py",
     "python examples/three_robots.py": "test/ros runs it",
 }
 # Where the lines of the diagnostics come from.

@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.graph is None and (arguments.truth is not None or arguments.stamps is not None):
         raise DemoError("--truth and --stamps belong to --graph; give the graph as well")
     try:
-        from rotavg_ros.ros.live_run import installed_node, keep_to_this_machine, play_to_node
+        from rotavg_ros.ros.harness.live_run import installed_node, keep_to_this_machine, play_to_node
     except ImportError as error:
         raise DemoError(
             f"the demo needs ROS 2's rclpy and rotavg_msgs ({error}); run `make setup` in the sources"

@@ -15,10 +15,10 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from rotavg_ros.online import Answer, OnlineEstimator
-from rotavg_ros.ros.conversions import flags_message, orientations_message, to_quaternion_message
-from rotavg_ros.ros.frame_correction import FrameCorrection
-from rotavg_ros.ros.topics import LATCHED, publisher
-from rotavg_ros.ros.visualization import markers_message, path_message
+from rotavg_ros.ros.node.output.conversions import flags_message, orientations_message, to_quaternion_message
+from rotavg_ros.ros.node.output.frame_correction import FrameCorrection
+from rotavg_ros.ros.node.output.visualization import markers_message, path_message
+from rotavg_ros.ros.node.topics import LATCHED, publisher
 from rotavg_ros.settings.parameters import NodeParameters
 
 # After a drawing the worker does other things for so many times as long: at 10 000 keyframes one takes half a second.

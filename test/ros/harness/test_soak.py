@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from rotavg_ros.ros import soak
+from rotavg_ros.ros.harness import soak
 
 pytestmark = pytest.mark.ros
 

@@ -10,7 +10,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
 from rclpy.executors import SingleThreadedExecutor
 
-from rotavg_ros.ros.worker import Worker
+from rotavg_ros.ros.node.worker import Worker
 
 PATIENCE_S = 30.0
 

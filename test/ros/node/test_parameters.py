@@ -11,7 +11,7 @@ import yaml
 rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
 from rclpy.parameter import Parameter
 
-from rotavg_ros.ros import parameter_server
+from rotavg_ros.ros.node import parameter_server
 from rotavg_ros.settings.fields import ParameterError
 from rotavg_ros.settings.parameters import NodeParameters
 from rotavg_ros.settings.text import to_markdown, to_yaml

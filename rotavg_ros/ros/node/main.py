@@ -66,7 +66,7 @@ def _run(stop: _StopSignal) -> int:
     try:
         from rclpy.executors import SingleThreadedExecutor
 
-        from rotavg_ros.ros.estimator_node import RotavgNode
+        from rotavg_ros.ros.node.estimator_node import RotavgNode
     except ModuleNotFoundError as error:
         return _fail_without(error)
     executor = SingleThreadedExecutor()

@@ -17,8 +17,8 @@ from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.node_answer import NodeAnswer
-from rotavg_ros.ros.domain import free_domain_id
-from rotavg_ros.ros.recorder import Recorder
+from rotavg_ros.ros.harness.domain import free_domain_id
+from rotavg_ros.ros.harness.recorder import Recorder
 
 _START_TIMEOUT_S = 60.0
 _REST_TIMEOUT_S = 180.0

@@ -13,8 +13,8 @@ from rclpy.node import Node
 
 from rotavg_ros.inputs import EdgeConverter, EdgeRecord, EdgeVerdict
 from rotavg_ros.online import OnlineEstimator, RejectReason
-from rotavg_ros.ros.message_counting import TopicCounter
-from rotavg_ros.ros.wiring import Input
+from rotavg_ros.ros.node.intake.wiring import Input
+from rotavg_ros.ros.node.message_counting import TopicCounter
 
 _SLICE_S = 0.005
 _BREAK_S = 0.001

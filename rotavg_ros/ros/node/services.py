@@ -11,9 +11,9 @@ from rotavg_msgs.srv import LabelEdge
 from std_srvs.srv import SetBool, Trigger
 
 from rotavg_ros.online import OnlineEstimator
-from rotavg_ros.ros.diagnostics import Health
-from rotavg_ros.ros.solving import Solving
-from rotavg_ros.ros.worker import Worker
+from rotavg_ros.ros.node.diagnostics import Health
+from rotavg_ros.ros.node.solving import Solving
+from rotavg_ros.ros.node.worker import Worker
 from rotavg_ros.view_graph import EdgeLabel
 
 

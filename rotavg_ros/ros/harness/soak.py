@@ -22,9 +22,9 @@ from rotavg_ros import rotations
 from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.datasets.trajectories import World
 from rotavg_ros.evaluation.tables import Column, Table
-from rotavg_ros.ros.conversions import to_quaternion_message
-from rotavg_ros.ros.live_run import LiveRunError, installed_node, keep_to_this_machine, stop_process
-from rotavg_ros.ros.recorder import Recorder
+from rotavg_ros.ros.harness.live_run import LiveRunError, installed_node, keep_to_this_machine, stop_process
+from rotavg_ros.ros.harness.recorder import Recorder
+from rotavg_ros.ros.node.output.conversions import to_quaternion_message
 from rotavg_ros.view_graph import ViewGraph
 
 RATES_HZ = (50.0, 200.0)

@@ -15,15 +15,15 @@ from rclpy.timer import Timer
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import OnlineEstimator
-from rotavg_ros.ros import parameter_server
-from rotavg_ros.ros.diagnostics import Health, Reporter
-from rotavg_ros.ros.outputs import Outputs
-from rotavg_ros.ros.services import Services
-from rotavg_ros.ros.solving import Solving
-from rotavg_ros.ros.subscriptions import Subscriptions
-from rotavg_ros.ros.warm_up import warm_up
-from rotavg_ros.ros.wiring import Wiring
-from rotavg_ros.ros.worker import Worker
+from rotavg_ros.ros.node import parameter_server
+from rotavg_ros.ros.node.diagnostics import Health, Reporter
+from rotavg_ros.ros.node.intake.subscriptions import Subscriptions
+from rotavg_ros.ros.node.intake.wiring import Wiring
+from rotavg_ros.ros.node.output.outputs import Outputs
+from rotavg_ros.ros.node.services import Services
+from rotavg_ros.ros.node.solving import Solving
+from rotavg_ros.ros.node.warm_up import warm_up
+from rotavg_ros.ros.node.worker import Worker
 from rotavg_ros.settings.parameters import NODE_NAME, NodeParameters
 from rotavg_ros.version import __version__
 

@@ -334,7 +334,7 @@ def test_a_clean_end_during_a_long_solve(live_node) -> None:
 
 @pytest.mark.parametrize("package", ["rclpy", "rotavg_msgs"])
 def test_without_ros_it_is_one_line(package: str) -> None:
-    hidden = f"import sys; sys.modules[{package!r}] = None; from rotavg_ros.ros.node import main; sys.exit(main())"
+    hidden = f"import sys; sys.modules[{package!r}] = None; from rotavg_ros.ros.node.main import main; sys.exit(main())"
     ended = subprocess.run([sys.executable, "-c", hidden], capture_output=True, text=True, timeout=300, check=False)
     assert (ended.returncode, ended.stdout) == (2, "")
     assert ended.stderr.startswith(f"rotavg_node: error: there is no Python package {package}; source ROS 2's setup.sh")
@@ -373,7 +373,7 @@ def test_networks_that_cannot_be_used_are_told_at_the_start(tmp_path: Path, dama
     else:
         stated = {"network": "slam-clean-net", "architecture_version": "0"}
         safetensors.torch.save_file(safetensors.torch.load(content), weights, stated)
-    command = [sys.executable, "-c", "import sys; from rotavg_ros.ros.node import main; sys.exit(main())"]
+    command = [sys.executable, "-c", "import sys; from rotavg_ros.ros.node.main import main; sys.exit(main())"]
     ended = subprocess.run(
         command,
         cwd=tmp_path,

@@ -18,9 +18,9 @@ from rotavg_ros.online import Answer, OnlineEstimator
 from rotavg_ros.online.estimator import TickAbandonedError
 from rotavg_ros.online.joins import joins
 from rotavg_ros.online.state_file import remove_leftovers
-from rotavg_ros.ros.diagnostics import Health
-from rotavg_ros.ros.message_counting import Durations
-from rotavg_ros.ros.outputs import Outputs
+from rotavg_ros.ros.node.diagnostics import Health
+from rotavg_ros.ros.node.message_counting import Durations
+from rotavg_ros.ros.node.output.outputs import Outputs
 
 _LOG_PERIOD_S = 5.0
 

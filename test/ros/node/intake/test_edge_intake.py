@@ -12,9 +12,9 @@ from rclpy.qos import QoSProfile
 
 from rotavg_ros.inputs import EdgeRecord
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
-from rotavg_ros.ros.edge_intake import EdgeIntake
-from rotavg_ros.ros.message_counting import TopicCounter
-from rotavg_ros.ros.wiring import Input
+from rotavg_ros.ros.node.intake.edge_intake import EdgeIntake
+from rotavg_ros.ros.node.intake.wiring import Input
+from rotavg_ros.ros.node.message_counting import TopicCounter
 
 LENGTH = 3000
 IDENTITY = (0.0, 0.0, 0.0, 1.0)

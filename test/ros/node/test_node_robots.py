@@ -21,7 +21,7 @@ from rotavg_msgs.msg import AbsoluteOrientations
 
 pytestmark = pytest.mark.ros
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "three_robots.py"
+EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "three_robots.py"
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 JOINED_ERROR_DEG = 5.0  # a closure's own error is 1°, that of a robot's odometry by the end about 8°
 

@@ -7,7 +7,7 @@ import os
 import pytest
 
 rclpy = pytest.importorskip("rclpy")
-from rotavg_ros.ros.domain import free_domain_id
+from rotavg_ros.ros.harness.domain import free_domain_id
 
 pytestmark = pytest.mark.ros
 

@@ -15,7 +15,7 @@ from rotavg_msgs.msg import KeyframeReference, RelativeRotation, RelativeRotatio
 from std_msgs.msg import Header
 
 from rotavg_ros.inputs import EDGE_CONVERTERS, Source
-from rotavg_ros.ros.serialized_array import SerializedArray
+from rotavg_ros.ros.node.intake.serialized_array import SerializedArray
 
 
 def some_edges(number: int) -> RelativeRotationArray:
@@ -73,7 +73,7 @@ def test_both_byte_orders_are_read_and_other_representations_are_left_to_rclpy(m
     assert (array.header.stamp.sec, array.header.stamp.nanosec, array.header.frame_id) == (7, 9, "cam")
     assert list(array.edges) == []
     other = b"\x00\x07" + serialize_message(some_edges(2))[2:]
-    monkeypatch.setattr("rotavg_ros.ros.serialized_array.deserialize_message", lambda *_: some_edges(2))
+    monkeypatch.setattr("rotavg_ros.ros.node.intake.serialized_array.deserialize_message", lambda *_: some_edges(2))
     assert [plain(edge) for edge in SerializedArray(other, RelativeRotationArray).edges] == [
         plain(edge) for edge in some_edges(2).edges
     ]

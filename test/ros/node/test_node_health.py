@@ -24,7 +24,7 @@ SABOTAGED = """
 import sys, time
 from pathlib import Path
 import rotavg_ros.solver
-from rotavg_ros.ros.node import main
+from rotavg_ros.ros.node.main import main
 order, solve = Path(sys.argv.pop(1)), rotavg_ros.solver.solve
 
 def sabotaged(*arguments, **options):

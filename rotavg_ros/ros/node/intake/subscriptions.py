@@ -16,15 +16,15 @@ from rotavg_ros.inputs import OdometryConverter
 from rotavg_ros.online import OnlineEstimator, RejectReason
 from rotavg_ros.online.measurements import RejectedInputError
 from rotavg_ros.online.quaternion import Quaternion
-from rotavg_ros.ros import adapters
-from rotavg_ros.ros.adapters import EdgeTopic, OdometryTopic
-from rotavg_ros.ros.diagnostics import Health
-from rotavg_ros.ros.edge_intake import EdgeIntake
-from rotavg_ros.ros.message_counting import TopicCounter
-from rotavg_ros.ros.outputs import Outputs
-from rotavg_ros.ros.serialized_array import SerializedArray
-from rotavg_ros.ros.topics import overrides, user_error_about
-from rotavg_ros.ros.wiring import Input
+from rotavg_ros.ros.node.diagnostics import Health
+from rotavg_ros.ros.node.intake import adapters
+from rotavg_ros.ros.node.intake.adapters import EdgeTopic, OdometryTopic
+from rotavg_ros.ros.node.intake.edge_intake import EdgeIntake
+from rotavg_ros.ros.node.intake.serialized_array import SerializedArray
+from rotavg_ros.ros.node.intake.wiring import Input
+from rotavg_ros.ros.node.message_counting import TopicCounter
+from rotavg_ros.ros.node.output.outputs import Outputs
+from rotavg_ros.ros.node.topics import overrides, user_error_about
 from rotavg_ros.settings.parameters import NodeParameters
 
 _LOG_PERIOD_S = 5.0

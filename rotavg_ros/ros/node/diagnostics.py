@@ -11,7 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from rotavg_ros.online import Answer
 from rotavg_ros.online.content import Counts
-from rotavg_ros.ros.message_counting import Durations, TopicCounter
+from rotavg_ros.ros.node.message_counting import Durations, TopicCounter
 from rotavg_ros.settings.parameters import NodeParameters
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind

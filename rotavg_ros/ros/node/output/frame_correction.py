@@ -9,8 +9,8 @@ from std_msgs.msg import Header
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.online.quaternion import Quaternion
-from rotavg_ros.ros.conversions import to_quaternion_message
-from rotavg_ros.ros.topics import publisher
+from rotavg_ros.ros.node.output.conversions import to_quaternion_message
+from rotavg_ros.ros.node.topics import publisher
 
 NO_TRANSLATION = (
     "publish_tf: the transform from the world to the odometry frame has no translation yet; take positions from "
