@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import BinaryIO
@@ -53,92 +54,108 @@ def keep_to_this_machine() -> None:
     os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
 
 
+@dataclass(frozen=True)
+class Playing:
+    """What is played to the node.
+
+    Attributes:
+        bag: its path.
+        topics: of the bag.
+        rate: times real time.
+    """
+
+    bag: Path
+    topics: list[str]
+    rate: float
+
+
 def play_to_node(
-    bag: Path,
+    playing: Playing,
     parameters: dict[str, str],
-    *,
-    rate: float,
-    topics: list[str],
     log: Path,
     waiting: Callable[[str], AbstractContextManager[None]],
 ) -> NodeAnswer:
     """Start the node, play the bag to it, wait until it is at rest, and stop it.
 
     Args:
-        bag: what to play.
+        playing: the bag, and how.
         parameters: of the node, by name.
-        rate: times real time.
-        topics: of the bag.
         log: file for what the node and the player print.
         waiting: shows that something takes its time.
 
     Raises:
         LiveRunError: the node died or gave no answer; the message has its last words.
     """
-    settings = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
     with log.open("wb") as sink, Recorder() as recorder:
-        node = subprocess.Popen(
-            [installed_node(), "--ros-args", *settings], stdin=subprocess.DEVNULL, stdout=sink, stderr=subprocess.STDOUT
-        )
+        node = _StartedNode(parameters, log, sink)
         try:
             with waiting("starting the node"):
-                _spin_until(recorder, lambda: recorder.hears_node, node, log, _START_TIMEOUT_S, "did not start")
-            _play(bag, rate, topics, recorder, node, log, sink)
+                node.spin_until(recorder, lambda: recorder.hears_node, _START_TIMEOUT_S, "did not start")
+            _play(playing, recorder, node, sink)
             recorder.forget_reports()
             with waiting("waiting for the last answer"):
-                _spin_until(recorder, lambda: recorder.is_at_rest, node, log, _REST_TIMEOUT_S, "did not come to rest")
+                node.spin_until(recorder, lambda: recorder.is_at_rest, _REST_TIMEOUT_S, "did not come to rest")
             answer = recorder.answer()
-            exit_code = stop_process(node)
         finally:
-            stop_process(node)
+            exit_code = node.stop()
     if exit_code != 0:
-        raise LiveRunError(f"the node ended with exit code {exit_code}; {_last_words(log)}")
+        raise LiveRunError(f"the node ended with exit code {exit_code}; {node.last_words()}")
     if answer is None or len(answer.keyframe_ids) == 0:
-        raise LiveRunError(f"the node gave no answer; {_last_words(log)}")
+        raise LiveRunError(f"the node gave no answer; {node.last_words()}")
     return answer
 
 
-def _play(
-    bag: Path,
-    rate: float,
-    topics: list[str],
-    recorder: Recorder,
-    node: subprocess.Popen[bytes],
-    log: Path,
-    sink: BinaryIO,
-) -> None:
-    command = [sys.executable, "-m", "rotavg_ros.cli.main", "play", str(bag), "--rate", str(rate), "--topics", *topics]
+class _StartedNode:
+    """The installed node as a process that prints into a log."""
+
+    def __init__(self, parameters: dict[str, str], log: Path, sink: BinaryIO) -> None:
+        settings = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
+        command = [str(installed_node()), "--ros-args", *settings]
+        self._log = log
+        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=sink, stderr=subprocess.STDOUT)
+
+    def spin_until(self, recorder: Recorder, condition: Callable[[], bool], timeout_s: float, failure: str) -> None:
+        """Listen until the condition holds.
+
+        Raises:
+            LiveRunError: the node died, or ``failure``: the time was over.
+        """
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            recorder.spin(0.1)
+            self.check_alive()
+            if time.monotonic() > deadline:
+                raise LiveRunError(f"the node {failure} within {timeout_s:.0f} s; {self.last_words()}")
+
+    def check_alive(self) -> None:
+        """Raise a :class:`LiveRunError` if it has died."""
+        if self._process.poll() is not None:
+            raise LiveRunError(f"the node died with exit code {self._process.returncode}; {self.last_words()}")
+
+    def stop(self) -> int:
+        """End it; returns its exit code."""
+        return stop_process(self._process)
+
+    def last_words(self) -> str:
+        """The last line that it, or the player, printed."""
+        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        return f"its last words in {self._log}: {lines[-1].strip()}" if lines else f"it printed nothing ({self._log})"
+
+
+def _play(playing: Playing, recorder: Recorder, node: _StartedNode, sink: BinaryIO) -> None:
+    command = [sys.executable, "-m", "rotavg_ros.cli.main", "play", str(playing.bag), "--rate", str(playing.rate)]
     # Ctrl-C reaches the player as well; what it says then is for the log.
-    player = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=sink)
+    player = subprocess.Popen(
+        [*command, "--topics", *playing.topics], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=sink
+    )
     try:
         while player.poll() is None:
             recorder.spin(0.2)
-            _check_alive(node, log)
+            node.check_alive()
     finally:
         stop_process(player)
     if player.returncode != 0:
-        raise LiveRunError(f"playing the bag failed with exit code {player.returncode}; {_last_words(log)}")
-
-
-def _spin_until(
-    recorder: Recorder,
-    condition: Callable[[], bool],
-    node: subprocess.Popen[bytes],
-    log: Path,
-    timeout_s: float,
-    failure: str,
-) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        recorder.spin(0.1)
-        _check_alive(node, log)
-        if time.monotonic() > deadline:
-            raise LiveRunError(f"the node {failure} within {timeout_s:.0f} s; {_last_words(log)}")
-
-
-def _check_alive(node: subprocess.Popen[bytes], log: Path) -> None:
-    if node.poll() is not None:
-        raise LiveRunError(f"the node died with exit code {node.returncode}; {_last_words(log)}")
+        raise LiveRunError(f"playing the bag failed with exit code {player.returncode}; {node.last_words()}")
 
 
 def stop_process(process: subprocess.Popen[bytes]) -> int:
@@ -150,8 +167,3 @@ def stop_process(process: subprocess.Popen[bytes]) -> int:
         with suppress(subprocess.TimeoutExpired):
             process.wait(_EXIT_TIMEOUT_S)
     return process.wait()
-
-
-def _last_words(log: Path) -> str:
-    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    return f"its last words in {log}: {lines[-1].strip()}" if lines else f"it printed nothing ({log})"

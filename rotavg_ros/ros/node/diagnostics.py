@@ -1,17 +1,14 @@
-"""How the node is doing, once a second."""
+"""How the node is doing, told once a second."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from rotavg_ros.online import Answer
 from rotavg_ros.online.content import Counts
-from rotavg_ros.ros.node.message_counting import Durations, TopicCounter
+from rotavg_ros.ros.node.health import Health
 from rotavg_ros.settings.parameters import NodeParameters
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind
@@ -25,46 +22,6 @@ _SUSPICIOUS_OUTLIER_SHARE = 0.5
 _MOST_NAMES = 3
 # Refusals that a healthy system produces: a sender that repeats itself.
 _HARMLESS = {"duplicate_edge", "marginalized_keyframe"}
-
-
-@dataclass
-class Health:
-    """What the node measures about itself. Times are of the monotonic clock, in seconds.
-
-    Attributes:
-        odometry, edges: counters per topic name.
-        ticks, odometry_callback, odometry_latency: durations; latency from sending to ``orientation``.
-        answer: the last one published, and when.
-        last_odometry: when a message was last taken, per topic name.
-        mistakes: in the wiring and the parameters, a line each.
-        joins: how often components became one.
-        unsolved_since: since when the graph has been ahead of the answer; None if it is not.
-        solve_failures: how many ticks failed in all; ``failure`` is the last one's message, None after a good tick.
-        save_failure: why the last save failed, None if it did not.
-    """
-
-    odometry: dict[str, TopicCounter] = field(default_factory=dict)
-    edges: dict[str, TopicCounter] = field(default_factory=dict)
-    ticks: Durations = field(default_factory=Durations)
-    odometry_callback: Durations = field(default_factory=Durations)
-    odometry_latency: Durations = field(default_factory=Durations)
-    started: float = field(default_factory=time.monotonic)
-    last_odometry: dict[str, float] = field(default_factory=dict)
-    mistakes: list[str] = field(default_factory=list)
-    answer: Answer | None = None
-    joins: int = 0
-    answered: float | None = None
-    unsolved_since: float | None = None
-    solve_failures: int = 0
-    failure: str | None = None
-    save_failure: str | None = None
-
-    @property
-    def lost(self) -> int:
-        return sum(counter.lost for counter in self._counters())
-
-    def _counters(self) -> Iterable[TopicCounter]:
-        return [*self.odometry.values(), *self.edges.values()]
 
 
 class Reporter:

@@ -16,14 +16,15 @@ from rclpy.timer import Timer
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import OnlineEstimator
 from rotavg_ros.ros.node import parameter_server
-from rotavg_ros.ros.node.diagnostics import Health, Reporter
+from rotavg_ros.ros.node.diagnostics import Reporter
+from rotavg_ros.ros.node.health import Health
 from rotavg_ros.ros.node.intake.subscriptions import Subscriptions
 from rotavg_ros.ros.node.intake.wiring import Wiring
 from rotavg_ros.ros.node.output.outputs import Outputs
 from rotavg_ros.ros.node.services import Services
 from rotavg_ros.ros.node.solving import Solving
 from rotavg_ros.ros.node.warm_up import warm_up
-from rotavg_ros.ros.node.worker import Worker
+from rotavg_ros.ros.node.worker import Worker, Workers
 from rotavg_ros.settings.parameters import NODE_NAME, NodeParameters
 from rotavg_ros.version import __version__
 
@@ -56,7 +57,8 @@ class RotavgNode(Node):
         state_file = Path(parameters.state_file) if parameters.state_file else None
         self._solving = Solving(self, self._estimator, self._health, self._outputs, state_file)
         listening = Subscriptions(self, parameters, self._estimator, self._health, self._outputs, self._on_time_jump)
-        Services(self, self._estimator, self._health, self._solving, self._worker, self._saver, parameters.robots[0])
+        workers = Workers(solver=self._worker, saver=self._saver)
+        Services(self, self._estimator, self._solving, workers, parameters.robots[0])
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # ticks though /clock is paused or absent
         self._solve_timer = self._create_timer(parameters.solve_period_s, self._on_solve_timer)
@@ -125,11 +127,8 @@ class RotavgNode(Node):
             self.get_logger().warning("time went back: odometry is refused until it is ahead again (on_time_jump)")
 
     def _on_diagnostics_timer(self) -> None:
-        self._health.mistakes = [
-            *self._mistaken_parameters,
-            *self._wiring.warnings(self._settings),
-            *self._outputs.warnings(),
-        ]
+        wiring = self._wiring.warnings(self._settings)
+        self._health.noticed([*self._mistaken_parameters, *wiring, *self._outputs.warnings()])
         status = self._reporter.report(self._health, self._estimator.counts(), self._settings, self._estimator.paused)
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()

@@ -51,13 +51,17 @@ class _StopSignal:
 
     def __init__(self) -> None:
         self.requested = False
-        self.starting = True
+        self._starting = True
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 signal.signal(number, self._request)
 
+    def has_started(self) -> None:
+        """From now on there is something to tidy up at the end."""
+        self._starting = False
+
     def _request(self, _number: int, _frame: FrameType | None) -> None:
-        if self.starting:
+        if self._starting:
             os._exit(0)  # in the middle of an import, perhaps; there is nothing to tidy up yet
         self.requested = True
 
@@ -75,7 +79,7 @@ def _run(stop: _StopSignal) -> int:
     except UserError as error:
         return _fail(str(error))
     executor.add_node(node)
-    stop.starting = False
+    stop.has_started()
     while not stop.requested:
         try:
             executor.spin_once(timeout_sec=_LONGEST_WAIT_S)

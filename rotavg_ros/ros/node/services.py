@@ -11,9 +11,8 @@ from rotavg_msgs.srv import LabelEdge
 from std_srvs.srv import SetBool, Trigger
 
 from rotavg_ros.online import OnlineEstimator
-from rotavg_ros.ros.node.diagnostics import Health
 from rotavg_ros.ros.node.solving import Solving
-from rotavg_ros.ros.node.worker import Worker
+from rotavg_ros.ros.node.worker import Worker, Workers
 from rotavg_ros.view_graph import EdgeLabel
 
 
@@ -24,21 +23,18 @@ class Services:
         self,
         node: Node,
         estimator: OnlineEstimator,
-        health: Health,
         solving: Solving,
-        worker: Worker,
-        saver: Worker,
+        workers: Workers,
         default_robot: str,
     ) -> None:
         self._estimator = estimator
-        self._health = health
         self._solving = solving
-        self._worker = worker
+        self._workers = workers
         self._default_robot = default_robot
         for name, job, thread in (
-            ("solve_now", solving.solve_now, worker),
-            ("save", solving.save, saver),
-            ("load", self._load, saver),
+            ("solve_now", solving.solve_now, workers.solver),
+            ("save", solving.save, workers.saver),
+            ("load", self._load, workers.saver),
         ):
             # The default group runs one callback at a time, and would run nothing while one of these is awaited.
             on_trigger = partial(self._on_trigger, job, thread)
@@ -61,7 +57,7 @@ class Services:
 
     def _load(self) -> str:
         message = self._solving.load()
-        self._worker.submit_once(self._solving.tick_quietly)
+        self._workers.solver.submit_once(self._solving.tick_quietly)
         return message
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -70,10 +66,8 @@ class Services:
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self._estimator.pause(request.data)
-        self._health.unsolved_since = None
+        response.message = self._solving.pause(request.data)
         response.success = True
-        response.message = "paused: inputs are kept, nothing is solved" if request.data else "running"
         return response
 
     def _on_label_edge(self, request: LabelEdge.Request, response: LabelEdge.Response) -> LabelEdge.Response:

@@ -7,7 +7,6 @@ reset on the executor's thread, which give the running solve up.
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,8 +17,7 @@ from rotavg_ros.online import Answer, OnlineEstimator
 from rotavg_ros.online.estimator import TickAbandonedError
 from rotavg_ros.online.joins import joins
 from rotavg_ros.online.state_file import remove_leftovers
-from rotavg_ros.ros.node.diagnostics import Health
-from rotavg_ros.ros.node.message_counting import Durations
+from rotavg_ros.ros.node.health import Health
 from rotavg_ros.ros.node.output.outputs import Outputs
 
 _LOG_PERIOD_S = 5.0
@@ -50,17 +48,16 @@ class Solving:
     def tick(self, force_cold: bool = False) -> Answer | None:
         """Solve if there is anything new, and publish the answer; None if there is none."""
         health = self._health
-        if self._estimator.is_behind and health.unsolved_since is None:
-            health.unsolved_since = time.monotonic()
+        if self._estimator.is_behind:
+            health.fell_behind()
         try:
             answer = self._estimator.tick(force_cold)
         except TickAbandonedError:
             raise
         except Exception as error:
-            health.solve_failures += 1
-            health.failure = str(error)
+            health.tick_failed(error)
             raise
-        health.failure = None
+        health.tick_went_well()
         if answer is not None:
             self._publish(answer)
             self._outputs.draw(answer)
@@ -78,10 +75,15 @@ class Solving:
         self._forget_answer()
         return "reset"
 
+    def pause(self, paused: bool) -> str:
+        self._estimator.pause(paused)
+        self._health.waits_for_nothing()
+        return "paused: inputs are kept, nothing is solved" if paused else "running"
+
     def save(self) -> str:
         state_file = self._named_state_file()
         self._estimator.save(state_file)
-        self._health.save_failure = None
+        self._health.saved()
         return f"saved to {state_file}"
 
     def load(self) -> str:
@@ -105,7 +107,7 @@ class Solving:
         except Exception as error:
             if str(error) != self._health.save_failure:
                 self._node.get_logger().error(str(error))
-            self._health.save_failure = str(error)
+            self._health.saved(failure=str(error))
 
     def draw_quietly(self) -> None:
         """Draw the last answer for those who look; what goes wrong is logged."""
@@ -130,14 +132,13 @@ class Solving:
                 raise TickAbandonedError("abandoned: everything was forgotten or replaced meanwhile")
             self._tell_of_joins(answer)
             self._outputs.publish_answer(answer)
-            health.ticks.add(answer.seconds)
-            health.answer, health.answered, health.unsolved_since = answer, time.monotonic(), None
+            health.published(answer)
 
     def _tell_of_joins(self, answer: Answer) -> None:
         health = self._health
         if health.answer is not None and health.answer.version > self._estimator.first_version:
             for join in joins(health.answer, answer):
-                health.joins += 1
+                health.joined()
                 left = f"the graph is in {answer.num_components} components" if answer.num_components > 1 else "all one"
                 self._node.get_logger().info(f"{join} ({left})")
 
@@ -145,11 +146,10 @@ class Solving:
         """The published answers belong to what was forgotten: latch empty ones."""
         with self._publishing:
             answer = self._health.answer
-            self._health.unsolved_since = None
-            self._health.ticks = Durations()
+            self._health.begin_anew()
             if answer is not None and answer.version <= self._estimator.first_version:
                 self._outputs.publish_answer(answer.without_content())
-                self._health.answer = None
+                self._health.forget_answer()
 
     def _content(self) -> tuple[int, int]:
         """Differs when the graph does."""

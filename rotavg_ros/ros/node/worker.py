@@ -5,10 +5,19 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from rclpy.executors import Executor
 from rclpy.task import Future
+
+
+@dataclass(frozen=True)
+class Workers:
+    """The node's two: a save need not wait for a solve."""
+
+    solver: Worker
+    saver: Worker
 
 
 class Worker:

@@ -12,7 +12,8 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` instal
 
 from rotavg_ros.online import KeyframeReference
 from rotavg_ros.online.content import Counts
-from rotavg_ros.ros.node.diagnostics import Health, Reporter
+from rotavg_ros.ros.node.diagnostics import Reporter
+from rotavg_ros.ros.node.health import Health
 from rotavg_ros.ros.node.message_counting import TopicCounter
 from rotavg_ros.settings.parameters import NodeParameters
 

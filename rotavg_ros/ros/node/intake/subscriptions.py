@@ -16,7 +16,7 @@ from rotavg_ros.inputs import OdometryConverter
 from rotavg_ros.online import OnlineEstimator, RejectReason
 from rotavg_ros.online.measurements import RejectedInputError
 from rotavg_ros.online.quaternion import Quaternion
-from rotavg_ros.ros.node.diagnostics import Health
+from rotavg_ros.ros.node.health import Health
 from rotavg_ros.ros.node.intake import adapters
 from rotavg_ros.ros.node.intake.adapters import EdgeTopic, OdometryTopic
 from rotavg_ros.ros.node.intake.edge_intake import EdgeIntake
@@ -135,7 +135,7 @@ class Subscriptions:
             topic.note_frames(record.frame_id, record.child_frame_id)
             reason = self._estimator.add_odometry(topic.robot, record.stamp_ns, record.world_from_body, record.position)
         if reason is None:
-            self._health.last_odometry[topic.name] = time.monotonic()
+            self._health.took_odometry(topic.name)
             self._outputs.publish_orientation(topic.robot, topic.name, message.header)
         else:
             self._warn_of_refusal(f"odometry of {topic.robot}", reason)

@@ -48,6 +48,10 @@ class Input:
     def is_odometry(self) -> bool:
         return bool(self.robot)
 
+    def is_published(self) -> None:
+        """Somebody publishes it now."""
+        self.published = time.monotonic()
+
     def note_frames(self, *frames: str) -> None:
         """Remember in which frames a message is."""
         if frames not in self.frames and len(self.frames) < _MOST_FRAMES:
@@ -77,7 +81,7 @@ class Wiring:
             publishers = self._node.get_publishers_info_by_topic(each.name)
             found += _of_publishers(each, publishers)
             if publishers:
-                each.published = now
+                each.is_published()
             elif now - each.published > parameters.odometry_timeout_s:
                 missing.append(each)
         found += self._of_missing(missing, parameters)
