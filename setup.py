@@ -53,7 +53,7 @@ setup(
     entry_points={
         "console_scripts": [
             "rotavg = rotavg_ros.cli.main:main",
-            "rotavg_node = rotavg_ros.ros.node:main",
+            "rotavg_node = rotavg_ros.ros.node.main:main",
         ],
     },
 )

@@ -146,7 +146,7 @@ def node_command(namespace: str, robots: Iterable[str]) -> list[str]:
         **{f"qos_overrides./{robot}/odom.subscription.reliability": "reliable" for robot in robots},
     }
     words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
-    return [sys.executable, "-m", "rotavg_ros.ros.node", "--ros-args", "-r", f"__ns:=/{namespace}", *words]
+    return [sys.executable, "-m", "rotavg_ros.ros.node.main", "--ros-args", "-r", f"__ns:=/{namespace}", *words]
 
 
 # Looking on

@@ -15,7 +15,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-from rotavg_ros.ros.domain import DOMAIN_IDS, free_domain_id
+from rotavg_ros.ros.harness.domain import DOMAIN_IDS, free_domain_id
 
 # A shell that runs the tests in the background lets its children ignore SIGINT, which the tests send.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -49,7 +49,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "solution": set(),
         "pipeline": {"algebra", "devices", "estimate", "methods", "neurora", "sfm", "slam", "solution"},
         "batch": {"methods", "pipeline", "solution"},
-        "": {"batch", "devices", "methods", "pipeline", "solution"},
+        "": {"algebra", "batch", "devices", "methods", "pipeline", "solution"},
     },
     "datasets": {
         "dead_reckoning": set(),
@@ -95,10 +95,18 @@ ROOMS: dict[str, dict[str, set[str]]] = {
 # What those outside may import from the inside of a wing, besides its face.
 FACES = {"solver": {"batch", "closures", "devices", "methods", "networks", "pipeline", "solution"}}
 INSIDERS = {"baselines": {"algebra", "neurora"}, "training": {"algebra", "neurora"}}
+# What a robot runs needs no more.
+NODE_MAY_USE = {"errors", "inputs", "online", "settings", "solver", "version", "view_graph"}
 # Others' packages that only one wing may know.
 BORDERS = {"rclpy": "ros", "rosbags": "bags", "mcap": "bags"}
 # Who imports by name what no arrow is about: subcommands, message packages, peers that may not be installed.
-BY_NAME = {"cli.main", "evaluation.common.peers", "ros.adapters", "ros.player"}
+BY_NAME = {
+    "cli.main",
+    "evaluation.common.peers",
+    "ros.harness.player",
+    "ros.node.intake.adapters",
+    "ros.node.intake.serialized_array",
+}
 MAX_ROOMS = 16
 
 
@@ -142,6 +150,15 @@ def test_no_wing_imports_outward(wing: str) -> None:
                 assert inner.partition(".")[0] in {wing, *INWARD[wing]}, f"{file} imports {name}"
             else:
                 assert top not in BORDERS and not top.endswith("_msgs"), f"{file} imports {name}"
+
+
+def test_the_node_stands_by_itself() -> None:
+    """What demonstrates and measures a node may use its parts, and never the other way round."""
+    for file in files("ros/node"):
+        for name in imported_inside(file):
+            assert name.partition(".")[0] in {"", *NODE_MAY_USE} or name.startswith("ros.node"), (
+                f"{file} imports {name}"
+            )
 
 
 def test_borders() -> None:

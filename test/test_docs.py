@@ -18,7 +18,9 @@ from rotavg_ros.cli.main import COMMANDS, main
 from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.simulation.robot_run import RobotRun
 from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
-from rotavg_ros.ros import diagnostics
+from rotavg_ros.ros.node import diagnostics, parameter_server
+from rotavg_ros.ros.node.intake import wiring
+from rotavg_ros.ros.node.output import frame_correction
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -29,7 +31,7 @@ PROGRAMS = ("rotavg", "rotavg_node", "make", "ros2", "pip", "rosdep", "colcon", 
 
 # What is not run here, by its first words, and why.
 NOT_RUN = {
-    "make demo": "minutes; test/ros/test_demo.py runs what it calls",
+    "make demo": "minutes; test/ros/harness/test_demo.py runs what it calls",
     ". .venv/bin/activate": "a shell's own",
     "git clone": "the network",
     "cd rotavg_ros": "a clone",
@@ -44,12 +46,14 @@ NOT_RUN = {
     "colcon build": "ROS 2 from apt; `make setup` builds the same folders",
     "ros2 run rotavg_ros": "ros2cli is not on PyPI; test/ros starts the same node with the same parameters",
     "rotavg_node": "runs until it is stopped; test/ros starts it",
-    "rotavg play run": "ends only when a subscriber has everything; test/ros/test_play.py",
+    "rotavg play run": "ends only when a subscriber has everything; test/ros/harness/test_play.py",
     "rotavg play b25b": "the same",
-    "rotavg demo": "starts a node and plays for 12 s; test/ros/test_demo.py",
-    "rotavg convert B25b_0.000.g2o": "data that is no part of the repository; test/ros/test_node_b25b.py",
+    "rotavg demo": "starts a node and plays for 12 s; test/ros/harness/test_demo.py",
+    "rotavg convert B25b_0.000.g2o": "data that is no part of the repository; test/ros/node/test_node_b25b.py",
     "python examples/three_robots.py": "test/ros runs it",
 }
+# Where the lines of the diagnostics come from.
+WARNING = (diagnostics, wiring, frame_correction, parameter_server)
 # What makes a command take seconds instead of minutes or hours.
 SMALLER = {"--laps 4": "--laps 1", "replay my_bag --output": "replay my_bag --duration 10 --no-report --output"}
 
@@ -246,7 +250,8 @@ def test_where_is_what() -> None:
 def test_diagnostics_that_troubleshooting_quotes() -> None:
     page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
     table = page[page.index("| diagnostics say") : page.index("**Nothing at all arrives.**")]
-    source = " ".join(Path(diagnostics.__file__).read_text(encoding="utf-8").split())
+    sources = [Path(module.__file__).read_text(encoding="utf-8") for module in WARNING]
+    source = re.sub(r'"\s+f?"', "", " ".join(" ".join(sources).split()))  # strings over several lines as one
     quotes = re.findall(r"^\| `([^`]+)` \|", table, re.MULTILINE)
     assert len(quotes) >= 5
     for quote in quotes:

@@ -118,7 +118,7 @@ def _benchmark(arguments: argparse.Namespace) -> Path:
 
 
 def _soak(arguments: argparse.Namespace) -> Path:
-    from rotavg_ros.ros import soak  # needs ROS 2, which the rest does not
+    from rotavg_ros.ros.harness import soak  # needs ROS 2, which the rest does not
 
     load = _load()
     rows = soak.run(arguments.keyframes or SOAK_KEYFRAMES, arguments.seconds or SOAK_SECONDS)

@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.graph is None and (arguments.truth is not None or arguments.stamps is not None):
         raise DemoError("--truth and --stamps belong to --graph; give the graph as well")
     try:
-        from rotavg_ros.ros.live_run import installed_node, keep_to_this_machine, play_to_node
+        from rotavg_ros.ros.harness.live_run import Playing, installed_node, keep_to_this_machine, play_to_node
     except ImportError as error:
         raise DemoError(
             f"the demo needs ROS 2's rclpy and rotavg_msgs ({error}); run `make setup` in the sources"
@@ -68,14 +68,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise
     print(f"{scene.title}: {scene.description}\nplaying it to the node …", flush=True)
     keep_to_this_machine()
-    answer = play_to_node(
-        bag,
-        scene.node_parameters,
-        rate=_rate(bag) if arguments.rate is None else arguments.rate,
-        topics=_topics(bag),
-        log=output / "node.log",
-        waiting=working,
-    )
+    playing = Playing(bag, _topics(bag), _rate(bag) if arguments.rate is None else arguments.rate)
+    answer = play_to_node(playing, scene.node_parameters, output / "node.log", working)
     report = judge(answer, scene.run, scene.is_closure)
     with working("drawing"):
         from rotavg_ros.evaluation.live.picture import draw

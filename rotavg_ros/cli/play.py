@@ -18,7 +18,7 @@ class PlayNeedsRosError(UserError):
 def run(arguments: argparse.Namespace) -> int:
     """Play and say what was played."""
     try:
-        from rotavg_ros.ros.player import PlayOptions, play
+        from rotavg_ros.ros.harness.player import PlayOptions, play
     except ImportError as error:
         raise PlayNeedsRosError(
             f"playing needs ROS 2's rclpy ({error}); source your ROS 2 setup, or run `make setup` in the sources"

@@ -5,11 +5,12 @@ import neither.
 """
 
 from rotavg_ros.inputs.records import EdgeConverter, EdgeRecord, EdgeVerdict, OdometryConverter, OdometryRecord, Source
-from rotavg_ros.inputs.registry import BRINGS_KEYFRAMES, EDGE_CONVERTERS, ODOMETRY_CONVERTERS
+from rotavg_ros.inputs.registry import BRINGS_KEYFRAMES, EDGE_CONVERTERS, FRAMELESS_ODOMETRY, ODOMETRY_CONVERTERS
 
 __all__ = [
     "BRINGS_KEYFRAMES",
     "EDGE_CONVERTERS",
+    "FRAMELESS_ODOMETRY",
     "ODOMETRY_CONVERTERS",
     "EdgeConverter",
     "EdgeRecord",

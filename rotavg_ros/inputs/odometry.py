@@ -13,7 +13,7 @@ from rotavg_ros.online.quaternion import Quaternion
 
 def from_odometry(message: Any, body_from_sensor: Quaternion) -> OdometryRecord:
     """``nav_msgs/Odometry``."""
-    return _record(message.header, message.pose.pose, body_from_sensor)
+    return _record(message.header, message.pose.pose, body_from_sensor, message.child_frame_id)
 
 
 def from_pose_with_covariance(message: Any, body_from_sensor: Quaternion) -> OdometryRecord:
@@ -35,15 +35,18 @@ def from_imu(message: Any, body_from_sensor: Quaternion) -> OdometryRecord:
     if message.orientation_covariance[0] == -1:
         raise RejectedInputError(RejectReason.NO_ORIENTATION)
     stamp_ns = to_nanoseconds(message.header.stamp)
-    return OdometryRecord(stamp_ns, _world_from_body(message.orientation, body_from_sensor), None)
+    orientation = _world_from_body(message.orientation, body_from_sensor)
+    return OdometryRecord(stamp_ns, orientation, None, child_frame_id=message.header.frame_id)
 
 
-def _record(header: Any, pose: Any, body_from_sensor: Quaternion) -> OdometryRecord:
+def _record(header: Any, pose: Any, body_from_sensor: Quaternion, child_frame_id: str = "") -> OdometryRecord:
     position = pose.position
     return OdometryRecord(
         to_nanoseconds(header.stamp),
         _world_from_body(pose.orientation, body_from_sensor),
         (position.x, position.y, position.z),
+        header.frame_id,
+        child_frame_id,
     )
 
 

@@ -50,11 +50,13 @@ class EdgeRecord:
     Attributes:
         edge: the measurement, or why it cannot be read.
         sender, sequence: who counts, and the count; 0 for senders that do not.
+        frame_id: the sensor frame that the sender says it measured in; empty where it says nothing.
     """
 
     edge: EdgeMeasurement | RejectReason
     sender: str = ""
     sequence: int = 0
+    frame_id: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,11 +76,14 @@ class OdometryRecord:
         stamp_ns: nanoseconds.
         world_from_body: xyzw, not checked.
         position: metres, of the sensor; None where the message carries none.
+        frame_id, child_frame_id: of the odometry and of what moves in it; empty where the message does not say.
     """
 
     stamp_ns: int
     world_from_body: Quaternion
     position: Position | None
+    frame_id: str = ""
+    child_frame_id: str = ""
 
 
 class EdgeConverter(Protocol):

@@ -33,10 +33,13 @@ EDGE_CONVERTERS: dict[str, Callable[[Source], EdgeConverter]] = {
 # Edges between keyframes that the sender itself has chosen and numbered, so that none may be made from odometry.
 BRINGS_KEYFRAMES = frozenset(_FOREIGN)
 
+# Says in which frame it is attached to the body, and nothing of the frame that the body turns in.
+FRAMELESS_ODOMETRY = "sensor_msgs/msg/Imu"
+
 # What carries the rotation of a robot's odometry.
 ODOMETRY_CONVERTERS: dict[str, OdometryConverter] = {
     "nav_msgs/msg/Odometry": from_odometry,
     "geometry_msgs/msg/PoseWithCovarianceStamped": from_pose_with_covariance,
     "geometry_msgs/msg/PoseStamped": from_pose,
-    "sensor_msgs/msg/Imu": from_imu,
+    FRAMELESS_ODOMETRY: from_imu,
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 from rotavg_ros.inputs.fields import target_from_source, to_nanoseconds, to_tuple
@@ -25,7 +26,7 @@ class RelativeRotationConverter:
             edge: EdgeMeasurement | RejectReason = edge_from_message(message, self._source)
         except RejectedInputError as rejection:
             edge = rejection.reason
-        yield EdgeRecord(edge, message.source.robot, int(message.sequence))
+        yield EdgeRecord(edge, message.source.robot, int(message.sequence), message.header.frame_id)
 
     def forget(self) -> None:
         """Nothing is remembered."""
@@ -35,8 +36,10 @@ class RelativeRotationArrayConverter(RelativeRotationConverter):
     """Many edges in a message."""
 
     def __call__(self, message: Any) -> Iterator[EdgeRecord]:
+        frame_id = message.header.frame_id
         for edge in message.edges:
-            yield from super().__call__(edge)
+            for record in super().__call__(edge):
+                yield record if record.frame_id or not frame_id else replace(record, frame_id=frame_id)
 
 
 def edge_from_message(message: Any, source: Source) -> EdgeMeasurement:

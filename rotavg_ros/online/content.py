@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,8 @@ from torch import Tensor
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.anchoring import anchor, corrections, first_correction
 from rotavg_ros.online.graph_builder import GraphBuilder
-from rotavg_ros.online.measurements import RejectReason
+from rotavg_ros.online.measurements import KeyframeReference, RejectReason
+from rotavg_ros.online.options import NANOSECONDS
 from rotavg_ros.online.problem import Problem
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.online.renumbering import Renumbering
@@ -30,6 +32,10 @@ class Counts:
         odometry_restarts: how often the odometry of one of the robots began anew.
         marginalized, dropped_closures: how many keyframes and closures a full graph has done without so far.
         is_full: whether nothing more can be spared, and there are no new keyframes.
+        robots: that have keyframes.
+        pending_by_robot: how many edges wait for each robot.
+        longest_pending: the end that the edge waits for that has waited the longest; None if none waits.
+        longest_pending_s: how long it has, seconds of the data's time.
     """
 
     keyframes: int
@@ -42,6 +48,10 @@ class Counts:
     marginalized: int = 0
     dropped_closures: int = 0
     is_full: bool = False
+    robots: tuple[str, ...] = ()
+    pending_by_robot: Mapping[str, int] = field(default_factory=dict)
+    longest_pending: KeyframeReference | None = None
+    longest_pending_s: float = 0.0
 
 
 class Content:
@@ -106,9 +116,14 @@ class Content:
         return quaternion.normalize(quaternion.multiply(self.correction(robot), track.latest.world_from_body))
 
     @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to solve: no keyframe yet."""
+        return self.builder.graph.num_keyframes == 0
+
+    @property
     def is_behind(self) -> bool:
-        """Whether the graph has changed since the last answer."""
-        return self.builder.graph.revision != self._answered_revision
+        """Whether the graph has changed since the last answer; an empty one has no answer to wait for."""
+        return not self.is_empty and self.builder.graph.revision != self._answered_revision
 
     def solve_anew(self) -> None:
         """Let the next tick solve though the graph is the same."""
@@ -120,7 +135,7 @@ class Content:
         idle = self.builder.graph.revision == self._ticked_revision
         if idle or force_cold:
             self.builder.settle()
-        if not self.is_behind and self._answer_was_cold:
+        if self.is_empty or (not self.is_behind and self._answer_was_cold):
             return None
         snapshot = self.builder.graph.snapshot()
         self._ticked_revision = snapshot.revision
@@ -171,6 +186,7 @@ class Content:
     def counts(self, time_jumps: int) -> Counts:
         """Sizes and refusals now."""
         builder = self.builder
+        longest = builder.pending.longest(builder.data_time_ns)
         return Counts(
             keyframes=builder.graph.num_keyframes,
             edges=builder.graph.num_edges,
@@ -182,4 +198,8 @@ class Content:
             marginalized=builder.marginalized,
             dropped_closures=builder.dropped_closures,
             is_full=builder.is_full,
+            robots=tuple(builder.graph.robots),
+            pending_by_robot=dict(builder.pending.by_robot),
+            longest_pending=None if longest is None else longest[0],
+            longest_pending_s=0.0 if longest is None else longest[1] / NANOSECONDS,
         )

@@ -23,6 +23,7 @@ from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.online.time_jumps import LateMessage
 from rotavg_ros.online.trajectory import Trajectory, corrected_trajectories
+from rotavg_ros.solver import Abandoned, abandonable
 from rotavg_ros.view_graph import EdgeLabel
 
 if TYPE_CHECKING:
@@ -34,6 +35,26 @@ _MANY_EDGES = 1000
 
 # The signature of :func:`rotavg_ros.solve`.
 Solver = Callable[..., "Solution"]
+
+
+class TickAbandonedError(Exception):
+    """A tick was given up, since nobody waits for its answer any more; the message says why."""
+
+
+class _Tick:
+    """A tick that is running.
+
+    Attributes:
+        is_forced: somebody has asked for its answer.
+        abandoned_by: what made its answer worthless; None as long as it is wanted.
+    """
+
+    def __init__(self, is_forced: bool) -> None:
+        self.is_forced = is_forced
+        self.abandoned_by: str | None = None
+
+    def is_abandoned(self) -> bool:
+        return self.abandoned_by is not None
 
 
 class OnlineEstimator:
@@ -56,6 +77,7 @@ class OnlineEstimator:
         self._lock = threading.Lock()
         self._tick_lock = threading.Lock()  # one tick at a time; taken before ``_lock``
         self._paused = False
+        self._running: _Tick | None = None
         self._generation = 0
         self._time_jumps = 0
         self._content = Content(GraphBuilder(self.options), None, 0)
@@ -64,6 +86,12 @@ class OnlineEstimator:
         """Begin with this content; ``answered`` is the last answer's body_from_world ``(n, 4)``."""
         self._generation += 1
         self._content = Content(builder, answered, version)
+        self._abandon_tick("everything was forgotten or replaced meanwhile")
+
+    def _abandon_tick(self, why: str) -> None:
+        """Have the running tick, if there is one, end soon and change nothing."""
+        if self._running is not None:
+            self._running.abandoned_by = why
 
     def add_odometry(
         self,
@@ -188,8 +216,11 @@ class OnlineEstimator:
         return self._paused
 
     def pause(self, paused: bool) -> None:
-        """While paused, inputs are taken as ever but ticks do nothing (a forced one does)."""
-        self._paused = paused
+        """While paused, inputs are taken as ever but ticks do nothing, and a running one is given up, unless forced."""
+        with self._lock:
+            self._paused = paused
+            if paused and self._running is not None and not self._running.is_forced:
+                self._abandon_tick("paused meanwhile")
 
     def reset(self) -> None:
         """Forget everything, counters included. Answers go on counting up; a running tick is thrown away."""
@@ -231,6 +262,7 @@ class OnlineEstimator:
 
         Raises:
             UserError: from the solver; the next tick tries again.
+            TickAbandonedError: everything was forgotten or replaced meanwhile, or ticks were paused.
         """
         with self._tick_lock:
             started = time.perf_counter()
@@ -245,18 +277,23 @@ class OnlineEstimator:
         with self._lock:
             content, options = self._content, self.options
             problem = None if self._paused and not force_cold else content.next_problem(force_cold)
+            running = self._running = _Tick(force_cold)
         if problem is None:
             return None
         snapshot, warm_start = problem.snapshot, problem.warm_start()
-        solution = self._solver(
-            snapshot.graph,
-            method=options.method,
-            profile=options.profile,
-            device=options.device,
-            refinement_steps=options.refinement_steps,
-            warm_start=warm_start,
-            memory=None if warm_start is None else problem.memory,
-        )
+        try:
+            with abandonable(running.is_abandoned):
+                solution = self._solver(
+                    snapshot.graph,
+                    method=options.method,
+                    profile=options.profile,
+                    device=options.device,
+                    refinement_steps=options.refinement_steps,
+                    warm_start=warm_start,
+                    memory=None if warm_start is None else problem.memory,
+                )
+        except Abandoned:
+            raise TickAbandonedError(f"abandoned: {running.abandoned_by}") from None
         component = solution.component.cpu()
         with self._lock:
             roots = root_orientations(content.builder, snapshot, component, problem.answered)
@@ -272,8 +309,8 @@ class OnlineEstimator:
             was_cold,
         )
         with self._lock:
-            if content is not self._content:
-                return None  # reset or loaded meanwhile
+            if content is not self._content:  # the solve had ended before it could be told
+                raise TickAbandonedError(f"abandoned: {running.abandoned_by}")
             content.accept(body_from_world, component, answer.outlier, snapshot.revision, was_cold, solution.memory)
             if options is not self.options:
                 content.solve_anew()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right, insort
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ class PendingEdges:
 
     Attributes:
         fingerprints: of those that wait.
+        by_robot: how many wait for each robot.
     """
 
     def __init__(self, capacity: int, timeout_ns: int) -> None:
@@ -29,6 +31,7 @@ class PendingEdges:
         self._serial = 0
         self._waiting: dict[int, _Waiting] = {}  # by serial number, so in order of arrival
         self.fingerprints: set[int] = set()
+        self.by_robot: Counter[str] = Counter()
         self._by_keyframe: dict[tuple[str, int], dict[int, None]] = {}
         self._by_stamp: dict[str, list[tuple[int, int]]] = {}  # per robot, ascending (stamp, serial)
 
@@ -37,6 +40,15 @@ class PendingEdges:
 
     def __iter__(self) -> Iterator[EdgeMeasurement]:
         return (waiting.edge for waiting in self._waiting.values())
+
+    def longest(self, data_time_ns: int | None) -> tuple[KeyframeReference, int] | None:
+        """What the first edge to come waits for, and for how many nanoseconds of data time; None if none waits."""
+        first = next(iter(self._waiting.values()), None)
+        if first is None:
+            return None
+        if data_time_ns is None or first.since_ns is None:
+            return first.waits_for, 0
+        return first.waits_for, data_time_ns - first.since_ns
 
     def add(
         self, edge: EdgeMeasurement, waits_for: KeyframeReference, data_time_ns: int | None
@@ -48,6 +60,7 @@ class PendingEdges:
         self._serial += 1
         self._waiting[self._serial] = _Waiting(edge, waits_for, data_time_ns)
         self.fingerprints.add(edge.fingerprint())
+        self.by_robot[waits_for.robot] += 1
         if waits_for.keyframe_id is not None:
             key = (waits_for.robot, waits_for.keyframe_id)
             self._by_keyframe.setdefault(key, {})[self._serial] = None
@@ -83,6 +96,9 @@ class PendingEdges:
         waiting = self._waiting.pop(serial)
         self.fingerprints.discard(waiting.edge.fingerprint())
         reference = waiting.waits_for
+        self.by_robot[reference.robot] -= 1
+        if not self.by_robot[reference.robot]:
+            del self.by_robot[reference.robot]
         if reference.keyframe_id is not None:
             key = (reference.robot, reference.keyframe_id)
             del self._by_keyframe[key][serial]

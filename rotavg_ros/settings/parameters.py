@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from rotavg_ros.inputs import BRINGS_KEYFRAMES, Source
+from rotavg_ros.inputs import BRINGS_KEYFRAMES, FRAMELESS_ODOMETRY, Source
 from rotavg_ros.online import EstimatorOptions, quaternion
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.online.time_jumps import POLICIES
@@ -50,7 +50,9 @@ class NodeParameters:
         "or one per edge topic",
     )
     world_frame: str = parameter("map", "frame id of what is published")
-    publish_tf: bool = parameter(False, "publish world → odometry frame (rotation only) on /tf; needs tf2_msgs")
+    publish_tf: bool = parameter(
+        False, "publish world → odometry frame on /tf, rotation only and no translation yet; needs tf2_msgs"
+    )
     odometry_queue_depth: int = parameter(10_000, "messages that may wait per odometry topic", low=1, high=1_000_000)
     edge_queue_depth: int = parameter(10_000, "messages that may wait per edge topic", low=1, high=1_000_000)
 
@@ -158,6 +160,7 @@ class NodeParameters:
         self._check_topics()
         if self.autosave_period_s > 0 and not self.state_file:
             raise ParameterError("autosave_period_s is set but state_file is empty; name a file")
+        self._check_frames()
         self.estimator_options()
 
     def _check_topics(self) -> None:
@@ -182,6 +185,17 @@ class NodeParameters:
         for entry in self.edge_topics:
             if entry.partition(":")[2] in BRINGS_KEYFRAMES and self.keyframe_source != "edges":
                 raise ParameterError(f"edge topic {entry!r} brings keyframes of its own; set keyframe_source to edges")
+
+    def _check_frames(self) -> None:
+        if not self.world_frame or self.world_frame.startswith("/"):
+            raise ParameterError(
+                f"world_frame is {self.world_frame!r}; name the frame of what is published, without a '/' in front: map"
+            )
+        for entry in self.odometry_topics if self.publish_tf else ():
+            if entry.endswith(f":{FRAMELESS_ODOMETRY}"):
+                raise ParameterError(
+                    f"publish_tf places the odometry's frame, and {entry} has none; use another odometry, or no tf"
+                )
 
     def odometry_sensors(self) -> list[Quaternion]:
         """body_from_sensor of every odometry topic."""

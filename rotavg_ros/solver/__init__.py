@@ -8,12 +8,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rotavg_ros.solver.algebra.abandonment import Abandoned, abandonable
     from rotavg_ros.solver.batch import solve_batch
     from rotavg_ros.solver.methods import DEVICES, METHODS, PROFILES
     from rotavg_ros.solver.pipeline import solve
     from rotavg_ros.solver.solution import Solution
 
-__all__ = ["DEVICES", "METHODS", "PROFILES", "Solution", "solve", "solve_batch"]
+__all__ = ["DEVICES", "METHODS", "PROFILES", "Abandoned", "Solution", "abandonable", "solve", "solve_batch"]
 
 
 def __getattr__(name: str) -> Any:
@@ -21,6 +22,10 @@ def __getattr__(name: str) -> Any:
         from rotavg_ros.solver import methods
 
         return getattr(methods, name)
+    if name in {"Abandoned", "abandonable"}:
+        from rotavg_ros.solver.algebra import abandonment
+
+        return getattr(abandonment, name)
     if name == "Solution":
         from rotavg_ros.solver import solution
 

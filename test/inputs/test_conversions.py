@@ -258,7 +258,7 @@ def test_odometry_of_a_sensor_that_is_turned_in_the_body(type_name: str) -> None
         "geometry_msgs/msg/PoseWithCovarianceStamped": Fields(pose=here),
         "geometry_msgs/msg/PoseStamped": here,
     }
-    message = Fields(header=Fields(stamp=stamp(2)))
+    message = Fields(header=Fields(stamp=stamp(2), frame_id="odom"), child_frame_id="base")
     if type_name in posed:
         message.pose = posed[type_name]
     else:
@@ -270,7 +270,7 @@ def test_odometry_of_a_sensor_that_is_turned_in_the_body(type_name: str) -> None
 
 
 def test_an_imu_without_orientation() -> None:
-    message = Fields(header=Fields(stamp=stamp(0)), orientation=quaternion(Rotation.identity()))
+    message = Fields(header=Fields(stamp=stamp(0), frame_id="imu"), orientation=quaternion(Rotation.identity()))
     message.orientation_covariance = np.array([-1.0] + [0.0] * 8)
     with pytest.raises(RejectedInputError, match="no_orientation"):
         ODOMETRY_CONVERTERS["sensor_msgs/msg/Imu"](message, (0.0, 0.0, 0.0, 1.0))
@@ -306,7 +306,7 @@ QUATERNIONS = st.one_of(
 )
 POSITIONS = st.builds(Fields, x=NUMBERS, y=NUMBERS, z=NUMBERS)
 STAMPS = st.builds(Fields, sec=INT32, nanosec=UINT32)
-HEADERS = st.builds(Fields, stamp=STAMPS)
+HEADERS = st.builds(Fields, stamp=STAMPS, frame_id=st.sampled_from(["", "camera"]))
 POSES = st.builds(Fields, position=POSITIONS, orientation=QUATERNIONS)
 TRANSFORMS = st.builds(Fields, translation=POSITIONS, rotation=QUATERNIONS)
 MATRICES = st.builds(lambda a, b: np.array([a] * 20 + [b] * 16), NUMBERS, NUMBERS)
@@ -322,6 +322,7 @@ ODOMETRIES = st.builds(Fields, header=HEADERS, pose=st.builds(Fields, pose=POSES
 REFERENCES = st.builds(Fields, by=st.integers(0, 3), robot=st.sampled_from(["", "b"]), id=UINT64, stamp=STAMPS)
 RELATIVE_ROTATIONS = st.builds(
     Fields,
+    header=HEADERS,
     id=UINT64,
     sequence=UINT32,
     source=REFERENCES,
@@ -332,7 +333,9 @@ RELATIVE_ROTATIONS = st.builds(
 )
 MESSAGES = {
     "rotavg_msgs/msg/RelativeRotation": RELATIVE_ROTATIONS,
-    "rotavg_msgs/msg/RelativeRotationArray": st.builds(Fields, edges=st.lists(RELATIVE_ROTATIONS, max_size=5)),
+    "rotavg_msgs/msg/RelativeRotationArray": st.builds(
+        Fields, header=HEADERS, edges=st.lists(RELATIVE_ROTATIONS, max_size=5)
+    ),
     "rtabmap_msgs/msg/MapGraph": st.builds(
         Fields, header=HEADERS, poses_id=st.lists(INT32, max_size=5), links=st.lists(LINKS, max_size=8)
     ),

@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online import Answer, EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
+from rotavg_ros.online.estimator import TickAbandonedError
+from rotavg_ros.solver.algebra.abandonment import check
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
 SECOND = 1_000_000_000
@@ -331,9 +333,72 @@ def test_reset_during_a_solve_throws_its_answer_away(solver):
     run, estimator = drive(), make(solver)
     feed(estimator, run)
     solver.on_call = estimator.reset
-    assert estimator.tick() is None
+    with pytest.raises(TickAbandonedError, match="forgotten or replaced"):
+        estimator.tick()
     assert estimator.counts().keyframes == 0 and estimator.counts().rejected == {}
     assert estimator.tick() is None
+
+
+@pytest.mark.parametrize("act", ["reset", "load", "pause"])
+def test_a_solve_is_given_up_where_nobody_waits_for_its_answer(solver, tmp_path, act: str) -> None:
+    run, estimator = drive(), make(solver)
+    feed(estimator, run)
+    before = estimator.tick()
+    estimator.save(tmp_path / "state.npz")
+    feed(estimator, drive(seed=2), robot="s")
+    acts = {
+        "reset": estimator.reset,
+        "load": lambda: estimator.load(tmp_path / "state.npz"),
+        "pause": lambda: estimator.pause(True),
+    }
+    asked = []
+
+    def solve_until_told() -> None:
+        check()
+        acts[act]()
+        asked.append(act)
+        check()
+        pytest.fail("the solve went on")
+
+    solver.on_call = solve_until_told
+    with pytest.raises(TickAbandonedError, match="paused" if act == "pause" else "forgotten or replaced"):
+        estimator.tick()
+    solver.on_call = None
+    assert asked == [act]
+    if act == "pause":
+        assert estimator.tick() is None
+        estimator.pause(False)
+    answer = estimator.tick()
+    assert len(before.keyframe_id) == 14
+    assert (0 if answer is None else len(answer.keyframe_id)) == {"reset": 0, "load": 14, "pause": 28}[act]
+
+
+def test_a_pause_leaves_an_answer_alone_that_somebody_has_asked_for(solver) -> None:
+    estimator = make(solver)
+    feed(estimator, drive())
+
+    def pause() -> None:
+        estimator.pause(True)
+        check()
+
+    solver.on_call = pause
+    assert estimator.tick(force_cold=True) is not None
+
+
+def test_an_empty_graph_is_nothing_to_solve() -> None:
+    estimator = OnlineEstimator(OPTIONS)
+
+    def nothing() -> None:
+        assert estimator.tick() is None and estimator.tick(force_cold=True) is None and not estimator.is_behind
+
+    nothing()
+    estimator.set_options(replace(OPTIONS, outlier_threshold=0.4))
+    nothing()
+    feed(estimator, drive())
+    assert estimator.tick() is not None
+    estimator.reset()
+    estimator.set_options(OPTIONS)
+    nothing()
 
 
 def test_pause_keeps_inputs_and_stops_ticks(solver):

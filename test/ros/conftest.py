@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rotavg_msgs.msg import AbsoluteOrientations, OutlierFlags, RelativeRotation, RelativeRotationArray
 from std_srvs.srv import Trigger
 
+INTERFACES = Path(__file__).resolve().parents[2] / "build" / "test_interfaces" / "install"
 NODE = Path(sys.executable).with_name("rotavg_node")
 STARTUP_SECONDS = 150.0  # far more than needed: a loaded machine must not fail a test
 
@@ -79,6 +81,22 @@ def start_process(tmp_path: Path) -> Iterator[Callable[..., RunningProcess]]:
     yield start
     for process in started:
         process.end_for_sure()
+
+
+@pytest.fixture
+def foreign_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets processes that are started from now on see others' message packages."""
+    if not INTERFACES.is_dir():
+        pytest.skip("others' messages are not built; `make test` or `tools/setup_environment.py --for-tests` does it")
+    python = next(INTERFACES.glob("lib/python3.*/site-packages"))
+    for variable, folder in (
+        ("AMENT_PREFIX_PATH", INTERFACES),
+        ("LD_LIBRARY_PATH", INTERFACES / "lib"),
+        ("PYTHONPATH", python),
+    ):
+        monkeypatch.setenv(variable, str(folder), prepend=os.pathsep)
+    # The ROS wheels restart Python once to set library paths; they must do so with these.
+    monkeypatch.delenv("_ROS_WHEELS_BOOTSTRAP_COMPLETE", raising=False)
 
 
 @pytest.fixture

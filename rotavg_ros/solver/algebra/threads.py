@@ -11,9 +11,12 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import copy_context
 from typing import TypeVar
 
 import torch
+
+from rotavg_ros.solver.algebra.abandonment import check
 
 Item = TypeVar("Item")
 
@@ -111,11 +114,17 @@ def for_each(work: Callable[[Item], None], items: Sequence[Item], threads: int |
     """
     if min(len(items), _crew.size if threads is None else min(threads, _crew.size)) <= 1:
         for item in items:
+            check()
             work(item)
         return
-    # Gradients are switched off by thread, so every worker needs it said.
-    for _ in _crew.pool().map(torch.no_grad()(work), items):
-        pass
+    context = copy_context()
+
+    @torch.no_grad()  # gradients are switched off by thread, so every worker needs it said
+    def in_context(item: Item) -> None:
+        context.copy().run(work, item)
+
+    for _ in _crew.pool().map(in_context, items):
+        check()
 
 
 def threads_on(device: torch.device) -> int | None:

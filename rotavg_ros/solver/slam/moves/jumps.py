@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.abandonment import check
 from rotavg_ros.solver.algebra.minimum_cut import FlowNetwork, TwoLabels
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
 from rotavg_ros.solver.slam.moves.truncated_cost import TruncatedCost
@@ -72,6 +73,7 @@ class _Jumps:
         questions = turns(cost, residual, residual[candidates], costs)
         bounds = questions.gain_bounds(system)
         for number in np.flatnonzero(bounds > hopeless[candidates] + _MIN_GAIN):
+            check()
             edge = candidates[number]
             if costs[edge] < 0.5 * cost.cap[edge]:
                 continue

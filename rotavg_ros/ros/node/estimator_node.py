@@ -1,0 +1,136 @@
+"""The ROS node: messages in, messages out. What they mean is decided in :mod:`rotavg_ros.online`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump  # type: ignore[attr-defined]
+from rclpy.duration import Duration
+from rclpy.executors import Executor
+from rclpy.node import Node
+from rclpy.timer import Timer
+
+from rotavg_ros.errors import UserError
+from rotavg_ros.online import OnlineEstimator
+from rotavg_ros.ros.node import parameter_server
+from rotavg_ros.ros.node.diagnostics import Reporter
+from rotavg_ros.ros.node.health import Health
+from rotavg_ros.ros.node.intake.subscriptions import Subscriptions
+from rotavg_ros.ros.node.intake.wiring import Wiring
+from rotavg_ros.ros.node.output.outputs import Outputs
+from rotavg_ros.ros.node.services import Services
+from rotavg_ros.ros.node.solving import Solving
+from rotavg_ros.ros.node.warm_up import warm_up
+from rotavg_ros.ros.node.worker import Worker, Workers
+from rotavg_ros.settings.parameters import NODE_NAME, NodeParameters
+from rotavg_ros.version import __version__
+
+_SHORT_SOLVE_S = 0.2  # a longer one need not be waited for at the end: nobody would read its answer
+
+
+class RotavgNode(Node):
+    """Subscriptions, publications, services and timers around an :class:`OnlineEstimator`.
+
+    Callbacks run on the executor's thread and stay short; solving, saving and publishing answers happen on workers.
+
+    Raises:
+        UserError: parameters that cannot be; the message is one line for the user.
+    """
+
+    def __init__(self, executor: Executor) -> None:
+        try:
+            super().__init__(NODE_NAME)
+        except Exception as error:  # rclpy has a type of its own for each of its own parameters
+            raise UserError(" ".join(str(error).split())) from error
+        self._settings = parameters = parameter_server.declare(self)
+        torch.set_num_threads(parameters.solver_threads or max(1, torch.get_num_threads() - 1))
+        device = warm_up(parameters.estimator_options())
+        self._estimator = OnlineEstimator(parameters.estimator_options())
+        self._health = Health()
+        self._reporter = Reporter(f"{self.get_fully_qualified_name().lstrip('/')}: estimator")
+        self._worker = Worker(executor, "rotavg_worker")
+        self._saver = Worker(executor, "rotavg_saver")
+        self._outputs = Outputs(self, parameters, self._estimator)
+        state_file = Path(parameters.state_file) if parameters.state_file else None
+        self._solving = Solving(self, self._estimator, self._health, self._outputs, state_file)
+        listening = Subscriptions(self, parameters, self._estimator, self._health, self._outputs, self._on_time_jump)
+        workers = Workers(solver=self._worker, saver=self._saver)
+        Services(self, self._estimator, self._solving, workers, parameters.robots[0])
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # ticks though /clock is paused or absent
+        self._solve_timer = self._create_timer(parameters.solve_period_s, self._on_solve_timer)
+        self._create_timer(1.0, self._on_diagnostics_timer)
+        if parameters.autosave_period_s > 0:
+            self._create_timer(
+                parameters.autosave_period_s, lambda: self._saver.submit_once(self._solving.autosave_quietly)
+            )
+        backward = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
+        self._jump_handle = self.get_clock().create_jump_callback(backward, post_callback=self._on_clock_jump)
+        parameter_server.watch(self, lambda: self._settings, self._apply)
+        topics = ", ".join([*parameters.odometry_topics, *parameters.edge_topics])
+        self.get_logger().info(f"rotavg {__version__} on {device}, listening to {topics}")
+        if parameters.device == "cuda" and device == "cpu":
+            self.get_logger().warning("there is no CUDA device; the networks run on the CPU")
+        given = frozenset(parameter_server.given(self))
+        self._wiring = Wiring(self, listening.inputs, self._outputs.exclusive_topics, given)
+        self._mistaken_parameters, other_parameters = parameter_server.unknown(self)
+        for line in [*self._mistaken_parameters, *other_parameters, *self._outputs.warnings()]:
+            self.get_logger().warning(line)
+
+    def close(self, timeout_s: float) -> bool:
+        """Save if that is wanted, and stop working; False if a save still runs after the timeout, or a solve does."""
+        if self._settings.autosave_period_s > 0:
+            self._on_autosave_timer()
+        is_saved = self._saver.stop(timeout_s, finish=True)
+        return self._worker.stop(_SHORT_SOLVE_S) and is_saved
+
+    def _create_timer(self, period_s: float, callback: Callable[[], object]) -> Timer:
+        return self.create_timer(period_s, callback, clock=self._steady)
+
+    def _apply(self, parameters: NodeParameters) -> None:
+        """Put changed parameters into force.
+
+        Raises:
+            UserError: the solver does not know its options; nothing has changed then.
+        """
+        old, options = self._settings, parameters.estimator_options()
+        if (options.method, options.profile) != (self._estimator.options.method, self._estimator.options.profile):
+            warm_up(options)
+        if options != self._estimator.options:
+            self._estimator.set_options(options)
+        self._settings = parameters
+        if parameters.solve_period_s != old.solve_period_s:
+            self.destroy_timer(self._solve_timer)
+            self._solve_timer = self._create_timer(parameters.solve_period_s, self._on_solve_timer)
+
+    def _on_solve_timer(self) -> None:
+        self._worker.submit_once(self._solving.tick_quietly)
+
+    def _on_autosave_timer(self) -> None:
+        self._saver.submit_once(self._solving.autosave_quietly)
+
+    def _on_clock_jump(self, _jump: TimeJump) -> None:
+        """Simulated time went back: only ``use_sim_time`` knows of that."""
+        time_jumps = self._estimator.time_jumps
+        self._estimator.clock_went_back(self.get_clock().now().nanoseconds)
+        if self._estimator.time_jumps != time_jumps:
+            self._on_time_jump()
+
+    def _on_time_jump(self) -> None:
+        if self._settings.on_time_jump == "reset":
+            self.get_logger().warning("time went back: everything is forgotten and begins anew (on_time_jump)")
+            self._worker.submit(self._solving.forget_quietly)
+        else:
+            self.get_logger().warning("time went back: odometry is refused until it is ahead again (on_time_jump)")
+
+    def _on_diagnostics_timer(self) -> None:
+        wiring = self._wiring.warnings(self._settings)
+        self._health.noticed([*self._mistaken_parameters, *wiring, *self._outputs.warnings()])
+        status = self._reporter.report(self._health, self._estimator.counts(), self._settings, self._estimator.paused)
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+        self._worker.submit_once(self._solving.draw_quietly)

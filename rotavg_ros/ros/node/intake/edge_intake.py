@@ -1,0 +1,100 @@
+"""Edges of messages, long ones a slice at a time, so that odometry, services and signals get their turn in between."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
+from rclpy.node import Node
+
+from rotavg_ros.inputs import EdgeConverter, EdgeRecord, EdgeVerdict
+from rotavg_ros.online import OnlineEstimator, RejectReason
+from rotavg_ros.ros.node.intake.wiring import Input
+from rotavg_ros.ros.node.message_counting import TopicCounter
+
+_SLICE_S = 0.005
+_BREAK_S = 0.001
+# With so many messages under way no more are taken: they wait in the middleware's queue, which is bounded, and what it
+# loses is counted.
+_MOST_MESSAGES = 100
+
+
+class _WhileThereIsRoom(MutuallyExclusiveCallbackGroup):
+    """Callbacks run one at a time, and only while there is room for what they bring."""
+
+    def __init__(self, has_room: Callable[[], bool]) -> None:
+        super().__init__()
+        self._has_room = has_room
+
+    def can_execute(self, entity: Any) -> bool:
+        return self._has_room() and bool(super().can_execute(entity))
+
+
+class EdgeIntake:
+    """Takes edges in the order in which their messages came. Runs on the executor's thread.
+
+    Attributes:
+        callback_group: for the subscriptions to edges; it holds them back while too many messages are under way.
+    """
+
+    def __init__(self, node: Node, estimator: OnlineEstimator, on_refusal: Callable[[RejectReason], None]) -> None:
+        self._estimator = estimator
+        self._on_refusal = on_refusal
+        self.callback_group = _WhileThereIsRoom(lambda: len(self._under_way) < _MOST_MESSAGES)
+        self._generation = estimator.generation
+        self._converters: list[EdgeConverter] = []
+        self._under_way: deque[tuple[Input, TopicCounter, Iterator[EdgeRecord | EdgeVerdict]]] = deque()
+        self._timer = node.create_timer(_BREAK_S, self._go_on, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._timer.cancel()
+
+    def add_source(self, convert: EdgeConverter) -> None:
+        """Have a converter forget what it remembers whenever the estimator does."""
+        self._converters.append(convert)
+
+    def take(self, topic: Input, counter: TopicCounter, records: Iterator[EdgeRecord | EdgeVerdict]) -> None:
+        """Take what a message says, now or in a while."""
+        self._forget_with_the_estimator()
+        self._under_way.append((topic, counter, records))
+        self._take_some()
+
+    def _go_on(self) -> None:
+        self._forget_with_the_estimator()
+        self._take_some()
+
+    def _take_some(self) -> None:
+        deadline = time.perf_counter() + _SLICE_S
+        while self._under_way:
+            topic, counter, records = self._under_way[0]
+            for record in records:
+                self._take(record, topic, counter)
+                if time.perf_counter() > deadline:
+                    self._timer.reset()
+                    return
+            self._under_way.popleft()
+        self._timer.cancel()
+
+    def _take(self, record: EdgeRecord | EdgeVerdict, topic: Input, counter: TopicCounter) -> None:
+        if isinstance(record, EdgeVerdict):
+            self._estimator.label_edge(record.source_robot, record.edge_id, record.label)
+            return
+        topic.note_frames(record.frame_id)
+        counter.by_sequence.observe(record.sender, record.sequence)
+        if isinstance(record.edge, RejectReason):
+            reason: RejectReason | None = record.edge
+            self._estimator.reject(record.edge)
+        else:
+            reason = self._estimator.add_edge(record.edge)
+        if reason is not None and reason is not RejectReason.DUPLICATE_EDGE:
+            self._on_refusal(reason)
+
+    def _forget_with_the_estimator(self) -> None:
+        """After a reset, what a sender repeats is new again, and what it sent before is of no use."""
+        if self._generation != self._estimator.generation:
+            self._generation = self._estimator.generation
+            self._under_way.clear()
+            for convert in self._converters:
+                convert.forget()

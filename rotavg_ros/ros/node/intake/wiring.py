@@ -1,0 +1,164 @@
+"""Mistakes in how the node is connected: what it listens to, who publishes there, and in which frames.
+
+None of them is an error to ROS; each costs an integrator an afternoon. Looked for once a second, told in the
+diagnostics with the topic and what to do.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
+from rotavg_ros.settings.parameters import NodeParameters
+
+_CLOCK = "/clock"
+# Frames come from messages and may be anything; so many different ones of a topic tell enough.
+_MOST_FRAMES = 3
+
+
+@dataclass
+class Input:
+    """A topic that the node listens to.
+
+    Attributes:
+        name: of the topic, in full.
+        type_name: of its messages, ``package/msg/Type``.
+        parameter: the parameter that names it, ``odometry_topics`` or ``edge_topics``.
+        robot: whose odometry it is; empty for edges.
+        qos: what is asked for.
+        frames: of the messages so far: of odometry header.frame_id and that of the body, of edges that of the sensor.
+        published: when somebody was last seen to publish it, by the monotonic clock; at first when it was subscribed.
+    """
+
+    name: str
+    type_name: str
+    parameter: str
+    robot: str
+    qos: QoSProfile
+    frames: dict[tuple[str, ...], None] = field(default_factory=dict)
+    published: float = field(default_factory=time.monotonic)
+
+    @property
+    def is_odometry(self) -> bool:
+        return bool(self.robot)
+
+    def is_published(self) -> None:
+        """Somebody publishes it now."""
+        self.published = time.monotonic()
+
+    def note_frames(self, *frames: str) -> None:
+        """Remember in which frames a message is."""
+        if frames not in self.frames and len(self.frames) < _MOST_FRAMES:
+            self.frames[frames] = None
+
+
+class Wiring:
+    """Looks at the ROS graph around a node, and at what came over it."""
+
+    def __init__(self, node: Node, inputs: Sequence[Input], outputs: Sequence[str], given: frozenset[str]) -> None:
+        """Watch a node.
+
+        Args:
+            node: the node.
+            inputs: what it listens to.
+            outputs: full names of topics that only this node should publish.
+            given: names of the parameters that it was started with.
+        """
+        self._node, self._inputs, self._outputs, self._given = node, inputs, outputs, given
+
+    def warnings(self, parameters: NodeParameters) -> list[str]:
+        """One line for each mistake that there is now."""
+        found: list[str] = []
+        now = time.monotonic()
+        missing = []
+        for each in self._inputs:
+            publishers = self._node.get_publishers_info_by_topic(each.name)
+            found += _of_publishers(each, publishers)
+            if publishers:
+                each.is_published()
+            elif now - each.published > parameters.odometry_timeout_s:
+                missing.append(each)
+        found += self._of_missing(missing, parameters)
+        found += self._of_frames()
+        for topic in self._outputs:
+            if self._node.count_publishers(topic) > 1:
+                found.append(f"another node publishes {topic}, too: stop it, or give one of them a namespace")
+        if self._node.get_parameter("use_sim_time").value and self._node.count_publishers(_CLOCK) == 0:
+            found.append(f"use_sim_time is set, but nobody publishes {_CLOCK}: play the bag with --clock or unset it")
+        return found
+
+    def _of_missing(self, missing: Sequence[Input], parameters: NodeParameters) -> list[str]:
+        """Topics that nobody publishes, as far as they are needed."""
+        edges = [each for each in self._inputs if not each.is_odometry]
+        # The default topics are two forms of the same; whoever uses one does without the other.
+        all_needed = "edge_topics" in self._given or all(each in missing for each in edges)
+        needs_odometry = parameters.keyframe_source == "odometry" and parameters.unknown_keyframes == "wait"
+        lines = []
+        for each in missing:
+            if needs_odometry if each.is_odometry else all_needed:
+                others = self._topics_of(each.type_name)
+                hint = f"{each.type_name} is published on {', '.join(others)}" if others else "is it started?"
+                lines.append(f"nobody publishes {each.name} ({each.parameter}): {hint}")
+        return lines
+
+    def _topics_of(self, type_name: str) -> list[str]:
+        """Topics of a type that are published and that this node does not know, a few of them."""
+        known = {each.name for each in self._inputs}
+        by_others = (
+            topic
+            for topic, types in self._node.get_topic_names_and_types()
+            if type_name in types and topic not in known and self._node.count_publishers(topic)
+        )
+        return sorted(by_others)[:_MOST_FRAMES]
+
+    def _of_frames(self) -> list[str]:
+        lines, bodies = [], []
+        for each in self._inputs:
+            if each.is_odometry:
+                bodies += [body for _, body in each.frames if body and body not in bodies]
+                if len(each.frames) > 1:
+                    named = " and ".join(" → ".join(frames) for frames in each.frames)
+                    lines.append(f"{each.name} comes in frames {named}: a robot's odometry has one source")
+        if "edge_sensor_orientations" in self._given or not bodies:
+            return lines
+        for each in self._inputs:
+            sensors = [] if each.is_odometry else [sensor for (sensor,) in each.frames if sensor not in (*bodies, "")]
+            if sensors:
+                lines.append(
+                    f"{each.name} is in frame {', '.join(sensors)}, but odometry tells of {', '.join(bodies)}: set "
+                    "edge_sensor_orientations to the orientation of the one in the other (0, 0, 0, 1 if they are equal)"
+                )
+        return lines
+
+
+def _of_publishers(topic: Input, publishers: Sequence[TopicEndpointInfo]) -> list[str]:
+    """What is wrong with those who publish a topic."""
+    lines = []
+    fitting = [each for each in publishers if each.topic_type == topic.type_name]
+    for other in sorted({each.topic_type for each in publishers} - {topic.type_name}):
+        known = other in (ODOMETRY_CONVERTERS if topic.is_odometry else EDGE_CONVERTERS)
+        remedy = f"write {topic.name}:{other}" if known else "there is no adapter for that"
+        lines.append(f"{topic.name} carries {other}, but {topic.parameter} says {topic.type_name}: {remedy}")
+    if topic.is_odometry and len(fitting) > 1:
+        names = ", ".join(sorted(_name(each) for each in fitting))
+        lines.append(
+            f"{topic.name} has {len(fitting)} publishers ({names}): stop all but one, or give each robot a topic of "
+            "its own (odometry_topics)"
+        )
+    for each in fitting:
+        if qos_check_compatible(each.qos_profile, topic.qos)[0] == QoSCompatibility.ERROR:
+            remedy = "set its reliability to reliable"
+            if each.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT:
+                remedy = f"-p qos_overrides.{topic.name}.subscription.reliability:=best_effort"
+            lines.append(f"{topic.name}: nothing arrives from {_name(each)}, whose QoS is incompatible: {remedy}")
+    return lines
+
+
+def _name(endpoint: TopicEndpointInfo) -> str:
+    return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"

@@ -1,0 +1,65 @@
+"""The transform from the world frame to a robot's odometry frame, for those who ask for it."""
+
+from __future__ import annotations
+
+from geometry_msgs.msg import TransformStamped
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Header
+
+from rotavg_ros.errors import UserError
+from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.ros.node.output.conversions import to_quaternion_message
+from rotavg_ros.ros.node.topics import publisher
+
+NO_TRANSLATION = (
+    "publish_tf: the transform from the world to the odometry frame has no translation yet; take positions from "
+    "corrected_path, not from tf"
+)
+
+
+class FrameCorrection:
+    """Publishes on ``/tf``; says nothing there for a robot whose odometry has no frame that could be placed.
+
+    Raises:
+        UserError: tf2_msgs is not installed, or a topic's ``qos_overrides`` cannot be.
+    """
+
+    def __init__(self, node: Node, world_frame: str) -> None:
+        try:
+            from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
+        except ImportError as error:
+            raise UserError("publish_tf needs tf2_msgs: install that package or leave publish_tf off") from error
+        self._message_type, self._world_frame = TFMessage, world_frame
+        self._publisher = publisher(node, TFMessage, "/tf", QoSProfile(depth=100))
+        self._robot_of_frame: dict[str, str] = {}
+        self._mistakes: dict[str, str] = {}
+
+    def publish(self, robot: str, topic: str, odometry: Header, world_from_odometry: Quaternion) -> None:
+        """Place the frame of a robot's odometry message, which came on ``topic`` and has this header."""
+        mistake = self._mistake(robot, odometry.frame_id)
+        if mistake is not None:
+            self._mistakes[topic] = f"publish_tf says nothing about {topic}: {mistake}"
+            return
+        self._mistakes.pop(topic, None)
+        header = Header(stamp=odometry.stamp, frame_id=self._world_frame)
+        transform = TransformStamped(header=header, child_frame_id=odometry.frame_id)
+        transform.transform.rotation = to_quaternion_message(world_from_odometry)
+        self._publisher.publish(self._message_type(transforms=[transform]))
+
+    def warnings(self) -> list[str]:
+        """What there is to say about it, a line each."""
+        return [NO_TRANSLATION, *list(self._mistakes.values())]
+
+    def _mistake(self, robot: str, frame: str) -> str | None:
+        """Why a frame cannot be placed; None if it can."""
+        if not frame:
+            return "its header.frame_id is empty; have the driver name the odometry frame"
+        if frame.startswith("/"):
+            return f"tf2 takes no frame that begins with '/', as {frame} does; have the driver leave that out"
+        if frame == self._world_frame:
+            return f"it is in the world frame {frame} already; set world_frame to another one, or feed the raw odometry"
+        other = self._robot_of_frame.setdefault(frame, robot)
+        if other != robot:
+            return f"{other} has the odometry frame {frame}, too; give each robot a frame of its own"
+        return None

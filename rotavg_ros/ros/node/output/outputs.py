@@ -1,0 +1,110 @@
+"""What the node publishes: answers, pictures of them, and the present orientation."""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+
+from geometry_msgs.msg import QuaternionStamped
+from nav_msgs.msg import Path
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rotavg_msgs.msg import AbsoluteOrientations, OutlierFlags
+from std_msgs.msg import Header
+from visualization_msgs.msg import MarkerArray
+
+from rotavg_ros.online import Answer, OnlineEstimator
+from rotavg_ros.ros.node.output.conversions import flags_message, orientations_message, to_quaternion_message
+from rotavg_ros.ros.node.output.frame_correction import FrameCorrection
+from rotavg_ros.ros.node.output.visualization import markers_message, path_message
+from rotavg_ros.ros.node.topics import LATCHED, publisher
+from rotavg_ros.settings.parameters import NodeParameters
+
+# After a drawing the worker does other things for so many times as long: at 10 000 keyframes one takes half a second.
+_REST = 4.0
+
+
+class Outputs:
+    """All publishers but that of the diagnostics.
+
+    Raises:
+        UserError: a topic's ``qos_overrides`` cannot be, or ``publish_tf`` without tf2_msgs.
+    """
+
+    def __init__(self, node: Node, parameters: NodeParameters, estimator: OnlineEstimator) -> None:
+        self._estimator = estimator
+        self._robots, self._frame_id = parameters.robots, parameters.world_frame
+        self._drawn: dict[Publisher, tuple[int, int]] = {}
+        self._rests_until = 0.0  # on the monotonic clock
+        latched = partial(publisher, node, qos=LATCHED)
+        self._orientations = latched(AbsoluteOrientations, "abs_orientations")
+        self._flags = latched(OutlierFlags, "outlier_flags")
+        self._markers = latched(MarkerArray, "~/markers")
+        prefix = {robot: f"{robot}/" if len(self._robots) > 1 else "" for robot in self._robots}
+        self._paths = {robot: latched(Path, f"{prefix[robot]}corrected_path") for robot in self._robots}
+        self._orientation = {
+            robot: publisher(node, QuaternionStamped, f"{prefix[robot]}orientation", QoSProfile(depth=10))
+            for robot in self._robots
+        }
+        self._tf = FrameCorrection(node, self._frame_id) if parameters.publish_tf else None
+
+    @property
+    def exclusive_topics(self) -> list[str]:
+        """Full names of topics that only one node should publish."""
+        return [self._orientations.topic_name, *(each.topic_name for each in self._orientation.values())]
+
+    def warnings(self) -> list[str]:
+        """What is not as it should be, a line each."""
+        return [] if self._tf is None else self._tf.warnings()
+
+    def publish_answer(self, answer: Answer) -> None:
+        """Latch the answer's keyframes and edges."""
+        self._orientations.publish(orientations_message(answer, self._frame_id))
+        self._flags.publish(flags_message(answer, self._frame_id))
+
+    def draw(self, answer: Answer | None) -> None:
+        """Path and markers of the last answer, for those who look; again when somebody begins to.
+
+        Called once a second at least, so that what is left out because too much time went into drawing comes later.
+        """
+        started = time.monotonic()
+        if answer is None or started < self._rests_until:
+            return
+        missing = [p for p in (*self._paths.values(), self._markers) if self._lacks(p, answer)]
+        if not missing:
+            return
+        trajectories = self._estimator.trajectories(answer)
+        for robot, path in self._paths.items():
+            if path in missing and robot in trajectories:
+                path.publish(path_message(trajectories[robot], self._frame_id))
+        if self._markers in missing:
+            self._markers.publish(markers_message(answer, list(trajectories.values()), self._frame_id))
+        ended = time.monotonic()
+        self._rests_until = ended + _REST * (ended - started)
+
+    def _lacks(self, picture: Publisher, answer: Answer) -> bool:
+        """Whether somebody looks who has not been sent this answer yet; from now on they have."""
+        watchers = picture.get_subscription_count()
+        version, watchers_then = self._drawn.get(picture, (0, 0))
+        self._drawn[picture] = answer.version, watchers
+        return watchers > 0 and (version != answer.version or watchers > watchers_then)
+
+    def publish_orientation(self, robot: str, topic: str, odometry: Header) -> None:
+        """The robot's corrected orientation at the moment of its newest odometry message.
+
+        Args:
+            robot: whose.
+            topic: that the message came on.
+            odometry: the message's header.
+        """
+        orientation = self._estimator.current_orientation(robot)
+        if orientation is None:
+            return
+        stamped = QuaternionStamped(quaternion=to_quaternion_message(orientation))
+        stamped.header.stamp = odometry.stamp
+        stamped.header.frame_id = self._frame_id
+        self._orientation[robot].publish(stamped)
+        correction = self._estimator.world_from_odometry(robot) if self._tf is not None else None
+        if self._tf is not None and correction is not None:
+            self._tf.publish(robot, topic, odometry, correction)

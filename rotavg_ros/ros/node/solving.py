@@ -1,0 +1,168 @@
+"""Everything slow: ticks and their answers, and drawing, on one worker's thread; the state file on another's.
+
+A solve may take longer than the time between two autosaves, and a save must not wait for it; nor does a load, or a
+reset on the executor's thread, which give the running solve up.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from rclpy.node import Node
+
+from rotavg_ros.errors import UserError
+from rotavg_ros.online import Answer, OnlineEstimator
+from rotavg_ros.online.estimator import TickAbandonedError
+from rotavg_ros.online.joins import joins
+from rotavg_ros.online.state_file import remove_leftovers
+from rotavg_ros.ros.node.health import Health
+from rotavg_ros.ros.node.output.outputs import Outputs
+
+_LOG_PERIOD_S = 5.0
+
+
+class Solving:
+    """Jobs for the workers, and :meth:`reset`, which takes milliseconds.
+
+    Those that a service asks for return what to tell the caller, or raise.
+
+    Raises:
+        UserError: the state file cannot be read or written.
+    """
+
+    def __init__(
+        self, node: Node, estimator: OnlineEstimator, health: Health, outputs: Outputs, state_file: Path | None
+    ) -> None:
+        self._node = node
+        self._estimator = estimator
+        self._health = health
+        self._outputs = outputs
+        self._state_file = state_file
+        self._publishing = threading.Lock()  # an answer goes out before it is forgotten, or not at all
+        if state_file is not None:
+            self._resume(state_file)
+        self._saved = self._content()
+
+    def tick(self, force_cold: bool = False) -> Answer | None:
+        """Solve if there is anything new, and publish the answer; None if there is none."""
+        health = self._health
+        if self._estimator.is_behind:
+            health.fell_behind()
+        try:
+            answer = self._estimator.tick(force_cold)
+        except TickAbandonedError:
+            raise
+        except Exception as error:
+            health.tick_failed(error)
+            raise
+        health.tick_went_well()
+        if answer is not None:
+            self._publish(answer)
+            self._outputs.draw(answer)
+        return answer
+
+    def solve_now(self) -> str:
+        answer = self.tick(force_cold=True)
+        if answer is None:
+            empty = self._estimator.counts().keyframes == 0
+            return "there are no keyframes: nothing to solve" if empty else "nothing has changed since the last answer"
+        return f"answer {answer.version}: {len(answer.keyframe_id)} keyframes, {int(answer.outlier.sum())} outliers"
+
+    def reset(self) -> str:
+        self._estimator.reset()
+        self._forget_answer()
+        return "reset"
+
+    def pause(self, paused: bool) -> str:
+        self._estimator.pause(paused)
+        self._health.waits_for_nothing()
+        return "paused: inputs are kept, nothing is solved" if paused else "running"
+
+    def save(self) -> str:
+        state_file = self._named_state_file()
+        self._estimator.save(state_file)
+        self._health.saved()
+        return f"saved to {state_file}"
+
+    def load(self) -> str:
+        state_file = self._named_state_file()
+        self._estimator.load(state_file)
+        self._forget_answer()
+        return f"loaded {state_file}"
+
+    def tick_quietly(self) -> None:
+        """As :meth:`tick`; what goes wrong is logged."""
+        self._quietly("solving failed: ", self.tick)
+
+    def autosave_quietly(self) -> None:
+        """Save what has changed since it was last saved; what goes wrong is logged once, until it goes well again."""
+        content = self._content()
+        if content == self._saved and self._health.save_failure is None:
+            return
+        try:
+            self.save()
+            self._saved = content
+        except Exception as error:
+            if str(error) != self._health.save_failure:
+                self._node.get_logger().error(str(error))
+            self._health.saved(failure=str(error))
+
+    def draw_quietly(self) -> None:
+        """Draw the last answer for those who look; what goes wrong is logged."""
+        self._quietly("drawing failed: ", lambda: self._outputs.draw(self._health.answer))
+
+    def forget_quietly(self) -> None:
+        """Latch empty answers in place of those that the estimator has forgotten; what goes wrong is logged."""
+        self._quietly("", self._forget_answer)
+
+    def _quietly(self, what: str, job: Callable[[], object]) -> None:
+        try:
+            job()
+        except TickAbandonedError:
+            pass
+        except Exception as error:  # a correction node that dies takes the robot with it
+            self._node.get_logger().error(f"{what}{error}", throttle_duration_sec=_LOG_PERIOD_S)
+
+    def _publish(self, answer: Answer) -> None:
+        health = self._health
+        with self._publishing:
+            if answer.version <= self._estimator.first_version:
+                raise TickAbandonedError("abandoned: everything was forgotten or replaced meanwhile")
+            self._tell_of_joins(answer)
+            self._outputs.publish_answer(answer)
+            health.published(answer)
+
+    def _tell_of_joins(self, answer: Answer) -> None:
+        health = self._health
+        if health.answer is not None and health.answer.version > self._estimator.first_version:
+            for join in joins(health.answer, answer):
+                health.joined()
+                left = f"the graph is in {answer.num_components} components" if answer.num_components > 1 else "all one"
+                self._node.get_logger().info(f"{join} ({left})")
+
+    def _forget_answer(self) -> None:
+        """The published answers belong to what was forgotten: latch empty ones."""
+        with self._publishing:
+            answer = self._health.answer
+            self._health.begin_anew()
+            if answer is not None and answer.version <= self._estimator.first_version:
+                self._outputs.publish_answer(answer.without_content())
+                self._health.forget_answer()
+
+    def _content(self) -> tuple[int, int]:
+        """Differs when the graph does."""
+        return self._estimator.generation, self._estimator.revision
+
+    def _resume(self, state_file: Path) -> None:
+        if state_file.exists():
+            self._estimator.load(state_file)
+        elif not state_file.parent.is_dir():
+            raise UserError(f"state_file is {state_file}, but there is no folder {state_file.parent}; make it first")
+        remove_leftovers(state_file)
+
+    def _named_state_file(self) -> Path:
+        if self._state_file is None:
+            raise UserError("the parameter state_file is empty; start the node with the file's name")
+        return self._state_file

@@ -1,0 +1,75 @@
+"""A long message is taken in slices: nothing is lost, nothing overtakes, and a reset drops the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
+
+from rotavg_ros.inputs import EdgeRecord
+from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
+from rotavg_ros.ros.node.intake.edge_intake import EdgeIntake
+from rotavg_ros.ros.node.intake.wiring import Input
+from rotavg_ros.ros.node.message_counting import TopicCounter
+
+LENGTH = 3000
+IDENTITY = (0.0, 0.0, 0.0, 1.0)
+
+
+class Chain:
+    """Converts a number into a chain of so many odometry edges."""
+
+    forgotten = 0
+
+    def __call__(self, message: tuple[str, int]) -> Iterator[EdgeRecord]:
+        robot, length = message
+        for index in range(length):
+            ends = (KeyframeReference(robot, index), KeyframeReference(robot, index + 1))
+            yield EdgeRecord(EdgeMeasurement(index, *ends, IDENTITY, kind=0), robot, index + 1)
+
+    def forget(self) -> None:
+        self.forgotten += 1
+
+
+@pytest.fixture
+def executor() -> Iterator[SingleThreadedExecutor]:
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(rclpy.create_node("intake", context=context))
+    yield executor
+    for node in executor.get_nodes():
+        node.destroy_node()
+    executor.shutdown()
+    rclpy.shutdown(context=context)
+
+
+def test_a_long_message_lets_others_have_their_turn(executor: SingleThreadedExecutor) -> None:
+    online = OnlineEstimator(EstimatorOptions(keyframe_source="edges"), lambda *_, **__: None)
+    intake = EdgeIntake(executor.get_nodes()[0], online, lambda reason: None)
+    convert, counter = Chain(), TopicCounter()
+    intake.add_source(convert)
+    topic = Input("/edges", "any", "edge_topics", "", QoSProfile(depth=1))
+
+    def take(robot: str, length: int) -> None:
+        intake.take(topic, counter, convert((robot, length)))
+
+    take("long", LENGTH)
+    assert 0 < online.counts().edges < LENGTH
+    take("short", 1)
+    for _ in range(100 * LENGTH):
+        if online.counts().edges == LENGTH + 1:
+            break
+        executor.spin_once(timeout_sec=0.1)
+    assert online.snapshot().edge_id.tolist() == [*range(LENGTH), 0]
+    assert online.snapshot().robots == ("long", "short") and counter.lost == 0
+
+    take("other", LENGTH)
+    online.reset()
+    for _ in range(20):
+        executor.spin_once(timeout_sec=0.01)
+    assert online.counts().edges == 0 and convert.forgotten == 1

@@ -1,0 +1,119 @@
+"""OK, WARN and ERROR mean something."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
+
+from rotavg_ros.online import KeyframeReference
+from rotavg_ros.online.content import Counts
+from rotavg_ros.ros.node.diagnostics import Reporter
+from rotavg_ros.ros.node.health import Health
+from rotavg_ros.ros.node.message_counting import TopicCounter
+from rotavg_ros.settings.parameters import NodeParameters
+
+OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"
+
+
+def answer(**changes: object) -> SimpleNamespace:
+    values = {
+        "version": 3,
+        "kind": np.array([0, 1, 1, 1]),
+        "outlier": np.array([False, True, False, False]),
+        "num_components": 1,
+        "device": "cpu",
+        "profile": "slam",
+        "method": "neurora",
+        "was_cold": True,
+    }
+    return SimpleNamespace(**values | changes)
+
+
+@pytest.fixture
+def health() -> Health:
+    now = time.monotonic()
+    healthy = Health(last_odometry={"/odom": now}, answer=answer(), answered=now)
+    healthy.odometry["/odom"] = TopicCounter()
+    healthy.ticks.add(0.1)
+    return healthy
+
+
+def report(health: Health, parameters: NodeParameters | None = None, paused: bool = False, **rejected: int):
+    counts = Counts(keyframes=10, edges=12, pending=1, rejected=rejected)
+    return Reporter("rotavg: estimator").report(health, counts, parameters or NodeParameters(), paused)
+
+
+def test_all_is_well(health: Health) -> None:
+    status = report(health, duplicate_edge=4)
+    assert (status.level, status.message, status.hardware_id) == (OK, "ok", "cpu")
+    values = {pair.key: pair.value for pair in status.values}
+    assert values["loop closures"] == "3" and values["outliers"] == "1" and values["dropped duplicate_edge"] == "4"
+    assert values["tick p50 ms"] == "100.0" and values["answer cold"] == "true"
+    assert report(health, paused=True).message == "paused"
+
+
+@pytest.mark.parametrize(
+    ("changes", "level", "message"),
+    [
+        ({"mistakes": ["nobody publishes /odom"]}, WARN, "nobody publishes /odom"),
+        ({"answer": answer(num_components=2)}, WARN, "2 components"),
+        ({"answer": answer(outlier=np.ones(4, bool))}, WARN, "100 % of the loop closures"),
+        ({"failure": "no memory"}, ERROR, "solving fails: no memory"),
+        ({"unsolved_since": -100.0}, ERROR, "stale"),
+    ],
+)
+def test_what_is_wrong_is_said(health: Health, changes: dict[str, object], level: bytes, message: str) -> None:
+    for name, value in changes.items():
+        setattr(health, name, time.monotonic() + value if isinstance(value, float) else value)
+    status = report(health)
+    assert status.level == level and message in status.message
+
+
+def test_silence_is_told_of_each_topic(health: Health) -> None:
+    health.odometry["/b/odom"] = TopicCounter()
+    health.started = time.monotonic() - 100
+    assert report(health).message == "no odometry yet on /b/odom"
+    health.last_odometry = {"/odom": health.started, "/b/odom": time.monotonic()}
+    assert report(health).message == "no odometry for 100 s on /odom"
+
+
+def test_edges_that_wait_for_what_hardly_comes(health: Health) -> None:
+    def of(**counts: object) -> str:
+        reporter = Reporter("rotavg: estimator")
+        return reporter.report(
+            health, Counts(10, 12, 7, {}, robots=("robot",), **counts), NodeParameters(), False
+        ).message
+
+    assert of() == of(pending_by_robot={"robot": 7}) == "ok"
+    unknown = of(pending_by_robot={"robot": 3, "roboter": 4})
+    assert unknown.startswith("4 edges are about robots that are not known ('roboter'); known are robot: ")
+    by_id = KeyframeReference("robot", 900)
+    assert of(longest_pending=by_id, longest_pending_s=1.0) == "ok"
+    assert "such as 900 of robot" in of(longest_pending=by_id, longest_pending_s=100.0)
+    assert "one clock" in of(longest_pending=KeyframeReference("robot", None, 5), longest_pending_s=100.0)
+
+
+def test_slow_solves_losses_and_refusals_warn(health: Health) -> None:
+    health.ticks.add(20.0)
+    assert "longer" in report(health).message
+    assert "2 inputs refused" in report(health, nan_rotation=2).message
+    for number in (1, 4):
+        health.odometry["/odom"].by_sequence.observe("", number)
+    assert "2 messages lost" in report(health).message
+
+
+def test_a_graph_without_odometry_does_not_miss_it(health: Health) -> None:
+    health.last_odometry.clear()
+    health.started = time.monotonic() - 100
+    assert report(health, NodeParameters(keyframe_source="edges")).level == OK
+    assert report(health, NodeParameters(unknown_keyframes="create")).level == OK
+
+
+def test_before_the_first_answer() -> None:
+    values = {pair.key: pair.value for pair in report(Health()).values}
+    assert values["answer age s"] == values["tick p95 ms"] == values["answer cold"] == "nan"
