@@ -21,6 +21,17 @@ _STALE_PERIODS = 10
 # Ticks longer ago than this say nothing about the load now.
 _RECENT_S = 60.0
 _SUSPICIOUS_OUTLIER_SHARE = 0.5
+# So long the diagnostics tell of something that has happened once.
+_NOTICE_S = 60.0
+# What happens when time goes back, by the policy.
+TIME_WENT_BACK = {
+    "new_component": "time went back: the graph is kept, and a new component begins (on_time_jump)",
+    "reset": "time went back: everything is forgotten and begins anew (on_time_jump)",
+    "ignore": "time went back: odometry is refused until it is ahead again (on_time_jump)",
+    "error": "time went back: odometry is refused until it is ahead again (on_time_jump)",
+}
+KEPT = "what was forgotten or replaced is kept in"
+NOT_KEPT = "what was forgotten or replaced could not be backed up:"
 # Refusals that a healthy system produces: a sender that repeats itself.
 _HARMLESS = {"duplicate_edge", "marginalized_keyframe"}
 
@@ -37,6 +48,7 @@ class Health:
         unsolved_since: since when the graph has been ahead of the answer; None if it is not.
         solve_failures: how many ticks failed in all; ``failure`` is the last one's message, None after a good tick.
         save_failure: why the last save failed, None if it did not.
+        notices: what has happened to the graph, and when.
     """
 
     odometry: dict[str, TopicCounter] = field(default_factory=dict)
@@ -53,6 +65,13 @@ class Health:
     solve_failures: int = 0
     failure: str | None = None
     save_failure: str | None = None
+    notices: dict[str, float] = field(default_factory=dict)
+
+    def note(self, notice: str) -> None:
+        """Have the diagnostics tell of something for a minute."""
+        now = time.monotonic()
+        recent = {text: noted for text, noted in self.notices.items() if now - noted < _NOTICE_S}
+        self.notices = recent | {notice: now}
 
     @property
     def lost(self) -> int:
@@ -118,6 +137,7 @@ def _errors(health: Health, parameters: NodeParameters, paused: bool, now: float
 
 def _warnings(health: Health, parameters: NodeParameters, paused: bool, now: float) -> list[str]:
     warnings = [] if health.save_failure is None else [health.save_failure]
+    warnings += [notice for notice, noted in health.notices.items() if now - noted < _NOTICE_S]
     silent = now - (health.started if health.last_odometry is None else health.last_odometry)
     needed = parameters.keyframe_source == "odometry" and parameters.unknown_keyframes == "wait"
     if silent > parameters.odometry_timeout_s and (needed or health.last_odometry is not None):

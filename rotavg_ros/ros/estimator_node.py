@@ -14,9 +14,10 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.online import OnlineEstimator
+from rotavg_ros.online import Discarded, OnlineEstimator
+from rotavg_ros.online.time_jumps import KEEPS_TIME_LINE
 from rotavg_ros.ros import parameter_server
-from rotavg_ros.ros.diagnostics import Health, Reporter
+from rotavg_ros.ros.diagnostics import TIME_WENT_BACK, Health, Reporter
 from rotavg_ros.ros.outputs import Outputs
 from rotavg_ros.ros.services import Services
 from rotavg_ros.ros.solving import Solving
@@ -46,7 +47,7 @@ class RotavgNode(Node):
         self._settings = parameters = parameter_server.declare(self)
         torch.set_num_threads(parameters.solver_threads or max(1, torch.get_num_threads() - 1))
         device = warm_up(parameters.estimator_options())
-        self._estimator = OnlineEstimator(parameters.estimator_options())
+        self._estimator = OnlineEstimator(parameters.estimator_options(), on_discard=self._on_discard)
         self._health = Health()
         self._reporter = Reporter(f"{self.get_fully_qualified_name().lstrip('/')}: estimator")
         self._worker = Worker(executor, "rotavg_worker")
@@ -79,6 +80,8 @@ class RotavgNode(Node):
         if self._settings.autosave_period_s > 0:
             self._on_autosave_timer()
         is_saved = self._saver.stop(timeout_s, finish=True)
+        if is_saved:
+            self._solving.let_go()
         return self._worker.stop(_SHORT_SOLVE_S) and is_saved
 
     def _create_timer(self, period_s: float, callback: Callable[[], object]) -> Timer:
@@ -114,11 +117,16 @@ class RotavgNode(Node):
             self._on_time_jump()
 
     def _on_time_jump(self) -> None:
-        if self._settings.on_time_jump == "reset":
-            self.get_logger().warning("time went back: everything is forgotten and begins anew (on_time_jump)")
+        policy = self._settings.on_time_jump
+        self.get_logger().warning(TIME_WENT_BACK[policy])
+        if policy not in KEEPS_TIME_LINE:
+            self._health.note(TIME_WENT_BACK[policy])
+        if policy == "reset":
             self._worker.submit(self._solving.forget_quietly)
-        else:
-            self.get_logger().warning("time went back: odometry is refused until it is ahead again (on_time_jump)")
+
+    def _on_discard(self, discarded: Discarded) -> None:
+        """Runs under the estimator's lock; the saver does it before it saves anything else."""
+        self._saver.submit(lambda: self._solving.back_up_quietly(discarded))
 
     def _on_diagnostics_timer(self) -> None:
         status = self._reporter.report(self._health, self._estimator.counts(), self._settings, self._estimator.paused)
