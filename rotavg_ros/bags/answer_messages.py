@@ -30,7 +30,7 @@ def orientations_message(answer: Answer, frame_id: str) -> Any:
     """A ``rotavg_msgs/msg/AbsoluteOrientations``."""
     return _make(
         ORIENTATIONS,
-        header=_header(_newest(answer), frame_id),
+        header=_header(answer.newest_stamp_ns, frame_id),
         robots=list(answer.robots),
         keyframe_robots=answer.keyframe_robot.astype(np.uint32),
         keyframe_ids=answer.keyframe_id,
@@ -45,7 +45,7 @@ def flags_message(answer: Answer, frame_id: str) -> Any:
     """A ``rotavg_msgs/msg/OutlierFlags``."""
     return _make(
         FLAGS,
-        header=_header(_newest(answer), frame_id),
+        header=_header(answer.newest_stamp_ns, frame_id),
         edge_ids=answer.edge_id,
         robots=list(answer.robots),
         source_robots=answer.keyframe_robot[answer.source].astype(np.uint32),
@@ -124,10 +124,6 @@ def diagnostics_message(stamp_ns: int, level: int, name: str, message: str, valu
         values=[pair(key=key, value=value) for key, value in values.items()],
     )
     return _make(DIAGNOSTICS, header=_header(stamp_ns, ""), status=[status])
-
-
-def _newest(answer: Answer) -> int:
-    return int(answer.stamp_ns.max()) if len(answer.stamp_ns) else 0
 
 
 def _header(stamp_ns: int, frame_id: str) -> Any:

@@ -8,9 +8,8 @@ from functools import cached_property
 from typing import Any, Protocol
 
 from rotavg_ros.online import EdgeMeasurement, RejectReason
-from rotavg_ros.online.keyframes import Position
 from rotavg_ros.online.odometry_continuity import ANY_MOTION, ContinuityLimits
-from rotavg_ros.online.quaternion import IDENTITY, Quaternion
+from rotavg_ros.online.quaternion import IDENTITY, Quaternion, Vector
 from rotavg_ros.view_graph import EdgeLabel
 
 
@@ -81,7 +80,7 @@ class OdometryRecord:
 
     stamp_ns: int
     world_from_body: Quaternion
-    position: Position | None
+    position: Vector | None
     frame_id: str = ""
     child_frame_id: str = ""
 

@@ -13,7 +13,6 @@ from rotavg_ros.online.graph_builder import GraphBuilder
 from rotavg_ros.online.growing_view_graph import GraphSnapshot
 from rotavg_ros.online.keyframes import OdometryTrack
 from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS, RejectedInputError
-from rotavg_ros.online.odometry_continuity import OdometrySample
 from rotavg_ros.online.quaternion import Quaternion
 
 
@@ -40,8 +39,9 @@ def root_orientations(
         if answered is not None and root < known:
             orientations.append(answered[root].tolist())
         else:
-            robot, stamp_ns = snapshot.robots[snapshot.keyframe_robot[root]], int(snapshot.stamp_ns[root])
-            orientations.append(quaternion.inverse(_initial_world_from_body(builder, robot, stamp_ns)))
+            robot = snapshot.robots[snapshot.keyframe_robot[root]]
+            moment = int(snapshot.stamp_ns[root]), int(snapshot.time_line[root])
+            orientations.append(quaternion.inverse(_initial_world_from_body(builder, robot, *moment)))
     return torch.tensor(orientations, dtype=torch.float64)
 
 
@@ -52,21 +52,20 @@ def first_correction(builder: GraphBuilder, robot: str) -> Quaternion:
     """
     if anchors := builder.tracks[robot].anchors:
         return anchors[-1]
-    return quaternion.IDENTITY if builder.options.gauge == "odometry" else builder.tracks[robot].first_body_from_world()
+    samples = builder.tracks[robot].samples
+    return quaternion.IDENTITY if builder.options.gauge == "odometry" else samples.first_body_from_world()
 
 
-def anchor(track: OdometryTrack, last: OdometrySample, world_from_odometry: Quaternion) -> None:
-    """Let a chain that has just begun start where the robot was last: the best guess, though nothing is known.
+def anchor(track: OdometryTrack, world_from_odometry: Quaternion) -> None:
+    """Let the chain that has just begun start where the robot was last: the best guess, though nothing is known.
 
     Args:
-        track: its latest message is the chain's first.
-        last: the message before it, of the chain before.
+        track: with one chain more than anchors.
         world_from_odometry: of the chain before.
     """
-    assert track.latest is not None
+    last, first = track.samples.seam(track.chain)
     world_from_body = quaternion.multiply(world_from_odometry, last.world_from_body)
-    odometry_from_body = track.latest.world_from_body
-    track.anchors.append(quaternion.multiply(world_from_body, quaternion.inverse(odometry_from_body)))
+    track.anchors.append(quaternion.multiply(world_from_body, quaternion.inverse(first.world_from_body)))
 
 
 def corrections(builder: GraphBuilder, body_from_world: Tensor) -> dict[str, Quaternion]:
@@ -81,10 +80,11 @@ def corrections(builder: GraphBuilder, body_from_world: Tensor) -> dict[str, Qua
         for node in builder.graph.nodes_newest_first(robot):
             if node >= len(body_from_world):
                 continue
-            if track.chain_at(builder.graph.stamp_of(node)) != track.chain:
+            moment = builder.graph.moment_of(node)
+            if track.samples.chain_at(*moment) != track.chain:
                 break
             try:
-                odometry = track.world_from_body_at(builder.graph.stamp_of(node))
+                odometry = track.samples.world_from_body_at(*moment)
             except RejectedInputError:
                 continue
             x, y, z, w = body_from_world[node].tolist()
@@ -93,16 +93,16 @@ def corrections(builder: GraphBuilder, body_from_world: Tensor) -> dict[str, Qua
     return found
 
 
-def _initial_world_from_body(builder: GraphBuilder, robot: str, stamp_ns: int) -> Quaternion:
+def _initial_world_from_body(builder: GraphBuilder, robot: str, stamp_ns: int, time_line: int) -> Quaternion:
     """Where a component's first keyframe begins."""
     track = builder.tracks.get(robot)
     if track is None or stamp_ns == UNKNOWN_STAMP_NS:
         return quaternion.IDENTITY
-    chain = track.chain_at(stamp_ns)
+    chain = track.samples.chain_at(stamp_ns, time_line)
     if chain == 0 and builder.options.gauge == "identity":
         return quaternion.IDENTITY
     try:
-        odometry = track.world_from_body_at(stamp_ns)
+        odometry = track.samples.world_from_body_at(stamp_ns, time_line)
     except RejectedInputError:
         return quaternion.IDENTITY  # the odometry does not cover the keyframe: as good as anything
     return odometry if chain == 0 else quaternion.multiply(track.anchors[chain - 1], odometry)

@@ -28,6 +28,8 @@ class Answer:
         keyframe_robot: ``(N,)`` int32 index into ``robots``.
         keyframe_id: ``(N,)`` uint64.
         stamp_ns: ``(N,)`` int64, -1 where unknown.
+        time_line: ``(N,)`` int32, which of its robot's time lines the stamp is of: where a robot's clock went back,
+            the next one begins, and the same stamps may come again.
         world_from_body: ``(N, 4)`` float64 xyzw, w ≥ 0, in the component's fixed gauge.
         component: ``(N,)`` int64, numbered by first keyframe.
         uncertainty: ``(N,)`` float64, one sigma in radians relative to the component's first keyframe, NaN unknown.
@@ -52,6 +54,7 @@ class Answer:
     keyframe_robot: NDArray[np.int32]
     keyframe_id: NDArray[np.uint64]
     stamp_ns: NDArray[np.int64]
+    time_line: NDArray[np.int32]
     world_from_body: NDArray[np.float64]
     component: NDArray[np.int64]
     uncertainty: NDArray[np.float64]
@@ -98,6 +101,7 @@ class Answer:
             keyframe_robot=snapshot.keyframe_robot,
             keyframe_id=snapshot.keyframe_id,
             stamp_ns=snapshot.stamp_ns,
+            time_line=snapshot.time_line,
             world_from_body=rotations.canonical(rotations.inverse(body_from_world)).numpy(),
             component=component.numpy(),
             uncertainty=solution.uncertainty.cpu().numpy(),
@@ -122,6 +126,14 @@ class Answer:
     @property
     def num_components(self) -> int:
         return int(self.component.max()) + 1 if len(self.component) else 0
+
+    @property
+    def newest_stamp_ns(self) -> int:
+        """Of all keyframes on their robots' latest time lines; 0 without any stamp."""
+        latest = np.zeros(len(self.robots), dtype=np.int32)
+        np.maximum.at(latest, self.keyframe_robot, self.time_line)
+        is_latest = self.time_line == latest[self.keyframe_robot]
+        return int(self.stamp_ns[is_latest].max(initial=0))
 
     def without_content(self) -> Answer:
         """The same answer about no keyframes and no edges."""

@@ -47,37 +47,45 @@ def attach(
     robot, stamp_ns = reference.robot, reference.stamp_ns
     if reference.keyframe_id is not None:
         node = graph.node(robot, reference.keyframe_id)
-        return _marginalized(reference, graph) if node is None else Attachment(node)
+        return _marginalized(reference, graph, 0) if node is None else Attachment(node)
     assert stamp_ns is not None
-    node = graph.keyframe_at_or_before(robot, stamp_ns)
-    if node is not None and graph.stamp_of(node) == stamp_ns:
+    line = 0 if track is None else track.time_line_of(stamp_ns)
+    node = graph.keyframe_at_or_before(robot, stamp_ns, line)
+    if node is not None and graph.moment_of(node)[0] == stamp_ns:
         return Attachment(node)
-    if (marginalized := _marginalized(reference, graph)) is not None:
+    if (marginalized := _marginalized(reference, graph, line)) is not None:
         return marginalized
-    if track is None or not (track.reaches(stamp_ns) or (settle and track.within_tolerance(stamp_ns))):
+    if track is None:
         return None
-    now = track.world_from_body_at(stamp_ns)
+    is_covered = line < track.time_line or track.reaches(stamp_ns)
+    if not (is_covered or (settle and track.within_tolerance(stamp_ns))):
+        return None
+    samples = track.samples
+    now = samples.world_from_body_at(stamp_ns, line)
     if node is None:
-        node = graph.first_keyframe(robot)
+        node = graph.first_keyframe(robot, line)
     if node is None:
         raise RejectedInputError(RejectReason.UNKNOWN_KEYFRAME)
-    keyframe_ns = graph.stamp_of(node)
-    if track.chain_at(keyframe_ns) != track.chain_at(stamp_ns):
+    keyframe_ns, _ = graph.moment_of(node)
+    if samples.chain_at(keyframe_ns, line) != samples.chain_at(stamp_ns, line):
         raise RejectedInputError(RejectReason.ODOMETRY_GAP)
-    keyframe_from_odometry = quaternion.inverse(track.world_from_body_at(keyframe_ns))
+    keyframe_from_odometry = quaternion.inverse(samples.world_from_body_at(keyframe_ns, line))
+    step = difference(samples.position_at(stamp_ns, line), samples.position_at(keyframe_ns, line))
     return Attachment(
-        node,
-        quaternion.multiply(keyframe_from_odometry, now),
-        quaternion.rotate(
-            keyframe_from_odometry, difference(track.position_at(stamp_ns), track.position_at(keyframe_ns))
-        ),
+        node, quaternion.multiply(keyframe_from_odometry, now), quaternion.rotate(keyframe_from_odometry, step)
     )
 
 
-def _marginalized(reference: KeyframeReference, graph: GrowingViewGraph) -> Attachment | None:
-    """A keyframe that is no node any more, tied to the nearest one along the odometry that still is."""
+def _marginalized(reference: KeyframeReference, graph: GrowingViewGraph, time_line: int) -> Attachment | None:
+    """A keyframe that is no node any more, tied to the nearest one along the odometry that still is.
+
+    Args:
+        reference: to it.
+        graph: that it was a node of.
+        time_line: number of the one that the reference's stamp is of, where it has no id.
+    """
     robot, keyframe_id = reference.robot, reference.keyframe_id
-    found = graph.marginalized_keyframe(robot, keyframe_id, reference.stamp_ns)
+    found = graph.marginalized_keyframe(robot, keyframe_id, reference.stamp_ns, time_line)
     if found is not None:
         return Attachment(*found, at_keyframe=False)
     if keyframe_id is not None and graph.was_marginalized(robot, keyframe_id):

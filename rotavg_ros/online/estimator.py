@@ -9,19 +9,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torch import Tensor
-
-from rotavg_ros.online import free_memory, state_file
+from rotavg_ros.online import free_memory, state_content, state_file
 from rotavg_ros.online.anchoring import root_orientations
 from rotavg_ros.online.answer import Answer
-from rotavg_ros.online.content import Content, Counts
+from rotavg_ros.online.backups import back_up
+from rotavg_ros.online.content import AcceptedAnswer, Content, ContentState, Counts
 from rotavg_ros.online.gauge import fix_gauge
-from rotavg_ros.online.graph_builder import GraphBuilder
 from rotavg_ros.online.growing_view_graph import GraphSnapshot
-from rotavg_ros.online.measurements import EdgeMeasurement, RejectReason
+from rotavg_ros.online.measurements import EdgeMeasurement, OdometryMessage, RejectReason
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.quaternion import Quaternion
-from rotavg_ros.online.time_jumps import LateMessage
 from rotavg_ros.online.trajectory import Trajectory, corrected_trajectories
 from rotavg_ros.solver import Abandoned, abandonable
 from rotavg_ros.view_graph import EdgeLabel
@@ -57,6 +54,25 @@ class _Tick:
         return self.abandoned_by is not None
 
 
+class Discarded:
+    """A graph that was forgotten or replaced, and everything that belonged to it; it does not change any more."""
+
+    def __init__(self, content: Content) -> None:
+        self._state = content.state
+
+    @property
+    def num_keyframes(self) -> int:
+        return self._state.growth.graph.num_keyframes
+
+    def back_up(self, path: Path) -> Path:
+        """Write it beside a state file, as a file that can be loaded, see :func:`~rotavg_ros.online.backups.back_up`.
+
+        Raises:
+            StateFileError: it cannot be written.
+        """
+        return back_up(path, state_content.collect(self._state).encoded())
+
+
 class OnlineEstimator:
     """Thread-safe: inputs may come while another thread solves; they wait for microseconds only.
 
@@ -65,12 +81,19 @@ class OnlineEstimator:
     same graph, and nothing is computed after it until something changes.
     """
 
-    def __init__(self, options: EstimatorOptions | None = None, solver: Solver | None = None) -> None:
+    def __init__(
+        self,
+        options: EstimatorOptions | None = None,
+        solver: Solver | None = None,
+        on_discard: Callable[[Discarded], None] | None = None,
+    ) -> None:
         """Start empty.
 
         Args:
             options: default: the defaults.
             solver: default: :func:`rotavg_ros.solve`.
+            on_discard: told of every graph that is forgotten (:meth:`reset`, time that goes back) or replaced
+                (:meth:`load`), unless it is empty. Called within these methods, so it must be quick.
         """
         self.options = options or EstimatorOptions()
         self._solver = solver or _default_solver()
@@ -80,13 +103,17 @@ class OnlineEstimator:
         self._running: _Tick | None = None
         self._generation = 0
         self._time_jumps = 0
-        self._content = Content(GraphBuilder(self.options), None, 0)
+        self._on_discard = on_discard
+        self._content = Content(ContentState.begin(self.options))
 
-    def _start_over(self, builder: GraphBuilder, answered: Tensor | None, version: int) -> None:
-        """Begin with this content; ``answered`` is the last answer's body_from_world ``(n, 4)``."""
+    def _start_over(self, state: ContentState) -> None:
+        """Begin with this content; the one before is handed over if there is anything in it."""
+        discarded = Discarded(self._content)
         self._generation += 1
-        self._content = Content(builder, answered, version)
+        self._content = Content(state)
         self._abandon_tick("everything was forgotten or replaced meanwhile")
+        if self._on_discard is not None and discarded.num_keyframes:
+            self._on_discard(discarded)
 
     def _abandon_tick(self, why: str) -> None:
         """Have the running tick, if there is one, end soon and change nothing."""
@@ -115,13 +142,16 @@ class OnlineEstimator:
             why it was refused and counted; None if it was taken.
         """
         with self._lock:
-            reason, since_jump = self._content.add_odometry(LateMessage(robot, stamp_ns, world_from_body, position))
+            reason, since_jump = self._content.add_odometry(OdometryMessage(robot, stamp_ns, world_from_body, position))
             if not since_jump:
                 return reason
             self._time_jumps += 1
-            if self.options.on_time_jump != "reset":
+            if self.options.on_time_jump == "new_component":
+                self._content.builder.begin_time_line(robot, len(since_jump))
+            elif self.options.on_time_jump == "reset":
+                self._forget()
+            else:
                 return reason
-            self._forget()
             for message in since_jump:
                 reason, _ = self._content.add_odometry(message)
             return reason
@@ -129,12 +159,14 @@ class OnlineEstimator:
     def clock_went_back(self, now_ns: int) -> None:
         """The clock that stamps the data (``/clock``) went back to ``now_ns``; taken as if odometry had told it."""
         with self._lock:
-            data_time_ns = self._content.builder.data_time_ns
+            data_time_ns = self._content.state.growth.data_time.now_ns
             if data_time_ns is None or data_time_ns - now_ns <= self.options.time_jump_ns:
                 return  # nothing of the future is known, or odometry has told it already
             if self.options.on_time_jump == "reset":
                 self._time_jumps += 1
                 self._forget()
+            elif self.options.on_time_jump == "new_component":
+                self._time_jumps += self._content.builder.clock_went_back(now_ns)
 
     def add_edge(self, edge: EdgeMeasurement) -> RejectReason | None:
         """Take a measured edge; returns why it was refused and counted, None if it was taken or may wait."""
@@ -144,7 +176,7 @@ class OnlineEstimator:
     def reject(self, reason: RejectReason) -> None:
         """Count an input that could not even be read as a measurement."""
         with self._lock:
-            self._content.builder.rejected[reason.value] += 1
+            self._content.state.growth.refuse(reason)
 
     def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
         """Accept or reject for good every edge with a sender's id, or hand it back; returns how many there are."""
@@ -228,7 +260,7 @@ class OnlineEstimator:
             self._forget()
 
     def _forget(self) -> None:
-        self._start_over(GraphBuilder(self.options), None, self._content.version)
+        self._start_over(ContentState.begin(self.options, self._content.version))
 
     def save(self, path: Path) -> None:
         """Write everything into one file, whole or not at all.
@@ -237,8 +269,7 @@ class OnlineEstimator:
             StateFileError: the file cannot be written.
         """
         with self._lock:
-            content = self._content
-            state = state_file.collect(content.builder, content.answered, content.version)
+            state = state_content.collect(self._content.state)
         state_file.write(path, state.encoded())
 
     def load(self, path: Path) -> None:
@@ -247,9 +278,10 @@ class OnlineEstimator:
         Raises:
             StateFileError: not a state file, or not a whole one. The old state is kept.
         """
-        builder, answered, version = state_file.restore(state_file.read(path), self.options)
+        state = state_content.restore(state_file.read(path), self.options)
         with self._lock:
-            self._start_over(builder, answered, max(version, self._content.version))
+            state.version = max(state.version, self._content.version)
+            self._start_over(state)
 
     def tick(self, force_cold: bool = False) -> Answer | None:
         """Solve, if there is anything new.
@@ -311,7 +343,9 @@ class OnlineEstimator:
         with self._lock:
             if content is not self._content:  # the solve had ended before it could be told
                 raise TickAbandonedError(f"abandoned: {running.abandoned_by}")
-            content.accept(body_from_world, component, answer.outlier, snapshot.revision, was_cold, solution.memory)
+            content.accept(
+                AcceptedAnswer(body_from_world, component, answer.outlier, snapshot.revision, was_cold, solution.memory)
+            )
             if options is not self.options:
                 content.solve_anew()
         return answer

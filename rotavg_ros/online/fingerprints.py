@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,13 +39,17 @@ class Fingerprints:
             if len(self._younger) >= self._capacity:
                 self._younger, self._older = self._older[:0], self._younger
 
-    def update(self, numbers: Iterable[int]) -> None:
-        for number in numbers:
-            self.add(number)
+    def arrays(self) -> dict[str, NDArray[np.uint64]]:
+        """All of them, for :meth:`from_arrays`."""
+        return {"older": self._older, "younger": self._younger, "newest": np.sort(self._newest_as_array())}
 
-    def as_array(self) -> NDArray[np.uint64]:
-        """All of them, the older ones first."""
-        return np.concatenate((self._older, self._younger, self._newest_as_array()))
+    @classmethod
+    def from_arrays(cls, capacity: int, arrays: Mapping[str, NDArray[np.uint64]]) -> Fingerprints:
+        """The set that :meth:`arrays` came from."""
+        fingerprints = cls(capacity)
+        fingerprints._older, fingerprints._younger = arrays["older"], arrays["younger"]
+        fingerprints._newest = set(arrays["newest"].tolist())
+        return fingerprints
 
     def _newest_as_array(self) -> NDArray[np.uint64]:
         return np.fromiter(self._newest, dtype=np.uint64, count=len(self._newest))

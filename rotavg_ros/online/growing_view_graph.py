@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
@@ -13,13 +14,13 @@ from rotavg_ros.online.growing_array import GrowingArray
 from rotavg_ros.online.keyframe_index import KeyframeIndex
 from rotavg_ros.online.marginalization import Columns, marginalize
 from rotavg_ros.online.marginalized_keyframes import MarginalizedIndex, MarginalizedKeyframes
-from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS
+from rotavg_ros.online.measurements import OWN_EDGE_ID, UNKNOWN_STAMP_NS
 from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion, Vector
 from rotavg_ros.online.renumbering import Renumbering
 from rotavg_ros.online.thinning import thin
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-_KEYFRAME_COLUMNS = {"robot": np.int32, "keyframe_id": np.uint64, "stamp_ns": np.int64}
+_KEYFRAME_COLUMNS = {"robot": np.int32, "keyframe_id": np.uint64, "stamp_ns": np.int64, "time_line": np.int32}
 _EDGE_COLUMNS = {
     "edge_id": (np.uint64, None),
     "source": (np.int64, None),
@@ -36,6 +37,31 @@ _SOLVED_COLUMNS = ("source", "target", "target_from_source", "kind", "precision"
 _LATEST_SHARE = 0.1
 
 
+@dataclass(frozen=True, slots=True)
+class GraphEdge:
+    """An edge between two nodes.
+
+    Attributes:
+        source, target: nodes.
+        target_from_source: xyzw, of unit length.
+        kind, label: :class:`EdgeKind` and :class:`EdgeLabel` values.
+        edge_id: the sender's; default: of an edge that the estimator itself makes.
+        precision: rad⁻², NaN unknown.
+        translation: of the target in the source's frame, metres; NaN unknown.
+        steps: odometry steps that it stands for.
+    """
+
+    source: int
+    target: int
+    target_from_source: Quaternion
+    kind: int
+    label: int = EdgeLabel.AUTOMATIC
+    edge_id: int = OWN_EDGE_ID
+    precision: float = math.nan
+    translation: Vector = UNKNOWN_VECTOR
+    steps: float = 1.0
+
+
 @dataclass(frozen=True)
 class GraphSnapshot:
     """The graph at one moment, sharing memory with the growing one (N keyframes, M edges).
@@ -46,6 +72,7 @@ class GraphSnapshot:
         keyframe_robot: ``(N,)`` int32 index into ``robots``.
         keyframe_id: ``(N,)`` uint64.
         stamp_ns: ``(N,)`` int64, -1 where unknown.
+        time_line: ``(N,)`` int32, which of its robot's time lines the stamp is of, from 0.
         edge_id: ``(M,)`` uint64, the senders' ids.
         translation: ``(M, 3)`` position of the edge's target in its source's frame, metres; NaN unknown.
         marginalized: keyframes that the edges have swallowed.
@@ -57,6 +84,7 @@ class GraphSnapshot:
     keyframe_robot: NDArray[np.int32]
     keyframe_id: NDArray[np.uint64]
     stamp_ns: NDArray[np.int64]
+    time_line: NDArray[np.int32]
     edge_id: NDArray[np.uint64]
     translation: NDArray[np.float64]
     marginalized: MarginalizedIndex
@@ -86,8 +114,8 @@ class GrowingViewGraph:
     def num_edges(self) -> int:
         return len(self._edge["edge_id"])
 
-    def add_keyframe(self, robot: str, keyframe_id: int, stamp_ns: int = UNKNOWN_STAMP_NS) -> int:
-        """Append a keyframe, or find it and complete its stamp; returns its node."""
+    def add_keyframe(self, robot: str, keyframe_id: int, stamp_ns: int = UNKNOWN_STAMP_NS, time_line: int = 0) -> int:
+        """Append a keyframe, or find it and complete its moment, a stamp on a time line; returns its node."""
         robot_index = self._index_of_robot(robot)
         index = self._index[robot_index]
         node = index.node(keyframe_id)
@@ -97,28 +125,19 @@ class GrowingViewGraph:
             self._keyframe["robot"].append(robot_index)
             self._keyframe["keyframe_id"].append(keyframe_id)
             self._keyframe["stamp_ns"].append(UNKNOWN_STAMP_NS)
+            self._keyframe["time_line"].append(time_line)
             self.revision += 1
         stamps = self._keyframe["stamp_ns"].view
         if stamp_ns != UNKNOWN_STAMP_NS and stamps[node] == UNKNOWN_STAMP_NS:
             stamps[node] = stamp_ns
-            index.add_stamp(stamp_ns, node)
+            self._keyframe["time_line"].view[node] = time_line
+            index.add_moment(time_line, stamp_ns, node)
         return node
 
-    def add_edge(
-        self,
-        edge_id: int,
-        source: int,
-        target: int,
-        target_from_source: Quaternion,
-        kind: int,
-        precision: float,
-        label: int = EdgeLabel.AUTOMATIC,
-        translation: Vector = UNKNOWN_VECTOR,
-    ) -> None:
-        """Append an edge between two nodes; the rotation must be of unit length. Precision in rad⁻², NaN unknown."""
-        values = (edge_id, source, target, target_from_source, kind, precision, label, translation, 1.0)
-        for column, value in zip(self._edge.values(), values, strict=True):
-            column.append(value)  # type: ignore[arg-type]
+    def add_edge(self, edge: GraphEdge) -> None:
+        """Append an edge between two nodes."""
+        for name, column in self._edge.items():
+            column.append(getattr(edge, name))
         self.revision += 1
 
     def label_edges(self, source_robot: str, edge_id: int, label: int) -> int:
@@ -139,40 +158,39 @@ class GrowingViewGraph:
     def robot_of(self, node: int) -> str:
         return self.robots[int(self._keyframe["robot"].view[node])]
 
-    def stamp_of(self, node: int) -> int:
-        """Nanoseconds, or -1."""
-        return int(self._keyframe["stamp_ns"].view[node])
+    def moment_of(self, node: int) -> tuple[int, int]:
+        """Nanoseconds, or -1, and the number of the time line."""
+        return int(self._keyframe["stamp_ns"].view[node]), int(self._keyframe["time_line"].view[node])
 
-    def keyframe_at_or_before(self, robot: str, stamp_ns: int) -> int | None:
-        """The robot's newest node that is not younger than the stamp."""
+    def keyframe_at_or_before(self, robot: str, stamp_ns: int, time_line: int) -> int | None:
+        """The newest node of the robot's time line that is not younger than the stamp."""
         index = self._index_of(robot)
-        return None if index is None else index.at_or_before(stamp_ns)
+        return None if index is None else index.at_or_before(time_line, stamp_ns)
 
-    def first_keyframe(self, robot: str) -> int | None:
-        """The robot's node with the smallest stamp."""
+    def first_keyframe(self, robot: str, time_line: int) -> int | None:
+        """The node of the robot's time line with the smallest stamp."""
         index = self._index_of(robot)
-        return None if index is None else index.first()
+        return None if index is None else index.first(time_line)
 
     def nodes_newest_first(self, robot: str) -> Iterator[int]:
-        """The robot's nodes with a stamp, in descending order of it."""
+        """The robot's nodes with a stamp, the latest moment first."""
         index = self._index_of(robot)
         return iter(()) if index is None else index.newest_first()
 
-    def stamps(self, robot: str) -> NDArray[np.int64]:
-        """Of the robot's nodes, ascending, those that are known."""
-        index = self._index_of(robot)
-        return np.empty(0, dtype=np.int64) if index is None else index.stamps
+    def moments(self, robot: str) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """Stamps and time lines of the robot's nodes with a stamp, in the order of the moments."""
+        return (KeyframeIndex() if (index := self._index_of(robot)) is None else index).moments
 
     def marginalized_keyframe(
-        self, robot: str, keyframe_id: int | None, stamp_ns: int | None
+        self, robot: str, keyframe_id: int | None, stamp_ns: int | None, time_line: int
     ) -> tuple[int, Quaternion, Vector] | None:
-        """A marginalised keyframe by id, or by its exact stamp.
+        """A marginalised keyframe by id, or by its exact moment.
 
         Returns:
             the node of the nearer end of the odometry edge that it lies on; its orientation and its position (metres)
             in that keyframe's frame. None if there is no such keyframe.
         """
-        row = self._marginalized_row(robot, keyframe_id, stamp_ns)
+        row = self._marginalized_row(robot, keyframe_id, stamp_ns, time_line)
         if row is None:
             return None
         edge = int(self.marginalized.keyframes.edge[row])
@@ -184,7 +202,7 @@ class GrowingViewGraph:
 
     def was_marginalized(self, robot: str, keyframe_id: int) -> bool:
         """Whether there was such a keyframe, known or forgotten."""
-        if self._marginalized_row(robot, keyframe_id, None) is not None:
+        if self._marginalized_row(robot, keyframe_id) is not None:
             return True
         return self.marginalized.is_forgotten(self._robot_index.get(robot, -1), keyframe_id)
 
@@ -225,7 +243,7 @@ class GrowingViewGraph:
         return Renumbering(contraction.kept, edge_of, stays[contraction.last], int(thinning.edges.sum()))
 
     def snapshot(self) -> GraphSnapshot:
-        """The graph now. Only the labels and stamps, which alone can change later, are copied."""
+        """The graph now. Only the labels and moments, which alone can change later, are copied."""
         columns = {name: self._edge[name].view for name in _SOLVED_COLUMNS}
         columns["label"] = columns["label"].copy()
         return GraphSnapshot(
@@ -234,6 +252,7 @@ class GrowingViewGraph:
             keyframe_robot=self._keyframe["robot"].view,
             keyframe_id=self._keyframe["keyframe_id"].view,
             stamp_ns=self._keyframe["stamp_ns"].view.copy(),
+            time_line=self._keyframe["time_line"].view.copy(),
             edge_id=self._edge["edge_id"].view,
             translation=self._edge["translation"].view,
             marginalized=self.marginalized,
@@ -254,6 +273,7 @@ class GrowingViewGraph:
             ("robot", snapshot.keyframe_robot),
             ("keyframe_id", snapshot.keyframe_id),
             ("stamp_ns", snapshot.stamp_ns),
+            ("time_line", snapshot.time_line),
         ):
             growing._keyframe[name].extend(values)
         growing._edge["edge_id"].extend(snapshot.edge_id)
@@ -284,15 +304,18 @@ class GrowingViewGraph:
         columns = {name: column.view for name, column in self._keyframe.items()}
         for robot in range(len(self.robots)):
             nodes = np.flatnonzero(columns["robot"] == robot)
-            self._index[robot] = KeyframeIndex.of(nodes, columns["keyframe_id"][nodes], columns["stamp_ns"][nodes])
+            of_robot = (columns[name][nodes] for name in ("keyframe_id", "time_line", "stamp_ns"))
+            self._index[robot] = KeyframeIndex.of(nodes, *of_robot)
 
-    def _marginalized_row(self, robot: str, keyframe_id: int | None, stamp_ns: int | None) -> int | None:
+    def _marginalized_row(
+        self, robot: str, keyframe_id: int | None, stamp_ns: int | None = None, time_line: int = 0
+    ) -> int | None:
         robot_index = self._robot_index.get(robot)
         if robot_index is None or len(self.marginalized.keyframes) == 0:
             return None
         if keyframe_id is not None:
             return self.marginalized.by_id(robot_index, keyframe_id)
-        return None if stamp_ns is None else self.marginalized.by_stamp(robot_index, stamp_ns)
+        return None if stamp_ns is None else self.marginalized.by_moment(robot_index, time_line, stamp_ns)
 
     def _index_of(self, robot: str) -> KeyframeIndex | None:
         robot_index = self._robot_index.get(robot)

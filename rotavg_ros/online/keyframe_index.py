@@ -1,4 +1,4 @@
-"""From keys and stamps to nodes: which keyframe is meant."""
+"""From keys and moments to nodes: which keyframe is meant."""
 
 from __future__ import annotations
 
@@ -12,17 +12,25 @@ from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS
 
 
 class KeyframeIndex:
-    """Nodes of one robot by keyframe id and by stamp."""
+    """Nodes of one robot by keyframe id, and by the moments of those that have a stamp.
+
+    A moment is a stamp on a time line, see :class:`~rotavg_ros.online.odometry_samples.OdometrySamples`.
+    """
 
     def __init__(self) -> None:
         self._node_of_id: dict[int, int] = {}
-        # In ascending order of the stamps; of equal ones in the order of the nodes.
+        # In ascending order of the time lines, then of the stamps, then of the nodes.
+        self._time_line = GrowingArray(np.int32)
         self._stamp_ns = GrowingArray(np.int64)
         self._node = GrowingArray(np.int64)
 
     @classmethod
     def of(
-        cls, nodes: NDArray[np.int64], keyframe_id: NDArray[np.uint64], stamp_ns: NDArray[np.int64]
+        cls,
+        nodes: NDArray[np.int64],
+        keyframe_id: NDArray[np.uint64],
+        time_line: NDArray[np.int32],
+        stamp_ns: NDArray[np.int64],
     ) -> KeyframeIndex:
         """The index of keyframes ``(K,)`` in ascending order of their nodes.
 
@@ -34,7 +42,8 @@ class KeyframeIndex:
         if len(index._node_of_id) < len(nodes):
             raise ValueError("a keyframe occurs twice")
         known = stamp_ns != UNKNOWN_STAMP_NS
-        order = np.argsort(stamp_ns[known], kind="stable")
+        order = np.lexsort((stamp_ns[known], time_line[known]))
+        index._time_line.extend(time_line[known][order])
         index._stamp_ns.extend(stamp_ns[known][order])
         index._node.extend(nodes[known][order])
         return index
@@ -45,28 +54,35 @@ class KeyframeIndex:
     def add(self, keyframe_id: int, node: int) -> None:
         self._node_of_id[keyframe_id] = node
 
-    def add_stamp(self, stamp_ns: int, node: int) -> None:
+    def add_moment(self, time_line: int, stamp_ns: int, node: int) -> None:
         stamps, nodes = self._stamp_ns.view, self._node.view
-        position = int(np.searchsorted(stamps, stamp_ns, "right"))
-        while position and stamps[position - 1] == stamp_ns and nodes[position - 1] > node:
+        start, position = self._places(time_line, stamp_ns)
+        while position > start and stamps[position - 1] == stamp_ns and nodes[position - 1] > node:
             position -= 1
+        self._time_line.insert(position, time_line)
         self._stamp_ns.insert(position, stamp_ns)
         self._node.insert(position, node)
 
-    def at_or_before(self, stamp_ns: int) -> int | None:
-        """The newest node that is not younger than the stamp."""
-        position = int(np.searchsorted(self._stamp_ns.view, stamp_ns, "right"))
-        return int(self._node.view[position - 1]) if position else None
+    def at_or_before(self, time_line: int, stamp_ns: int) -> int | None:
+        """The time line's newest node that is not younger than the stamp."""
+        start, position = self._places(time_line, stamp_ns)
+        return int(self._node.view[position - 1]) if position > start else None
 
-    def first(self) -> int | None:
-        """The node with the smallest stamp."""
-        return int(self._node.view[0]) if len(self._node) else None
+    def first(self, time_line: int) -> int | None:
+        """The time line's node with the smallest stamp."""
+        start, stop = np.searchsorted(self._time_line.view, (time_line, time_line + 1)).tolist()
+        return int(self._node.view[start]) if stop > start else None
 
     @property
-    def stamps(self) -> NDArray[np.int64]:
-        """Ascending."""
-        return self._stamp_ns.view
+    def moments(self) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """Stamps and time lines, in the order of the moments."""
+        return self._stamp_ns.view, self._time_line.view
+
+    def _places(self, time_line: int, stamp_ns: int) -> tuple[int, int]:
+        """Where a time line begins, and where a stamp that comes after all its equals belongs on it."""
+        start, stop = np.searchsorted(self._time_line.view, (time_line, time_line + 1)).tolist()
+        return start, start + int(np.searchsorted(self._stamp_ns.view[start:stop], stamp_ns, "right"))
 
     def newest_first(self) -> Iterator[int]:
-        """Nodes with a stamp, in descending order of it."""
+        """Nodes with a stamp, the latest moment first."""
         return (int(node) for node in self._node.view[::-1])

@@ -71,7 +71,7 @@ def marginalize(
     Where only a pair of nodes would be left of a cycle of odometry, one node in it stays.
 
     Args:
-        keyframes: robot, keyframe_id, stamp_ns.
+        keyframes: robot, keyframe_id, stamp_ns, time_line.
         edges: see :data:`Columns`.
         remove: ``(N,)``.
         marginalized: those there are; their edges are renumbered, their poses kept.
@@ -107,6 +107,7 @@ class _Work:
             keyframes["robot"][nodes],
             keyframes["keyframe_id"][nodes],
             keyframes["stamp_ns"][nodes],
+            keyframes["time_line"][nodes],
             np.full(len(nodes), -1),
             np.empty((len(nodes), 4)),
             np.empty((len(nodes), 3)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -22,6 +22,7 @@ class MarginalizedKeyframes:
         robot: ``(K,)`` int32 index.
         keyframe_id: ``(K,)`` uint64.
         stamp_ns: ``(K,)`` int64, -1 where unknown.
+        time_line: ``(K,)`` int32, which of its robot's time lines the stamp is of.
         edge: ``(K,)`` int64, the odometry edge.
         keyframe_from_source: ``(K, 4)`` xyzw, from the frame of the edge's source.
         position: ``(K, 3)`` in the frame of the edge's source, metres; NaN unknown.
@@ -31,6 +32,7 @@ class MarginalizedKeyframes:
     robot: NDArray[np.int32]
     keyframe_id: NDArray[np.uint64]
     stamp_ns: NDArray[np.int64]
+    time_line: NDArray[np.int32]
     edge: NDArray[np.int64]
     keyframe_from_source: NDArray[np.float64]
     position: NDArray[np.float64]
@@ -45,6 +47,7 @@ class MarginalizedKeyframes:
             np.empty(0, dtype=np.int32),
             np.empty(0, dtype=np.uint64),
             np.empty(0, dtype=np.int64),
+            np.empty(0, dtype=np.int32),
             np.empty(0, dtype=np.int64),
             np.empty((0, 4)),
             np.empty((0, 3)),
@@ -69,7 +72,7 @@ class MarginalizedKeyframes:
 
 @dataclass(frozen=True)
 class MarginalizedIndex:
-    """Finds marginalised keyframes by key and by stamp.
+    """Finds marginalised keyframes by key and by moment.
 
     Attributes:
         keyframes: which can be found.
@@ -79,13 +82,13 @@ class MarginalizedIndex:
     keyframes: MarginalizedKeyframes
     forgotten_up_to: Mapping[int, int]
     _by_id: NDArray[np.int64]
-    _by_stamp: NDArray[np.int64]
+    _by_moment: NDArray[np.int64]
 
     @classmethod
     def of(cls, keyframes: MarginalizedKeyframes, forgotten_up_to: Mapping[int, int]) -> MarginalizedIndex:
         by_id = np.lexsort((keyframes.keyframe_id, keyframes.robot))
-        by_stamp = np.lexsort((keyframes.stamp_ns, keyframes.robot))
-        return cls(keyframes, forgotten_up_to, by_id, by_stamp)
+        by_moment = np.lexsort((keyframes.stamp_ns, keyframes.time_line, keyframes.robot))
+        return cls(keyframes, forgotten_up_to, by_id, by_moment)
 
     def limited_to(self, capacity: int) -> MarginalizedIndex:
         """Of more than ``capacity`` the first are forgotten."""
@@ -101,11 +104,14 @@ class MarginalizedIndex:
 
     def by_id(self, robot: int, keyframe_id: int) -> int | None:
         """Row of a keyframe."""
-        return self._find(self._by_id, self.keyframes.keyframe_id, robot, keyframe_id)
+        keyframes = self.keyframes
+        return _find(self._by_id, (keyframes.robot, keyframes.keyframe_id), (robot, keyframe_id))
 
-    def by_stamp(self, robot: int, stamp_ns: int) -> int | None:
-        """Row of the robot's keyframe with exactly this stamp."""
-        return self._find(self._by_stamp, self.keyframes.stamp_ns, robot, stamp_ns)
+    def by_moment(self, robot: int, time_line: int, stamp_ns: int) -> int | None:
+        """Row of the robot's keyframe with exactly this stamp on this time line."""
+        keyframes = self.keyframes
+        columns = (keyframes.robot, keyframes.time_line, keyframes.stamp_ns)
+        return _find(self._by_moment, columns, (robot, time_line, stamp_ns))
 
     def is_forgotten(self, robot: int, keyframe_id: int) -> bool:
         return keyframe_id <= self.forgotten_up_to.get(robot, -1)
@@ -133,9 +139,12 @@ class MarginalizedIndex:
         position = rotations.rotate(turn, torch.from_numpy(keyframes.position[row] - translation))
         return False, rotations.multiply(turn, source_from_keyframe).numpy(), position.numpy()
 
-    def _find(self, order: NDArray[np.int64], column: NDArray[Any], robot: int, key: int) -> int | None:
-        rows = self.keyframes.robot
-        place = bisect_left(order, (robot, key), key=lambda row: (int(rows[row]), int(column[row])))
-        if place == len(order) or (rows[order[place]], column[order[place]]) != (robot, key):
-            return None
-        return int(order[place])
+
+def _find(order: NDArray[np.int64], columns: Sequence[NDArray[Any]], key: tuple[int, ...]) -> int | None:
+    """The row with a key, of rows in ascending order of their keys."""
+
+    def key_of(row: int) -> tuple[int, ...]:
+        return tuple(int(column[row]) for column in columns)
+
+    place = bisect_left(order, key, key=key_of)
+    return int(order[place]) if place < len(order) and key_of(order[place]) == key else None

@@ -58,6 +58,23 @@ class RejectedInputError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
+class OdometryMessage:
+    """What a robot's odometry says at a moment.
+
+    Attributes:
+        robot: the robot's name.
+        stamp_ns: nanoseconds.
+        world_from_body: xyzw, the body in the odometry's frame.
+        position: metres, None or not finite where it is not known.
+    """
+
+    robot: str
+    stamp_ns: int
+    world_from_body: Sequence[float]
+    position: Sequence[float] | None
+
+
+@dataclass(frozen=True, slots=True)
 class KeyframeReference:
     """One end of an edge: a keyframe's id, or a moment of a robot.
 
@@ -126,9 +143,14 @@ class EdgeMeasurement:
         target_from_source = quaternion.inverse((x, y, z, w))
         return cls(edge_id, source, target, target_from_source, precision=precision, translation=translation)
 
-    def fingerprint(self) -> int:
-        """64 bits that agree for a retransmission (same id, ends and rotation) and for nothing else in practice."""
-        ends = repr((self.source.key, self.target.key)).encode("utf-8", "surrogatepass")
+    def fingerprint(self, time_lines: tuple[int, int] = (0, 0)) -> int:
+        """64 bits that agree for a retransmission (same id, ends and rotation) and for nothing else in practice.
+
+        Args:
+            time_lines: numbers of the time lines that the ends' stamps are of, 0 for an end by keyframe id.
+        """
+        keys = (self.source.key, self.target.key)
+        ends = repr((*keys, *time_lines) if any(time_lines) else keys).encode("utf-8", "surrogatepass")
         numbers = struct.pack("<Q4d", self.edge_id, *self.target_from_source)
         return int.from_bytes(hashlib.blake2b(numbers + ends, digest_size=8).digest(), "little")
 

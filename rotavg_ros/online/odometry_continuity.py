@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.measurements import RejectedInputError, RejectReason
-from rotavg_ros.online.quaternion import Quaternion, Vector
+from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion, Vector
 
 # Within a shorter time than this, stamps and rotations are too noisy for a rate to mean anything.
 _SHORTEST_S = 0.2
@@ -71,17 +75,53 @@ class ContinuityCheck:
         Raises:
             RejectedInputError: the message stands alone so far.
         """
+        return self._judge(sample, last, before, after_break=False)
+
+    def admit_after_a_break(self, sample: OdometrySample, last: OdometrySample, before: OdometrySample | None) -> bool:
+        """As :meth:`admit`, when the robot may have been switched off since ``last``, and nobody was watching.
+
+        Odometry counts as begun anew unless :func:`goes_on` and no more than ``lead_ns`` has passed.
+        """
+        return self._judge(sample, last, before, after_break=True)
+
+    def _judge(
+        self, sample: OdometrySample, last: OdometrySample, before: OdometrySample | None, *, after_break: bool
+    ) -> bool:
         refused, refused_jumps = self._refused, self._refused_jumps
         self._refused = None
         is_ahead = sample.stamp_ns - last.stamp_ns > self.limits.lead_ns
         follows = refused is not None and 0 < sample.stamp_ns - refused.stamp_ns <= self.limits.lead_ns
         if refused is not None and follows and (is_ahead or _distance(refused, sample) < _distance(last, sample)):
-            return refused_jumps
+            return refused_jumps or (after_break and not goes_on(sample, refused, self.limits))
         jumps = has_jumped(sample, last, before, self.limits)
         if is_ahead or jumps:
-            self._refused, self._refused_jumps = sample, jumps
+            self._refused, self._refused_jumps = sample, jumps or after_break
             raise RejectedInputError(RejectReason.FUTURE_STAMP if is_ahead else RejectReason.ODOMETRY_JUMP)
-        return False
+        return after_break and not goes_on(sample, last, self.limits)
+
+    def forget(self) -> None:
+        """What was refused has nothing to do with what comes next."""
+        self._refused = None
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What was refused last, for :meth:`from_arrays`: a row of stamp, rotation and position, or none."""
+        refused = [] if self._refused is None else [self._refused]
+        return {
+            "refused_stamp_ns": np.array([sample.stamp_ns for sample in refused], dtype=np.int64),
+            "refused_world_from_body": np.array([sample.world_from_body for sample in refused]).reshape(-1, 4),
+            "refused_position": np.array([sample.position or UNKNOWN_VECTOR for sample in refused]).reshape(-1, 3),
+            "refused_jumps": np.array(self._refused_jumps),
+        }
+
+    @classmethod
+    def from_arrays(cls, limits: ContinuityLimits, arrays: dict[str, NDArray[Any]]) -> ContinuityCheck:
+        """The check that :meth:`arrays` came from."""
+        check = cls(limits)
+        columns = (arrays[f"refused_{name}"].tolist() for name in ("stamp_ns", "world_from_body", "position"))
+        for stamp_ns, (qx, qy, qz, qw), (x, y, z) in zip(*columns, strict=True):
+            check._refused = OdometrySample(stamp_ns, (qx, qy, qz, qw), (x, y, z) if math.isfinite(x) else None)
+        check._refused_jumps = bool(arrays["refused_jumps"])
+        return check
 
 
 def has_jumped(
@@ -103,6 +143,18 @@ def has_jumped(
         return False
     angle, metres = _angle_and_metres(_going_on(last, before, sample.stamp_ns), sample)
     return angle > _RETURN_ANGLE or metres > _RETURN_DISTANCE_M
+
+
+def goes_on(sample: OdometrySample, last: OdometrySample, limits: ContinuityLimits) -> bool:
+    """Whether odometry that nobody watched in between is nearer to where it was last than to where it would begin.
+
+    Args:
+        sample: the message.
+        last: the last one before.
+        limits: with an infinite turn rate it always counts as going on.
+    """
+    beginning = OdometrySample(sample.stamp_ns, quaternion.IDENTITY, (0.0, 0.0, 0.0))
+    return math.isinf(limits.turn_rate) or _distance(last, sample) < _distance(beginning, sample)
 
 
 def _angle_and_metres(first: OdometrySample, second: OdometrySample) -> tuple[float, float]:

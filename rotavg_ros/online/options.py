@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.online.keyframes import KeyframePolicy, OdometryBounds
+from rotavg_ros.online.keyframes import KeyframePolicy
 from rotavg_ros.online.odometry_continuity import ContinuityLimits
+from rotavg_ros.online.odometry_samples import OdometryBounds
 from rotavg_ros.online.time_jumps import POLICIES
 
 NANOSECONDS = 1_000_000_000
@@ -33,9 +34,10 @@ class EstimatorOptions:
         max_turn_rate, max_speed: odometry that moves faster has jumped; rad/s, m/s; 0: any speed, and no look-out for
             odometry that begins anew.
         max_stamp_lead_s: a stamp farther ahead of the last one needs a second message to be believed; 0: no limit.
-        on_time_jump: when the data's time goes back by more than ``time_jump_s`` (a bag that begins again): ``reset``
-            forgets everything and begins anew, ``ignore`` refuses odometry until it is ahead again, ``error`` does
-            too and says so.
+        on_time_jump: when the data's time goes back by more than ``time_jump_s`` (a bag that begins again, a clock
+            that was set): ``new_component`` keeps everything and begins a new time line, whose keyframes no odometry
+            joins to the earlier ones; ``reset`` forgets everything and begins anew; ``ignore`` refuses odometry until
+            it is ahead again, ``error`` does too and says so.
         time_jump_s: going back by less is no jump; such odometry is out of order.
         max_odometry_samples: per robot; older messages are thinned out beyond it.
         max_keyframes, max_edges: there the graph does without what can best be spared, see
@@ -58,7 +60,7 @@ class EstimatorOptions:
     max_turn_rate: float = math.radians(360.0)
     max_speed: float = 50.0
     max_stamp_lead_s: float = 60.0
-    on_time_jump: str = "reset"
+    on_time_jump: str = "new_component"
     time_jump_s: float = 1.0
     max_odometry_samples: int = 200_000
     max_keyframes: int = 200_000

@@ -4,21 +4,33 @@ from __future__ import annotations
 
 from bisect import bisect_right, insort
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 
-from rotavg_ros.online.measurements import EdgeMeasurement, KeyframeReference
+from rotavg_ros.online.measurements import MAX_STAMP_NS, EdgeMeasurement, KeyframeReference
 
 
 @dataclass(slots=True)
-class _Waiting:
+class Waiting:
+    """An edge that waits.
+
+    Attributes:
+        edge: the edge.
+        waits_for: the end that is not there yet.
+        since_ns: in data time; None while no data time is known.
+        is_undecided: whether it waits to know which time line the end's stamp is of.
+    """
+
     edge: EdgeMeasurement
     waits_for: KeyframeReference
-    since_ns: int | None  # in data time; None while no data time is known
+    since_ns: int | None
+    is_undecided: bool
 
 
 class PendingEdges:
     """Each waiting edge waits for one of its ends. When there are more than ``capacity`` the oldest has to go.
+
+    Undecided ones wait until it is known which time line of a robot their stamps are of.
 
     Attributes:
         fingerprints: of those that wait.
@@ -29,11 +41,12 @@ class PendingEdges:
         self._capacity = capacity
         self._timeout_ns = timeout_ns
         self._serial = 0
-        self._waiting: dict[int, _Waiting] = {}  # by serial number, so in order of arrival
+        self._waiting: dict[int, Waiting] = {}  # by serial number, so in order of arrival
         self.fingerprints: set[int] = set()
         self.by_robot: Counter[str] = Counter()
         self._by_keyframe: dict[tuple[str, int], dict[int, None]] = {}
         self._by_stamp: dict[str, list[tuple[int, int]]] = {}  # per robot, ascending (stamp, serial)
+        self._undecided: dict[str, dict[int, None]] = {}  # per robot
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -51,22 +64,44 @@ class PendingEdges:
         return first.waits_for, data_time_ns - first.since_ns
 
     def add(
-        self, edge: EdgeMeasurement, waits_for: KeyframeReference, data_time_ns: int | None
+        self,
+        edge: EdgeMeasurement,
+        waits_for: KeyframeReference,
+        data_time_ns: int | None,
+        is_undecided: bool = False,
     ) -> EdgeMeasurement | None:
         """Let an edge wait for one of its ends; returns the edge that had to go for it, if any."""
         evicted = None
         if len(self._waiting) >= self._capacity:
             evicted = self._remove(next(iter(self._waiting)))
-        self._serial += 1
-        self._waiting[self._serial] = _Waiting(edge, waits_for, data_time_ns)
-        self.fingerprints.add(edge.fingerprint())
-        self.by_robot[waits_for.robot] += 1
-        if waits_for.keyframe_id is not None:
-            key = (waits_for.robot, waits_for.keyframe_id)
-            self._by_keyframe.setdefault(key, {})[self._serial] = None
-        else:
-            insort(self._by_stamp.setdefault(waits_for.robot, []), (_stamp(waits_for), self._serial))
+        self._add(Waiting(edge, waits_for, data_time_ns, is_undecided))
         return evicted
+
+    def _add(self, waiting: Waiting) -> None:
+        self._serial += 1
+        self._waiting[self._serial] = waiting
+        self.fingerprints.add(waiting.edge.fingerprint())
+        reference = waiting.waits_for
+        self.by_robot[reference.robot] += 1
+        if waiting.is_undecided:
+            self._undecided.setdefault(reference.robot, {})[self._serial] = None
+        elif reference.keyframe_id is not None:
+            self._by_keyframe.setdefault((reference.robot, reference.keyframe_id), {})[self._serial] = None
+        else:
+            insort(self._by_stamp.setdefault(reference.robot, []), (_stamp(reference), self._serial))
+
+    def pop_undecided(self, robot: str) -> list[EdgeMeasurement]:
+        """Take out what has waited for a decision about a robot's time line."""
+        return [self._remove(serial) for serial in list(self._undecided.get(robot, ()))]
+
+    def pop_of_time_line(self, robot: str) -> list[EdgeMeasurement]:
+        """Take out what waits for a moment of a robot on a time line that has come to its end."""
+        return self.pop_until(robot, MAX_STAMP_NS)
+
+    def restart_timeouts(self) -> None:
+        """Data time has changed: whatever waits has only begun to."""
+        for waiting in self._waiting.values():
+            waiting.since_ns = None
 
     def pop_keyframe(self, robot: str, keyframe_id: int) -> list[EdgeMeasurement]:
         """Take out what waits for a keyframe."""
@@ -99,7 +134,11 @@ class PendingEdges:
         self.by_robot[reference.robot] -= 1
         if not self.by_robot[reference.robot]:
             del self.by_robot[reference.robot]
-        if reference.keyframe_id is not None:
+        if waiting.is_undecided:
+            del self._undecided[reference.robot][serial]
+            if not self._undecided[reference.robot]:
+                del self._undecided[reference.robot]
+        elif reference.keyframe_id is not None:
             key = (reference.robot, reference.keyframe_id)
             del self._by_keyframe[key][serial]
             if not self._by_keyframe[key]:
@@ -110,6 +149,15 @@ class PendingEdges:
             if not stamps:
                 del self._by_stamp[reference.robot]
         return waiting.edge
+
+    def waiting(self) -> list[Waiting]:
+        """What waits, in order of arrival; it stays as it is."""
+        return [replace(waiting) for waiting in self._waiting.values()]
+
+    def take(self, waiting: Iterable[Waiting]) -> None:
+        """Let wait again what :meth:`waiting` returned."""
+        for each in waiting:
+            self._add(each)
 
 
 def _stamp(reference: KeyframeReference) -> int:

@@ -2,33 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
+
+from rotavg_ros.online.measurements import OdometryMessage
 
 # So many messages in a row must agree before the past is believed: stray ones, however old, change nothing.
 _RUN_LENGTH = 5
 
-POLICIES = ("reset", "ignore", "error")
-
-
-@dataclass(frozen=True, slots=True)
-class LateMessage:
-    """An odometry message stamped before the one that came before it; the fields of ``add_odometry``."""
-
-    robot: str
-    stamp_ns: int
-    world_from_body: Sequence[float]
-    position: Sequence[float] | None
+POLICIES = ("new_component", "reset", "ignore", "error")
+# With these a robot's stamps mean what they did before, whatever its clock says.
+KEEPS_TIME_LINE = ("ignore", "error")
 
 
 class BackwardJumps:
     """Collects late messages until they show that time runs on from an earlier moment."""
 
     def __init__(self) -> None:
-        self._runs: dict[str, list[LateMessage]] = {}
+        self._runs: dict[str, list[OdometryMessage]] = {}
         self._told: set[str] = set()
 
-    def late(self, message: LateMessage, latest_ns: int, threshold_ns: int, longest_step_ns: int) -> list[LateMessage]:
+    def late(
+        self, message: OdometryMessage, latest_ns: int, threshold_ns: int, longest_step_ns: int
+    ) -> list[OdometryMessage]:
         """Note a message that was refused as out of order.
 
         Args:
@@ -54,6 +49,29 @@ class BackwardJumps:
         """Note a message that came in order: time runs on as before."""
         self._runs.pop(robot, None)
         self._told.discard(robot)
+
+    def is_undecided(self, robot: str) -> bool:
+        """Whether late messages have come of which it is not known yet whether time went back."""
+        return bool(self._runs.get(robot))
+
+    def header(self) -> dict[str, Any]:
+        """Everything, as JSON can say it, for :meth:`from_header`."""
+        runs = {
+            robot: [
+                [message.stamp_ns, list(map(float, message.world_from_body)), message.position and [*message.position]]
+                for message in run
+            ]
+            for robot, run in self._runs.items()
+        }
+        return {"runs": runs, "told": sorted(self._told)}
+
+    @classmethod
+    def from_header(cls, header: dict[str, Any]) -> BackwardJumps:
+        """The late messages that :meth:`header` came from."""
+        jumps = cls()
+        jumps._runs = {robot: [OdometryMessage(robot, *row) for row in run] for robot, run in header["runs"].items()}
+        jumps._told = set(header["told"])
+        return jumps
 
     @property
     def is_back(self) -> bool:

@@ -22,7 +22,7 @@ class Trajectory:
 
     Attributes:
         node: ``(K,)`` indices into the answer's keyframes.
-        stamp_ns: ``(K,)``.
+        stamp_ns, time_line: ``(K,)``; stamps ascend within a time line.
         world_from_body: ``(K, 4)`` xyzw.
         position: ``(K, 3)`` metres in the world, from odometry's steps and closures; NaN where nothing tells.
         position_dead_reckoned: ``(K, 3)`` metres, from odometry's steps alone, from its first position on; NaN without.
@@ -31,6 +31,7 @@ class Trajectory:
 
     node: NDArray[np.int64]
     stamp_ns: NDArray[np.int64]
+    time_line: NDArray[np.int32]
     world_from_body: NDArray[np.float64]
     position: NDArray[np.float64]
     position_dead_reckoned: NDArray[np.float64]
@@ -56,7 +57,9 @@ def corrected_trajectories(answer: Answer, tracks: Mapping[str, OdometryTrack]) 
     for robot, nodes in nodes_of.items():
         track = tracks.get(robot)
         if track is not None and track.latest is not None:
-            odometry[0][nodes], odometry[1][nodes], chain[nodes] = track.poses_at(answer.stamp_ns[nodes])
+            odometry[0][nodes], odometry[1][nodes], chain[nodes] = track.samples.poses_at(
+                answer.stamp_ns[nodes], answer.time_line[nodes]
+            )
             reckoned[nodes] = dead_reckoning(
                 answer.world_from_body[nodes], odometry[0][nodes], odometry[1][nodes], chain[nodes]
             )
@@ -80,6 +83,7 @@ def corrected_trajectories(answer: Answer, tracks: Mapping[str, OdometryTrack]) 
         robot: Trajectory(
             nodes,
             answer.stamp_ns[nodes],
+            answer.time_line[nodes],
             answer.world_from_body[nodes],
             position[nodes],
             reckoned[nodes],
@@ -93,7 +97,7 @@ def corrected_trajectories(answer: Answer, tracks: Mapping[str, OdometryTrack]) 
 def _nodes_by_time(answer: Answer, robot: str) -> NDArray[np.int64]:
     of_robot = answer.keyframe_robot == answer.robots.index(robot)
     nodes = np.flatnonzero(of_robot & (answer.stamp_ns != UNKNOWN_STAMP_NS))
-    return nodes[np.argsort(answer.stamp_ns[nodes], kind="stable")]
+    return nodes[np.lexsort((answer.stamp_ns[nodes], answer.time_line[nodes]))]
 
 
 def _odometry_steps(

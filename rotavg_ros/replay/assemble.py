@@ -53,6 +53,7 @@ def _robot(answer: Answer, robot: str, trajectory: Trajectory, reference: Refere
         robot=robot,
         nodes=trajectory.node,
         stamp_ns=trajectory.stamp_ns,
+        time_line=trajectory.time_line,
         keyframe_id=answer.keyframe_id[trajectory.node],
         odometry_world_from_body=trajectory.odometry_world_from_body,
         odometry_position=_known(trajectory.odometry_position),
@@ -72,27 +73,29 @@ def _references(
     bag: BagReader, plan: Plan, outcome: Outcome, trajectories: Mapping[str, Trajectory]
 ) -> dict[str, Reference]:
     inputs = {robot: source for robot, source in plan.references.items() if isinstance(source, Input)}
-    references = read_references(bag, inputs, outcome.start_ns, outcome.end_ns + 1)
+    references = read_references(bag, inputs, plan.parameters, outcome.start_ns, outcome.end_ns + 1)
     for robot, topic in inputs.items():
         if topic.type_name == _IMU and robot in references and robot in trajectories:
             trajectory = trajectories[robot]
-            orientation = trajectory.odometry_world_from_body
-            references[robot] = without_mounting(references[robot], trajectory.stamp_ns, orientation)
+            last = trajectory.time_line == trajectory.time_line.max()
+            orientation = trajectory.odometry_world_from_body[last]
+            references[robot] = without_mounting(references[robot], trajectory.stamp_ns[last], orientation)
     for robot, source in plan.references.items():
         if isinstance(source, Path) and robot in trajectories:
             odometry_ns = outcome.odometry_stamps_ns.get(robot, np.empty(0, dtype=np.int64))
-            references[robot] = _from_file(source, trajectories[robot].stamp_ns, odometry_ns)
+            references[robot] = _from_file(source, trajectories[robot], odometry_ns)
     return references
 
 
-def _from_file(path: Path, keyframes_ns: NDArray[np.int64], odometry_ns: NDArray[np.int64]) -> Reference:
+def _from_file(path: Path, trajectory: Trajectory, odometry_ns: NDArray[np.int64]) -> Reference:
     """A file's poses; those without stamps are of the odometry's messages, or of the keyframes, one by one.
 
     Raises:
         GraphFileError: stamps of another time, or a number of rows that fits neither.
     """
     poses = read_pose_file(path)
-    rows = len(poses.position)
+    rows, keyframes_ns = len(poses.position), trajectory.stamp_ns
+    time_line = None
     if poses.stamps_ns is None:
         stamps_ns = next((stamps for stamps in (odometry_ns, keyframes_ns) if len(stamps) == rows), None)
         if stamps_ns is None:
@@ -101,12 +104,15 @@ def _from_file(path: Path, keyframes_ns: NDArray[np.int64], odometry_ns: NDArray
                 "keyframes were replayed; give a file with stamps (TUM), or replay the whole bag"
             )
             raise GraphFileError.at(path, None, what)
+        if (np.diff(stamps_ns) <= 0).any():
+            time_line = np.cumsum(np.diff(stamps_ns, prepend=stamps_ns[0] - 1) <= 0, dtype=np.int32)
     else:
         stamps_ns = poses.stamps_ns
-        if stamps_ns[0] > keyframes_ns[-1] or stamps_ns[-1] < keyframes_ns[0]:
+        first_ns, last_ns = keyframes_ns.min(), keyframes_ns.max()
+        if stamps_ns[0] > last_ns or stamps_ns[-1] < first_ns:
             what = (
                 f"its stamps ({stamps_ns[0] / 1e9:.1f} … {stamps_ns[-1] / 1e9:.1f} s) do not overlap the bag's "
-                f"({keyframes_ns[0] / 1e9:.1f} … {keyframes_ns[-1] / 1e9:.1f} s)"
+                f"({first_ns / 1e9:.1f} … {last_ns / 1e9:.1f} s)"
             )
             raise GraphFileError.at(path, None, what)
-    return Reference(path.name, stamps_ns, poses.world_from_body, poses.position)
+    return Reference(path.name, stamps_ns, poses.world_from_body, poses.position, time_line)

@@ -73,6 +73,21 @@ def truth_at_keyframes(reference: Reference, stamp_ns: NDArray[np.int64]) -> Tru
     return Truth(orientation, position)
 
 
+def _truth(reference: Reference, stamp_ns: NDArray[np.int64], time_line: NDArray[np.int32]) -> Truth:
+    """:func:`truth_at_keyframes`, each time line of a robot with that of the reference."""
+    orientation = np.full((len(stamp_ns), 4), np.nan)
+    position = None if reference.position is None else np.full((len(stamp_ns), 3), np.nan)
+    for number in np.unique(time_line).tolist():
+        on_line = time_line == number
+        seen = reference.on_time_line(number, int(time_line.max()) + 1)
+        if seen is not None:
+            truth = truth_at_keyframes(seen, stamp_ns[on_line])
+            orientation[on_line] = truth.world_from_body
+            if position is not None and truth.position is not None:
+                position[on_line] = truth.position
+    return Truth(orientation, position)
+
+
 def errors_of_orientations(
     world_from_body: FloatArray, truth: Truth, component: NDArray[np.int64] | None = None
 ) -> OrientationErrors:
@@ -127,7 +142,7 @@ def compare(robot: RobotRecord, component: NDArray[np.int64]) -> RobotComparison
     """
     if robot.reference is None:
         return None
-    truth = truth_at_keyframes(robot.reference, robot.stamp_ns)
+    truth = _truth(robot.reference, robot.stamp_ns, robot.time_line)
     if not _finite(truth.world_from_body).any():
         return None
 

@@ -19,11 +19,13 @@ from rotavg_ros.inputs import (
     OdometryConverter,
     OdometryRecord,
 )
-from rotavg_ros.online import OnlineEstimator, RejectReason
-from rotavg_ros.online.measurements import RejectedInputError
+from rotavg_ros.online import EstimatorOptions, OnlineEstimator, RejectReason
+from rotavg_ros.online.measurements import OdometryMessage, RejectedInputError
 from rotavg_ros.online.quaternion import IDENTITY, Quaternion, Vector
+from rotavg_ros.online.time_jumps import KEEPS_TIME_LINE, BackwardJumps
 from rotavg_ros.replay.plan import Input, Plan
 from rotavg_ros.replay.record import Reference
+from rotavg_ros.settings.parameters import NodeParameters
 
 # Called with the robot and its odometry whenever the estimator has taken a message of it.
 OnOdometry = Callable[[str, OdometryRecord], None]
@@ -114,26 +116,54 @@ def read_translations(bag: BagReader, plan: Plan, start_ns: int, stop_ns: int) -
     return vectors if len(vectors) == edges else []
 
 
-def read_references(bag: BagReader, inputs: Mapping[str, Input], start_ns: int, stop_ns: int) -> dict[str, Reference]:
-    """The references in the bag's topics, by robot; those without a usable pose are left out."""
-    references = {robot: _read_reference(bag, source, start_ns, stop_ns) for robot, source in inputs.items()}
+def read_references(
+    bag: BagReader, inputs: Mapping[str, Input], parameters: NodeParameters, start_ns: int, stop_ns: int
+) -> dict[str, Reference]:
+    """The references in the bag's topics between two moments, by robot; those without a usable pose are left out."""
+    options = parameters.estimator_options()
+    references = {
+        robot: _reference(source.topic, list(_records(bag, source, start_ns, stop_ns)), options)
+        for robot, source in inputs.items()
+    }
     return {robot: reference for robot, reference in references.items() if len(reference.stamp_ns)}
 
 
-def _read_reference(bag: BagReader, source: Input, start_ns: int, stop_ns: int) -> Reference:
-    records = sorted(_records(bag, source, start_ns, stop_ns), key=lambda record: record.stamp_ns)
+def _reference(name: str, records: list[OdometryRecord], options: EstimatorOptions) -> Reference:
+    time_line = _time_lines(records, options)
+    in_order = np.lexsort((np.array([record.stamp_ns for record in records], dtype=np.int64), time_line))
+    records, time_line = [records[row] for row in in_order], time_line[in_order]
     stamp_ns = np.array([record.stamp_ns for record in records], dtype=np.int64)
     orientation = _rows([record.world_from_body for record in records], 4)
     position = _rows([record.position or (np.nan,) * 3 for record in records], 3)
     length = np.linalg.norm(orientation, axis=1)
-    sound = np.isfinite(length) & (length > 0) & np.concatenate((np.diff(stamp_ns) > 0, [True]))[: len(records)]
+    is_last = np.concatenate(((np.diff(stamp_ns) > 0) | (np.diff(time_line) > 0), [True]))[: len(records)]
+    sound = np.isfinite(length) & (length > 0) & is_last
     has_position = bool(np.isfinite(position[sound]).all())
     return Reference(
-        source.topic,
+        name,
         stamp_ns[sound],
         orientation[sound] / length[sound, None],
         position[sound] if has_position else None,
+        time_line[sound] if time_line.any() else None,
     )
+
+
+def _time_lines(records: list[OdometryRecord], options: EstimatorOptions) -> NDArray[np.int32]:
+    """Number of the time line of each record, by the rule that the robots' odometry follows."""
+    time_line = np.zeros(len(records), dtype=np.int32)
+    if options.on_time_jump in KEEPS_TIME_LINE:
+        return time_line
+    jumps, newest_ns, step_ns = BackwardJumps(), -1, options.odometry_bounds.max_gap_ns
+    for row, record in enumerate(records):
+        if record.stamp_ns <= newest_ns:
+            message = OdometryMessage("reference", record.stamp_ns, record.world_from_body, record.position)
+            since_jump = jumps.late(message, newest_ns, options.time_jump_ns, step_ns)
+            if not since_jump:
+                continue
+            time_line[row + 1 - len(since_jump) :] += 1
+        jumps.on_time("reference")
+        newest_ns = record.stamp_ns
+    return time_line
 
 
 def _records(bag: BagReader, source: Input, start_ns: int, stop_ns: int) -> Iterator[OdometryRecord]:

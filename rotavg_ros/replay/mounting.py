@@ -26,19 +26,20 @@ def without_mounting(
 
     Args:
         reference: orientations of a sensor.
-        stamp_ns: ``(n,)`` of the keyframes.
+        stamp_ns: ``(n,)`` of the keyframes on the robot's last time line.
         odometry_world_from_body: ``(n, 4)`` xyzw at the keyframes; NaN rows unknown.
 
     Returns:
         as given, where there are no turns in common.
     """
-    nearest = np.searchsorted(reference.stamp_ns, stamp_ns).clip(0, len(reference.stamp_ns) - 1)
+    seen = reference.on_last_time_line()
+    nearest = np.searchsorted(seen.stamp_ns, stamp_ns).clip(0, len(seen.stamp_ns) - 1)
     known = np.isfinite(odometry_world_from_body).all(axis=1)
-    known &= np.abs(reference.stamp_ns[nearest] - stamp_ns) <= _MAX_STAMP_DISTANCE_NS
+    known &= np.abs(seen.stamp_ns[nearest] - stamp_ns) <= _MAX_STAMP_DISTANCE_NS
     if known.sum() < 2:
         return reference
     body = _turns(odometry_world_from_body[known])
-    sensor = _turns(reference.world_from_body[nearest[known]])
+    sensor = _turns(seen.world_from_body[nearest[known]])
     large = np.linalg.norm(body, axis=1) >= _SMALLEST_TURN
     if not large.any():
         return reference

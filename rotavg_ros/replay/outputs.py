@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rotavg_ros.datasets.files.csv_writer import Column, write_csv
 from rotavg_ros.datasets.files.pose_files import write_kitti, write_tum
@@ -103,15 +104,30 @@ def write_summary(folder: Path, record: RunRecord, bag: Path, outcome: Outcome) 
 
 
 def _write_trajectory(folder: Path, name: str, odometry_name: str, robot: RobotRecord) -> None:
+    """Poses, those with stamps in a file for every time line: the last under the name itself, earlier ones numbered."""
     nothing = np.zeros((len(robot.stamp_ns), 3))
     position = nothing if robot.position is None else np.nan_to_num(robot.position)
-    write_tum(folder / f"{name}.tum", robot.stamp_ns, position, robot.world_from_body)
+    odometry = nothing if robot.odometry_position is None else np.nan_to_num(robot.odometry_position)
     write_kitti(folder / f"{name}.kitti", position, robot.world_from_body)
-    known = np.isfinite(robot.odometry_world_from_body).all(axis=1)
-    if known.any():
-        odometry = nothing if robot.odometry_position is None else np.nan_to_num(robot.odometry_position)
-        stamps_ns, orientation = robot.stamp_ns[known], robot.odometry_world_from_body[known]
-        write_tum(folder / f"{odometry_name}.tum", stamps_ns, odometry[known], orientation)
+    has_odometry = np.isfinite(robot.odometry_world_from_body).all(axis=1)
+    for line in np.unique(robot.time_line).tolist():
+        suffix = "" if line == robot.time_line.max() else f"_time_line_{line}"
+        chosen = robot.time_line == line
+        _write_tum(folder / f"{name}{suffix}.tum", robot.stamp_ns, position, robot.world_from_body, chosen)
+        chosen &= has_odometry
+        if chosen.any():
+            path = folder / f"{odometry_name}{suffix}.tum"
+            _write_tum(path, robot.stamp_ns, odometry, robot.odometry_world_from_body, chosen)
+
+
+def _write_tum(
+    path: Path,
+    stamp_ns: NDArray[np.int64],
+    position: NDArray[np.float64],
+    world_from_body: NDArray[np.float64],
+    chosen: NDArray[np.bool_],
+) -> None:
+    write_tum(path, stamp_ns[chosen], position[chosen], world_from_body[chosen])
 
 
 def _orientation_columns(answer: Answer) -> list[Column]:

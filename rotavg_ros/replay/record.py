@@ -55,15 +55,37 @@ class Reference:
 
     Attributes:
         name: the topic or the file.
-        stamp_ns: ``(r,)`` int64, on the bag's clock.
+        stamp_ns: ``(r,)`` int64, on the bag's clock; ascending within a time line.
         world_from_body: ``(r, 4)`` xyzw, in a world of its own.
         position: ``(r, 3)`` metres; None where it states none.
+        time_line: ``(r,)`` int32 as of a robot's keyframes; None: one, which stands for all of the robot's.
     """
 
     name: str
     stamp_ns: NDArray[np.int64]
     world_from_body: NDArray[np.float64]
     position: NDArray[np.float64] | None
+    time_line: NDArray[np.int32] | None = None
+
+    def on_time_line(self, time_line: int, num_time_lines: int) -> Reference | None:
+        """What it says of one of a robot's time lines; None where nobody knows.
+
+        Its own stamps went back as often as the robot's; if not, only the last of both belong together for sure.
+        """
+        if self.time_line is None:
+            return self
+        last = int(self.time_line.max(initial=0))
+        if time_line == num_time_lines - 1:
+            return self.on_last_time_line()
+        return self._chosen(self.time_line == time_line) if num_time_lines == last + 1 else None
+
+    def on_last_time_line(self) -> Reference:
+        """What it says since its stamps went back for the last time."""
+        return self if self.time_line is None else self._chosen(self.time_line == self.time_line.max(initial=0))
+
+    def _chosen(self, rows: NDArray[np.bool_]) -> Reference:
+        position = None if self.position is None else self.position[rows]
+        return Reference(self.name, self.stamp_ns[rows], self.world_from_body[rows], position)
 
 
 @dataclass(frozen=True)
@@ -73,7 +95,8 @@ class RobotRecord:
     Attributes:
         robot: its name.
         nodes: ``(n,)`` int64 indices into the answer's keyframes.
-        stamp_ns: ``(n,)`` int64.
+        stamp_ns: ``(n,)`` int64; ascending within a time line.
+        time_line: ``(n,)`` int32: where the robot's clock went back, the next one begins.
         keyframe_id: ``(n,)`` uint64.
         odometry_world_from_body: ``(n, 4)`` xyzw, in odometry's frame; NaN rows without odometry.
         odometry_position: ``(n, 3)`` metres in odometry's frame; None without positions.
@@ -87,6 +110,7 @@ class RobotRecord:
     robot: str
     nodes: NDArray[np.int64]
     stamp_ns: NDArray[np.int64]
+    time_line: NDArray[np.int32]
     keyframe_id: NDArray[np.uint64]
     odometry_world_from_body: NDArray[np.float64]
     odometry_position: NDArray[np.float64] | None

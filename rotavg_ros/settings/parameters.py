@@ -102,9 +102,10 @@ class NodeParameters:
         live=True,
     )
     on_time_jump: str = parameter(
-        "reset",
-        "when the data's time goes back (a bag or a simulation that begins again): begin anew; or refuse odometry "
-        "until it is ahead again, silently or with an error in the diagnostics",
+        "new_component",
+        "when the data's time goes back (a bag or a simulation that begins again, a clock that was set): keep the "
+        "graph and begin a new component; forget everything and begin anew, which suits a bag in a loop; or refuse "
+        "odometry until it is ahead again, silently or with an error in the diagnostics",
         choices=POLICIES,
         live=True,
     )

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros import rotations
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.datasets.simulation.trajectories import World
-from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator, graph_builder
+from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator, room
 from rotavg_ros.online.fingerprints import Fingerprints
 from rotavg_ros.solver.algebra.residuals import edge_residual
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
@@ -89,7 +89,7 @@ def check(drive: Drive) -> None:
         assert (Rotation.from_quat(orientation) * truth.inv()).magnitude() < 1e-6
     poses = estimator.trajectories(answer)["a"]
     np.testing.assert_allclose(poses.position_dead_reckoned, drive.place["a"][poses.stamp_ns // SECOND], atol=1e-6)
-    snapshot, flags = estimator.snapshot(), estimator._content.builder.outlier
+    snapshot, flags = estimator.snapshot(), estimator._content.state.last.outlier
     np.testing.assert_array_equal(flags, snapshot.graph.precision.numpy()[: len(flags)] == FALSE)
     for robot in "ab":
         present = Rotation.from_quat(estimator.current_orientation(robot))
@@ -124,7 +124,7 @@ def test_indices_follow_even_while_a_solve_is_under_way(judging, solver, tmp_pat
 
 
 def test_a_closure_to_a_marginalized_keyframe_is_tied_to_the_nearest_that_is_left(solver, monkeypatch):
-    monkeypatch.setattr(graph_builder, "_REMEMBERED_AT_LEAST", 100)
+    monkeypatch.setattr(room, "_REMEMBERED_AT_LEAST", 100)
     estimator = OnlineEstimator(replace(EVERY_MESSAGE, max_keyframes=30), solver)
     drive = Drive(estimator, 400)
     drive.go(60)
@@ -225,10 +225,13 @@ def test_a_long_drive_with_a_limit_is_hardly_less_accurate():
 def test_fingerprints_hold_the_newest_and_forget_the_oldest():
     known = Fingerprints(10_000)
     numbers = np.random.default_rng(0).integers(0, 2**64, 50_000, dtype=np.uint64).tolist()
-    known.update(numbers)
+    for number in numbers:
+        known.add(number)
     assert all(number in known for number in numbers[-10_000:])
     assert not any(number in known for number in numbers[:1000]) and 5 not in known
     assert 10_000 <= len(known) <= 20_000 + 4096
-    again = Fingerprints(10_000)
-    again.update(known.as_array().tolist())
-    assert all(number in again for number in numbers[-10_000:])
+    again = Fingerprints.from_arrays(10_000, known.arrays())
+    for number in range(20_000):
+        known.add(number)
+        again.add(number)
+        assert (numbers[-5_000] in again) == (numbers[-5_000] in known)

@@ -88,4 +88,4 @@ def test_a_saved_state_keeps_them(drive, tmp_path: Path) -> None:
     restored = OnlineEstimator(estimator.options, lambda *_, **__: None)
     restored.load(tmp_path / "state.npz")
     np.testing.assert_array_equal(restored.snapshot().translation, estimator.snapshot().translation)
-    assert next(iter(restored._content.builder.pending)).translation == [1.0, 2.0, 3.0]
+    assert next(iter(restored._content.state.growth.pending)).translation == [1.0, 2.0, 3.0]

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from rotavg_ros.online.keyframes import KeyframePolicy, OdometryBounds, OdometryTrack
+from rotavg_ros.online.keyframes import KeyframePolicy, OdometryTrack
 from rotavg_ros.online.measurements import RejectedInputError
+from rotavg_ros.online.odometry_samples import OdometryBounds
 
 BOUNDS = OdometryBounds(tolerance_ns=5, max_gap_ns=100, max_samples=1000)
 
@@ -82,7 +83,7 @@ def test_interpolation_against_scipy():
     slerp = Slerp(stamps - stamps[0], rotations)
     for query in range(int(stamps[0]), int(stamps[-1]), 7):
         expected = slerp(query - stamps[0]).as_quat(canonical=True)
-        np.testing.assert_allclose(track.world_from_body_at(query), expected, atol=1e-12)
+        np.testing.assert_allclose(track.samples.world_from_body_at(query), expected, atol=1e-12)
 
 
 def test_the_tolerance_and_gaps_bound_what_is_known():
@@ -90,10 +91,10 @@ def test_the_tolerance_and_gaps_bound_what_is_known():
     track.add(1000, yaw(10), None)
     track.add(1200, yaw(30), None)
     for stamp, degrees in ((995, 10), (1005, 10), (1195, 30), (1205, 30)):
-        np.testing.assert_allclose(track.world_from_body_at(stamp), yaw(degrees), atol=1e-15)
+        np.testing.assert_allclose(track.samples.world_from_body_at(stamp), yaw(degrees), atol=1e-15)
     for stamp, reason in ((994, "stamp_out_of_range"), (1206, "stamp_out_of_range"), (1100, "odometry_gap")):
         with pytest.raises(RejectedInputError, match=reason):
-            track.world_from_body_at(stamp)
+            track.samples.world_from_body_at(stamp)
     assert track.reaches(1200) and not track.reaches(1201)
     assert track.within_tolerance(1205) and not track.within_tolerance(1206)
 
@@ -112,7 +113,7 @@ def test_old_messages_are_thinned_out_but_keyframes_stay():
     assert set(keyframes) <= set(stamps.tolist())
     for stamp in (0, 333, 5005, 19_985):
         np.testing.assert_allclose(
-            Rotation.from_quat(track.world_from_body_at(stamp)).as_euler("xyz", degrees=True)[2] % 360,
+            Rotation.from_quat(track.samples.world_from_body_at(stamp)).as_euler("xyz", degrees=True)[2] % 360,
             0.01 * stamp % 360,
             atol=1e-9,
         )

@@ -29,7 +29,12 @@ def columns_of(graph: ViewGraph) -> Columns:
 
 def keyframes_of(count: int) -> Columns:
     numbers = np.arange(count)
-    return {"robot": np.zeros(count, np.int32), "keyframe_id": numbers.astype(np.uint64), "stamp_ns": 10 * numbers}
+    return {
+        "robot": np.zeros(count, np.int32),
+        "keyframe_id": numbers.astype(np.uint64),
+        "stamp_ns": 10 * numbers,
+        "time_line": np.zeros(count, np.int32),
+    }
 
 
 def laplacian(num_nodes: int, edges: Columns) -> np.ndarray:
@@ -97,7 +102,7 @@ def test_what_is_left_is_the_schur_complement_and_true_to_the_poses(drive, seed)
     index = MarginalizedIndex.of(riders, {})
     for keyframe in gone.tolist():
         row = index.by_id(0, keyframe)
-        assert row == index.by_stamp(0, 10 * keyframe) and index.by_id(1, keyframe) is None
+        assert row == index.by_moment(0, 0, 10 * keyframe) and index.by_id(1, keyframe) is None
         edge = riders.edge[row]
         on_edge = (edges[name][edge] for name in ("target_from_source", "translation", "steps"))
         at_source, turn, offset = index.nearest_end(row, *on_edge)

@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.online.keyframes import OdometryBounds, OdometryTrack
+from rotavg_ros.online.keyframes import OdometryTrack
 from rotavg_ros.online.measurements import RejectedInputError
 from rotavg_ros.online.odometry_continuity import ContinuityLimits
+from rotavg_ros.online.odometry_samples import OdometryBounds
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
@@ -114,12 +115,12 @@ def test_nothing_is_interpolated_between_chains():
     robot.say(0, 0, after_s=1.0)
     robot.say(0, 0.1)
     track = robot.track
-    np.testing.assert_allclose(track.world_from_body_at(last + SECOND // 25), [0, 0, 1, 0], atol=1e-12)
-    assert track.position_at(last + SECOND // 25)[0] == pytest.approx(19.8)
+    np.testing.assert_allclose(track.samples.world_from_body_at(last + SECOND // 25), [0, 0, 1, 0], atol=1e-12)
+    assert track.samples.position_at(last + SECOND // 25)[0] == pytest.approx(19.8)
     with pytest.raises(RejectedInputError, match="odometry_gap"):
-        track.world_from_body_at(robot.stamp - SECOND // 25)
-    np.testing.assert_allclose(track.world_from_body_at(robot.stamp), [0, 0, 0, 1], atol=1e-12)
-    assert (track.chain_at(last), track.chain_at(robot.stamp)) == (0, 1)
+        track.samples.world_from_body_at(robot.stamp - SECOND // 25)
+    np.testing.assert_allclose(track.samples.world_from_body_at(robot.stamp), [0, 0, 0, 1], atol=1e-12)
+    assert (track.samples.chain_at(last), track.samples.chain_at(robot.stamp)) == (0, 1)
     restored = OdometryTrack.from_arrays(BOUNDS, track.arrays(), LIMITS)
     assert restored.chain == 1 and restored.last_keyframe is None
 

@@ -65,11 +65,10 @@ def test_the_orientation_goes_on_and_no_edge_is_made(estimator, answered_between
     answer = estimator.tick(force_cold=True)
     assert answer.num_components == 2
     assert math.degrees((turned.inv() * orientation(estimator)).magnitude()) < 1e-6
-    robot = estimator._content.builder.graph
     crossing = [
         (source, target)
         for source, target in zip(answer.source.tolist(), answer.target.tolist(), strict=True)
-        if (robot.stamp_of(source) < stamp(RESTART)) != (robot.stamp_of(target) < stamp(RESTART))
+        if (answer.stamp_ns[source] < stamp(RESTART)) != (answer.stamp_ns[target] < stamp(RESTART))
     ]
     assert crossing == []
     assert set(answer.kind.tolist()) == {EdgeKind.ODOMETRY}

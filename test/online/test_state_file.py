@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import pickle
+import socket
 import subprocess
 import sys
 from dataclasses import replace
@@ -107,11 +109,12 @@ def test_foreign_and_damaged_files_are_refused_and_the_old_state_kept(filled, tm
         assert filled.counts() == before, path
 
 
-def test_another_format_version_is_named(filled, tmp_path, monkeypatch):
+def test_another_format_version_is_named(filled, tmp_path):
     path = tmp_path / "state.npz"
-    monkeypatch.setattr(state_file, "FORMAT_VERSION", 99)
     filled.save(path)
-    monkeypatch.undo()
+    arrays = state_file.read(path)
+    header = json.loads(arrays["header"].tobytes()) | {"format_version": 99}
+    state_file.write(path, arrays | {"header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)})
     with pytest.raises(UserError, match="state format 99"):
         filled.load(path)
 
@@ -130,6 +133,26 @@ def test_a_failed_save_leaves_the_old_file(filled, tmp_path, monkeypatch):
     assert path.read_bytes() == content and os.listdir(tmp_path) == ["state.npz"]
     with pytest.raises(UserError, match="cannot write"):
         filled.save(Path("/nonexistent/folder/state.npz"))
+
+
+@pytest.mark.parametrize("kind", ["a folder", "a FIFO", "a socket", "a device"])
+def test_what_is_no_file_is_refused_at_once(filled, tmp_path, kind):
+    """A FIFO would keep the node waiting for somebody who writes into it."""
+    path = tmp_path / "state"
+    if kind == "a folder":
+        path.mkdir()
+    elif kind == "a FIFO":
+        os.mkfifo(path)
+    elif kind == "a socket":
+        with socket.socket(socket.AF_UNIX) as listening:
+            listening.bind(str(path))
+    else:
+        path.symlink_to("/dev/null")
+    for refused in (state_file.check_kind, filled.save) + (() if kind == "a socket" else (filled.load,)):
+        with pytest.raises(UserError, match=f"state is {kind}"):
+            refused(path)
+    with pytest.raises(UserError):
+        filled.load(path)
 
 
 def test_what_a_killed_process_left_behind_is_removed(filled, tmp_path):
@@ -175,10 +198,11 @@ for _ in range(50):
     if child == 0:
         work(writer)
     os.close(writer)
+    told = os.read(reader, 4) if draw.random() < 0.7 else b""  # the others may be killed while they load
     time.sleep(draw.uniform(0.005, 0.08))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    told = os.read(reader, 1 << 20)
+    told += os.read(reader, 1 << 20)
     os.close(reader)
     saved = int.from_bytes(told[-4:], "little") if told else saved
     if path.exists():
@@ -192,9 +216,9 @@ print(saved)
 def test_killed_at_any_moment_only_what_came_since_the_last_save_is_lost(tmp_path):
     """Fifty processes, one after the other, that feed, solve and save, until SIGKILL at a random moment."""
     command = [sys.executable, "-c", KILL, tmp_path / "state.npz"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
     assert ended.returncode == 0, ended.stderr
-    assert int(ended.stdout) > 20, "they got somewhere"  # even on a machine that does ten other things
+    assert int(ended.stdout) > 20, "they got somewhere"
 
 
 def test_options_may_differ_after_the_restart(filled, solver, tmp_path):

@@ -20,6 +20,15 @@ _RECENT_S = 60.0
 _SUSPICIOUS_OUTLIER_SHARE = 0.5
 # Robots' names come from messages and may be anything; a few are told.
 _MOST_NAMES = 3
+# What happens when time goes back, by the policy.
+TIME_WENT_BACK = {
+    "new_component": "time went back: the graph is kept, and a new component begins (on_time_jump)",
+    "reset": "time went back: everything is forgotten and begins anew (on_time_jump)",
+    "ignore": "time went back: odometry is refused until it is ahead again (on_time_jump)",
+    "error": "time went back: odometry is refused until it is ahead again (on_time_jump)",
+}
+KEPT = "what was forgotten or replaced is kept in"
+NOT_KEPT = "what was forgotten or replaced could not be backed up:"
 # Refusals that a healthy system produces: a sender that repeats itself.
 _HARMLESS = {"duplicate_edge", "marginalized_keyframe"}
 
@@ -80,6 +89,7 @@ def _errors(health: Health, parameters: NodeParameters, paused: bool, now: float
 
 def _warnings(health: Health, parameters: NodeParameters, now: float) -> list[str]:
     warnings = [] if health.save_failure is None else [health.save_failure]
+    warnings += health.recent_notices(now)
     needed = parameters.keyframe_source == "odometry" and parameters.unknown_keyframes == "wait"
     for topic in health.odometry:
         last = health.last_odometry.get(topic)

@@ -7,16 +7,18 @@ from pathlib import Path
 
 import torch
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump  # type: ignore[attr-defined]
+from rclpy.clock import Clock, JumpThreshold, TimeJump
+from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.timer import Timer
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.online import OnlineEstimator
+from rotavg_ros.online import Discarded, OnlineEstimator
+from rotavg_ros.online.time_jumps import KEEPS_TIME_LINE
 from rotavg_ros.ros.node import parameter_server
-from rotavg_ros.ros.node.diagnostics import Reporter
+from rotavg_ros.ros.node.diagnostics import TIME_WENT_BACK, Reporter
 from rotavg_ros.ros.node.health import Health
 from rotavg_ros.ros.node.intake.subscriptions import Subscriptions
 from rotavg_ros.ros.node.intake.wiring import Wiring
@@ -48,7 +50,7 @@ class RotavgNode(Node):
         self._settings = parameters = parameter_server.declare(self)
         torch.set_num_threads(parameters.solver_threads or max(1, torch.get_num_threads() - 1))
         device = warm_up(parameters.estimator_options())
-        self._estimator = OnlineEstimator(parameters.estimator_options())
+        self._estimator = OnlineEstimator(parameters.estimator_options(), on_discard=self._on_discard)
         self._health = Health()
         self._reporter = Reporter(f"{self.get_fully_qualified_name().lstrip('/')}: estimator")
         self._worker = Worker(executor, "rotavg_worker")
@@ -85,6 +87,8 @@ class RotavgNode(Node):
         if self._settings.autosave_period_s > 0:
             self._on_autosave_timer()
         is_saved = self._saver.stop(timeout_s, finish=True)
+        if is_saved:
+            self._solving.let_go()
         return self._worker.stop(_SHORT_SOLVE_S) and is_saved
 
     def _create_timer(self, period_s: float, callback: Callable[[], object]) -> Timer:
@@ -120,11 +124,16 @@ class RotavgNode(Node):
             self._on_time_jump()
 
     def _on_time_jump(self) -> None:
-        if self._settings.on_time_jump == "reset":
-            self.get_logger().warning("time went back: everything is forgotten and begins anew (on_time_jump)")
+        policy = self._settings.on_time_jump
+        self.get_logger().warning(TIME_WENT_BACK[policy])
+        if policy not in KEEPS_TIME_LINE:
+            self._health.note(TIME_WENT_BACK[policy])
+        if policy == "reset":
             self._worker.submit(self._solving.forget_quietly)
-        else:
-            self.get_logger().warning("time went back: odometry is refused until it is ahead again (on_time_jump)")
+
+    def _on_discard(self, discarded: Discarded) -> None:
+        """Runs under the estimator's lock; the saver does it before it saves anything else."""
+        self._saver.submit(lambda: self._solving.back_up_quietly(discarded))
 
     def _on_diagnostics_timer(self) -> None:
         wiring = self._wiring.warnings(self._settings)

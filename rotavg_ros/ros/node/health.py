@@ -9,6 +9,9 @@ from dataclasses import dataclass, field
 from rotavg_ros.online import Answer
 from rotavg_ros.ros.node.message_counting import Durations, TopicCounter
 
+# So long the diagnostics tell of something that has happened once.
+_NOTICE_S = 60.0
+
 
 @dataclass
 class Health:
@@ -24,6 +27,7 @@ class Health:
         unsolved_since: since when the graph has been ahead of the answer; None if it is not.
         solve_failures: how many ticks failed in all; ``failure`` is the last one's message, None after a good tick.
         save_failure: why the last save failed, None if it did not.
+        notices: what has happened to the graph, and when.
     """
 
     odometry: dict[str, TopicCounter] = field(default_factory=dict)
@@ -41,6 +45,7 @@ class Health:
     solve_failures: int = 0
     failure: str | None = None
     save_failure: str | None = None
+    notices: dict[str, float] = field(default_factory=dict)
 
     @property
     def lost(self) -> int:
@@ -48,6 +53,15 @@ class Health:
 
     def _counters(self) -> Iterable[TopicCounter]:
         return [*self.odometry.values(), *self.edges.values()]
+
+    def note(self, notice: str) -> None:
+        """Have the diagnostics tell of something for a minute."""
+        now = time.monotonic()
+        self.notices = {text: noted for text, noted in self.notices.items() if now - noted < _NOTICE_S} | {notice: now}
+
+    def recent_notices(self, now: float) -> list[str]:
+        """What has happened in the last minute."""
+        return [notice for notice, noted in self.notices.items() if now - noted < _NOTICE_S]
 
     def took_odometry(self, topic: str) -> None:
         """A message was taken."""

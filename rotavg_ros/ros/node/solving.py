@@ -13,10 +13,12 @@ from pathlib import Path
 from rclpy.node import Node
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.online import Answer, OnlineEstimator
+from rotavg_ros.online import Answer, Discarded, OnlineEstimator
 from rotavg_ros.online.estimator import TickAbandonedError
 from rotavg_ros.online.joins import joins
-from rotavg_ros.online.state_file import remove_leftovers
+from rotavg_ros.online.lock import StateFileLock
+from rotavg_ros.online.state_file import StateFileError, StateFileInUseError, check_kind, remove_leftovers
+from rotavg_ros.ros.node.diagnostics import KEPT, NOT_KEPT
 from rotavg_ros.ros.node.health import Health
 from rotavg_ros.ros.node.output.outputs import Outputs
 
@@ -41,6 +43,7 @@ class Solving:
         self._outputs = outputs
         self._state_file = state_file
         self._publishing = threading.Lock()  # an answer goes out before it is forgotten, or not at all
+        self._lock: StateFileLock | None = None
         if state_file is not None:
             self._resume(state_file)
         self._saved = self._content()
@@ -81,13 +84,13 @@ class Solving:
         return "paused: inputs are kept, nothing is solved" if paused else "running"
 
     def save(self) -> str:
-        state_file = self._named_state_file()
+        state_file = self._own_state_file()
         self._estimator.save(state_file)
         self._health.saved()
         return f"saved to {state_file}"
 
     def load(self) -> str:
-        state_file = self._named_state_file()
+        state_file = self._own_state_file(to_write=False)
         self._estimator.load(state_file)
         self._forget_answer()
         return f"loaded {state_file}"
@@ -108,6 +111,23 @@ class Solving:
             if str(error) != self._health.save_failure:
                 self._node.get_logger().error(str(error))
             self._health.saved(failure=str(error))
+
+    def back_up_quietly(self, discarded: Discarded) -> None:
+        """Keep what was forgotten or replaced beside the state file; the diagnostics tell of it, or why it failed."""
+        if self._state_file is None:
+            return
+        try:
+            notice = f"{KEPT} {discarded.back_up(self._own_state_file())}"
+            self._node.get_logger().warning(notice)
+        except Exception as error:
+            notice = f"{NOT_KEPT} {error}"
+            self._node.get_logger().error(notice)
+        self._health.note(notice)
+
+    def let_go(self) -> None:
+        """Let other nodes have the state file; nothing is saved any more."""
+        if self._lock is not None:
+            self._lock.release()
 
     def draw_quietly(self) -> None:
         """Draw the last answer for those who look; what goes wrong is logged."""
@@ -156,13 +176,32 @@ class Solving:
         return self._estimator.generation, self._estimator.revision
 
     def _resume(self, state_file: Path) -> None:
-        if state_file.exists():
-            self._estimator.load(state_file)
-        elif not state_file.parent.is_dir():
+        check_kind(state_file)
+        if not state_file.parent.is_dir():
             raise UserError(f"state_file is {state_file}, but there is no folder {state_file.parent}; make it first")
+        self._lock = StateFileLock(state_file)
+        self._own_state_file(to_write=False)
+        try:
+            if state_file.exists():
+                self._estimator.load(state_file)
+        except UserError:
+            self.let_go()
+            raise
         remove_leftovers(state_file)
 
-    def _named_state_file(self) -> Path:
-        if self._state_file is None:
+    def _own_state_file(self, *, to_write: bool = True) -> Path:
+        """The state file, which is this node's alone.
+
+        Raises:
+            UserError: there is none, another node has it, or it is to be written and its folder cannot be.
+        """
+        if self._state_file is None or self._lock is None:
             raise UserError("the parameter state_file is empty; start the node with the file's name")
+        try:
+            self._lock.acquire()
+        except StateFileInUseError:
+            raise
+        except StateFileError:
+            if to_write:
+                raise
         return self._state_file

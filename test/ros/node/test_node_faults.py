@@ -6,6 +6,7 @@ import math
 import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -310,6 +311,32 @@ def test_a_foreign_state_file_is_refused_at_the_start(tmp_path: Path) -> None:
     ended = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert ended.returncode == 2 and str(path) in ended.stderr and ended.stderr.count("\n") == 1
     assert path.read_bytes() == content
+
+
+@pytest.mark.parametrize("kind", ["a FIFO", "a folder", "a device"])
+def test_a_state_file_that_is_no_file_is_refused_at_the_start(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "state"
+    {"a FIFO": os.mkfifo, "a folder": os.mkdir, "a device": lambda path: path.symlink_to("/dev/null")}[kind](path)
+    command = [NODE, "--ros-args", "-p", f"state_file:={path}"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert ended.returncode == 2
+    assert ended.stderr.startswith(f"rotavg_node: error: the state file {path} is {kind}; ")
+    assert ended.stderr.count("\n") == 1 and os.listdir(tmp_path) == ["state"]
+
+
+def test_two_nodes_on_one_state_file(live_node, tmp_path: Path) -> None:
+    """The second is refused, until the first has ended, even by SIGKILL."""
+    state = f"state_file:={tmp_path / 'state.npz'}"
+    live_node.start(*EVERY_MESSAGE, state)
+    command = [NODE, "--ros-args", "-p", state, "-r", "__node:=second"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert ended.returncode == 2
+    assert f"{tmp_path / 'state.npz'} is in use by another node (process {live_node.process.pid})" in ended.stderr
+    assert ended.stderr.startswith("rotavg_node: error: ") and ended.stderr.count("\n") == 1
+    live_node.stop(signal.SIGKILL)
+    live_node.start(*EVERY_MESSAGE, state)
+    assert live_node.stop() == 0
+    assert os.listdir(tmp_path) == []
 
 
 def test_a_clean_end_during_a_long_solve(live_node) -> None:

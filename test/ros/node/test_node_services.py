@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 
@@ -18,6 +19,8 @@ from rclpy.parameter import Parameter
 from rotavg_msgs.msg import KeyframeReference, RelativeRotation
 from rotavg_msgs.srv import LabelEdge
 from std_srvs.srv import SetBool
+
+from rotavg_ros.ros.node.output.conversions import to_quaternion_message
 
 pytestmark = pytest.mark.ros
 
@@ -138,6 +141,31 @@ def test_a_node_that_was_killed_goes_on_where_it_was_saved(live_node, tmp_path) 
     feed(live_node, 20, 25)
     wait_for(live_node, "keyframes", 25)  # the middleware may take seconds to serve a reader that has just come
     assert len(live_node.wait_for_silence().keyframe_ids) == 25
+
+
+def test_a_robot_that_was_switched_off_and_on_begins_a_component(live_node, tmp_path) -> None:
+    """Its clock begins in 1970, its odometry at zero; yesterday's map stays in the file."""
+    state = (f"state_file:={tmp_path / 'state.npz'}", "autosave_period_s:=0.2")
+    live_node.start(*EVERY_MESSAGE, *state)
+    for index in range(5, 25):
+        live_node.odometry.publish(odometry(1000 + index))
+    live_node.wait_for_silence()
+    assert live_node.stop() == 0
+    live_node.answers.clear()
+    live_node.start(*EVERY_MESSAGE, *state)
+    for index in range(15):
+        message = odometry(index)
+        message.pose.pose.orientation = to_quaternion_message((0.0, 0.0, math.sin(0.1 * index), math.cos(0.1 * index)))
+        live_node.odometry.publish(message)
+    wait_for(live_node, "keyframes", 35)
+    answer = live_node.wait_for_silence()
+    assert list(answer.components) == [0] * 20 + [1] * 15
+    flags = live_node.flags[-1]
+    assert not any(
+        (source < 20) != (target < 20) for source, target in zip(flags.source_ids, flags.target_ids, strict=True)
+    )
+    assert live_node.stop() == 0
+    assert len(np.load(tmp_path / "state.npz")["keyframe_id"]) == 35
 
 
 def test_load_goes_back_and_refuses_a_broken_file(live_node, tmp_path) -> None:

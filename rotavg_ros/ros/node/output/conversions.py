@@ -60,8 +60,7 @@ def flags_message(answer: Answer, frame_id: str) -> OutlierFlags:
 
 
 def _header(answer: Answer, frame_id: str) -> Header:
-    newest = int(answer.stamp_ns.max()) if len(answer.stamp_ns) else 0
-    return Header(stamp=to_time(newest), frame_id=frame_id)
+    return Header(stamp=to_time(answer.newest_stamp_ns), frame_id=frame_id)
 
 
 def _array(typecode: str, values: NDArray[Any], dtype: DTypeLike) -> array[Any]:
