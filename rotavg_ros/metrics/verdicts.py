@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import astuple, dataclass
 
 import numpy as np
-from scipy.stats import rankdata
 from torch import Tensor
 
 
@@ -66,5 +65,8 @@ def roc_area(value: np.ndarray, is_positive: np.ndarray) -> float:
     negatives = len(is_positive) - positives
     if positives == 0 or negatives == 0:
         return float("nan")
-    rank_sum = rankdata(value)[is_positive].sum()
+    # Ranks from 1, equal values sharing their mean rank; scipy.stats has them, too, and costs every replay 30 MB.
+    _, place, count = np.unique(value, return_inverse=True, return_counts=True)
+    rank = np.cumsum(count) - (count - 1) / 2
+    rank_sum = rank[place][is_positive].sum()
     return float((rank_sum - positives * (positives + 1) / 2) / (positives * negatives))
