@@ -119,7 +119,7 @@ class ViewGraph:
         precision = _column("precision", precision, torch.float64, num_edges, torch.nan)
         label = _column("label", label, torch.int64, num_edges, EdgeLabel.AUTOMATIC)
         steps = _column("steps", steps, torch.float64, num_edges, 1.0)
-        num_nodes = _num_nodes(torch.stack((source, target)), num_nodes)
+        num_nodes = _num_nodes(source, target, num_nodes)
         _refuse(source == target, "the same source and target", source)
         _refuse((kind < 0) | (kind >= len(EdgeKind)), "kind {}; 0 is odometry, 1 a loop closure", kind)
         unknown_label = (label < 0) | (label >= len(EdgeLabel))
@@ -217,9 +217,8 @@ def _quaternions(target_from_source: ArrayLike | None, source_from_target: Array
         values = from_matrix(values)
     elif values.ndim == 2 and values.shape[1] == 4:
         norm = values.norm(dim=1)
-        _refuse(~torch.isfinite(norm), f"a quaternion in {name} that is not finite", norm)
-        far = (norm - 1).abs() > UNIT_NORM_TOLERANCE
-        _refuse(far, f"a quaternion of length {{:.6g}} in {name}; it must be of unit length", norm)
+        is_unit = (norm - 1).abs() <= UNIT_NORM_TOLERANCE
+        _refuse(~is_unit, f"a quaternion of length {{:.6g}} in {name}; it must be finite and of unit length", norm)
         # One product, one new array: at millions of edges its pages cost more than the arithmetic.
         values = values * torch.where(values[:, 3] < 0, -1 / norm, 1 / norm)[:, None]
     elif values.numel() == 0:
@@ -232,9 +231,9 @@ def _quaternions(target_from_source: ArrayLike | None, source_from_target: Array
     return inverse(values) if is_inverse else values
 
 
-def _num_nodes(ends: Tensor, given: int | None) -> int:
-    """How many nodes a graph has whose edges join ``ends`` ``(2, M)``; refuses ends beyond them."""
-    smallest, largest = ends.amin(dim=0), ends.amax(dim=0)
+def _num_nodes(source: Tensor, target: Tensor, given: int | None) -> int:
+    """How many nodes a graph of these edges has; refuses ends beyond them."""
+    smallest, largest = torch.minimum(source, target), torch.maximum(source, target)
     _refuse(smallest < 0, "node {}; node indices count from 0", smallest)
     if given is not None and not 0 <= given <= _MAX_NODES:
         raise ViewGraphError(f"num_nodes is {given}; it must be 0 … {_MAX_NODES}")

@@ -6,6 +6,7 @@ import gzip
 import os
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from rotavg_ros.datasets.files.graph_file import GraphFileError
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.datasets.files.pose_files import read_pose_file
 
+packed = partial(gzip.compress, mtime=0)  # the same bytes, and names of tests, at any time
 BOM = b"\xef\xbb\xbf"
 G2O = b"".join(b"EDGE_SE2 %d %d 1 2 0.5 500 0 0 500 0 90\n" % (i, i + 1) for i in range(2000))
 IDENTITY = b"1 0 0 0 1 0 0 0 1"
@@ -28,9 +30,9 @@ TEXTS = {
 }
 FORMS: dict[str, Callable[[bytes], bytes]] = {
     "mark": lambda text: BOM + text,
-    "gzip": gzip.compress,
-    "gzipped mark": lambda text: gzip.compress(BOM + text),
-    "two parts": lambda text: gzip.compress(text[: len(text) // 2]) + gzip.compress(text[len(text) // 2 :]),
+    "gzip": packed,
+    "gzipped mark": lambda text: packed(BOM + text),
+    "two parts": lambda text: packed(text[: len(text) // 2]) + packed(text[len(text) // 2 :]),
 }
 
 
@@ -64,7 +66,7 @@ def test_companions_and_trajectories(tmp_path: Path, form: str) -> None:
 
 
 def test_lines_are_counted_as_in_the_text(tmp_path: Path) -> None:
-    path = written(tmp_path / "graph.g2o.gz", gzip.compress(BOM + G2O + b"EDGE_SE2 1 2 nan\n"))
+    path = written(tmp_path / "graph.g2o.gz", packed(BOM + G2O + b"EDGE_SE2 1 2 nan\n"))
     with pytest.raises(GraphFileError, match=r"graph\.g2o\.gz:2001: "):
         read_graph(path)
 
@@ -74,7 +76,7 @@ def test_a_pipe_may_be_gzipped(tmp_path: Path) -> None:
     graph = read_graph(written(tmp_path / "graph.g2o", G2O[: G2O.index(b"\n") + 1]))
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    writer = threading.Thread(target=pipe.write_bytes, args=(gzip.compress(BOM + b"1\n2\n"),))
+    writer = threading.Thread(target=pipe.write_bytes, args=(packed(BOM + b"1\n2\n"),))
     writer.start()
     assert attach_stamps(graph, pipe).stamps_ns is not None
     writer.join()
@@ -85,13 +87,13 @@ def test_a_pipe_may_be_gzipped(tmp_path: Path) -> None:
     [
         (G2O.decode().encode("utf-16"), "is UTF-16 text; save it as UTF-8"),
         (b"\xfe\xff" + G2O.decode().encode("utf-16-be"), "is UTF-16 text; save it as UTF-8"),
-        (gzip.compress(G2O.decode().encode("utf-16")), "is UTF-16 text; save it as UTF-8"),
-        (gzip.compress(G2O)[:-20], "is a damaged gzip file: "),
-        (gzip.compress(G2O)[:5], "is a damaged gzip file: "),
-        (gzip.compress(G2O)[:-8] + bytes(8), "is a damaged gzip file: "),
-        (gzip.compress(G2O, mtime=0)[:60] + bytes(40) + gzip.compress(G2O, mtime=0)[100:], "is a damaged gzip file: "),
+        (packed(G2O.decode().encode("utf-16")), "is UTF-16 text; save it as UTF-8"),
+        (packed(G2O)[:-20], "is a damaged gzip file: "),
+        (packed(G2O)[:5], "is a damaged gzip file: "),
+        (packed(G2O)[:-8] + bytes(8), "is a damaged gzip file: "),
+        (packed(G2O)[:60] + bytes(40) + packed(G2O)[100:], "is a damaged gzip file: "),
         (BOM, "the file is empty"),
-        (gzip.compress(b""), "the file is empty"),
+        (packed(b""), "the file is empty"),
     ],
 )
 def test_what_cannot_be_read_is_named_in_one_line(tmp_path: Path, content: bytes, message: str) -> None:
@@ -103,6 +105,6 @@ def test_what_cannot_be_read_is_named_in_one_line(tmp_path: Path, content: bytes
 
 
 def test_the_answer_to_a_gzipped_graph_has_its_name(tmp_path: Path) -> None:
-    graphs = [written(tmp_path / f"{name}.g2o.gz", gzip.compress(TEXTS["graph.toro"])) for name in "ab"]
+    graphs = [written(tmp_path / f"{name}.g2o.gz", packed(TEXTS["graph.toro"])) for name in "ab"]
     assert main(["solve", *map(str, graphs), "--output", str(tmp_path / "out")]) == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a", "b"]
