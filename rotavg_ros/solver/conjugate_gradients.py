@@ -12,7 +12,7 @@ import warnings
 import torch
 from torch import Tensor
 
-from rotavg_ros.solver.abandonment import check
+from rotavg_ros.solver.abandonment import stop_if_abandoned
 from rotavg_ros.solver.parallel import for_each, num_workers
 from rotavg_ros.solver.sorted_edges import SortedEdges, Tile
 
@@ -67,7 +67,7 @@ def solve_laplacian(adjacency: WeightedAdjacency, right_hand_side: Tensor) -> Te
     direction = scaled.clone()
     energy = (residual * scaled).sum(dim=0)
     for _ in range(MAX_ITERATIONS):
-        check()
+        stop_if_abandoned()
         if float(scaled.abs().amax()) < _TOLERANCE:
             return solution
         image = adjacency.degree * direction - adjacency.product(direction)

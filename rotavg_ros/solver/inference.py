@@ -15,7 +15,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
-from rotavg_ros.solver.abandonment import check
+from rotavg_ros.solver.abandonment import stop_if_abandoned
 from rotavg_ros.solver.message_passing import MessagePassingLayer, MessagePassingNetwork
 from rotavg_ros.solver.parallel import for_each, stretches
 from rotavg_ros.solver.scratch import scratch
@@ -130,7 +130,7 @@ class _Walk:
 
         def walk(tiles: Sequence[Tile]) -> None:
             for tile in tiles:
-                check()
+                stop_if_abandoned()
                 state = self.state[tile.edges]
                 if is_first:
                     self._write_features(tile, state)

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.abandonment import check
+from rotavg_ros.solver.abandonment import stop_if_abandoned
 from rotavg_ros.solver.agreement import AgreementPairs
 from rotavg_ros.solver.minimum_cut import FlowNetwork, TwoLabels
 from rotavg_ros.solver.truncated_cost import TruncatedCost
@@ -74,7 +74,7 @@ def _round_of_jumps(
     questions = _turns(cost, residual, residual[candidates], costs)
     bounds = questions.gain_bounds(system)
     for number in np.flatnonzero(bounds > hopeless[candidates] + _MIN_GAIN):
-        check()
+        stop_if_abandoned()
         edge = candidates[number]
         if costs[edge] < 0.5 * cost.cap[edge]:
             continue
