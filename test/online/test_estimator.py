@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online import Answer, EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
 from rotavg_ros.online.estimator import TickAbandonedError
-from rotavg_ros.solver.algebra.abandonment import check
+from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
 SECOND = 1_000_000_000
@@ -354,10 +354,10 @@ def test_a_solve_is_given_up_where_nobody_waits_for_its_answer(solver, tmp_path,
     asked = []
 
     def solve_until_told() -> None:
-        check()
+        stop_if_abandoned()
         acts[act]()
         asked.append(act)
-        check()
+        stop_if_abandoned()
         pytest.fail("the solve went on")
 
     solver.on_call = solve_until_told
@@ -379,7 +379,7 @@ def test_a_pause_leaves_an_answer_alone_that_somebody_has_asked_for(solver) -> N
 
     def pause() -> None:
         estimator.pause(True)
-        check()
+        stop_if_abandoned()
 
     solver.on_call = pause
     assert estimator.tick(force_cold=True) is not None

@@ -35,7 +35,7 @@ def abandonable(is_abandoned: Callable[[], bool]) -> Iterator[None]:
         _is_abandoned.reset(token)
 
 
-def check() -> None:
+def stop_if_abandoned() -> None:
     """Call it once per factorisation, iteration, search step or tile; it costs a tenth of a microsecond.
 
     Raises:

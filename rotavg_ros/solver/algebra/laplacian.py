@@ -16,7 +16,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import SuperLU, splu
 
-from rotavg_ros.solver.algebra.abandonment import check
+from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
 
 # How much stiffer than its own edges a root is tied to zero.
 _GROUNDING = 1e6
@@ -84,7 +84,7 @@ class LaplacianPattern:
 
     def factorize(self, weight: np.ndarray) -> FactorisedLaplacian:
         """The system with positive weights ``(E,)``; a node reached by tiny weights alone stays solvable."""
-        check()
+        stop_if_abandoned()
         matrix = self.matrix(weight)
         num_edges, num_nodes = len(self.source), self.num_nodes
         is_dense = num_edges > max(_DENSE_SHARE * num_nodes**2 / 2, _DENSE_EDGES_PER_NODE * num_nodes)
@@ -184,7 +184,7 @@ def iterate(
     goal = max(tolerance, relative_tolerance * float(np.abs(scaled).max(initial=0.0)))
     direction, energy = scaled, (residual * scaled).sum(axis=0)
     for _ in range(max_iterations):
-        check()
+        stop_if_abandoned()
         image = product(direction)
         curvature = (direction * image).sum(axis=0)
         length = np.divide(energy, curvature, out=np.zeros_like(energy), where=curvature > 0)
@@ -224,7 +224,7 @@ class FactorisedLaplacian:
 
     def solve(self, right_hand_side: np.ndarray) -> np.ndarray:
         """``L⁻¹ b`` for ``(N, k)`` columns."""
-        check()
+        stop_if_abandoned()
         return np.asarray(self._solve(right_hand_side))
 
     def fit(self, difference: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import torch
 
-from rotavg_ros.solver.algebra.abandonment import check
+from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
 
 Item = TypeVar("Item")
 
@@ -114,7 +114,7 @@ def for_each(work: Callable[[Item], None], items: Sequence[Item], threads: int |
     """
     if min(len(items), _crew.size if threads is None else min(threads, _crew.size)) <= 1:
         for item in items:
-            check()
+            stop_if_abandoned()
             work(item)
         return
     context = copy_context()
@@ -124,7 +124,7 @@ def for_each(work: Callable[[Item], None], items: Sequence[Item], threads: int |
         context.copy().run(work, item)
 
     for _ in _crew.pool().map(in_context, items):
-        check()
+        stop_if_abandoned()
 
 
 def threads_on(device: torch.device) -> int | None:

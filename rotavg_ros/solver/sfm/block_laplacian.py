@@ -16,7 +16,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from rotavg_ros.solver.algebra.abandonment import check
+from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
 from rotavg_ros.solver.algebra.laplacian import LaplacianSystem
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.algebra.threads import for_each, threads_on
@@ -120,7 +120,7 @@ class BlockLaplacian:
         direction, energy = scaled.clone(), self._dot(residual, scaled)
         goal = (relative_tolerance * self._largest(scaled)).clamp(min=tolerance)
         for _ in range(_MAX_ITERATIONS):
-            check()
+            stop_if_abandoned()
             is_open = self._largest(scaled) > goal
             if not bool(is_open.any()):
                 return solution, True

@@ -25,7 +25,7 @@ import sys, time
 from pathlib import Path
 import rotavg_ros.solver
 from rotavg_ros.ros.node.main import main
-from rotavg_ros.solver.algebra.abandonment import Abandoned, check
+from rotavg_ros.solver.algebra.abandonment import Abandoned, stop_if_abandoned
 notes, order, solve = Path(sys.argv.pop(1)), Path(sys.argv.pop(1)), rotavg_ros.solver.solve
 
 def note(what):
@@ -36,7 +36,7 @@ def noting(*arguments, **options):
     note("begun")
     try:
         while order.read_text() == "block":
-            check()
+            stop_if_abandoned()
             time.sleep(0.01)
         solution = solve(*arguments, **options)
     except Abandoned:

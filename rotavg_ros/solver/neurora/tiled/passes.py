@@ -15,7 +15,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
-from rotavg_ros.solver.algebra.abandonment import check
+from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
 from rotavg_ros.solver.algebra.scratch import scratch
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges, Tile
 from rotavg_ros.solver.algebra.threads import for_each, stretches
@@ -130,7 +130,7 @@ class _Walk:
 
         def walk(tiles: Sequence[Tile]) -> None:
             for tile in tiles:
-                check()
+                stop_if_abandoned()
                 state = self.state[tile.edges]
                 if is_first:
                     self._write_features(tile, state)

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.abandonment import check
+from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
 from rotavg_ros.solver.algebra.minimum_cut import FlowNetwork, TwoLabels
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
 from rotavg_ros.solver.slam.moves.truncated_cost import TruncatedCost
@@ -73,7 +73,7 @@ class _Jumps:
         questions = turns(cost, residual, residual[candidates], costs)
         bounds = questions.gain_bounds(system)
         for number in np.flatnonzero(bounds > hopeless[candidates] + _MIN_GAIN):
-            check()
+            stop_if_abandoned()
             edge = candidates[number]
             if costs[edge] < 0.5 * cost.cap[edge]:
                 continue
