@@ -17,6 +17,7 @@ from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
+from rotavg_ros.solver.algebra.conjugate_gradients import Stop, iterate
 
 # How much stiffer than its own edges a root is tied to zero.
 _GROUNDING = 1e6
@@ -31,8 +32,7 @@ _DENSE_MAX_NODES = 5000
 _COLUMNS_AT_ONCE = 4
 _ENTRIES_AT_ONCE = 100_000
 # Conjugate gradients from a factorisation with other weights; after so many iterations another one is cheaper.
-_RELATIVE_TOLERANCE = 1e-3
-_MAX_ITERATIONS = 8
+_NEARLY = Stop(tolerance=0.0, relative_tolerance=1e-3, max_iterations=8)
 
 
 def incidence_matrix(num_nodes: int, source: np.ndarray, target: np.ndarray) -> csr_array:
@@ -155,48 +155,11 @@ class _Iteration:
         self._node, self._rank = np.argsort(rank), rank
 
     def __call__(self, right_hand_side: np.ndarray) -> np.ndarray:
-        solution = iterate(self._product, self._precondition, right_hand_side)
+        solution = iterate(self._product, self._precondition, right_hand_side, _NEARLY)
         return self._pattern.factorize(self._weight).solve(right_hand_side) if solution is None else solution
 
     def _product(self, columns: np.ndarray) -> np.ndarray:
         return np.asarray((self._matrix @ columns.take(self._node, axis=0)).take(self._rank, axis=0))
-
-
-def iterate(
-    product: Callable[[np.ndarray], np.ndarray],
-    precondition: Callable[[np.ndarray], np.ndarray],
-    right_hand_side: np.ndarray,
-    *,
-    tolerance: float = 0.0,
-    relative_tolerance: float = _RELATIVE_TOLERANCE,
-    max_iterations: int = _MAX_ITERATIONS,
-) -> np.ndarray | None:
-    """``L⁻¹ b`` by preconditioned conjugate gradients (Hestenes & Stiefel 1952); None if they take too long.
-
-    Args:
-        product, precondition: ``L x`` and ``M⁻¹ x`` of ``(N, k)`` columns, M near L.
-        right_hand_side: ``(N, k)``.
-        tolerance, relative_tolerance: it ends where ``M⁻¹`` of the residual, in the solution's unit, is below the one,
-            or below the other times what it was at the beginning.
-    """
-    solution, residual = np.zeros_like(right_hand_side), right_hand_side.copy()
-    scaled = precondition(residual)
-    goal = max(tolerance, relative_tolerance * float(np.abs(scaled).max(initial=0.0)))
-    direction, energy = scaled, (residual * scaled).sum(axis=0)
-    for _ in range(max_iterations):
-        stop_if_abandoned()
-        image = product(direction)
-        curvature = (direction * image).sum(axis=0)
-        length = np.divide(energy, curvature, out=np.zeros_like(energy), where=curvature > 0)
-        solution += length * direction
-        residual -= length * image
-        scaled = precondition(residual)
-        if float(np.abs(scaled).max(initial=0.0)) <= goal:
-            return solution
-        previous, energy = energy, (residual * scaled).sum(axis=0)
-        ratio = np.divide(energy, previous, out=np.zeros_like(energy), where=previous > 0)
-        direction = scaled + ratio * direction
-    return None
 
 
 class FactorisedLaplacian:

@@ -16,7 +16,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
+from rotavg_ros.solver.algebra.conjugate_gradients import Stop, conjugate_gradients
 from rotavg_ros.solver.algebra.laplacian import LaplacianSystem
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.algebra.threads import for_each, threads_on
@@ -71,8 +71,7 @@ class BlockLaplacian:
     def __init__(self, arrivals: Arrivals, weight: Tensor, shape: NoiseShape, component: Tensor) -> None:
         self._matrices = arrivals.matrices(weight)
         self._threads = threads_on(weight.device) if len(weight) > _WORTH_WORKERS else 1
-        self._component = component
-        self._num_components = int(component.max()) + 1
+        self._components = _Components(component, int(component.max()) + 1)
         # (3, 3, N): what is said of an edge at the end that it comes from, and at the one where it arrives.
         at_source, at_target = (end.to(weight).contiguous() for end in (shape.at_source, shape.at_target))
         self._far, self._near = (at_source, at_target), (at_target, at_source)
@@ -115,41 +114,33 @@ class BlockLaplacian:
             tolerance: largest entry of the preconditioned residual, in the unknowns' unit.
             relative_tolerance: the same as a share of what it is at zero; the larger of the two counts.
         """
-        solution, residual = torch.zeros_like(force), force.clone()
-        scaled = precondition(residual)
-        direction, energy = scaled.clone(), self._dot(residual, scaled)
-        goal = (relative_tolerance * self._largest(scaled)).clamp(min=tolerance)
-        for _ in range(_MAX_ITERATIONS):
-            stop_if_abandoned()
-            is_open = self._largest(scaled) > goal
-            if not bool(is_open.any()):
-                return solution, True
-            image = self.product(direction)
-            curvature = self._dot(direction, image)
-            length = self._of_node(torch.where(is_open & (curvature > 0), energy / curvature, 0.0))
-            solution.addcmul_(length, direction)
-            residual.addcmul_(length, image, value=-1)
-            scaled = precondition(residual)
-            previous, energy = energy, self._dot(residual, scaled)
-            ratio = self._of_node(torch.where(previous > 0, energy / previous, 0.0))
-            direction = torch.addcmul(scaled, ratio, direction)
-        return solution, False
+        stop = Stop(tolerance, relative_tolerance, _MAX_ITERATIONS)
+        return conjugate_gradients(self.product, precondition, force, self._components, stop)
 
-    def _of_node(self, value: Tensor) -> Tensor:
+
+class _Components:
+    """The components of a graph, each a system by itself; vectors are ``(3, N)``.
+
+    Args:
+        component: ``(N,)``.
+    """
+
+    def __init__(self, component: Tensor, count: int) -> None:
+        self._component, self._count = component, count
+
+    def spread(self, value: Tensor) -> Tensor:
         """What each node's component has, of ``(C,)``: ``(N,)``, or ``(1,)`` where there is but one."""
-        return value if self._num_components == 1 else value[self._component]
+        return value if self._count == 1 else value[self._component]
 
-    def _dot(self, a: Tensor, b: Tensor) -> Tensor:
-        """Inner products ``(C,)`` by component."""
-        if self._num_components == 1:  # index_add would take a node after the other
+    def dot(self, a: Tensor, b: Tensor) -> Tensor:
+        if self._count == 1:  # index_add would take a node after the other
             return torch.dot(a.flatten(), b.flatten())[None]
-        return a.new_zeros(self._num_components).index_add_(0, self._component, (a * b).sum(dim=0))
+        return a.new_zeros(self._count).index_add_(0, self._component, (a * b).sum(dim=0))
 
-    def _largest(self, x: Tensor) -> Tensor:
-        """Largest absolute entries ``(C,)`` by component."""
-        if self._num_components == 1:
+    def largest(self, x: Tensor) -> Tensor:
+        if self._count == 1:
             return x.abs().max()[None]
-        return x.new_zeros(self._num_components).scatter_reduce(0, self._component, x.abs().amax(dim=0), "amax")
+        return x.new_zeros(self._count).scatter_reduce(0, self._component, x.abs().amax(dim=0), "amax")
 
 
 def factorised(graph: ViewGraph, weight: Tensor, shape: NoiseShape, roots: Tensor) -> Preconditioner:

@@ -19,18 +19,17 @@ import torch
 from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
 
+from rotavg_ros.solver.algebra.conjugate_gradients import Stop, iterate
 from rotavg_ros.solver.algebra.laplacian import (
     FactorisedLaplacian,
     incidence_matrix,
-    iterate,
     root_stiffness,
     solve_in_parts,
 )
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 
 # Conjugate gradients end at a step that no orientation could be seen to take, or at a hundredth of the first one.
-_TOLERANCE, _RELATIVE_TOLERANCE = np.radians(0.002), 1e-2
-_MAX_ITERATIONS = 12
+_SETTLED = Stop(tolerance=float(np.radians(0.002)), relative_tolerance=1e-2, max_iterations=12)
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,7 @@ class GrownLaplacian:
     def fit(self, difference: np.ndarray) -> np.ndarray | None:
         """Node values ``(K, k)`` whose differences over the edges fit ``(E, k)`` best; None if that takes too long."""
         forces = np.asarray(self._incidence @ (self.weight[:, None] * difference))
-        return iterate(self._product, self._precondition, forces, tolerance=_TOLERANCE, max_iterations=_MAX_ITERATIONS)
+        return iterate(self._product, self._precondition, forces, _SETTLED)
 
     def prediction_variance(self) -> np.ndarray:
         """Of what the rest of the graph predicts of each new closure, ``(r,)``, old ones weighing what they did."""

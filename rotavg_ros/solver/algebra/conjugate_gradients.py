@@ -1,0 +1,105 @@
+"""Preconditioned conjugate gradients (Hestenes & Stiefel 1952), for several systems at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
+
+
+class Systems(Protocol):
+    """How vectors are taken apart into the S systems that are solved at once."""
+
+    def dot(self, a: Tensor, b: Tensor) -> Tensor:
+        """Inner products ``(S,)``."""
+
+    def largest(self, x: Tensor) -> Tensor:
+        """Largest absolute entries ``(S,)``, or ``(1,)`` where all systems end together."""
+
+    def spread(self, value: Tensor) -> Tensor:
+        """A number of each system ``(S,)`` → what multiplies vectors by it."""
+
+
+class Columns:
+    """One matrix, and a right-hand side in each column of ``(N, S)``; they end together."""
+
+    def dot(self, a: Tensor, b: Tensor) -> Tensor:
+        return (a * b).sum(dim=0)
+
+    def largest(self, x: Tensor) -> Tensor:
+        return x.abs().amax().reshape(1) if x.numel() else x.new_zeros(1)
+
+    def spread(self, value: Tensor) -> Tensor:
+        return value
+
+
+class Stop(NamedTuple):
+    """When iterations end.
+
+    Attributes:
+        tolerance: largest entry of the preconditioned residual, in the unknowns' unit.
+        relative_tolerance: the same as a share of what it is at zero; the larger of the two counts.
+        max_iterations: at most so many.
+    """
+
+    tolerance: float
+    relative_tolerance: float
+    max_iterations: int
+
+
+def conjugate_gradients(
+    product: Callable[[Tensor], Tensor],
+    precondition: Callable[[Tensor], Tensor],
+    right_hand_side: Tensor,
+    systems: Systems,
+    stop: Stop,
+) -> tuple[Tensor, bool]:
+    """``L⁻¹ b``, and whether it is as good as asked for.
+
+    Args:
+        product, precondition: ``L x`` and ``M⁻¹ x`` of vectors like ``b``; L positive semidefinite, M near L.
+        right_hand_side: ``b``, of any shape that ``systems`` takes apart.
+    """
+    solution, residual = torch.zeros_like(right_hand_side), right_hand_side.clone()
+    scaled = precondition(residual)
+    largest = systems.largest(scaled)
+    goal = (stop.relative_tolerance * largest).clamp(min=stop.tolerance)
+    direction, energy = scaled.clone(), systems.dot(residual, scaled)
+    for _ in range(stop.max_iterations):
+        stop_if_abandoned()
+        is_open = largest > goal
+        if not bool(is_open.any()):
+            return solution, True
+        image = product(direction)
+        # A system that is solved to the last bit has nothing left to divide.
+        curvature = systems.dot(direction, image)
+        length = systems.spread(torch.where(is_open & (curvature > 0), energy / curvature, 0.0))
+        solution.addcmul_(length, direction)
+        residual.addcmul_(length, image, value=-1)
+        scaled = precondition(residual)
+        largest = systems.largest(scaled)
+        previous, energy = energy, systems.dot(residual, scaled)
+        ratio = systems.spread(torch.where(previous > 0, energy / previous, 0.0))
+        direction = torch.addcmul(scaled, ratio, direction)
+    return solution, not bool((largest > goal).any())
+
+
+def iterate(
+    product: Callable[[np.ndarray], np.ndarray],
+    precondition: Callable[[np.ndarray], np.ndarray],
+    right_hand_side: np.ndarray,
+    stop: Stop,
+) -> np.ndarray | None:
+    """The same on arrays with columns ``(N, S)``; None if it is not as good as asked for."""
+
+    def on_tensors(operator: Callable[[np.ndarray], np.ndarray]) -> Callable[[Tensor], Tensor]:
+        return lambda x: torch.from_numpy(operator(x.numpy()))
+
+    columns = torch.from_numpy(right_hand_side)
+    solution, is_solved = conjugate_gradients(on_tensors(product), on_tensors(precondition), columns, Columns(), stop)
+    return solution.numpy() if is_solved else None
