@@ -101,14 +101,14 @@ def _replay(bag: BagReader, plan: Plan, window: Window, arguments: argparse.Name
     # The solver and the pictures take seconds to import: not before there is something to do for them.
     from rotavg_ros.replay.assemble import assemble
     from rotavg_ros.replay.outputs import RECORDING, output_folder, write_summary, write_tables
-    from rotavg_ros.replay.run import replay
+    from rotavg_ros.replay.run import Spectator, replay
     from rotavg_ros.reports import write_report
 
     seconds = min(bag.duration_s - window.start_s, window.duration_s or bag.duration_s)
     period_ns = round(1e9 * seconds / arguments.answers) if arguments.answers else 0
     with output_folder(arguments.output, overwrite=arguments.overwrite) as folder:
         with _asked_to_stop() as stop, seconds_bar("replaying", seconds) as progress:
-            outcome = replay(bag, plan, window, folder / RECORDING, period_ns, progress, stop)
+            outcome = replay(bag, plan, window, folder / RECORDING, period_ns, Spectator(progress, stop))
         with working("writing the report"):
             record = assemble(bag, plan, outcome)
             write_tables(folder, record)

@@ -108,7 +108,7 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
     parameters = NodeParameters().changed(settings)
     references = _references(bag, found, wishes.references, parameters.robots, odometry)
     translations = _translations(found, edges)
-    topics = _uses(bag, found, parameters, odometry, edges, translations, references)
+    topics = _uses(bag, found, _roles(parameters, odometry, edges, translations, references))
     return Plan(parameters, odometry, edges, translations, references, topics)
 
 
@@ -218,15 +218,14 @@ def _translations(found: Candidates, edges: Sequence[Input]) -> tuple[str, str] 
     return None
 
 
-def _uses(
-    bag: BagReader,
-    found: Candidates,
+def _roles(
     parameters: NodeParameters,
     odometry: Sequence[Input],
     edges: Sequence[Input],
     translations: tuple[str, str] | None,
     references: Mapping[str, Input | Path],
-) -> tuple[TopicUse, ...]:
+) -> dict[str, list[str]]:
+    """What each topic that is used is used as."""
     roles: dict[str, list[str]] = {}
     for robot, source in zip(parameters.robots, odometry, strict=False):
         roles.setdefault(source.topic, []).append(f"odometry of {robot}")
@@ -238,6 +237,10 @@ def _uses(
     for robot, reference in references.items():
         if isinstance(reference, Input):
             roles.setdefault(reference.topic, []).append(f"reference for {robot}")
+    return roles
+
+
+def _uses(bag: BagReader, found: Candidates, roles: Mapping[str, list[str]]) -> tuple[TopicUse, ...]:
     could_be = {candidate.topic: "could be a reference: --reference" for candidate in found.references}
     could_be |= {candidate.topic: "could be odometry: --odometry" for candidate in found.odometry}
     could_be |= {candidate.topic: "could be loop closures: --edges" for candidate in found.edges}

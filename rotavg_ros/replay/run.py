@@ -73,14 +73,26 @@ class ReplayError(UserError):
     """A bag of which nothing came; the message says why."""
 
 
+@dataclass(frozen=True)
+class Spectator:
+    """Who looks on.
+
+    Attributes:
+        progress: called with the seconds of bag time that have passed since the last call.
+        stop: asked between messages whether the user wants it to end.
+    """
+
+    progress: Callable[[float], object]
+    stop: Callable[[], bool]
+
+
 def replay(
     bag: BagReader,
     plan: Plan,
     window: Window,
     recording: Path | None,
     answer_period_ns: int,
-    progress: Callable[[float], object],
-    stop: Callable[[], bool],
+    spectator: Spectator,
 ) -> Outcome:
     """Replay.
 
@@ -90,8 +102,7 @@ def replay(
         window: which part.
         recording: file for what the node would have published.
         answer_period_ns: see :class:`Recording`.
-        progress: called with the seconds of bag time that have passed since the last call.
-        stop: asked between messages whether the user wants it to end.
+        spectator: see :class:`Spectator`.
 
     Raises:
         BagReadError: a bag that is damaged before anything could be made of it.
@@ -112,12 +123,12 @@ def replay(
         records = Sound(bag.decoded(feed.topics, *((None, None) if is_whole else (start_ns, stop_ns))))
         for topic, time_ns, message in records:
             if window.rate > 0:
-                _wait_until(started + (time_ns - start_ns) / _NANOSECONDS / window.rate, stop)
-            if interrupted := stop():
+                _wait_until(started + (time_ns - start_ns) / _NANOSECONDS / window.rate, spectator.stop)
+            if interrupted := spectator.stop():
                 break
             loop.advance(time_ns)
             feed(topic, message)
-            progress((time_ns - end_ns) / _NANOSECONDS)
+            spectator.progress((time_ns - end_ns) / _NANOSECONDS)
             end_ns = time_ns
         damage = records.damage
         answer = loop.finish()

@@ -13,7 +13,7 @@ from rotavg_ros import ViewGraph, solve
 from rotavg_ros.datasets.slam_simulation import Precisions, SimulatedRun, SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.datasets.trajectories import World
 from rotavg_ros.evaluation.metrics import orientation_errors
-from rotavg_ros.online.gauge import extend_along_edges
+from rotavg_ros.online.answer.gauge import extend_along_edges
 from rotavg_ros.solver.noise_model import NoiseModel
 from rotavg_ros.solver.stated_precision import StatedTrust, estimate_trust
 
