@@ -9,7 +9,7 @@ import numpy as np
 from rotavg_ros.datasets.files.corrected_graph import write_corrected_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.files.pose_files import write_kitti, write_tum
-from rotavg_ros.online.positions import fit_positions
+from rotavg_ros.online.answer.positions import Translations, fit_positions
 
 POSE_FILES = ("graph.g2o", "trajectory.kitti", "trajectory.tum")
 
@@ -30,17 +30,15 @@ def write_corrected_poses(
     """
     graph = graph_file.graph
     translation = graph_file.edge_translation
-    position = fit_positions(
-        world_from_body,
+    edges = Translations(
         graph.source.cpu().numpy(),
         graph.target.cpu().numpy(),
         np.full((graph.num_edges, 3), np.nan) if translation is None else translation,
         graph.is_odometry.cpu().numpy(),
         outlier_score,
-        np.zeros((graph.num_nodes, 3)),
         graph.steps.cpu().numpy(),
     )
-    position = np.nan_to_num(position)
+    position = np.nan_to_num(fit_positions(world_from_body, edges, np.zeros((graph.num_nodes, 3))))
     write_corrected_graph(folder / "graph.g2o", graph_file, world_from_body, position, outlier_score > 0.5)
     write_kitti(folder / "trajectory.kitti", position, world_from_body)
     if graph_file.stamps_ns is not None:

@@ -16,7 +16,7 @@ from rotavg_ros.inputs.foreign_graph import ForeignGraph, Key
 from rotavg_ros.inputs.records import EdgeRecord, Source
 from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason, quaternion
 from rotavg_ros.online.measurements import RejectedInputError, checked_rotation
-from rotavg_ros.online.odometry_continuity import OdometrySample, has_jumped
+from rotavg_ros.online.odometry.continuity import OdometrySample, has_jumped
 from rotavg_ros.view_graph import EdgeKind
 
 _UNKNOWN_PRECISION = 0.0

@@ -9,7 +9,7 @@ from typing import Any
 from rotavg_ros.inputs.fields import edge_id_of, target_from_source, to_tuple, to_vector
 from rotavg_ros.inputs.records import EdgeRecord, Source
 from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason, quaternion
-from rotavg_ros.online.fingerprints import Fingerprints
+from rotavg_ros.online.graph.fingerprints import Fingerprints
 from rotavg_ros.online.measurements import MAX_ID, RejectedInputError
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.view_graph import EdgeKind

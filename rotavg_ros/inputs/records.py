@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any, Protocol
 
 from rotavg_ros.online import EdgeMeasurement, RejectReason
-from rotavg_ros.online.odometry_continuity import ANY_MOTION, ContinuityLimits
+from rotavg_ros.online.odometry.continuity import ANY_MOTION, ContinuityLimits
 from rotavg_ros.online.quaternion import IDENTITY, Quaternion, Vector
 from rotavg_ros.view_graph import EdgeLabel
 

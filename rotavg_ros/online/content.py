@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rotavg_ros.online import quaternion
-from rotavg_ros.online.anchoring import anchor, corrections, first_correction
-from rotavg_ros.online.graph_builder import GraphBuilder
-from rotavg_ros.online.growth import Growth
-from rotavg_ros.online.last_answer import LastAnswer
+from rotavg_ros.online.answer.anchoring import anchor, corrections, first_correction
+from rotavg_ros.online.answer.last_answer import LastAnswer
+from rotavg_ros.online.answer.problem import Problem
+from rotavg_ros.online.graph.builder import GraphBuilder
+from rotavg_ros.online.graph.growth import Growth
 from rotavg_ros.online.measurements import KeyframeReference, OdometryMessage, RejectReason
 from rotavg_ros.online.options import NANOSECONDS, EstimatorOptions
-from rotavg_ros.online.problem import Problem
 from rotavg_ros.online.quaternion import Quaternion
 
 

@@ -9,17 +9,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rotavg_ros.online import free_memory, state_content, state_file
-from rotavg_ros.online.anchoring import root_orientations
-from rotavg_ros.online.answer import Answer
-from rotavg_ros.online.backups import back_up
+from rotavg_ros.online import free_memory
+from rotavg_ros.online.answer.anchoring import root_orientations
+from rotavg_ros.online.answer.answer import Answer
+from rotavg_ros.online.answer.gauge import fix_gauge
+from rotavg_ros.online.answer.trajectory import Trajectory, corrected_trajectories
 from rotavg_ros.online.content import AcceptedAnswer, Content, ContentState, Counts
-from rotavg_ros.online.gauge import fix_gauge
-from rotavg_ros.online.growing_view_graph import GraphSnapshot
+from rotavg_ros.online.graph.snapshot import GraphSnapshot
 from rotavg_ros.online.measurements import EdgeMeasurement, OdometryMessage, RejectReason
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.quaternion import Quaternion
-from rotavg_ros.online.trajectory import Trajectory, corrected_trajectories
+from rotavg_ros.online.state import content as state_content
+from rotavg_ros.online.state import file as state_file
+from rotavg_ros.online.state.discarded import Discarded
 from rotavg_ros.solver import Abandoned, abandonable
 from rotavg_ros.view_graph import EdgeLabel
 
@@ -52,25 +54,6 @@ class _Tick:
 
     def is_abandoned(self) -> bool:
         return self.abandoned_by is not None
-
-
-class Discarded:
-    """A graph that was forgotten or replaced, and everything that belonged to it; it does not change any more."""
-
-    def __init__(self, content: Content) -> None:
-        self._state = content.state
-
-    @property
-    def num_keyframes(self) -> int:
-        return self._state.growth.graph.num_keyframes
-
-    def back_up(self, path: Path) -> Path:
-        """Write it beside a state file, as a file that can be loaded, see :func:`~rotavg_ros.online.backups.back_up`.
-
-        Raises:
-            StateFileError: it cannot be written.
-        """
-        return back_up(path, state_content.collect(self._state).encoded())
 
 
 class OnlineEstimator:
@@ -108,7 +91,7 @@ class OnlineEstimator:
 
     def _start_over(self, state: ContentState) -> None:
         """Begin with this content; the one before is handed over if there is anything in it."""
-        discarded = Discarded(self._content)
+        discarded = Discarded(self._content.state)
         self._generation += 1
         self._content = Content(state)
         self._abandon_tick("everything was forgotten or replaced meanwhile")
@@ -335,7 +318,6 @@ class OnlineEstimator:
             snapshot,
             solution,
             body_from_world,
-            component,
             problem.thresholds(options.outlier_threshold, was_cold),
             content.version + 1,
             was_cold,

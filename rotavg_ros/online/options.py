@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.online.keyframes import KeyframePolicy
-from rotavg_ros.online.odometry_continuity import ContinuityLimits
-from rotavg_ros.online.odometry_samples import OdometryBounds
-from rotavg_ros.online.time_jumps import POLICIES
+from rotavg_ros.online.odometry.continuity import ContinuityLimits
+from rotavg_ros.online.odometry.keyframe_choice import KeyframePolicy
+from rotavg_ros.online.odometry.samples import OdometryBounds
+from rotavg_ros.online.odometry.time_jumps import POLICIES
 
 NANOSECONDS = 1_000_000_000
 
@@ -41,7 +41,7 @@ class EstimatorOptions:
         time_jump_s: going back by less is no jump; such odometry is out of order.
         max_odometry_samples: per robot; older messages are thinned out beyond it.
         max_keyframes, max_edges: there the graph does without what can best be spared, see
-            :mod:`~rotavg_ros.online.thinning`; what odometry still needs comes on top of the edges.
+            :mod:`~rotavg_ros.online.compaction.thinning`; what odometry still needs comes on top of the edges.
         pending_capacity: edges that may wait at a time.
         pending_timeout_s: how long in data time.
         gauge: of the first keyframe of a component: the ``odometry``'s orientation there, or ``identity``.

@@ -13,7 +13,7 @@ from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.datasets.files.graph_file import GraphFileError
 from rotavg_ros.datasets.files.pose_files import read_pose_file
 from rotavg_ros.online import Answer
-from rotavg_ros.online.trajectory import Trajectory
+from rotavg_ros.online.answer.trajectory import Trajectory
 from rotavg_ros.replay.feed import read_references
 from rotavg_ros.replay.mounting import without_mounting
 from rotavg_ros.replay.plan import Input, Plan

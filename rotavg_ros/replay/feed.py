@@ -21,8 +21,8 @@ from rotavg_ros.inputs import (
 )
 from rotavg_ros.online import EstimatorOptions, OnlineEstimator, RejectReason
 from rotavg_ros.online.measurements import OdometryMessage, RejectedInputError
+from rotavg_ros.online.odometry.time_jumps import KEEPS_TIME_LINE, BackwardJumps
 from rotavg_ros.online.quaternion import IDENTITY, Quaternion, Vector
-from rotavg_ros.online.time_jumps import KEEPS_TIME_LINE, BackwardJumps
 from rotavg_ros.replay.plan import Input, Plan
 from rotavg_ros.replay.record import Reference
 from rotavg_ros.settings.parameters import NodeParameters

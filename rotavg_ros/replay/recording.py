@@ -12,7 +12,7 @@ from rotavg_ros.bags import answer_messages as messages
 from rotavg_ros.bags.writer import BagWriter
 from rotavg_ros.inputs import OdometryRecord
 from rotavg_ros.online import Answer, OnlineEstimator
-from rotavg_ros.online.drawing import draw
+from rotavg_ros.online.answer.drawing import draw
 from rotavg_ros.settings.parameters import NODE_NAME, NodeParameters
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind

@@ -9,8 +9,8 @@ from typing import Any
 
 from rotavg_ros.inputs import BRINGS_KEYFRAMES, FRAMELESS_ODOMETRY, Source
 from rotavg_ros.online import EstimatorOptions, quaternion
+from rotavg_ros.online.odometry.time_jumps import POLICIES
 from rotavg_ros.online.quaternion import Quaternion
-from rotavg_ros.online.time_jumps import POLICIES
 from rotavg_ros.settings.fields import ParameterError, check, parameter
 from rotavg_ros.solver import DEVICES, PROFILES
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rotavg_ros.online.gauge import extend_along_edges
+from rotavg_ros.online.answer.gauge import extend_along_edges
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.datasets.simulation.trajectories import World
 from rotavg_ros.online import Answer
-from rotavg_ros.online.trajectory import dead_reckoning
+from rotavg_ros.online.answer.trajectory import dead_reckoning
 from rotavg_ros.replay.record import Reference, RobotRecord, RunRecord, TickRecord, TopicUse
 from rotavg_ros.view_graph import EdgeKind
 

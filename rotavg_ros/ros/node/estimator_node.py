@@ -16,7 +16,7 @@ from rclpy.timer import Timer
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import Discarded, OnlineEstimator
-from rotavg_ros.online.time_jumps import KEEPS_TIME_LINE
+from rotavg_ros.online.odometry.time_jumps import KEEPS_TIME_LINE
 from rotavg_ros.ros.node import parameter_server
 from rotavg_ros.ros.node.diagnostics import TIME_WENT_BACK, Reporter
 from rotavg_ros.ros.node.health import Health

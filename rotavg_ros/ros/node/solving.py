@@ -14,10 +14,10 @@ from rclpy.node import Node
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import Answer, Discarded, OnlineEstimator
+from rotavg_ros.online.answer.joins import joins
 from rotavg_ros.online.estimator import TickAbandonedError
-from rotavg_ros.online.joins import joins
-from rotavg_ros.online.lock import StateFileLock
-from rotavg_ros.online.state_file import StateFileError, StateFileInUseError, check_kind, remove_leftovers
+from rotavg_ros.online.state.file import StateFileError, StateFileInUseError, check_kind, remove_leftovers
+from rotavg_ros.online.state.lock import StateFileLock
 from rotavg_ros.ros.node.diagnostics import KEPT, NOT_KEPT
 from rotavg_ros.ros.node.health import Health
 from rotavg_ros.ros.node.output.outputs import Outputs

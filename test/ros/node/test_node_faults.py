@@ -326,17 +326,19 @@ def test_a_state_file_that_is_no_file_is_refused_at_the_start(tmp_path: Path, ki
 
 def test_two_nodes_on_one_state_file(live_node, tmp_path: Path) -> None:
     """The second is refused, until the first has ended, even by SIGKILL."""
-    state = f"state_file:={tmp_path / 'state.npz'}"
+    path = tmp_path / "state" / "state.npz"
+    path.parent.mkdir()
+    state = f"state_file:={path}"
     live_node.start(*EVERY_MESSAGE, state)
     command = [NODE, "--ros-args", "-p", state, "-r", "__node:=second"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert ended.returncode == 2
-    assert f"{tmp_path / 'state.npz'} is in use by another node (process {live_node.process.pid})" in ended.stderr
+    assert f"{path} is in use by another node (process {live_node.process.pid})" in ended.stderr
     assert ended.stderr.startswith("rotavg_node: error: ") and ended.stderr.count("\n") == 1
     live_node.stop(signal.SIGKILL)
     live_node.start(*EVERY_MESSAGE, state)
     assert live_node.stop() == 0
-    assert os.listdir(tmp_path) == []
+    assert os.listdir(path.parent) == []
 
 
 def test_a_clean_end_during_a_long_solve(live_node) -> None:

@@ -20,7 +20,8 @@ EVERY_MESSAGE = ("keyframe_angle_deg:=0.0", "keyframe_distance_m:=0.0", "solve_p
 
 def test_a_bag_that_is_played_again_begins_a_component(live_node, tmp_path) -> None:
     """And what was autosaved is still in the file."""
-    path = tmp_path / "state.npz"
+    path = tmp_path / "state" / "state.npz"
+    path.parent.mkdir()
     live_node.start(*EVERY_MESSAGE, f"state_file:={path}", "autosave_period_s:=0.2")
     live_node.turn(0, 30)
     first = live_node.wait_for_silence()
@@ -35,7 +36,7 @@ def test_a_bag_that_is_played_again_begins_a_component(live_node, tmp_path) -> N
     told = (1, "time went back: the graph is kept, and a new component begins (on_time_jump)")
     assert any(level == told[0] and told[1] in message for level, message in live_node.said)
     assert live_node.stop() == 0
-    assert len(np.load(path)["keyframe_id"]) == 50 and os.listdir(tmp_path) == ["state.npz"]
+    assert len(np.load(path)["keyframe_id"]) == 50 and os.listdir(path.parent) == ["state.npz"]
 
 
 def test_what_reset_and_load_discard_is_kept_beside_the_state_file(live_node, tmp_path) -> None:

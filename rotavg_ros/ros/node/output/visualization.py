@@ -10,8 +10,8 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from rotavg_ros.online import Answer
-from rotavg_ros.online.drawing import EDGE_WIDTH_M, KEYFRAME_COLOR, KEYFRAME_SIZE_M, PALETTE, draw
-from rotavg_ros.online.trajectory import Trajectory
+from rotavg_ros.online.answer.drawing import EDGE_WIDTH_M, KEYFRAME_COLOR, KEYFRAME_SIZE_M, PALETTE, draw
+from rotavg_ros.online.answer.trajectory import Trajectory
 from rotavg_ros.ros.node.output.conversions import to_quaternion_message, to_time
 
 

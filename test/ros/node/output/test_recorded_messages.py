@@ -16,8 +16,8 @@ from rotavg_ros.bags.message_types import typestore
 from rotavg_ros.datasets.simulation.robot_run import RobotRun
 from rotavg_ros.datasets.simulation.slam_simulation import simulate_slam_graph
 from rotavg_ros.online import Answer, EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
-from rotavg_ros.online.drawing import draw
-from rotavg_ros.online.trajectory import Trajectory
+from rotavg_ros.online.answer.drawing import draw
+from rotavg_ros.online.answer.trajectory import Trajectory
 from rotavg_ros.ros.node.output import conversions, visualization
 
 FRAME = "map"

@@ -17,8 +17,8 @@ from rotavg_ros.datasets.simulation.slam_simulation import (
     simulate_slam_graph,
 )
 from rotavg_ros.datasets.simulation.trajectories import World
-from rotavg_ros.metrics import orientation_errors
-from rotavg_ros.online.gauge import extend_along_edges
+from rotavg_ros.metrics.orientations import orientation_errors
+from rotavg_ros.online.answer.gauge import extend_along_edges
 from rotavg_ros.solver.slam.noise.model import NoiseModel
 from rotavg_ros.solver.slam.noise.stated_precision import StatedTrust, estimate_trust
 

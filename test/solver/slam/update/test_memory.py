@@ -11,7 +11,7 @@ import torch
 from rotavg_ros import ViewGraph, rotations, solve
 from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.datasets.simulation.trajectories import World
-from rotavg_ros.online.gauge import extend_along_edges
+from rotavg_ros.online.answer.gauge import extend_along_edges
 from rotavg_ros.solver.slam.update.memory import SlamMemory, UpdateLimits
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel

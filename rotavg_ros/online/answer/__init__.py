@@ -1,0 +1,1 @@
+"""What is said of the graph: orientations in their gauge, verdicts, positions, pictures."""

@@ -1,0 +1,142 @@
+"""What one tick of the estimator says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.online.graph.snapshot import GraphSnapshot
+from rotavg_ros.view_graph import EdgeLabel
+
+if TYPE_CHECKING:
+    from rotavg_ros.solver import Solution
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Absolute orientations of all keyframes and a verdict on every edge (N keyframes, M edges).
+
+    Attributes:
+        version: counts the answers of an estimator, from 1.
+        robots: names.
+        keyframe_robot: ``(N,)`` int32 index into ``robots``.
+        keyframe_id: ``(N,)`` uint64.
+        stamp_ns: ``(N,)`` int64, -1 where unknown.
+        time_line: ``(N,)`` int32, which of its robot's time lines the stamp is of: where a robot's clock went back,
+            the next one begins, and the same stamps may come again.
+        world_from_body: ``(N, 4)`` float64 xyzw, w ≥ 0, in the component's fixed gauge.
+        component: ``(N,)`` int64, numbered by first keyframe.
+        uncertainty: ``(N,)`` float64, one sigma in radians relative to the component's first keyframe, NaN unknown.
+        edge_id: ``(M,)`` uint64, the sender's; 2⁶⁴-1 for the estimator's own odometry edges.
+        source, target: ``(M,)`` int64 indices into the keyframes.
+        kind: ``(M,)`` int64 :class:`~rotavg_ros.view_graph.EdgeKind`.
+        target_from_source: ``(M, 4)`` xyzw, as measured.
+        precision: ``(M,)`` rad⁻², NaN unknown.
+        translation: ``(M, 3)`` position of the target in the source's frame, metres; NaN unknown.
+        steps: ``(M,)`` odometry steps that an odometry edge stands for, more than one where keyframes in between were
+            marginalised.
+        outlier_score: ``(M,)`` float64 in [0, 1].
+        outlier: ``(M,)`` bool, score above the edge's threshold; a user's label decides where there is one.
+        was_cold: solved from scratch, as ``rotavg solve`` would.
+        seconds: of the whole tick.
+        stage_seconds: of the solver's stages.
+        method, profile, device: as the solver resolved them.
+    """
+
+    version: int
+    robots: tuple[str, ...]
+    keyframe_robot: NDArray[np.int32]
+    keyframe_id: NDArray[np.uint64]
+    stamp_ns: NDArray[np.int64]
+    time_line: NDArray[np.int32]
+    world_from_body: NDArray[np.float64]
+    component: NDArray[np.int64]
+    uncertainty: NDArray[np.float64]
+    edge_id: NDArray[np.uint64]
+    source: NDArray[np.int64]
+    target: NDArray[np.int64]
+    kind: NDArray[np.int64]
+    target_from_source: NDArray[np.float64]
+    precision: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    steps: NDArray[np.float64]
+    outlier_score: NDArray[np.float64]
+    outlier: NDArray[np.bool_]
+    was_cold: bool
+    seconds: float
+    stage_seconds: dict[str, float]
+    method: str
+    profile: str
+    device: str
+
+    @classmethod
+    def of_solution(
+        cls,
+        snapshot: GraphSnapshot,
+        solution: Solution,
+        body_from_world: Tensor,
+        outlier_threshold: NDArray[np.float64],
+        version: int,
+        was_cold: bool,
+    ) -> Answer:
+        """What a solve of a snapshot says, with the orientations ``(N, 4)`` in their fixed gauge; ``seconds`` is 0.
+
+        An edge is an outlier if its score exceeds its threshold, ``(M,)``; what a user has accepted has the score 0,
+        what was rejected 1.
+        """
+        graph = snapshot.graph
+        score = solution.outlier_score.cpu()
+        score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, score)
+        score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
+        return cls(
+            version=version,
+            robots=snapshot.robots,
+            keyframe_robot=snapshot.keyframe_robot,
+            keyframe_id=snapshot.keyframe_id,
+            stamp_ns=snapshot.stamp_ns,
+            time_line=snapshot.time_line,
+            world_from_body=rotations.canonical(rotations.inverse(body_from_world)).numpy(),
+            component=solution.component.cpu().numpy(),
+            uncertainty=solution.uncertainty.cpu().numpy(),
+            edge_id=snapshot.edge_id,
+            source=graph.source.numpy(),
+            target=graph.target.numpy(),
+            kind=graph.kind.numpy(),
+            target_from_source=graph.target_from_source.numpy(),
+            precision=graph.precision.numpy(),
+            translation=snapshot.translation,
+            steps=graph.steps.numpy(),
+            outlier_score=score.numpy(),
+            outlier=score.numpy() > outlier_threshold,
+            was_cold=was_cold,
+            seconds=0.0,  # known when the tick is over
+            stage_seconds=dict(solution.stage_seconds),
+            method=solution.method,
+            profile=solution.profile,
+            device=solution.device,
+        )
+
+    @property
+    def num_components(self) -> int:
+        return int(self.component.max()) + 1 if len(self.component) else 0
+
+    @property
+    def newest_stamp_ns(self) -> int:
+        """Of all keyframes on their robots' latest time lines; 0 without any stamp."""
+        latest = np.zeros(len(self.robots), dtype=np.int32)
+        np.maximum.at(latest, self.keyframe_robot, self.time_line)
+        is_latest = self.time_line == latest[self.keyframe_robot]
+        return int(self.stamp_ns[is_latest].max(initial=0))
+
+    def without_content(self) -> Answer:
+        """The same answer about no keyframes and no edges."""
+        arrays: dict[str, Any] = {
+            name: value[:0] for name, value in vars(self).items() if isinstance(value, np.ndarray)
+        }
+        return replace(self, robots=(), **arrays)

@@ -1,0 +1,53 @@
+"""The last answer, kept in the numbers of a graph that grows and is compacted meanwhile."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rotavg_ros.online.compaction.renumbering import Renumbering
+
+
+class LastAnswer:
+    """What the last answer says of the graph's first n nodes and first m edges.
+
+    Attributes:
+        body_from_world: ``(n, 4)``; None before the first answer.
+        component: ``(n,)``; None where it is not known.
+        outlier: ``(m,)`` flags.
+    """
+
+    def __init__(
+        self,
+        body_from_world: Tensor | None = None,
+        component: Tensor | None = None,
+        outlier: NDArray[np.bool_] | None = None,
+    ) -> None:
+        self.body_from_world = body_from_world
+        self.component = component
+        self.outlier: NDArray[np.bool_] = np.zeros(0, dtype=bool) if outlier is None else outlier
+        self._since_problem: Renumbering | None = None
+
+    def begin_problem(self) -> None:
+        """From now on an answer comes in the graph's present numbers."""
+        self._since_problem = None
+
+    def replace(self, body_from_world: Tensor, component: Tensor, outlier: NDArray[np.bool_]) -> None:
+        """Take the answer to the last problem, ``(N, 4)``, ``(N,)`` and ``(M,)`` in the numbers of that time."""
+        self.body_from_world, self.component, self.outlier = body_from_world, component, outlier
+        if self._since_problem is not None:
+            self._apply(self._since_problem)
+
+    def renumber(self, renumbering: Renumbering) -> None:
+        """Follow the graph."""
+        earlier = self._since_problem
+        self._since_problem = renumbering if earlier is None else earlier.then(renumbering)
+        self._apply(renumbering)
+
+    def _apply(self, renumbering: Renumbering) -> None:
+        if self.body_from_world is not None:
+            self.body_from_world = renumbering.nodes(self.body_from_world)
+        if self.component is not None:
+            self.component = renumbering.nodes(self.component)
+        self.outlier = renumbering.flags(self.outlier)

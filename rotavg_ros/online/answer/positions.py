@@ -1,0 +1,122 @@
+"""Positions from known orientations: a sparse linear least-squares problem, since ``p_target - p_source = R t``.
+
+With the orientations fixed, translations are linear in the positions and their three axes share one scalar Laplacian.
+What odometry steps and closures are worth against each other, and where a closure's translation is too far off to
+be one, was settled on simulated runs, never on the robots reported.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.solver.algebra.laplacian import LaplacianPattern
+
+# A closure is worth as much as this many typical steps of odometry in a row.
+_CLOSURE_STEPS = 30.0
+# A step's variance grows with its length, and is that of this share of a typical one at least: wheels slip on the spot.
+_SHORTEST_STEP = 0.05
+_PASSES = 5
+# Geman & McClure's weight is a quarter at this many standard deviations; squared normal errors have about this median.
+_SCALE_SIGMAS = 3.0
+_MEDIAN_OF_SQUARED = 0.8
+# Keeps closures so slight that positions are odometry's, where one starts from.
+_NEXT_TO_NOTHING = 1e-9
+
+
+@dataclass(frozen=True)
+class Translations:
+    """Edges between N nodes (M of them).
+
+    Attributes:
+        source, target: ``(M,)`` ends of the edges.
+        translation: ``(M, 3)`` position of the target in the source's frame, metres; an edge with NaN is left out.
+        is_odometry: ``(M,)``.
+        outlier_score: ``(M,)`` in [0, 1]; closures above 0.5 are left out, others weigh ``1 - score``.
+        steps: ``(M,)`` odometry steps that an odometry edge stands for.
+    """
+
+    source: NDArray[np.int64]
+    target: NDArray[np.int64]
+    translation: NDArray[np.float64]
+    is_odometry: NDArray[np.bool_]
+    outlier_score: NDArray[np.float64]
+    steps: NDArray[np.float64]
+
+    @property
+    def trust(self) -> NDArray[np.float64]:
+        """``(M,)``."""
+        return np.where(self.is_odometry, 1.0, 1.0 - self.outlier_score)
+
+    def usable(self) -> Translations:
+        """Those that say anything."""
+        used = np.isfinite(self.translation).all(axis=1) & (self.trust >= 0.5)
+        return Translations(**{each.name: getattr(self, each.name)[used] for each in fields(self)})
+
+
+def fit_positions(
+    world_from_body: NDArray[np.float64], edges: Translations, origin: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Positions that fit the translations best, closures weighted down the farther they are off.
+
+    A closure whose rotation is right may still be of another place that looks alike: corridors are parallel. So the
+    passes begin at what odometry alone says, the scale on which closures are judged is their own median residual, and
+    what is far off loses all weight (Geman & McClure 1985).
+
+    Args:
+        world_from_body: ``(N, 4)`` xyzw.
+        edges: between the nodes.
+        origin: ``(N, 3)`` metres; the first node of every component gets its own, 0 for NaN.
+
+    Returns:
+        ``(N, 3)`` metres; NaN for nodes on which there is no translation.
+    """
+    edges = edges.usable()
+    source, target, is_odometry = edges.source, edges.target, edges.is_odometry
+    steps = np.where(is_odometry, edges.steps, 1.0)
+    num_nodes = len(world_from_body)
+    component, roots = _components(num_nodes, source, target)
+    step = Rotation.from_quat(world_from_body[source]).apply(edges.translation) if len(source) else np.empty((0, 3))
+    length = np.linalg.norm(step, axis=1)
+    typical = _typical((length / steps)[is_odometry] if is_odometry.any() else length)
+    shortest = _SHORTEST_STEP * typical * steps
+    weight = np.where(is_odometry, typical / np.maximum(length, shortest), edges.trust / _CLOSURE_STEPS)
+
+    pattern = LaplacianPattern(num_nodes, source, target, roots)
+
+    def solve(share: NDArray[np.float64]) -> NDArray[np.float64]:
+        return pattern.factorize(weight * share).fit(step)
+
+    position = solve(np.where(is_odometry, 1.0, _NEXT_TO_NOTHING))
+    if not is_odometry.all():
+        for _ in range(_PASSES):
+            squared = ((position[target] - position[source] - step) ** 2).sum(axis=1)
+            variance = np.median(squared[~is_odometry]) / _MEDIAN_OF_SQUARED
+            share = 1 / (1 + squared / max(_SCALE_SIGMAS**2 * variance, np.finfo(float).tiny)) ** 2
+            position = solve(np.where(is_odometry, 1.0, np.maximum(share, _NEXT_TO_NOTHING)))
+    position += np.nan_to_num(origin[roots])[component]
+    touched = np.zeros(num_nodes, dtype=bool)
+    touched[source] = touched[target] = True
+    position[~touched] = np.nan
+    return position
+
+
+def _components(
+    num_nodes: int, source: NDArray[np.int64], target: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Component of every node, ``(N,)``, and the first node of every component, ``(C,)``."""
+    adjacency = coo_array((np.ones(len(source), dtype=bool), (source, target)), shape=(num_nodes, num_nodes))
+    _, component = connected_components(adjacency, directed=False)
+    _, roots = np.unique(component, return_index=True)
+    return component.astype(np.int64), roots.astype(np.int64)
+
+
+def _typical(length: NDArray[np.float64]) -> float:
+    """Median of the lengths that are not zero; 1 where all are."""
+    moving = length[length > 0]
+    return float(np.median(moving)) if len(moving) else 1.0

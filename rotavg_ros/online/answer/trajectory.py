@@ -1,0 +1,137 @@
+"""Positions along corrected orientations: from odometry's steps alone, and with closures that carry translations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.online.answer.answer import Answer
+from rotavg_ros.online.answer.positions import Translations, fit_positions
+from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS
+from rotavg_ros.online.odometry.track import OdometryTrack
+from rotavg_ros.view_graph import EdgeKind
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A robot's keyframes in order of time (K of them).
+
+    Attributes:
+        node: ``(K,)`` indices into the answer's keyframes.
+        stamp_ns, time_line: ``(K,)``; stamps ascend within a time line.
+        world_from_body: ``(K, 4)`` xyzw.
+        position: ``(K, 3)`` metres in the world, from odometry's steps and closures; NaN where nothing tells.
+        position_dead_reckoned: ``(K, 3)`` metres, from odometry's steps alone, from its first position on; NaN without.
+        odometry_world_from_body, odometry_position: ``(K, 4)`` xyzw and ``(K, 3)`` metres, odometry's own; NaN without.
+    """
+
+    node: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64]
+    time_line: NDArray[np.int32]
+    world_from_body: NDArray[np.float64]
+    position: NDArray[np.float64]
+    position_dead_reckoned: NDArray[np.float64]
+    odometry_world_from_body: NDArray[np.float64]
+    odometry_position: NDArray[np.float64]
+
+
+def corrected_trajectories(answer: Answer, tracks: Mapping[str, OdometryTrack]) -> dict[str, Trajectory]:
+    """Poses of every robot's keyframes that have a stamp.
+
+    Args:
+        answer: with N keyframes and M edges; where an odometry edge has no translation, the odometry's own stands in.
+        tracks: odometry by robot.
+
+    Returns:
+        by robot; those without such keyframes are left out.
+    """
+    nodes_of = {robot: nodes for robot in answer.robots if len(nodes := _nodes_by_time(answer, robot))}
+    count = len(answer.keyframe_id)
+    odometry = np.full((count, 4), np.nan), np.full((count, 3), np.nan)
+    chain = np.full(count, -1)
+    reckoned = np.full((count, 3), np.nan)
+    for robot, nodes in nodes_of.items():
+        track = tracks.get(robot)
+        if track is not None and track.latest is not None:
+            odometry[0][nodes], odometry[1][nodes], chain[nodes] = track.samples.poses_at(
+                answer.stamp_ns[nodes], answer.time_line[nodes]
+            )
+            reckoned[nodes] = dead_reckoning(
+                answer.world_from_body[nodes], odometry[0][nodes], odometry[1][nodes], chain[nodes]
+            )
+    is_odometry = answer.kind == EdgeKind.ODOMETRY
+    no_translation = np.isnan(answer.translation) & is_odometry[:, None]
+    edges = Translations(
+        answer.source,
+        answer.target,
+        np.where(no_translation, _odometry_steps(answer, *odometry, chain), answer.translation),
+        is_odometry,
+        np.where(answer.outlier, 1.0, answer.outlier_score),
+        answer.steps,
+    )
+    position = fit_positions(answer.world_from_body, edges, reckoned)
+    position = np.where(np.isnan(position), reckoned, position)
+    return {
+        robot: Trajectory(
+            nodes,
+            answer.stamp_ns[nodes],
+            answer.time_line[nodes],
+            answer.world_from_body[nodes],
+            position[nodes],
+            reckoned[nodes],
+            odometry[0][nodes],
+            odometry[1][nodes],
+        )
+        for robot, nodes in nodes_of.items()
+    }
+
+
+def _nodes_by_time(answer: Answer, robot: str) -> NDArray[np.int64]:
+    of_robot = answer.keyframe_robot == answer.robots.index(robot)
+    nodes = np.flatnonzero(of_robot & (answer.stamp_ns != UNKNOWN_STAMP_NS))
+    return nodes[np.lexsort((answer.stamp_ns[nodes], answer.time_line[nodes]))]
+
+
+def _odometry_steps(
+    answer: Answer, world_from_body: NDArray[np.float64], position: NDArray[np.float64], chain: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """``(M, 3)`` where odometry has the target in the source's frame; NaN between robots, chains, and without it."""
+    source, target = answer.source, answer.target
+    robot = answer.keyframe_robot
+    known = (robot[source] == robot[target]) & (chain[source] == chain[target]) & (chain[source] >= 0)
+    step = np.full((len(source), 3), np.nan)
+    source, target = source[known], target[known]
+    if len(source):
+        step[known] = Rotation.from_quat(world_from_body[source]).inv().apply(position[target] - position[source])
+    return step
+
+
+def dead_reckoning(
+    world_from_body: NDArray[np.float64],
+    odometry_world_from_body: NDArray[np.float64],
+    odometry_position: NDArray[np.float64],
+    chain: NDArray[np.int32] | None = None,
+) -> NDArray[np.float64]:
+    """Odometry's steps, seen from the body, laid along other orientations.
+
+    Args:
+        world_from_body: ``(K, 4)`` xyzw, the orientations to use.
+        odometry_world_from_body: ``(K, 4)`` xyzw, odometry's own.
+        odometry_position: ``(K, 3)`` metres in odometry's frame.
+        chain: ``(K,)`` number of the odometry chain; from one to the next the step is unknown and counts as none.
+
+    Returns:
+        ``(K, 3)`` metres; the first position is odometry's.
+    """
+    if len(odometry_position) < 2:
+        return odometry_position
+    world_from_odometry = Rotation.from_quat(world_from_body) * Rotation.from_quat(odometry_world_from_body).inv()
+    steps = world_from_odometry[:-1].apply(np.diff(odometry_position, axis=0))
+    if chain is not None:
+        steps[np.diff(chain) != 0] = 0.0
+    position: NDArray[np.float64] = np.cumsum(np.vstack((odometry_position[:1], steps)), axis=0)
+    return position

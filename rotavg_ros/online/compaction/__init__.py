@@ -1,0 +1,1 @@
+"""What a full graph does without."""

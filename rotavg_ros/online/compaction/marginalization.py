@@ -1,0 +1,261 @@
+"""Taking keyframes out of a pose graph without changing what it says of the others.
+
+A keyframe v between two odometry edges u → v → x and without a loop closure can be integrated out: rotations are
+composed, ``R_xu = R_xv R_vu``, variances are added. That is what :mod:`rotavg_ros.solver.slam.graph.closure_graph` does
+for every solve anyway, so the solution at all other keyframes stays what it was. Long runs of such keyframes vanish in
+a few vectorised rounds, each of which takes an independent set out of what is left (Luby 1986).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rotavg_ros import rotations
+from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedKeyframes
+from rotavg_ros.online.measurements import OWN_EDGE_ID
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel
+
+Columns = dict[str, NDArray[Any]]
+"""Of the graph's edges, by name: those of :class:`~rotavg_ros.view_graph.ViewGraph`, edge_id and translation."""
+
+
+def is_plain_odometry(edges: Columns) -> NDArray[np.bool_]:
+    """Odometry edges that nobody has labelled, ``(M,)``: these can be drawn together."""
+    return np.asarray((edges["kind"] == EdgeKind.ODOMETRY) & (edges["label"] == EdgeLabel.AUTOMATIC))
+
+
+def can_be_marginalized(num_nodes: int, edges: Columns) -> NDArray[np.bool_]:
+    """Nodes between exactly two plain odometry edges to different nodes and without any other edge, ``(N,)``."""
+    plain = is_plain_odometry(edges)
+    source, target = edges["source"], edges["target"]
+    both = np.concatenate((source[plain], target[plain]))
+    opposite = np.concatenate((target[plain], source[plain])).astype(np.float64)
+    degree = np.bincount(both, minlength=num_nodes)
+    total = np.bincount(both, opposite, num_nodes)
+    # Exact in float64: two equal neighbours n have 2 n² for the sum of squares of n + n.
+    squares = np.bincount(both, opposite**2, num_nodes)
+    free = (degree == 2) & (2 * squares != total**2)
+    free[source[~plain]] = free[target[~plain]] = False
+    return np.asarray(free)
+
+
+@dataclass(frozen=True)
+class Contraction:
+    """What became of a graph's N nodes and M edges (N', M' afterwards).
+
+    Attributes:
+        kept: ``(N',)`` the nodes that are left, ascending.
+        edges: the edges that are left; ends are new nodes.
+        last: ``(M',)`` ascending, the last of the edges that each consists of.
+        edge_of: ``(M,)`` which edge each has gone into.
+        marginalized: those there were, then the new ones.
+    """
+
+    kept: NDArray[np.int64]
+    edges: Columns
+    last: NDArray[np.int64]
+    edge_of: NDArray[np.int64]
+    marginalized: MarginalizedKeyframes
+
+
+def marginalize(
+    keyframes: Columns, edges: Columns, remove: NDArray[np.bool_], marginalized: MarginalizedKeyframes
+) -> Contraction:
+    """Take the nodes of a mask ``(N,)`` out, each of which :func:`can_be_marginalized`.
+
+    Where only a pair of nodes would be left of a cycle of odometry, one node in it stays.
+
+    Args:
+        keyframes: robot, keyframe_id, stamp_ns, time_line.
+        edges: see :data:`Columns`.
+        remove: ``(N,)``.
+        marginalized: those there are; their edges are renumbered, their poses kept.
+    """
+    work = _Work.begin(keyframes, edges, remove, marginalized)
+    while work.round():
+        pass
+    return work.result()
+
+
+@dataclass
+class _Work:
+    """A contraction under way; edges keep their rows until the end, merged ones live on in the later row."""
+
+    edges: Columns
+    riders: Columns
+    row_of_node: NDArray[np.int64]
+    remove: NDArray[np.bool_]
+    incident: NDArray[np.int64]
+    merged_into: NDArray[np.int64]
+    waiting: NDArray[np.int64]
+    rank: NDArray[np.int64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.rank = np.random.default_rng(0).permutation(len(self.remove))
+
+    @classmethod
+    def begin(
+        cls, keyframes: Columns, edges: Columns, remove: NDArray[np.bool_], marginalized: MarginalizedKeyframes
+    ) -> _Work:
+        nodes = np.flatnonzero(remove)
+        new = MarginalizedKeyframes(
+            keyframes["robot"][nodes],
+            keyframes["keyframe_id"][nodes],
+            keyframes["stamp_ns"][nodes],
+            keyframes["time_line"][nodes],
+            np.full(len(nodes), -1),
+            np.empty((len(nodes), 4)),
+            np.empty((len(nodes), 3)),
+            np.empty(len(nodes)),
+        )
+        row_of_node = np.full(len(remove), -1)
+        row_of_node[nodes] = len(marginalized) + np.arange(len(nodes))
+        num_edges = len(edges["source"])
+        both = np.concatenate((edges["source"], edges["target"]))
+        half_edges = np.flatnonzero(remove[both])
+        half_edges = half_edges[np.argsort(both[half_edges], kind="stable")]
+        incident = np.full((len(remove), 2), -1)
+        incident[nodes] = half_edges.reshape(-1, 2) % max(num_edges, 1)
+        return cls(
+            {name: values.copy() for name, values in edges.items()},
+            marginalized.followed_by(new).arrays(),
+            row_of_node,
+            remove.copy(),
+            incident,
+            np.arange(num_edges),
+            nodes,
+        )
+
+    def round(self) -> bool:
+        """Take an independent set of the waiting nodes out; whether any are left."""
+        nodes = self.waiting
+        if len(nodes) == 0:
+            return False
+        pair = self.incident[nodes]
+        ends = self.edges["source"][pair] + self.edges["target"][pair] - nodes[:, None]
+        is_cycle = ends[:, 0] == ends[:, 1]
+        self.remove[nodes[is_cycle]] = False
+        waits = np.zeros(len(self.remove), dtype=bool)
+        waits[nodes[~is_cycle]] = True
+        first_comes = waits[ends] & (self.rank[ends] < self.rank[nodes][:, None])
+        chosen = ~is_cycle & ~first_comes.any(axis=1)
+        backwards = ends[:, 0] > ends[:, 1]
+        pair[backwards] = pair[backwards, ::-1]
+        ends[backwards] = ends[backwards, ::-1]
+        self._merge(nodes[chosen], pair[chosen], ends[chosen])
+        self.waiting = nodes[~chosen & ~is_cycle]
+        self.incident[self.waiting] = self.merged_into[self.incident[self.waiting]]
+        return True
+
+    def _merge(self, nodes: NDArray[np.int64], pair: NDArray[np.int64], ends: NDArray[np.int64]) -> None:
+        """Draw the edges u – v – x of each node v, ``pair`` and ``ends`` ``(n, 2)``, together to u → x."""
+        edges = self.edges
+        before, after = pair.T
+        before_forwards, after_forwards = edges["target"][before] == nodes, edges["source"][after] == nodes
+        v_from_u, v_in_u = _directed(edges, before, before_forwards)
+        x_from_v, x_in_v = _directed(edges, after, after_forwards)
+        x_from_u, x_in_u = rotations.multiply(x_from_v, v_from_u), _place(v_from_u, v_in_u, x_in_v)
+        steps_before, steps = edges["steps"][before], edges["steps"][pair].sum(axis=1)
+
+        # What rides on an edge is told from that edge's source: u or v, v or x.
+        zero, still = torch.zeros_like(v_in_u), rotations.identity(len(nodes))
+        frames = (
+            (before, before_forwards, (still, zero, 0 * steps), (v_from_u, v_in_u, steps_before)),
+            (after, after_forwards, (v_from_u, v_in_u, steps_before), (x_from_u, x_in_u, steps)),
+        )
+        survivor = pair.max(axis=1)
+        moved = []
+        for edge, forwards, source_is_nearer, source_is_farther in frames:
+            riders, place = self._riders_on(edge)
+            onwards = torch.from_numpy(forwards[place])[:, None]
+            turn, origin = (
+                torch.where(onwards, near[place], far[place])
+                for near, far in zip(source_is_nearer[:2], source_is_farther[:2], strict=True)
+            )
+            sign = np.where(forwards[place], 1.0, -1.0)
+            base = np.where(forwards[place], source_is_nearer[2][place], source_is_farther[2][place])
+            moved.append(
+                (
+                    riders,
+                    survivor[place],
+                    rotations.multiply(torch.from_numpy(self.riders["keyframe_from_source"][riders]), turn),
+                    _place(turn, origin, torch.from_numpy(self.riders["position"][riders])),
+                    base + sign * self.riders["steps"][riders],
+                )
+            )
+        for columns in moved:
+            self._write_riders(*columns)
+        self._write_riders(self.row_of_node[nodes], survivor, v_from_u, v_in_u, steps_before)
+
+        with np.errstate(divide="ignore"):
+            precision = 1 / (1 / edges["precision"][pair]).sum(axis=1)
+        self.merged_into[pair.min(axis=1)] = survivor
+        values = {
+            "source": ends[:, 0],
+            "target": ends[:, 1],
+            "target_from_source": rotations.normalize(x_from_u).numpy(),
+            "translation": x_in_u.numpy(),
+            "precision": precision,
+            "steps": steps,
+            "edge_id": np.uint64(OWN_EDGE_ID),
+        }
+        for name, value in values.items():
+            edges[name][survivor] = value
+
+    def _riders_on(self, edges: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows of the keyframes on some edges, and the places of their edges among these."""
+        place_of_edge = np.full(len(self.merged_into), -1)
+        place_of_edge[edges] = np.arange(len(edges))
+        on_edge = self.riders["edge"]
+        riders = np.flatnonzero((on_edge >= 0) & (place_of_edge[on_edge] >= 0))
+        return riders, place_of_edge[on_edge[riders]]
+
+    def _write_riders(
+        self,
+        rows: NDArray[np.int64],
+        edge: NDArray[np.int64],
+        keyframe_from_source: torch.Tensor,
+        position: torch.Tensor,
+        steps: NDArray[np.float64],
+    ) -> None:
+        riders = self.riders
+        riders["edge"][rows], riders["steps"][rows] = edge, steps
+        riders["keyframe_from_source"][rows] = rotations.normalize(keyframe_from_source).numpy()
+        riders["position"][rows] = position.numpy()
+
+    def result(self) -> Contraction:
+        kept, last = np.flatnonzero(~self.remove), np.flatnonzero(self.merged_into == np.arange(len(self.merged_into)))
+        edge_of = self.merged_into
+        while not np.array_equal(farther := edge_of[edge_of], edge_of):
+            edge_of = farther
+        new_edge = np.cumsum(self.merged_into == np.arange(len(edge_of))) - 1
+        new_node = np.cumsum(~self.remove) - 1
+        edges = {name: values[last] for name, values in self.edges.items()}
+        edges["source"], edges["target"] = new_node[edges["source"]], new_node[edges["target"]]
+        riders = MarginalizedKeyframes(**self.riders)
+        riders = riders.select(riders.edge >= 0)
+        riders.edge[:] = new_edge[edge_of[riders.edge]]
+        return Contraction(kept, edges, last, new_edge[edge_of], riders)
+
+
+def _directed(
+    edges: Columns, chosen: NDArray[np.int64], forwards: NDArray[np.bool_]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rotation and translation of edges, turned round where they do not run forwards."""
+    rotation = torch.from_numpy(edges["target_from_source"][chosen])
+    translation = torch.from_numpy(edges["translation"][chosen])
+    onwards = torch.from_numpy(forwards)[:, None]
+    return (
+        torch.where(onwards, rotation, rotations.inverse(rotation)),
+        torch.where(onwards, translation, -rotations.rotate(rotation, translation)),
+    )
+
+
+def _place(frame_from_world: torch.Tensor, origin: torch.Tensor, position: torch.Tensor) -> torch.Tensor:
+    """World coordinates of positions in frames at ``origin``."""
+    return origin + rotations.rotate(rotations.inverse(frame_from_world), position)

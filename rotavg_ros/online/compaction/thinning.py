@@ -1,0 +1,192 @@
+"""Which keyframes and loop closures a full graph can best do without.
+
+Everything is thinned evenly over the way the robot has gone, in dyadic steps: of the keyframes (and then of the
+closures) within 2, 4, 8 … odometry steps of each other one stays, the older ones first. So however long it drives, what
+is left covers all of its way, and a closure to anywhere finds a keyframe near by.
+
+1. Keyframes that no closure touches: taking them out changes nothing
+   (:mod:`~rotavg_ros.online.compaction.marginalization`).
+2. Only when these do not suffice, closures: first those judged false, then those that are not the best (the newest that
+   is not false) on either of the two stretches of the way that they join, and those that span hardly more than a
+   stretch; stretches double until enough is free. So every stretch that has closures keeps one.
+
+Closures without which the graph would fall apart, and those a user has accepted, stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
+
+from rotavg_ros.online.compaction.marginalization import Columns, can_be_marginalized
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel
+
+
+@dataclass(frozen=True)
+class Way:
+    """Where the N nodes lie along the odometry.
+
+    Attributes:
+        chain: ``(N,)`` number of the odometry chain.
+        position: ``(N,)`` odometry steps from the chain's first node; taking nodes out does not change it.
+        first: ``(C,)`` first node of each chain.
+    """
+
+    chain: NDArray[np.int64]
+    position: NDArray[np.float64]
+    first: NDArray[np.int64]
+
+    @classmethod
+    def along(cls, num_nodes: int, edges: Columns) -> Way:
+        odometry = edges["kind"] == EdgeKind.ODOMETRY
+        ends = edges["source"][odometry], edges["target"][odometry]
+        # Of parallel edges the shortest counts; a sparse matrix would add them up.
+        low, high, steps = np.minimum(*ends), np.maximum(*ends), edges["steps"][odometry]
+        order = np.lexsort((steps, high, low))
+        low, high, steps = low[order], high[order], steps[order]
+        new = np.ones(len(low), dtype=bool)
+        new[1:] = (np.diff(low) != 0) | (np.diff(high) != 0)
+        adjacency = csr_array(coo_array((steps[new], (low[new], high[new])), shape=(num_nodes, num_nodes)))
+        _, label = connected_components(adjacency, directed=False)
+        _, first, chain = np.unique(label, return_index=True, return_inverse=True)
+        distance = dijkstra(adjacency, directed=False, indices=first, min_only=True)
+        return cls(chain, np.asarray(distance), first)
+
+    @property
+    def length(self) -> float:
+        """Of the longest chain, steps."""
+        return float(self.position.max(initial=0.0))
+
+
+@dataclass(frozen=True)
+class Thinning:
+    """What to do without.
+
+    Attributes:
+        nodes: ``(N,)`` bool; they can be marginalised once the edges are gone.
+        edges: ``(M,)`` bool.
+    """
+
+    nodes: NDArray[np.bool_]
+    edges: NDArray[np.bool_]
+
+
+def thin(
+    num_nodes: int,
+    edges: Columns,
+    is_false: NDArray[np.bool_],
+    protected: NDArray[np.bool_],
+    surplus_nodes: int,
+    surplus_edges: int,
+) -> Thinning:
+    """Choose what goes; less than asked for where nothing else can be spared.
+
+    Args:
+        num_nodes: N.
+        edges: of the graph, see :data:`~rotavg_ros.online.marginalization.Columns`.
+        is_false: ``(M,)`` edges that were judged outliers.
+        protected: ``(N,)`` nodes that must stay; the first of every chain does in any case.
+        surplus_nodes, surplus_edges: how many have to go.
+    """
+    way = Way.along(num_nodes, edges)
+    stays = protected.copy()
+    stays[way.first] = True
+    dropped = np.zeros(len(edges["source"]), dtype=bool)
+
+    def free() -> NDArray[np.bool_]:
+        left = {name: edges[name][~dropped] for name in ("source", "target", "kind", "label")}
+        return np.asarray(can_be_marginalized(num_nodes, left) & ~stays)
+
+    def lacking() -> bool:
+        nodes = int(free().sum())
+        return nodes < surplus_nodes or min(nodes, surplus_nodes) + int(dropped.sum()) < surplus_edges
+
+    if lacking():
+        for spared in _sparable_closures(way, edges, is_false, stays):
+            spared = spared[~dropped[spared]]
+            dropped[spared] = True
+            if not lacking():
+                # No more than needed, and the oldest.
+                enough, count = len(spared), 0
+                while enough - count > 1:
+                    middle = (enough + count) // 2
+                    dropped[spared] = np.arange(len(spared)) < middle
+                    enough, count = (enough, middle) if lacking() else (middle, count)
+                dropped[spared] = np.arange(len(spared)) < enough
+                break
+    return Thinning(_evenly(way, free(), surplus_nodes), dropped)
+
+
+def _evenly(way: Way, free: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
+    """``count`` of the free nodes ``(N,)``, so that what stays is as even as can be; all of them if there are fewer."""
+    if free.sum() <= count:
+        return free
+    less, width = np.zeros_like(free), 2.0
+    while True:
+        stretch = np.floor_divide(way.position, width)
+        # Nodes that stay anyway come first of their stretch and stand for it.
+        order = np.lexsort((free, stretch, way.chain))
+        first = np.ones(len(order), dtype=bool)
+        first[1:] = (np.diff(way.chain[order]) != 0) | (np.diff(stretch[order]) != 0)
+        more = free.copy()
+        more[order[first]] = False
+        if width > way.length:
+            more = free
+        if more.sum() >= count:
+            added = np.flatnonzero(more & ~less)[: count - int(less.sum())]
+            less[added] = True
+            return less
+        less, width = more, 2 * width
+
+
+def _sparable_closures(
+    way: Way, edges: Columns, is_false: NDArray[np.bool_], stays: NDArray[np.bool_]
+) -> Iterator[NDArray[np.int64]]:
+    """Closures in the order in which they go: arrays of edge indices, ascending, that may repeat what went before."""
+    source, target = edges["source"], edges["target"]
+    false = is_false | (edges["label"] == EdgeLabel.REJECTED)
+    may_go = (edges["kind"] == EdgeKind.LOOP_CLOSURE) & (edges["label"] != EdgeLabel.ACCEPTED)
+    may_go &= ~(stays[source] & stays[target])
+    may_go[_bridges(way, edges, false)] = False
+    yield np.flatnonzero(may_go & false)
+
+    closure = np.flatnonzero(edges["kind"] == EdgeKind.LOOP_CLOSURE)
+    ends = np.stack((source[closure], target[closure]), axis=1)
+    ends.sort(axis=1)
+    chain, position = way.chain[ends], way.position[ends]
+    span = np.where(chain[:, 0] == chain[:, 1], np.abs(position[:, 0] - position[:, 1]), np.inf)
+    # The best first: what has to stay, then what is not false, then the newest.
+    rank = np.empty(len(closure), dtype=np.int64)
+    rank[np.lexsort((-closure, false[closure], may_go[closure]))] = np.arange(len(closure))
+    width = 1.0
+    while width < 4 * way.length + 4:
+        stretches = np.stack((chain, np.floor_divide(position, width)), axis=-1).reshape(-1, 2)
+        stretch = np.unique(stretches, axis=0, return_inverse=True)[1].reshape(-1, 2)
+        best = np.full(stretch.max(initial=-1) + 1, len(closure))
+        np.minimum.at(best, stretch, rank[:, None])
+        redundant = (best[stretch] != rank[:, None]).all(axis=1) | (span <= width)
+        yield closure[redundant & may_go[closure]]
+        width *= 2
+
+
+def _bridges(way: Way, edges: Columns, false: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Edges of a spanning forest over the odometry chains, of those that are not false where there are any."""
+    ends = np.stack((way.chain[edges["source"]], way.chain[edges["target"]]), axis=1)
+    ends.sort(axis=1)
+    between = np.flatnonzero(ends[:, 0] != ends[:, 1])
+    low, high = ends[between].T
+    order = np.lexsort((false[between], high, low))
+    low, high, between = low[order], high[order], between[order]
+    new = np.ones(len(low), dtype=bool)
+    new[1:] = (np.diff(low) != 0) | (np.diff(high) != 0)
+    low, high, between = low[new], high[new], between[new]
+    shape = (len(way.first), len(way.first))
+    tree = minimum_spanning_tree(csr_array(coo_array((1.0 + false[between], (low, high)), shape=shape))).tocoo()
+    # Row by row and ascending, as `low` and `high` are.
+    place = np.searchsorted(low * len(way.first) + high, tree.row.astype(np.int64) * len(way.first) + tree.col)
+    return np.asarray(between[place])

@@ -1,0 +1,1 @@
+"""The graph as it grows: keyframes, edges, and what waits."""

@@ -1,0 +1,151 @@
+"""From messages to a graph: keyframes from odometry, edges tied to keyframes, everything unusable counted."""
+
+from __future__ import annotations
+
+from rotavg_ros.online import quaternion
+from rotavg_ros.online.graph.edge_placement import EdgePlacement
+from rotavg_ros.online.graph.growing_view_graph import GrowingViewGraph
+from rotavg_ros.online.graph.growth import Growth
+from rotavg_ros.online.graph.snapshot import GraphEdge
+from rotavg_ros.online.measurements import EdgeMeasurement, OdometryMessage, RejectedInputError, RejectReason
+from rotavg_ros.online.odometry.time_jumps import KEEPS_TIME_LINE
+from rotavg_ros.online.odometry.track import OdometryTrack
+from rotavg_ros.online.options import EstimatorOptions
+from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, difference
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel
+
+
+class GraphBuilder:
+    """Grows a graph from odometry and edges. Not thread-safe.
+
+    The graph depends on the messages of each robot's odometry in their order and on the set of edges, not on how
+    they were interleaved: an edge by stamp waits until the odometry has come as far, and is then tied to the
+    keyframe at or before the stamp, with the odometry's rotation in between taken out. Only where a robot's clock
+    goes back does it matter what comes first, for then a stamp means the time line that has just begun.
+
+    Attributes:
+        growth: what it has come to so far.
+    """
+
+    def __init__(self, growth: Growth) -> None:
+        self.growth = growth
+        self._edges = EdgePlacement(growth)
+        self._policy = growth.options.keyframe_policy
+
+    @property
+    def options(self) -> EstimatorOptions:
+        return self.growth.options
+
+    @property
+    def graph(self) -> GrowingViewGraph:
+        return self.growth.graph
+
+    @property
+    def tracks(self) -> dict[str, OdometryTrack]:
+        return self.growth.tracks
+
+    def set_options(self, options: EstimatorOptions) -> None:
+        """Change what applies to inputs from now on: keyframe thresholds, tolerances, gaps."""
+        self.growth.options = options
+        self._policy = options.keyframe_policy
+        for track in self.tracks.values():
+            track.set_limits(options.odometry_bounds, options.continuity_limits)
+        self.growth.room.try_again()
+
+    def add_odometry(self, message: OdometryMessage) -> tuple[RejectReason | None, list[OdometryMessage]]:
+        """Take an odometry message.
+
+        Returns:
+            why it was refused and counted, None if it was taken; and the robot's messages since its clock went back,
+            if this one shows that it has.
+        """
+        robot, growth = message.robot, self.growth
+        track = self.tracks.get(robot)
+        if track is None:
+            track = OdometryTrack(self.options.odometry_bounds, self.options.continuity_limits)
+        try:
+            track.add(message.stamp_ns, message.world_from_body, message.position)
+        except RejectedInputError as rejection:
+            is_late = rejection.reason is RejectReason.OUT_OF_ORDER_ODOMETRY
+            return growth.refuse(rejection.reason), self._late(message, track) if is_late else []
+        self.tracks[robot] = track
+        growth.backward_jumps.on_time(robot)
+        chooses = self.options.keyframe_source == "odometry"
+        if chooses and track.reached(self._policy) and growth.has_room_for_keyframe():
+            self._add_keyframe(robot, track)
+        self._edges.place_all(growth.pending.pop_until(robot, message.stamp_ns))
+        growth.advance_data_time(message.stamp_ns)
+        self._edges.decide(robot)
+        return None, []
+
+    def _late(self, message: OdometryMessage, track: OdometryTrack) -> list[OdometryMessage]:
+        """Note a message that is out of order; returns those since the robot's clock went back, if that is clear."""
+        assert track.latest is not None
+        options, jumps = self.options, self.growth.backward_jumps
+        step_ns = options.odometry_bounds.max_gap_ns
+        since_jump = jumps.late(message, track.latest.stamp_ns, options.time_jump_ns, step_ns)
+        if not since_jump or options.on_time_jump in KEEPS_TIME_LINE:
+            self._edges.decide(message.robot)
+        return since_jump
+
+    def begin_time_line(self, robot: str, num_late: int = 0) -> None:
+        """The robot's clock went back: stamps from now on are of a new time line, and its odometry of a new chain.
+
+        Args:
+            robot: with odometry.
+            num_late: messages that were refused as out of order and will be taken again now.
+        """
+        growth = self.growth
+        self._edges.end_time_line(robot)
+        self.tracks[robot].begin_time_line()
+        growth.refuse(RejectReason.OUT_OF_ORDER_ODOMETRY, -num_late)
+        going_on = [track.latest for track in self.tracks.values() if not track.begins_time_line]
+        growth.data_time.go_back(max((latest.stamp_ns for latest in going_on if latest is not None), default=None))
+        growth.pending.restart_timeouts()
+
+    def clock_went_back(self, now_ns: int) -> bool:
+        """The clock that stamps the data went back: a new time line for every robot whose odometry is ahead of it.
+
+        Returns:
+            whether there was one.
+        """
+        ahead = [
+            robot
+            for robot, track in self.tracks.items()
+            if track.latest is not None
+            and track.latest.stamp_ns - now_ns > self.options.time_jump_ns
+            and not track.begins_time_line
+        ]
+        for robot in ahead:
+            self.begin_time_line(robot)
+        return bool(ahead)
+
+    def add_edge(self, edge: EdgeMeasurement) -> RejectReason | None:
+        """Take an edge into the graph or into the waiting room; returns why it was refused, if it was."""
+        return self._edges.add(edge)
+
+    def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
+        """Label all edges a sender gave this id, waiting ones and later repetitions included; returns how many."""
+        return self._edges.label(source_robot, edge_id, label)
+
+    def settle(self) -> None:
+        """No more input is expected for now: tie edges just ahead of the odometry to its end."""
+        for robot in self.tracks:
+            self._edges.settle(robot)
+
+    def _add_keyframe(self, robot: str, track: OdometryTrack) -> None:
+        """Make the latest odometry message a keyframe, with an edge from the one before on the same chain."""
+        assert track.latest is not None
+        keyframe_id, previous, latest = track.num_keyframes, track.last_keyframe, track.latest
+        node = self.graph.add_keyframe(robot, keyframe_id, latest.stamp_ns, track.time_line)
+        if previous is not None:
+            source = self.graph.node(robot, keyframe_id - 1)
+            assert source is not None
+            turn = quaternion.multiply(quaternion.inverse(latest.world_from_body), previous.world_from_body)
+            step = difference(latest.position or UNKNOWN_VECTOR, previous.position or UNKNOWN_VECTOR)
+            translation = quaternion.rotate(quaternion.inverse(previous.world_from_body), step)
+            self.graph.add_edge(
+                GraphEdge(source, node, quaternion.normalize(turn), EdgeKind.ODOMETRY, translation=translation)
+            )
+        track.mark_keyframe()
+        self._edges.place_all(self.growth.pending.pop_keyframe(robot, keyframe_id))

@@ -1,0 +1,162 @@
+"""Edges into the graph: refused, tied to keyframes, or left to wait for what they refer to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+from rotavg_ros.online.graph.attachment import attach, between_keyframes
+from rotavg_ros.online.graph.growth import Growth
+from rotavg_ros.online.graph.snapshot import GraphEdge
+from rotavg_ros.online.measurements import (
+    OWN_EDGE_ID,
+    UNKNOWN_STAMP_NS,
+    EdgeMeasurement,
+    KeyframeReference,
+    RejectedInputError,
+    RejectReason,
+    check_edge,
+)
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel
+
+
+class EdgePlacement:
+    """Places edges in a growing graph. Not thread-safe."""
+
+    def __init__(self, growth: Growth) -> None:
+        self._growth = growth
+
+    def add(self, edge: EdgeMeasurement) -> RejectReason | None:
+        """Take an edge into the graph or into the waiting room; returns why it was refused, if it was."""
+        growth = self._growth
+        try:
+            edge = replace(edge, target_from_source=check_edge(edge))
+            undecided = self._undecided_end(edge)
+            is_known = undecided is None and self._fingerprint(edge) in growth.fingerprints
+            if is_known or edge.fingerprint() in growth.pending.fingerprints:
+                raise RejectedInputError(RejectReason.DUPLICATE_EDGE)
+            if not growth.has_room_for_edge():
+                raise RejectedInputError(RejectReason.GRAPH_FULL)
+            if undecided is not None:
+                self._let_wait(edge, undecided, is_undecided=True)
+            else:
+                self._create_keyframes(edge)
+                self._place(edge)
+        except RejectedInputError as rejection:
+            return growth.refuse(rejection.reason)
+        return None
+
+    def place_all(self, edges: Iterable[EdgeMeasurement], settle: bool = False) -> None:
+        """Take edges that have waited.
+
+        Args:
+            edges: checked before.
+            settle: odometry's end stands for moments shortly after it.
+        """
+        for edge in edges:
+            try:
+                self._place(edge, settle)
+            except RejectedInputError as rejection:
+                self._growth.refuse(rejection.reason)
+
+    def decide(self, robot: str) -> None:
+        """Take the edges that waited to know which time line a robot is on, if that is known now."""
+        if not self._growth.is_undecided(robot):
+            for edge in self._growth.pending.pop_undecided(robot):
+                self.add(edge)
+
+    def end_time_line(self, robot: str) -> None:
+        """No more odometry comes on a robot's time line: tie edges just ahead of its end to it, refuse the others."""
+        growth = self._growth
+        self.settle(robot)
+        growth.refuse(RejectReason.STAMP_OUT_OF_RANGE, len(growth.pending.pop_of_time_line(robot)))
+
+    def settle(self, robot: str) -> None:
+        """No more odometry is expected for now: tie edges just ahead of its end to it."""
+        growth, track = self._growth, self._growth.tracks[robot]
+        if track.latest is not None and not track.begins_time_line:
+            horizon_ns = track.latest.stamp_ns + growth.options.odometry_bounds.tolerance_ns
+            self.place_all(growth.pending.pop_until(robot, horizon_ns), settle=True)
+
+    def label(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
+        """Label all edges a sender gave this id, waiting ones and later repetitions included; returns how many."""
+        growth = self._growth
+        waiting = sum(edge.edge_id == edge_id and edge.source.robot == source_robot for edge in growth.pending)
+        labelled = growth.graph.label_edges(source_robot, edge_id, label) if edge_id != OWN_EDGE_ID else 0
+        if labelled + waiting:
+            growth.labels[source_robot, edge_id] = label
+        return labelled + waiting
+
+    def _undecided_end(self, edge: EdgeMeasurement) -> KeyframeReference | None:
+        """The first end whose stamp matters and may be of one of two time lines."""
+        growth = self._growth
+        for end in (edge.source, edge.target):
+            if end.stamp_ns is not None and growth.is_undecided(end.robot):
+                is_known = end.keyframe_id is not None and growth.graph.node(end.robot, end.keyframe_id) is not None
+                if not is_known:
+                    return end
+        return None
+
+    def _fingerprint(self, edge: EdgeMeasurement) -> int:
+        """Of an edge to moments on their time lines: a looped bag states the same stamps, but of other keyframes."""
+        source, target = (
+            0 if end.keyframe_id is not None else self._growth.time_line_of(end.robot, end.stamp_ns)
+            for end in (edge.source, edge.target)
+        )
+        return edge.fingerprint((source, target))
+
+    def _create_keyframes(self, edge: EdgeMeasurement) -> None:
+        """Make the keyframes that the edge names, where edges may do so."""
+        growth = self._growth
+        chosen_by_front_end = growth.options.keyframe_source == "edges" and edge.kind == EdgeKind.ODOMETRY
+        for end in (edge.source, edge.target):
+            stamp_ns = UNKNOWN_STAMP_NS if end.stamp_ns is None else end.stamp_ns
+            if end.keyframe_id is not None and (chosen_by_front_end or growth.options.unknown_keyframes == "create"):
+                keyframe_id = end.keyframe_id
+            elif end.keyframe_id is None and chosen_by_front_end:
+                keyframe_id = stamp_ns
+            else:
+                continue
+            is_new = growth.graph.node(end.robot, keyframe_id) is None
+            if is_new and (growth.graph.was_marginalized(end.robot, keyframe_id) or not growth.has_room_for_keyframe()):
+                continue
+            growth.graph.add_keyframe(end.robot, keyframe_id, stamp_ns, growth.time_line_of(end.robot, end.stamp_ns))
+            self.place_all(growth.pending.pop_keyframe(end.robot, keyframe_id))
+        if chosen_by_front_end:
+            growth.advance_data_time(max(end.stamp_ns or 0 for end in (edge.source, edge.target)))
+
+    def _place(self, edge: EdgeMeasurement, settle: bool = False) -> None:
+        """Put an edge into the graph, or let it wait for its first end that is not there yet."""
+        growth = self._growth
+        ends = []
+        for reference in (edge.source, edge.target):
+            attachment = attach(reference, growth.graph, growth.tracks.get(reference.robot), settle)
+            if attachment is None:
+                self._let_wait(edge, reference)
+                return
+            ends.append(attachment)
+        source, target = ends
+        if edge.kind == EdgeKind.ODOMETRY and not (source.at_keyframe and target.at_keyframe):
+            raise RejectedInputError(RejectReason.MARGINALIZED_KEYFRAME)  # the graph has this odometry already
+        if source.node == target.node:
+            raise RejectedInputError(RejectReason.SELF_EDGE)
+        target_from_source, translation = between_keyframes(edge, source, target)
+        growth.graph.add_edge(
+            GraphEdge(
+                source.node,
+                target.node,
+                target_from_source,
+                edge.kind,
+                edge_id=edge.edge_id,
+                precision=edge.precision or math.nan,
+                label=growth.labels.get((edge.source.robot, edge.edge_id), EdgeLabel.AUTOMATIC),
+                translation=translation,
+            )
+        )
+        growth.fingerprints.add(self._fingerprint(edge))
+
+    def _let_wait(self, edge: EdgeMeasurement, waits_for: KeyframeReference, is_undecided: bool = False) -> None:
+        growth = self._growth
+        if growth.pending.add(edge, waits_for, growth.data_time.now_ns, is_undecided) is not None:
+            growth.refuse(RejectReason.PENDING_OVERFLOW)

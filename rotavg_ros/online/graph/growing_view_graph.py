@@ -1,0 +1,284 @@
+"""A view-graph that grows by appending; when it is compacted, some keyframes and edges go and the others move up."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rotavg_ros.online.compaction.marginalization import Columns, marginalize
+from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedIndex, MarginalizedKeyframes
+from rotavg_ros.online.compaction.renumbering import Renumbering
+from rotavg_ros.online.compaction.thinning import thin
+from rotavg_ros.online.graph.keyframe_index import KeyframeIndex
+from rotavg_ros.online.graph.snapshot import GraphEdge, GraphSnapshot
+from rotavg_ros.online.growing_array import GrowingArray
+from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS
+from rotavg_ros.online.quaternion import Quaternion, Vector
+from rotavg_ros.view_graph import ViewGraph
+
+_KEYFRAME_COLUMNS = {"robot": np.int32, "keyframe_id": np.uint64, "stamp_ns": np.int64, "time_line": np.int32}
+_EDGE_COLUMNS = {
+    "edge_id": (np.uint64, None),
+    "source": (np.int64, None),
+    "target": (np.int64, None),
+    "target_from_source": (np.float64, 4),
+    "kind": (np.int64, None),
+    "precision": (np.float64, None),
+    "label": (np.int64, None),
+    "translation": (np.float64, 3),
+    "steps": (np.float64, None),
+}
+_SOLVED_COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
+# Of all keyframes, the share that are the robots' latest and stay whatever happens.
+_LATEST_SHARE = 0.1
+
+
+class GrowingViewGraph:
+    """Keyframes keyed by (robot, id) and the edges between them.
+
+    ``revision`` counts changes: equal revisions mean equal graphs. Not thread-safe.
+    """
+
+    def __init__(self) -> None:
+        self.revision = 0
+        self.robots: list[str] = []
+        self.marginalized = MarginalizedIndex.of(MarginalizedKeyframes.none(), {})
+        self._robot_index: dict[str, int] = {}
+        self._index: list[KeyframeIndex] = []  # by robot
+        self._keyframe = {name: GrowingArray(dtype) for name, dtype in _KEYFRAME_COLUMNS.items()}
+        self._edge = {name: GrowingArray(*column) for name, column in _EDGE_COLUMNS.items()}
+
+    @property
+    def num_keyframes(self) -> int:
+        return len(self._keyframe["robot"])
+
+    @property
+    def num_edges(self) -> int:
+        return len(self._edge["edge_id"])
+
+    def add_keyframe(self, robot: str, keyframe_id: int, stamp_ns: int = UNKNOWN_STAMP_NS, time_line: int = 0) -> int:
+        """Append a keyframe, or find it and complete its moment, a stamp on a time line; returns its node."""
+        robot_index = self._index_of_robot(robot)
+        index = self._index[robot_index]
+        node = index.node(keyframe_id)
+        if node is None:
+            node = self.num_keyframes
+            index.add(keyframe_id, node)
+            self._keyframe["robot"].append(robot_index)
+            self._keyframe["keyframe_id"].append(keyframe_id)
+            self._keyframe["stamp_ns"].append(UNKNOWN_STAMP_NS)
+            self._keyframe["time_line"].append(time_line)
+            self.revision += 1
+        stamps = self._keyframe["stamp_ns"].view
+        if stamp_ns != UNKNOWN_STAMP_NS and stamps[node] == UNKNOWN_STAMP_NS:
+            stamps[node] = stamp_ns
+            self._keyframe["time_line"].view[node] = time_line
+            index.add_moment(time_line, stamp_ns, node)
+        return node
+
+    def add_edge(self, edge: GraphEdge) -> None:
+        """Append an edge between two nodes."""
+        for name, column in self._edge.items():
+            column.append(getattr(edge, name))
+        self.revision += 1
+
+    def label_edges(self, source_robot: str, edge_id: int, label: int) -> int:
+        """Label every edge with the sender's id and source robot; returns how many there are."""
+        robot_of_source = self._keyframe["robot"].view[self._edge["source"].view]
+        robot = self._robot_index.get(source_robot, -1)
+        chosen = (self._edge["edge_id"].view == np.uint64(edge_id)) & (robot_of_source == robot)
+        labels = self._edge["label"].view
+        if (labels[chosen] != label).any():
+            labels[chosen] = label
+            self.revision += 1
+        return int(chosen.sum())
+
+    def node(self, robot: str, keyframe_id: int) -> int | None:
+        index = self._index_of(robot)
+        return None if index is None else index.node(keyframe_id)
+
+    def robot_of(self, node: int) -> str:
+        return self.robots[int(self._keyframe["robot"].view[node])]
+
+    def moment_of(self, node: int) -> tuple[int, int]:
+        """Nanoseconds, or -1, and the number of the time line."""
+        return int(self._keyframe["stamp_ns"].view[node]), int(self._keyframe["time_line"].view[node])
+
+    def keyframe_at_or_before(self, robot: str, stamp_ns: int, time_line: int) -> int | None:
+        """The newest node of the robot's time line that is not younger than the stamp."""
+        index = self._index_of(robot)
+        return None if index is None else index.at_or_before(time_line, stamp_ns)
+
+    def first_keyframe(self, robot: str, time_line: int) -> int | None:
+        """The node of the robot's time line with the smallest stamp."""
+        index = self._index_of(robot)
+        return None if index is None else index.first(time_line)
+
+    def nodes_newest_first(self, robot: str) -> Iterator[int]:
+        """The robot's nodes with a stamp, the latest moment first."""
+        index = self._index_of(robot)
+        return iter(()) if index is None else index.newest_first()
+
+    def moments(self, robot: str) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """Stamps and time lines of the robot's nodes with a stamp, in the order of the moments."""
+        return (KeyframeIndex() if (index := self._index_of(robot)) is None else index).moments
+
+    def marginalized_keyframe(
+        self, robot: str, keyframe_id: int | None, stamp_ns: int | None, time_line: int
+    ) -> tuple[int, Quaternion, Vector] | None:
+        """A marginalised keyframe by id, or by its exact moment.
+
+        Returns:
+            the node of the nearer end of the odometry edge that it lies on; its orientation and its position (metres)
+            in that keyframe's frame. None if there is no such keyframe.
+        """
+        row = self._marginalized_row(robot, keyframe_id, stamp_ns, time_line)
+        if row is None:
+            return None
+        edge = int(self.marginalized.keyframes.edge[row])
+        columns = (self._edge[name].view[edge] for name in ("target_from_source", "translation", "steps"))
+        at_source, rotation, position = self.marginalized.nearest_end(row, *columns)
+        x, y, z = position.tolist()
+        qx, qy, qz, qw = rotation.tolist()
+        return int(self._edge["source" if at_source else "target"].view[edge]), (qx, qy, qz, qw), (x, y, z)
+
+    def was_marginalized(self, robot: str, keyframe_id: int) -> bool:
+        """Whether there was such a keyframe, known or forgotten."""
+        if self._marginalized_row(robot, keyframe_id) is not None:
+            return True
+        return self.marginalized.is_forgotten(self._robot_index.get(robot, -1), keyframe_id)
+
+    def compact(
+        self, surplus_keyframes: int, surplus_edges: int, is_false: NDArray[np.bool_], max_marginalized: int
+    ) -> Renumbering | None:
+        """Do without so many keyframes and edges, as :func:`thin` chooses them; None if nothing can be spared.
+
+        Args:
+            surplus_keyframes, surplus_edges: how many.
+            is_false: edges judged to be outliers, of the first M' ≤ M.
+            max_marginalized: keyframes beyond it that were marginalised are forgotten.
+        """
+        keyframes: Columns = {name: column.view for name, column in self._keyframe.items()}
+        edges: Columns = {name: column.view for name, column in self._edge.items()}
+        false = np.zeros(self.num_edges, dtype=bool)
+        false[: len(is_false)] = is_false
+        thinning = thin(self.num_keyframes, edges, false, self._latest(), surplus_keyframes, surplus_edges)
+        if not thinning.nodes.any() and not thinning.edges.any():
+            return None
+        stays = np.flatnonzero(~thinning.edges)
+        place = np.cumsum(~thinning.edges) - 1
+        riders = self.marginalized.keyframes
+        riders = MarginalizedKeyframes(**(riders.arrays() | {"edge": place[riders.edge]}))
+        contraction = marginalize(
+            keyframes, {name: values[stays] for name, values in edges.items()}, thinning.nodes, riders
+        )
+        for name, keyframe_column in self._keyframe.items():
+            keyframe_column.replace(keyframes[name][contraction.kept])
+        for name, edge_column in self._edge.items():
+            edge_column.replace(contraction.edges[name])
+        self._index_anew()
+        known = MarginalizedIndex.of(contraction.marginalized, self.marginalized.forgotten_up_to)
+        self.marginalized = known.limited_to(max_marginalized)
+        self.revision += 1
+        edge_of = np.full(len(place), -1)
+        edge_of[stays] = contraction.edge_of
+        return Renumbering(contraction.kept, edge_of, stays[contraction.last], int(thinning.edges.sum()))
+
+    def snapshot(self) -> GraphSnapshot:
+        """The graph now. Only the labels and moments, which alone can change later, are copied."""
+        columns = {name: self._edge[name].view for name in _SOLVED_COLUMNS}
+        columns["label"] = columns["label"].copy()
+        return GraphSnapshot(
+            graph=ViewGraph(self.num_keyframes, **{name: torch.from_numpy(values) for name, values in columns.items()}),
+            robots=tuple(self.robots),
+            keyframe_robot=self._keyframe["robot"].view,
+            keyframe_id=self._keyframe["keyframe_id"].view,
+            stamp_ns=self._keyframe["stamp_ns"].view.copy(),
+            time_line=self._keyframe["time_line"].view.copy(),
+            edge_id=self._edge["edge_id"].view,
+            translation=self._edge["translation"].view,
+            marginalized=self.marginalized,
+            revision=self.revision,
+        )
+
+    @classmethod
+    def from_snapshot(cls, snapshot: GraphSnapshot) -> GrowingViewGraph:
+        """A growing graph with the same content and the same indices.
+
+        Raises:
+            ValueError: columns of different lengths, an index out of range, or a keyframe that occurs twice.
+        """
+        growing = cls()
+        for robot in snapshot.robots:
+            growing._index_of_robot(robot)
+        for name, values in (
+            ("robot", snapshot.keyframe_robot),
+            ("keyframe_id", snapshot.keyframe_id),
+            ("stamp_ns", snapshot.stamp_ns),
+            ("time_line", snapshot.time_line),
+        ):
+            growing._keyframe[name].extend(values)
+        growing._edge["edge_id"].extend(snapshot.edge_id)
+        growing._edge["translation"].extend(snapshot.translation)
+        for name in _SOLVED_COLUMNS:
+            growing._edge[name].extend(getattr(snapshot.graph, name).numpy())
+        marginalized = snapshot.marginalized.keyframes
+        _check_rows(growing._keyframe, len(snapshot.robots), "robot")
+        _check_rows(growing._edge, growing.num_keyframes, "source", "target")
+        if not ((marginalized.edge >= 0) & (marginalized.edge < growing.num_edges)).all():
+            raise ValueError("a keyframe on an edge that is not there")
+        growing._index_anew()
+        growing.marginalized = snapshot.marginalized
+        growing.revision = snapshot.revision
+        return growing
+
+    def _latest(self) -> NDArray[np.bool_]:
+        """The latest keyframes of every robot, two at least, ``(N,)``."""
+        robot = self._keyframe["robot"].view
+        count = max(2, int(_LATEST_SHARE * len(robot) / max(len(self.robots), 1)))
+        order = np.argsort(robot, kind="stable")
+        last = np.searchsorted(robot[order], robot, "right") - 1
+        place = np.empty(len(robot), dtype=np.int64)
+        place[order] = np.arange(len(robot))
+        return np.asarray(last - place < count)
+
+    def _index_anew(self) -> None:
+        columns = {name: column.view for name, column in self._keyframe.items()}
+        for robot in range(len(self.robots)):
+            nodes = np.flatnonzero(columns["robot"] == robot)
+            of_robot = (columns[name][nodes] for name in ("keyframe_id", "time_line", "stamp_ns"))
+            self._index[robot] = KeyframeIndex.of(nodes, *of_robot)
+
+    def _marginalized_row(
+        self, robot: str, keyframe_id: int | None, stamp_ns: int | None = None, time_line: int = 0
+    ) -> int | None:
+        robot_index = self._robot_index.get(robot)
+        if robot_index is None or len(self.marginalized.keyframes) == 0:
+            return None
+        if keyframe_id is not None:
+            return self.marginalized.by_id(robot_index, keyframe_id)
+        return None if stamp_ns is None else self.marginalized.by_moment(robot_index, time_line, stamp_ns)
+
+    def _index_of(self, robot: str) -> KeyframeIndex | None:
+        robot_index = self._robot_index.get(robot)
+        return None if robot_index is None else self._index[robot_index]
+
+    def _index_of_robot(self, robot: str) -> int:
+        index = self._robot_index.setdefault(robot, len(self.robots))
+        if index == len(self.robots):
+            self.robots.append(robot)
+            self._index.append(KeyframeIndex())
+        return index
+
+
+def _check_rows(columns: Mapping[str, GrowingArray], limit: int, *indices: str) -> None:
+    """Equal lengths, and columns of indices below a limit."""
+    if len({len(column) for column in columns.values()}) > 1:
+        raise ValueError("columns of different lengths")
+    for name in indices:
+        view = columns[name].view
+        if ((view < 0) | (view >= limit)).any():
+            raise ValueError(f"{name} is out of range")

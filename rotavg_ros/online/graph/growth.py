@@ -1,0 +1,93 @@
+"""What a growing graph has come to so far: everything that decides how it grows on."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+from rotavg_ros.online.graph.fingerprints import Fingerprints
+from rotavg_ros.online.graph.growing_view_graph import GrowingViewGraph
+from rotavg_ros.online.graph.pending import PendingEdges
+from rotavg_ros.online.graph.room import GraphsAnswer, Room
+from rotavg_ros.online.measurements import RejectReason
+from rotavg_ros.online.odometry.data_time import DataTime
+from rotavg_ros.online.odometry.time_jumps import BackwardJumps
+from rotavg_ros.online.odometry.track import OdometryTrack
+from rotavg_ros.online.options import EstimatorOptions
+
+
+@dataclass
+class Growth:
+    """The growing graph and its surroundings; a state file holds all of it but the options.
+
+    Attributes:
+        options: that apply from now on.
+        answer: what has been answered about the graph so far.
+        pending: edges that wait for a keyframe or for odometry.
+        fingerprints: of the edges in the graph and of the latest of those that were in it.
+        graph: the graph.
+        tracks: odometry per robot.
+        backward_jumps: late odometry, as long as it may show that time went back.
+        rejected: how many inputs were refused, by :class:`RejectReason`.
+        labels: the users' verdicts, by source robot and edge id.
+        room: what was taken out of a full graph.
+        data_time: newest stamp of odometry or of keyframes.
+    """
+
+    options: EstimatorOptions
+    answer: GraphsAnswer
+    pending: PendingEdges
+    fingerprints: Fingerprints
+    graph: GrowingViewGraph = field(default_factory=GrowingViewGraph)
+    tracks: dict[str, OdometryTrack] = field(default_factory=dict)
+    backward_jumps: BackwardJumps = field(default_factory=BackwardJumps)
+    rejected: Counter[str] = field(default_factory=Counter)
+    labels: dict[tuple[str, int], int] = field(default_factory=dict)
+    room: Room = field(default_factory=Room)
+    data_time: DataTime = field(default_factory=DataTime)
+
+    @classmethod
+    def begin(cls, options: EstimatorOptions, answer: GraphsAnswer) -> Growth:
+        """An empty graph."""
+        pending = PendingEdges(options.pending_capacity, options.pending_timeout_ns)
+        return cls(options, answer, pending, Fingerprints(options.max_edges))
+
+    def refuse(self, reason: RejectReason, count: int = 1) -> RejectReason:
+        """Count refusals, or take them back; returns the reason."""
+        self.rejected[reason.value] += count
+        if self.rejected[reason.value] <= 0:
+            del self.rejected[reason.value]
+        return reason
+
+    def has_room_for_keyframe(self) -> bool:
+        """Whether one may come, if need be after others have gone."""
+        if self.graph.num_keyframes >= self.options.max_keyframes:
+            self._make_room()
+        return self.graph.num_keyframes < self.options.max_keyframes
+
+    def has_room_for_edge(self) -> bool:
+        """Whether one may come, if need be after others have gone."""
+        if self.graph.num_edges >= self.options.max_edges:
+            self._make_room()
+        return self.graph.num_edges < self.options.max_edges
+
+    def _make_room(self) -> None:
+        if self.room.make(self.graph, self.options.max_keyframes, self.options.max_edges, self.answer):
+            for robot, track in self.tracks.items():
+                track.samples.release_keyframes(*self.graph.moments(robot))
+
+    def time_line_of(self, robot: str, stamp_ns: int | None) -> int:
+        """Number of the robot's time line that a stamp means, see :meth:`OdometrySamples.time_line_of`."""
+        track = self.tracks.get(robot)
+        return 0 if track is None or stamp_ns is None else track.time_line_of(stamp_ns)
+
+    def is_undecided(self, robot: str) -> bool:
+        """Whether it is open which time line of a robot a stamp that comes now is of."""
+        track = self.tracks.get(robot)
+        return self.backward_jumps.is_undecided(robot) or (track is not None and track.begins_time_line)
+
+    def advance_data_time(self, stamp_ns: int) -> None:
+        """Let what has waited for too long go."""
+        now_ns = self.data_time.advance(stamp_ns, self.options.continuity_limits.lead_ns)
+        if now_ns is not None:
+            self.refuse(RejectReason.PENDING_TIMEOUT, len(self.pending.pop_expired(now_ns)))

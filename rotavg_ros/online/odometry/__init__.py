@@ -1,0 +1,1 @@
+"""A robot's odometry: messages, chains, time lines, keyframes."""

@@ -1,0 +1,242 @@
+"""A robot's odometry messages as they were taken, and where the body was at any moment among them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rotavg_ros.online import quaternion
+from rotavg_ros.online.growing_array import GrowingArray
+from rotavg_ros.online.measurements import RejectedInputError, RejectReason
+from rotavg_ros.online.odometry.continuity import OdometrySample
+from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion, Vector
+
+_COLUMNS = ("stamp_ns", "world_from_body", "position", "is_keyframe", "chain", "time_line")
+
+
+@dataclass(frozen=True)
+class OdometryBounds:
+    """How far the odometry may be stretched when a moment between its messages is asked for.
+
+    Attributes:
+        tolerance_ns: a stamp this far before the first or after the last message takes that message's rotation.
+        max_gap_ns: between two messages farther apart than this nothing is interpolated.
+        max_samples: beyond it, the older half gives up every second message that is not a keyframe.
+    """
+
+    tolerance_ns: int
+    max_gap_ns: int
+    max_samples: int
+
+
+class OdometrySamples:
+    """Messages in the order in which they were taken, in chains and time lines.
+
+    Between two chains nothing is known of the body's rotation. Stamps ascend within a time line; where the robot's
+    clock went back, a new time line begins and a new chain with it. So a stamp means a moment only together with the
+    number of its time line; where that is left out, the present one is meant.
+
+    Attributes:
+        bounds: see :class:`OdometryBounds`.
+    """
+
+    def __init__(self, bounds: OdometryBounds) -> None:
+        self.bounds = bounds
+        self._limit = bounds.max_samples
+        self._stamp_ns = GrowingArray(np.int64)
+        self._world_from_body = GrowingArray(np.float64, 4)
+        self._position = GrowingArray(np.float64, 3)
+        self._is_keyframe = GrowingArray(np.bool_)
+        self._chain = GrowingArray(np.int32)
+        self._time_line = GrowingArray(np.int32)
+
+    def __len__(self) -> int:
+        return len(self._stamp_ns)
+
+    def append(self, sample: OdometrySample, chain: int, time_line: int) -> None:
+        """Add a message at the end; the older half is thinned out where there are too many."""
+        if len(self) >= self._limit:
+            self._thin_out()
+        self._stamp_ns.append(sample.stamp_ns)
+        self._world_from_body.append(sample.world_from_body)
+        self._position.append(UNKNOWN_VECTOR if sample.position is None else sample.position)
+        self._is_keyframe.append(False)
+        self._chain.append(chain)
+        self._time_line.append(time_line)
+
+    def mark_keyframe(self) -> None:
+        """Let the last message never be thinned out."""
+        self._is_keyframe.view[-1] = True
+
+    def release_keyframes(self, kept_stamps_ns: NDArray[np.int64], kept_time_lines: NDArray[np.int32]) -> None:
+        """Where keyframes take up most of the room, let those be thinned out that are none of these ``(K,)``."""
+        if np.count_nonzero(self._is_keyframe.view) > self.bounds.max_samples // 2:
+            rows = self._rows_from(kept_stamps_ns, kept_time_lines)
+            kept = np.zeros(len(self), dtype=bool)
+            kept[rows[self._stamp_ns.view[rows] == kept_stamps_ns]] = True
+            self._is_keyframe.view[:] &= kept
+
+    def latest_of_chain(self) -> tuple[OdometrySample | None, OdometrySample | None, OdometrySample | None]:
+        """Of the last message's chain: the message before the last, the last message, the last keyframe."""
+        if not len(self):
+            return None, None, None
+        chain = self._chain.view
+        keyframes = np.flatnonzero(self._is_keyframe.view & (chain == chain[-1]))
+        return (
+            self._sample(-2) if len(self) > 1 and chain[-2] == chain[-1] else None,
+            self._sample(-1),
+            self._sample(int(keyframes[-1])) if len(keyframes) else None,
+        )
+
+    def seam(self, chain: int) -> tuple[OdometrySample, OdometrySample]:
+        """The last message before a chain, and its first."""
+        first = int(np.searchsorted(self._chain.view, chain))
+        return self._sample(first - 1), self._sample(first)
+
+    @property
+    def last_chain(self) -> int:
+        return int(self._chain.view[-1]) if len(self) else 0
+
+    @property
+    def last_time_line(self) -> int:
+        return int(self._time_line.view[-1]) if len(self) else 0
+
+    def time_line_of(self, stamp_ns: int, lead_ns: float) -> int:
+        """Number of the time line that a stamp from outside means. There must be a message.
+
+        It is the present one, from its first message on to ``lead_ns`` after its last; for any other stamp the latest
+        that has messages on both sides of it, or the present one where there is none.
+        """
+        present = self.last_time_line
+        if present == 0:
+            return 0
+        starts = np.searchsorted(self._time_line.view, np.arange(present + 2))
+        first, last = self._stamp_ns.view[starts[:-1]], self._stamp_ns.view[starts[1:] - 1]
+        tolerance = self.bounds.tolerance_ns
+        if first[-1] - tolerance <= stamp_ns <= int(last[-1]) + lead_ns:
+            return present
+        covering = np.flatnonzero((first - tolerance <= stamp_ns) & (stamp_ns <= last + tolerance))
+        return int(covering[-1]) if len(covering) else present
+
+    def world_from_body_at(self, stamp_ns: int, time_line: int | None = None) -> Quaternion:
+        """The odometry's rotation at a moment: interpolated between two messages, clamped just outside of them.
+
+        Raises:
+            RejectedInputError: the stamp is outside the odometry by more than the tolerance, or inside a gap, which
+                is also where one chain ends and another begins.
+        """
+        line = self._rows_of(time_line)
+        stamps = self._stamp_ns.view
+        after = line.start + int(np.searchsorted(stamps[line], stamp_ns))
+        tolerance = self.bounds.tolerance_ns
+        if after < line.stop and stamps[after] == stamp_ns:
+            return self._rotation(after)
+        until_next = int(stamps[after]) - stamp_ns if after < line.stop else None
+        since_last = stamp_ns - int(stamps[after - 1]) if after > line.start else None
+        if until_next is None or since_last is None:
+            if until_next is not None and until_next <= tolerance:
+                return self._rotation(line.start)
+            if since_last is not None and since_last <= tolerance:
+                return self._rotation(after - 1)
+            raise RejectedInputError(RejectReason.STAMP_OUT_OF_RANGE)
+        if self._chain.view[after - 1] != self._chain.view[after]:
+            if since_last > tolerance:
+                raise RejectedInputError(RejectReason.ODOMETRY_GAP)
+            return self._rotation(after - 1)
+        gap = since_last + until_next
+        if gap > self.bounds.max_gap_ns:
+            if min(since_last, until_next) > tolerance:
+                raise RejectedInputError(RejectReason.ODOMETRY_GAP)
+            return self._rotation(after if until_next < since_last else after - 1)
+        return quaternion.slerp(self._rotation(after - 1), self._rotation(after), since_last / gap)
+
+    def position_at(self, stamp_ns: int, time_line: int | None = None) -> Vector:
+        """The odometry's position at a moment: interpolated, clamped at the ends, NaN without positions."""
+        line = self._rows_of(time_line)
+        stamps, positions = self._stamp_ns.view, self._position.view
+        after = min(line.start + int(np.searchsorted(stamps[line], stamp_ns)), line.stop - 1)
+        before = max(after - 1, line.start)
+        gap = int(stamps[after] - stamps[before])
+        share = min(max((stamp_ns - int(stamps[before])) / gap, 0.0), 1.0) if gap else 1.0
+        if share < 1 and self._chain.view[before] != self._chain.view[after]:
+            share = 0.0
+        x, y, z = (
+            positions[after] if share == 1 else (1 - share) * positions[before] + share * positions[after]
+        ).tolist()
+        return (x, y, z)
+
+    def chain_at(self, stamp_ns: int, time_line: int | None = None) -> int:
+        """Number of the chain that a moment belongs to. There must be a message."""
+        line = self._rows_of(time_line)
+        place = int(np.searchsorted(self._stamp_ns.view[line], stamp_ns, "right")) - 1
+        return int(self._chain.view[line.start + max(place, 0)])
+
+    def poses_at(
+        self, stamp_ns: NDArray[np.int64], time_line: NDArray[np.int32]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
+        """The messages at or next after the moments ``(K,)``.
+
+        Returns:
+            world_from_body ``(K, 4)``, position ``(K, 3)`` and number of the chain ``(K,)``.
+
+        Positions are NaN where the odometry carries none. There must be a message.
+        """
+        rows = self._rows_from(stamp_ns, time_line)
+        return self._world_from_body.view[rows], self._position.view[rows], self._chain.view[rows]
+
+    def first_body_from_world(self) -> Quaternion:
+        """Inverse of the first message's rotation."""
+        return quaternion.inverse(self._rotation(0))
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The messages as arrays, for :meth:`from_arrays`; what may change later is copied."""
+        columns = {name: getattr(self, f"_{name}").view for name in _COLUMNS}
+        columns["is_keyframe"] = columns["is_keyframe"].copy()
+        return columns | {"limit": np.array(self._limit)}
+
+    @classmethod
+    def from_arrays(cls, bounds: OdometryBounds, arrays: dict[str, NDArray[Any]]) -> OdometrySamples:
+        """The messages that :meth:`arrays` came from."""
+        samples = cls(bounds)
+        for name in _COLUMNS:
+            getattr(samples, f"_{name}").extend(arrays[name])
+        samples._limit = max(bounds.max_samples, int(arrays["limit"]))
+        return samples
+
+    def _rows_of(self, time_line: int | None) -> slice:
+        """Where a time line's messages are; there must be one."""
+        column = self._time_line.view
+        number = column[-1] if time_line is None else time_line
+        return slice(int(np.searchsorted(column, number)), int(np.searchsorted(column, number, "right")))
+
+    def _rows_from(self, stamp_ns: NDArray[np.int64], time_line: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Rows ``(K,)`` of the messages at or next after moments, the last of the time line where none is."""
+        rows = np.empty(len(stamp_ns), dtype=np.int64)
+        for number in np.unique(time_line).tolist():
+            line, chosen = self._rows_of(number), time_line == number
+            place = np.searchsorted(self._stamp_ns.view[line], stamp_ns[chosen])
+            rows[chosen] = np.minimum(line.start + place, line.stop - 1)
+        return rows
+
+    def _rotation(self, row: int) -> Quaternion:
+        x, y, z, w = self._world_from_body.view[row].tolist()
+        return (x, y, z, w)
+
+    def _sample(self, row: int) -> OdometrySample:
+        x, y, z = self._position.view[row].tolist()
+        position = (x, y, z) if math.isfinite(x) else None
+        return OdometrySample(int(self._stamp_ns.view[row]), self._rotation(row), position)
+
+    def _thin_out(self) -> None:
+        size = len(self)
+        keep = self._is_keyframe.view | (np.arange(size) % 2 == 0) | (np.arange(size) >= size // 2)
+        keep |= np.diff(self._time_line.view, prepend=-1) != 0  # a time line never vanishes
+        for name in _COLUMNS:
+            column = getattr(self, f"_{name}")
+            column.replace(column.view[keep])
+        # Where keyframes fill the room the limit yields; a quarter of it at least lies between two thinnings.
+        self._limit = max(self.bounds.max_samples, int(keep.sum()) + self.bounds.max_samples // 4 + 1)

@@ -1,0 +1,157 @@
+"""A robot's odometry: which messages go on from the last, and which become keyframes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rotavg_ros.online import quaternion
+from rotavg_ros.online.measurements import RejectedInputError, RejectReason, checked_rotation, checked_stamp
+from rotavg_ros.online.odometry.continuity import ANY_MOTION, ContinuityCheck, ContinuityLimits, OdometrySample
+from rotavg_ros.online.odometry.keyframe_choice import KeyframePolicy
+from rotavg_ros.online.odometry.samples import OdometryBounds, OdometrySamples
+from rotavg_ros.online.quaternion import Quaternion
+
+
+class OdometryTrack:
+    """The odometry of one robot, in chains between which nothing is known of the body's rotation.
+
+    A new chain begins where the odometry began anew, where the robot's clock went back, and where a track that was
+    restored from a file cannot tell that the odometry has gone on meanwhile.
+
+    Attributes:
+        samples: the messages.
+        latest: the last message.
+        last_keyframe: of the latest message's chain.
+        chain: number of the latest message's chain, from 0.
+        time_line: number of the latest message's time line, from 0.
+        anchors: world_from_odometry, one for every chain but the first, where whoever knows the world has set it.
+    """
+
+    def __init__(self, bounds: OdometryBounds, limits: ContinuityLimits = ANY_MOTION) -> None:
+        self.samples = OdometrySamples(bounds)
+        self.chain = self.time_line = 0
+        self.anchors: list[Quaternion] = []
+        self.latest: OdometrySample | None = None
+        self.last_keyframe: OdometrySample | None = None
+        self.num_keyframes = 0
+        self._continuity = ContinuityCheck(limits)
+        self._before_latest: OdometrySample | None = None
+        self._begins_time_line = False
+        self._is_restored = False
+
+    def set_limits(self, bounds: OdometryBounds, limits: ContinuityLimits) -> None:
+        """Change what applies from now on."""
+        self.samples.bounds, self._continuity.limits = bounds, limits
+
+    def begin_time_line(self) -> None:
+        """The robot's clock went back: the next message begins a new time line, whatever its stamp."""
+        self._begins_time_line = True
+
+    @property
+    def begins_time_line(self) -> bool:
+        """Whether the next message begins a new time line."""
+        return self._begins_time_line
+
+    def add(self, stamp_ns: int, world_from_body: Sequence[float], position: Sequence[float] | None) -> OdometrySample:
+        """Append a message.
+
+        Args:
+            stamp_ns: its stamp.
+            world_from_body: xyzw.
+            position: metres, or None; one that is not finite counts as None.
+
+        Raises:
+            RejectedInputError: a stamp not after the last one, a rotation that is none, or a message that does not
+                go on from the last one and that no other sides with yet.
+        """
+        stamp_ns = checked_stamp(stamp_ns)
+        rotation = checked_rotation(world_from_body)
+        if self.latest is not None and stamp_ns <= self.latest.stamp_ns and not self._begins_time_line:
+            repeated = stamp_ns == self.latest.stamp_ns
+            raise RejectedInputError(RejectReason.REPEATED_STAMP if repeated else RejectReason.OUT_OF_ORDER_ODOMETRY)
+        if position is not None:
+            x, y, z = position
+            position = (x, y, z) if math.isfinite(x + y + z) else None
+        sample = OdometrySample(stamp_ns, rotation, position)
+        if self._begins_time_line:
+            self._continuity.forget()
+            self.time_line += 1
+            self._begin_chain()
+        elif self.latest is not None and self._begins_anew(sample, self.latest):
+            self._begin_chain()
+        self._begins_time_line = self._is_restored = False
+        self._before_latest, self.latest = self.latest, sample
+        self.samples.append(sample, self.chain, self.time_line)
+        return sample
+
+    def _begins_anew(self, sample: OdometrySample, latest: OdometrySample) -> bool:
+        if self._is_restored:
+            return self._continuity.admit_after_a_break(sample, latest, self._before_latest)
+        return self._continuity.admit(sample, latest, self._before_latest)
+
+    def _begin_chain(self) -> None:
+        self.chain += 1
+        self.latest = self.last_keyframe = None
+
+    def reached(self, policy: KeyframePolicy) -> bool:
+        """Whether the latest message is far enough from the last keyframe to become one."""
+        sample, keyframe = self.latest, self.last_keyframe
+        if sample is None or keyframe is None:
+            return sample is not None
+        distance = 0.0
+        if sample.position is not None and keyframe.position is not None:
+            distance = math.dist(sample.position, keyframe.position)
+        angle = quaternion.angle_between(keyframe.world_from_body, sample.world_from_body)
+        return policy.reached(angle, distance, sample.stamp_ns - keyframe.stamp_ns)
+
+    def mark_keyframe(self) -> None:
+        """Make the latest message the last keyframe."""
+        self.samples.mark_keyframe()
+        self.last_keyframe = self.latest
+        self.num_keyframes += 1
+
+    def reaches(self, stamp_ns: int) -> bool:
+        """Whether the odometry has come as far as the stamp."""
+        return self.latest is not None and self.latest.stamp_ns >= stamp_ns
+
+    def within_tolerance(self, stamp_ns: int) -> bool:
+        """Whether the stamp is at most the tolerance ahead of the odometry."""
+        return self.reaches(stamp_ns - self.samples.bounds.tolerance_ns)
+
+    def time_line_of(self, stamp_ns: int) -> int:
+        """Number of the time line that a stamp from outside means, see :meth:`OdometrySamples.time_line_of`."""
+        return self.samples.time_line_of(stamp_ns, self._continuity.limits.lead_ns)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Everything as arrays, for :meth:`from_arrays`."""
+        anchors = np.array(self.anchors, dtype=np.float64).reshape(-1, 4)
+        return (
+            self.samples.arrays()
+            | self._continuity.arrays()
+            | {
+                "num_keyframes": np.array(self.num_keyframes),
+                "anchors": anchors,
+                "begins_time_line": np.array(self._begins_time_line),
+            }
+        )
+
+    @classmethod
+    def from_arrays(
+        cls, bounds: OdometryBounds, arrays: dict[str, NDArray[Any]], limits: ContinuityLimits = ANY_MOTION
+    ) -> OdometryTrack:
+        """The track that :meth:`arrays` came from; its next message says whether odometry has gone on meanwhile."""
+        track = cls(bounds, limits)
+        track.samples = samples = OdometrySamples.from_arrays(bounds, arrays)
+        track._continuity = ContinuityCheck.from_arrays(limits, arrays)
+        track.num_keyframes = int(arrays["num_keyframes"])
+        track.anchors = [(x, y, z, w) for x, y, z, w in arrays["anchors"].tolist()]
+        track._begins_time_line = bool(arrays["begins_time_line"])
+        track._before_latest, track.latest, track.last_keyframe = samples.latest_of_chain()
+        track.chain, track.time_line = samples.last_chain, samples.last_time_line
+        track._is_restored = track.latest is not None
+        return track

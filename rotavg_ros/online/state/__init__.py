@@ -1,0 +1,1 @@
+"""A state file: what it holds, its backups and its lock."""

@@ -1,0 +1,178 @@
+"""What a state file holds: everything that decides how the graph grows on, as arrays and a header for JSON."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rotavg_ros.errors import UserError
+from rotavg_ros.online.answer.anchoring import corrections
+from rotavg_ros.online.answer.last_answer import LastAnswer
+from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedIndex, MarginalizedKeyframes
+from rotavg_ros.online.content import ContentState
+from rotavg_ros.online.graph.builder import GraphBuilder
+from rotavg_ros.online.graph.fingerprints import Fingerprints
+from rotavg_ros.online.graph.growing_view_graph import GrowingViewGraph
+from rotavg_ros.online.graph.growth import Growth
+from rotavg_ros.online.graph.pending import PendingEdges, Waiting
+from rotavg_ros.online.graph.room import Room
+from rotavg_ros.online.graph.snapshot import GraphSnapshot
+from rotavg_ros.online.measurements import EdgeMeasurement, KeyframeReference
+from rotavg_ros.online.odometry.data_time import DataTime
+from rotavg_ros.online.odometry.time_jumps import BackwardJumps
+from rotavg_ros.online.odometry.track import OdometryTrack
+from rotavg_ros.online.options import EstimatorOptions
+from rotavg_ros.online.state.file import FORMAT, FORMAT_VERSION, Arrays, StateFileError
+from rotavg_ros.online.state.upgrade import upgraded
+from rotavg_ros.view_graph import ViewGraph
+
+_MARGINALIZED = "marginalized_"
+_FINGERPRINTS = "fingerprints_"
+_GRAPH_COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
+_KEYFRAME_COLUMNS = ("keyframe_robot", "keyframe_id", "stamp_ns", "time_line", "edge_id", "translation")
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything that a state file holds.
+
+    Attributes:
+        arrays: by name.
+        header: the rest, for JSON but for the pending edges.
+        pending: edges that wait.
+    """
+
+    arrays: Arrays
+    header: dict[str, Any]
+    pending: list[Waiting]
+
+    def encoded(self) -> Arrays:
+        """All of it as arrays; the header is JSON's bytes."""
+        header = self.header | {"pending": [asdict(waiting) for waiting in self.pending]}
+        return self.arrays | {"header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
+
+
+def collect(content: ContentState) -> State:
+    """The state, mostly as views: quick, so that the estimator's lock is held only briefly."""
+    growth, last = content.growth, content.last
+    snapshot = growth.graph.snapshot()
+    marginalized = snapshot.marginalized
+    arrays: Arrays = {name: getattr(snapshot, name) for name in _KEYFRAME_COLUMNS}
+    arrays |= {name: getattr(snapshot.graph, name).numpy() for name in _GRAPH_COLUMNS}
+    arrays["answered"] = np.empty((0, 4)) if last.body_from_world is None else last.body_from_world.numpy()
+    arrays["outlier"] = last.outlier
+    arrays |= _prefixed(_FINGERPRINTS, growth.fingerprints.arrays())
+    arrays |= _prefixed(_MARGINALIZED, marginalized.keyframes.arrays())
+    for index, track in enumerate(growth.tracks.values()):
+        arrays |= _prefixed(f"odometry{index}_", track.arrays())
+    header = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "version": content.version,
+        "ticked_revision": content.ticked_revision,
+        "world_from_odometry": dict(content.world_from_odometry),
+        "revision": snapshot.revision,
+        "robots": snapshot.robots,
+        "odometry_robots": list(growth.tracks),
+        "data_time": asdict(growth.data_time),
+        "backward_jumps": growth.backward_jumps.header(),
+        "rejected": dict(growth.rejected),
+        "room": asdict(growth.room),
+        "forgotten_up_to": list(marginalized.forgotten_up_to.items()),
+        "labels": [[robot, edge_id, int(label)] for (robot, edge_id), label in growth.labels.items()],
+    }
+    return State(arrays, header, growth.pending.waiting())
+
+
+def restore(arrays: Arrays, options: EstimatorOptions) -> ContentState:
+    """What :func:`collect` took, to go on with.
+
+    Raises:
+        StateFileError: the arrays do not fit together.
+    """
+    try:
+        return _restore(*upgraded(arrays, json.loads(arrays["header"].tobytes())), options)
+    except (UserError, ValueError, KeyError, TypeError, IndexError, AttributeError, StopIteration) as error:
+        raise StateFileError(f"the state file's content is inconsistent ({error}); save a new one") from error
+
+
+def _restore(arrays: Arrays, header: dict[str, Any], options: EstimatorOptions) -> ContentState:
+    graph = _graph(arrays, header)
+    answered = torch.from_numpy(arrays["answered"])
+    if answered.shape[1:] != (4,) or len(answered) > graph.num_keyframes:
+        raise ValueError("more orientations than keyframes")
+    if arrays["outlier"].dtype != bool or len(arrays["outlier"]) > graph.num_edges:
+        raise ValueError("more flags than edges")
+    last = LastAnswer(answered if len(answered) else None, outlier=arrays["outlier"])
+    growth = Growth(
+        options,
+        last,
+        _pending(header["pending"], options),
+        Fingerprints.from_arrays(options.max_edges, _with_prefix(_FINGERPRINTS, arrays)),
+        graph,
+        {
+            robot: OdometryTrack.from_arrays(
+                options.odometry_bounds, _with_prefix(f"odometry{index}_", arrays), options.continuity_limits
+            )
+            for index, robot in enumerate(header["odometry_robots"])
+        },
+        BackwardJumps.from_header(header["backward_jumps"]),
+        Counter(header["rejected"]),
+        {(robot, edge_id): label for robot, edge_id, label in header["labels"]},
+        Room(**header["room"]),
+        DataTime(**header["data_time"]),
+    )
+    builder = GraphBuilder(growth)
+    for row in header.get("unplaced", ()):
+        builder.add_edge(_edge(row))
+    known = header["world_from_odometry"]
+    if known is not None:
+        world_from_odometry = {robot: (x, y, z, w) for robot, (x, y, z, w) in known.items()}
+    else:
+        world_from_odometry = {} if last.body_from_world is None else corrections(builder, last.body_from_world)
+    return ContentState(growth, last, header["version"], header["ticked_revision"], world_from_odometry)
+
+
+def _graph(arrays: Arrays, header: dict[str, Any]) -> GrowingViewGraph:
+    columns: dict[str, Any] = {name: arrays[name] for name in _GRAPH_COLUMNS}
+    checked = ViewGraph.create(num_nodes=len(arrays["keyframe_id"]), **columns)
+    as_saved = torch.from_numpy(arrays["target_from_source"])  # the check may have rounded it
+    return GrowingViewGraph.from_snapshot(
+        GraphSnapshot(
+            graph=replace(checked, target_from_source=as_saved),
+            robots=tuple(header["robots"]),
+            marginalized=MarginalizedIndex.of(
+                MarginalizedKeyframes(**_with_prefix(_MARGINALIZED, arrays)), dict(header["forgotten_up_to"])
+            ),
+            revision=header["revision"],
+            **{name: arrays[name] for name in _KEYFRAME_COLUMNS},
+        )
+    )
+
+
+def _pending(rows: list[dict[str, Any]], options: EstimatorOptions) -> PendingEdges:
+    pending = PendingEdges(options.pending_capacity, options.pending_timeout_ns)
+    pending.take(
+        Waiting(_edge(row["edge"]), KeyframeReference(**row["waits_for"]), row["since_ns"], row["is_undecided"])
+        for row in rows
+    )
+    return pending
+
+
+def _edge(row: dict[str, Any]) -> EdgeMeasurement:
+    ends = {name: KeyframeReference(**row[name]) for name in ("source", "target")}
+    return EdgeMeasurement(**(row | ends))
+
+
+def _prefixed(prefix: str, arrays: dict[str, NDArray[Any]]) -> Arrays:
+    return {f"{prefix}{name}": values for name, values in arrays.items()}
+
+
+def _with_prefix(prefix: str, arrays: Arrays) -> Arrays:
+    return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}

@@ -1,0 +1,136 @@
+"""Keyframes that are marginalised leave what the graph says of the others as it was."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.simulation.trajectories import World
+from rotavg_ros.online.compaction.marginalization import Columns, can_be_marginalized, marginalize
+from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedIndex, MarginalizedKeyframes
+from rotavg_ros.solver import solve
+from rotavg_ros.solver.algebra.probes import probe_signs
+from rotavg_ros.solver.slam.passes import system as slam_system
+from rotavg_ros.view_graph import ViewGraph
+
+COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
+
+
+def columns_of(graph: ViewGraph) -> Columns:
+    edges = {name: getattr(graph, name).numpy() for name in COLUMNS}
+    return edges | {
+        "edge_id": np.arange(graph.num_edges, dtype=np.uint64),
+        "translation": np.zeros((graph.num_edges, 3)),
+    }
+
+
+def keyframes_of(count: int) -> Columns:
+    numbers = np.arange(count)
+    return {
+        "robot": np.zeros(count, np.int32),
+        "keyframe_id": numbers.astype(np.uint64),
+        "stamp_ns": 10 * numbers,
+        "time_line": np.zeros(count, np.int32),
+    }
+
+
+def laplacian(num_nodes: int, edges: Columns) -> np.ndarray:
+    """Of the variances: closures as good as a step."""
+    matrix = np.zeros((num_nodes, num_nodes))
+    for source, target, steps in zip(edges["source"], edges["target"], edges["steps"], strict=True):
+        matrix[[source, target], [source, target]] += 1 / steps
+        matrix[[source, target], [target, source]] -= 1 / steps
+    return matrix
+
+
+@st.composite
+def drives(draw) -> tuple[Rotation, np.ndarray, Columns]:
+    """True poses, and edges without noise: a chain with edges either way, a few more of either kind, and labels."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    count, more = draw(st.integers(3, 25)), draw(st.integers(0, 6))
+    ends = np.array([(i, i + 1) for i in range(count - 1)] + [rng.choice(count, 2, replace=False) for _ in range(more)])
+    turned = rng.random(len(ends)) < 0.3
+    ends[turned] = ends[turned, ::-1]
+    source, target = ends[rng.permutation(len(ends))].T
+    world_from_body, position = Rotation.random(count, rng=rng), rng.normal(size=(count, 3))
+    graph = ViewGraph.create(
+        source,
+        target,
+        (world_from_body[target].inv() * world_from_body[source]).as_quat(canonical=True),
+        num_nodes=count,
+        kind=(np.abs(target - source) > 1) & (rng.random(len(ends)) < 0.7),
+        label=np.where(rng.random(len(ends)) < 0.1, 2, 0),
+        precision=np.where(rng.random(len(ends)) < 0.1, np.nan, 4.0),
+    )
+    edges = columns_of(graph) | {
+        "translation": world_from_body[source].inv().apply(position[target] - position[source])
+    }
+    return world_from_body, position, edges
+
+
+@settings(max_examples=60, deadline=None)
+@given(drives(), st.integers(0, 2**32))
+def test_what_is_left_is_the_schur_complement_and_true_to_the_poses(drive, seed):
+    world_from_body, position, edges = drive
+    rng = np.random.default_rng(seed)
+    count = len(position)
+    full, nodes = laplacian(count, edges), np.arange(count)
+    ids, riders = keyframes_of(count), MarginalizedKeyframes.none()
+    for _ in range(2):  # the second time there are marginalised keyframes already
+        free = can_be_marginalized(len(nodes), edges)
+        done = marginalize(ids, edges, free & (rng.random(len(nodes)) < 0.7), riders)
+        nodes, edges, riders = nodes[done.kept], done.edges, done.marginalized
+        ids = {name: values[done.kept] for name, values in ids.items()}
+    gone = np.setdiff1d(np.arange(count), nodes)
+    schur = full[np.ix_(nodes, nodes)]
+    if len(gone):
+        schur = schur - full[np.ix_(nodes, gone)] @ np.linalg.solve(full[np.ix_(gone, gone)], full[np.ix_(gone, nodes)])
+    np.testing.assert_allclose(laplacian(len(nodes), edges), schur, atol=1e-9)
+    assert ids["keyframe_id"].tolist() == nodes.tolist()
+
+    body, place = world_from_body[nodes], position[nodes]
+    source, target = edges["source"], edges["target"]
+    measured = Rotation.from_quat(edges["target_from_source"])
+    assert (measured * (body[target].inv() * body[source]).inv()).magnitude().max() < 1e-7
+    steps = body[source].inv().apply(place[target] - place[source])
+    np.testing.assert_allclose(edges["translation"], steps, atol=1e-7)
+
+    assert sorted(riders.keyframe_id.tolist()) == gone.tolist()
+    index = MarginalizedIndex.of(riders, {})
+    for keyframe in gone.tolist():
+        row = index.by_id(0, keyframe)
+        assert row == index.by_moment(0, 0, 10 * keyframe) and index.by_id(1, keyframe) is None
+        edge = riders.edge[row]
+        on_edge = (edges[name][edge] for name in ("target_from_source", "translation", "steps"))
+        at_source, turn, offset = index.nearest_end(row, *on_edge)
+        end = source[edge] if at_source else target[edge]
+        assert (body[end] * Rotation.from_quat(turn) * world_from_body[keyframe].inv()).magnitude() < 1e-7
+        np.testing.assert_allclose(place[end] + body[end].apply(offset), position[keyframe], atol=1e-7)
+
+
+def test_the_solver_says_the_same_of_those_that_are_left(monkeypatch):
+    def signs_by_rank(source: np.ndarray, target: np.ndarray, count: int) -> np.ndarray:
+        ranks = np.unique(np.concatenate((source, target)), return_inverse=True)[1]
+        return probe_signs(ranks[: len(source)], ranks[len(source) :], count)
+
+    # Uncertainties are estimated with random signs that hang on the nodes' numbers; here these must not matter.
+    monkeypatch.setattr(slam_system, "probe_signs", signs_by_rank)
+    config = SlamSimulationConfig(
+        World.CITY, num_keyframes=600, laps=3, keyframe_distance_m=2.0, closures_per_keyframe=0.1, false_share=0.2
+    )
+    graph = simulate_slam_graph(config, np.random.default_rng(1004)).graph
+    edges = columns_of(graph)
+    remove = can_be_marginalized(600, edges)
+    assert remove.sum() > 300
+    done = marginalize(keyframes_of(600), edges, remove, MarginalizedKeyframes.none())
+    left = ViewGraph.create(**{name: done.edges[name] for name in COLUMNS}, num_nodes=len(done.kept))
+    full, small = solve(graph), solve(left)
+    turned = Rotation.from_quat(small.body_from_world) * Rotation.from_quat(full.body_from_world[done.kept]).inv()
+    assert np.degrees(turned.magnitude().max()) < 1e-5
+    np.testing.assert_allclose(small.uncertainty, full.uncertainty[done.kept], atol=1e-6)
+    # What an edge of several steps is suspected of is what all of them are.
+    together = np.bincount(done.edge_of, full.outlier_score, len(done.last))
+    np.testing.assert_allclose(small.outlier_score, together, atol=1e-6)

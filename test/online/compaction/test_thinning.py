@@ -1,0 +1,238 @@
+"""A full graph goes on: what can be spared goes, and everything that hangs on indices follows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros import rotations
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.simulation.trajectories import World
+from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
+from rotavg_ros.online.graph import room
+from rotavg_ros.online.graph.fingerprints import Fingerprints
+from rotavg_ros.solver.algebra.residuals import edge_residual
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel
+
+EVERY_MESSAGE = EstimatorOptions(keyframe_angle=0, keyframe_distance=0, max_turn_rate=0, max_speed=0)
+SECOND = 1_000_000_000
+FALSE = 7.0  # precision of a closure that the solver below judges false
+
+
+class Drive:
+    """Noise-free odometry of two robots, and closures; every other one of these by stamp."""
+
+    def __init__(self, estimator: OnlineEstimator, length: int, seed: int = 0) -> None:
+        self.estimator, self.rng = estimator, np.random.default_rng(seed)
+        self.truth = {robot: Rotation.random(length, rng=self.rng) for robot in "ab"}
+        self.place = {robot: self.rng.normal(size=(length, 3)) for robot in "ab"}
+        self.now = 0
+
+    def go(self, steps: int) -> None:
+        for _ in range(steps):
+            for robot in "ab":
+                pose = self.truth[robot][self.now].as_quat().tolist(), self.place[robot][self.now]
+                assert self.estimator.add_odometry(robot, self.now * SECOND, *pose) is None
+            self.now += 1
+
+    def close(self, edge_id: int, source: tuple[str, int], target: tuple[str, int], **values: object) -> object:
+        first, second = (self.truth[robot][index] for robot, index in (source, target))
+        by_stamp = edge_id % 2 == 0
+        ends = [
+            KeyframeReference(robot, stamp_ns=index * SECOND) if by_stamp else KeyframeReference(robot, index)
+            for robot, index in (source, target)
+        ]
+        step = first.inv().apply(self.place[target[0]][target[1]] - self.place[source[0]][source[1]])
+        edge = EdgeMeasurement(edge_id, *ends, (second.inv() * first).as_quat(), translation=step)
+        return self.estimator.add_edge(replace(edge, **values))
+
+    def close_some(self, count: int) -> None:
+        for _ in range(count):
+            source, target = (("ab"[self.rng.integers(2)], int(self.rng.integers(self.now))) for _ in range(2))
+            if source != target:
+                false = self.rng.random() < 0.3
+                self.close(self.next_id(), source, target, precision=FALSE if false else 1.0)
+
+    def next_id(self) -> int:
+        self.last_id = getattr(self, "last_id", 0) + 1
+        return self.last_id
+
+
+@pytest.fixture
+def judging(solver):
+    """The solver, checking what it is given: a warm start fits every edge, and false closures are found."""
+
+    def solve(graph, *, warm_start, **options):
+        if warm_start is not None:
+            residual = edge_residual(warm_start, graph.target_from_source, graph.source, graph.target)
+            assert float(rotations.angle(residual).max()) < 1e-6
+        solution = solver(graph, warm_start=warm_start, **options)
+        return replace(solution, outlier_score=(graph.precision == FALSE).double())
+
+    return solve
+
+
+def check(drive: Drive) -> None:
+    """The answer, the graph and the flags agree with the truth."""
+    estimator = drive.estimator
+    answer = estimator.tick()
+    if answer is None:
+        return
+    for keyframe, robot, orientation in zip(
+        answer.keyframe_id.tolist(), answer.keyframe_robot, answer.world_from_body, strict=True
+    ):
+        truth = drive.truth[answer.robots[robot]][keyframe]
+        assert (Rotation.from_quat(orientation) * truth.inv()).magnitude() < 1e-6
+    poses = estimator.trajectories(answer)["a"]
+    np.testing.assert_allclose(poses.position_dead_reckoned, drive.place["a"][poses.stamp_ns // SECOND], atol=1e-6)
+    snapshot, flags = estimator.snapshot(), estimator._content.state.last.outlier
+    np.testing.assert_array_equal(flags, snapshot.graph.precision.numpy()[: len(flags)] == FALSE)
+    for robot in "ab":
+        present = Rotation.from_quat(estimator.current_orientation(robot))
+        assert (present * drive.truth[robot][drive.now - 1].inv()).magnitude() < 1e-6
+
+
+def test_indices_follow_even_while_a_solve_is_under_way(judging, solver, tmp_path):
+    estimator = OnlineEstimator(replace(EVERY_MESSAGE, max_keyframes=60, gauge="odometry"), judging)
+    drive = Drive(estimator, 500)
+    drive.go(5)
+    drive.close(drive.next_id(), ("a", 2), ("b", 3))
+
+    def meanwhile() -> None:
+        drive.go(7)
+        drive.close_some(4)
+
+    solver.on_call = meanwhile
+    first = None
+    while drive.now < 300:
+        drive.go(3)
+        check(drive)
+        assert estimator.counts().keyframes <= 60
+        first = first or estimator.snapshot().keyframe_id[:2].tolist()
+        if 150 <= drive.now < 160:
+            estimator.save(tmp_path / "state")
+            estimator.load(tmp_path / "state")
+    counts = estimator.counts()
+    assert counts.marginalized > 400 and counts.dropped_closures > 20 and solver.warm > 20
+    assert estimator.snapshot().keyframe_id[:2].tolist() == first == [0, 0]
+    solver.on_call = None
+    assert estimator.tick(force_cold=True).num_components == 1
+
+
+def test_a_closure_to_a_marginalized_keyframe_is_tied_to_the_nearest_that_is_left(solver, monkeypatch):
+    monkeypatch.setattr(room, "_REMEMBERED_AT_LEAST", 100)
+    estimator = OnlineEstimator(replace(EVERY_MESSAGE, max_keyframes=30), solver)
+    drive = Drive(estimator, 400)
+    drive.go(60)
+    left = set(estimator.snapshot().keyframe_id[estimator.snapshot().keyframe_robot == 0].tolist())
+    gone = [keyframe for keyframe in range(40) if keyframe not in left]
+    for edge_id in (1, 2):
+        assert drive.close(edge_id, ("a", gone[edge_id]), ("b", 59)) is None
+        assert drive.close(edge_id, ("a", gone[edge_id]), ("b", 59)) == "duplicate_edge"
+        graph = estimator.snapshot()
+        source, target = (int(end[-1]) for end in (graph.graph.source, graph.graph.target))
+        nearest = int(graph.keyframe_id[source])
+        assert graph.keyframe_robot[source] == 0 and int(graph.keyframe_id[target]) == 59
+        assert abs(nearest - gone[edge_id]) == min(abs(keyframe - gone[edge_id]) for keyframe in left)
+        truth = drive.truth["b"][59].inv() * drive.truth["a"][nearest]
+        tied = Rotation.from_quat(graph.graph.target_from_source[-1].numpy())
+        assert (tied * truth.inv()).magnitude() < 1e-6
+        step = drive.truth["a"][nearest].inv().apply(drive.place["b"][59] - drive.place["a"][nearest])
+        np.testing.assert_allclose(graph.translation[-1], step, atol=1e-6)
+    assert drive.close(3, ("a", gone[2]), ("a", gone[2] + 1), kind=EdgeKind.ODOMETRY) == "marginalized_keyframe"
+    drive.go(90)
+    assert drive.close(5, ("a", gone[5]), ("b", 59)) == "marginalized_keyframe"  # so long ago that it is forgotten
+    assert estimator.counts().pending == 0
+
+
+def test_keyframes_of_a_front_end_are_spared_too_and_not_made_anew(solver):
+    options = replace(EVERY_MESSAGE, keyframe_source="edges", unknown_keyframes="create", max_keyframes=40)
+    estimator = OnlineEstimator(options, solver)
+    turn = Rotation.from_rotvec([0.1, 0.0, 0.2])
+    for index in range(200):
+        ends = KeyframeReference("r", index, index * SECOND), KeyframeReference("r", index + 1, (index + 1) * SECOND)
+        estimator.add_edge(EdgeMeasurement(index, *ends, turn.as_quat(), kind=0, precision=4.0))
+    before = estimator.snapshot()
+    assert len(before.keyframe_id) <= 40
+    assert before.graph.steps.sum() == 200 and torch.allclose(before.graph.precision, 4.0 / before.graph.steps)
+    gone = next(keyframe for keyframe in range(80, 200) if keyframe not in before.keyframe_id)
+    ends = KeyframeReference("r", 0), KeyframeReference("r", stamp_ns=gone * SECOND)
+    assert estimator.add_edge(EdgeMeasurement(999, *ends, (turn**gone).as_quat())) is None
+    after = estimator.snapshot()
+    node = int(after.graph.target[-1])
+    assert len(after.keyframe_id) == len(before.keyframe_id) and abs(int(after.keyframe_id[node]) - gone) <= 20
+    tied = Rotation.from_quat(after.graph.target_from_source[-1].numpy())
+    assert (tied * (turn ** int(after.keyframe_id[node])).inv()).magnitude() < 1e-6
+
+
+def test_what_users_accepted_and_what_holds_the_graph_together_stays(judging):
+    estimator = OnlineEstimator(replace(EVERY_MESSAGE, max_keyframes=50), judging)
+    drive = Drive(estimator, 400)
+    drive.go(10)
+    drive.close(1, ("a", 3), ("b", 4), precision=FALSE)  # the only bridge
+    drive.close(3, ("a", 2), ("a", 8), precision=FALSE)
+    estimator.label_edge("a", 3, EdgeLabel.ACCEPTED)
+    drive.last_id = 4
+    while drive.now < 200:
+        drive.go(10)
+        for back in (3, 5):
+            drive.close(drive.next_id(), ("a", drive.now - back - 2), ("a", drive.now - 1))
+        estimator.tick()
+    answer = estimator.tick(force_cold=True)
+    assert answer.num_components == 1 and {1, 3} <= set(answer.edge_id.tolist())
+    assert estimator.counts().dropped_closures > 0
+
+
+def odometry_of(run: SimulatedRun) -> Iterator[tuple[int, list[float], np.ndarray]]:
+    return zip(run.stamps_ns.tolist(), run.odometry_world_from_body.tolist(), run.odometry_position, strict=True)
+
+
+def test_a_long_drive_with_a_limit_is_hardly_less_accurate():
+    config = SlamSimulationConfig(
+        World.CITY, num_keyframes=800, laps=4, keyframe_distance_m=2.0, closures_per_keyframe=0.3, false_share=0.1
+    )
+    run = simulate_slam_graph(config, np.random.default_rng(1006))
+    graph, truth = run.graph, Rotation.from_quat(run.world_from_body)
+    closures = np.flatnonzero(graph.kind.numpy() == EdgeKind.LOOP_CLOSURE)
+    due = np.maximum(graph.source.numpy(), graph.target.numpy())[closures]
+    errors = {}
+    for limit in (300, 10**6):
+        estimator = OnlineEstimator(replace(EVERY_MESSAGE, max_keyframes=limit))
+        for index, odometry in enumerate(odometry_of(run)):
+            estimator.add_odometry("r", *odometry)
+            for edge in closures[due == index].tolist():
+                ends = (KeyframeReference("r", int(end[edge])) for end in (graph.source, graph.target))
+                assert estimator.add_edge(EdgeMeasurement(edge, *ends, graph.target_from_source[edge].tolist())) is None
+            assert estimator.counts().keyframes <= limit
+            if index % 100 == 99:
+                estimator.tick()
+        answer = estimator.tick(force_cold=True)
+        nodes = answer.keyframe_id.astype(int)
+        off = Rotation.from_quat(answer.world_from_body) * truth[nodes].inv() * truth[0]
+        off = off * (Rotation.from_quat(answer.world_from_body[0])).inv()
+        errors[limit] = dict(zip(nodes.tolist(), np.degrees(off.magnitude()), strict=True))
+    kept = list(errors[300])
+    limited, free = (np.mean([errors[limit][node] for node in kept]) for limit in (300, 10**6))
+    drift = Rotation.from_quat(run.odometry_world_from_body) * truth.inv()
+    drifted = np.degrees((drift[kept] * drift[0].inv()).magnitude().mean())
+    assert limited < 1.5 * free + 0.2 and limited < 0.2 * drifted
+
+
+def test_fingerprints_hold_the_newest_and_forget_the_oldest():
+    known = Fingerprints(10_000)
+    numbers = np.random.default_rng(0).integers(0, 2**64, 50_000, dtype=np.uint64).tolist()
+    for number in numbers:
+        known.add(number)
+    assert all(number in known for number in numbers[-10_000:])
+    assert not any(number in known for number in numbers[:1000]) and 5 not in known
+    assert 10_000 <= len(known) <= 20_000 + 4096
+    again = Fingerprints.from_arrays(10_000, known.arrays())
+    for number in range(20_000):
+        known.add(number)
+        again.add(number)
+        assert (numbers[-5_000] in again) == (numbers[-5_000] in known)

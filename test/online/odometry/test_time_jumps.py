@@ -1,0 +1,224 @@
+"""Time that goes back: one stray message is not believed, a run of them is, and nothing is forgotten unasked."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator, RejectReason
+
+SECOND = 1_000_000_000
+LENGTH = 60
+
+
+def rotation(index: int) -> np.ndarray:
+    return Rotation.from_rotvec([0.02 * index, 0, 0.1 * index]).as_quat()
+
+
+def estimator(policy: str) -> OnlineEstimator:
+    options = EstimatorOptions(keyframe_angle=0, keyframe_distance=0, on_time_jump=policy)
+    return OnlineEstimator(options, lambda *_, **__: None)
+
+
+def feed(online: OnlineEstimator, indices: range, offset_ns: int = 0) -> list[RejectReason | None]:
+    return [online.add_odometry("r", offset_ns + index * SECOND // 10, rotation(index)) for index in indices]
+
+
+def graph(online: OnlineEstimator) -> tuple[list[int], list[list[float]]]:
+    snapshot = online.snapshot()
+    return snapshot.stamp_ns.tolist(), snapshot.graph.target_from_source.tolist()
+
+
+def test_with_reset_a_bag_that_begins_again_leaves_the_graph_of_one_playing() -> None:
+    once, twice = estimator("reset"), estimator("reset")
+    feed(once, range(LENGTH))
+    feed(twice, range(LENGTH))
+    feed(twice, range(LENGTH))
+    assert graph(twice) == graph(once), "the messages that proved the jump are not lost"
+    assert twice.time_jumps == 1 and twice.counts().rejected == {}
+
+
+def turn(source: int, target: int) -> list[float]:
+    between = Rotation.from_quat(rotation(target)).inv() * Rotation.from_quat(rotation(source))
+    return between.as_quat().tolist()
+
+
+def closure(edge_id: int, *stamps_ns: int) -> EdgeMeasurement:
+    source, target = (KeyframeReference("r", stamp_ns=stamp_ns) for stamp_ns in stamps_ns)
+    return EdgeMeasurement(edge_id, source, target, turn(0, 1))
+
+
+def ends(online: OnlineEstimator) -> list[tuple[int, int]]:
+    """Nodes of the closures."""
+    graph = online.snapshot().graph
+    pairs = torch.stack((graph.source, graph.target), dim=1)
+    return [tuple(pair) for pair in pairs[~graph.is_odometry].tolist()]
+
+
+@pytest.fixture
+def kept(solver) -> OnlineEstimator:
+    """With the policy that is the default."""
+    return OnlineEstimator(EstimatorOptions(keyframe_angle=0, keyframe_distance=0), solver)
+
+
+JUMPS = {
+    "two seconds back": (LENGTH * SECOND // 10 - 2 * SECOND, 0),
+    "a bag that begins again": (0, 0),
+    "after two messages an hour ahead": (LENGTH * SECOND // 10, 2),
+}
+
+
+@pytest.mark.parametrize(("resume_ns", "ahead"), JUMPS.values(), ids=JUMPS.keys())
+def test_a_jump_begins_a_component_and_keeps_what_there_was(kept, resume_ns: int, ahead: int) -> None:
+    feed(kept, range(LENGTH))
+    feed(kept, range(LENGTH, LENGTH + ahead), 3600 * SECOND)
+    before = kept.counts().keyframes
+    kept.tick()
+    feed(kept, range(LENGTH), resume_ns)
+    answer = kept.tick()
+    assert len(answer.keyframe_id) == before + LENGTH and answer.num_components == 2
+    assert kept.time_jumps == 1
+    refused = kept.counts().rejected
+    assert refused.get("out_of_order_odometry", 0) == 0, "the messages that proved the jump are not lost"
+    assert answer.newest_stamp_ns == resume_ns + (LENGTH - 1) * SECOND // 10
+    trajectory = kept.trajectories(answer)["r"]
+    assert trajectory.node.tolist() == list(range(before + LENGTH))
+    now = Rotation.from_quat(kept.current_orientation("r"))
+    assert (now * Rotation.from_quat(answer.world_from_body[-1]).inv()).magnitude() < 1e-9
+
+
+def test_stamps_mean_the_time_line_that_has_come_last(kept) -> None:
+    """A bag in a loop: the same closures again are about the keyframes of the second time."""
+    edges = [closure(1, 0, 3 * SECOND), closure(2, SECOND // 20, 4 * SECOND + SECOND // 20)]
+    for _ in range(3):
+        feed(kept, range(LENGTH))
+        assert [kept.add_edge(edge) for edge in edges] == [None, None]
+        assert [kept.add_edge(edge) for edge in edges] == [RejectReason.DUPLICATE_EDGE] * 2
+    assert ends(kept) == [
+        (first + source, first + target) for first in (0, LENGTH, 2 * LENGTH) for source, target in ((0, 30), (0, 40))
+    ]
+    graph = kept.snapshot().graph
+    first, *others = graph.target_from_source[~graph.is_odometry].reshape(3, 2, 4)
+    for again in others:  # also what is told of the moments between keyframes
+        assert torch.allclose(again, first, atol=1e-12)
+    answer = kept.tick()
+    assert answer.num_components == 3 and len(set(answer.stamp_ns.tolist())) == LENGTH
+
+
+def test_a_stamp_that_the_present_time_line_does_not_cover_means_an_earlier_one(kept) -> None:
+    feed(kept, range(LENGTH), 1000 * SECOND)
+    feed(kept, range(LENGTH), 100 * SECOND)
+    present, earlier = 103 * SECOND, 1003 * SECOND
+    assert kept.add_edge(closure(1, earlier, present)) is None
+    assert kept.add_edge(closure(2, present, present + 30 * SECOND)) is None, "not there yet: it waits"
+    assert kept.add_edge(closure(3, present, 90 * SECOND)) is RejectReason.STAMP_OUT_OF_RANGE
+    assert ends(kept) == [(30, LENGTH + 30)]
+
+
+def test_edges_wait_while_it_is_open_which_time_line_their_stamps_are_of(kept) -> None:
+    """Odometry shows the jump with its fifth message; closures come before that."""
+    feed(kept, range(LENGTH))
+    feed(kept, range(3))
+    assert kept.add_edge(closure(1, 0, SECOND // 10)) is None
+    assert ends(kept) == [] and kept.counts().pending == 1
+    feed(kept, range(3, 20))
+    assert ends(kept) == [(LENGTH, LENGTH + 1)]
+    feed(kept, range(2))  # two strays …
+    assert kept.add_edge(closure(2, 0, SECOND)) is None
+    assert kept.counts().pending == 1
+    feed(kept, range(20, 22))  # … and time goes on
+    assert ends(kept) == [(LENGTH, LENGTH + 1), (LENGTH, LENGTH + 10)]
+    feed(kept, range(1))  # one stray alone is nothing to wait for: perhaps no odometry comes any more
+    assert kept.add_edge(closure(3, 0, SECOND // 2)) is None
+    assert ends(kept)[-1] == (LENGTH, LENGTH + 5) and kept.counts().pending == 0
+
+
+@pytest.mark.parametrize("policy", ["new_component", "ignore", "error"])
+def test_what_waited_at_the_jump(solver, policy: str) -> None:
+    """What is just ahead of the last message is tied to it; what waits for more odometry of then is refused."""
+    options = EstimatorOptions(keyframe_angle=0, keyframe_distance=0, on_time_jump=policy)
+    online = OnlineEstimator(options, solver)
+    last_ns = (LENGTH - 1) * SECOND // 10
+    feed(online, range(LENGTH))
+    assert online.add_edge(closure(1, 0, last_ns + SECOND // 20)) is None
+    assert online.add_edge(closure(2, 0, last_ns + SECOND)) is None
+    feed(online, range(10))
+    begins = policy == "new_component"
+    assert ends(online) == ([(0, LENGTH - 1)] if begins else [])
+    assert online.counts().pending == (0 if begins else 2)
+    assert online.counts().rejected.get("stamp_out_of_range", 0) == int(begins)
+
+
+def test_waiting_edges_time_out_on_the_new_time_line(solver) -> None:
+    options = EstimatorOptions(keyframe_angle=0, keyframe_distance=0, pending_timeout_s=3.0)
+    online = OnlineEstimator(options, solver)
+    feed(online, range(LENGTH), 1000 * SECOND)
+    online.add_edge(EdgeMeasurement(1, KeyframeReference("r", 0), KeyframeReference("r", 5000), turn(0, 1)))
+    feed(online, range(20))
+    assert online.counts().pending == 1
+    feed(online, range(20, 50))
+    assert online.counts().pending == 0
+
+
+def test_the_clock_begins_a_time_line_for_the_robots_that_are_ahead_of_it(kept) -> None:
+    feed(kept, range(LENGTH), 100 * SECOND)
+    kept.add_odometry("slow", 10 * SECOND, rotation(0))
+    kept.clock_went_back(9 * SECOND + SECOND // 2)
+    kept.clock_went_back(9 * SECOND + SECOND // 2)
+    assert kept.time_jumps == 1
+    kept.add_odometry("slow", 11 * SECOND, rotation(1))
+    feed(kept, range(LENGTH), 100 * SECOND)  # no run of late messages is needed
+    answer = kept.tick()
+    assert answer.num_components == 3 and len(answer.keyframe_id) == 2 * LENGTH + 2
+    assert answer.time_line.tolist() == [0] * LENGTH + [0, 0] + [1] * LENGTH
+    assert kept.counts().rejected == {}
+
+
+@given(late=st.lists(st.tuples(st.integers(0, LENGTH - 1), st.integers(0, 10_000)), max_size=40))
+def test_stray_old_messages_among_good_ones_change_nothing(late: list[tuple[int, int]]) -> None:
+    """Up to four in a row whatever their stamps; a good message in between starts the count anew."""
+    clean, mixed = estimator("new_component"), estimator("new_component")
+    feed(clean, range(LENGTH), 1000 * SECOND)
+    by_index: dict[int, list[int]] = {}
+    for index, milliseconds in late:
+        by_index.setdefault(index, []).append(milliseconds * SECOND // 1000)
+    for index in range(LENGTH):
+        feed(mixed, range(index, index + 1), 1000 * SECOND)
+        for stamp_ns in by_index.get(index, [])[:4]:
+            assert mixed.add_odometry("r", stamp_ns, rotation(0)) is RejectReason.OUT_OF_ORDER_ODOMETRY
+    assert graph(mixed) == graph(clean) and mixed.time_jumps == 0
+
+
+@pytest.mark.parametrize("policy", ["ignore", "error"])
+def test_without_reset_the_graph_is_kept_until_time_is_ahead_again(policy: str) -> None:
+    online = estimator(policy)
+    feed(online, range(LENGTH))
+    before = graph(online)
+    assert set(feed(online, range(LENGTH - 1))) == {RejectReason.OUT_OF_ORDER_ODOMETRY}
+    assert graph(online) == before and online.time_jumps == 1
+    assert online.counts().time_is_back == (policy == "error")
+    assert feed(online, range(LENGTH, LENGTH + 3)) == [None] * 3
+    assert not online.counts().time_is_back
+
+
+def test_a_small_step_back_is_only_out_of_order() -> None:
+    online = estimator("new_component")
+    feed(online, range(LENGTH))
+    assert set(feed(online, range(LENGTH - 9, LENGTH - 1))) == {RejectReason.OUT_OF_ORDER_ODOMETRY}
+    assert online.time_jumps == 0
+
+
+def test_the_clock_tells_it_at_once_but_only_what_odometry_has_not() -> None:
+    online = estimator("reset")
+    feed(online, range(LENGTH))
+    online.clock_went_back(5 * SECOND + SECOND // 2)  # odometry is at 5.9 s
+    assert online.counts().keyframes == LENGTH
+    online.clock_went_back(0)
+    assert online.counts().keyframes == 0 and online.time_jumps == 1
+    feed(online, range(3))
+    online.clock_went_back(0)
+    assert online.counts().keyframes == 3 and online.time_jumps == 1
