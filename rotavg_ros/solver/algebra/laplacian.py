@@ -12,7 +12,7 @@ from contextlib import suppress
 from functools import partial
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_solve
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import SuperLU, splu
 
@@ -91,7 +91,9 @@ class LaplacianPattern:
         if is_dense and num_nodes <= _DENSE_MAX_NODES:
             # Weights that span all of double precision can leave no positive pivot; the sparse factorisation copes.
             with suppress(np.linalg.LinAlgError):
-                factor = partial(cho_solve, cho_factor(matrix.toarray(), lower=True, overwrite_a=True))
+                # SciPy's cho_factor would keep Python's global lock, and with it every other thread, for seconds.
+                lower = np.linalg.cholesky(matrix.toarray())
+                factor = partial(cho_solve, (lower.T, False))
                 return FactorisedLaplacian(self._incidence, weight, factor, num_nodes**2)
         return FactorisedLaplacian(self._incidence, weight, *self._factorize_sparse(matrix))
 
