@@ -9,7 +9,7 @@ import numpy as np
 from rotavg_ros.datasets.files.corrected_graph import write_corrected_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.files.pose_files import write_kitti, write_tum
-from rotavg_ros.online.answer.positions import Translations, fit_positions
+from rotavg_ros.solver.positions import Translations, fit_positions
 
 POSE_FILES = ("graph.g2o", "trajectory.kitti", "trajectory.tum")
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from rotavg_ros.hamilton import hamilton_product
+
 Quaternion = tuple[float, float, float, float]
 Vector = tuple[float, float, float]
 
@@ -18,14 +20,7 @@ UNKNOWN_VECTOR: Vector = (math.nan, math.nan, math.nan)
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     """Hamilton product ``a ∘ b``."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
+    return hamilton_product(a, b)
 
 
 def inverse(a: Quaternion) -> Quaternion:

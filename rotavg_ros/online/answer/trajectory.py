@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online.answer.answer import Answer
-from rotavg_ros.online.answer.positions import Translations, fit_positions
 from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS
 from rotavg_ros.online.odometry.track import OdometryTrack
+from rotavg_ros.solver.positions import Translations, fit_positions
 from rotavg_ros.view_graph import EdgeKind
 
 

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros.datasets.simulation.robot_run import RobotRun
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, simulate_slam_graph
-from rotavg_ros.online.answer.positions import Translations, fit_positions
 from rotavg_ros.online.answer.trajectory import dead_reckoning
+from rotavg_ros.solver.positions import Translations, fit_positions
 
 
 @pytest.fixture(scope="module")
