@@ -166,7 +166,9 @@ BY_NAME = {
     "ros.node.intake.adapters",
     "ros.node.intake.serialized_array",
 }
-MAX_ROOMS = 16
+MAX_ROOMS, MAX_PARAMETERS = 16, 6
+# Columns of a table and options of a public call, by keyword, most of which nobody gives.
+BY_KEYWORD = {"solver.pipeline.solve", "view_graph.create", "datasets.files.graph_file.from_ids"}
 
 
 def files(folder: str = "") -> list[Path]:
@@ -287,3 +289,14 @@ def test_a_folder_holds_no_more_than_can_be_held_in_the_head() -> None:
     for folder in {file.parent for file in files()} - {PACKAGE, PACKAGE / "cli"}:
         rooms = [path for path in folder.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()]
         assert len(rooms) - 1 <= MAX_ROOMS, f"{folder} has {len(rooms) - 1} rooms"
+
+
+def test_parameters_that_travel_together_are_a_class() -> None:
+    for name, file in MODULES.items():
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                given = [*node.args.posonlyargs, *node.args.args]
+                if f"{name}.{node.name}" not in BY_KEYWORD:
+                    given += node.args.kwonlyargs
+                count = sum(argument.arg not in ("self", "cls") for argument in given)
+                assert count <= MAX_PARAMETERS, f"{file}: {node.name} takes {count} parameters"

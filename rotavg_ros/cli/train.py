@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -32,11 +33,9 @@ def run(arguments: argparse.Namespace) -> int:
     trainer = make_trainer(
         arguments.network,
         config,
+        Inputs(arguments.config, arguments.clean_net, arguments.start),
         arguments.output,
-        arguments.clean_net,
         arguments.device,
-        arguments.config,
-        arguments.start,
     )
     if trainer.epochs_done:
         print(f"going on after epoch {trainer.epochs_done} of {config.epochs}", flush=True)
@@ -62,31 +61,35 @@ def load_config(name: str) -> TrainingConfig:
     return TrainingConfig.load(path)
 
 
-def make_trainer(
-    network: str,
-    config: TrainingConfig,
-    output: Path,
-    clean_net: Path | None,
-    device: str,
-    origin: str,
-    start: Path | None = None,
-) -> Trainer:
+@dataclass(frozen=True)
+class Inputs:
+    """What a training begins with.
+
+    Attributes:
+        config: how the user named the configuration, for the card.
+        clean_net: weights for the CleanNet before a FineNet.
+        start: weights to begin with.
+    """
+
+    config: str
+    clean_net: Path | None = None
+    start: Path | None = None
+
+
+def make_trainer(network: str, config: TrainingConfig, given: Inputs, output: Path, device: str) -> Trainer:
     """Task and trainer for a network ("clean-net" or "fine-net") of the configuration's family.
 
     Args:
-        clean_net: weights for the CleanNet before a FineNet.
         device: "auto", "cpu" or "cuda".
-        origin: how the user named the configuration, for the card.
-        start: weights to begin with.
 
     Raises:
         UserError: options that do not fit, weights or a checkpoint that cannot be used.
     """
-    if network == "clean-net" and clean_net is not None:
+    if network == "clean-net" and given.clean_net is not None:
         raise TrainCommandError("--clean-net is for fine-net; to go on with a CleanNet, give the same --output")
-    if config.goes_on_from and start is None:
+    if config.goes_on_from and given.start is None:
         raise TrainCommandError(
-            f"{origin}: goes on from the weights that `rotavg train {network} {config.goes_on_from}` makes; name them "
+            f"{given.config}: goes on from the weights that `rotavg train {network} {config.goes_on_from}` makes; name them "
             "with --start"
         )
     if config.family == "slam" and network == "fine-net":
@@ -95,7 +98,7 @@ def make_trainer(
         raise TrainCommandError("the SLAM profile's CleanNet trains on the CPU, where its graphs live")
     name = f"{config.family}-{network}"
     # What is wrong with any of the files shows before the minutes that drawing graphs takes.
-    given = None if start is None else read_network(NETWORKS[name], start)
+    weights = None if given.start is None else read_network(NETWORKS[name], given.start)
     make_folder(output)
     inputs: dict[str, str] = {}
     task: TrainingTask
@@ -106,16 +109,16 @@ def make_trainer(
         with working("drawing view-graphs"):
             task = SfmCleanTask(config, _torch_device(device))
     else:
-        before = _clean_net(output, clean_net)
+        before = _clean_net(output, given.clean_net)
         inputs["clean_net_fingerprint"] = fingerprint(before)
         with working("drawing view-graphs"):
             task = SfmFineTask(config, _torch_device(device), before)
-    command = f"rotavg train {network} {Path(origin).stem if Path(origin).exists() else origin}"
-    if clean_net is not None:
+    command = f"rotavg train {network} {Path(given.config).stem if Path(given.config).exists() else given.config}"
+    if given.clean_net is not None:
         command += " --clean-net WEIGHTS"
-    if given is not None:
-        inputs["start_fingerprint"] = fingerprint(given)
-        task.network.load_state_dict(given.state_dict())
+    if weights is not None:
+        inputs["start_fingerprint"] = fingerprint(weights)
+        task.network.load_state_dict(weights.state_dict())
         command += " --start WEIGHTS"
     return Trainer(task, config, output, name, inputs, command)
 
