@@ -89,8 +89,8 @@ def make_trainer(network: str, config: TrainingConfig, given: Inputs, output: Pa
         raise TrainCommandError("--clean-net is for fine-net; to go on with a CleanNet, give the same --output")
     if config.goes_on_from and given.start is None:
         raise TrainCommandError(
-            f"{given.config}: goes on from the weights that `rotavg train {network} {config.goes_on_from}` makes; name them "
-            "with --start"
+            f"{given.config}: goes on from the weights that `rotavg train {network} {config.goes_on_from}` makes; "
+            "name them with --start"
         )
     if config.family == "slam" and network == "fine-net":
         raise TrainCommandError("the SLAM profile has no FineNet; its refinement does that work")
