@@ -20,7 +20,7 @@ class KeyframeIndex:
     def __init__(self) -> None:
         self._node_of_id: dict[int, int] = {}
         # In ascending order of the time lines, then of the stamps, then of the nodes.
-        self._time_line = GrowingArray(np.int32)
+        self._time_line = GrowingArray(np.int64)
         self._stamp_ns = GrowingArray(np.int64)
         self._node = GrowingArray(np.int64)
 
@@ -29,7 +29,7 @@ class KeyframeIndex:
         cls,
         nodes: NDArray[np.int64],
         keyframe_id: NDArray[np.uint64],
-        time_line: NDArray[np.int32],
+        time_line: NDArray[np.int64],
         stamp_ns: NDArray[np.int64],
     ) -> KeyframeIndex:
         """The index of keyframes ``(K,)`` in ascending order of their nodes.
@@ -74,7 +74,7 @@ class KeyframeIndex:
         return int(self._node.view[start]) if stop > start else None
 
     @property
-    def moments(self) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    def moments(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Stamps and time lines, in the order of the moments."""
         return self._stamp_ns.view, self._time_line.view
 
