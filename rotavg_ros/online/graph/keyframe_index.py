@@ -70,7 +70,7 @@ class KeyframeIndex:
 
     def first(self, time_line: int) -> int | None:
         """The time line's node with the smallest stamp."""
-        start, stop = np.searchsorted(self._time_line.view, (time_line, time_line + 1)).tolist()
+        start, stop = self._rows_of(time_line)
         return int(self._node.view[start]) if stop > start else None
 
     @property
@@ -78,9 +78,16 @@ class KeyframeIndex:
         """Stamps and time lines, in the order of the moments."""
         return self._stamp_ns.view, self._time_line.view
 
+    def _rows_of(self, time_line: int) -> tuple[int, int]:
+        column = self._time_line.view
+        if time_line == 0 and (not len(column) or column[-1] == 0):
+            return 0, len(column)
+        start, stop = np.searchsorted(column, (time_line, time_line + 1)).tolist()
+        return start, stop
+
     def _places(self, time_line: int, stamp_ns: int) -> tuple[int, int]:
         """Where a time line begins, and where a stamp that comes after all its equals belongs on it."""
-        start, stop = np.searchsorted(self._time_line.view, (time_line, time_line + 1)).tolist()
+        start, stop = self._rows_of(time_line)
         return start, start + int(np.searchsorted(self._stamp_ns.view[start:stop], stamp_ns, "right"))
 
     def newest_first(self) -> Iterator[int]:

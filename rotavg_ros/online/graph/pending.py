@@ -30,9 +30,6 @@ class PendingEdges:
     """Each waiting edge waits for one of its ends. When there are more than ``capacity`` the oldest has to go.
 
     Undecided ones wait until it is known which time line of a robot their stamps are of.
-
-    Attributes:
-        fingerprints: of those that wait.
     """
 
     def __init__(self, capacity: int, timeout_ns: int) -> None:
@@ -40,13 +37,17 @@ class PendingEdges:
         self._timeout_ns = timeout_ns
         self._serial = 0
         self._waiting: dict[int, Waiting] = {}  # by serial number, so in order of arrival
-        self.fingerprints: set[int] = set()
+        self._fingerprints: set[int] = set()
         self._by_keyframe: dict[tuple[str, int], dict[int, None]] = {}
         self._by_stamp: dict[str, list[tuple[int, int]]] = {}  # per robot, ascending (stamp, serial)
         self._undecided: dict[str, dict[int, None]] = {}  # per robot
 
     def __len__(self) -> int:
         return len(self._waiting)
+
+    def __contains__(self, edge: EdgeMeasurement) -> bool:
+        """Whether the edge, or a retransmission of it, waits."""
+        return bool(self._fingerprints) and edge.fingerprint() in self._fingerprints
 
     def __iter__(self) -> Iterator[EdgeMeasurement]:
         return (waiting.edge for waiting in self._waiting.values())
@@ -68,7 +69,7 @@ class PendingEdges:
     def _add(self, waiting: Waiting) -> None:
         self._serial += 1
         self._waiting[self._serial] = waiting
-        self.fingerprints.add(waiting.edge.fingerprint())
+        self._fingerprints.add(waiting.edge.fingerprint())
         reference = waiting.waits_for
         if waiting.is_undecided:
             self._undecided.setdefault(reference.robot, {})[self._serial] = None
@@ -116,7 +117,7 @@ class PendingEdges:
 
     def _remove(self, serial: int) -> EdgeMeasurement:
         waiting = self._waiting.pop(serial)
-        self.fingerprints.discard(waiting.edge.fingerprint())
+        self._fingerprints.discard(waiting.edge.fingerprint())
         reference = waiting.waits_for
         if waiting.is_undecided:
             del self._undecided[reference.robot][serial]

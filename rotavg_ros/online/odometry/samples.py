@@ -211,6 +211,8 @@ class OdometrySamples:
     def _rows_of(self, time_line: int | None) -> slice:
         """Where a time line's messages are; there must be one."""
         column = self._time_line.view
+        if column[-1] == 0:
+            return slice(0, len(column))
         number = column[-1] if time_line is None else time_line
         return slice(int(np.searchsorted(column, number)), int(np.searchsorted(column, number, "right")))
 
