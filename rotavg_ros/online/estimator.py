@@ -28,7 +28,6 @@ from rotavg_ros.view_graph import EdgeLabel
 if TYPE_CHECKING:
     from rotavg_ros.solver import Solution
 
-
 # Whole solves of so many edges take memory that is worth the milliseconds of giving it back.
 _MANY_EDGES = 1000
 
@@ -135,9 +134,7 @@ class OnlineEstimator:
                 self._forget()
             else:
                 return reason
-            for message in since_jump:
-                reason, _ = self._content.add_odometry(message)
-            return reason
+            return [self._content.add_odometry(message)[0] for message in since_jump][-1]
 
     def clock_went_back(self, now_ns: int) -> None:
         """The clock that stamps the data (``/clock``) went back to ``now_ns``; taken as if odometry had told it."""

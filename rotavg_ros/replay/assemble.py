@@ -105,7 +105,7 @@ def _from_file(path: Path, trajectory: Trajectory, odometry_ns: NDArray[np.int64
             )
             raise GraphFileError.at(path, None, what)
         if (np.diff(stamps_ns) <= 0).any():
-            time_line = np.cumsum(np.diff(stamps_ns, prepend=stamps_ns[0] - 1) <= 0, dtype=np.int32)
+            time_line = np.cumsum(np.diff(stamps_ns, prepend=stamps_ns[0] - 1) <= 0, dtype=np.int64)
     else:
         stamps_ns = poses.stamps_ns
         first_ns, last_ns = keyframes_ns.min(), keyframes_ns.max()

@@ -73,7 +73,7 @@ def truth_at_keyframes(reference: Reference, stamp_ns: NDArray[np.int64]) -> Tru
     return Truth(orientation, position)
 
 
-def _truth(reference: Reference, stamp_ns: NDArray[np.int64], time_line: NDArray[np.int32]) -> Truth:
+def _truth(reference: Reference, stamp_ns: NDArray[np.int64], time_line: NDArray[np.int64]) -> Truth:
     """:func:`truth_at_keyframes`, each time line of a robot with that of the reference."""
     orientation = np.full((len(stamp_ns), 4), np.nan)
     position = None if reference.position is None else np.full((len(stamp_ns), 3), np.nan)

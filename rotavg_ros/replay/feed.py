@@ -148,9 +148,9 @@ def _reference(name: str, records: list[OdometryRecord], options: EstimatorOptio
     )
 
 
-def _time_lines(records: list[OdometryRecord], options: EstimatorOptions) -> NDArray[np.int32]:
+def _time_lines(records: list[OdometryRecord], options: EstimatorOptions) -> NDArray[np.int64]:
     """Number of the time line of each record, by the rule that the robots' odometry follows."""
-    time_line = np.zeros(len(records), dtype=np.int32)
+    time_line = np.zeros(len(records), dtype=np.int64)
     if options.on_time_jump in KEEPS_TIME_LINE:
         return time_line
     jumps, newest_ns, step_ns = BackwardJumps(), -1, options.odometry_bounds.max_gap_ns

@@ -58,14 +58,14 @@ class Reference:
         stamp_ns: ``(r,)`` int64, on the bag's clock; ascending within a time line.
         world_from_body: ``(r, 4)`` xyzw, in a world of its own.
         position: ``(r, 3)`` metres; None where it states none.
-        time_line: ``(r,)`` int32 as of a robot's keyframes; None: one, which stands for all of the robot's.
+        time_line: ``(r,)`` int64 as of a robot's keyframes; None: one, which stands for all of the robot's.
     """
 
     name: str
     stamp_ns: NDArray[np.int64]
     world_from_body: NDArray[np.float64]
     position: NDArray[np.float64] | None
-    time_line: NDArray[np.int32] | None = None
+    time_line: NDArray[np.int64] | None = None
 
     def on_time_line(self, time_line: int, num_time_lines: int) -> Reference | None:
         """What it says of one of a robot's time lines; None where nobody knows.
@@ -96,7 +96,7 @@ class RobotRecord:
         robot: its name.
         nodes: ``(n,)`` int64 indices into the answer's keyframes.
         stamp_ns: ``(n,)`` int64; ascending within a time line.
-        time_line: ``(n,)`` int32: where the robot's clock went back, the next one begins.
+        time_line: ``(n,)`` int64: where the robot's clock went back, the next one begins.
         keyframe_id: ``(n,)`` uint64.
         odometry_world_from_body: ``(n, 4)`` xyzw, in odometry's frame; NaN rows without odometry.
         odometry_position: ``(n, 3)`` metres in odometry's frame; None without positions.
@@ -110,7 +110,7 @@ class RobotRecord:
     robot: str
     nodes: NDArray[np.int64]
     stamp_ns: NDArray[np.int64]
-    time_line: NDArray[np.int32]
+    time_line: NDArray[np.int64]
     keyframe_id: NDArray[np.uint64]
     odometry_world_from_body: NDArray[np.float64]
     odometry_position: NDArray[np.float64] | None

@@ -28,7 +28,7 @@ class Answer:
         keyframe_robot: ``(N,)`` int32 index into ``robots``.
         keyframe_id: ``(N,)`` uint64.
         stamp_ns: ``(N,)`` int64, -1 where unknown.
-        time_line: ``(N,)`` int32, which of its robot's time lines the stamp is of: where a robot's clock went back,
+        time_line: ``(N,)`` int64, which of its robot's time lines the stamp is of: where a robot's clock went back,
             the next one begins, and the same stamps may come again.
         world_from_body: ``(N, 4)`` float64 xyzw, w ≥ 0, in the component's fixed gauge.
         component: ``(N,)`` int64, numbered by first keyframe.
@@ -54,7 +54,7 @@ class Answer:
     keyframe_robot: NDArray[np.int32]
     keyframe_id: NDArray[np.uint64]
     stamp_ns: NDArray[np.int64]
-    time_line: NDArray[np.int32]
+    time_line: NDArray[np.int64]
     world_from_body: NDArray[np.float64]
     component: NDArray[np.int64]
     uncertainty: NDArray[np.float64]
@@ -129,7 +129,7 @@ class Answer:
     @property
     def newest_stamp_ns(self) -> int:
         """Of all keyframes on their robots' latest time lines; 0 without any stamp."""
-        latest = np.zeros(len(self.robots), dtype=np.int32)
+        latest = np.zeros(len(self.robots), dtype=np.int64)
         np.maximum.at(latest, self.keyframe_robot, self.time_line)
         is_latest = self.time_line == latest[self.keyframe_robot]
         return int(self.stamp_ns[is_latest].max(initial=0))

@@ -31,7 +31,7 @@ class Trajectory:
 
     node: NDArray[np.int64]
     stamp_ns: NDArray[np.int64]
-    time_line: NDArray[np.int32]
+    time_line: NDArray[np.int64]
     world_from_body: NDArray[np.float64]
     position: NDArray[np.float64]
     position_dead_reckoned: NDArray[np.float64]
@@ -114,7 +114,7 @@ def dead_reckoning(
     world_from_body: NDArray[np.float64],
     odometry_world_from_body: NDArray[np.float64],
     odometry_position: NDArray[np.float64],
-    chain: NDArray[np.int32] | None = None,
+    chain: NDArray[np.int64] | None = None,
 ) -> NDArray[np.float64]:
     """Odometry's steps, seen from the body, laid along other orientations.
 

@@ -22,7 +22,7 @@ class MarginalizedKeyframes:
         robot: ``(K,)`` int32 index.
         keyframe_id: ``(K,)`` uint64.
         stamp_ns: ``(K,)`` int64, -1 where unknown.
-        time_line: ``(K,)`` int32, which of its robot's time lines the stamp is of.
+        time_line: ``(K,)`` int64, which of its robot's time lines the stamp is of.
         edge: ``(K,)`` int64, the odometry edge.
         keyframe_from_source: ``(K, 4)`` xyzw, from the frame of the edge's source.
         position: ``(K, 3)`` in the frame of the edge's source, metres; NaN unknown.
@@ -32,7 +32,7 @@ class MarginalizedKeyframes:
     robot: NDArray[np.int32]
     keyframe_id: NDArray[np.uint64]
     stamp_ns: NDArray[np.int64]
-    time_line: NDArray[np.int32]
+    time_line: NDArray[np.int64]
     edge: NDArray[np.int64]
     keyframe_from_source: NDArray[np.float64]
     position: NDArray[np.float64]
@@ -47,7 +47,7 @@ class MarginalizedKeyframes:
             np.empty(0, dtype=np.int32),
             np.empty(0, dtype=np.uint64),
             np.empty(0, dtype=np.int64),
-            np.empty(0, dtype=np.int32),
+            np.empty(0, dtype=np.int64),
             np.empty(0, dtype=np.int64),
             np.empty((0, 4)),
             np.empty((0, 3)),

@@ -34,7 +34,7 @@ class EdgePlacement:
             edge = replace(edge, target_from_source=check_edge(edge))
             undecided = self._undecided_end(edge)
             is_known = undecided is None and self._fingerprint(edge) in growth.fingerprints
-            if is_known or edge.fingerprint() in growth.pending.fingerprints:
+            if is_known or edge in growth.pending:
                 raise RejectedInputError(RejectReason.DUPLICATE_EDGE)
             if not growth.has_room_for_edge():
                 raise RejectedInputError(RejectReason.GRAPH_FULL)

@@ -19,7 +19,7 @@ from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS
 from rotavg_ros.online.quaternion import Quaternion, Vector
 from rotavg_ros.view_graph import ViewGraph
 
-_KEYFRAME_COLUMNS = {"robot": np.int32, "keyframe_id": np.uint64, "stamp_ns": np.int64, "time_line": np.int32}
+_KEYFRAME_COLUMNS = {"robot": np.int64, "keyframe_id": np.uint64, "stamp_ns": np.int64, "time_line": np.int64}
 _EDGE_COLUMNS = {
     "edge_id": (np.uint64, None),
     "source": (np.int64, None),
@@ -122,7 +122,7 @@ class GrowingViewGraph:
         index = self._index_of(robot)
         return iter(()) if index is None else index.newest_first()
 
-    def moments(self, robot: str) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    def moments(self, robot: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Stamps and time lines of the robot's nodes with a stamp, in the order of the moments."""
         return (KeyframeIndex() if (index := self._index_of(robot)) is None else index).moments
 

@@ -20,7 +20,7 @@ class KeyframeIndex:
     def __init__(self) -> None:
         self._node_of_id: dict[int, int] = {}
         # In ascending order of the time lines, then of the stamps, then of the nodes.
-        self._time_line = GrowingArray(np.int32)
+        self._time_line = GrowingArray(np.int64)
         self._stamp_ns = GrowingArray(np.int64)
         self._node = GrowingArray(np.int64)
 
@@ -29,7 +29,7 @@ class KeyframeIndex:
         cls,
         nodes: NDArray[np.int64],
         keyframe_id: NDArray[np.uint64],
-        time_line: NDArray[np.int32],
+        time_line: NDArray[np.int64],
         stamp_ns: NDArray[np.int64],
     ) -> KeyframeIndex:
         """The index of keyframes ``(K,)`` in ascending order of their nodes.
@@ -70,17 +70,24 @@ class KeyframeIndex:
 
     def first(self, time_line: int) -> int | None:
         """The time line's node with the smallest stamp."""
-        start, stop = np.searchsorted(self._time_line.view, (time_line, time_line + 1)).tolist()
+        start, stop = self._rows_of(time_line)
         return int(self._node.view[start]) if stop > start else None
 
     @property
-    def moments(self) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    def moments(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Stamps and time lines, in the order of the moments."""
         return self._stamp_ns.view, self._time_line.view
 
+    def _rows_of(self, time_line: int) -> tuple[int, int]:
+        column = self._time_line.view
+        if time_line == 0 and (not len(column) or column[-1] == 0):
+            return 0, len(column)
+        start, stop = np.searchsorted(column, (time_line, time_line + 1)).tolist()
+        return start, stop
+
     def _places(self, time_line: int, stamp_ns: int) -> tuple[int, int]:
         """Where a time line begins, and where a stamp that comes after all its equals belongs on it."""
-        start, stop = np.searchsorted(self._time_line.view, (time_line, time_line + 1)).tolist()
+        start, stop = self._rows_of(time_line)
         return start, start + int(np.searchsorted(self._stamp_ns.view[start:stop], stamp_ns, "right"))
 
     def newest_first(self) -> Iterator[int]:

@@ -33,7 +33,6 @@ class PendingEdges:
     Undecided ones wait until it is known which time line of a robot their stamps are of.
 
     Attributes:
-        fingerprints: of those that wait.
         by_robot: how many wait for each robot.
     """
 
@@ -42,7 +41,7 @@ class PendingEdges:
         self._timeout_ns = timeout_ns
         self._serial = 0
         self._waiting: dict[int, Waiting] = {}  # by serial number, so in order of arrival
-        self.fingerprints: set[int] = set()
+        self._fingerprints: set[int] = set()
         self.by_robot: Counter[str] = Counter()
         self._by_keyframe: dict[tuple[str, int], dict[int, None]] = {}
         self._by_stamp: dict[str, list[tuple[int, int]]] = {}  # per robot, ascending (stamp, serial)
@@ -50,6 +49,10 @@ class PendingEdges:
 
     def __len__(self) -> int:
         return len(self._waiting)
+
+    def __contains__(self, edge: EdgeMeasurement) -> bool:
+        """Whether the edge, or a retransmission of it, waits."""
+        return bool(self._fingerprints) and edge.fingerprint() in self._fingerprints
 
     def __iter__(self) -> Iterator[EdgeMeasurement]:
         return (waiting.edge for waiting in self._waiting.values())
@@ -80,7 +83,7 @@ class PendingEdges:
     def _add(self, waiting: Waiting) -> None:
         self._serial += 1
         self._waiting[self._serial] = waiting
-        self.fingerprints.add(waiting.edge.fingerprint())
+        self._fingerprints.add(waiting.edge.fingerprint())
         reference = waiting.waits_for
         self.by_robot[reference.robot] += 1
         if waiting.is_undecided:
@@ -129,7 +132,7 @@ class PendingEdges:
 
     def _remove(self, serial: int) -> EdgeMeasurement:
         waiting = self._waiting.pop(serial)
-        self.fingerprints.discard(waiting.edge.fingerprint())
+        self._fingerprints.discard(waiting.edge.fingerprint())
         reference = waiting.waits_for
         self.by_robot[reference.robot] -= 1
         if not self.by_robot[reference.robot]:

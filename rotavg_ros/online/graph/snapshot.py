@@ -49,7 +49,7 @@ class GraphSnapshot:
         keyframe_robot: ``(N,)`` int32 index into ``robots``.
         keyframe_id: ``(N,)`` uint64.
         stamp_ns: ``(N,)`` int64, -1 where unknown.
-        time_line: ``(N,)`` int32, which of its robot's time lines the stamp is of, from 0.
+        time_line: ``(N,)`` int64, which of its robot's time lines the stamp is of, from 0.
         edge_id: ``(M,)`` uint64, the senders' ids.
         translation: ``(M, 3)`` position of the edge's target in its source's frame, metres; NaN unknown.
         marginalized: keyframes that the edges have swallowed.
@@ -61,7 +61,7 @@ class GraphSnapshot:
     keyframe_robot: NDArray[np.int32]
     keyframe_id: NDArray[np.uint64]
     stamp_ns: NDArray[np.int64]
-    time_line: NDArray[np.int32]
+    time_line: NDArray[np.int64]
     edge_id: NDArray[np.uint64]
     translation: NDArray[np.float64]
     marginalized: MarginalizedIndex

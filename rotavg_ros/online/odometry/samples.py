@@ -51,8 +51,9 @@ class OdometrySamples:
         self._world_from_body = GrowingArray(np.float64, 4)
         self._position = GrowingArray(np.float64, 3)
         self._is_keyframe = GrowingArray(np.bool_)
-        self._chain = GrowingArray(np.int32)
-        self._time_line = GrowingArray(np.int32)
+        # As wide as what is looked up in them: a search would copy narrower columns whole.
+        self._chain = GrowingArray(np.int64)
+        self._time_line = GrowingArray(np.int64)
 
     def __len__(self) -> int:
         return len(self._stamp_ns)
@@ -72,7 +73,7 @@ class OdometrySamples:
         """Let the last message never be thinned out."""
         self._is_keyframe.view[-1] = True
 
-    def release_keyframes(self, kept_stamps_ns: NDArray[np.int64], kept_time_lines: NDArray[np.int32]) -> None:
+    def release_keyframes(self, kept_stamps_ns: NDArray[np.int64], kept_time_lines: NDArray[np.int64]) -> None:
         """Where keyframes take up most of the room, let those be thinned out that are none of these ``(K,)``."""
         if np.count_nonzero(self._is_keyframe.view) > self.bounds.max_samples // 2:
             rows = self._rows_from(kept_stamps_ns, kept_time_lines)
@@ -111,15 +112,15 @@ class OdometrySamples:
         It is the present one, from its first message on to ``lead_ns`` after its last; for any other stamp the latest
         that has messages on both sides of it, or the present one where there is none.
         """
-        present = self.last_time_line
+        present, tolerance_ns = self.last_time_line, self.bounds.tolerance_ns
         if present == 0:
             return 0
-        starts = np.searchsorted(self._time_line.view, np.arange(present + 2))
-        first, last = self._stamp_ns.view[starts[:-1]], self._stamp_ns.view[starts[1:] - 1]
-        tolerance = self.bounds.tolerance_ns
-        if first[-1] - tolerance <= stamp_ns <= int(last[-1]) + lead_ns:
+        stamps = self._stamp_ns.view[self._rows_of(present)]
+        if stamps[0] - tolerance_ns <= stamp_ns <= int(stamps[-1]) + lead_ns:
             return present
-        covering = np.flatnonzero((first - tolerance <= stamp_ns) & (stamp_ns <= last + tolerance))
+        starts = np.searchsorted(self._time_line.view, np.arange(present + 1))
+        first, last = self._stamp_ns.view[starts[:-1]], self._stamp_ns.view[starts[1:] - 1]
+        covering = np.flatnonzero((first - tolerance_ns <= stamp_ns) & (stamp_ns <= last + tolerance_ns))
         return int(covering[-1]) if len(covering) else present
 
     def world_from_body_at(self, stamp_ns: int, time_line: int | None = None) -> Quaternion:
@@ -176,8 +177,8 @@ class OdometrySamples:
         return int(self._chain.view[line.start + max(place, 0)])
 
     def poses_at(
-        self, stamp_ns: NDArray[np.int64], time_line: NDArray[np.int32]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
+        self, stamp_ns: NDArray[np.int64], time_line: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
         """The messages at or next after the moments ``(K,)``.
 
         Returns:
@@ -210,10 +211,12 @@ class OdometrySamples:
     def _rows_of(self, time_line: int | None) -> slice:
         """Where a time line's messages are; there must be one."""
         column = self._time_line.view
+        if column[-1] == 0:
+            return slice(0, len(column))
         number = column[-1] if time_line is None else time_line
         return slice(int(np.searchsorted(column, number)), int(np.searchsorted(column, number, "right")))
 
-    def _rows_from(self, stamp_ns: NDArray[np.int64], time_line: NDArray[np.int32]) -> NDArray[np.int64]:
+    def _rows_from(self, stamp_ns: NDArray[np.int64], time_line: NDArray[np.int64]) -> NDArray[np.int64]:
         """Rows ``(K,)`` of the messages at or next after moments, the last of the time line where none is."""
         rows = np.empty(len(stamp_ns), dtype=np.int64)
         for number in np.unique(time_line).tolist():

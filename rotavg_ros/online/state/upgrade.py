@@ -33,8 +33,8 @@ def upgraded(arrays: Arrays, header: dict[str, Any]) -> tuple[Arrays, dict[str, 
 def _with_time_lines(arrays: Arrays) -> Arrays:
     nothing = np.empty(0, dtype=np.uint64)
     added: Arrays = {
-        "time_line": np.zeros(len(arrays["keyframe_id"]), dtype=np.int32),
-        "marginalized_time_line": np.zeros(len(arrays["marginalized_edge"]), dtype=np.int32),
+        "time_line": np.zeros(len(arrays["keyframe_id"]), dtype=np.int64),
+        "marginalized_time_line": np.zeros(len(arrays["marginalized_edge"]), dtype=np.int64),
         "outlier": np.zeros(0, dtype=bool),
         "fingerprints_older": nothing,
         "fingerprints_younger": np.sort(arrays["fingerprints"]),
@@ -44,7 +44,7 @@ def _with_time_lines(arrays: Arrays) -> Arrays:
         if name.startswith("odometry") and name.endswith("_stamp_ns"):
             prefix = name.removesuffix("stamp_ns")
             added |= {
-                f"{prefix}time_line": np.zeros(len(values), dtype=np.int32),
+                f"{prefix}time_line": np.zeros(len(values), dtype=np.int64),
                 f"{prefix}limit": np.array(0),
                 f"{prefix}refused_stamp_ns": np.empty(0, dtype=np.int64),
                 f"{prefix}refused_world_from_body": np.empty((0, 4)),

@@ -33,7 +33,7 @@ def keyframes_of(count: int) -> Columns:
         "robot": np.zeros(count, np.int32),
         "keyframe_id": numbers.astype(np.uint64),
         "stamp_ns": 10 * numbers,
-        "time_line": np.zeros(count, np.int32),
+        "time_line": np.zeros(count, np.int64),
     }
 
 
