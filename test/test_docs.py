@@ -11,8 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from rotavg_ros.ros.node.main.intake import wiring
-from rotavg_ros.ros.node.main.output import frame_correction
 
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.cli.main import COMMANDS, main
@@ -20,6 +18,8 @@ from rotavg_ros.datasets.graph_file import write_graph
 from rotavg_ros.datasets.robot_run import robot_run_config
 from rotavg_ros.datasets.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.ros.node import diagnostics, parameter_server
+from rotavg_ros.ros.node.intake import wiring
+from rotavg_ros.ros.node.output import frame_correction
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]

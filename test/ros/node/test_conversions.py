@@ -13,7 +13,6 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion
 from nav_msgs.msg import Odometry
 from rotavg_msgs.msg import KeyframeReference, RelativeRotation, RelativeRotationArray
-from rotavg_ros.ros.node.main.intake import adapters
 from sensor_msgs.msg import Imu
 
 from rotavg_ros.errors import UserError
@@ -21,6 +20,7 @@ from rotavg_ros.inputs import Source
 from rotavg_ros.inputs.fields import to_nanoseconds
 from rotavg_ros.inputs.rotavg import edge_from_message
 from rotavg_ros.online.measurements import RejectedInputError
+from rotavg_ros.ros.node.intake import adapters
 from rotavg_ros.ros.node.message_counting import Durations, SequenceGaps, TopicCounter
 from rotavg_ros.ros.node.output.conversions import to_time
 

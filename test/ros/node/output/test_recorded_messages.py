@@ -10,7 +10,6 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
 from rclpy.serialization import deserialize_message, serialize_message
-from rotavg_ros.ros.node.main.output import conversions, visualization
 
 from rotavg_ros.bags import answer_messages as recorded
 from rotavg_ros.bags.message_types import typestore
@@ -19,6 +18,7 @@ from rotavg_ros.datasets.slam_simulation import simulate_slam_graph
 from rotavg_ros.online import Answer, EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
 from rotavg_ros.online.drawing import draw
 from rotavg_ros.online.trajectory import Trajectory
+from rotavg_ros.ros.node.output import conversions, visualization
 
 FRAME = "map"
 
