@@ -15,6 +15,7 @@ TOP = PACKAGE.name
 # The wings that others build on, and those that they may import themselves.
 INWARD: dict[str, set[str]] = {
     "errors": set(),
+    "option": {"errors"},
     "view_graph": {"errors", "rotations"},
     "hamilton": set(),
     "rotations": {"hamilton"},
@@ -29,9 +30,9 @@ INWARD: dict[str, set[str]] = {
         *("rotations", "solver", "training", "version", "view_graph"),
     },
     "training": {"datasets", "errors", "metrics", "results", "rotations", "solver", "version", "view_graph"},
-    "online": {"errors", "hamilton", "rotations", "solver", "view_graph"},
+    "online": {"errors", "hamilton", "option", "rotations", "solver", "view_graph"},
     "inputs": {"online", "view_graph"},
-    "settings": {"errors", "inputs", "online", "solver", "view_graph"},
+    "settings": {"inputs", "online", "option", "view_graph"},
 }
 # Inside a wing, the rooms (modules and folders) that a room may import; "" is what the folder's own name gives.
 ROOMS: dict[str, dict[str, set[str]]] = {
@@ -155,7 +156,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
 FACES = {"solver": {"batch", "closures", "devices", "methods", "networks", "pipeline", "positions", "solution"}}
 INSIDERS = {"baselines": {"algebra", "neurora"}, "training": {"algebra", "neurora"}}
 # What a robot runs needs no more.
-NODE_MAY_USE = {"errors", "inputs", "online", "settings", "solver", "version", "view_graph"}
+NODE_MAY_USE = {"errors", "inputs", "online", "option", "settings", "solver", "version", "view_graph"}
 # Others' packages that only one wing may know.
 BORDERS = {"rclpy": "ros", "rosbags": "bags", "mcap": "bags"}
 # Who imports by name what no arrow is about: subcommands, message packages, peers that may not be installed.

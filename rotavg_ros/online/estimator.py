@@ -300,7 +300,7 @@ class OnlineEstimator:
                     method=options.method,
                     profile=options.profile,
                     device=options.device,
-                    refinement_steps=options.refinement_steps,
+                    refinement_steps=options.max_refinement_steps,
                     warm_start=warm_start,
                     memory=None if warm_start is None else problem.memory,
                 )

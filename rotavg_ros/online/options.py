@@ -1,100 +1,142 @@
-"""The estimator's options."""
+"""The estimator's options; the node's parameters, their YAML and their table are made of them as well."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
-from rotavg_ros.errors import UserError
 from rotavg_ros.online.odometry.continuity import ContinuityLimits
 from rotavg_ros.online.odometry.keyframe_choice import KeyframePolicy
 from rotavg_ros.online.odometry.samples import OdometryBounds
 from rotavg_ros.online.odometry.time_jumps import POLICIES
+from rotavg_ros.option import DEGREES, DEGREES_PER_SECOND, METRES, METRES_PER_SECOND, check_options, documented, option
+from rotavg_ros.solver import DEVICES, PROFILES
 
 NANOSECONDS = 1_000_000_000
 
 
-class OptionError(UserError):
-    """An option has a value it cannot have."""
-
-
+@documented
 @dataclass(frozen=True)
 class EstimatorOptions:
     """How the graph grows and how it is solved.
 
-    Attributes:
-        keyframe_source: ``odometry``: keyframes are chosen from odometry messages and numbered 0, 1, 2 … per robot;
-            ``edges``: a front end chooses them and sends them as odometry edges with ids or stamps (one without an id
-            gets its stamp as id), and odometry only carries the newest one on to the present.
-        unknown_keyframes: what an edge does that names a keyframe which does not exist (yet): ``wait`` for it, or
-            ``create`` it (view-graphs without odometry).
-        keyframe_angle, keyframe_distance, keyframe_interval_s: see :class:`KeyframePolicy`; radians, metres, seconds.
-        stamp_tolerance_s: how far outside the odometry the stamp of an edge may be.
-        max_odometry_gap_s: odometry messages farther apart are not interpolated.
-        max_turn_rate, max_speed: odometry that moves faster has jumped; rad/s, m/s; 0: any speed, and no look-out for
-            odometry that begins anew.
-        max_stamp_lead_s: a stamp farther ahead of the last one needs a second message to be believed; 0: no limit.
-        on_time_jump: when the data's time goes back by more than ``time_jump_s`` (a bag that begins again, a clock
-            that was set): ``new_component`` keeps everything and begins a new time line, whose keyframes no odometry
-            joins to the earlier ones; ``reset`` forgets everything and begins anew; ``ignore`` refuses odometry until
-            it is ahead again, ``error`` does too and says so.
-        time_jump_s: going back by less is no jump; such odometry is out of order.
-        max_odometry_samples: per robot; older messages are thinned out beyond it.
-        max_keyframes, max_edges: there the graph does without what can best be spared, see
-            :mod:`~rotavg_ros.online.compaction.thinning`; what odometry still needs comes on top of the edges.
-        pending_capacity: edges that may wait at a time.
-        pending_timeout_s: how long in data time.
-        gauge: of the first keyframe of a component: the ``odometry``'s orientation there, or ``identity``.
-        method, profile, device, refinement_steps: as in :func:`rotavg_ros.solve`.
-        outlier_threshold: an edge with a higher score is an outlier.
-        warm_start: start from the previous answer while data flows.
+    Keyframes that are chosen from odometry are numbered 0, 1, 2 … per robot. Where a front end sends them, one without
+    an id gets its stamp as id, and odometry only carries the newest one on to the present. Edges of odometry come on
+    top of ``max_edges``. What a graph that has become too large does without:
+    :mod:`~rotavg_ros.online.compaction.thinning`.
+
+    Raises:
+        OptionError: a value that an option cannot have.
     """
 
-    keyframe_source: str = "odometry"
-    unknown_keyframes: str = "wait"
-    keyframe_angle: float = math.radians(5.0)
-    keyframe_distance: float = 0.5
-    keyframe_interval_s: float = 0.0
-    stamp_tolerance_s: float = 0.1
-    max_odometry_gap_s: float = 5.0
-    max_turn_rate: float = math.radians(360.0)
-    max_speed: float = 50.0
-    max_stamp_lead_s: float = 60.0
-    on_time_jump: str = "new_component"
-    time_jump_s: float = 1.0
-    max_odometry_samples: int = 200_000
-    max_keyframes: int = 200_000
-    max_edges: int = 2_000_000
-    pending_capacity: int = 20_000
-    pending_timeout_s: float = 300.0
-    gauge: str = "odometry"
-    method: str = "neurora"
-    profile: str = "auto"
-    device: str = "auto"
-    refinement_steps: int | None = None
-    outlier_threshold: float = 0.5
-    warm_start: bool = True
+    keyframe_source: str = option(
+        "odometry",
+        "'odometry': keyframes are chosen from odometry messages; 'edges': a front end sends them as odometry edges",
+        choices=("odometry", "edges"),
+    )
+    unknown_keyframes: str = option(
+        "wait", "an edge that names an unknown keyframe waits for it, or creates it", choices=("wait", "create")
+    )
+    keyframe_angle: float = option(
+        5.0, "turn that makes a keyframe; 0 switches the criterion off", within=(0.0, 360.0), live=True, unit=DEGREES
+    )
+    keyframe_distance: float = option(
+        0.5, "way that makes a keyframe; 0 switches the criterion off", within=(0.0, 1e6), live=True, unit=METRES
+    )
+    keyframe_interval_s: float = option(
+        0.0,
+        "time that makes a keyframe; 0 switches the criterion off; with all three off every message is one",
+        within=(0.0, 1e6),
+        live=True,
+    )
+    stamp_tolerance_s: float = option(
+        0.1,
+        "how far before the first or after the last odometry an edge's stamp may be",
+        within=(0.0, 60.0),
+        live=True,
+    )
+    max_odometry_gap_s: float = option(
+        5.0, "between odometry messages farther apart no edge is placed", within=(0.0, 1e6), live=True
+    )
+    max_turn_rate: float = option(
+        360.0,
+        "odometry that turns faster has jumped, and begins a new component if it goes on from there; 0: believe all, "
+        "a return to zero as well",
+        within=(0.0, 1e6),
+        live=True,
+        unit=DEGREES_PER_SECOND,
+    )
+    max_speed: float = option(
+        50.0,
+        "odometry that moves faster has jumped, likewise; 0: any speed",
+        within=(0.0, 1e6),
+        live=True,
+        unit=METRES_PER_SECOND,
+    )
+    max_stamp_lead_s: float = option(
+        60.0,
+        "a stamp farther ahead of the last needs a second message to be believed; 0: believe all",
+        within=(0.0, 1e9),
+        live=True,
+    )
+    on_time_jump: str = option(
+        "new_component",
+        "when the data's time goes back (a bag or a simulation that begins again, a clock that was set): keep the "
+        "graph and begin a new component; forget everything and begin anew, which suits a bag in a loop; or refuse "
+        "odometry until it is ahead again, silently or with an error in the diagnostics",
+        choices=POLICIES,
+        live=True,
+    )
+    time_jump_s: float = option(
+        1.0, "going back by less is no jump; such odometry is refused as out of order", within=(0.0, 1e6), live=True
+    )
+    max_odometry_samples: int = option(
+        200_000,
+        "odometry messages that are kept per robot; beyond it older ones are thinned out",
+        within=(1, 100_000_000),
+    )
+    max_keyframes: int = option(
+        200_000,
+        "at so many keyframes those that can best be spared are taken out, first without any loss, then with some",
+        within=(1, 100_000_000),
+        live=True,
+    )
+    max_edges: int = option(
+        2_000_000,
+        "at so many edges the loop closures that can best be spared are dropped",
+        within=(1, 1_000_000_000),
+        live=True,
+    )
+    pending_capacity: int = option(
+        20_000, "edges that may wait for a keyframe or for odometry; the oldest go first", within=(1, 10_000_000)
+    )
+    pending_timeout_s: float = option(300.0, "how long they may wait, in the data's time", within=(0.0, 1e9))
+    gauge: str = option(
+        "odometry",
+        "orientation of the first keyframe of a component: the odometry's, or identity",
+        choices=("odometry", "identity"),
+    )
+    method: str = option("neurora", "solver, as in `rotavg solve --method`", live=True)
+    profile: str = option("auto", "'slam', 'sfm', or by what the edges are", choices=PROFILES, live=True)
+    device: str = option("auto", "where the networks run", choices=DEVICES)
+    refinement_steps: int = option(
+        -1, "refinement steps at most, 0 for none, -1 for the profile's own number", within=(-1, 1000), live=True
+    )
+    warm_start: bool = option(True, "start from the last answer while data flows", live=True)
+    outlier_threshold: float = option(0.5, "an edge with a higher score is an outlier", within=(0.0, 1.0), live=True)
 
     def __post_init__(self) -> None:
-        for name, choices in (
-            ("keyframe_source", ("odometry", "edges")),
-            ("unknown_keyframes", ("wait", "create")),
-            ("gauge", ("odometry", "identity")),
-            ("on_time_jump", POLICIES),
-        ):
-            if getattr(self, name) not in choices:
-                raise OptionError(f"{name} is {getattr(self, name)!r}; it must be one of {', '.join(choices)}")
-        for name in (
-            *("stamp_tolerance_s", "max_odometry_gap_s", "pending_timeout_s"),
-            *("max_turn_rate", "max_speed", "max_stamp_lead_s", "time_jump_s"),
-        ):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise OptionError(f"{name} is {getattr(self, name)}; it must be finite and not negative")
-        for name in ("max_odometry_samples", "max_keyframes", "max_edges", "pending_capacity"):
-            if getattr(self, name) < 1:
-                raise OptionError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        if not 0 <= self.outlier_threshold <= 1:
-            raise OptionError(f"outlier_threshold is {self.outlier_threshold}; it must be between 0 and 1")
+        check_options(self)
+
+    @property
+    def max_refinement_steps(self) -> int | None:
+        """As :func:`rotavg_ros.solve` wants it; None: the profile's own number."""
+        return None if self.refinement_steps < 0 else self.refinement_steps
+
+    @property
+    def needs_odometry(self) -> bool:
+        """Whether odometry alone makes keyframes."""
+        return self.keyframe_source == "odometry" and self.unknown_keyframes == "wait"
 
     @property
     def keyframe_policy(self) -> KeyframePolicy:

@@ -120,7 +120,7 @@ def read_references(
     bag: BagReader, inputs: Mapping[str, Input], parameters: NodeParameters, start_ns: int, stop_ns: int
 ) -> dict[str, Reference]:
     """The references in the bag's topics between two moments, by robot; those without a usable pose are left out."""
-    options = parameters.estimator_options()
+    options = parameters.estimator
     references = {
         robot: _reference(source.topic, list(_records(bag, source, start_ns, stop_ns)), options)
         for robot, source in inputs.items()

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.settings.parameters import NODE_NAME, NodeParameters
+from rotavg_ros.option import OptionError
+from rotavg_ros.settings.parameters import NODE_NAME, PARAMETERS
 
 Values = dict[str, Any]
-
-_DEFAULTS: dict[str, Any] = {parameter.name: parameter.default for parameter in fields(NodeParameters)}
 
 
 class ReplayOptionError(UserError):
@@ -26,7 +24,7 @@ def read_parameter_file(path: Path) -> Values:
     """What a file for ``--params-file`` says about the node; ``qos_overrides`` have no meaning here.
 
     Raises:
-        ReplayOptionError: no such file, not YAML, or not a parameter file of the node.
+        ReplayOptionError: no such file, not YAML, not a parameter file of the node, or a value that cannot be.
     """
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -52,7 +50,7 @@ def read_settings(words: Iterable[str]) -> Values:
     """Parameters from words ``name:=value``, the value in YAML, as after ``--ros-args -p``.
 
     Raises:
-        ReplayOptionError: another form, an unknown name, or a value of the wrong type.
+        ReplayOptionError: another form, an unknown name, or a value that cannot be.
     """
     values: Values = {}
     for word in words:
@@ -68,24 +66,12 @@ def read_settings(words: Iterable[str]) -> Values:
 
 
 def _checked(name: str, value: Any, where: str) -> Any:
-    """The value in its parameter's type."""
-    if name not in _DEFAULTS:
-        close = difflib.get_close_matches(name, list(_DEFAULTS), n=1)
+    """The value in its parameter's own type."""
+    if name not in PARAMETERS:
+        close = difflib.get_close_matches(name, list(PARAMETERS), n=1)
         hint = f"did you mean {close[0]}?" if close else "see `rotavg_node --print-parameters`"
         raise ReplayOptionError(f"{where}: unknown parameter {name}; {hint}")
-    default = _DEFAULTS[name]
-    if isinstance(default, tuple):
-        if isinstance(value, list) and all(_fits(entry, default[0]) for entry in value):
-            return tuple(type(default[0])(entry) for entry in value)
-        expected = f"list of {type(default[0]).__name__}"
-    elif _fits(value, default):
-        return type(default)(value)
-    else:
-        expected = type(default).__name__
-    raise ReplayOptionError(f"{where}: parameter {name} is {value!r}; it must be a {expected}")
-
-
-def _fits(value: Any, example: Any) -> bool:
-    if isinstance(example, bool) or isinstance(value, bool):
-        return isinstance(value, bool) and isinstance(example, bool)
-    return isinstance(value, (int, float) if isinstance(example, float) else type(example))
+    try:
+        return PARAMETERS[name].checked(value)
+    except OptionError as error:
+        raise ReplayOptionError(f"{where}: {error}") from None

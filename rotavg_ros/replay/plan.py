@@ -88,7 +88,7 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
     Raises:
         PlanError: a topic that is not in the bag, or whose type nothing can be made of.
         GraphFileError: a file for reference that holds no poses.
-        ParameterError: parameters that do not fit together.
+        OptionError: parameters that do not fit together.
     """
     if bag.num_messages() == 0:
         raise PlanError(f"{bag.path}: has no messages; there is nothing to replay")
@@ -224,7 +224,7 @@ def _uses(bag: BagReader, found: Candidates, plan: Plan) -> tuple[TopicUse, ...]
     for robot, source in zip(plan.parameters.robots, plan.odometry, strict=False):
         roles.setdefault(source.topic, []).append(f"odometry of {robot}")
     for source in plan.edges:
-        brings = plan.parameters.keyframe_source == "edges"
+        brings = plan.parameters.estimator.keyframe_source == "edges"
         roles.setdefault(source.topic, []).append("keyframes and loop closures" if brings else "loop closures")
     if plan.translations:
         translations, edges = plan.translations

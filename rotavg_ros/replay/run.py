@@ -105,7 +105,7 @@ def replay(
     started = time.perf_counter()
     start_ns, stop_ns = _bounds(bag, window)
     torch.set_num_threads(plan.parameters.solver_threads or max(1, torch.get_num_threads() - 1))  # as in the node
-    estimator = OnlineEstimator(plan.parameters.estimator_options())
+    estimator = OnlineEstimator(plan.parameters.estimator)
     with Recording(recording, plan.parameters, estimator, answer_period_ns) as recorder:
         loop = _Loop(estimator, plan.parameters.solve_period_s, recorder)
         feed = Feed(estimator, plan, read_translations(bag, plan, start_ns, stop_ns), loop.on_odometry)

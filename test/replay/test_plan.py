@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -78,7 +77,7 @@ def test_a_usual_robot(plan_for) -> None:
     }
     why = {use.topic: use.why_not for use in plan.topics if not use.used_as}
     assert why == {"/imu": "could be odometry: --odometry", "/wind": "neither odometry nor relative rotations"}
-    assert plan.parameters.keyframe_source == "odometry"
+    assert plan.parameters.estimator.keyframe_source == "odometry"
     assert plan.parameters.odometry_topics == ("/odom:nav_msgs/msg/Odometry",)
 
 
@@ -91,11 +90,11 @@ def test_the_better_odometry_is_taken_and_an_imu_that_knows_nothing_is_not(plan_
 
 
 def test_who_brings_the_keyframes(plan_for) -> None:
-    assert plan_for({"/odom": ODOM, "/edges": STEP}).parameters.keyframe_source == "edges"
-    assert plan_for({"/odom": ODOM, "/edges": CLOSURE}).parameters.unknown_keyframes == "wait"
-    assert plan_for({"/edges": CLOSURE}).parameters.unknown_keyframes == "create"
+    assert plan_for({"/odom": ODOM, "/edges": STEP}).parameters.estimator.keyframe_source == "edges"
+    assert plan_for({"/odom": ODOM, "/edges": CLOSURE}).parameters.estimator.unknown_keyframes == "wait"
+    assert plan_for({"/edges": CLOSURE}).parameters.estimator.unknown_keyframes == "create"
     told = plan_for({"/odom": ODOM, "/edges": STEP}, values={"keyframe_source": "odometry"})
-    assert told.parameters.keyframe_source == "odometry"
+    assert told.parameters.estimator.keyframe_source == "odometry"
 
 
 def test_several_robots(plan_for) -> None:
@@ -122,7 +121,7 @@ def test_options_win_over_parameters_and_these_over_guesses(plan_for) -> None:
 
 def test_a_node_listens_to_more_than_was_recorded(plan_for) -> None:
     """Its parameters for topics that are not there go with them; options have to be right."""
-    everything = {parameter.name: getattr(NodeParameters(), parameter.name) for parameter in fields(NodeParameters)}
+    everything = NodeParameters().values()
     assert roles(plan_for({"/wheels": ODOM, "/relative_rotations": CLOSURE}, values=everything)) == {
         "/wheels": "odometry of robot",
         "/relative_rotations": "loop closures",
@@ -143,9 +142,10 @@ def test_a_node_listens_to_more_than_was_recorded(plan_for) -> None:
 
 def test_the_nodes_own_parameter_file(tmp_path: Path) -> None:
     path = tmp_path / "node.yaml"
-    path.write_text(to_yaml(NodeParameters(keyframe_angle_deg=7.0, robots=("rover",))))
+    wanted = NodeParameters().changed({"keyframe_angle_deg": 7.0, "robots": ("rover",)})
+    path.write_text(to_yaml(wanted))
     values = read_parameter_file(path)
-    assert NodeParameters().changed(values) == NodeParameters(keyframe_angle_deg=7.0, robots=("rover",))
+    assert NodeParameters().changed(values) == wanted
     path.write_text("/**:\n  ros__parameters:\n    keyframe_angle_deg: 7\n    qos_overrides./odom.depth: 5\n")
     assert read_parameter_file(path) == {"keyframe_angle_deg": 7.0}
     path.write_text("/other:\n  ros__parameters:\n    keyframe_angle_deg: 7\n")

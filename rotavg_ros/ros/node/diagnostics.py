@@ -90,7 +90,7 @@ def _errors(health: Health, parameters: NodeParameters, paused: bool, now: float
 def _warnings(health: Health, parameters: NodeParameters, now: float) -> list[str]:
     warnings = [] if health.save_failure is None else [health.save_failure]
     warnings += health.recent_notices(now)
-    needed = parameters.keyframe_source == "odometry" and parameters.unknown_keyframes == "wait"
+    needed = parameters.estimator.needs_odometry
     for topic in health.odometry:
         last = health.last_odometry.get(topic)
         silent = now - (health.started if last is None else last)
@@ -108,7 +108,7 @@ def _warnings(health: Health, parameters: NodeParameters, now: float) -> list[st
         closures = answer.kind == EdgeKind.LOOP_CLOSURE
         if closures.any() and answer.outlier[closures].mean() > _SUSPICIOUS_OUTLIER_SHARE:
             warnings.append(f"{100 * answer.outlier[closures].mean():.0f} % of the loop closures are outliers")
-        if parameters.device == "cuda" and answer.device == "cpu":
+        if parameters.estimator.device == "cuda" and answer.device == "cpu":
             warnings.append("device cuda was asked for, cpu is used")
     return warnings
 

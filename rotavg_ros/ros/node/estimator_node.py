@@ -11,7 +11,6 @@ from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.executors import Executor
-from rclpy.node import Node
 from rclpy.timer import Timer
 
 from rotavg_ros.errors import UserError
@@ -33,7 +32,7 @@ from rotavg_ros.version import __version__
 _SHORT_SOLVE_S = 0.2  # a longer one need not be waited for at the end: nobody would read its answer
 
 
-class RotavgNode(Node):
+class RotavgNode(parameter_server.ParameterNode):
     """Subscriptions, publications, services and timers around an :class:`OnlineEstimator`.
 
     Callbacks run on the executor's thread and stay short; solving, saving and publishing answers happen on workers.
@@ -49,8 +48,8 @@ class RotavgNode(Node):
             raise UserError(" ".join(str(error).split())) from error
         self._settings = parameters = parameter_server.declare(self)
         torch.set_num_threads(parameters.solver_threads or max(1, torch.get_num_threads() - 1))
-        device = warm_up(parameters.estimator_options())
-        self._estimator = OnlineEstimator(parameters.estimator_options(), on_discard=self._on_discard)
+        device = warm_up(parameters.estimator)
+        self._estimator = OnlineEstimator(parameters.estimator, on_discard=self._on_discard)
         self._health = Health()
         self._reporter = Reporter(f"{self.get_fully_qualified_name().lstrip('/')}: estimator")
         self._worker = Worker(executor, "rotavg_worker")
@@ -74,7 +73,7 @@ class RotavgNode(Node):
         parameter_server.watch(self, lambda: self._settings, self._apply)
         topics = ", ".join([*parameters.odometry_topics, *parameters.edge_topics])
         self.get_logger().info(f"rotavg {__version__} on {device}, listening to {topics}")
-        if parameters.device == "cuda" and device == "cpu":
+        if parameters.estimator.device == "cuda" and device == "cpu":
             self.get_logger().warning("there is no CUDA device; the networks run on the CPU")
         given = frozenset(parameter_server.given(self))
         self._wiring = Wiring(self, listening.inputs, self._outputs.exclusive_topics, given)
@@ -100,7 +99,7 @@ class RotavgNode(Node):
         Raises:
             UserError: the solver does not know its options; nothing has changed then.
         """
-        old, options = self._settings, parameters.estimator_options()
+        old, options = self._settings, parameters.estimator
         if (options.method, options.profile) != (self._estimator.options.method, self._estimator.options.profile):
             warm_up(options)
         if options != self._estimator.options:
@@ -124,7 +123,7 @@ class RotavgNode(Node):
             self._on_time_jump()
 
     def _on_time_jump(self) -> None:
-        policy = self._settings.on_time_jump
+        policy = self._settings.estimator.on_time_jump
         self.get_logger().warning(TIME_WENT_BACK[policy])
         if policy not in KEEPS_TIME_LINE:
             self._health.note(TIME_WENT_BACK[policy])

@@ -21,5 +21,5 @@ def warm_up(options: EstimatorOptions) -> str:
         method=options.method,
         profile=options.profile,
         device=options.device,
-        refinement_steps=options.refinement_steps,
+        refinement_steps=options.max_refinement_steps,
     ).device

@@ -110,8 +110,8 @@ def test_slow_solves_losses_and_refusals_warn(health: Health) -> None:
 def test_a_graph_without_odometry_does_not_miss_it(health: Health) -> None:
     health.last_odometry.clear()
     health.started = time.monotonic() - 100
-    assert report(health, NodeParameters(keyframe_source="edges")).level == OK
-    assert report(health, NodeParameters(unknown_keyframes="create")).level == OK
+    assert report(health, NodeParameters().changed({"keyframe_source": "edges"})).level == OK
+    assert report(health, NodeParameters().changed({"unknown_keyframes": "create"})).level == OK
 
 
 def test_before_the_first_answer() -> None:

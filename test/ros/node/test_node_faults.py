@@ -145,7 +145,7 @@ ODOMETRY_KINDS = (
 def answer_to_good_stream() -> Answer:
     """What comes of :func:`feed_good` alone, in this process."""
     every_message = NodeParameters().changed({"keyframe_angle_deg": 0.0, "keyframe_distance_m": 0.0})
-    online = OnlineEstimator(every_message.estimator_options())
+    online = OnlineEstimator(every_message.estimator)
     for index in range(LENGTH):
         online.add_odometry("robot", (1000 + index) * 10**9, rotation(index).as_quat().tolist())
         if index >= 20:
@@ -277,7 +277,7 @@ def test_a_flood_is_survived_and_every_loss_counted(live_node) -> None:
 @pytest.mark.parametrize(
     ("parameter", "message"),
     [
-        ("keyframe_angle_deg:=fast", "keyframe_angle_deg has the wrong type; it must be double"),
+        ("keyframe_angle_deg:=fast", "keyframe_angle_deg is 'fast'; it must be a number"),
         ("edge_topics:=['x:nobodys_msgs/msg/Edge']", "nobodys_msgs/msg/Edge"),
         ("qos_overrides./odom.subscription.depth:=many", "odom"),
         ("odometry_topics:=[]", "odometry_topics is empty"),

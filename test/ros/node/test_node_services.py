@@ -224,9 +224,13 @@ def test_parameters_change_live_all_or_none(live_node) -> None:
     feed(live_node, 20, 24)
     wait_for(live_node, "odometry messages", 24)
     assert live_node.status["keyframes"] == "3"
-    for name, value in (("gauge", "identity"), ("outlier_threshold", 1.5), ("outlier_threshold", "high")):
+    for name, value, reason in (
+        ("gauge", "identity", "read-only"),
+        ("outlier_threshold", 1.5, "outlier_threshold is 1.5; it must be between 0 and 1"),
+        ("outlier_threshold", "high", "outlier_threshold is 'high'; it must be a number"),
+    ):
         parameter = Parameter(name, value=value).to_parameter_msg()
         (result,) = live_node.call("set_parameters", SetParameters, parameters=[parameter]).results
-        assert not result.successful and result.reason
+        assert not result.successful and reason in result.reason
     (descriptor,) = live_node.call("describe_parameters", DescribeParameters, names=["outlier_threshold"]).descriptors
     assert descriptor.description and descriptor.floating_point_range[0].to_value == 1.0

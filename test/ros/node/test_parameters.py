@@ -1,9 +1,11 @@
-"""Parameters: one dataclass, and everything that is made from it."""
+"""Parameters as ROS declares, reads and changes them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
-from dataclasses import fields
+from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -11,22 +13,24 @@ import yaml
 rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
 from rclpy.parameter import Parameter
 
+from rotavg_ros import EstimatorOptions
+from rotavg_ros.option import OptionError
+from rotavg_ros.replay.options import ReplayOptionError, read_parameter_file, read_settings
 from rotavg_ros.ros.node import parameter_server
-from rotavg_ros.settings.fields import ParameterError
-from rotavg_ros.settings.parameters import NodeParameters
-from rotavg_ros.settings.text import to_markdown, to_yaml
+from rotavg_ros.settings.parameters import PARAMETERS, NodeParameters
+from rotavg_ros.settings.text import to_yaml
 
 
 @pytest.fixture
-def make_node() -> Iterator[Callable[..., rclpy.node.Node]]:
+def make_node() -> Iterator[Callable[..., parameter_server.ParameterNode]]:
     """A function that makes a node that was started with some parameters."""
     context = rclpy.Context()
     rclpy.init(context=context)
     nodes = []
 
-    def make(**overrides: object) -> rclpy.node.Node:
+    def make(**overrides: object) -> parameter_server.ParameterNode:
         parameters = [Parameter(name, value=value) for name, value in overrides.items()]
-        nodes.append(rclpy.create_node("parameters", context=context, parameter_overrides=parameters))
+        nodes.append(parameter_server.ParameterNode("parameters", context=context, parameter_overrides=parameters))
         return nodes[-1]
 
     yield make
@@ -38,10 +42,10 @@ def make_node() -> Iterator[Callable[..., rclpy.node.Node]]:
 def test_the_defaults_are_good_and_declared_with_descriptions_and_ranges(make_node) -> None:
     node = make_node()
     assert parameter_server.declare(node) == NodeParameters()
-    for parameter in fields(NodeParameters):
-        descriptor = node.describe_parameter(parameter.name)
-        assert descriptor.description
-        assert descriptor.read_only != parameter.metadata["live"]
+    for name, option in PARAMETERS.items():
+        descriptor = node.describe_parameter(name)
+        assert descriptor.description == option.description
+        assert descriptor.read_only != option.live
     assert node.describe_parameter("outlier_threshold").floating_point_range[0].to_value == 1.0
     assert node.describe_parameter("refinement_steps").integer_range[0].from_value == -1
 
@@ -49,16 +53,16 @@ def test_the_defaults_are_good_and_declared_with_descriptions_and_ranges(make_no
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        ({"keyframe_angle_deg": "5"}, "keyframe_angle_deg has the wrong type; it must be double"),
-        ({"keyframe_angle_deg": 500}, "keyframe_angle_deg must be between 0 and 360"),
+        ({"keyframe_angle_deg": "5"}, "keyframe_angle_deg is '5'; it must be a number"),
+        ({"keyframe_angle_deg": 500}, r"keyframe_angle_deg is 500\.0; it must be between 0 and 360"),
         ({"world_frame": ""}, "world_frame is ''; name the frame"),
         ({"world_frame": "/map"}, "world_frame is '/map'; name the frame"),
         ({"publish_tf": True, "odometry_topics": ["imu:sensor_msgs/msg/Imu"]}, "imu:sensor_msgs/msg/Imu has none"),
         ({"odometry_topics": None}, "odometry_topics is empty"),
-        ({"robots": "a"}, "robots has the wrong type; it must be string array"),
-        ({"pending_capacity": 0}, "pending_capacity must be between 1 and"),
-        ({"outlier_threshold": 1.5}, "outlier_threshold must be between 0 and 1"),
-        ({"keyframe_angle_deg": float("nan")}, "keyframe_angle_deg"),
+        ({"robots": "a"}, "robots is 'a'; it must be a list of texts"),
+        ({"pending_capacity": 0}, "pending_capacity is 0; it must be between 1 and"),
+        ({"outlier_threshold": 1.5}, r"outlier_threshold is 1\.5; it must be between 0 and 1"),
+        ({"keyframe_angle_deg": float("nan")}, "keyframe_angle_deg is nan; it must be between 0 and 360"),
         ({"gauge": "up"}, "choose from odometry, identity"),
         ({"device": "tpu"}, "choose from"),
         ({"robots": ["a", "b"]}, "one robot per topic"),
@@ -72,7 +76,7 @@ def test_the_defaults_are_good_and_declared_with_descriptions_and_ranges(make_no
     ],
 )
 def test_mistakes_are_one_clear_line(make_node, overrides: dict[str, object], message: str) -> None:
-    with pytest.raises(ParameterError, match=message) as refusal:
+    with pytest.raises(OptionError, match=message) as refusal:
         parameter_server.declare(make_node(**overrides))
     assert "\n" not in str(refusal.value)
 
@@ -91,11 +95,11 @@ def test_unknown_parameters_are_named_with_a_suggestion(make_node) -> None:
 def test_whole_numbers_are_taken_where_fractions_may_be(make_node) -> None:
     node = make_node(keyframe_angle_deg=5, edge_sensor_orientations=[0, 0, 0, 1])
     found = parameter_server.declare(node)
-    assert (found.keyframe_angle_deg, found.edge_sensor_orientations) == (5.0, (0.0, 0.0, 0.0, 1.0))
+    assert (found.values()["keyframe_angle_deg"], found.edge_sensor_orientations) == (5.0, (0.0, 0.0, 0.0, 1.0))
     now = [found]
     parameter_server.watch(node, lambda: now[0], lambda parameters: now.__setitem__(0, parameters))
-    (result,) = node.set_parameters([Parameter("keyframe_angle_deg", value=7)])
-    assert result.successful and now[0].keyframe_angle_deg == 7.0
+    result = node.set_parameters_atomically([Parameter("keyframe_angle_deg", value=7)])
+    assert result.successful and now[0].values()["keyframe_angle_deg"] == 7.0
     assert node.get_parameter("keyframe_angle_deg").value == 7.0
 
 
@@ -105,7 +109,40 @@ def test_the_yaml_is_what_a_node_reads(make_node) -> None:
     assert parameter_server.declare(make_node(**loaded)) == parameters
 
 
-def test_the_table_names_every_parameter() -> None:
-    table = to_markdown()
-    assert all(f"| `{parameter.name}` |" in table for parameter in fields(NodeParameters))
-    assert len(table.splitlines()) == 2 + len(fields(NodeParameters))
+@pytest.mark.parametrize(
+    ("name", "value", "in_library"),
+    [
+        ("keyframe_angle_deg", 500.0, {"keyframe_angle": math.radians(500)}),
+        ("keyframe_distance_m", -1.5, {"keyframe_distance": -1.5}),
+        ("max_turn_rate_deg_s", 2e6, {"max_turn_rate": math.radians(2e6)}),
+        ("max_keyframes", 0, {"max_keyframes": 0}),
+        ("refinement_steps", -2, {"refinement_steps": -2}),
+        ("outlier_threshold", 1.5, {"outlier_threshold": 1.5}),
+        ("outlier_threshold", "high", {"outlier_threshold": "high"}),
+        ("on_time_jump", "faint", {"on_time_jump": "faint"}),
+        ("profile", "slow", {"profile": "slow"}),
+        ("warm_start", 1, {"warm_start": 1}),
+    ],
+)
+def test_the_same_mistake_is_told_in_the_same_words_everywhere(
+    make_node, tmp_path: Path, name: str, value: object, in_library: dict[str, Any]
+) -> None:
+    with pytest.raises(OptionError) as refusal:
+        EstimatorOptions(**in_library)
+    said = str(refusal.value)
+    assert said.startswith(f"{name} is {value!r}; ")
+    with pytest.raises(OptionError) as refusal:
+        parameter_server.declare(make_node(**{name: value}))
+    assert str(refusal.value) == said
+    path = tmp_path / "node.yaml"
+    path.write_text(yaml.safe_dump({"/rotavg": {"ros__parameters": {name: value}}}))
+    with pytest.raises(ReplayOptionError) as refusal:
+        read_parameter_file(path)
+    assert str(refusal.value) == f"{path}: {said}"
+    with pytest.raises(ReplayOptionError) as refusal:
+        read_settings([f"{name}:={value}"])
+    assert str(refusal.value) == f"-p: {said}"
+    node = make_node()
+    parameter_server.declare(node)
+    result = node.set_parameters_atomically([Parameter(name, value=value)])
+    assert (result.successful, result.reason) == (False, said)

@@ -98,7 +98,7 @@ class Wiring:
         edges = [each for each in self._inputs if not each.is_odometry]
         # The default topics are two forms of the same; whoever uses one does without the other.
         all_needed = "edge_topics" in self._given or all(each in missing for each in edges)
-        needs_odometry = parameters.keyframe_source == "odometry" and parameters.unknown_keyframes == "wait"
+        needs_odometry = parameters.estimator.needs_odometry
         lines = []
         for each in missing:
             if needs_odometry if each.is_odometry else all_needed:

@@ -1,8 +1,10 @@
 """What a replay records is what the node publishes: the same answer, as both sides serialise it."""
 
 from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
+
 import numpy as np
 import pytest
 

@@ -1,0 +1,84 @@
+"""The node's parameters come from one description: the estimator's options, the YAML, the table."""
+
+from __future__ import annotations
+
+import pydoc
+import re
+
+import pytest
+import yaml
+
+from rotavg_ros import EstimatorOptions, UserError
+from rotavg_ros.option import options_of
+from rotavg_ros.settings.parameters import PARAMETERS, NodeParameters
+from rotavg_ros.settings.text import to_markdown, to_yaml
+
+
+def table() -> dict[str, list[str]]:
+    rows = [line.split(" | ") for line in to_markdown().splitlines()[2:]]
+    return {row[0].strip("|` "): [cell.strip(" |") for cell in row[1:]] for row in rows}
+
+
+@pytest.mark.parametrize("option", options_of(EstimatorOptions), ids=lambda option: option.name)
+def test_every_option_of_the_estimator_is_a_parameter_of_the_node(option) -> None:
+    assert PARAMETERS[option.name] is option
+    assert NodeParameters().values()[option.name] == option.default
+    lines = to_yaml(NodeParameters()).splitlines()
+    entry = next(index for index, line in enumerate(lines) if line.startswith(f"    {option.name}: "))
+    assert yaml.safe_load(lines[entry]) == {option.name: option.default}
+    assert lines[entry - 1] == f"    # {option.description}"
+    default, allowed, live, description = table()[option.name]
+    assert yaml.safe_load(default.strip("`")) == option.default
+    assert allowed == (option.range or " ".join(f"`{choice}`" for choice in option.choices))
+    assert (live, description) == ("yes" if option.live else "", option.description)
+
+
+def test_the_estimator_has_no_field_that_is_no_option() -> None:
+    assert [each.field for each in options_of(EstimatorOptions)] == list(vars(EstimatorOptions()))
+
+
+def test_help_tells_every_option_of_the_estimator() -> None:
+    said = " ".join(pydoc.plain(pydoc.render_doc(EstimatorOptions)).replace("|", " ").split())
+    for each in options_of(EstimatorOptions):
+        assert f" {each.field}: {each.description} (" in said
+
+
+def test_the_table_and_the_yaml_name_every_parameter_once() -> None:
+    assert list(table()) == list(PARAMETERS) == list(NodeParameters().values())
+    ours = yaml.safe_load(to_yaml(NodeParameters()))["/rotavg"]["ros__parameters"]
+    assert list(ours) == list(PARAMETERS)
+
+
+def test_the_units_of_the_library_are_those_of_its_names() -> None:
+    """By the numbers that the estimator has always begun with."""
+    options = NodeParameters().estimator
+    assert options == EstimatorOptions()
+    assert (options.keyframe_angle, options.keyframe_distance) == (pytest.approx(0.0872664625997165), 0.5)
+    assert (options.max_turn_rate, options.max_speed) == (pytest.approx(6.28318530717959), 50.0)
+    changed = NodeParameters().changed({"keyframe_angle_deg": 180, "max_speed_m_s": 3, "refinement_steps": 0})
+    assert changed.estimator.keyframe_angle == pytest.approx(3.14159265358979)
+    assert (changed.estimator.max_speed, changed.estimator.max_refinement_steps) == (3.0, 0)
+    assert options.max_refinement_steps is None
+
+
+def test_a_change_keeps_the_rest_and_ignores_other_nodes_parameters() -> None:
+    first = NodeParameters().changed({"gauge": "identity", "robots": ["a"], "use_sim_time": True})
+    second = first.changed({"solve_period_s": 2})
+    expected = NodeParameters().values() | {"gauge": "identity", "robots": ("a",), "solve_period_s": 2.0}
+    assert second.values() == expected
+    assert first.values() == expected | {"solve_period_s": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"keyframe_distance_m": -1}, "keyframe_distance_m is -1.0; it must be between 0 and 1e+06"),
+        ({"gauge": "up"}, "gauge is 'up'; choose from odometry, identity"),
+        ({"robots": ["a", "b"]}, "robots has 2 entries and odometry_topics 1; give one robot per topic"),
+        ({"edge_topics": ["graph:rtabmap_msgs/msg/MapGraph"]}, "edge topic 'graph:rtabmap_msgs/msg/MapGraph' brings "),
+        ({"autosave_period_s": 5.0}, "autosave_period_s is set but state_file is empty; name a file"),
+    ],
+)
+def test_parameters_that_cannot_be(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(UserError, match=f"^{re.escape(message)}"):
+        NodeParameters().changed(changes)
