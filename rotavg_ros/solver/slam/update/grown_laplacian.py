@@ -28,8 +28,8 @@ from rotavg_ros.solver.algebra.laplacian import (
 )
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 
-# Conjugate gradients end at a step that no orientation could be seen to take, or at a hundredth of the first one.
-_SETTLED = Stop(tolerance=float(np.radians(0.002)), relative_tolerance=1e-2, max_iterations=12)
+# Conjugate gradients end at a step that no orientation could be seen to take, or at a thousandth of the first one.
+_SETTLED = Stop(tolerance=float(np.radians(0.002)), relative_tolerance=1e-3, max_iterations=12)
 
 
 @dataclass(frozen=True)
