@@ -110,7 +110,7 @@ class Start:
         correction: ``(K, 4)``; identities for the odometry itself.
         inlier_probability: ``(E,)``; that of odometry is kept.
         noise: to begin with.
-        prior_log_odds: ``(E,)`` of each edge to be good, beyond the common outlier share; ±inf decide it.
+        network_log_odds: ``(E,)`` of each edge to be good, beyond the common outlier share; ±inf decide it.
         exact_share: ``(E,)`` probability of a good closure to err no more than most; default: 1.
         is_new: ``(E,)`` bool, in an update the closures that have just come; None: this is no update.
     """
@@ -119,7 +119,7 @@ class Start:
     correction: Tensor
     inlier_probability: np.ndarray
     noise: NoiseModel
-    prior_log_odds: np.ndarray
+    network_log_odds: np.ndarray
     exact_share: np.ndarray | None = None
     is_new: np.ndarray | None = None
 
@@ -146,7 +146,7 @@ class Passes:
     def __init__(self, start: Start, system: System, hold_noise: bool) -> None:
         graph = start.graph
         self.graph, self.noise, self.hold_noise = graph, start.noise, hold_noise
-        self.inlier_probability, self.prior_log_odds = start.inlier_probability, start.prior_log_odds
+        self.inlier_probability, self.network_log_odds = start.inlier_probability, start.network_log_odds
         self.system = system
         # In an update few edges are new, so that few weights change much from pass to pass.
         self._is_new = start.is_new
@@ -270,7 +270,7 @@ class Passes:
             self.exact_share[closure] = judged.exact_share
             self.exactness = exactness_of(self.exact_share, self.tail_ratio)
         before = self.inlier_probability[closure]
-        probability = expit(judged.log_odds + self.prior_log_odds[closure])
+        probability = expit(judged.log_odds + self.network_log_odds[closure])
         if self._is_new is not None:
             # Closures of which each is good if the other is not would change places from update to update.
             is_swinging = ~self._is_new[closure] & (np.abs(probability - before) > _SWING)
