@@ -186,12 +186,12 @@ class Problem:
 
 
 def l1_weight(squared_residual: Tensor) -> Tensor:
-    """The ℓ1 cost's weight of a squared residual s = |r|²: s^(−1/2) = |r|⁻¹."""
+    """Weight of the ℓ1 cost, of squared residuals s = |r|²: s^(−1/2) = |r|⁻¹."""
     return squared_residual.rsqrt()
 
 
 def l_half_weight(squared_residual: Tensor) -> Tensor:
-    """The ℓ½ cost's weight of a squared residual s = |r|²: s^(−3/4) = |r|^(−3/2).
+    """Weight of the ℓ½ cost, of squared residuals s = |r|²: s^(−3/4) = |r|^(−3/2).
 
     Two roots take a fifth of the time of a power.
     """

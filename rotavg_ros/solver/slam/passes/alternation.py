@@ -56,7 +56,8 @@ class Verdicts:
 
     Attributes:
         correction: ``(K, 4)`` C.
-        inlier_probability: ``(E,)`` that an edge is not a false one, which is what it weighs.
+        inlier_probability: ``(E,)`` p_e, that an edge is not of the noise model's false component: a factor of its
+            weight.
         outlier_probability: ``(E,)`` that its true noise exceeds 10° (``OUTLIER_ANGLE``), or that a segment slipped.
         noise: the estimated noise model.
         steps: ``(E,)`` the graph's, more where closures err together.
@@ -180,7 +181,7 @@ class Passes:
         return self._discrepancy
 
     def _residual_vectors(self) -> np.ndarray:
-        """Rotation vectors ``(E, 3)`` in radians, of ``fine_net.edge_residual``."""
+        """Rotation vectors ``(E, 3)`` in radians, of ``residuals.edge_residual``."""
         residual = quaternion_rows.residual(self._correction, self._measured, self.graph.source, self.graph.target)
         return np.ascontiguousarray(quaternion_rows.log(residual).T)
 
@@ -255,7 +256,7 @@ class Passes:
         if not self.hold_noise:
             self._estimate_noise(square, self.inlier_probability * leave_out, max_step_variance)
 
-        # What is left of the fit without the edge itself, and how far that may be off.
+        # Verdicts: what is left of the fit without the edge itself, and how far that may be off.
         closure = self._closure
         predicted_square = np.minimum(square[closure] / leave_out[closure] ** 2, np.pi**2)
         scale = self.noise.closure_variance / noise.closure_variance
@@ -270,6 +271,7 @@ class Passes:
             self.exact_share[closure] = judged.exact_share
             self.exactness = exactness_of(self.exact_share, self.tail_ratio)
         before = self.inlier_probability[closure]
+        # p_e. No edge is switched off: p_e is a factor of its weight in the next pass.
         probability = expit(judged.log_odds + self.network_log_odds[closure])
         if self._is_new is not None:
             # Closures of which each is good if the other is not would change places from update to update.
