@@ -47,6 +47,9 @@ def fine_net_loss(
 ) -> dict[str, Tensor]:
     """Edge term (errors of relative orientations) plus node term, either in units of the graph's noise.
 
+    The error ε_v of a node is twice x, y, z of the quaternion R_v,true⁻¹ R_v: along its axis, of length 2 sin(θ/2) for
+    an error of θ, which is the rotation vector to within 1 % up to 28°.
+
     The node term is about a robust mean of each graph's errors, so that no gauge is learned: it is the error that is
     reported, and weighs as much as the edge term (in the paper, where the gauge is the tree's, a tenth).
 

@@ -1,8 +1,11 @@
 """Weighted graph Laplacians: one sparse factorisation, many right-hand sides.
 
-Residuals are rotations of the world frame, so the three components of a correction share one scalar Laplacian
-``L = Bᵀ W B``, grounded at the roots (one per connected component). A solve factorises the same pattern with ever new
-weights, so what depends on the pattern alone is done once: the order of elimination, where each weight goes, and Bᵀ.
+Residuals are rotations of the world frame. Where noise has the same variance about every axis, an edge's weight is a
+scalar, and the three components of a correction share one scalar Laplacian ``L = Bᵀ W B``, grounded at the roots (one
+per connected component). SfM's shaped steps weigh edges by 3 × 3 matrices: ``sfm/block_laplacian.py``.
+
+A solve factorises the same pattern with ever new weights, so what depends on the pattern alone is done once: the order
+of elimination, where each weight goes, and Bᵀ.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ def exp(vector: np.ndarray) -> np.ndarray:
 
 
 def residual(correction: np.ndarray, measured: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """``(4, E)`` of either sign, what ``residuals.edge_residual`` computes, from ``(4, K)`` and ``(4, E)``."""
+    """``(4, E)`` of either sign: e_uv as ``residuals.edge_residual`` computes it, from ``(4, K)`` and ``(4, E)``."""
     at_target = correction.take(target, axis=1)
     np.negative(at_target[:3], out=at_target[:3])
     return multiply(at_target, multiply(measured, correction.take(source, axis=1)))

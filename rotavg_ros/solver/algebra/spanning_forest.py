@@ -51,11 +51,13 @@ def shortest_path_forest(
     edges: SortedEdges | None = None,
     component: Tensor | None = None,
 ) -> SpanningForest:
-    """Breadth-first tree from the best-connected node of each component (NeuRoRA §4.2).
+    """Tree of least total cost to the root of each component, by Dijkstra's algorithm (NeuRoRA §4.2).
+
+    Where all costs are equal it is a breadth-first tree.
 
     Args:
         graph: on the CPU.
-        cost: ``(M,)`` positive; paths of least total cost instead of fewest edges.
+        cost: ``(M,)`` positive; default: 1 each.
         root: "hub", the node of highest degree, or "first", the first node of the component.
         edges: the graph's edges sorted; default: computed.
         component: ``(N,)`` its connected components; default: computed.

@@ -19,17 +19,17 @@ NODE_FEATURES = 5
 class FineNet(StoredNetwork):
     """One correction of all orientations.
 
-    The state of a node begins as h_v = [R̃_v, log(1 + degree)/4], an edge's features are those of
-    :func:`edge_features`, made of its residuals e_uv; from the last state (``message_passing.py``) one linear head says
-    the tangent of half the correction's angle, along its axis, in units of the residuals' median σ:
+    The state of a node begins as h_v = [R_v, log(1 + degree)/4] of the current estimate R_v, an edge's features are
+    those of :func:`edge_features`, made of its residuals e_uv; from the last state (``message_passing.py``) one linear
+    head gives the tangent of half the correction's angle, along its axis, in units of the scale s:
 
-        t_v = σ (H h_v + b),        R̂_v = R̃_v · [t_v, 1] / ‖[t_v, 1]‖.
+        t_v = s (H h_v + b),        R_v ← R_v · [t_v, 1] / ‖[t_v, 1]‖.
 
     A solve runs the same formula in ``tiled/networks.py``: ``fine_tuned``.
 
-    Rectified measurements are precise, but their errors are alike throughout a neighbourhood; raw ones are noisy, but
-    each errs by itself, so that many of them say what the orientations of a whole region are off. FineNet sees the
-    residuals of both. All angles are in units of the median raw residual, so that it is the same at any level of noise.
+    Rectified measurements are precise, but their errors are alike throughout a neighbourhood. Raw errors are
+    independent. Their mean over a region estimates the region's common error. FineNet sees the residuals of both. All
+    angles are in units of s, the median raw residual, so that it is the same at any level of noise.
     """
 
     NAME = "sfm-fine-net"
@@ -48,9 +48,9 @@ class FineNet(StoredNetwork):
         """Corrected orientations ``(N, 4)``.
 
         Args:
-            body_from_world: ``(N, 4)`` current estimate R̃_v.
+            body_from_world: ``(N, 4)`` current estimate R_v.
             features: ``(M, ODD_FEATURES + EVEN_FEATURES)`` of the edges as given, from :func:`edge_features`.
-            scale: ``(N, 1)`` or ``(1, 1)``, what the features are measured in.
+            scale: s, ``(N, 1)`` or ``(1, 1)``, what the features are measured in.
         """
         backward = torch.cat((-features[:, :ODD_FEATURES], features[:, ODD_FEATURES:]), dim=1)
         states = node_features(body_from_world, 1 / edges.inverse_degree)
@@ -59,7 +59,7 @@ class FineNet(StoredNetwork):
 
     def correct(self, body_from_world: Tensor, states: Tensor, scale: Tensor) -> Tensor:
         """Orientations ``(N, 4)`` corrected by what the last node states ``(N, hidden)`` say."""
-        # The tangent of half the angle, along the axis.
+        # t_v, the tangent of half the angle, along the axis.
         tangent = self.correction_head(states) * scale
         correction = nn.functional.normalize(torch.cat((tangent, torch.ones_like(tangent[:, :1])), dim=1), dim=1)
         # Residuals are rotations of the world frame, and so is the correction: it goes on the right.
@@ -73,7 +73,7 @@ def edge_features(raw: Tensor, rectified: Tensor, outlier_logit: Tensor, scale: 
         raw, rectified: ``(3, k)`` x, y, z of the residual quaternions (w ≥ 0) of the measurements as they are and
             after CleanNet.
         outlier_logit: ``(k,)`` CleanNet's.
-        scale: ``(k,)`` or a number, what raw residuals typically measure.
+        scale: s, ``(k,)`` or a number, the median length of ``raw``.
     """
     raw, rectified = raw / scale, rectified / scale
     # The weight of an edge under a loss that is square for small residuals and linear for large ones.

@@ -30,9 +30,9 @@ class NeuroraNumbers:
         logit_unit, log_degree_unit: what FineNet's features of these are divided by, so that they are of order one.
             Part of the trained network: another value needs other weights. Without those, v2: +4 to +22 %, default
             up to 1.1 %.
-        score_scale: by how many times the uncertainty of the ends a residual has to pass the outlier angle for the
-            log-odds of an outlier to rise by one. Fitted: `python -m rotavg_ros.training.score_fit`. Orientations do
-            not depend on it; the calibration error is 0.003 at half, 0.004 as it is, 0.017 at twice the value.
+        score_scale: dimensionless. score = σ((|r| − outlier_angle) / (score_scale · u)) with the logistic function σ
+            and the uncertainty u of the ends, rad. Fitted: `python -m rotavg_ros.training.score_fit`. Orientations
+            do not depend on it; the calibration error is 0.003 at half, 0.004 as it is, 0.017 at twice the value.
         min_uncertainty: rad; the uncertainty of the ends is at least this, so that exact measurements have scores.
             Nothing depends on it else.
     """

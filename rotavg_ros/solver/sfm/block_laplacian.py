@@ -1,8 +1,8 @@
 """Laplacian systems whose weights are 3 × 3 matrices, by conjugate gradients.
 
-The weight of an edge u→v is ``w (S_u + T_v)``: a number of the edge times the sum of what its two ends say. So no
-matrix of an edge is ever formed, and a product with the whole takes two products with sparse matrices of numbers, W
-over the edges as they run and Wᵀ:
+The weight of an edge u→v is ``w (S_u + T_v)``: w is a scalar for each edge; S_u and T_v are 3 × 3 matrices for each
+node. So no matrix of an edge is ever formed, and a product with the whole takes two products with sparse matrices of
+scalars, W over the edges as they run and Wᵀ:
 
     (L x)_v = D_v x_v − (W S x)_v − T_v (W x)_v − (Wᵀ T x)_v − S_v (Wᵀ x)_v
 """

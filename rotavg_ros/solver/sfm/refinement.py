@@ -31,7 +31,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.sfm.priors import RefinementPriors
-from rotavg_ros.solver.sfm.step import Measure, Problem, Structure, l1, l_half
+from rotavg_ros.solver.sfm.step import Measure, Problem, Structure, l1_weight, l_half_weight
 from rotavg_ros.view_graph import ViewGraph
 
 PRIORS = RefinementPriors()
@@ -84,7 +84,7 @@ def refine(
 def _coarse(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: int) -> tuple[Tensor, int]:
     """ℓ1 steps until they are settled; with their number."""
     priors = problem.priors
-    measure = Measure(problem.round, problem.evenly(priors.coarse_smoothing**2 / 2), l1, torch.float32)
+    measure = Measure(problem.round, problem.evenly(priors.coarse_smoothing**2 / 2), l1_weight, torch.float32)
     is_open = torch.ones_like(problem.roots, dtype=torch.bool)
     for number in range(max_steps):
         typical = problem.typical(problem.sample(orientations))
@@ -111,7 +111,7 @@ def _shaped(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: in
             is_noisy = problem.is_well_knit and bool((problem.typical(sample) > priors.coarse_noise).all())
             dtype = torch.float32 if is_noisy else torch.float64
         noise = problem.shapes.estimate(sample, orientations, noise, is_held)
-        measure = Measure(noise, variance, l_half, dtype)
+        measure = Measure(noise, variance, l_half_weight, dtype)
         if not bool(is_held.all()):
             dispersion = torch.where(is_held, dispersion, problem.dispersion(sample, measure, prior))
         step = problem.step(orientations, measure, prior, is_open)

@@ -185,14 +185,17 @@ class Problem:
         return weight, torch.stack(forces).sum(dim=0)
 
 
-def l1(square: Tensor) -> Tensor:
-    """|r|⁻¹."""
-    return square.rsqrt()
+def l1_weight(squared_residual: Tensor) -> Tensor:
+    """Weight of the ℓ1 cost, of squared residuals s = |r|²: s^(−1/2) = |r|⁻¹."""
+    return squared_residual.rsqrt()
 
 
-def l_half(square: Tensor) -> Tensor:
-    """|r|^(−3/2), in a fifth of the time that a power takes."""
-    return (square * square.sqrt()).rsqrt_()
+def l_half_weight(squared_residual: Tensor) -> Tensor:
+    """Weight of the ℓ½ cost, of squared residuals s = |r|²: s^(−3/4) = |r|^(−3/2).
+
+    Two roots take a fifth of the time of a power.
+    """
+    return (squared_residual * squared_residual.sqrt()).rsqrt_()
 
 
 def _distinct_entries(matrices: Tensor) -> Tensor:

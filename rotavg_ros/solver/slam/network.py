@@ -1,4 +1,4 @@
-"""CleanNet of the SLAM profile: judges loop closures by the company they keep.
+"""CleanNet of the SLAM profile: judges loop closures by which of them agree.
 
 Four layers along a chain of 10⁴ keyframes see nothing of a loop. The SLAM network therefore passes its messages
 between *closures*: each one hears from the closures nearest to it along the odometry (``agreement.py``), and knows of

@@ -135,7 +135,7 @@ def estimate(
             verdicts.correction,
             state.inlier_probability,
             state.noise,
-            state.prior_log_odds,
+            state.network_log_odds,
         )
     return SlamEstimate(
         **vars(verdicts),

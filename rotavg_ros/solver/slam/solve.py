@@ -51,7 +51,7 @@ def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
         steps = slam_refinement.MAX_PASSES if stages.refine else 0
     if steps > 0:
         with watch.stage("refine"):
-            estimate = slam_stages.refine(prepared, cleaned, correction, steps, stages=stages)
+            estimate = slam_stages.refine_and_search(prepared, cleaned, correction, steps, stages=stages)
         with watch.stage("expand"):
             closure_graph = prepared.closure_graph
             variance = closure_graph.variance(estimate.samples, estimate.stated_step_variance)

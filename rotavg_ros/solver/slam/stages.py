@@ -38,15 +38,15 @@ class CleanedClosures:
 
     Attributes:
         inlier_probability: ``(E,)``; 1 for odometry.
-        prior_log_odds: ``(E,)`` log-odds of being good that the refinement adds to its own evidence; ±inf by label.
+        network_log_odds: ``(E,)`` log-odds of being good that the refinement adds to its own evidence; ±inf by label.
     """
 
     inlier_probability: np.ndarray
-    prior_log_odds: np.ndarray
+    network_log_odds: np.ndarray
 
 
 def clean(network: SlamCleanNet | None, prepared: Prepared, label: Tensor) -> CleanedClosures:
-    """Judge every closure by its discrepancy with the odometry and, with a network, by the company it keeps.
+    """Judge every closure by its discrepancy with the odometry and, with a network, by the closures that agree with it.
 
     A closure starts as good only if both say so: a group of false closures agrees with itself, and odometry that has
     drifted far believes anything. What the network says counts in the refinement's verdicts, too.
@@ -78,9 +78,9 @@ def judge_closures(
     by_chain = judge_by_chain(noise, squared_angle, path_steps) + noise.prior_log_odds
     if network is None or len(by_chain) == 0:
         return by_chain, np.zeros(len(by_chain))
-    by_company = -false_log_odds(network, closure_features(noise, squared_angle, path_steps, pairs)).double().numpy()
-    bounded = np.clip(by_company, -_MAX_NETWORK_LOG_ODDS, _MAX_NETWORK_LOG_ODDS)
-    return np.minimum(by_chain, by_company), _NETWORK_SHARE * (1 - noise.outlier_share) * bounded
+    by_network = -false_log_odds(network, closure_features(noise, squared_angle, path_steps, pairs)).double().numpy()
+    bounded = np.clip(by_network, -_MAX_NETWORK_LOG_ODDS, _MAX_NETWORK_LOG_ODDS)
+    return np.minimum(by_chain, by_network), _NETWORK_SHARE * (1 - noise.outlier_share) * bounded
 
 
 def bootstrap(prepared: Prepared, cleaned: CleanedClosures) -> Tensor:
@@ -99,7 +99,7 @@ def bootstrap(prepared: Prepared, cleaned: CleanedClosures) -> Tensor:
     return compose_orientations(forest, closure_graph)
 
 
-def refine(
+def refine_and_search(
     prepared: Prepared,
     cleaned: CleanedClosures,
     correction: Tensor,
@@ -118,7 +118,7 @@ def refine(
             start, prepared.pairs, max_passes=max_passes, hold_noise=not stages.scale_estimation, rank=rank
         )
 
-    prior = cleaned.prior_log_odds
+    prior = cleaned.network_log_odds
     estimate = run(Start(prepared.closure_graph, correction, cleaned.inlier_probability, prepared.noise, prior))
     doubt = measure_doubt(prepared, estimate) if stages.slip_search else Doubt.NONE
     without = without_false_groups(run, estimate, prepared, prior, doubt) if stages.group_search else estimate

@@ -17,7 +17,7 @@ from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.preparation import Prepared, prepare
-from rotavg_ros.solver.slam.stages import bootstrap, clean, refine
+from rotavg_ros.solver.slam.stages import bootstrap, clean, refine_and_search
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 from test.solver.graphs import measured, random_truth, slam_edges, small_noise
 
@@ -43,7 +43,7 @@ def probability_of(prepared: Prepared, graph: ViewGraph, edge: int, log_odds: fl
     """Of being good, after the refinement."""
     network = None if log_odds is None else verdict(log_odds)
     cleaned = clean(network, prepared, graph.label)
-    estimate = refine(prepared, cleaned, bootstrap(prepared, cleaned))
+    estimate = refine_and_search(prepared, cleaned, bootstrap(prepared, cleaned))
     return float(prepared.closure_graph.edge_values(estimate.inlier_probability)[edge])
 
 
@@ -74,7 +74,7 @@ def test_the_network_counts_less_the_more_is_false() -> None:
     said = []
     for share in (0.1, 0.5, 0.9):
         noise = replace(prepared.noise, outlier_share=share)
-        prior = clean(verdict(2.0), replace(prepared, noise=noise), graph.label).prior_log_odds
+        prior = clean(verdict(2.0), replace(prepared, noise=noise), graph.label).network_log_odds
         assert (prior[prepared.closure_graph.is_odometry] == 0).all()
         said.append(float(np.unique(prior[prepared.closure_graph.is_closure]).item()))
     assert -2 < said[0] < said[1] < said[2] < 0

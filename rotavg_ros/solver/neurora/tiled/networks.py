@@ -54,7 +54,7 @@ def clean_edges(network: CleanNet, target_from_source: Tensor, edges: SortedEdge
     def decide(part: slice) -> None:
         measured = target_from_source[part].t().contiguous()
         forward, backward = (opinion.index_select(1, direction[part]) for direction in column.view(2, -1))
-        # CleanNet.correct, multiplied out: R̃ (1 + (f + R̃⁻¹ b⁻¹ R̃) / 2) = R̃ + (R̃ f + b⁻¹ R̃) / 2.
+        # clean_net.correct, multiplied out: R̃ (1 + (f + R̃⁻¹ b⁻¹ R̃) / 2) = R̃ + (R̃ f + b⁻¹ R̃) / 2.
         inverse_backward = torch.cat((-backward[:3], backward[3:4]))
         change = multiply_rows(measured, forward[:4]) + multiply_rows(inverse_backward, measured)
         corrected = torch.add(measured, change, alpha=0.5)

@@ -55,6 +55,6 @@ def measure(num_edges: int = _EDGES) -> Tuning:
 
     everyone = num_workers()
     tile = min(_TILE_SIZES, key=lambda size: seconds(Tuning(size, everyone)))
-    # A machine that is busy at the moment must not have the last word, so one thread has to be clearly better.
+    # One thread is chosen only if it is 1.2 times as fast; load disturbs the measurement.
     alone = seconds(Tuning(tile, 1)) * _CLEARLY < seconds(Tuning(tile, everyone))
     return Tuning(tile, 1 if alone else everyone)

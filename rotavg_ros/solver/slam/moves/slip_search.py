@@ -169,8 +169,8 @@ def grouped_cost(cost: TruncatedCost, correction: Tensor, pairs: AgreementPairs,
     """The cost of a solution ``(K, 4)`` if wrong closures that agree with each other have one reason to be wrong."""
     costs, closure = cost.of_edges(cost.residual(correction)), cost.graph.is_closure
     wrong = costs[closure] > 0.5 * cost.cap[closure]
-    company = np.bincount(pairs.first, is_agreed & wrong[pairs.second], len(wrong))
-    return float(costs[~closure].sum() + (costs[closure] / np.where(wrong, 1 + company, 1.0)).sum())
+    agreeing = np.bincount(pairs.first, is_agreed & wrong[pairs.second], len(wrong))
+    return float(costs[~closure].sum() + (costs[closure] / np.where(wrong, 1 + agreeing, 1.0)).sum())
 
 
 def _noise_without_slips(cost: TruncatedCost, correction: Tensor, noise: NoiseModel) -> NoiseModel:

@@ -39,7 +39,11 @@ class Judgement(NamedTuple):
 def judge(
     noise: NoiseModel, square: np.ndarray, variance: np.ndarray, prediction_variance: np.ndarray, ratio: np.ndarray
 ) -> Judgement:
-    """Whether edges are good, by how far they are from what the rest of the graph predicts of them.
+    """Log-odds of edges to be good, by how far they are from what the rest of the graph predicts of them.
+
+    The alternative is the noise model's false component, uniform over all rotations. The common share of false edges is
+    in the log-odds. What the network says of each edge is not: ``Passes.one_pass`` adds it, and the logistic function
+    of the sum is p_e, a factor of the edge's weight. No edge is switched off.
 
     Args:
         square: ``(E,)`` rad², of the leave-one-out discrepancies.

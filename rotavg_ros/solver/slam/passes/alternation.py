@@ -56,7 +56,8 @@ class Verdicts:
 
     Attributes:
         correction: ``(K, 4)`` C.
-        inlier_probability: ``(E,)`` that an edge is not a false one, which is what it weighs.
+        inlier_probability: ``(E,)`` p_e, that an edge is not of the noise model's false component: a factor of its
+            weight.
         outlier_probability: ``(E,)`` that its true noise exceeds 10° (``OUTLIER_ANGLE``), or that a segment slipped.
         noise: the estimated noise model.
         steps: ``(E,)`` the graph's, more where closures err together.
@@ -110,7 +111,7 @@ class Start:
         correction: ``(K, 4)``; identities for the odometry itself.
         inlier_probability: ``(E,)``; that of odometry is kept.
         noise: to begin with.
-        prior_log_odds: ``(E,)`` of each edge to be good, beyond the common outlier share; ±inf decide it.
+        network_log_odds: ``(E,)`` of each edge to be good, beyond the common outlier share; ±inf decide it.
         exact_share: ``(E,)`` probability of a good closure to err no more than most; default: 1.
         is_new: ``(E,)`` bool, in an update the closures that have just come; None: this is no update.
     """
@@ -119,7 +120,7 @@ class Start:
     correction: Tensor
     inlier_probability: np.ndarray
     noise: NoiseModel
-    prior_log_odds: np.ndarray
+    network_log_odds: np.ndarray
     exact_share: np.ndarray | None = None
     is_new: np.ndarray | None = None
 
@@ -146,7 +147,7 @@ class Passes:
     def __init__(self, start: Start, system: System, hold_noise: bool) -> None:
         graph = start.graph
         self.graph, self.noise, self.hold_noise = graph, start.noise, hold_noise
-        self.inlier_probability, self.prior_log_odds = start.inlier_probability, start.prior_log_odds
+        self.inlier_probability, self.network_log_odds = start.inlier_probability, start.network_log_odds
         self.system = system
         # In an update few edges are new, so that few weights change much from pass to pass.
         self._is_new = start.is_new
@@ -180,7 +181,7 @@ class Passes:
         return self._discrepancy
 
     def _residual_vectors(self) -> np.ndarray:
-        """Rotation vectors ``(E, 3)`` in radians, of ``fine_net.edge_residual``."""
+        """Rotation vectors ``(E, 3)`` in radians, of ``residuals.edge_residual``."""
         residual = quaternion_rows.residual(self._correction, self._measured, self.graph.source, self.graph.target)
         return np.ascontiguousarray(quaternion_rows.log(residual).T)
 
@@ -255,7 +256,7 @@ class Passes:
         if not self.hold_noise:
             self._estimate_noise(square, self.inlier_probability * leave_out, max_step_variance)
 
-        # What is left of the fit without the edge itself, and how far that may be off.
+        # Verdicts: what is left of the fit without the edge itself, and how far that may be off.
         closure = self._closure
         predicted_square = np.minimum(square[closure] / leave_out[closure] ** 2, np.pi**2)
         scale = self.noise.closure_variance / noise.closure_variance
@@ -270,7 +271,8 @@ class Passes:
             self.exact_share[closure] = judged.exact_share
             self.exactness = exactness_of(self.exact_share, self.tail_ratio)
         before = self.inlier_probability[closure]
-        probability = expit(judged.log_odds + self.prior_log_odds[closure])
+        # p_e. No edge is switched off: p_e is a factor of its weight in the next pass.
+        probability = expit(judged.log_odds + self.network_log_odds[closure])
         if self._is_new is not None:
             # Closures of which each is good if the other is not would change places from update to update.
             is_swinging = ~self._is_new[closure] & (np.abs(probability - before) > _SWING)

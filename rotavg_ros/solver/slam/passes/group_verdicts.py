@@ -74,7 +74,7 @@ def false_groups(state: Passes, system: WholeSystem, pairs: AgreementPairs) -> n
 def _members(state: Passes, pairs: AgreementPairs, closure: np.ndarray) -> csc_array:
     """``(C, G)`` of :class:`_Groups`; groups of two closures and more."""
     graph, noise = state.graph, state.noise
-    believed = (state.inlier_probability[closure] > 0.5) & np.isfinite(state.prior_log_odds[closure])
+    believed = (state.inlier_probability[closure] > 0.5) & np.isfinite(state.network_log_odds[closure])
     # A χ² quantile, of the squared angle over its variance.
     limit = 2 * gammainccinv(noise.components / 2, _MAX_DISAGREEMENT)
     variance = np.maximum(pairs.steps, 0.5) * noise.step_variance + 2 * noise.closure_variance

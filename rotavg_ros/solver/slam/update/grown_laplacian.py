@@ -5,7 +5,7 @@ where a new closure ends. Odometry alone changes nothing about the nodes that th
 halves in a row are the whole), so it is eliminated exactly. New closures are of low rank: one solve each, done once.
 What remains, weights of old closures that have changed, is left to conjugate gradients.
 
-Dense products are torch's, which inside a solve keep to one thread; numpy's wait for each other (``parallel.py``).
+Dense products are torch's, which inside a solve keep to one thread; numpy's wait for each other (``threads.py``).
 """
 
 from __future__ import annotations

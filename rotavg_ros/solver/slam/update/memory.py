@@ -1,7 +1,7 @@
 """What a SLAM solve remembers for the next one of the same graph, grown by a handful of edges.
 
 A node's tick that judged ten thousand closures need not judge them from nothing when five more have come: their
-verdicts, the noise and the order of elimination are still right. New closures are judged by their company as ever;
+verdicts, the noise and the order of elimination are still right. New closures are judged by their neighbours as ever;
 then a few passes of the refinement go on from where the last ones ended. All closures are judged again in these, so
 that a verdict can still change; when several do, or the graph has grown by some percent, or some number of updates
 later, the whole solve runs again, and with it the search for slips and biases.
@@ -82,7 +82,7 @@ class SlamMemory:
         graph: the view-graph.
         inlier_probability: ``(M,)`` that an edge is not a false one; all of a segment have that of the segment.
         outlier_probability: ``(M,)`` that its true noise exceeds 10°, likewise.
-        prior_log_odds: ``(M,)`` what the network said of closures.
+        network_log_odds: ``(M,)`` what the network said of closures; ±inf by label.
         steps: ``(M,)`` variance by which a closure weighs in units of the closures', see
             :class:`~rotavg_ros.solver.slam.graph.closure_graph.ClosureGraph`.
         trust: how far the variances that closures state are believed.
@@ -103,7 +103,7 @@ class SlamMemory:
     graph: ViewGraph
     inlier_probability: np.ndarray
     outlier_probability: np.ndarray
-    prior_log_odds: np.ndarray
+    network_log_odds: np.ndarray
     steps: np.ndarray
     trust: StatedTrust
     exact_share: np.ndarray
@@ -134,7 +134,7 @@ class SlamMemory:
         if prepared.is_unbiased:
             return None
         return cls(
-            **_by_edge(closure_graph, estimate, cleaned.prior_log_odds),
+            **_by_edge(closure_graph, estimate, cleaned.network_log_odds),
             **_of_estimate(graph, closure_graph, estimate, UpdateLimits()),
             graph=graph,
             variance=variance,
@@ -200,7 +200,7 @@ class SlamMemory:
     def _updated(self, graph: ViewGraph, start: GrownStart, verdicts: Verdicts, factor: OlderFactor | None) -> Updated:
         """With the noise and predictions of before."""
         variance = grown_variance(self.variance, start.graph, start.weight)
-        by_edge = _by_edge(start.graph, verdicts, start.prior_log_odds)
+        by_edge = _by_edge(start.graph, verdicts, start.network_log_odds)
         memory = replace(self, **by_edge, graph=graph, variance=variance, factor=factor, updates=self.updates + 1)
         return Updated(start.graph, verdicts, variance, memory)
 
@@ -227,7 +227,7 @@ class SlamMemory:
         variance = closure_graph.variance(estimate.samples, estimate.stated_step_variance)
         memory = replace(
             self,
-            **_by_edge(closure_graph, estimate, start.prior_log_odds),
+            **_by_edge(closure_graph, estimate, start.network_log_odds),
             **_of_estimate(graph, closure_graph, estimate, self.limits),
             graph=graph,
             variance=variance,
@@ -242,7 +242,7 @@ class SlamMemory:
         new = np.flatnonzero(is_new)
         inlier_probability, prior = (
             carried_over(value, graph, otherwise)
-            for value, otherwise in ((self.inlier_probability, 1.0), (self.prior_log_odds, 0.0))
+            for value, otherwise in ((self.inlier_probability, 1.0), (self.network_log_odds, 0.0))
         )
         graph = believing(graph, self.trust)
         # By how much a closure weighs less for those that err as it does.
@@ -277,12 +277,12 @@ class SlamMemory:
         return rank
 
 
-def _by_edge(graph: ClosureGraph, verdicts: Verdicts, prior_log_odds: np.ndarray) -> dict[str, Any]:
+def _by_edge(graph: ClosureGraph, verdicts: Verdicts, network_log_odds: np.ndarray) -> dict[str, Any]:
     """What is remembered of every edge of the view-graph, ``(M,)`` each."""
     return {
         "inlier_probability": graph.edge_values(verdicts.inlier_probability),
         "outlier_probability": graph.edge_values(verdicts.outlier_probability),
-        "prior_log_odds": graph.edge_values(prior_log_odds),
+        "network_log_odds": graph.edge_values(network_log_odds),
         "steps": graph.edge_values(verdicts.steps),
         "exact_share": graph.edge_values(verdicts.exact_share),
         "prediction_variance": graph.edge_values(verdicts.prediction_variance),

@@ -19,10 +19,10 @@ from rotavg_ros.solver.slam.stages import judge_closures
 
 
 class NewClosures(NamedTuple):
-    """Of n closures ``(n,)`` each: probability of being good, prior log-odds, inflation for common errors."""
+    """Of n closures ``(n,)`` each: probability of being good, network's log-odds of it, inflation for common errors."""
 
     inlier_probability: np.ndarray
-    prior_log_odds: np.ndarray
+    network_log_odds: np.ndarray
     variance_factor: np.ndarray
 
 

@@ -55,7 +55,7 @@ def test_a_group_that_agrees_counts_as_one(planar: bool) -> None:
     prepared = slam_preparation.prepare(graph)
     cleaned = slam_stages.clean(None, prepared, graph.label)
     start = slam_stages.bootstrap(prepared, cleaned)
-    one_by_one = slam_stages.refine(prepared, cleaned, start, stages=SlamStages(group_search=False))
+    one_by_one = slam_stages.refine_and_search(prepared, cleaned, start, stages=SlamStages(group_search=False))
     assert (prepared.closure_graph.edge_values(one_by_one.outlier_probability)[is_false] < 0.5).all()
 
 
