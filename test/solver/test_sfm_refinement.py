@@ -210,7 +210,7 @@ def test_steps_are_bounded_and_more_than_needed_are_not_taken() -> None:
 
 
 def test_neither_the_worlds_nor_the_cameras_frame_matters() -> None:
-    """The cameras' frames: rel → A rel A⁻¹ and R → A R; the world's: R → R G. Conjugate gradients leave a difference."""
+    """The cameras': rel → A rel A⁻¹ and R → A R; the world's: R → R G. Conjugate gradients leave some difference."""
     graph, truth = _scan(14)
     start = _disturbed(truth, 5, 14)
     expected = sfm_refinement.refine(graph, start)
