@@ -73,9 +73,7 @@ class ShapeEstimator:
             before: what was estimated a step ago.
             is_held: ``(C,)`` components that keep in their cameras' frames what was estimated a step ago.
         """
-        matrix = rotations.to_matrix(body_from_world).permute(1, 2, 0).contiguous()
-        if before.scatter is not None and bool(is_held.all()):
-            return self._placed(before.scatter, matrix)
+        matrix = _matrices(body_from_world)
         ends, starts = (sample.source, sample.target), before.scatter or (None, None)
         scatters = [matrix] * 2
 
@@ -89,6 +87,10 @@ class ShapeEstimator:
         for_each(estimate, (0, 1), threads_on(matrix.device))
         return self._placed((scatters[0], scatters[1]), matrix)
 
+    def carried(self, shape: NoiseShape, body_from_world: Tensor) -> NoiseShape:
+        """The same in the cameras' frames, where the cameras have turned to ``(N, 4)``."""
+        return shape if shape.scatter is None else self._placed(shape.scatter, _matrices(body_from_world))
+
     def _placed(self, scatters: tuple[Tensor, Tensor], matrix: Tensor) -> NoiseShape:
         """Covariances in the cameras' frames → information in the world's, given body_from_world ``(3, 3, N)``."""
         at_ends = []
@@ -100,6 +102,11 @@ class ShapeEstimator:
             turned = (information[:, :, None] * matrix).sum(dim=1)
             at_ends.append((matrix[:, :, None] * turned[:, None]).sum(dim=0))
         return NoiseShape(at_ends[0], at_ends[1], scatters)
+
+
+def _matrices(body_from_world: Tensor) -> Tensor:
+    """Orientations ``(N, 4)`` → ``(3, 3, N)``."""
+    return rotations.to_matrix(body_from_world).permute(1, 2, 0).contiguous()
 
 
 _PRIORS = NoiseShapePriors()

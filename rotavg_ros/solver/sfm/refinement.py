@@ -106,13 +106,14 @@ def _shaped(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: in
     is_open = torch.ones_like(problem.roots, dtype=torch.bool)
     is_held = torch.zeros_like(is_open)
     for _ in range(max_steps):
-        if not bool(is_held.all()):
+        if bool(is_held.all()):
+            measure = Measure(problem.shapes.carried(noise, orientations), variance, l_half_weight, dtype)
+        else:
             sample = problem.sample(orientations)
             is_noisy = problem.is_well_knit and bool((problem.typical(sample) > priors.coarse_noise).all())
             dtype = torch.float32 if is_noisy else torch.float64
-        noise = problem.shapes.estimate(sample, orientations, noise, is_held)
-        measure = Measure(noise, variance, l_half_weight, dtype)
-        if not bool(is_held.all()):
+            noise = problem.shapes.estimate(sample, orientations, noise, is_held)
+            measure = Measure(noise, variance, l_half_weight, dtype)
             dispersion = torch.where(is_held, dispersion, problem.dispersion(sample, measure, prior))
         step = problem.step(orientations, measure, prior, is_open)
         variance = (dispersion[problem.component] / step.weight).clamp(min=priors.least_square / 2)
