@@ -15,7 +15,7 @@ from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion, Vector
 
 # Within a shorter time than this, stamps and rotations are too noisy for a rate to mean anything.
 _SHORTEST_S = 0.2
-# A pose this near to zero is where odometry begins …
+# A pose this near to zero is where odometry begins, and one this near to another is the same …
 _ZERO_ANGLE = math.radians(1.0)
 _ZERO_DISTANCE_M = 0.1
 # … and an odometry that has begun anew, if going on as before would have led this far from there.
@@ -80,7 +80,8 @@ class ContinuityCheck:
     def admit_after_a_break(self, sample: OdometrySample, last: OdometrySample, before: OdometrySample | None) -> bool:
         """As :meth:`admit`, when the robot may have been switched off since ``last``, and nobody was watching.
 
-        Odometry counts as begun anew unless :func:`goes_on` and no more than ``lead_ns`` has passed.
+        Odometry counts as begun anew unless :func:`goes_on`, and either at most ``lead_ns`` has passed or the robot
+        :func:`stands_still`.
         """
         return self._judge(sample, last, before, after_break=True)
 
@@ -95,7 +96,7 @@ class ContinuityCheck:
             return refused_jumps or (after_break and not goes_on(sample, refused, self.limits))
         jumps = has_jumped(sample, last, before, self.limits)
         if is_ahead or jumps:
-            self._refused, self._refused_jumps = sample, jumps or after_break
+            self._refused, self._refused_jumps = sample, jumps or (after_break and not stands_still(sample, last))
             raise RejectedInputError(RejectReason.FUTURE_STAMP if is_ahead else RejectReason.ODOMETRY_JUMP)
         return after_break and not goes_on(sample, last, self.limits)
 
@@ -153,8 +154,17 @@ def goes_on(sample: OdometrySample, last: OdometrySample, limits: ContinuityLimi
         last: the last one before.
         limits: with an infinite turn rate it always counts as going on.
     """
-    beginning = OdometrySample(sample.stamp_ns, quaternion.IDENTITY, (0.0, 0.0, 0.0))
-    return math.isinf(limits.turn_rate) or _distance(last, sample) < _distance(beginning, sample)
+    return math.isinf(limits.turn_rate) or _distance(last, sample) < _distance(_beginning(sample), sample)
+
+
+def stands_still(sample: OdometrySample, last: OdometrySample) -> bool:
+    """Whether a message tells the very pose of the last one, at which no odometry begins."""
+    angle, metres = _angle_and_metres(last, sample)
+    return angle < _ZERO_ANGLE and metres < _ZERO_DISTANCE_M and _distance(_beginning(sample), sample) > 1
+
+
+def _beginning(sample: OdometrySample) -> OdometrySample:
+    return OdometrySample(sample.stamp_ns, quaternion.IDENTITY, (0.0, 0.0, 0.0))
 
 
 def _angle_and_metres(first: OdometrySample, second: OdometrySample) -> tuple[float, float]:

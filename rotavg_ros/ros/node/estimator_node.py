@@ -84,7 +84,7 @@ class RotavgNode(parameter_server.ParameterNode):
     def close(self, timeout_s: float) -> bool:
         """Save if that is wanted, and stop working; False if a save still runs after the timeout, or a solve does."""
         if self._settings.autosave_period_s > 0:
-            self._on_autosave_timer()
+            self._saver.submit(lambda: self._solving.autosave_quietly(at_the_end=True))
         is_saved = self._saver.stop(timeout_s, finish=True)
         if is_saved:
             self._solving.let_go()
@@ -111,9 +111,6 @@ class RotavgNode(parameter_server.ParameterNode):
 
     def _on_solve_timer(self) -> None:
         self._worker.submit_once(self._solving.tick_quietly)
-
-    def _on_autosave_timer(self) -> None:
-        self._saver.submit_once(self._solving.autosave_quietly)
 
     def _on_clock_jump(self, _jump: TimeJump) -> None:
         """Simulated time went back: only ``use_sim_time`` knows of that."""

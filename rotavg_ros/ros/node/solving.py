@@ -99,10 +99,15 @@ class Solving:
         """As :meth:`tick`; what goes wrong is logged."""
         self._quietly("solving failed: ", self.tick)
 
-    def autosave_quietly(self) -> None:
-        """Save what has changed since it was last saved; what goes wrong is logged once, until it goes well again."""
+    def autosave_quietly(self, at_the_end: bool = False) -> None:
+        """Save what has changed since it was last saved; what goes wrong is logged once, until it goes well again.
+
+        Args:
+            at_the_end: odometry counts as well, for where the robot is tells the next node whether it has gone on.
+        """
         content = self._content()
-        if content == self._saved and self._health.save_failure is None:
+        moved = at_the_end and self._estimator.counts().keyframes > 0
+        if content == self._saved and not moved and self._health.save_failure is None:
             return
         try:
             self.save()

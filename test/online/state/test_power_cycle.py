@@ -124,13 +124,17 @@ def test_odometry_that_ran_on_while_the_node_was_down_is_joined(yesterday, tmp_p
     assert answer.num_components == 1 and odometry_edges_across(answer, LENGTH) == 1
 
 
-def test_after_a_longer_break_nobody_knows_and_it_is_not(yesterday, tmp_path) -> None:
+@pytest.mark.parametrize(("moved_m", "components"), [(0.0, 1), (0.05, 1), (0.5, 2)])
+def test_after_a_longer_break_only_the_very_same_pose_shows_that_it_ran_on(
+    yesterday, tmp_path, moved_m, components
+) -> None:
     estimator = restarted(yesterday, tmp_path)
-    start = YESTERDAY * SECOND + LENGTH * SECOND // 10 + 61 * SECOND
+    start = YESTERDAY * SECOND + LENGTH * SECOND // 10 + 3600 * SECOND
     pose = (truth(0).inv() * truth(LENGTH - 1)).as_quat().tolist()
+    parked_m = 5.0 * math.sin(0.05 * (LENGTH - 1))
     for index in range(20):
-        estimator.add_odometry("r", start + index * SECOND // 10, pose, (5.0 * math.sin(0.05 * (LENGTH - 1)), 0, 0))
-    assert estimator.tick().num_components == 2
+        estimator.add_odometry("r", start + index * SECOND // 10, pose, (parked_m + moved_m, 0, 0))
+    assert estimator.tick().num_components == components
 
 
 @pytest.mark.parametrize("today_s", TODAY.values(), ids=TODAY.keys())
