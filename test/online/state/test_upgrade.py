@@ -1,0 +1,76 @@
+"""State files of earlier versions: what they hold goes on as if this version had written it."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
+from rotavg_ros.online.state import file as state_file
+
+SECOND = 1_000_000_000
+OPTIONS = EstimatorOptions(keyframe_angle=0, keyframe_distance=0)
+
+
+def feed(online: OnlineEstimator, start: int, stop: int) -> None:
+    for index in range(start, stop):
+        turn = (0.0, 0.0, math.sin(0.05 * index), math.cos(0.05 * index))
+        position = (9 + 0.1 * index, 1, 0) if index < 60 else (0.1 * (index - 60), 0, 0)
+        online.add_odometry("r", (1000 + index) * SECOND, turn, position)
+
+
+def closure(edge_id: int, source: KeyframeReference, target: KeyframeReference) -> EdgeMeasurement:
+    return EdgeMeasurement(edge_id, source, target, (0.0, 0.0, 0.0, 1.0))
+
+
+def as_of_version(path: Path, version: int) -> dict:
+    """The content of a file of today, as that version wrote it."""
+    arrays = state_file.read(path)
+    header = json.loads(arrays.pop("header").tobytes())
+    names = ("older", "younger", "newest")
+    arrays["fingerprints"] = np.concatenate([arrays.pop(f"fingerprints_{name}") for name in names])
+    added = ("time_line", "limit", "refused_", "begins_time_line", "outlier")
+    arrays = {name: values for name, values in arrays.items() if not any(word in name for word in added)}
+    room = header.pop("room")
+    old = {
+        "format_version": version,
+        "data_time_ns": header.pop("data_time")["now_ns"],
+        "pending": [row["edge"] for row in header["pending"]],
+        "marginalized": room["marginalized"],
+        "dropped_closures": room["dropped_closures"],
+    }
+    for name in ("ticked_revision", "world_from_odometry", "revision", "backward_jumps"):
+        del header[name]
+    if version < 3:
+        arrays = {name: values for name, values in arrays.items() if not name.startswith("marginalized_")}
+        del arrays["steps"], header["forgotten_up_to"]
+    return arrays | {"header": np.frombuffer(json.dumps(header | old).encode(), dtype=np.uint8)}
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_it_goes_on(solver, tmp_path, version: int) -> None:
+    today, path = OnlineEstimator(OPTIONS, solver), tmp_path / "state.npz"
+    feed(today, 0, 80)  # odometry begins anew in between
+    stamps = KeyframeReference("r", stamp_ns=1003 * SECOND), KeyframeReference("r", stamp_ns=1040 * SECOND + 5)
+    assert today.add_edge(closure(5, *stamps)) is None
+    today.add_edge(closure(6, KeyframeReference("r", 0), KeyframeReference("r", 85)))
+    today.tick()
+    feed(today, 80, 82)
+    today.save(path)
+    state_file.write(path, as_of_version(path, version))
+    again = OnlineEstimator(OPTIONS, solver)
+    again.load(path)
+    assert again.counts() == today.counts() and again.counts().pending == 1
+    assert again.current_orientation("r") == pytest.approx(today.current_orientation("r"))
+    for each in (today, again):
+        feed(each, 82, 90)
+        assert each.add_edge(closure(5, *stamps)) == "duplicate_edge"
+    first, second = today.tick(force_cold=True), again.tick(force_cold=True)
+    for name in ("keyframe_id", "stamp_ns", "time_line", "edge_id", "source", "target", "world_from_body"):
+        np.testing.assert_allclose(getattr(second, name), getattr(first, name), atol=1e-12, err_msg=name)
+    again.save(path)
+    assert json.loads(state_file.read(path)["header"].tobytes())["format_version"] == state_file.FORMAT_VERSION
