@@ -24,6 +24,7 @@ def robot(seed: int = 0) -> RobotRecord:
         robot="robot",
         nodes=np.arange(COUNT),
         stamp_ns=stamps,
+        time_line=np.zeros(COUNT, dtype=np.int64),
         keyframe_id=np.arange(COUNT, dtype=np.uint64),
         odometry_world_from_body=(drift * orientation).as_quat(),
         odometry_position=drift.apply(position),

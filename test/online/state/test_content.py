@@ -81,24 +81,27 @@ steps = st.one_of(
 )
 
 
-def events(drawn: list[tuple]) -> tuple[list[Event], set[int]]:
+def events(drawn: list[tuple], policy: str) -> tuple[list[Event], set[int]]:
     """What is drawn, as calls, and before which of them a robot is silent for more than a minute.
 
     A clock that was set back is followed by enough odometry to show it.
     """
     both, made, breaks = Robots(), [], set()
     heard = dict.fromkeys(ROBOTS, 0)  # after which call the robot was last heard for sure
+    newest = dict.fromkeys(ROBOTS, START)  # odometry that is behind this is refused where a jump is ignored
     for name, *values in drawn:
         if name == "odometry":
             made.append(both.odometry(*values))
             robot, _, jump_deg, late_ms = values
-            if jump_deg == 0 and late_ms == 0:
-                heard[robot] = len(made)
+            is_behind = policy == "ignore" and both.now[robot] <= newest[robot]
+            if jump_deg == 0 and late_ms == 0 and not is_behind:
+                heard[robot], newest[robot] = len(made), both.now[robot]
         elif name == "ahead":
             robot, seconds = values
             both.now[robot] += seconds * SECOND
             breaks |= set(range(heard[robot], len(made) + 1))
-            heard[robot] = len(made) + 3
+            if policy != "ignore" or both.now[robot] > newest[robot]:
+                heard[robot], newest[robot] = len(made) + 3, both.now[robot] + 300 * SECOND // 1000
             made += [both.odometry(robot, 100, 0.0, 0) for _ in range(3)]
         elif name == "set back":
             both.clock_set_back(*values)
@@ -136,10 +139,13 @@ def content(online: OnlineEstimator, path: Path) -> dict[str, object]:
     return arrays | header
 
 
-def compare(first: dict[str, object], second: dict[str, object]) -> None:
+def compare(first: dict[str, object], second: dict[str, object], tolerance: float = 0.0) -> None:
     assert first.keys() == second.keys()
     for name, value in first.items():
-        np.testing.assert_equal(second[name], value, err_msg=name)
+        if isinstance(value, np.ndarray) and np.issubdtype(value.dtype, np.floating):
+            np.testing.assert_allclose(second[name], value, rtol=0, atol=tolerance, err_msg=name)
+        else:
+            np.testing.assert_equal(second[name], value, err_msg=name)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -152,7 +158,7 @@ def test_a_cut_anywhere_changes_nothing(solver, tmp_path, drawn, cuts, policy) -
     """Odometry stays far from where it began, so that it is seen to go on; breaks are no longer than a minute."""
     options = replace(OPTIONS, on_time_jump=policy)
     whole, parts = (OnlineEstimator(options, Judge(solver)) for _ in range(2))
-    calls, breaks = events(drawn)
+    calls, breaks = events(drawn, policy)
     at = {round(cut * len(calls)) for cut in cuts} - breaks
     for index, call in enumerate(calls):
         if index in at:
@@ -163,7 +169,8 @@ def test_a_cut_anywhere_changes_nothing(solver, tmp_path, drawn, cuts, policy) -
             # The node ticks then, to have something to publish; a tick may settle what waits at odometry's end.
             whole.tick(), parts.tick()
         call(whole), call(parts)
-    compare(content(whole, tmp_path / "whole.npz"), content(parts, tmp_path / "parts.npz"))
+    # What was solved from another start may differ by rounding.
+    compare(content(whole, tmp_path / "whole.npz"), content(parts, tmp_path / "parts.npz"), tolerance=1e-12)
 
 
 def test_what_the_streams_above_reach(solver, tmp_path) -> None:
@@ -172,7 +179,7 @@ def test_what_the_streams_above_reach(solver, tmp_path) -> None:
     drawn = [("odometry", robot, 200, 0.0, 0) for _ in range(60) for robot in ROBOTS]
     drawn += [("edge", index, [("a", index, False), ("b", 5, True)], EdgeKind.LOOP_CLOSURE) for index in range(40)]
     drawn += [("tick", False), ("set back", "a", 30), ("odometry", "a", 100, 80.0, 0), ("odometry", "b", 0, 0.0, 2_500)]
-    for call in events(drawn)[0]:
+    for call in events(drawn, "new_component")[0]:
         call(online)
     counts, state = online.counts(), content(online, tmp_path / "state.npz")
     assert counts.marginalized > 0 and counts.time_jumps == 1 and counts.pending > 0

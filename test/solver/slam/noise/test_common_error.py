@@ -12,8 +12,7 @@ from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
 from rotavg_ros.solver.slam.noise.common_error import RunErrors, closure_runs, common_share, variance_factor
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.preparation import prepare
-from rotavg_ros.solver.slam.refinement import refine
-from rotavg_ros.solver.slam.stages import bootstrap, clean
+from rotavg_ros.solver.slam.stages import bootstrap, clean, refine_and_search
 
 
 def test_runs_link_near_good_closures() -> None:
@@ -62,6 +61,8 @@ def test_a_front_end_that_repeats_its_errors_is_recognised(planted: float, low: 
         run = simulate_slam_graph(config, np.random.default_rng(seed))
         prepared = prepare(run.graph)
         cleaned = clean(None, prepared, run.graph.label)
-        estimate = refine(prepared, cleaned, bootstrap(prepared, cleaned), stages=SlamStages(slip_search=False))
+        estimate = refine_and_search(
+            prepared, cleaned, bootstrap(prepared, cleaned), stages=SlamStages(slip_search=False)
+        )
         shares.append(estimate.common_share)
     assert low <= np.median(shares) <= high
