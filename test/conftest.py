@@ -19,6 +19,8 @@ from rotavg_ros.ros.harness.domain import DOMAIN_IDS, free_domain_id
 
 # A shell that runs the tests in the background lets its children ignore SIGINT, which the tests send.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+# … and nohup lets them ignore SIGHUP.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 ROOT = Path(__file__).resolve().parent.parent
 MAX_THREADS = 2
