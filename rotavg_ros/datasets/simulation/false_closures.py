@@ -75,7 +75,7 @@ def replace_closures(
     closures = np.flatnonzero(graph.kind.numpy() == EdgeKind.LOOP_CLOSURE)
     count = round(share * len(closures))
     if grouped:
-        run_of_closure = _random_runs(len(closures), count, rng)
+        run_of_closure = random_runs(len(closures), count, rng)
         chosen, run = closures[run_of_closure >= 0], run_of_closure[run_of_closure >= 0]
         turn = random_rotations(
             int(run.max(initial=-1)) + 1, graph_file.planar, rng, at_least_deg=2 * FALSE_CLOSURE_DEG
@@ -155,7 +155,7 @@ def _check_share(share: float, what: str) -> None:
         raise FalseClosureError(f"the share of {what} is {share}; it lies in [0, 1]")
 
 
-def _random_runs(length: int, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def random_runs(length: int, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Which run each of ``length`` items belongs to (-1: none); disjoint runs of 4–12 that cover ``count`` items."""
     sizes: list[int] = []
     while count > 0:
