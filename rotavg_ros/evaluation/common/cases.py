@@ -72,6 +72,7 @@ class Case:
         family: of photo collections or of robots' graphs.
         intact: ``(M,)`` bool, edges that whoever spoiled the graph left as they were; None: nobody did.
         floor: rad; in ratios of errors smaller ones count as this, since the truth is no better.
+        true_precision: ``(M,)`` rad⁻², that of each edge's actual noise, where whoever drew the graph knows it.
     """
 
     key: CaseKey
@@ -80,6 +81,7 @@ class Case:
     family: Family = SFM
     intact: Tensor | None = None
     floor: float = 0.0
+    true_precision: Tensor | None = None
 
     @cached_property
     def noise(self) -> Tensor:
