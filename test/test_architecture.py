@@ -162,7 +162,7 @@ BORDERS = {"rclpy": "ros", "rosbags": "bags", "mcap": "bags"}
 # Who imports by name what no arrow is about: subcommands, message packages, peers that may not be installed.
 BY_NAME = {
     "cli.main",
-    "evaluation.common.peers",
+    "evaluation.common.peers.running",
     "ros.harness.player",
     "ros.node.intake.adapters",
     "ros.node.intake.serialized_array",

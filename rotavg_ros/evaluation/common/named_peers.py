@@ -9,7 +9,7 @@ from typing import NamedTuple
 from rotavg_ros.evaluation.common import peers
 from rotavg_ros.evaluation.common.answers import Answer
 from rotavg_ros.evaluation.common.kept_answers import KeptAnswers
-from rotavg_ros.evaluation.common.peers import PeerError
+from rotavg_ros.evaluation.common.peers import MissingPeerError, PeerError
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -25,6 +25,9 @@ PEERS = {
     "shonan": Peer("gtsam", peers.shonan),
     "gnc": Peer("gtsam", peers.gnc),
     "isam2": Peer("gtsam", peers.isam2_huber),
+    "isam2-cauchy": Peer("gtsam", peers.isam2_cauchy),
+    "isam2-geman-mcclure": Peer("gtsam", peers.isam2_geman_mcclure),
+    "open3d": Peer("open3d", peers.line_process),
 }
 
 
@@ -40,15 +43,17 @@ def peer_solver(name: str, keep: KeptAnswers | None = None) -> Callable[[ViewGra
         keep: answers, to be found again by a later run.
 
     Raises:
-        PeerError: the peer is not installed.
+        MissingPeerError: the peer is not installed.
     """
     package, solve = PEERS[name]
     if not is_available(name):
-        raise PeerError(f"method {name!r} needs {package}, which is not installed; run: pip install {package}")
+        raise MissingPeerError(f"method {name!r} needs {package}, which is not installed; run: pip install {package}")
 
     def attempt(graph: ViewGraph) -> Answer | None:
         try:
             return solve(graph)
+        except MissingPeerError:
+            raise
         except PeerError:
             return None
 

@@ -36,8 +36,10 @@ def oracle(case: Case) -> Tensor:
 
 ROSTER = Roster(
     SLAM,
-    peers=(GNC, "isam2", "colmap"),
+    peers=(GNC, "isam2", "isam2-cauchy", "isam2-geman-mcclure", "open3d", "colmap"),
     references={"odometry": odometry, "least-squares": all_edges, ORACLE: oracle},
+    # Its matrices are dense: half a gigabyte each there.
+    max_edges={"open3d": 2000},
 )
 ROWS: dict[str, str] = {
     OURS: "**ours** (NeuRoRA for SLAM)",
@@ -49,6 +51,9 @@ ROWS: dict[str, str] = {
     "spt": "· tree alone",
     "gnc": "GNC (GTSAM), told that odometry is right",
     "isam2": "iSAM2 with Huber's loss (GTSAM), incremental",
+    "isam2-cauchy": "iSAM2 with Cauchy's loss (GTSAM), incremental",
+    "isam2-geman-mcclure": "iSAM2 with Geman–McClure's loss (GTSAM), incremental",
+    "open3d": "line process (Open3D), told that odometry is right",
     "colmap": "COLMAP's rotation averaging",
     "chatterjee": "Chatterjee & Govindu (ℓ1 → ℓ½) from odometry",
     "least-squares": "least squares on all edges",

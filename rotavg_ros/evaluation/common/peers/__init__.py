@@ -1,0 +1,24 @@
+"""Independent implementations to compare with: COLMAP's, GTSAM's and Open3D's.
+
+They come with ``pip install pycolmap gtsam open3d`` and are imported only when one of them runs. Each takes a
+view-graph and times its own work alone: the clock starts when the graph is in the peer's form and stops before its
+answer is translated back. Pose-graph methods get rotation factors only, with the precisions that the graph states,
+since rotations are all that the others get.
+"""
+
+from rotavg_ros.evaluation.common.peers.colmap_peer import colmap
+from rotavg_ros.evaluation.common.peers.gtsam_peers import gnc, isam2_cauchy, isam2_geman_mcclure, isam2_huber, shonan
+from rotavg_ros.evaluation.common.peers.open3d_peer import line_process
+from rotavg_ros.evaluation.common.peers.running import MissingPeerError, PeerError
+
+__all__ = [
+    "MissingPeerError",
+    "PeerError",
+    "colmap",
+    "gnc",
+    "isam2_cauchy",
+    "isam2_geman_mcclure",
+    "isam2_huber",
+    "line_process",
+    "shonan",
+]
