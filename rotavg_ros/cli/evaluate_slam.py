@@ -9,21 +9,57 @@ from pathlib import Path
 from rotavg_ros.cli.data_folder import data_folder
 from rotavg_ros.cli.progress import progress, working
 from rotavg_ros.datasets.files.formats import read_graph
+from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.common.cases import drawings
 from rotavg_ros.evaluation.common.contenders import contenders, warm_up
 from rotavg_ros.evaluation.common.named_peers import is_available
 from rotavg_ros.evaluation.common.scoring import Step, score_all
 from rotavg_ros.evaluation.live import incremental
-from rotavg_ros.evaluation.slam import cases, report, uncertainty
+from rotavg_ros.evaluation.names import SLAM_GRAPHS, SLAM_SHARES
+from rotavg_ros.evaluation.slam import cases, report, stress, stress_report, uncertainty
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS, ROSTER, ROWS
+from rotavg_ros.evaluation.slam.stress_calibration import Calibration
 
 _UNCERTAINTY_GRAPHS = ("CSAIL", "intel", "manhattan", "sphere2500")
 _UNCERTAINTY_DRAWS = 20
+_RECORDED_SEEDS = (0, 1, 2)
+# Peers that the recorded suite's tables do without, unless asked for.
+_STRESS_ONLY = ("isam2-cauchy", "isam2-geman-mcclure", "open3d")
+
+
+class SlamOptionsError(UserError):
+    """An option that the chosen suite has no use for."""
 
 
 def run(arguments: argparse.Namespace) -> Path:
     """Run the suite and write the report; returns the Markdown file."""
-    names = _methods(arguments)
+    return SUITES[arguments.slam_suite](arguments)
+
+
+def _run_stress(arguments: argparse.Namespace) -> Path:
+    if arguments.graphs != SLAM_GRAPHS or arguments.shares != SLAM_SHARES:
+        raise SlamOptionsError("--graphs and --shares choose from the recorded suite; with --suite stress use --kinds")
+    kinds = stress.kinds(arguments.kinds or ())
+    seeds = arguments.seeds or stress.REPORTING_SEEDS
+    names = _methods(arguments, ROWS)
+    chosen = contenders(names, ROSTER, keep=arguments.keep)
+    with working("warming up"):
+        warm_up(contenders(names, ROSTER).values(), ROSTER)
+    calibration = Calibration()
+    chosen[OURS] = calibration.watching(chosen[OURS])
+
+    def watch(steps: Iterable[Step]) -> Iterable[Step]:
+        return progress(steps, total=len(kinds) * len(seeds) * len(chosen), description="solving", unit="solve")
+
+    scores = score_all(drawings(kinds, seeds), chosen, watch)
+    return stress_report.report(arguments.output, scores, calibration, arguments.command_line)
+
+
+def _run_recorded(arguments: argparse.Namespace) -> Path:
+    if arguments.kinds is not None:
+        raise SlamOptionsError("--kinds chooses from the stress suite; add --suite stress")
+    seeds = arguments.seeds or _RECORDED_SEEDS
+    names = _methods(arguments, [name for name in ROWS if name not in _STRESS_ONLY])
     chosen = contenders(names, ROSTER, keep=arguments.keep)
     # What the last table needs shows before the hours that the others take.
     more = [_uncertainty_file(name) for name in _UNCERTAINTY_GRAPHS] if arguments.uncertainty else []
@@ -35,16 +71,16 @@ def run(arguments: argparse.Namespace) -> Path:
         return progress(steps, description="solving", unit="solve")
 
     kinds = cases.kinds(data, arguments.graphs, arguments.shares, arguments.hard)
-    scores = score_all(drawings(kinds, arguments.seeds), chosen, watch)
+    scores = score_all(drawings(kinds, seeds), chosen, watch)
     runs: list[incremental.IncrementalRun] = []
     checks: list[uncertainty.UncertaintyCheck] = []
     if not scores.interrupted:
         kinds = cases.kinds(data, arguments.incremental, [0.3], hard=False)
-        for case in drawings(kinds, arguments.seeds[:1]):
+        for case in drawings(kinds, seeds[:1]):
             runs.append(incremental.play(case, watch=_watch_ticks(str(case.key))))
         for name in progress(_UNCERTAINTY_GRAPHS if more else (), description="uncertainty", total=len(more)):
             graph_file = read_graph(data / _uncertainty_file(name))
-            checks += uncertainty.check(name, graph_file, _UNCERTAINTY_DRAWS, arguments.seeds[0])
+            checks += uncertainty.check(name, graph_file, _UNCERTAINTY_DRAWS, seeds[0])
     return report.report(arguments.output, scores, runs, checks, arguments.command_line)
 
 
@@ -52,9 +88,9 @@ def _uncertainty_file(name: str) -> str:
     return f"slam/{name}.g2o"
 
 
-def _methods(arguments: argparse.Namespace) -> list[str]:
-    """Those asked for, or all that can run here; always with ours and the oracle, which ratios need."""
-    names = arguments.methods or [name for name in ROWS if is_available(name)]
+def _methods(arguments: argparse.Namespace, default: Iterable[str]) -> list[str]:
+    """Those asked for, or all by default that can run here; always with ours and the oracle, which ratios need."""
+    names = arguments.methods or [name for name in default if is_available(name)]
     if not arguments.peers:
         names = [name for name in names if name not in ROSTER.peers]
     return list(dict.fromkeys((OURS, *names, ORACLE)))
@@ -62,3 +98,6 @@ def _methods(arguments: argparse.Namespace) -> list[str]:
 
 def _watch_ticks(description: str) -> Callable[[Iterable[int]], Iterable[int]]:
     return lambda ticks: progress(ticks, description=description, unit="tick")
+
+
+SUITES: dict[str, Callable[[argparse.Namespace], Path]] = {"recorded": _run_recorded, "stress": _run_stress}

@@ -49,6 +49,22 @@ def test_report(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "GNC" not in text.split("## CPU seconds")[0]
 
 
+def test_stress(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Kinds by parts of their names, the seeds that are for reporting; no data."""
+    command = ["evaluate", "slam", "--suite", "stress", "--output", str(tmp_path), "--threads", "1"]
+    assert main([*command, "--kinds", "15 closures", "3 WITNESSES", "--methods", "odometry", "--seeds", "1000"]) == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'stress.md'}\n"
+    with (tmp_path / "stress-cases.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["method"] for row in rows] == ["neurora", "odometry", "oracle"] * 6
+    assert {row["seed"] for row in rows} == {"1000"}
+    assert [row["kind"] for row in rows[-6::3]] == [
+        f"lone slip: 3 witnesses, {places} of places" for places in ("one pair", "three pairs")
+    ]
+    again = "--suite stress --kinds '15 closures' '3 WITNESSES' --seeds 1000 --methods odometry"
+    assert f"`rotavg evaluate slam --threads 1 {again}`" in (tmp_path / "stress.md").read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -59,6 +75,10 @@ def test_report(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (["--seeds", "-1"], "must be 0 or more"),
         (["--graphs", "nowhere"], "invalid choice: 'nowhere'"),
         (["--data", ".", "--methods", "magic"], "unknown method 'magic'"),
+        (["--suite", "worse"], "invalid choice: 'worse'"),
+        (["--data", ".", "--kinds", "grid"], "--kinds chooses from the stress suite; add --suite stress"),
+        (["--suite", "stress", "--graphs", "CSAIL"], "with --suite stress use --kinds"),
+        (["--suite", "stress", "--kinds", "nowhere"], "no kind's name contains 'nowhere'; names begin with building,"),
     ],
 )
 def test_mistakes(

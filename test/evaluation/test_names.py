@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from rotavg_ros.cli import evaluate_slam
 from rotavg_ros.datasets.simulation.robot_run import RobotRun
 from rotavg_ros.datasets.worlds import ROBOT_WORLDS
 from rotavg_ros.evaluation import names
@@ -15,6 +16,7 @@ def test_names_are_those_of_what_runs() -> None:
     assert tuple(synthetic.RECIPES) == names.SYNTHETIC_RECIPES
     assert tuple(robustness.SETTINGS) == names.ROBUSTNESS_SETTINGS
     assert cases.GRAPHS == names.SLAM_GRAPHS
+    assert tuple(evaluate_slam.SUITES) == names.SLAM_SUITES
     assert tuple(FAMILIES) == names.BENCHMARK_FAMILIES
     assert tuple(LABELS) == names.BENCHMARK_CONTENDERS
 

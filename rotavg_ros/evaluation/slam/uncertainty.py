@@ -68,10 +68,8 @@ def check(
         normalized = []
         for _ in range(draws):
             solution = solver(_noisy(graph, truth, sigma, components, rng))
-            error = _error(solution.body_from_world, truth, solution.component)[:, 3 - components :]
-            stated = solution.uncertainty.numpy()
-            is_free = ~_is_first(solution.component)
-            normalized.append((error[is_free] / np.maximum(stated[is_free, None], _SMALLEST_STATED)).ravel())
+            found = (solution.body_from_world, solution.component, solution.uncertainty)
+            normalized.append(normalized_errors(*found, truth, components))
         values = np.abs(np.concatenate(normalized))
         yield UncertaintyCheck(
             name,
@@ -81,6 +79,25 @@ def check(
             float((values < 1).mean()),
             float((values < 2).mean()),
         )
+
+
+def normalized_errors(
+    estimate: torch.Tensor, component: torch.Tensor, stated: torch.Tensor, truth: torch.Tensor, components: int
+) -> np.ndarray:
+    """Errors relative to each component's first node, over their stated standard deviations; first nodes left out.
+
+    Args:
+        estimate, truth: ``(N, 4)`` body_from_world.
+        component: ``(N,)`` connected component of every node.
+        stated: ``(N,)`` rad per component of the rotation vector.
+        components: 1 for the yaw of planar graphs, or all 3.
+
+    Returns:
+        The values of all nodes and components in one row.
+    """
+    is_free = ~_is_first(component)
+    error = _error(estimate, truth, component)[is_free, 3 - components :]
+    return np.asarray(error / np.maximum(stated.numpy()[is_free, None], _SMALLEST_STATED)).ravel()
 
 
 def table(title: str, checks: Sequence[UncertaintyCheck]) -> Table:

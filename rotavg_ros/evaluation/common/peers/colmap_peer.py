@@ -17,7 +17,8 @@ def colmap(graph: ViewGraph) -> Answer:
     """COLMAP's rotation averaging (ℓ1 and then Geman–McClure IRLS) with its default options but for one.
 
     By default it withdraws, after the estimate, the orientations of nodes that no edge agrees with to 10°; here it
-    answers for every node, as all others do. Of parallel edges it takes the first.
+    answers for every node, as all others do. Of parallel edges it takes the first. It is told neither a start nor
+    precisions nor which edges are odometry.
     """
     pycolmap = load("pycolmap")
     options = pycolmap.RotationEstimatorOptions()

@@ -31,7 +31,10 @@ _SHONAN_MAX_DIMENSION = 10
 
 
 def shonan(graph: ViewGraph) -> Answer:
-    """GTSAM's Shonan averaging: the certifiably optimal least-squares solution, without robustness."""
+    """GTSAM's Shonan averaging: the certifiably optimal least-squares solution, without robustness.
+
+    It is told the stated precisions, and neither a start nor which edges are odometry.
+    """
     gtsam = load("gtsam")
     clock = Clock()
 

@@ -25,8 +25,9 @@ def line_process(graph: ViewGraph) -> Answer:
     """Open3D's global optimisation (Choi, Zhou & Koltun 2015) by Levenberg–Marquardt, with its default criteria.
 
     It is told the stated precisions, odometry's orientations as the start, and that only closures are uncertain. All
-    translations are zero, so that rotations alone matter. A score is one minus the line process's value. Its residual
-    is the angle's sine, so that an edge off by 180° looks right, and its matrix is dense: 6 N rows.
+    translations are zero, so that rotations alone matter. A score is 1 − √l of the line process l, one half where
+    Open3D drops a closure. Its residual is the angle's sine, so that an edge off by 180° looks right, and its matrix is
+    dense: 6 N rows.
     """
     open3d = load("open3d")
     registration = open3d.pipelines.registration
@@ -45,7 +46,8 @@ def line_process(graph: ViewGraph) -> Answer:
         )
     world_from_body = Rotation.from_matrix([node.pose[:3, :3] for node in pose_graph.nodes])
     answer = from_rows(world_from_body.inv().as_quat(canonical=True).tolist())
-    return Answer(answer, clock.seconds, clock.cpu_seconds, torch.from_numpy(1 - _confidence(graph, edges, pose_graph)))
+    score = torch.from_numpy(1 - np.sqrt(_confidence(graph, edges, pose_graph)))
+    return Answer(answer, clock.seconds, clock.cpu_seconds, score)
 
 
 def _pose_graph(registration: Any, graph: ViewGraph, is_uncertain: np.ndarray) -> Any:

@@ -1,0 +1,213 @@
+"""The stress suite's report: errors over the oracle's by kind and in all, and where a peer is better than ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rotavg_ros.evaluation.common.score_tables import Figure, per_case
+from rotavg_ros.evaluation.common.scoring import Scores, geometric_mean
+from rotavg_ros.evaluation.common.tables import Cell, Column, Report, Table
+from rotavg_ros.evaluation.slam import stress_calibration
+from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS, ROSTER, ROWS
+from rotavg_ros.evaluation.slam.stress_calibration import Calibration
+
+_FIGURE = "floored_deg"
+_LARGE, _VERY_LARGE = 2.0, 5.0
+# A peer is better where its error is smaller by this factor at least, and by more than so many standard errors.
+_BETTER, _STANDARD_ERRORS = 1.05, 2.0
+# Who counts as a peer: independent methods, none of which is told what only an oracle knows.
+_PEERS = (*ROSTER.peers, "chatterjee")
+_NUM_WORST = 20
+_CASE_KEY = {"kind": "kind", "seed": "seed"}
+_CASE_FIGURES = (
+    Figure("mean_deg", "mean_deg"),
+    Figure(_FIGURE, _FIGURE),
+    Figure("counts.true_positives", "false_flagged"),
+    Figure("counts.false_positives", "good_flagged"),
+    Figure("counts.false_negatives", "false_kept"),
+    Figure("counts.true_negatives", "good_kept"),
+    Figure("odometry_flagged", "odometry_flagged"),
+    Figure("cpu_seconds", "cpu_seconds"),
+)
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A peer on a kind on which it is better than a contender.
+
+    Attributes:
+        ratio: geometric mean of its error over the contender's, below one.
+        standard_error: of that mean's logarithm.
+    """
+
+    kind: str
+    peer: str
+    ratio: float
+    standard_error: float
+    num_cases: int
+
+
+def report(folder: Path, scores: Scores, calibration: Calibration, command: str) -> Path:
+    """Write the tables; returns the Markdown file.
+
+    Args:
+        calibration: of ours.
+        command: how to get the same figures again.
+    """
+    names = scores.contenders
+    of_kinds = calibration.of_kinds(scores.cases)
+    title = "Calibration of ours"
+    tables = {
+        "stress-totals": _totals(scores, names),
+        "stress-means": _means(scores, names),
+        "stress-better": _better(scores),
+        "stress-worst": _worst(scores),
+        "stress-calibration": stress_calibration.table(title, of_kinds, every_kind=False),
+    }
+    long = {
+        "stress-kinds": _kinds(scores, names),
+        "stress-cases": per_case("Every case", scores, _CASE_FIGURES, _CASE_KEY),
+        "stress-calibration-kinds": stress_calibration.table(title, of_kinds, every_kind=True),
+    }
+    introduction = (
+        f"`{command}`. Simulated pose graphs that are hard in one known way each. Error: mean angle between estimated "
+        "and true orientations after one robust global rotation of each component; below 0.1° it counts as 0.1°. The "
+        "oracle is least squares on the edges that are good, with their true variances. A closure is false if its "
+        "noise exceeds 10°; those between 8° and 12° do not count in verdicts."
+    )
+    return Report("stress", "Stress suite", introduction, tables, extra_csv=long).write(folder)
+
+
+def rivals(scores: Scores, name: str) -> Iterator[Rival]:
+    """On every kind of at least two common cases the peer that beats the contender by most, if any does."""
+    peers = [peer for peer in _PEERS if peer in scores.contenders and peer != name]
+    for kind in scores.kinds:
+        of_kind = [rival for peer in peers if (rival := _rival(scores, kind, peer, name)) is not None]
+        if of_kind:
+            yield min(of_kind, key=lambda rival: rival.ratio)
+
+
+def _rival(scores: Scores, kind: str, peer: str, name: str) -> Rival | None:
+    """None where the peer is not better for sure."""
+    logarithms = np.log(list(scores.ratios(peer, name, _FIGURE, kind).values()))
+    if len(logarithms) < 2:
+        return None
+    mean, error = float(logarithms.mean()), float(logarithms.std(ddof=1) / np.sqrt(len(logarithms)))
+    is_better = -mean > np.log(_BETTER) and -mean > _STANDARD_ERRORS * error
+    return Rival(kind, peer, float(np.exp(mean)), error, len(logarithms)) if is_better else None
+
+
+def _totals(scores: Scores, names: Sequence[str]) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for name in names:
+        ratios = np.array(list(scores.ratios(name, ORACLE, _FIGURE).values()))
+        counts = scores.where(name).counts()
+        rows.append(
+            (
+                ROWS.get(name, name),
+                len(ratios),
+                float(np.log(ratios).mean()) if len(ratios) else None,
+                geometric_mean(ratios),
+                *_tail(ratios),
+                None if name == ORACLE else len(list(rivals(scores, name))) / max(len(scores.kinds), 1),
+                counts.precision,
+                counts.recall,
+                scores.mean(name, "cpu_seconds"),
+            )
+        )
+    columns = (
+        Column("method"),
+        Column("cases", "d"),
+        Column("mean log ratio", ".3f"),
+        Column("geometric mean", ".2f"),
+        Column(f"share over {_LARGE:g}×", ".3f"),
+        Column(f"over {_VERY_LARGE:g}×", ".3f"),
+        Column("kinds where a peer is better", ".3f"),
+        Column("precision", ".4f"),
+        Column("recall", ".4f"),
+        Column("CPU s", ".3f"),
+    )
+    notes = (
+        "Ratios are errors over the oracle's, case by case.",
+        f"A peer is better on a kind where the geometric mean of its error over the method's is {1 / _BETTER:.3f} or "
+        f"less, and lies more than {_STANDARD_ERRORS:g} standard errors below one. Peers: {', '.join(_PEERS)}.",
+        "Cases that a method gave up, or that are too large for it, do not count against it.",
+    )
+    return Table("All kinds", columns, tuple(rows), notes)
+
+
+def _means(scores: Scores, names: Sequence[str]) -> Table:
+    shown = [name for name in names if name != ORACLE]
+    rows: list[tuple[Cell, ...]] = []
+    for kind in scores.kinds:
+        oracle = scores.where(ORACLE, kind=kind).mean(ORACLE, "mean_deg")
+        means = (geometric_mean(scores.ratios(name, ORACLE, _FIGURE, kind).values()) for name in shown)
+        rows.append((kind, oracle, *means))
+    columns = (Column("kind"), Column("oracle °", ".2f"), *(Column(ROWS.get(name, name), ".2f") for name in shown))
+    return Table("Every kind: geometric mean of error over the oracle's", columns, tuple(rows))
+
+
+def _kinds(scores: Scores, names: Sequence[str]) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for kind in scores.kinds:
+        for name in names:
+            ratios = np.array(list(scores.ratios(name, ORACLE, _FIGURE, kind).values()))
+            if len(ratios):
+                high = float(np.quantile(ratios, 0.9))
+                row = (kind, name, len(ratios), geometric_mean(ratios), high, float(ratios.max()))
+                rows.append((*row, *_tail(ratios)))
+    headings = ("kind", "method", "cases", "geometric_mean", "p90", "worst", "share_over_2", "share_over_5")
+    return Table("Every kind", tuple(map(Column, headings)), tuple(rows))
+
+
+def _tail(ratios: np.ndarray) -> tuple[Cell, Cell]:
+    if len(ratios) == 0:
+        return None, None
+    return float((ratios > _LARGE).mean()), float((ratios > _VERY_LARGE).mean())
+
+
+def _better(scores: Scores) -> Table:
+    found = sorted(rivals(scores, OURS), key=lambda rival: rival.ratio)
+    rows = tuple(
+        (rival.kind, ROWS.get(rival.peer, rival.peer), rival.ratio, rival.standard_error, rival.num_cases)
+        for rival in found
+    )
+    columns = (
+        Column("kind"),
+        Column("peer"),
+        Column("its error over ours", ".2f"),
+        Column("standard error of the logarithm", ".2f"),
+        Column("cases", "d"),
+    )
+    return Table("Where a peer is better than ours", columns, rows)
+
+
+def _worst(scores: Scores) -> Table:
+    ratios = scores.ratios(OURS, ORACLE, _FIGURE)
+    ours, oracle = scores.of(OURS), scores.of(ORACLE)
+    rows = tuple(
+        (
+            case.kind,
+            case.seed,
+            ratios[case],
+            ours[case].mean_deg,
+            oracle[case].mean_deg,
+            ours[case].counts.false_negatives,
+            ours[case].counts.false_positives,
+        )
+        for case in sorted(ratios, key=lambda case: -ratios[case])[:_NUM_WORST]
+    )
+    columns = (
+        Column("kind"),
+        Column("seed", "d"),
+        Column("ratio", ".2f"),
+        Column("ours °", ".2f"),
+        Column("oracle °", ".2f"),
+        Column("false not flagged", "d"),
+        Column("good flagged", "d"),
+    )
+    return Table("Where it is worst", columns, rows)
