@@ -56,7 +56,7 @@ def _drawn(kind: StressKind, seed: int) -> Case:
         drawn.graph,
         torch.from_numpy(drawn.body_from_world),
         SLAM,
-        torch.from_numpy(~drawn.is_false),
+        torch.from_numpy(drawn.is_intact),
         _FLOOR,
         torch.from_numpy(drawn.true_precision),
     )

@@ -45,7 +45,7 @@ def heavy_tailed(drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
 def few(good: int, false: int, drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
     """So many good and false closures are left."""
     keep = ~drawn.is_closure
-    for closures, count in ((drawn.is_closure & ~drawn.is_false, good), (drawn.is_false, false)):
+    for closures, count in ((drawn.is_closure & ~drawn.is_wrong, good), (drawn.is_wrong, false)):
         keep[rng.permutation(np.flatnonzero(closures))[:count]] = True
     return drawn.selected(keep)
 
@@ -78,7 +78,7 @@ def lying_precisions(drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
     draw = rng.random(drawn.graph.num_edges)
     good = np.where(draw < 0.1, _LIE, 1.0)
     false = np.where(draw < 0.5, _LIE, 1 / _LIE)
-    return _stating_times(drawn, np.where(drawn.is_closure, np.where(drawn.is_false, false, good), 1.0))
+    return _stating_times(drawn, np.where(drawn.is_closure, np.where(drawn.is_wrong, false, good), 1.0))
 
 
 def places_that_look_alike(share: float, drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:

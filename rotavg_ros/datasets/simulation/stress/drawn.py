@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -36,7 +37,7 @@ class DrawnGraph:
         body_from_world: ``(N, 4)`` xyzw, true.
         position: ``(N, 3)`` metres, true.
         edge_translation: ``(M, 3)`` measured position of the target in the source frame, metres.
-        is_slip: ``(M,)`` bool, odometry edges that slipped.
+        is_wrong: ``(M,)`` bool, edges that were made wrong: false closures, and odometry that slipped.
         sigma: ``(M,)`` rad, true standard deviation of the rotation vector's components, about as root mean square
             over the axes where they differ; of false closures and slips it is that of the noise on top.
         planar: all rotations are yaw.
@@ -46,7 +47,7 @@ class DrawnGraph:
     body_from_world: FloatArray
     position: FloatArray
     edge_translation: FloatArray
-    is_slip: BoolArray
+    is_wrong: BoolArray
     sigma: FloatArray
     planar: bool
 
@@ -59,6 +60,16 @@ class DrawnGraph:
     def error(self) -> Rotation:
         """M rotations in the target's frame: measured ∘ true⁻¹."""
         return self.measured * self.true_target_from_source.inv()
+
+    @property
+    def is_slip(self) -> BoolArray:
+        """``(M,)`` bool: odometry edges that slipped."""
+        return self.is_wrong & ~self.is_closure
+
+    @property
+    def is_intact(self) -> BoolArray:
+        """``(M,)`` bool: neither made wrong, though that may fit by chance, nor so noisy that it is called false."""
+        return ~(self.is_wrong | self.is_false)
 
     @property
     def is_false(self) -> BoolArray:
@@ -155,7 +166,9 @@ class DrawnGraph:
         measured = self.measured.as_quat()
         turned = self.error[edges] * body_from_world[target] * wrong * body_from_world[source].inv()
         measured[edges] = turned.as_quat()
-        return self.measuring(Rotation.from_quat(measured))
+        is_wrong = self.is_wrong.copy()
+        is_wrong[edges] = True
+        return replace(self.measuring(Rotation.from_quat(measured)), is_wrong=is_wrong)
 
     def selected(self, edges: BoolArray | IntArray) -> DrawnGraph:
         """Some of the edges, in the given order, repeated ones twice."""
@@ -164,7 +177,7 @@ class DrawnGraph:
             self,
             graph=self.graph.select_edges(torch.from_numpy(index)),
             edge_translation=self.edge_translation[index],
-            is_slip=self.is_slip[index],
+            is_wrong=self.is_wrong[index],
             sigma=self.sigma[index],
         )
 
@@ -176,6 +189,8 @@ def per_axis(degrees: float, planar: bool) -> float:
 
 def simulated(config: SlamSimulationConfig, rng: np.random.Generator) -> DrawnGraph:
     """A simulated run. A bias of the odometry counts into its true noise as its mean square."""
+    # The same random numbers without noise on closures tell which of them are wrong.
+    exact = simulate_slam_graph(replace(config, closure_noise_deg=0.0), deepcopy(rng))
     run = simulate_slam_graph(config, rng)
     planar = config.dimensions == 2
     odometry = np.hypot(per_axis(config.odometry_noise_deg, planar), per_axis(config.odometry_bias_deg, planar))
@@ -187,7 +202,7 @@ def simulated(config: SlamSimulationConfig, rng: np.random.Generator) -> DrawnGr
         body_from_world=graph_file.body_from_world_gt,
         position=run.position,
         edge_translation=run.edge_translation,
-        is_slip=np.zeros(run.graph.num_edges, dtype=bool),
+        is_wrong=exact.closure_is_false,
         sigma=np.where(run.graph.is_odometry.numpy(), odometry, closure),
         planar=planar,
     )

@@ -91,7 +91,7 @@ _WITNESSES = (3, 5, 10, 20)
 def _drive(all_noisy: bool, rng: np.random.Generator) -> DrawnGraph:
     """False closures agree exactly, or to the noise of the good ones."""
     drawn = simulated(_DRIVE, rng)
-    noisy = drawn.is_closure & (all_noisy | ~drawn.is_false)
+    noisy = drawn.is_closure & (all_noisy | ~drawn.is_wrong)
     sigma = per_axis(_DRIVE_CLOSURE_DEG, drawn.planar)
     precision = np.where(drawn.is_closure, sigma**-2, drawn.graph.precision.numpy())
     return drawn.stating(precision).gaussian(noisy, np.full(int(noisy.sum()), sigma), rng, sigma)

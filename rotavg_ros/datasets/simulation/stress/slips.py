@@ -39,7 +39,7 @@ def small_slips(share: float, drawn: DrawnGraph, rng: np.random.Generator) -> Dr
 def locatable_slips(drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
     """One step of a hundred is off by 20–60° where good closures can tell which."""
     spoiled = insert_slips(drawn.to_graph_file(), drawn.body_from_world, _LOCATABLE_SHARE, rng, rule=LOCATABLE)
-    return replace(drawn, graph=spoiled.graph_file.graph, is_slip=drawn.is_slip | spoiled.spoiled)
+    return replace(drawn, graph=spoiled.graph_file.graph, is_wrong=drawn.is_wrong | spoiled.spoiled)
 
 
 def lone_slip(witnesses: int, from_one_pair: bool, drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
@@ -129,7 +129,7 @@ def _with_closures(drawn: DrawnGraph, older: IntArray, newer: IntArray, sigma: f
             precision=np.concatenate((graph.precision.numpy(), np.full(count, sigma**-2))),
         ),
         edge_translation=np.concatenate((drawn.edge_translation, step)),
-        is_slip=np.concatenate((drawn.is_slip, np.zeros(count, dtype=bool))),
+        is_wrong=np.concatenate((drawn.is_wrong, np.zeros(count, dtype=bool))),
         sigma=np.concatenate((drawn.sigma, np.zeros(count))),
     )
     return more.selected(np.lexsort((kind, np.maximum(source, target))))
@@ -138,6 +138,6 @@ def _with_closures(drawn: DrawnGraph, older: IntArray, newer: IntArray, sigma: f
 def _slipped(drawn: DrawnGraph, edges: np.ndarray, turns: Rotation) -> DrawnGraph:
     measured = drawn.measured.as_quat()
     measured[edges] = (turns * drawn.measured[edges]).as_quat()
-    is_slip = drawn.is_slip.copy()
-    is_slip[edges] = True
-    return replace(drawn.measuring(Rotation.from_quat(measured)), is_slip=is_slip)
+    is_wrong = drawn.is_wrong.copy()
+    is_wrong[edges] = True
+    return replace(drawn.measuring(Rotation.from_quat(measured)), is_wrong=is_wrong)
