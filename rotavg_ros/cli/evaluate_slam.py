@@ -19,12 +19,15 @@ from rotavg_ros.evaluation.names import SLAM_GRAPHS, SLAM_SHARES
 from rotavg_ros.evaluation.slam import cases, report, stress, stress_report, uncertainty
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS, ROSTER, ROWS
 from rotavg_ros.evaluation.slam.stress_calibration import Calibration
+from rotavg_ros.solver.methods import POSTERIOR, SWITCHES, without
 
 _UNCERTAINTY_GRAPHS = ("CSAIL", "intel", "manhattan", "sphere2500")
 _UNCERTAINTY_DRAWS = 20
 _RECORDED_SEEDS = (0, 1, 2)
 # Peers that the recorded suite's tables do without, unless asked for.
 _STRESS_ONLY = ("isam2-cauchy", "isam2-geman-mcclure", "open3d")
+# Unless --without asks for them.
+_ABLATIONS = frozenset(without(name) for name in SWITCHES)
 
 
 class SlamOptionsError(UserError):
@@ -90,7 +93,9 @@ def _uncertainty_file(name: str) -> str:
 
 def _methods(arguments: argparse.Namespace, default: Iterable[str]) -> list[str]:
     """Those asked for, or all by default that can run here; always with ours and the oracle, which ratios need."""
-    names = arguments.methods or [name for name in default if is_available(name)]
+    names = arguments.methods or [name for name in default if is_available(name) and name not in _ABLATIONS]
+    if arguments.without:
+        names = [*names, POSTERIOR, *(without(name) for name in arguments.without)]
     if not arguments.peers:
         names = [name for name in names if name not in ROSTER.peers]
     return list(dict.fromkeys((OURS, *names, ORACLE)))

@@ -24,7 +24,7 @@ from rotavg_ros.datasets.files.csv_writer import Column, write_csv
 from rotavg_ros.datasets.files.formats import read_graph, stem_of
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.errors import UserError
-from rotavg_ros.solver import Solution, solve
+from rotavg_ros.solver import Solution, methods, solve
 from rotavg_ros.solver.networks import WEIGHTS_FOLDER
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
@@ -47,6 +47,10 @@ class Job:
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve every graph; a bad one does not keep the others from being solved."""
+    if arguments.without:
+        if arguments.method != methods.POSTERIOR:
+            raise SolveError(f"--without is for --method {methods.POSTERIOR}, not {arguments.method}")
+        arguments.method = methods.without(*arguments.without)
     jobs = plan(arguments.graphs, arguments.output, poses=arguments.poses)
     _check_weights(arguments.weights)
     solve_graph = partial(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from rotavg_ros.solver.sfm.options import SfmStages
+from rotavg_ros.solver.slam.options import SWITCHES as SWITCHES
 from rotavg_ros.solver.slam.options import SlamStages
 
 
@@ -21,6 +22,9 @@ def _without_refinement(clean: bool, fine_tunings: int) -> Method:
 
 
 DEFAULT_METHOD = "neurora"
+POSTERIOR = "neurora-posterior"
+# "neurora-posterior~slips,cleannet" is the posterior without these.
+_WITHOUT, _AND = "~", ","
 NETWORK_METHODS = {
     DEFAULT_METHOD: Method(),
     "neurora-paper": _without_refinement(clean=True, fine_tunings=1),
@@ -36,6 +40,7 @@ NETWORK_METHODS = {
     "neurora-round": Method(sfm=SfmStages(shaped=False)),
     "neurora-odometry-start": Method(slam=SlamStages(tree_start=False)),
     "neurora-stated-precisions": Method(slam=SlamStages(scale_estimation=False)),
+    POSTERIOR: Method(slam=SlamStages(posterior=True)),
     "neurora-without-slip-search": Method(slam=SlamStages(slip_search=False)),
 }
 # Others' methods, to compare with.
@@ -43,3 +48,29 @@ BASELINES = ("chatterjee", "weiszfeld", "arrigoni", "wang")
 METHODS = (*NETWORK_METHODS, *BASELINES)
 PROFILES = ("auto", "slam", "sfm")
 DEVICES = ("auto", "cpu", "cuda")
+
+
+def method_named(name: str) -> Method | None:
+    """The stages of a network method, None if there is none of that name.
+
+    Args:
+        name: of :data:`NETWORK_METHODS`; "neurora-posterior~A,B" is the posterior without A and B, which are of
+            :data:`rotavg_ros.solver.slam.options.SWITCHES`.
+    """
+    whole, *switched_off = name.split(_WITHOUT)
+    if not switched_off:
+        return NETWORK_METHODS.get(name)
+    without = frozenset(switched_off[0].split(_AND))
+    if whole != POSTERIOR or len(switched_off) > 1 or not without <= SWITCHES.keys():
+        return None
+    return Method(slam=SlamStages(posterior=True, without=without))
+
+
+def is_method(name: str) -> bool:
+    """Whether a solve knows it."""
+    return name in BASELINES or method_named(name) is not None
+
+
+def without(*names: str) -> str:
+    """Name of the posterior's method without some of :data:`rotavg_ros.solver.slam.options.SWITCHES`."""
+    return _WITHOUT.join((POSTERIOR, _AND.join(names))) if names else POSTERIOR

@@ -13,7 +13,14 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.solver import devices
 from rotavg_ros.solver.algebra.threads import workers
 from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
-from rotavg_ros.solver.methods import BASELINES, DEFAULT_METHOD, DEVICES, METHODS, NETWORK_METHODS, PROFILES
+from rotavg_ros.solver.methods import (
+    DEFAULT_METHOD,
+    DEVICES,
+    METHODS,
+    PROFILES,
+    is_method,
+    method_named,
+)
 from rotavg_ros.solver.neurora.network_store import Networks
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.solve import solve_sfm
@@ -46,7 +53,8 @@ def solve(
     Args:
         graph: N nodes, M edges; or what has it as its ``graph``, as the result of ``read_graph`` does.
         method: one of :data:`METHODS`, or several joined by "+", of which each starts from the answer of the one
-            before.
+            before. "neurora-posterior~A,B" is the posterior without A and B
+            (:data:`rotavg_ros.solver.slam.options.SWITCHES`).
         profile: "slam" for odometry chains with loop closures, "sfm" for unordered view-graphs, "auto": "slam" if any
             edge is odometry.
         device: where the SfM profile runs, whole: "cpu", "cuda", or "auto" (a GPU if torch finds one). Where there is
@@ -71,7 +79,8 @@ def solve(
     graph = view_graph_of(graph)
     names = method.split("+")
     for name in names:
-        _check_choice("method", name, METHODS)
+        if not is_method(name):
+            _check_choice("method", name, METHODS)
     _check_choice("profile", profile, PROFILES)
     _check_choice("device", device, DEVICES)
     if refinement_steps is not None and refinement_steps < 0:
@@ -80,7 +89,9 @@ def solve(
         raise UserError(f"the warm start has shape {tuple(warm_start.shape)}, the graph needs ({graph.num_nodes}, 4)")
     if profile == "auto":
         profile = "slam" if bool(graph.is_odometry.any()) else "sfm"
-    where = devices.choose(device) if profile == "sfm" and all(name in NETWORK_METHODS for name in names) else "cpu"
+    where = (
+        devices.choose(device) if profile == "sfm" and all(method_named(name) is not None for name in names) else "cpu"
+    )
     graph = graph.to("cpu")
     job = _Job(graph, graph.components(), names, profile)
     steps = refinement_steps
@@ -137,7 +148,7 @@ def _run(job: _Job, run: Run, memory: SlamMemory | None) -> Estimate:
 
 
 def _refines_slam(job: _Job) -> bool:
-    last = NETWORK_METHODS.get(job.names[-1])
+    last = method_named(job.names[-1])
     return job.profile == "slam" and last is not None and last.slam.refine
 
 
@@ -147,11 +158,12 @@ def _solve_once(job: _Job, name: str, run: Run) -> Estimate:
     if graph.num_edges == 0:
         unknown = torch.full((graph.num_nodes,), torch.nan)
         return Estimate(rotations.identity(graph.num_nodes), torch.empty(0).double(), unknown)
-    if name in BASELINES:
+    method = method_named(name)
+    if method is None:
         return _solve_baseline(job, name, run)
     if job.profile == "slam":
-        return solve_slam(graph, NETWORK_METHODS[name].slam, run)
-    return solve_sfm(graph, job.component, NETWORK_METHODS[name].sfm, run)
+        return solve_slam(graph, method.slam, run)
+    return solve_sfm(graph, job.component, method.sfm, run)
 
 
 def _solve_baseline(job: _Job, name: str, run: Run) -> Estimate:

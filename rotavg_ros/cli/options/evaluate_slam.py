@@ -7,6 +7,7 @@ import argparse
 from rotavg_ros.cli.arguments import share, whole_number
 from rotavg_ros.cli.data_folder import add_data_argument
 from rotavg_ros.evaluation.names import SLAM_GRAPHS, SLAM_SHARES, SLAM_SUITES
+from rotavg_ros.solver.methods import POSTERIOR, SWITCHES
 
 _INCREMENTAL = ("B25b_0.000",)
 
@@ -62,6 +63,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="methods of `rotavg solve`, gnc, isam2, isam2-cauchy, isam2-geman-mcclure, open3d, colmap, odometry, "
         "least-squares (default: all; recorded without isam2-cauchy, isam2-geman-mcclure and open3d)",
+    )
+    parser.add_argument(
+        "--without",
+        nargs="+",
+        default=(),
+        choices=SWITCHES,
+        metavar="PART",
+        help=f"also {POSTERIOR} without each of these: {', '.join(SWITCHES)}",
     )
     parser.add_argument(
         "--peers",

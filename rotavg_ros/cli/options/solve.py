@@ -12,7 +12,7 @@ import argparse
 from pathlib import Path
 
 from rotavg_ros.cli.arguments import whole_number
-from rotavg_ros.solver.methods import DEVICES, METHODS, PROFILES
+from rotavg_ros.solver.methods import DEVICES, METHODS, POSTERIOR, PROFILES, SWITCHES
 
 EDGE_FORMATS = ("csv", "npz")
 
@@ -23,6 +23,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for the answer")
     methods = f"{', '.join(METHODS)}, or A+B: B starts from A's answer (default: neurora)"
     parser.add_argument("--method", default="neurora", metavar="NAME", help=methods)
+    parser.add_argument(
+        "--without",
+        nargs="+",
+        default=(),
+        choices=SWITCHES,
+        metavar="PART",
+        help=f"with --method {POSTERIOR}: terms, moves or networks to switch off, of {', '.join(SWITCHES)}",
+    )
     parser.add_argument(
         "--profile", default="auto", choices=PROFILES, help="auto (default): slam if any edge is odometry"
     )

@@ -16,6 +16,7 @@ from rotavg_ros.evaluation.common.cases import Case, Family, warm_up_case
 from rotavg_ros.evaluation.common.kept_answers import KeptAnswers
 from rotavg_ros.evaluation.common.named_peers import peer_solver
 from rotavg_ros.solver import METHODS, solve
+from rotavg_ros.solver.methods import is_method
 from rotavg_ros.view_graph import ViewGraph
 
 # None: the case is too large for it, or it gives up.
@@ -77,7 +78,7 @@ def _contender(name: str, roster: Roster, weights: Path | None, keep: KeptAnswer
         reference = roster.references[name]
         run = partial(_run_reference, reference)
         return run if keep is None else keep.keeping(run, name, (__name__, reference.__module__))
-    unknown = [part for part in name.split("+") if part not in METHODS]
+    unknown = [part for part in name.split("+") if not is_method(part)]
     if unknown:
         choices = ", ".join((*METHODS, *roster.peers, *roster.references))
         raise ContenderError(f"unknown method {unknown[0]!r}; choose from {choices}, or combine: A+B")

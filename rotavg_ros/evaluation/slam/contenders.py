@@ -11,6 +11,7 @@ from rotavg_ros.baselines.least_squares import least_squares
 from rotavg_ros.baselines.start import start_orientations
 from rotavg_ros.evaluation.common.cases import SLAM, Case
 from rotavg_ros.evaluation.common.contenders import Roster
+from rotavg_ros.solver.methods import POSTERIOR, SWITCHES, without
 
 OURS, ORACLE, GNC = "neurora", "oracle", "gnc"
 
@@ -49,6 +50,8 @@ ROWS: dict[str, str] = {
     "neurora-without-slip-search": "· without the slip search",
     "cleannet-spt": "· without refinement",
     "spt": "· tree alone",
+    POSTERIOR: "**ours**, one posterior",
+    **{without(name): f"· without {name}" for name in SWITCHES},
     "gnc": "GNC (GTSAM), told that odometry is right",
     "isam2": "iSAM2 with Huber's loss (GTSAM), incremental",
     "isam2-cauchy": "iSAM2 with Cauchy's loss (GTSAM), incremental",

@@ -4,6 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+# Terms of the posterior, moves and starts of its search, and the network, each with what is left without it.
+SWITCHES: dict[str, str] = {
+    "cleannet": "closures are judged beforehand by their discrepancy with the odometry alone",
+    "tails": "good edges are Gaussian",
+    "near-misses": "false closures are uniform over all rotations",
+    "repeats": "every false closure is wrong by itself",
+    "label-runs": "closures that follow each other have independent labels",
+    "common-errors": "every closure errs by itself",
+    "stated-precisions": "all closures are alike, whatever they state",
+    "slips": "odometry does not slip",
+    "groups": "labels are flipped one by one",
+    "mending": "a slip, once found, is not taken back together with what it explains",
+    "annealing": "no start anneals the closures",
+    "robust-start": "no start weighs odometry down as it does closures",
+    "minimum-cuts": "no start turns whole parts",
+    "rivals": "the best labelling alone is published",
+}
+
 
 @dataclass(frozen=True)
 class SlamStages:
@@ -16,6 +34,8 @@ class SlamStages:
         scale_estimation: it estimates the noise; otherwise it believes the precisions that edges state.
         group_search: it looks for groups of closures that are false though each by itself looks good.
         slip_search: it looks for slips in the odometry where closures speak of them.
+        posterior: one posterior is searched (:mod:`rotavg_ros.solver.slam.posterior`) instead of the passes above.
+        without: what of :data:`SWITCHES` is switched off in it.
     """
 
     clean: bool = True
@@ -24,3 +44,5 @@ class SlamStages:
     scale_estimation: bool = True
     group_search: bool = True
     slip_search: bool = True
+    posterior: bool = False
+    without: frozenset[str] = frozenset()

@@ -16,6 +16,7 @@ from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.passes.alternation import Verdicts
+from rotavg_ros.solver.slam.posterior.solve import solve_posterior
 from rotavg_ros.solver.slam.preparation import prepare
 from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.view_graph import ViewGraph
@@ -37,8 +38,18 @@ def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     with watch.stage("contract"):
         prepared = prepare(graph, scale_estimation=stages.scale_estimation)
     with watch.stage("clean"):
-        network = run.networks.load(SlamCleanNet) if stages.clean else None
+        has_network = stages.clean and "cleannet" not in stages.without
+        network = run.networks.load(SlamCleanNet) if has_network else None
         cleaned = slam_stages.clean(network, prepared, graph.label)
+    if stages.posterior:
+        with watch.stage("refine"):
+            published = solve_posterior(prepared, cleaned, stages.without)
+        closure_graph = prepared.closure_graph
+        return Estimate(
+            closure_graph.orientations(torch.from_numpy(np.ascontiguousarray(published.correction.T))),
+            torch.from_numpy(slam_stages.outlier_scores(closure_graph, published.outlier_probability)),
+            torch.from_numpy(published.variance),
+        )
     with watch.stage("bootstrap"):
         if run.warm_start is not None:
             correction = prepared.closure_graph.corrections(run.warm_start.double())

@@ -1,0 +1,112 @@
+"""Expectation–maximisation around the sparse solve: corrections, noise and, where asked for, labels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import expit
+
+from rotavg_ros.solver.slam.posterior.left_out import leave_one_out
+from rotavg_ros.solver.slam.posterior.objective import Evaluation, evaluate
+from rotavg_ros.solver.slam.posterior.problem import Problem
+from rotavg_ros.solver.slam.posterior.rows import moved, residuals, variances, weights
+from rotavg_ros.solver.slam.posterior.state import Noise, State
+from rotavg_ros.solver.slam.posterior.system import Factorised
+
+# Residuals say nothing of noise or labels while orientations still turn by more than this; but not for ever.
+_SETTLED_TURN = np.radians(3.0)
+_MAX_UNSETTLED = 5
+# Noise is estimated anew in the first solves, and until it changes by less than this, in the logarithm of a variance.
+_NOISE_SOLVES, _NOISE_CONVERGED = 4, 0.05
+_PROBABILITY_CONVERGED = 0.02
+# Newton's steps to the likeliest variance, and how far from its prior it may end, in standard deviations.
+_NEWTON_STEPS, _FARTHEST = 20, 5.0
+
+
+def step(problem: Problem, state: State) -> tuple[State, float, Factorised]:
+    """One Gauss–Newton step on the corrections; also its largest component, rad, and the factor."""
+    residual = residuals(problem, state)
+    square = (residual**2).sum(axis=1)
+    factorised = problem.system.factorise(weights(problem, state, square, variances(problem, state.noise)))
+    turn = factorised.fit(residual)
+    return moved(state, turn), float(np.abs(turn).max(initial=0.0)), factorised
+
+
+def polish(problem: Problem, state: State, *, hold_noise: bool = False) -> tuple[State, Evaluation]:
+    """Corrections and noise at their optimum for labels as they are."""
+    for number in range(problem.limits.polish_solves):
+        state, turned, factorised = step(problem, state)
+        is_settled = turned < problem.limits.converged * np.sqrt(state.noise.step_variance)
+        if not hold_noise and turned < _SETTLED_TURN and (number < _NOISE_SOLVES or is_settled):
+            before = state.noise
+            state = replace(state, noise=estimate_noise(problem, state, factorised))
+            is_settled &= _log_change(before, state.noise) < _NOISE_CONVERGED
+        if is_settled:
+            break
+    return state, evaluate(problem, state)
+
+
+def settle(problem: Problem, state: State, solves: int | None = None) -> State:
+    """Labels of closures and corrections together, labels as probabilities on the way, made at the end.
+
+    Args:
+        problem: the graph.
+        state: where to begin.
+        solves: at most; default: those of the limits.
+    """
+    closure = problem.closure
+    told = problem.log_odds[closure]
+    for number in range(problem.limits.settling_solves if solves is None else solves):
+        state, turned, factorised = step(problem, state)
+        if turned > _SETTLED_TURN and number < _MAX_UNSETTLED:
+            continue
+        left_out = leave_one_out(problem, state, factorised)
+        trusted = state.trusted.copy()
+        trusted[closure] = np.where(np.isfinite(told), expit(left_out.log_odds[closure]), told > 0)
+        changed = float(np.abs(trusted - state.trusted).max(initial=0.0))
+        state = replace(state, trusted=trusted)
+        state = replace(state, noise=estimate_noise(problem, state, factorised))
+        is_settled = turned < problem.limits.converged * np.sqrt(state.noise.step_variance)
+        if changed < _PROBABILITY_CONVERGED and is_settled:
+            break
+    return replace(state, trusted=state.is_good.astype(np.float64))
+
+
+def estimate_noise(problem: Problem, state: State, factorised: Factorised) -> Noise:
+    """Both variances by the redundancy that residuals leave (Gull 1989, MacKay 1992), under their priors."""
+    priors, noise = problem.priors, state.noise
+    num_edges = len(problem.graph.source)
+    variance, residual = variances(problem, noise), residuals(problem, state)
+    num_runs = len(variance) - num_edges
+    weight = factorised.weight
+    trusted = np.concatenate((state.trusted, np.ones(num_runs)))
+    redundancy = problem.components * trusted * (1 - np.minimum(weight * factorised.resistance, 1.0))
+    # Of residuals in the tails as much counts as they weigh.
+    square = trusted * np.minimum(weight * variance, 1.0) * (residual**2).sum(axis=1) / variance
+    is_step = np.concatenate((problem.graph.is_odometry, np.zeros(num_runs, dtype=bool)))
+
+    def likeliest(rows: np.ndarray, before: float, prior_deg: float) -> float:
+        squares, freedom = before * float(square[rows].sum()), float(redundancy[rows].sum())
+        return _likeliest(squares, freedom, np.log(before), 2 * np.log(np.radians(prior_deg)), priors.noise_spread)
+
+    return replace(
+        noise,
+        step_variance=likeliest(is_step, noise.step_variance, priors.step_deg),
+        closure_variance=likeliest(~is_step, noise.closure_variance, priors.closure_deg),
+    )
+
+
+def _likeliest(squares: float, freedom: float, log_variance: float, log_prior: float, spread: float) -> float:
+    """The variance e^x that maximises −n/2 x − S/2 e⁻ˣ − (x − prior)²/(8 spread²), by Newton's steps."""
+    x = log_variance
+    for _ in range(_NEWTON_STEPS):
+        curved = squares / 2 * np.exp(-x)
+        slope = curved - freedom / 2 - (x - log_prior) / (4 * spread**2)
+        x += float(np.clip(slope / (curved + 1 / (4 * spread**2)), -1.0, 1.0))
+    return float(np.exp(np.clip(x, log_prior - 2 * _FARTHEST * spread, log_prior + 2 * _FARTHEST * spread)))
+
+
+def _log_change(before: Noise, after: Noise) -> float:
+    steps, closures = after.step_variance / before.step_variance, after.closure_variance / before.closure_variance
+    return float(max(abs(np.log(steps)), abs(np.log(closures))))

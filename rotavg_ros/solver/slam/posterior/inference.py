@@ -1,0 +1,86 @@
+"""The search for the labellings of least F: starts, then moves until none promises a gain."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from rotavg_ros.solver.slam.posterior.em import polish
+from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
+from rotavg_ros.solver.slam.posterior.moves import groups, noise, slips
+from rotavg_ros.solver.slam.posterior.moves.flips import flipped
+from rotavg_ros.solver.slam.posterior.moves.starts import starts
+from rotavg_ros.solver.slam.posterior.problem import Problem
+from rotavg_ros.solver.slam.posterior.state import State
+from rotavg_ros.solver.slam.preparation import Prepared
+from rotavg_ros.solver.slam.stages import CleanedClosures
+
+# A gain of so many nats is worth to leave the mode before at once: what that promised, the new one promises as well.
+_GAIN = 1.0
+# So many of the best modes are moved on from.
+_BEAM = 3
+
+
+class Search:
+    """Modes of a problem, found by starts and moves.
+
+    Attributes:
+        modes: what was found, the least F first.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.modes: list[Mode] = []
+        self._tried = 0
+
+    def run(self, prepared: Prepared, cleaned: CleanedClosures) -> list[Mode]:
+        """From all starts, move on from the best modes until no move is predicted to lower F."""
+        begun = [self.polished(state, name) for name, state in starts(self.problem, prepared, cleaned)]
+        least = min(mode.cost for mode in begun)
+        for mode in {mode.key: mode for mode in begun if mode.cost < least + self.problem.limits.hopeless}.values():
+            self.keep(flipped(mode))
+        return self.move_on()
+
+    def move_on(self) -> list[Mode]:
+        """The search from the modes that are kept."""
+        done: set[bytes] = set()
+        while (mode := self._next(done)) is not None:
+            done.add(mode.key)
+            for found in noise.tuned(mode):
+                self.keep(found)
+            if self.modes[0].cost < mode.cost - _GAIN:
+                continue
+            for proposal in sorted(proposals(mode), key=lambda proposal: proposal.predicted):
+                if proposal.predicted > self.problem.limits.slack or self._tried >= self.problem.limits.tried:
+                    break
+                self._tried += 1
+                found = flipped(self.polished(proposal.make(), proposal.name))
+                self.keep(found)
+                if found.cost < mode.cost - _GAIN:
+                    break
+        return self.modes
+
+    def polished(self, state: State, origin: str) -> Mode:
+        """The mode of a state's labels."""
+        return Mode(self.problem, *polish(self.problem, state), origin)
+
+    def keep(self, mode: Mode) -> None:
+        """Among the modes, in the place of the same labels at a higher F."""
+        known = {other.key: other for other in self.modes}
+        if mode.key not in known or known[mode.key].cost > mode.cost:
+            known[mode.key] = mode
+        self.modes = sorted(known.values(), key=lambda other: other.cost)
+
+    def _next(self, done: set[bytes]) -> Mode | None:
+        near = (mode for mode in self.modes[:_BEAM] if mode.cost < self.modes[0].cost + self.problem.limits.rival)
+        return next((mode for mode in near if mode.key not in done), None)
+
+
+def proposals(mode: Mode) -> Iterator[Proposal]:
+    """Of all moves that are switched on."""
+    without = mode.problem.without
+    if "groups" not in without:
+        yield from groups.propose(mode)
+    if "slips" not in without:
+        yield from slips.propose_slips(mode)
+    if not without & {"slips", "mending"}:
+        yield from slips.propose_mending(mode)

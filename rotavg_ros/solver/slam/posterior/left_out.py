@@ -1,0 +1,101 @@
+"""What the rest of the graph says of each edge: leave-one-out log-odds, scores; and labels by residuals alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import expit, logsumexp
+
+from rotavg_ros.solver.slam.noise.exceedance import exceedance
+from rotavg_ros.solver.slam.noise.judging import OUTLIER_ANGLE
+from rotavg_ros.solver.slam.posterior.densities import log_false, log_good, log_slipped
+from rotavg_ros.solver.slam.posterior.labels import false_density, label_log_odds, log_slip_odds, repeat_rates
+from rotavg_ros.solver.slam.posterior.problem import Problem
+from rotavg_ros.solver.slam.posterior.rows import residuals, variances
+from rotavg_ros.solver.slam.posterior.state import State
+from rotavg_ros.solver.slam.posterior.system import Factorised
+
+# What is left of an edge without itself, at least; one that alone holds two parts together tells nothing of them.
+_LEAST_REST = 1e-6
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What is known of every edge without itself (E edges).
+
+    Attributes:
+        log_odds: ``(E,)`` of being good, or of not having slipped: by how much F rises if that label flips.
+        square: ``(E,)`` rad², of the discrepancy with what the rest predicts.
+        predicted: ``(E,)`` rad², variance of that prediction.
+        worth: ``(E,)`` the log-odds of an edge that errs as a good one does: what it gains to be so.
+    """
+
+    log_odds: np.ndarray
+    square: np.ndarray
+    predicted: np.ndarray
+    worth: np.ndarray
+
+
+def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> LeftOut:
+    """What the rest of the graph says of every edge, the labels of all others given."""
+    graph, k, priors, closure = problem.graph, problem.components, problem.priors, problem.closure
+    num_edges = len(graph.source)
+    residual = residuals(problem, state)[:num_edges]
+    resistance = factorised.resistance[:num_edges]
+    rest = np.maximum(1 - factorised.weight[:num_edges] * resistance, _LEAST_REST)
+    square = np.minimum((residual**2).sum(axis=1) / rest**2, np.pi**2)
+    predicted = resistance / rest
+    own = variances(problem, state.noise)[:num_edges]
+
+    # The prior's log-odds, less the density of what an edge is if it is not good.
+    odds = problem.log_odds.copy()
+    is_false = ~state.is_good[closure]
+    rates = repeat_rates(problem, false_density(problem, is_false, residual[closure], np.flatnonzero(is_false)))
+    each = false_density(problem, is_false, residual[closure], np.arange(len(closure)), both_sides=True)
+    odds[closure] = label_log_odds(problem, is_false) - logsumexp(each.mixed() + rates[:, None], axis=0)
+    odometry = np.flatnonzero(graph.is_odometry)
+    slips = int((~state.is_good[odometry]).sum())
+    odds[odometry] -= log_slip_odds(problem, graph.own_steps[odometry], slips)
+    odds[odometry] -= log_slipped(square[odometry], own[odometry], predicted[odometry], k, priors)
+
+    log_odds = log_good(square, own, predicted, k, priors)[0] + odds
+    worth = log_good(k * (own + predicted), own, predicted, k, priors)[0] + odds
+    return LeftOut(log_odds, square, predicted, worth)
+
+
+def scores(problem: Problem, state: State, left_out: LeftOut) -> tuple[np.ndarray, np.ndarray]:
+    """``(E,)`` probability that an edge's noise exceeds 10° or that a segment slipped, and how far the edge is trusted.
+
+    The trust, a factor of the weight, is the probability that an edge is good and its noise below 10°. So what is
+    published as false does not pull.
+    """
+    closure, k = problem.closure, problem.components
+    good = expit(left_out.log_odds)
+    score, trust = 1 - good, good.copy()
+    square, predicted = left_out.square[closure], left_out.predicted[closure]
+    # A shared error is part of a closure's noise, too.
+    shared = problem.system.shared[closure] * state.noise.common_share * state.noise.closure_variance
+    total = variances(problem, state.noise)[closure] + shared
+    part = total / (total + predicted)
+    exceeds = exceedance(part * np.sqrt(square), part * predicted, OUTLIER_ANGLE, k)
+    if_false = exceedance(np.sqrt(square), predicted, OUTLIER_ANGLE, k)
+    trust[closure] = good[closure] * (1 - exceeds)
+    score[closure] = good[closure] * exceeds + (1 - good[closure]) * if_false
+    return score, trust
+
+
+def relabelled(problem: Problem, state: State) -> np.ndarray:
+    """``(E,)`` 1 for edges that residuals as they are speak for, else 0."""
+    graph, k, priors, closure = problem.graph, problem.components, problem.priors, problem.closure
+    num_edges = len(graph.source)
+    without_common = replace(state, common=np.zeros_like(state.common))
+    square = (residuals(problem, without_common) ** 2).sum(axis=1)[:num_edges]
+    own = variances(problem, state.noise)[:num_edges]
+    slack = np.where(graph.is_odometry, 0.0, state.noise.closure_variance)
+    log_odds = log_good(square, own, slack, k, priors)[0] + problem.log_odds
+    log_odds[closure] -= log_false(square[closure], k, priors)
+    odometry = np.flatnonzero(graph.is_odometry)
+    log_odds[odometry] -= log_slipped(square[odometry], own[odometry], 0.0, k, priors)
+    log_odds[odometry] -= log_slip_odds(problem, graph.own_steps[odometry], 1)
+    return np.asarray(log_odds > 0, dtype=np.float64)

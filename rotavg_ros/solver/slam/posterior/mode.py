@@ -1,0 +1,79 @@
+"""A labelling at its optimum, and a proposal of another one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from rotavg_ros.solver.slam.posterior.left_out import LeftOut, leave_one_out
+from rotavg_ros.solver.slam.posterior.objective import Evaluation
+from rotavg_ros.solver.slam.posterior.problem import Problem
+from rotavg_ros.solver.slam.posterior.state import State
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A labelling at its optimum.
+
+    Attributes:
+        problem: the graph.
+        state: labels, corrections, noise.
+        evaluation: F and the factor there.
+        origin: the start or move that found it.
+    """
+
+    problem: Problem
+    state: State
+    evaluation: Evaluation
+    origin: str
+
+    @property
+    def cost(self) -> float:
+        """F, nats."""
+        return float(self.evaluation.total)
+
+    @cached_property
+    def key(self) -> bytes:
+        """Equal for equal labels under equal α and κ."""
+        noise = self.state.noise
+        return np.packbits(self.state.is_good).tobytes() + str((noise.exponent, noise.common_share)).encode()
+
+    @cached_property
+    def is_false(self) -> np.ndarray:
+        """``(C,)`` bool."""
+        return np.asarray(~self.state.is_good[self.problem.closure])
+
+    @cached_property
+    def left_out(self) -> LeftOut:
+        """What the rest of the graph says of every edge."""
+        return leave_one_out(self.problem, self.state, self.evaluation.factorised)
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """``(C, C)`` rad², of what is estimated of closures."""
+        return self.evaluation.factorised.covariance(self.problem.closure)
+
+    @cached_property
+    def slipped(self) -> np.ndarray:
+        """Edges of odometry that slipped, along the path."""
+        graph = self.problem.graph
+        edges = np.flatnonzero(graph.is_odometry & ~self.state.is_good)
+        return np.asarray(edges[np.argsort(graph.position[graph.source[edges]], kind="stable")])
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Where a search might go.
+
+    Attributes:
+        name: of the move.
+        predicted: by how much F changes, nats, as far as it can be told before the work.
+        make: the state to polish.
+    """
+
+    name: str
+    predicted: float
+    make: Callable[[], State]

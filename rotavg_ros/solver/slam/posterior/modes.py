@@ -1,0 +1,100 @@
+"""What is published: the average over the rival labellings, each with single closures as probabilities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.slam.posterior.em import step
+from rotavg_ros.solver.slam.posterior.left_out import leave_one_out, scores
+from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.solver.slam.posterior.problem import Problem
+from rotavg_ros.solver.slam.posterior.state import State
+
+# No labelling counts that is less likely by so many nats.
+_FAR = 12.0
+# What is less likely good than this does not pull at all.
+_SURELY_FALSE = 0.05
+_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Published:
+    """Of a closure graph (K key nodes, E edges).
+
+    Attributes:
+        correction: ``(4, K)``.
+        outlier_probability: ``(E,)``.
+        variance: ``(N,)`` rad², of the view-graph's nodes.
+        rivals: probabilities of the labellings that were averaged, the best first.
+    """
+
+    correction: np.ndarray
+    outlier_probability: np.ndarray
+    variance: np.ndarray
+    rivals: tuple[float, ...]
+
+
+def publish(problem: Problem, modes: list[Mode]) -> Published:
+    """The average of distinct modes (the best first), weighted by exp(−F)."""
+    rivals = modes[:1] if "rivals" in problem.without else distinct(problem, modes)
+    cost = np.array([mode.cost for mode in rivals])
+    share = np.exp(cost.min() - cost)
+    share /= share.sum()
+    answers = [of_mode(problem, mode.state) for mode in rivals]
+    first = answers[0]
+    turns = [
+        quaternion_rows.log(quaternion_rows.multiply(quaternion_rows.inverse(first.correction), answer.correction))
+        for answer in answers
+    ]
+    mean = sum(weight * turn for weight, turn in zip(share, turns, strict=True))
+    correction = quaternion_rows.multiply(first.correction, quaternion_rows.exp(np.asarray(mean)))
+    score = sum(weight * answer.outlier_probability for weight, answer in zip(share, answers, strict=True))
+    graph, k = problem.graph, problem.components
+    variance = np.zeros(len(first.variance))
+    for weight, answer, turn in zip(share, answers, turns, strict=True):
+        off = np.sqrt(((turn - mean) ** 2).sum(axis=0) / k)
+        spread = (1 - graph.fraction) * off[graph.above] + graph.fraction * off[graph.below]
+        variance += weight * (answer.variance + spread**2)
+    return Published(correction, np.asarray(score), variance, tuple(share.tolist()))
+
+
+def distinct(problem: Problem, modes: list[Mode]) -> list[Mode]:
+    """Modes that are no neighbours of a better one.
+
+    They differ by a slip, by two closures of a run, or by how far stated precisions are believed and what runs share.
+    Single closures are probabilities within each.
+    """
+    kept: list[Mode] = []
+    for mode in modes:
+        if kept and (mode.cost > kept[0].cost + _FAR or len(kept) >= problem.limits.averaged):
+            break
+        if all(_is_rival(problem, mode.state, other.state) for other in kept):
+            kept.append(mode)
+    return kept
+
+
+def _is_rival(problem: Problem, state: State, other: State) -> bool:
+    if (state.noise.exponent, state.noise.common_share) != (other.noise.exponent, other.noise.common_share):
+        return True
+    differs = state.is_good != other.is_good
+    if differs[problem.graph.is_odometry].any():
+        return True
+    in_run = np.bincount(problem.run[differs[problem.closure]])
+    return bool(in_run.max(initial=0) >= 2)
+
+
+def of_mode(problem: Problem, state: State) -> Published:
+    """One labelling's answer, single closures and slips weighed by their leave-one-out probabilities."""
+    factorised = step(problem, state)[2]
+    for _ in range(_ROUNDS):
+        left_out = leave_one_out(problem, state, factorised)
+        score, trust = scores(problem, state, left_out)
+        trusted = np.where(trust < _SURELY_FALSE, 0.0, trust)
+        trusted = np.where(np.isinf(problem.log_odds), problem.log_odds > 0, trusted)
+        state, _, factorised = step(problem, replace(state, trusted=trusted.astype(np.float64)))
+    samples = factorised.samples[: problem.graph.num_nodes]
+    variance = problem.graph.variance(samples, state.noise.step_variance)
+    return Published(state.correction, score, variance, (1.0,))

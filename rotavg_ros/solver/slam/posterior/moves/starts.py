@@ -1,0 +1,122 @@
+"""Where a search begins: CleanNet's tree, closures annealed on odometry of several qualities, ℓ½, minimum cuts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from torch import Tensor
+
+from rotavg_ros.solver.slam.moves.jumps import jump_to_optimum
+from rotavg_ros.solver.slam.moves.slip_search import no_slip_log_odds
+from rotavg_ros.solver.slam.moves.truncated_cost import TruncatedCost
+from rotavg_ros.solver.slam.noise.model import NoiseModel, agree, noise_between_neighbours
+from rotavg_ros.solver.slam.posterior.em import settle
+from rotavg_ros.solver.slam.posterior.left_out import relabelled
+from rotavg_ros.solver.slam.posterior.priors import SlamPriors
+from rotavg_ros.solver.slam.posterior.problem import Problem
+from rotavg_ros.solver.slam.posterior.rows import moved, residuals, variances
+from rotavg_ros.solver.slam.posterior.state import Noise, State
+from rotavg_ros.solver.slam.preparation import Prepared
+from rotavg_ros.solver.slam.stages import CleanedClosures, bootstrap
+
+# The 99 % quantile of χ² in k components: what is farther off is no inlier of truncated least squares.
+_INLIER_SQUARE = {1: 6.63, 3: 11.34}
+# Annealing has ended once the loss is as sharp as this.
+_SHARP = 1e3
+# Steps of this many prior standard deviations above (below) the median are tried, closures of half one below it.
+_STEP_LEVELS, _CLOSURE_LEVEL = (-1.0, 0.0, 1.0, 2.0), -0.5
+# ρ(r) = |r|^½ beyond a standard deviation: weights are (1 + r²/σ²)^-¾.
+_ROBUST_POWER = -0.75
+# Chances of a slip per step under which parts are turned, first as dear as none.
+_ANNEALED_SLIPS = (0.5, 0.01)
+_LEAST_WEIGHT = 1e-9
+
+
+def starts(problem: Problem, prepared: Prepared, cleaned: CleanedClosures) -> Iterator[tuple[str, State]]:
+    """Name and state of each start that is switched on; CleanNet's tree always is one."""
+    noise = noise_of(problem, prepared.noise)
+    tree = bootstrap(prepared, cleaned)
+    yield "tree", settle(problem, at(problem, tree, cleaned.inlier_probability, noise))
+    if "annealing" not in problem.without:
+        for step_variance, closure_variance in _prior_levels(problem.priors):
+            level = replace(noise, step_variance=step_variance, closure_variance=closure_variance)
+            yield "annealing", annealed(problem, at(problem, tree, np.ones(len(problem.graph.source)), level))
+    if "robust-start" not in problem.without:
+        yield "robust start", _robust(problem, at(problem, tree, np.ones(len(problem.graph.source)), noise))
+    if len(prepared.pairs.first) and not problem.without & {"minimum-cuts", "slips"}:
+        near = noise_between_neighbours(prepared.pairs, problem.components)
+        found = _turned_parts(problem, prepared, tree, near)
+        yield "minimum cuts", _labelled(problem, at(problem, found, np.ones(0), noise_of(problem, near)))
+
+
+def noise_of(problem: Problem, model: NoiseModel) -> Noise:
+    """θ to begin with."""
+    return Noise(model.step_variance, model.closure_variance, 0.0, problem.priors.common_share)
+
+
+def at(problem: Problem, correction: Tensor, trusted: np.ndarray, noise: Noise) -> State:
+    """A state at corrections ``(K, 4)``."""
+    rows = np.ascontiguousarray(correction.numpy().T)
+    return State(rows, np.zeros((problem.system.num_runs, 3)), trusted.astype(np.float64), noise)
+
+
+def annealed(problem: Problem, state: State) -> State:
+    """Graduated non-convexity (Yang et al. 2020, truncated least squares) on closures, odometry trusted."""
+    variance, closure = variances(problem, state.noise), problem.closure
+    told = problem.log_odds[closure]
+    limit = _INLIER_SQUARE[problem.components]
+    sharpness = 0.0
+    for number in range(problem.limits.annealing_solves):
+        residual = residuals(problem, state)
+        square = (residual**2).sum(axis=1)[closure] / variance[closure]
+        if number == 0:
+            sharpness = limit / max(2 * float(square.max(initial=0.0)) - limit, _LEAST_WEIGHT)
+        else:
+            weight = np.sqrt(limit * sharpness * (sharpness + 1) / np.maximum(square, _LEAST_WEIGHT)) - sharpness
+            trusted = state.trusted.copy()
+            trusted[closure] = np.where(np.isinf(told), told > 0, np.clip(weight, 0.0, 1.0))
+            state = replace(state, trusted=trusted)
+            sharpness *= problem.limits.annealing_factor
+        trust = np.concatenate((state.trusted, np.ones(problem.system.num_runs)))
+        state = moved(state, problem.system.factorise(np.maximum(trust, _LEAST_WEIGHT) / variance).fit(residual))
+        if sharpness > _SHARP:
+            break
+    return replace(state, trusted=state.is_good.astype(np.float64))
+
+
+def _prior_levels(priors: SlamPriors) -> list[tuple[float, float]]:
+    """Step and closure variances, rad², from the lower to the far upper end of what is likely beforehand."""
+    closure = np.radians(priors.closure_deg * np.exp(_CLOSURE_LEVEL * priors.noise_spread)) ** 2
+    steps = np.radians(priors.step_deg * np.exp(priors.noise_spread * np.array(_STEP_LEVELS))) ** 2
+    return [(float(step), float(closure)) for step in steps]
+
+
+def _robust(problem: Problem, state: State) -> State:
+    """ℓ½ with a robust odometry: iteratively reweighted least squares on all edges alike."""
+    own = variances(problem, state.noise)
+    for _ in range(problem.limits.robust_solves):
+        residual = residuals(problem, state)
+        weight = (1 + (residual**2).sum(axis=1) / own) ** _ROBUST_POWER / own
+        state = moved(state, problem.system.factorise(weight).fit(residual))
+    return _labelled(problem, state)
+
+
+def _turned_parts(problem: Problem, prepared: Prepared, correction: Tensor, model: NoiseModel) -> Tensor:
+    """Parts turned by minimum cuts under a truncated cost, first with cheap slips; corrections ``(K, 4)``."""
+    graph, pairs = problem.graph, prepared.pairs
+    is_agreed, everyone = agree(pairs, model), np.ones(len(problem.closure), dtype=bool)
+    for number, probability in enumerate(_ANNEALED_SLIPS):
+        no_slip = no_slip_log_odds(graph.steps, problem.components, probability)
+        prior = np.where(graph.is_odometry, no_slip, model.prior_log_odds + problem.log_odds)
+        cost = TruncatedCost.create(graph, model, prior)
+        if number == 0:
+            correction = cost.descend(correction, np.ones(len(graph.source)))
+        correction = jump_to_optimum(cost, correction, pairs, is_agreed, everyone)
+    return correction
+
+
+def _labelled(problem: Problem, state: State) -> State:
+    """With labels by what residuals cost one way or the other."""
+    return replace(state, common=np.zeros_like(state.common), trusted=relabelled(problem, state))

@@ -1,0 +1,83 @@
+"""F(labels, θ) = −log p(labels, θ | data) in nats, the corrections integrated out by Laplace's method.
+
+With r_e the residuals at the best corrections Ĉ and H the Hessian there,
+
+    F = − Σ_sound log p(r_e | sound)  − Σ_slipped log p(r_e | slipped)  − Σ_good log p(r_e | good)  − Σ_runs log p(b)
+        − log p(false closures)  − log p(labels)  − log p(θ)  + ½ k (log det H − d log 2π)
+
+d is the number of unknowns: key nodes but for the roots, and runs' common errors b. Two labellings are compared by F
+and by nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rotavg_ros.solver.slam.posterior.densities import log_good, log_normal, log_slipped
+from rotavg_ros.solver.slam.posterior.labels import false_density, log_false_set, log_label_prior, log_slip_prior
+from rotavg_ros.solver.slam.posterior.priors import SlamPriors
+from rotavg_ros.solver.slam.posterior.problem import Problem
+from rotavg_ros.solver.slam.posterior.rows import residuals, variances, weights
+from rotavg_ros.solver.slam.posterior.state import Noise, State
+from rotavg_ros.solver.slam.posterior.system import Factorised
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """F of a state and what it was made of.
+
+    Attributes:
+        terms: nats by name.
+        residual: ``(E + R, 3)`` rad, of all rows.
+        weight: ``(E + R,)`` rad⁻².
+        factorised: H.
+    """
+
+    terms: dict[str, float]
+    residual: np.ndarray
+    weight: np.ndarray
+    factorised: Factorised
+
+    @property
+    def total(self) -> float:
+        """F, nats."""
+        return sum(self.terms.values())
+
+
+def evaluate(problem: Problem, state: State) -> Evaluation:
+    """F where corrections are at their optimum; labels are rounded."""
+    graph, priors, k = problem.graph, problem.priors, problem.components
+    state = replace(state, trusted=state.is_good.astype(np.float64))
+    variance, residual = variances(problem, state.noise), residuals(problem, state)
+    square = (residual**2).sum(axis=1)
+    weight = weights(problem, state, square, variance)
+    factorised = problem.system.factorise(weight)
+    num_edges, good = len(graph.source), state.is_good
+    own, common = np.split(variance, [num_edges])
+    log_if_good = log_good(square[:num_edges], own, 0.0, k, priors)[0]
+    slipped = np.flatnonzero(graph.is_odometry & ~good)
+    log_if_slipped = log_slipped(square[slipped], own[slipped], 0.0, k, priors)
+    is_false = ~good[problem.closure]
+    false = false_density(problem, is_false, residual[problem.closure], np.flatnonzero(is_false))
+    unknowns = problem.system.size - len(graph.roots)
+    terms = {
+        "odometry": -float(log_if_good[graph.is_odometry & good].sum()),
+        "slips": -float(log_if_slipped.sum()) - log_slip_prior(problem, slipped),
+        "good closures": -float(log_if_good[graph.is_closure & good].sum()),
+        "common errors": -float(log_normal(square[num_edges:], common, k).sum()),
+        "false closures": -log_false_set(problem, false),
+        "labels": -log_label_prior(problem, is_false),
+        "noise": -log_noise_prior(state.noise, priors),
+        "orientations": k / 2 * (factorised.log_det - unknowns * np.log(2 * np.pi)),
+    }
+    return Evaluation(terms, residual, weight, factorised)
+
+
+def log_noise_prior(noise: Noise, priors: SlamPriors) -> float:
+    """Of θ: log-normal in both standard deviations, a share for α above 0; all κ are as likely."""
+    step = np.log(noise.step_variance) / 2 - np.log(np.radians(priors.step_deg))
+    closure = np.log(noise.closure_variance) / 2 - np.log(np.radians(priors.closure_deg))
+    believed = np.log(priors.stated_share if noise.exponent > 0 else 1 - priors.stated_share)
+    return float(believed - (step**2 + closure**2) / (2 * priors.noise_spread**2))

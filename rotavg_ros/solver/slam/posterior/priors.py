@@ -1,0 +1,97 @@
+"""Every number that the posterior believes beforehand, and every bound of its search, in two frozen classes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class SlamPriors:
+    """What is believed of a robot's graph before it is seen. Angles are in degrees, per component of a rotation.
+
+    Rates that are not named here (the share of repeated turns, the stickiness of labels) are integrated over a grid,
+    see :mod:`rotavg_ros.solver.slam.posterior.labels`.
+
+    Attributes:
+        step_deg: median of the standard deviation of one step of odometry.
+        closure_deg: the same of a good closure.
+        noise_spread: standard deviation of the logarithm of both.
+        tail_share: this share of the good edges, closures and segments, …
+        tail_ratio: … has so many times the variance (Huber's contaminated normal).
+        outlier_share: mean of the Beta prior of the share of false closures, …
+        outlier_count: … and how many closures it counts for.
+        near_miss_share: this share of the false closures is wrong by a normal turn …
+        near_miss_deg: … of this standard deviation, and by any turn else.
+        elsewhere_count: the share of false closures that repeat the wrong turn of others elsewhere on the path has the
+            prior Beta(1, elsewhere_count); that of repeats nearby, uniform.
+        slip_count: the share of slipping steps has the prior Beta(slip_count, slip_steps), …
+        slip_steps: … so the first slip is dear and later ones are cheaper.
+        slip_deg: standard deviation of what a step is off by where it slipped.
+        run_gap_steps: closures follow each other in a run if their ends are at most so many steps of odometry apart,
+            both ends summed, …
+        run_steps: … and no run is longer than this at its older end.
+        common_share: share of a good closure's error variance that its run has in common, to begin with; the values
+            that are compared are those of :mod:`rotavg_ros.solver.slam.posterior.moves.noise`.
+        stated_share: probability that stated variances say anything.
+        least_stated_ratio: no closure is believed to be more exact than this share of the typical variance.
+        largest_stated_ratio: a stated variance farther from the typical one than by this factor says nothing.
+    """
+
+    step_deg: float = 0.3
+    closure_deg: float = 2.0
+    noise_spread: float = 1.2
+    tail_share: float = 0.1
+    tail_ratio: float = 16.0
+    outlier_share: float = 0.25
+    outlier_count: float = 4.0
+    near_miss_share: float = 0.2
+    near_miss_deg: float = 20.0
+    elsewhere_count: float = 10.0
+    slip_count: float = 0.2
+    slip_steps: float = 2000.0
+    slip_deg: float = 60.0
+    run_gap_steps: float = 30.0
+    run_steps: float = 300.0
+    common_share: float = 0.3
+    stated_share: float = 0.5
+    least_stated_ratio: float = 0.25
+    largest_stated_ratio: float = 100.0
+
+
+@dataclass(frozen=True)
+class SearchLimits:
+    """How far the search goes; none of them says what is likelier.
+
+    Attributes:
+        polish_solves: sparse solves at most to bring a labelling to its optimum.
+        settling_solves: the same while labels are probabilities.
+        converged: such a part of a step's standard deviation is no movement.
+        flip_rounds: batches of single flips.
+        annealing_solves: of graduated non-convexity …
+        annealing_factor: … and by how much its loss is sharpened from solve to solve.
+        robust_solves: of the ℓ½ start.
+        hopeless: nats by which a start may be worse than the best to be gone on from.
+        tried: moves that are tried, at most.
+        slack: a move is tried if F is predicted to rise by no more than this, nats.
+        rival: modes within so many nats of the best are moved on from.
+        groups: groups of closures that are looked at, of either label.
+        slips: places for a slip that are looked at.
+        window: false closures before (and after) one that it is compared with.
+        averaged: labellings that are averaged, at most.
+    """
+
+    polish_solves: int = 8
+    settling_solves: int = 15
+    converged: float = 0.05
+    flip_rounds: int = 8
+    annealing_solves: int = 40
+    annealing_factor: float = 1.6
+    robust_solves: int = 12
+    hopeless: float = 200.0
+    tried: int = 60
+    slack: float = 1.0
+    rival: float = 6.0
+    groups: int = 64
+    slips: int = 12
+    window: int = 48
+    averaged: int = 8

@@ -1,0 +1,174 @@
+"""What stays the same while labels, noise and orientations change: the graph, its runs of closures, what is told."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from rotavg_ros.solver.slam.graph.agreement import AgreementPairs, closure_ends
+from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
+from rotavg_ros.solver.slam.posterior.priors import SearchLimits, SlamPriors
+from rotavg_ros.solver.slam.posterior.system import NormalEquations
+
+# A share that is none; the logarithm stays finite.
+_NONE = 1e-12
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A closure graph (K key nodes, E edges, C closures) and what is known of it.
+
+    Attributes:
+        graph: the closure graph.
+        components: k, 1 where all rotations share an axis, else 3.
+        log_odds: ``(E,)`` of each edge to be good by networks and labels, beyond what is common to all; ±inf decide.
+        run: ``(C,)`` number of the run of each closure; closures of a run may err alike.
+        follows: ``(C,)`` the nearest closure that was detected before and is near enough for the same label, or -1.
+        priors: all that is believed beforehand.
+        limits: of the search.
+        without: names of terms and moves that are switched off (:data:`rotavg_ros.solver.slam.options.SWITCHES`).
+    """
+
+    graph: ClosureGraph
+    components: int
+    log_odds: np.ndarray
+    run: np.ndarray
+    follows: np.ndarray
+    priors: SlamPriors
+    limits: SearchLimits = field(default_factory=SearchLimits)
+    without: frozenset[str] = frozenset()
+
+    @classmethod
+    def of(
+        cls,
+        graph: ClosureGraph,
+        pairs: AgreementPairs,
+        components: int,
+        log_odds: np.ndarray,
+        *,
+        priors: SlamPriors | None = None,
+        without: Collection[str] = (),
+    ) -> Problem:
+        """Find the runs: closures that follow each other closely.
+
+        Args:
+            pairs: the graph's neighbouring closures.
+            log_odds: ``(E,)`` of each edge by itself. A network judges the closures of a run by the same evidence, so
+                that together they count once.
+        """
+        priors = SlamPriors() if priors is None else priors
+        if "tails" in without:
+            priors = replace(priors, tail_share=_NONE)
+        if "near-misses" in without:
+            priors = replace(priors, near_miss_share=_NONE)
+        run = _runs(graph, pairs, priors)
+        told = log_odds.copy()
+        if len(run):
+            told[graph.is_closure] /= np.bincount(run)[run]
+        if "slips" in without:
+            told[graph.is_odometry] = np.inf
+        follows = _predecessors(graph, pairs, priors)
+        return cls(graph, components, told, run, follows, priors, without=frozenset(without))
+
+    @cached_property
+    def closure(self) -> np.ndarray:
+        """``(C,)`` edges."""
+        return np.flatnonzero(self.graph.is_closure)
+
+    @cached_property
+    def sign(self) -> np.ndarray:
+        """``(C,)`` +1 where a closure runs from its older to its newer end, else −1."""
+        position = self.graph.position
+        is_forward = position[self.graph.source] <= position[self.graph.target]
+        return np.asarray(np.where(is_forward, 1.0, -1.0)[self.closure])
+
+    @cached_property
+    def measured(self) -> np.ndarray:
+        """``(4, E)`` measured residuals under the odometry's orientations."""
+        return np.ascontiguousarray(self.graph.residual.numpy().T)
+
+    @cached_property
+    def ends(self) -> np.ndarray:
+        """``(C, 2)`` older and newer end, in steps along the odometry."""
+        return closure_ends(self.graph, self.closure)
+
+    @cached_property
+    def detection(self) -> np.ndarray:
+        """``(C,)`` closures in the order in which they were detected, that of their newer ends."""
+        return _detection(self.ends)
+
+    @cached_property
+    def detected(self) -> np.ndarray:
+        """``(C,)`` when each was detected, as a rank."""
+        return np.argsort(self.detection)
+
+    @cached_property
+    def stated_ratio(self) -> np.ndarray:
+        """``(C,)`` logarithm of stated variances over the typical one, the median; 0 where unknown or absurd."""
+        stated = self.graph.stated_variance[self.closure]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            logarithm = np.log(stated)
+        is_known = np.isfinite(logarithm)
+        if not is_known.any():
+            return np.zeros(len(stated))
+        ratio = np.where(is_known, logarithm, 0.0) - np.median(logarithm[is_known])
+        is_sane = is_known & (np.abs(ratio) <= np.log(self.priors.largest_stated_ratio))
+        return np.where(is_sane, np.maximum(ratio, np.log(self.priors.least_stated_ratio)), 0.0)
+
+    @cached_property
+    def system(self) -> NormalEquations:
+        """Normal equations; runs of two and more closures have a common error."""
+        graph = self.graph
+        run = np.full(len(graph.source), -1, dtype=np.int64)
+        if len(self.run) and "common-errors" not in self.without:
+            is_shared = np.bincount(self.run)[self.run] >= 2
+            run[self.closure[is_shared]] = np.unique(self.run[is_shared], return_inverse=True)[1].reshape(-1)
+        sign = np.zeros(len(graph.source))
+        sign[self.closure] = self.sign
+        return NormalEquations(graph.num_nodes, graph.source, graph.target, run, sign, roots=graph.roots)
+
+    @cached_property
+    def total_steps(self) -> float:
+        """Of all odometry."""
+        return float(self.graph.own_steps[self.graph.is_odometry].sum())
+
+
+def _runs(graph: ClosureGraph, pairs: AgreementPairs, priors: SlamPriors) -> np.ndarray:
+    """``(C,)`` number of each closure's run."""
+    closure = np.flatnonzero(graph.is_closure)
+    if len(closure) == 0:
+        return np.empty(0, dtype=np.int64)
+    linked = pairs.steps <= priors.run_gap_steps
+    links = coo_array(
+        (np.ones(int(linked.sum())), (pairs.first[linked], pairs.second[linked])), shape=(len(closure),) * 2
+    )
+    chain = connected_components(links, directed=False)[1]
+    older = closure_ends(graph, closure)[:, 0]
+    start = np.full(int(chain.max()) + 1, np.inf)
+    np.minimum.at(start, chain, older)
+    stretch = np.stack((chain, (older - start[chain]) // priors.run_steps), axis=1)
+    return np.asarray(np.unique(stretch, axis=0, return_inverse=True)[1], dtype=np.int64).reshape(-1)
+
+
+def _detection(ends: np.ndarray) -> np.ndarray:
+    return np.lexsort((ends[:, 0], ends[:, 1]))
+
+
+def _predecessors(graph: ClosureGraph, pairs: AgreementPairs, priors: SlamPriors) -> np.ndarray:
+    """``(C,)`` the nearest earlier closure whose ends are near both ends of each, or -1."""
+    closure = np.flatnonzero(graph.is_closure)
+    follows = np.full(len(closure), -1, dtype=np.int64)
+    if len(pairs.first) == 0:
+        return follows
+    detected = np.argsort(_detection(closure_ends(graph, closure)))
+    is_before = (detected[pairs.second] < detected[pairs.first]) & (pairs.steps <= priors.run_gap_steps)
+    later, earlier, steps = pairs.first[is_before], pairs.second[is_before], pairs.steps[is_before]
+    order = np.lexsort((-detected[earlier], steps, later))
+    found, first = np.unique(later[order], return_index=True)
+    follows[found] = earlier[order][first]
+    return follows

@@ -1,0 +1,91 @@
+"""The rows of the linear system at a state: residuals, variances, weights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+
+from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.slam.posterior.densities import log_good
+from rotavg_ros.solver.slam.posterior.problem import Problem
+from rotavg_ros.solver.slam.posterior.state import Noise, State
+
+# What a false closure weighs, of a good one: nothing, but the system stays solvable.
+_NOTHING = 1e-10
+# A step turns nothing by more than this, rad; beyond, the linear system says nothing.
+_MAX_TURN = 1.0
+
+
+def variances(problem: Problem, noise: Noise) -> np.ndarray:
+    """``(E + R,)`` rad² of every row's own noise if it is good; of closures, what their run does not share."""
+    graph, system = problem.graph, problem.system
+    variance = graph.own_steps * noise.step_variance
+    closure = problem.closure
+    own = np.where(system.shared[closure], 1 - noise.common_share, 1.0)
+    variance[closure] = own * np.exp(noise.exponent * problem.stated_ratio) * noise.closure_variance
+    common = np.full(system.num_runs, noise.common_share * noise.closure_variance)
+    return np.concatenate((variance, common))
+
+
+def residuals(problem: Problem, state: State) -> np.ndarray:
+    """``(E + R, 3)`` rad, of all rows."""
+    graph, system = problem.graph, problem.system
+    turned = quaternion_rows.residual(state.correction, problem.measured, graph.source, graph.target)
+    vectors = quaternion_rows.log(turned).T
+    edges = np.flatnonzero(system.shared)
+    vectors[edges] -= system.sign[edges, None] * state.common[system.run[edges]]
+    return np.concatenate((vectors, -state.common))
+
+
+def moved(state: State, step: np.ndarray) -> State:
+    """The state after a Gauss–Newton step ``(K + R, 3)``, shortened where it is long."""
+    step = step / max(1.0, float(np.abs(step).max(initial=0.0)) / _MAX_TURN)
+    num_nodes = state.correction.shape[1]
+    turned = quaternion_rows.multiply(state.correction, quaternion_rows.exp(step[:num_nodes].T))
+    return replace(state, correction=quaternion_rows.normalize(turned), common=state.common + step[num_nodes:])
+
+
+def weights(problem: Problem, state: State, square: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """``(E + R,)`` rad⁻²: the mean of 1/variance over what a row's residual may be of.
+
+    Args:
+        problem: the graph.
+        state: labels.
+        square: ``(E + R,)`` rad² of the residuals.
+        variance: ``(E + R,)`` rad² of :func:`variances`.
+    """
+    priors, num_edges = problem.priors, len(problem.graph.source)
+    own = variance[:num_edges]
+    exact = log_good(square[:num_edges], own, 0.0, problem.components, priors)[1]
+    good = (exact + (1 - exact) / priors.tail_ratio) / own
+    slipped = 1 / (own + np.radians(priors.slip_deg) ** 2)
+    otherwise = np.where(problem.graph.is_odometry, slipped, _NOTHING * good)
+    weight = state.trusted * good + (1 - state.trusted) * otherwise
+    return np.concatenate((_bridged(problem, state, weight), 1 / variance[num_edges:]))
+
+
+def _bridged(problem: Problem, state: State, weight: np.ndarray) -> np.ndarray:
+    """Weights ``(E,)`` with which parts that false closures alone connect are held by one edge each.
+
+    A part that nothing holds may be turned by anything; a normal density of the same volume stands for that.
+    """
+    graph = problem.graph
+    holds = graph.is_odometry | state.is_good
+    ends = graph.source[holds], graph.target[holds]
+    held = coo_array((np.ones(len(ends[0])), ends), shape=(graph.num_nodes,) * 2)
+    parts, part = connected_components(held.tocsr(), directed=False)
+    if parts == len(graph.roots):
+        return weight
+    loose = np.flatnonzero(~holds)
+    low, high = np.sort(np.stack((part[graph.source[loose]], part[graph.target[loose]])), axis=0)
+    between, first = np.unique(low * parts + high, return_index=True)
+    # Which of several edges between two parts it is makes no difference.
+    bridges = coo_array((1.0 + np.arange(len(between)), np.divmod(between, parts)), shape=(parts, parts))
+    chosen = minimum_spanning_tree(bridges.tocsr()).data.astype(np.int64) - 1
+    volume = 2 * np.pi if problem.components == 1 else 8 * np.pi**2
+    weight = weight.copy()
+    weight[loose[first[chosen]]] = 2 * np.pi * volume ** (-2 / problem.components)
+    return weight

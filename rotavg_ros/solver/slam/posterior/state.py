@@ -1,0 +1,46 @@
+"""A point of the search: orientations, common errors, labels and noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Noise:
+    """θ.
+
+    Attributes:
+        step_variance: rad² per component, of one step of odometry.
+        closure_variance: rad² per component, of a good closure that states what is typical.
+        exponent: α, how far the ratios of stated variances are believed.
+        common_share: κ, share of a closure's error variance that its run has in common.
+    """
+
+    step_variance: float
+    closure_variance: float
+    exponent: float
+    common_share: float
+
+
+@dataclass(frozen=True)
+class State:
+    """Of a problem (K key nodes, R runs, E edges).
+
+    Attributes:
+        correction: ``(4, K)`` C, world-frame corrections of the odometry's orientations.
+        common: ``(R, 3)`` common errors of runs, rad.
+        trusted: ``(E,)`` 1 for good closures and sound segments, 0 for others; between while labels are probabilities.
+        noise: θ.
+    """
+
+    correction: np.ndarray
+    common: np.ndarray
+    trusted: np.ndarray
+    noise: Noise
+
+    @property
+    def is_good(self) -> np.ndarray:
+        """``(E,)`` bool."""
+        return self.trusted > 0.5

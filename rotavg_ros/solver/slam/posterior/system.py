@@ -1,0 +1,147 @@
+"""The sparse system of the posterior: normal equations of edges between key nodes that may share a common error.
+
+Row e of J says  C_target − C_source + b = r_e,  b the common error of its run; a run's error has a row of its own with
+residual 0, its prior. H = Jᵀ W J is factorised once for each choice of weights and gives corrections, log det H and
+what everything else predicts of a row.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import csc_array, csr_array
+from scipy.sparse.linalg import SuperLU, splu
+
+from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
+from rotavg_ros.solver.algebra.laplacian import root_stiffness, solve_in_parts
+from rotavg_ros.solver.algebra.probes import likeliest_leverage, probe_signs
+
+_NUM_PROBES = 48
+_MAX_LEVERAGE = 1 - 1e-6
+
+
+class NormalEquations:
+    """The pattern of H for E edges between K key nodes and R runs.
+
+    Args:
+        num_nodes: K.
+        source, target: ``(E,)`` key nodes.
+        run: ``(E,)`` column of the common error in 0 … R − 1, or -1.
+        sign: ``(E,)`` ±1, the direction in which an edge has it.
+        roots: key nodes that stay where they are.
+    """
+
+    def __init__(
+        self,
+        num_nodes: int,
+        source: np.ndarray,
+        target: np.ndarray,
+        run: np.ndarray,
+        sign: np.ndarray,
+        roots: np.ndarray,
+    ) -> None:
+        self.num_nodes, self.num_runs = num_nodes, int(run.max(initial=-1)) + 1
+        self.roots, self.run, self.sign = roots, run, sign
+        self.shared = has_run = run >= 0
+        column = np.concatenate(
+            (
+                np.stack((target, source, np.where(has_run, num_nodes + run, target)), axis=1),
+                np.repeat(num_nodes + np.arange(self.num_runs)[:, None], 3, axis=1),
+            )
+        )
+        value = np.concatenate(
+            (
+                np.stack((np.ones(len(source)), -np.ones(len(source)), np.where(has_run, sign, 0.0)), axis=1),
+                np.tile([1.0, 0.0, 0.0], (self.num_runs, 1)),
+            )
+        )
+        self.column, self.value = column, value
+        self.size = num_nodes + self.num_runs
+        rows = np.repeat(np.arange(len(column)), 3)
+        self.rows: csr_array = csr_array((value.ravel(), (rows, column.ravel())), shape=(len(column), self.size))
+        self._transposed = self.rows.T.tocsr()
+        self._rank = np.arange(self.size)
+        self._is_ordered = False
+        self._lay_out()
+        self.probes = probe_signs(
+            np.concatenate((source, num_nodes + np.arange(self.num_runs))),
+            np.concatenate((target, 2 * num_nodes + self.num_runs + np.arange(self.num_runs))),
+            _NUM_PROBES,
+        ).astype(np.float64)
+
+    def _lay_out(self) -> None:
+        column = self._rank[self.column]
+        first, second = np.repeat(column, 3, axis=1), np.tile(column, 3)
+        keys = np.concatenate(((second * self.size + first).ravel(), self._rank * (self.size + 1)))
+        occupied, slot = np.unique(keys, return_inverse=True)
+        self._slot, diagonal = np.split(slot, [first.size])
+        self._root_slot = diagonal[self.roots]
+        self._product = (np.repeat(self.value, 3, axis=1) * np.tile(self.value, 3)).ravel()
+        self._row = (occupied % self.size).astype(np.int32)
+        self._first = np.searchsorted(occupied, np.arange(self.size + 1) * self.size).astype(np.int32)
+
+    def factorise(self, weight: np.ndarray) -> Factorised:
+        """With weights ``(E + R,)``, rad⁻²."""
+        stop_if_abandoned()
+        values = np.bincount(self._slot, self._product * np.repeat(weight, 9), len(self._row))
+        stiffness = root_stiffness(weight)
+        values[self._root_slot] += stiffness
+        matrix = csc_array((values, self._row, self._first), shape=(self.size, self.size))
+        factor = splu(
+            matrix,
+            permc_spec="NATURAL" if self._is_ordered else "MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            relax=1,
+            panel_size=1,
+            options={"SymmetricMode": True},
+        )
+        rank = self._rank
+        if not self._is_ordered:
+            self._rank, self._is_ordered = factor.perm_c.astype(np.int64), True
+            self._lay_out()
+        return Factorised(self, weight, factor, rank, len(self.roots) * np.log(stiffness))
+
+
+class Factorised:
+    """H for one choice of weights."""
+
+    def __init__(
+        self, system: NormalEquations, weight: np.ndarray, factor: SuperLU, rank: np.ndarray, grounding: float
+    ) -> None:
+        self.system, self.weight = system, weight
+        self._factor, self._rank, self._node, self._grounding = factor, rank, np.argsort(rank), grounding
+
+    @property
+    def log_det(self) -> float:
+        """Log det H, without the rows that tie the roots down."""
+        return float(np.log(np.abs(self._factor.U.diagonal())).sum()) - self._grounding
+
+    def solve(self, right_hand_side: np.ndarray) -> np.ndarray:
+        """``H⁻¹ b`` for ``(K + R, k)`` columns."""
+        stop_if_abandoned()
+        return solve_in_parts(self._factor, right_hand_side.take(self._node, axis=0)).take(self._rank, axis=0)
+
+    def fit(self, difference: np.ndarray) -> np.ndarray:
+        """Unknowns ``(K + R, k)`` that explain ``(E + R, k)`` best."""
+        return self.solve(self.system._transposed @ (self.weight[:, None] * difference))
+
+    @cached_property
+    def samples(self) -> np.ndarray:
+        """Unknowns ``(K + R, 48)`` whose second moments are H⁻¹."""
+        return self.fit(self.system.probes / np.sqrt(self.weight)[:, None])
+
+    @cached_property
+    def resistance(self) -> np.ndarray:
+        """``(E + R,)`` rad², variance of what the fit says of every row, estimated by samples."""
+        scaled = np.sqrt(self.weight)[:, None] * (self.system.rows @ self.samples)
+        probes = self.system.probes
+        leverage = likeliest_leverage((scaled**2).mean(axis=1), (scaled * probes).mean(axis=1))
+        return np.asarray(np.minimum(leverage, _MAX_LEVERAGE) / self.weight)
+
+    def covariance(self, rows: np.ndarray) -> np.ndarray:
+        """``(n, n)`` rad², exact, of what the fit says of some rows."""
+        chosen = self.system.rows[rows]
+        columns = np.zeros((self.system.size, len(rows)))
+        np.add.at(columns, (self.system.column[rows], np.arange(len(rows))[:, None]), self.system.value[rows])
+        return np.asarray(chosen @ self.solve(columns))

@@ -1,0 +1,168 @@
+"""F against integrals computed independently and densely, and against its own leave-one-out odds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import expit, logsumexp
+from scipy.stats import multivariate_normal
+
+from rotavg_ros.solver.slam.posterior.em import polish
+from rotavg_ros.solver.slam.posterior.labels import label_log_odds, log_label_prior
+from rotavg_ros.solver.slam.posterior.left_out import leave_one_out
+from rotavg_ros.solver.slam.posterior.objective import evaluate
+from rotavg_ros.solver.slam.posterior.priors import SlamPriors
+from rotavg_ros.solver.slam.posterior.problem import Problem
+from rotavg_ros.solver.slam.posterior.state import Noise, State
+from rotavg_ros.solver.slam.preparation import prepare
+from rotavg_ros.view_graph import ViewGraph
+
+# Gaussian where a mixture would be integrated approximately only.
+_PRIORS = replace(SlamPriors(), tail_share=1e-12, near_miss_share=1e-12)
+_NOISE = Noise(np.radians(1.0) ** 2, np.radians(1.5) ** 2, 0.0, 0.4)
+
+
+def _yaw(angle: np.ndarray) -> np.ndarray:
+    return np.stack((np.zeros_like(angle), np.zeros_like(angle), np.sin(angle / 2), np.cos(angle / 2)), axis=1)
+
+
+def _planar(seed: int, num_closures: int, false_share: float, length: int = 60) -> tuple[ViewGraph, np.ndarray]:
+    """A planar chain with closures, some of them wrong by up to 40°; returns the graph and what closures are off by."""
+    rng = np.random.default_rng(seed)
+    older = rng.integers(0, length // 2, num_closures)
+    newer = older + rng.integers(length // 4, length // 2, num_closures)
+    # Two closures of a run, so that common errors count.
+    older[1], newer[1] = older[0] + 1, newer[0] + 2
+    off = np.where(rng.random(num_closures) < false_share, rng.uniform(-0.7, 0.7, num_closures), 0.0)
+    noise = off + rng.normal(size=num_closures) * np.radians(1.5)
+    odometry = rng.normal(size=length - 1) * np.radians(1.0)
+    graph = ViewGraph.create(
+        np.concatenate((np.arange(length - 1), older)),
+        np.concatenate((np.arange(1, length), newer)),
+        _yaw(np.concatenate((odometry, noise))),
+        num_nodes=length,
+        kind=[0] * (length - 1) + [1] * num_closures,
+    )
+    return graph, off
+
+
+def _problem(graph: ViewGraph) -> Problem:
+    prepared = prepare(graph)
+    closure_graph = prepared.closure_graph
+    return Problem.of(closure_graph, prepared.pairs, 1, np.zeros(len(closure_graph.source)), priors=_PRIORS)
+
+
+def _state(problem: Problem, is_false: np.ndarray) -> State:
+    trusted = np.ones(len(problem.graph.source))
+    trusted[problem.closure[is_false]] = 0.0
+    correction = np.zeros((4, problem.graph.num_nodes))
+    correction[3] = 1.0
+    return State(correction, np.zeros((problem.system.num_runs, 3)), trusted, _NOISE)
+
+
+def _log_evidence(problem: Problem, is_false: np.ndarray) -> float:
+    """Of the data given labels: the good closures' residuals are jointly normal, by what they pass and share."""
+    measured = problem.measured[:, problem.closure]
+    discrepancy = 2 * np.arctan2(measured[2], measured[3]) * problem.sign
+    older, newer = problem.ends.T
+    passed = np.maximum(np.minimum(newer[:, None], newer) - np.maximum(older[:, None], older), 0.0)
+    shared = problem.system.shared[problem.closure]
+    common = (problem.run[:, None] == problem.run) & shared[:, None] & shared
+    own = np.where(shared, 1 - _NOISE.common_share, 1.0) * _NOISE.closure_variance
+    covariance = passed * _NOISE.step_variance + common * _NOISE.common_share * _NOISE.closure_variance + np.diag(own)
+    good = ~is_false
+    if not good.any():
+        return 0.0
+    normal = multivariate_normal(np.zeros(int(good.sum())), covariance[np.ix_(good, good)], allow_singular=True)
+    return float(normal.logpdf(discrepancy[good]))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_marginals_are_those_of_dense_integrals(seed: int) -> None:
+    graph, _ = _planar(seed, 7, 0.4)
+    problem = _problem(graph)
+    labels = [np.array(bits) for bits in product([False, True], repeat=len(problem.closure))]
+    by_f, densely = [], []
+    for is_false in labels:
+        _, evaluation = polish(problem, _state(problem, is_false), hold_noise=True)
+        by_f.append(-evaluation.total)
+        # What false closures contribute is a density by itself; the integral over orientations is what is checked.
+        densely.append(
+            _log_evidence(problem, is_false) - evaluation.terms["false closures"] - evaluation.terms["labels"]
+        )
+    is_false = np.stack(labels)
+    marginals = [(np.exp(np.array(log) - logsumexp(log))[:, None] * is_false).sum(axis=0) for log in (by_f, densely)]
+    np.testing.assert_allclose(marginals[0], marginals[1], atol=0.01)
+    assert marginals[0].max() > 0.02 and marginals[0].min() < 0.98
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_flip_changes_f_by_the_leave_one_out_log_odds(seed: int) -> None:
+    graph, _ = _planar(seed, 10, 0.0)
+    problem = _problem(graph)
+    good = np.zeros(len(problem.closure), dtype=bool)
+    state, before = polish(problem, _state(problem, good), hold_noise=True)
+    exact = np.diag(before.factorised.covariance(problem.closure))
+    before.factorised.resistance[problem.closure] = exact
+    log_odds = leave_one_out(problem, state, before.factorised).log_odds[problem.closure]
+    for number in range(len(problem.closure)):
+        flipped = good.copy()
+        flipped[number] = True
+        _, after = polish(problem, _state(problem, flipped), hold_noise=True)
+        assert after.total - before.total == pytest.approx(log_odds[number], abs=0.02)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_prior_log_odds_of_labels_are_differences_of_their_prior(seed: int) -> None:
+    graph, _ = _planar(seed, 10, 0.0)
+    problem = _problem(graph)
+    is_false = np.random.default_rng(seed).random(len(problem.closure)) < 0.5
+    log_odds = label_log_odds(problem, is_false)
+    for number in range(len(is_false)):
+        with_label = []
+        for value in (False, True):
+            changed = is_false.copy()
+            changed[number] = value
+            with_label.append(log_label_prior(problem, changed))
+        assert log_odds[number] == pytest.approx(with_label[0] - with_label[1], abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_f_does_not_depend_on_order_and_direction_of_edges(seed: int) -> None:
+    graph, _ = _planar(seed, 9, 0.3)
+    rng = np.random.default_rng(seed)
+    order = torch.from_numpy(rng.permutation(graph.num_edges))
+    shuffled = graph.select_edges(order)
+    turned = torch.from_numpy(rng.random(graph.num_edges) < 0.5)
+    inverse = shuffled.target_from_source * torch.tensor([-1.0, -1.0, -1.0, 1.0])
+    changed = replace(
+        shuffled,
+        source=torch.where(turned, shuffled.target, shuffled.source),
+        target=torch.where(turned, shuffled.source, shuffled.target),
+        target_from_source=torch.where(turned[:, None], inverse, shuffled.target_from_source),
+    )
+    totals = []
+    for given in (graph, changed):
+        problem = _problem(given)
+        is_false = expit(np.abs(2 * np.arctan2(problem.measured[2], problem.measured[3]))[problem.closure]) > 0.55
+        totals.append(polish(problem, _state(problem, is_false), hold_noise=True)[1].total)
+    assert totals[0] == pytest.approx(totals[1], abs=1e-6)
+
+
+def test_a_part_that_nothing_holds_weighs_as_one_that_may_be_turned_by_anything() -> None:
+    """Two chains joined by one closure: whether it is good or false, F stays finite and comparable."""
+    graph = ViewGraph.create(
+        [0, 1, 3, 4, 1], [1, 2, 4, 5, 4], _yaw(np.array([0.0, 0.0, 0.0, 0.0, 0.5])), num_nodes=6, kind=[0, 0, 0, 0, 1]
+    )
+    problem = _problem(graph)
+    good, false = (
+        evaluate(problem, polish(problem, _state(problem, np.array([label])), hold_noise=True)[0]).terms
+        for label in (False, True)
+    )
+    # Nothing contradicts the closure, so its residual tells nothing: only the labels' prior does.
+    evidence = [sum(terms.values()) - terms["labels"] for terms in (good, false)]
+    assert evidence[0] == pytest.approx(evidence[1], abs=0.05)
