@@ -42,6 +42,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "algebra": set(),
         "estimate": {"neurora"},
         "closures": {"slam"},
+        "diagnosis": {"neurora", "slam"},
         "positions": {"algebra"},
         "neurora": {"algebra"},
         "networks": {"neurora", "slam"},
@@ -172,7 +173,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
     },
 }
 # What those outside may import from the inside of a wing, besides its face.
-FACES = {"solver": {"batch", "closures", "devices", "methods", "networks", "pipeline", "positions", "solution"}}
+FACES = {"solver": {"batch", "closures", "devices", "diagnosis", "methods", "networks", "pipeline", "positions", "solution"}}
 INSIDERS = {"baselines": {"algebra", "neurora"}, "training": {"algebra", "neurora"}}
 # What a robot runs needs no more.
 NODE_MAY_USE = {"errors", "inputs", "online", "option", "settings", "solver", "version", "view_graph"}

@@ -18,6 +18,7 @@ from rotavg_ros.evaluation.live import incremental
 from rotavg_ros.evaluation.names import SLAM_GRAPHS, SLAM_SHARES
 from rotavg_ros.evaluation.slam import cases, report, stress, stress_report, uncertainty
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS, ROSTER, ROWS
+from rotavg_ros.evaluation.slam.search_or_model import Diagnosis, diagnose
 from rotavg_ros.evaluation.slam.stress_calibration import Calibration
 from rotavg_ros.solver.methods import POSTERIOR, SWITCHES, without
 
@@ -55,7 +56,11 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
         return progress(steps, total=len(kinds) * len(seeds) * len(chosen), description="solving", unit="solve")
 
     scores = score_all(drawings(kinds, seeds), chosen, watch)
-    return stress_report.report(arguments.output, scores, calibration, arguments.command_line)
+    diagnoses: list[Diagnosis] = []
+    if arguments.search_or_model and not scores.interrupted:
+        cases_again = progress(drawings(kinds, seeds), total=len(kinds) * len(seeds), description="from the truth")
+        diagnoses = [diagnose(case) for case in cases_again]
+    return stress_report.report(arguments.output, scores, calibration, arguments.command_line, diagnoses)
 
 
 def _run_recorded(arguments: argparse.Namespace) -> Path:

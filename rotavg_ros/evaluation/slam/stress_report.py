@@ -11,8 +11,9 @@ import numpy as np
 from rotavg_ros.evaluation.common.score_tables import Figure, per_case
 from rotavg_ros.evaluation.common.scoring import Scores, geometric_mean
 from rotavg_ros.evaluation.common.tables import Cell, Column, Report, Table
-from rotavg_ros.evaluation.slam import stress_calibration
+from rotavg_ros.evaluation.slam import search_or_model, stress_calibration
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS, ROSTER, ROWS
+from rotavg_ros.evaluation.slam.search_or_model import Diagnosis
 from rotavg_ros.evaluation.slam.stress_calibration import Calibration
 
 _FIGURE = "floored_deg"
@@ -51,12 +52,15 @@ class Rival:
     num_cases: int
 
 
-def report(folder: Path, scores: Scores, calibration: Calibration, command: str) -> Path:
+def report(
+    folder: Path, scores: Scores, calibration: Calibration, command: str, diagnoses: Sequence[Diagnosis] = ()
+) -> Path:
     """Write the tables; returns the Markdown file.
 
     Args:
         calibration: of ours.
         command: how to get the same figures again.
+        diagnoses: of the posterior's answers.
     """
     names = scores.contenders
     of_kinds = calibration.of_kinds(scores.cases)
@@ -73,6 +77,9 @@ def report(folder: Path, scores: Scores, calibration: Calibration, command: str)
         "stress-cases": per_case("Every case", scores, _CASE_FIGURES, _CASE_KEY),
         "stress-calibration-kinds": stress_calibration.table(title, of_kinds, every_kind=True),
     }
+    if diagnoses:
+        tables["stress-causes"] = search_or_model.shares("Why the posterior's answers are wrong", diagnoses)
+        tables["stress-failures"] = search_or_model.failures("Wrong answers that are not divided", diagnoses)
     introduction = (
         f"`{command}`. Simulated pose graphs that are hard in one known way each. Error: mean angle between estimated "
         "and true orientations after one robust global rotation of each component; below 0.1° it counts as 0.1°. The "

@@ -44,7 +44,7 @@ class Search:
         """The search from the modes that are kept."""
         done: set[bytes] = set()
         while (mode := self._next(done)) is not None:
-            done.add(mode.key)
+            done.add(mode.labels)
             for found in noise.tuned(mode):
                 self.keep(found)
             if self.modes[0].cost < mode.cost - _GAIN:
@@ -71,8 +71,10 @@ class Search:
         self.modes = sorted(known.values(), key=lambda other: other.cost)
 
     def _next(self, done: set[bytes]) -> Mode | None:
-        near = (mode for mode in self.modes[:_BEAM] if mode.cost < self.modes[0].cost + self.problem.limits.rival)
-        return next((mode for mode in near if mode.key not in done), None)
+        # Of the same labels the best noise stands for all.
+        best = list({mode.labels: mode for mode in reversed(self.modes)}.values())[::-1][:_BEAM]
+        near = (mode for mode in best if mode.cost < self.modes[0].cost + self.problem.limits.rival)
+        return next((mode for mode in near if mode.labels not in done), None)
 
 
 def proposals(mode: Mode) -> Iterator[Proposal]:

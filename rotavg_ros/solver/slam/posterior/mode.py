@@ -36,10 +36,14 @@ class Mode:
         return float(self.evaluation.total)
 
     @cached_property
-    def key(self) -> bytes:
+    def labels(self) -> bytes:
+        """Equal for equal labels."""
+        return np.packbits(self.state.is_good).tobytes()
+
+    @property
+    def key(self) -> tuple[bytes, float, float]:
         """Equal for equal labels under equal α and κ."""
-        noise = self.state.noise
-        return np.packbits(self.state.is_good).tobytes() + str((noise.exponent, noise.common_share)).encode()
+        return self.labels, self.state.noise.exponent, self.state.noise.common_share
 
     @cached_property
     def is_false(self) -> np.ndarray:

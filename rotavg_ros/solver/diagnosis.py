@@ -1,0 +1,99 @@
+"""Search or model? A robot's graph solved as usual, and by the same posterior from its true labels and orientations."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros.solver.neurora.network_store import Networks
+from rotavg_ros.solver.slam import stages as slam_stages
+from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
+from rotavg_ros.solver.slam.network import SlamCleanNet
+from rotavg_ros.solver.slam.posterior.inference import Search
+from rotavg_ros.solver.slam.posterior.modes import of_mode, publish
+from rotavg_ros.solver.slam.posterior.moves.flips import flipped
+from rotavg_ros.solver.slam.posterior.moves.noise import tuned
+from rotavg_ros.solver.slam.posterior.moves.starts import at, noise_of
+from rotavg_ros.solver.slam.posterior.solve import problem_of
+from rotavg_ros.solver.slam.preparation import Prepared, prepare
+from rotavg_ros.view_graph import ViewGraph
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What the search found, and what it finds from the truth by single flips alone (N nodes).
+
+    Attributes:
+        found: ``(N, 4)`` body_from_world as published.
+        from_truth: ``(N, 4)``.
+        rise: F of the best labelling found less that from the truth, nats. Above zero the search failed, below it the
+            posterior prefers another answer than the truth.
+        terms: of F, by how much each rises.
+        rivals: number of labellings that were averaged.
+    """
+
+    found: Tensor
+    from_truth: Tensor
+    rise: float
+    terms: dict[str, float]
+    rivals: int
+
+
+@torch.no_grad()
+def compare_with_truth(
+    graph: ViewGraph,
+    body_from_world: Tensor,
+    is_wrong: Tensor,
+    *,
+    without: Collection[str] = (),
+    weights: Path | None = None,
+) -> Comparison:
+    """Solve a robot's graph by its posterior, from its own starts and from the truth.
+
+    Args:
+        graph: N nodes, M edges.
+        body_from_world: ``(N, 4)`` true orientations, all known.
+        is_wrong: ``(M,)`` bool, false closures and odometry that slipped.
+        without: of :data:`rotavg_ros.solver.slam.options.SWITCHES`.
+        weights: folder of networks to use in place of the package's.
+    """
+    repeats = first_of_each(graph)
+    if repeats is not None:
+        first = torch.from_numpy(repeats[0])
+        graph, is_wrong = graph.select_edges(first), is_wrong[first]
+    prepared = prepare(graph)
+    network = None if "cleannet" in without else Networks("cpu", weights).load(SlamCleanNet)
+    cleaned = slam_stages.clean(network, prepared, graph.label)
+    problem = problem_of(prepared, cleaned, without)
+    modes = Search(problem).run(prepared, cleaned)
+    published = publish(problem, modes)
+
+    closure_graph = prepared.closure_graph
+    trusted = np.ones(len(closure_graph.source))
+    trusted[closure_graph.num_segments :] = ~is_wrong.numpy()[closure_graph.view_graph_edge]
+    slipped = closure_graph.segment_of_edge[is_wrong.numpy() & (closure_graph.segment_of_edge >= 0)]
+    trusted[slipped] = 0.0
+    search = Search(problem)
+    correction = closure_graph.corrections(body_from_world)
+    start = search.polished(at(problem, correction, trusted, noise_of(problem, prepared.noise)), "truth")
+    search.keep(flipped(start))
+    for mode in tuned(search.modes[0]):
+        search.keep(mode)
+    truth = search.modes[0]
+    terms = {name: nats - truth.evaluation.terms[name] for name, nats in modes[0].evaluation.terms.items()}
+    return Comparison(
+        _orientations(prepared, published.correction),
+        _orientations(prepared, of_mode(problem, truth.state).correction),
+        modes[0].cost - truth.cost,
+        terms,
+        len(published.rivals),
+    )
+
+
+def _orientations(prepared: Prepared, correction: np.ndarray) -> Tensor:
+    return prepared.closure_graph.orientations(torch.from_numpy(np.ascontiguousarray(correction.T)))
