@@ -49,8 +49,8 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
     chosen = contenders(names, ROSTER, keep=arguments.keep)
     with working("warming up"):
         warm_up(contenders(names, ROSTER).values(), ROSTER)
-    calibration = Calibration()
-    chosen[OURS] = calibration.watching(chosen[OURS])
+    calibrations = {name: Calibration() for name in (OURS, POSTERIOR) if name in chosen}
+    chosen |= {name: calibration.watching(chosen[name]) for name, calibration in calibrations.items()}
 
     def watch(steps: Iterable[Step]) -> Iterable[Step]:
         return progress(steps, total=len(kinds) * len(seeds) * len(chosen), description="solving", unit="solve")
@@ -60,7 +60,7 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
     if arguments.search_or_model and not scores.interrupted:
         cases_again = progress(drawings(kinds, seeds), total=len(kinds) * len(seeds), description="from the truth")
         diagnoses = [diagnose(case) for case in cases_again]
-    return stress_report.report(arguments.output, scores, calibration, arguments.command_line, diagnoses)
+    return stress_report.report(arguments.output, scores, calibrations, arguments.command_line, diagnoses)
 
 
 def _run_recorded(arguments: argparse.Namespace) -> Path:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,30 +53,35 @@ class Rival:
 
 
 def report(
-    folder: Path, scores: Scores, calibration: Calibration, command: str, diagnoses: Sequence[Diagnosis] = ()
+    folder: Path,
+    scores: Scores,
+    calibrations: Mapping[str, Calibration],
+    command: str,
+    diagnoses: Sequence[Diagnosis] = (),
 ) -> Path:
     """Write the tables; returns the Markdown file.
 
     Args:
-        calibration: of ours.
+        calibrations: of ours, by method.
         command: how to get the same figures again.
         diagnoses: of the posterior's answers.
     """
     names = scores.contenders
-    of_kinds = calibration.of_kinds(scores.cases)
-    title = "Calibration of ours"
     tables = {
         "stress-totals": _totals(scores, names),
         "stress-means": _means(scores, names),
         "stress-better": _better(scores),
         "stress-worst": _worst(scores),
-        "stress-calibration": stress_calibration.table(title, of_kinds, every_kind=False),
     }
     long = {
         "stress-kinds": _kinds(scores, names),
         "stress-cases": per_case("Every case", scores, _CASE_FIGURES, _CASE_KEY),
-        "stress-calibration-kinds": stress_calibration.table(title, of_kinds, every_kind=True),
     }
+    for name, calibration in calibrations.items():
+        of_kinds, title = calibration.of_kinds(scores.cases), f"Calibration of {ROWS[name].replace('**', '')}"
+        stem = "stress-calibration" if name == OURS else f"stress-calibration-{name}"
+        tables[stem] = stress_calibration.table(title, of_kinds, every_kind=False)
+        long[f"{stem}-kinds"] = stress_calibration.table(title, of_kinds, every_kind=True)
     if diagnoses:
         tables["stress-causes"] = search_or_model.shares("Why the posterior's answers are wrong", diagnoses)
         tables["stress-failures"] = search_or_model.failures("Wrong answers that are not divided", diagnoses)
