@@ -89,7 +89,17 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "update": {"graph", "network", "noise", "passes", "preparation", "refinement", "stages"},
         "stages": {"graph", "moves", "network", "noise", "options", "passes", "preparation", "refinement"},
         "posterior": {"graph", "moves", "noise", "preparation", "stages"},
-        "solve": {"graph", "network", "options", "passes", "posterior", "preparation", "refinement", "stages", "update"},
+        "solve": {
+            "graph",
+            "network",
+            "options",
+            "passes",
+            "posterior",
+            "preparation",
+            "refinement",
+            "stages",
+            "update",
+        },
     },
     "solver/slam/posterior": {
         "": set(),
@@ -173,7 +183,9 @@ ROOMS: dict[str, dict[str, set[str]]] = {
     },
 }
 # What those outside may import from the inside of a wing, besides its face.
-FACES = {"solver": {"batch", "closures", "devices", "diagnosis", "methods", "networks", "pipeline", "positions", "solution"}}
+FACES = {
+    "solver": {"batch", "closures", "devices", "diagnosis", "methods", "networks", "pipeline", "positions", "solution"}
+}
 INSIDERS = {"baselines": {"algebra", "neurora"}, "training": {"algebra", "neurora"}}
 # What a robot runs needs no more.
 NODE_MAY_USE = {"errors", "inputs", "online", "option", "settings", "solver", "version", "view_graph"}

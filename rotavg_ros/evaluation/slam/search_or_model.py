@@ -52,7 +52,7 @@ def diagnose(case: Case) -> Diagnosis:
     comparison = compare_with_truth(case.graph, case.truth, ~case.is_inlier)
     component = case.graph.components()
     found, from_truth = (
-        float(np.degrees(orientation_errors(orientations, case.truth, component).mean()))
+        float(np.degrees(orientation_errors(orientations, case.truth, component).numpy().mean()))
         for orientations in (comparison.found, comparison.from_truth)
     )
     return Diagnosis(case.key, found, from_truth, comparison.rise, comparison.terms)

@@ -1,0 +1,179 @@
+"""What the search finds on graphs whose truth is known, and what holds of every answer."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import fields, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros import rotations
+from rotavg_ros.datasets.simulation.stress.drawn import DrawnGraph
+from rotavg_ros.datasets.simulation.stress.kinds import KINDS
+from rotavg_ros.errors import UserError
+from rotavg_ros.metrics import orientation_errors
+from rotavg_ros.solver import Solution, solve
+from rotavg_ros.solver.diagnosis import compare_with_truth
+from rotavg_ros.solver.methods import POSTERIOR, SWITCHES, without
+from rotavg_ros.solver.slam import posterior
+from rotavg_ros.solver.slam.posterior.priors import SearchLimits, SlamPriors
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+
+
+@cache
+def drawn(kind: str, seed: int) -> DrawnGraph:
+    return next(one for one in KINDS if one.name == kind).drawn(seed)
+
+
+@cache
+def solved(kind: str, seed: int) -> Solution:
+    return solve(drawn(kind, seed).graph, profile="slam", method=POSTERIOR)
+
+
+def error_deg(graph: ViewGraph, solution: Solution, body_from_world: np.ndarray) -> float:
+    errors = orientation_errors(solution.body_from_world, torch.from_numpy(body_from_world), graph.components())
+    return float(np.degrees(errors.numpy().mean()))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", ["drive: 26 closures, 16 agree with noise", "building: 30 % grouped"])
+def test_no_slip_is_invented_to_save_false_closures_that_agree(kind: str, seed: int) -> None:
+    case, solution = drawn(kind, seed), solved(kind, seed)
+    is_flagged = solution.outlier_score.numpy() > 0.5
+    assert not is_flagged[~case.is_closure].any()
+    assert (is_flagged == case.is_false)[case.is_closure].mean() > 0.9
+
+
+@pytest.mark.parametrize("witnesses", [5, 10, 20])
+def test_a_slip_that_three_pairs_of_places_tell_of_is_found(witnesses: int) -> None:
+    kind = f"lone slip: {witnesses} witnesses, three pairs of places"
+    case, solution = drawn(kind, 0), solved(kind, 0)
+    assert error_deg(case.graph, solution, case.body_from_world) < 1.0
+    assert not (solution.outlier_score.numpy() > 0.5)[case.is_closure].any()
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["building: 30 % near misses", "hills: closures of 6°", "3 robots: half random", "building: precisions that lie"],
+)
+def test_what_is_published_as_false_does_not_pull(kind: str) -> None:
+    case, solution = drawn(kind, 0), solved(kind, 0)
+    false = case.is_closure & (solution.outlier_score.numpy() >= 0.95)
+    assert false.any()
+    label = torch.where(torch.from_numpy(false), int(EdgeLabel.REJECTED), int(EdgeLabel.AUTOMATIC)).to(case.graph.label)
+    again = solve(replace(case.graph, label=label), profile="slam", method=POSTERIOR)
+    moved = rotations.log(rotations.multiply(rotations.inverse(again.body_from_world), solution.body_from_world)).norm(
+        dim=1
+    )
+    assert bool((moved <= solution.uncertainty.clamp(min=float(np.radians(0.05)))).all())
+
+
+@pytest.mark.parametrize("kind", ["building: 30 % grouped", "hills: 50 % random"])
+def test_order_and_direction_of_edges_change_nothing(kind: str) -> None:
+    case, solution = drawn(kind, 1), solved(kind, 1)
+    rng = np.random.default_rng(0)
+    order = torch.from_numpy(rng.permutation(case.graph.num_edges))
+    shuffled = case.graph.select_edges(order)
+    turned = torch.from_numpy(rng.random(shuffled.num_edges) < 0.5) & ~shuffled.is_odometry
+    again = solve(
+        replace(
+            shuffled,
+            source=torch.where(turned, shuffled.target, shuffled.source),
+            target=torch.where(turned, shuffled.source, shuffled.target),
+            target_from_source=torch.where(
+                turned[:, None], rotations.inverse(shuffled.target_from_source), shuffled.target_from_source
+            ),
+        ),
+        profile="slam",
+        method=POSTERIOR,
+    )
+    moved = rotations.multiply(rotations.inverse(again.body_from_world), solution.body_from_world)
+    assert float(np.degrees(float(rotations.log(moved).norm(dim=1).max()))) < 0.02
+    torch.testing.assert_close(again.outlier_score, solution.outlier_score[order], atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize("name", SWITCHES)
+def test_every_switch_has_an_effect_or_none_but_always_an_answer(name: str) -> None:
+    case = drawn("building: 15 closures", 0)
+    solution = solve(case.graph, profile="slam", method=without(name))
+    assert error_deg(case.graph, solution, case.body_from_world) < 10
+    assert bool(((solution.outlier_score >= 0) & (solution.outlier_score <= 1)).all())
+
+
+def test_a_switch_that_does_not_exist_is_an_error() -> None:
+    for method in (f"{POSTERIOR}~nothing", "neurora~slips", f"{POSTERIOR}~slips~groups"):
+        with pytest.raises(UserError, match="unknown method"):
+            solve(drawn("building: 15 closures", 0).graph, method=method)
+
+
+def test_labels_decide() -> None:
+    case = drawn("building: 30 % grouped", 0)
+    label = case.graph.label.clone()
+    closures = np.flatnonzero(case.is_closure)
+    good, false = closures[~case.is_false[closures]][0], closures[case.is_false[closures]][0]
+    label[good], label[false] = int(EdgeLabel.REJECTED), int(EdgeLabel.ACCEPTED)
+    score = solve(replace(case.graph, label=label), profile="slam", method=POSTERIOR).outlier_score
+    assert (float(score[good]), float(score[false])) == (1.0, 0.0)
+
+
+def test_graphs_with_little_in_them() -> None:
+    chain = ViewGraph.create([0, 1, 2], [1, 2, 3], [[0.0, 0.0, 0.0, 1.0]] * 3, kind=[0, 0, 0])
+    closed = ViewGraph.create([0, 1, 0], [1, 2, 2], [[0.0, 0.0, 0.0, 1.0]] * 3, kind=[0, 0, 1])
+    apart = ViewGraph.create([0, 2, 0], [1, 3, 1], [[0.0, 0.0, 0.0, 1.0]] * 3, num_nodes=4, kind=[0, 0, 1])
+    for graph in (chain, closed, apart):
+        solution = solve(graph, profile="slam", method=POSTERIOR)
+        torch.testing.assert_close(solution.body_from_world, rotations.identity(graph.num_nodes))
+        assert float(solution.outlier_score.max()) < 0.5
+
+
+def test_from_the_truth_f_is_no_higher_than_what_the_search_finds() -> None:
+    case = drawn("building: 50 % random", 0)
+    comparison = compare_with_truth(case.graph, torch.from_numpy(case.body_from_world), torch.from_numpy(case.is_false))
+    assert comparison.rise < 5
+    assert comparison.rise == pytest.approx(sum(comparison.terms.values()))
+
+
+def test_there_are_few_numbers() -> None:
+    assert len(fields(SlamPriors)) <= 20
+    assert len(fields(SearchLimits)) <= 15
+
+
+# Numbers of the posterior's modules that are neither beliefs nor bounds of the search: quadrature nodes, convergence,
+# numerical floors.
+STRUCTURAL = {
+    "densities": set[str](),
+    "em": {"_SETTLED_TURN", "_MAX_UNSETTLED", "_NOISE_SOLVES", "_NOISE_CONVERGED", "_PROBABILITY_CONVERGED"}
+    | {"_NEWTON_STEPS", "_FARTHEST"},
+    "inference": {"_GAIN", "_BEAM"},
+    "labels": {"_SHARES", "_STAY", "_NEAR_SHARES", "_FAR_SHARES", "_REPEAT_DEG", "_LEAST", "_GRID_SIZE"}
+    | {"_LOG_FIRST", "_LOG_FOLLOWS", "_LOG_STEPS"},
+    "left_out": {"_LEAST_REST"},
+    "modes": {"_FAR", "_SURELY_FALSE", "_ROUNDS"},
+    "moves/flips": {"_PART", "_LEAST_GAIN"},
+    "moves/groups": {"_AGREE", "_TIGHTER", "_SETTLING", "_MAX_DENSE"},
+    "moves/noise": {"_GRIDS", "_MIN_SPREAD"},
+    "moves/slips": {"_AGREE", "_AGREE_ANGLE", "_SETTLING"},
+    "moves/starts": {"_INLIER_SQUARE", "_SHARP", "_STEP_LEVELS", "_CLOSURE_LEVEL", "_ROBUST_POWER"}
+    | {"_ANNEALED_SLIPS", "_LEAST_WEIGHT"},
+    "problem": {"_NONE"},
+    "rows": {"_NOTHING", "_MAX_TURN"},
+    "system": {"_NUM_PROBES", "_MAX_LEVERAGE"},
+}
+
+
+def test_beliefs_and_bounds_stand_in_two_classes() -> None:
+    folder = Path(posterior.__file__).parent
+    for file in sorted(folder.rglob("*.py")):
+        names = {
+            name.id
+            for node in ast.parse(file.read_text()).body
+            if isinstance(node, ast.Assign)
+            for target in node.targets
+            for name in ast.walk(target)
+            if isinstance(name, ast.Name)
+        }
+        assert names <= STRUCTURAL.get(str(file.relative_to(folder).with_suffix("")), set()), file
