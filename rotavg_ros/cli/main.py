@@ -94,6 +94,11 @@ def print_error(error: UserError) -> None:
     print(f"rotavg: error: {error}", file=sys.stderr)
 
 
+def print_warning(warning: str) -> None:
+    """A line about what went on in spite of something."""
+    print(f"rotavg: warning: {warning}", file=sys.stderr)
+
+
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """What the words after ``rotavg`` say; besides options, ``command`` and ``command_line`` (see :class:`Command`).
 

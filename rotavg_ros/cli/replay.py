@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +11,7 @@ from types import FrameType
 from typing import Any
 
 from rotavg_ros.bags.reader import BagReader
+from rotavg_ros.cli.main import print_warning
 from rotavg_ros.cli.progress import seconds_bar, working
 from rotavg_ros.errors import UserError
 from rotavg_ros.replay.options import read_parameter_file, read_settings
@@ -47,9 +47,11 @@ def run(arguments: argparse.Namespace) -> int:
         window = Window(arguments.start, arguments.duration, arguments.rate)
         summary = _replay(bag, plan, window, arguments)
     print(_told(summary, arguments.output))
+    for warning in summary["warnings"]:
+        print_warning(f"{arguments.bag}: {warning}")
     if summary["damage"] is None:
         return 0
-    print(f"rotavg: warning: {summary['damage']}; what could be read is in {arguments.output}", file=sys.stderr)
+    print_warning(f"{summary['damage']}; what could be read is in {arguments.output}")
     return 2
 
 

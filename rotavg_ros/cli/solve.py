@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from rotavg_ros.cli.main import EXIT_USER_ERROR, print_error
+from rotavg_ros.cli.main import EXIT_USER_ERROR, print_error, print_warning
 from rotavg_ros.cli.options.solve import EDGE_FORMATS
 from rotavg_ros.cli.poses import POSE_FILES, write_corrected_poses
 from rotavg_ros.cli.progress import working
@@ -72,6 +72,8 @@ def run(arguments: argparse.Namespace) -> int:
             errors.append(mistake)
         else:
             print(f"{job.graph}: {_told(summary)} → {job.output}", flush=True)
+            for warning in summary["warnings"]:
+                print_warning(f"{job.graph}: {warning}")
     for error in errors:
         print_error(error)
     return EXIT_USER_ERROR if errors else 0
@@ -163,6 +165,7 @@ def summarize(
         "loop_closures": int(is_closure.sum()),
         "outliers": int(outlier.sum()),
         "flagged_closures": int((outlier & is_closure).sum()),
+        "warnings": list(solution.warnings),
         "skipped": graph_file.skipped,
         "stage_seconds": solution.stage_seconds,
         "read_seconds": read_seconds,

@@ -143,11 +143,7 @@ def _notes(facts: RunFacts) -> list[str]:
             f"The graph falls into {record.answer.num_components} parts that no edge connects; each is right only "
             "within itself."
         )
-    if facts.num_flagged > 0.5 * len(facts.closures) > 0:
-        notes.append(
-            "More than half of the loop closures are held false. Check that their direction (target in the source's "
-            "frame) and their sensor's mounting are as documented before blaming the front end."
-        )
+    notes += [f"{warning[:1].upper()}{warning[1:]}." for warning in record.answer.warnings]
     if facts.num_flagged_odometry:
         count = _count(facts.num_flagged_odometry, "odometry edge")
         notes.append(f"{count} contradict the rest of the graph: a slip, a jump, or a wrong stamp.")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from rotavg_ros.solver import warnings
 from rotavg_ros.solver.methods import NETWORK_METHODS
 from rotavg_ros.solver.pipeline import solve
 from rotavg_ros.solver.solution import Solution
@@ -73,7 +74,7 @@ def _split(joint: Solution, graphs: Sequence[ViewGraph]) -> list[Solution]:
     node = _starts([graph.num_nodes for graph in graphs])
     edge = _starts([graph.num_edges for graph in graphs])
     parts = []
-    for index in range(len(graphs)):
+    for index, graph in enumerate(graphs):
         nodes, edges = slice(node[index], node[index + 1]), slice(edge[index], edge[index + 1])
         component = joint.component[nodes]
         parts.append(
@@ -86,6 +87,7 @@ def _split(joint: Solution, graphs: Sequence[ViewGraph]) -> list[Solution]:
                 joint.method,
                 joint.profile,
                 joint.device,
+                warnings=warnings.mostly_flagged(graph.to("cpu"), joint.outlier_score[edges]),
             )
         )
     return parts

@@ -17,12 +17,14 @@ class Estimate:
     """What a profile's solve gives: orientations in any gauge, scores, variance in rad² (NaN: unknown).
 
     ``memory`` is what makes the profile's next solve of the same graph, grown a little, cheaper; nobody else reads it.
+    ``warnings`` say why it should not be trusted, a sentence each.
     """
 
     body_from_world: Tensor
     outlier_score: Tensor
     variance: Tensor
     memory: object | None = None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass

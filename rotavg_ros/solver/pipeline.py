@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rotavg_ros import baselines, rotations
 from rotavg_ros.errors import UserError
-from rotavg_ros.solver import devices
+from rotavg_ros.solver import devices, warnings
 from rotavg_ros.solver.algebra.threads import workers
 from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
 from rotavg_ros.solver.methods import (
@@ -118,6 +118,7 @@ def solve(
         profile,
         where,
         estimate.memory,
+        (*estimate.warnings, *warnings.mostly_flagged(graph, score)),
     )
 
 
@@ -143,8 +144,19 @@ def _run(job: _Job, run: Run, memory: SlamMemory | None) -> Estimate:
     if memory is not None and run.warm_start is not None and job.profile == "slam":
         estimate = update_slam(job.graph, memory, run)
         if estimate is not None:
-            return estimate
-    return _solve_once(job, job.names[-1], replace(run, refinement_steps=last_steps))
+            return replace(estimate, warnings=memory.warnings)
+    estimate = _solve_once(job, job.names[-1], replace(run, refinement_steps=last_steps))
+    return _with_warnings(job.graph, estimate) if job.profile == "slam" else estimate
+
+
+def _with_warnings(graph: ViewGraph, estimate: Estimate) -> Estimate:
+    """With those about a whole solve of a robot's graph, which hold until the next one."""
+    found = warnings.of_whole_solve(graph, estimate.body_from_world, estimate.outlier_score)
+    found = (*estimate.warnings, *found)
+    goes_on = estimate.memory
+    if isinstance(goes_on, SlamMemory):
+        goes_on = replace(goes_on, warnings=found)
+    return replace(estimate, warnings=found, memory=goes_on)
 
 
 def _refines_slam(job: _Job) -> bool:

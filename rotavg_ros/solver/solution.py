@@ -23,6 +23,7 @@ class Solution:
         method, profile, device: what was run, with "auto" resolved.
         memory: what makes the next solve of the same graph cheaper once it has grown a little, to be handed to it as it
             is; None if there is none.
+        warnings: why it should not be trusted, a sentence each: what was seen, what may be the cause, what to do.
     """
 
     body_from_world: Tensor
@@ -34,6 +35,7 @@ class Solution:
     profile: str
     device: str
     memory: object | None = None
+    warnings: tuple[str, ...] = ()
 
     @property
     def world_from_body(self) -> Tensor:

@@ -96,6 +96,27 @@ def test_answer(graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert summary["peak_memory_bytes"] > 10_000_000
 
 
+def test_warnings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Twelve closures that state the wrong way round what a quarter of a turn in thirty steps measures."""
+    path, out = tmp_path / "run.g2o", tmp_path / "out"
+    edge = "EDGE_SE2 {} {} 0 0 {:.9f} 1 0 0 1 0 100\n"
+    odometry = "".join(edge.format(i, i + 1, np.pi / 60) for i in range(400))
+    closures = [edge.format(i, i + 30, -np.pi / 2) for i in range(0, 360, 30)]
+    path.write_text(odometry + "".join(closures))
+    assert main(["solve", str(path), "--output", str(out)]) == 0
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    summary = json.loads((out / "summary.json").read_text())
+    assert lines == [f"rotavg: warning: {path}: {text}" for text in summary["warnings"]]
+    assert "0 of 12 loop closures agree" in lines[0] and "12 would with the closures' rotations inverted" in lines[0]
+    assert "401 nodes" in captured.out
+
+    path.write_text(odometry)
+    assert main(["solve", str(path), "--output", str(out)]) == 0
+    assert capsys.readouterr().err == ""
+    assert json.loads((out / "summary.json").read_text())["warnings"] == []
+
+
 def test_components_lone_nodes_and_skipped_lines(tmp_path: Path) -> None:
     path = tmp_path / "two.g2o"
     edge = "EDGE_SE2 {} {} 1 0 0.1 1 0 0 1 0 100\n"

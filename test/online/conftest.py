@@ -23,6 +23,7 @@ class TreeSolution:
     profile: str = "slam"
     device: str = "cpu"
     memory: None = None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass

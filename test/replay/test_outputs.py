@@ -87,6 +87,7 @@ def test_tables_are_like_those_of_solve(run: SimulatedRun, replayed: Path) -> No
     assert list(orientations) == ["id", "qx", "qy", "qz", "qw", "component"]
     assert list(edges) == ["source", "target", "outlier_score", "outlier"]
     summary = json.loads((replayed / "summary.json").read_text())
+    assert summary["warnings"] == []
     assert len(orientations["id"]) == summary["keyframes"]
     assert (np.diff(orientations["id"]) == 1).all()
     assert summary["edges"] == len(edges["source"])

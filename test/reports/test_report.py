@@ -154,6 +154,14 @@ def test_a_page_says_what_is_missing(record: RunRecord, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("few_pictures")
+def test_warnings_stand_above_all_results(record: RunRecord, tmp_path: Path) -> None:
+    warned = replace(record, answer=replace(record.answer, warnings=("closures <may> be inverted: invert them",)))
+    text = Page(write_report(warned, tmp_path)).text
+    assert "Closures <may> be inverted: invert them." in text
+    assert text.index("Closures <may> be") < text.index("Odometry and the corrected trajectory")
+
+
+@pytest.mark.usefixtures("few_pictures")
 def test_a_reference_at_another_time(record: RunRecord, tmp_path: Path) -> None:
     (robot,) = record.robots
     assert robot.reference is not None

@@ -47,6 +47,7 @@ class Answer:
         seconds: of the whole tick.
         stage_seconds: of the solver's stages.
         method, profile, device: as the solver resolved them.
+        warnings: why it should not be trusted, a sentence each.
     """
 
     version: int
@@ -74,6 +75,7 @@ class Answer:
     method: str
     profile: str
     device: str
+    warnings: tuple[str, ...] = ()
 
     @classmethod
     def of_solution(
@@ -120,6 +122,7 @@ class Answer:
             method=solution.method,
             profile=solution.profile,
             device=solution.device,
+            warnings=solution.warnings,
         )
 
     @property
@@ -139,4 +142,4 @@ class Answer:
         arrays: dict[str, Any] = {
             name: value[:0] for name, value in vars(self).items() if isinstance(value, np.ndarray)
         }
-        return replace(self, robots=(), **arrays)
+        return replace(self, robots=(), warnings=(), **arrays)

@@ -17,7 +17,6 @@ from rotavg_ros.view_graph import EdgeKind
 _STALE_PERIODS = 10
 # Ticks longer ago than this say nothing about the load now.
 _RECENT_S = 60.0
-_SUSPICIOUS_OUTLIER_SHARE = 0.5
 # Robots' names come from messages and may be anything; a few are told.
 _MOST_NAMES = 3
 # What happens when time goes back, by the policy.
@@ -105,9 +104,7 @@ def _warnings(health: Health, parameters: NodeParameters, now: float) -> list[st
     if answer is not None:
         if answer.num_components > 1:
             warnings.append(f"the graph is in {answer.num_components} components")
-        closures = answer.kind == EdgeKind.LOOP_CLOSURE
-        if closures.any() and answer.outlier[closures].mean() > _SUSPICIOUS_OUTLIER_SHARE:
-            warnings.append(f"{100 * answer.outlier[closures].mean():.0f} % of the loop closures are outliers")
+        warnings += answer.warnings
         if parameters.estimator.device == "cuda" and answer.device == "cpu":
             warnings.append("device cuda was asked for, cpu is used")
     return warnings

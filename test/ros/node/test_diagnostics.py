@@ -30,6 +30,7 @@ def answer(**changes: object) -> SimpleNamespace:
         "profile": "slam",
         "method": "neurora",
         "was_cold": True,
+        "warnings": (),
     }
     return SimpleNamespace(**values | changes)
 
@@ -62,7 +63,7 @@ def test_all_is_well(health: Health) -> None:
     [
         ({"mistakes": ["nobody publishes /odom"]}, WARN, "nobody publishes /odom"),
         ({"answer": answer(num_components=2)}, WARN, "2 components"),
-        ({"answer": answer(outlier=np.ones(4, bool))}, WARN, "100 % of the loop closures"),
+        ({"answer": answer(warnings=("3 of 4 are flagged", "inverted"))}, WARN, "3 of 4 are flagged; inverted"),
         ({"failure": "no memory"}, ERROR, "solving fails: no memory"),
         ({"unsolved_since": -100.0}, ERROR, "stale"),
     ],
@@ -72,6 +73,13 @@ def test_what_is_wrong_is_said(health: Health, changes: dict[str, object], level
         setattr(health, name, time.monotonic() + value if isinstance(value, float) else value)
     status = report(health)
     assert status.level == level and message in status.message
+
+
+def test_warnings_about_an_answer_stay_until_one_has_none(health: Health) -> None:
+    health.answer = answer(warnings=("all would agree inverted",))
+    assert [report(health).level for _ in range(3)] == [WARN] * 3
+    health.answer = answer()
+    assert (report(health).level, report(health).message) == (OK, "ok")
 
 
 def test_silence_is_told_of_each_topic(health: Health) -> None:

@@ -98,6 +98,7 @@ class SlamMemory:
         closures: how many there were when the whole solve ran.
         updates: how many there have been since.
         limits: of the updates.
+        warnings: about the answer of the whole solve.
     """
 
     graph: ViewGraph
@@ -118,6 +119,7 @@ class SlamMemory:
     closures: int
     updates: int = 0
     limits: UpdateLimits = field(default_factory=UpdateLimits)
+    warnings: tuple[str, ...] = ()
 
     @classmethod
     def of(

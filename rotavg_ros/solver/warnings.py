@@ -1,0 +1,310 @@
+"""Why an answer should not be trusted: what measurements and answer look like when a convention was mistaken.
+
+All functions are pure and change nothing. They compare loop closures with the odometry between their ends, as it is
+stated and as it would be under a hypothesis: rotations inverted, quaternions in another order. Only closures that the
+hypothesis turns by 30° and more count: an identity is its own inverse and speaks for neither.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.residuals import edge_residual
+from rotavg_ros.solver.algebra.spanning_forest import (
+    SpanningForest,
+    accumulate_to_root,
+    compose_orientations,
+    shortest_path_forest,
+)
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+
+# The probability above which an edge counts as flagged.
+_FLAGGED = 0.5
+# Closures that more than half of which are flagged says something of.
+_MIN_CLOSURES = 4
+# A closure agrees with a prediction up to so many degrees: the noise that makes an edge of a robot's graph an outlier,
+# and twice as much for odometry that drifts. Beside it, the closures that this takes: of fewer, more than half agree by
+# chance with a probability above 3e-5 (in the plane, where random rotations agree with probability 1/18 or 1/9).
+_TOLERANCES = ((10.0, 8), (20.0, 16))
+_MIN_COMPARED = _TOLERANCES[0][1]
+# False closures of one pair of places agree with each other, and so by chance with a prediction: those that agree join
+# at least so many pairs of stretches, each of so many odometry edges.
+_MIN_PLACES, _STRETCH = 3, 30
+# A closure tells two readings apart if they differ by so many tolerances.
+_TELLS = 3.0
+# Closures that are compared at most, those with the shortest ways along odometry.
+_MAX_COMPARED = 200
+# A hypothesis is stated if less than the first share agrees without it and more than the second with it. No random
+# closures reach the second; 70 % of the closures must be wrong to stay below the first.
+_SHARE_AS_STATED, _SHARE_OTHERWISE = 0.3, 0.6
+# Of hypotheses whose shares differ by no more than such a factor, the first is stated.
+_NEARLY = 0.9
+# An odometry edge turns by less than the first in the median, rad, and by more than the second if its quaternion's
+# order is mistaken: w = cos(θ/2) in x's place makes a turn by θ one by 180° - θ or more.
+_SMALL_STEP, _LARGE_STEP = math.radians(60.0), math.radians(120.0)
+# So few believed closures may be false together; they turn the answer far from odometry's if by more than this, rad.
+_FEW_BELIEVED, _FAR = 10, math.radians(30.0)
+
+
+def mostly_flagged(graph: ViewGraph, outlier_score: Tensor) -> tuple[str, ...]:
+    """More than half of the loop closures (of a graph without odometry: of the edges) flagged, labelled ones apart.
+
+    Args:
+        graph: on the CPU, M edges.
+        outlier_score: ``(M,)``.
+    """
+    judged = ~graph.is_odometry & (graph.label == EdgeLabel.AUTOMATIC)
+    closures, flagged = int(judged.sum()), int((judged & (outlier_score > _FLAGGED)).sum())
+    if closures < _MIN_CLOSURES or 2 * flagged <= closures:
+        return ()
+    what = "loop closures" if bool(graph.is_odometry.any()) else "edges"
+    return (
+        f"{flagged} of {closures} {what} are flagged as false; the front end may match wrong places, or all of them "
+        "may have a wrong direction, sensor mounting or clock: check that each edge's rotation is the target's in the "
+        "source's frame, and compare some with the odometry by hand",
+    )
+
+
+def of_whole_solve(graph: ViewGraph, body_from_world: Tensor, outlier_score: Tensor) -> tuple[str, ...]:
+    """What a solve of a robot's graph from scratch is checked for besides.
+
+    Args:
+        graph: on the CPU, N nodes, M edges.
+        body_from_world: ``(N, 4)`` the answer, in any gauge.
+        outlier_score: ``(M,)``.
+    """
+    closures = ~graph.is_odometry & (graph.label != EdgeLabel.REJECTED)
+    if not bool(graph.is_odometry.any()):
+        return ()
+    odometry = _Odometry.of(graph)
+    found = [_mistaken_convention(odometry, graph.select_edges(closures.nonzero()[:, 0]))]
+    believed = int((closures & (outlier_score <= _FLAGGED)).sum())
+    if 0 < believed < _FEW_BELIEVED and bool((graph.components() == odometry.component).all()):
+        found.append(_far_from_odometry(odometry, body_from_world, believed))
+    return tuple(text for text in found if text is not None)
+
+
+def _far_from_odometry(odometry: _Odometry, body_from_world: Tensor, believed: int) -> str | None:
+    angle = float(_angles_after_alignment(odometry.orientation, body_from_world, odometry.component).mean())
+    if angle <= _FAR:
+        return None
+    count = "1 believed loop closure turns" if believed == 1 else f"{believed} believed loop closures turn"
+    return (
+        f"{count} the orientations by {math.degrees(angle):.0f}° in the mean from odometry's; so few may be false "
+        "together: look at them, label those that are wrong, or compare with odometry alone"
+    )
+
+
+def _angles_after_alignment(a: Tensor, b: Tensor, component: Tensor) -> Tensor:
+    """``(N,)`` angles between orientations after the one rotation of the world, for each component, that suits best.
+
+    It is the chordal mean of a_v⁻¹ b_v: the first eigenvector of Σ q qᵀ (Markley et al. 2007).
+    """
+    turn = rotations.multiply(rotations.inverse(a), b)
+    moment = torch.zeros(int(component.max()) + 1, 4, 4, dtype=turn.dtype)
+    moment.index_add_(0, component, turn[:, :, None] * turn[:, None, :])
+    mean = torch.linalg.eigh(moment)[1][:, :, -1]
+    return rotations.angle_between(mean[component], turn)
+
+
+# Quaternions as stored, target_from_source ``(n, 4)``, to what they would be.
+_Reading = Callable[[Tensor], Tensor]
+
+
+def _as_stated(quaternions: Tensor) -> Tensor:
+    return quaternions
+
+
+def _reordered(quaternions: Tensor) -> Tensor:
+    """(w, x, y, z) taken for (x, y, z, w), put right."""
+    return quaternions[:, [1, 2, 3, 0]]
+
+
+def _inversely_reordered(quaternions: Tensor) -> Tensor:
+    """The same where the inverse of what is stored was written, as files and messages have it."""
+    return rotations.inverse(_reordered(rotations.inverse(quaternions)))
+
+
+class _Hypothesis(NamedTuple):
+    """How rotations would have to be read, and whose they are."""
+
+    odometry: _Reading
+    closures: _Reading
+    whose: str
+    is_order: bool
+
+
+_INVERTED = _Hypothesis(_as_stated, rotations.inverse, "the closures'", False)
+_OR_THOSE = "they (or the odometry's instead, if all turn about one axis)"
+_CLOSURES_REORDERED = (
+    _Hypothesis(_as_stated, _inversely_reordered, "the closures'", True),
+    _Hypothesis(_as_stated, _reordered, "the closures'", True),
+)
+# All reordered is the same whether the inverse was written or not, up to half a turn of the world about z.
+_ODOMETRY_REORDERED = (
+    _Hypothesis(_inversely_reordered, _inversely_reordered, "all", True),
+    _Hypothesis(_inversely_reordered, _as_stated, "the odometry's", True),
+)
+# In the plane inverting all changes no agreement, and inverting odometry is as good as inverting closures.
+_ODOMETRY_INVERTED = (
+    _Hypothesis(rotations.inverse, _as_stated, "the odometry's", False),
+    _Hypothesis(rotations.inverse, rotations.inverse, "all", False),
+)
+
+
+class _Agreement(NamedTuple):
+    """Within ``degrees``: how many closures were compared, agree with odometry as stated, and under a hypothesis.
+
+    The latter join ``places`` pairs of stretches.
+    """
+
+    hypothesis: _Hypothesis
+    degrees: float
+    compared: int
+    as_stated: int
+    otherwise: int
+    places: int
+
+    @property
+    def is_striking(self) -> bool:
+        return (
+            self.compared >= dict(_TOLERANCES)[self.degrees]
+            and self.as_stated < _SHARE_AS_STATED * self.compared
+            and self.otherwise > _SHARE_OTHERWISE * self.compared
+            and self.places >= _MIN_PLACES
+        )
+
+    @property
+    def share(self) -> float:
+        """Of the closures compared, those that agree under the hypothesis."""
+        return self.otherwise / self.compared
+
+    def __str__(self) -> str:
+        whose = self.hypothesis.whose
+        changed = "in the order w, x, y, z" if self.hypothesis.is_order else "inverted"
+        return (
+            f"{self.as_stated} of {self.compared} loop closures agree with the odometry between their ends within "
+            f"{self.degrees:.0f}°, and {self.otherwise} would with {whose} rotations {changed}"
+        )
+
+
+@dataclass(frozen=True)
+class _Odometry:
+    """The odometry edges of a graph that nobody has rejected.
+
+    Attributes:
+        graph: all nodes, and these edges alone.
+        forest: of the fewest edges.
+    """
+
+    graph: ViewGraph
+    forest: SpanningForest
+
+    @classmethod
+    def of(cls, graph: ViewGraph) -> _Odometry:
+        usable = graph.is_odometry & (graph.label != EdgeLabel.REJECTED)
+        alone = graph.select_edges(usable.nonzero()[:, 0])
+        return cls(alone, shortest_path_forest(alone, root="first"))
+
+    @property
+    def component(self) -> Tensor:
+        """``(N,)`` what odometry alone connects, numbered by first node."""
+        return torch.from_numpy(self.forest.component)
+
+    def level(self) -> Tensor:
+        """``(N,)`` edges from the root: along a chain, ways are differences of these."""
+        return torch.from_numpy(accumulate_to_root(self.forest, (self.forest.parent_edge >= 0) * 1.0))
+
+    def median_angle(self, reading: _Reading) -> float:
+        """Of its edges, in radians."""
+        cosine = reading(self.graph.target_from_source)[:, 3].abs()
+        return 2 * math.acos(min(float(cosine.median()), 1.0)) if len(cosine) else 0.0
+
+    @cached_property
+    def orientation(self) -> Tensor:
+        """``(N, 4)`` body_from_world composed along it."""
+        return compose_orientations(self.forest, self.graph)
+
+    def read_as(self, reading: _Reading) -> Tensor:
+        """The same under another reading."""
+        if reading is _as_stated:
+            return self.orientation
+        read = reading(self.graph.target_from_source)
+        return compose_orientations(self.forest, replace(self.graph, target_from_source=read))
+
+
+def _mistaken_convention(odometry: _Odometry, closures: ViewGraph) -> str | None:
+    """Inverted rotations or another order of quaternions, of the closures, the odometry or both."""
+    tells = odometry.component[closures.source] == odometry.component[closures.target]
+    closures = closures.select_edges(tells.nonzero()[:, 0])
+    stated, reordered = (odometry.median_angle(reading) for reading in (_as_stated, _reordered))
+    is_reordered = stated > _LARGE_STEP and reordered < _SMALL_STEP
+    agreements = []
+    if closures.num_edges >= _MIN_COMPARED:
+        agreements = list(_agreements(odometry, closures, is_reordered))
+    most = max((agreement.share for agreement in agreements), default=0.0)
+    best = next((agreement for agreement in agreements if agreement.share >= _NEARLY * most), None)
+    order = "w, x, y, z may have been written where x, y, z, w is read: write x, y, z, w"
+    if is_reordered:
+        whose = "their" if best is None else best.hypothesis.whose
+        return (
+            f"odometry edges turn by {math.degrees(stated):.0f}° in the median, and would by "
+            f"{math.degrees(reordered):.0f}° with {whose} quaternions in the order w, x, y, z; {order}"
+        )
+    if best is None:
+        return None
+    if best.hypothesis.is_order:
+        return f"{best}; {order}"
+    return (
+        f"{best}; {_OR_THOSE if best.hypothesis == _INVERTED else 'they'} may be the source's in the target's frame, "
+        "while the target's in the source's is read: invert them, or swap source and target of these edges"
+    )
+
+
+def _agreements(odometry: _Odometry, closures: ViewGraph, is_reordered: bool) -> Iterator[_Agreement]:
+    """What is striking. Inverting closures turns only some; what turns all is tried where few agree as it is."""
+    level = odometry.level()
+    nearest = (level[closures.source] - level[closures.target]).abs().argsort(stable=True)
+    closures = closures.select_edges(nearest)
+    ends = torch.stack((level[closures.source], level[closures.target])).sort(dim=0)[0] // _STRETCH
+    stated = _errors(odometry.orientation, closures, _as_stated)
+    angle_as_stated = torch.rad2deg(rotations.angle(stated))
+    if not is_reordered and int((angle_as_stated > _TOLERANCES[0][0]).sum()) <= _SHARE_OTHERWISE * _MIN_COMPARED:
+        return
+    hypotheses: tuple[_Hypothesis, ...] = (_INVERTED,)
+    if is_reordered:
+        hypotheses = _ODOMETRY_REORDERED
+    elif bool((angle_as_stated[:_MAX_COMPARED] < _TOLERANCES[0][0]).double().mean() < _SHARE_AS_STATED):
+        hypotheses = (_INVERTED, *_CLOSURES_REORDERED, *_ODOMETRY_INVERTED)
+        # In another order, odometry that turns little would turn by half a turn at every edge.
+        if odometry.median_angle(_reordered) < _LARGE_STEP:
+            hypotheses = (*hypotheses, *_ODOMETRY_REORDERED)
+    composed = {reading: odometry.read_as(reading) for reading in {hypothesis.odometry for hypothesis in hypotheses}}
+    for hypothesis in hypotheses:
+        errors = _errors(composed[hypothesis.odometry], closures, hypothesis.closures)
+        angle, apart = (
+            torch.rad2deg(value) for value in (rotations.angle(errors), rotations.angle_between(stated, errors))
+        )
+        for degrees, _ in _TOLERANCES:
+            tells = (apart > _TELLS * degrees).nonzero()[:_MAX_COMPARED, 0]
+            as_stated = int((angle_as_stated[tells] < degrees).sum())
+            agree = tells[angle[tells] < degrees]
+            places = np.unique(ends[:, agree].numpy(), axis=1).shape[1]
+            agreement = _Agreement(hypothesis, degrees, len(tells), as_stated, len(agree), places)
+            if agreement.is_striking:
+                yield agreement
+
+
+def _errors(orientation: Tensor, closures: ViewGraph, reading: _Reading) -> Tensor:
+    """``(n, 4)`` closures' residuals under orientations ``(N, 4)``."""
+    measured = reading(closures.target_from_source)
+    return edge_residual(orientation, measured, closures.source, closures.target)
