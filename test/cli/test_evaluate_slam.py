@@ -92,3 +92,17 @@ def test_mistakes(
     monkeypatch.delenv("ROTAVG_DATA", raising=False)
     assert main(["evaluate", "slam", "--no-peers", "--no-uncertainty", "--output", str(tmp_path), *options]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_stress_tells_why_answers_are_wrong_and_what_parts_earn(tmp_path: Path) -> None:
+    command = ["evaluate", "slam", "--suite", "stress", "--output", str(tmp_path), "--threads", "1", "--seeds", "1000"]
+    command += ["--kinds", "drive: 26 closures, 16 agree exactly", "--methods", "odometry"]
+    assert main([*command, "--without", "repeats", "--search-or-model"]) == 0
+    with (tmp_path / "stress-cases.csv").open() as file:
+        methods = [row["method"] for row in csv.DictReader(file)]
+    assert methods == ["neurora", "odometry", "neurora-posterior", "neurora-posterior~repeats", "oracle"]
+    with (tmp_path / "stress-causes.csv").open() as file:
+        everything, kind = csv.DictReader(file)
+    assert (everything["kind"], everything["drawings"]) == ("all", "1")
+    assert sum(float(kind[f"{cause} %"]) for cause in ("right", "search", "model", "divided")) == pytest.approx(100)
+    assert (tmp_path / "stress-calibration-neurora-posterior.csv").exists()

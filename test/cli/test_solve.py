@@ -212,3 +212,14 @@ def test_clean_graphs_come_close_to_the_truth(shared_data: Path, tmp_path: Path,
     offset = rotations.multiply(rotations.normalize(truth[:1]), rotations.inverse(estimate[:1]))
     error = rotations.angle_between(rotations.multiply(offset, estimate), rotations.normalize(truth))
     assert error.rad2deg().mean() < bound_deg
+
+
+def test_parts_of_the_posterior_can_be_switched_off(
+    graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["solve", str(graph_path), "--output", str(tmp_path / "out"), "--without", "slips", "cleannet"]
+    assert main([*command, "--method", "neurora-posterior"]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["method"] == "neurora-posterior~slips,cleannet"
+    assert main(command) == 2
+    assert "--without is for --method neurora-posterior" in capsys.readouterr().err

@@ -49,6 +49,7 @@ def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
             closure_graph.orientations(torch.from_numpy(np.ascontiguousarray(published.correction.T))),
             torch.from_numpy(slam_stages.outlier_scores(closure_graph, published.outlier_probability)),
             torch.from_numpy(published.variance),
+            warnings=published.warnings,
         )
     with watch.stage("bootstrap"):
         if run.warm_start is not None:

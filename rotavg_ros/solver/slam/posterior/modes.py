@@ -15,6 +15,8 @@ from rotavg_ros.solver.slam.posterior.state import State
 
 # No labelling counts that is less likely by so many nats.
 _FAR = 12.0
+# Rivals as likely as this that turn a node by more than this, rad, are worth a warning.
+_LIKELY, _FAR_TURN = 0.05, np.radians(5.0)
 # What is less likely good than this does not pull at all.
 _SURELY_FALSE = 0.05
 _ROUNDS = 3
@@ -29,12 +31,14 @@ class Published:
         outlier_probability: ``(E,)``.
         variance: ``(N,)`` rad², of the view-graph's nodes.
         rivals: probabilities of the labellings that were averaged, the best first.
+        warnings: where rivals are likely and differ.
     """
 
     correction: np.ndarray
     outlier_probability: np.ndarray
     variance: np.ndarray
     rivals: tuple[float, ...]
+    warnings: tuple[str, ...] = ()
 
 
 def publish(problem: Problem, modes: list[Mode]) -> Published:
@@ -58,7 +62,28 @@ def publish(problem: Problem, modes: list[Mode]) -> Published:
         off = np.sqrt(((turn - mean) ** 2).sum(axis=0) / k)
         spread = (1 - graph.fraction) * off[graph.above] + graph.fraction * off[graph.below]
         variance += weight * (answer.variance + spread**2)
-    return Published(correction, np.asarray(score), variance, tuple(share.tolist()))
+    warnings = _warnings(problem, rivals, share, turns)
+    return Published(correction, np.asarray(score), variance, tuple(share.tolist()), warnings)
+
+
+def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: list[np.ndarray]) -> tuple[str, ...]:
+    """What rivals disagree about, if any that is likely turns a part of the map by far."""
+    largest = [float(np.sqrt((turn**2).sum(axis=0)).max(initial=0.0)) for turn in turns]
+    others = [
+        number
+        for number in range(1, len(rivals))
+        if share[number] >= _LIKELY and largest[number] > _FAR_TURN and rivals[number].labels != rivals[0].labels
+    ]
+    if not others:
+        return ()
+    differs = np.any([rivals[number].state.is_good != rivals[0].state.is_good for number in others], axis=0)
+    closures, steps = int(differs[problem.closure].sum()), int(differs[problem.graph.is_odometry].sum())
+    turned = np.degrees(max(largest[number] for number in others))
+    return (
+        f"Other answers are nearly as likely ({100 * share[others].sum():.0f} %): they disagree about {closures} "
+        f"closures and {steps} stretches of odometry, and turn parts of the map by up to {turned:.0f}°. What is "
+        "published is the average; see its uncertainty, and label the closures that you know.",
+    )
 
 
 def distinct(problem: Problem, modes: list[Mode]) -> list[Mode]:

@@ -110,6 +110,13 @@ def test_a_switch_that_does_not_exist_is_an_error() -> None:
             solve(drawn("building: 15 closures", 0).graph, method=method)
 
 
+def test_rivals_are_told_of() -> None:
+    kind = "lone slip: 20 witnesses, one pair of places"
+    told = [solved(kind, seed).warnings for seed in range(2, 5)]
+    assert any("nearly as likely" in warning for warnings in told for warning in warnings)
+    assert not any("nearly as likely" in warning for warning in solved("building: 30 % grouped", 0).warnings)
+
+
 def test_labels_decide() -> None:
     case = drawn("building: 30 % grouped", 0)
     label = case.graph.label.clone()
@@ -152,7 +159,7 @@ STRUCTURAL = {
     "labels": {"_SHARES", "_STAY", "_NEAR_SHARES", "_FAR_SHARES", "_REPEAT_DEG", "_LEAST", "_GRID_SIZE"}
     | {"_LOG_FIRST", "_LOG_FOLLOWS", "_LOG_STEPS"},
     "left_out": {"_LEAST_REST"},
-    "modes": {"_FAR", "_SURELY_FALSE", "_ROUNDS"},
+    "modes": {"_FAR", "_LIKELY", "_FAR_TURN", "_SURELY_FALSE", "_ROUNDS"},
     "moves/flips": {"_PART", "_LEAST_GAIN"},
     "moves/groups": {"_AGREE", "_TIGHTER", "_SETTLING", "_MAX_DENSE"},
     "moves/noise": {"_GRIDS", "_MIN_SPREAD"},
