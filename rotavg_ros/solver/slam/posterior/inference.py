@@ -47,8 +47,7 @@ class Search:
             done.add(mode.labels)
             for found in noise.tuned(mode):
                 self.keep(found)
-            if self.modes[0].cost < mode.cost - _GAIN:
-                continue
+                mode = min(mode, found, key=lambda either: either.cost)
             for proposal in sorted(proposals(mode), key=lambda proposal: proposal.predicted):
                 if proposal.predicted > self.problem.limits.slack or self._tried >= self.problem.limits.tried:
                     break

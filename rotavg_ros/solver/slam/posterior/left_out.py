@@ -18,6 +18,8 @@ from rotavg_ros.solver.slam.posterior.system import Factorised
 
 # What is left of an edge without itself, at least; one that alone holds two parts together tells nothing of them.
 _LEAST_REST = 1e-6
+# Log-odds of what a user has decided.
+CERTAIN = 1e6
 
 
 @dataclass(frozen=True)
@@ -87,15 +89,27 @@ def scores(problem: Problem, state: State, left_out: LeftOut) -> tuple[np.ndarra
 
 def relabelled(problem: Problem, state: State) -> np.ndarray:
     """``(E,)`` 1 for edges that residuals as they are speak for, else 0."""
+    good, otherwise = _log_densities(problem, state)
+    return np.asarray(good > otherwise, dtype=np.float64)
+
+
+def rough_cost(problem: Problem, state: State) -> float:
+    """What edges cost by their residuals as they are, each by its better label, nats: F without what is integrated."""
+    return -float(np.maximum(*_log_densities(problem, state)).sum())
+
+
+def _log_densities(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarray]:
+    """``(E,)`` each: of edges if they are good, and if not, by residuals and the prior."""
     graph, k, priors, closure = problem.graph, problem.components, problem.priors, problem.closure
     num_edges = len(graph.source)
     without_common = replace(state, common=np.zeros_like(state.common))
     square = (residuals(problem, without_common) ** 2).sum(axis=1)[:num_edges]
     own = variances(problem, state.noise)[:num_edges]
     slack = np.where(graph.is_odometry, 0.0, state.noise.closure_variance)
-    log_odds = log_good(square, own, slack, k, priors)[0] + problem.log_odds
-    log_odds[closure] -= log_false(square[closure], k, priors)
+    good = log_good(square, own, slack, k, priors)[0] + np.clip(problem.log_odds, -CERTAIN, CERTAIN)
+    otherwise = np.empty(num_edges)
+    otherwise[closure] = log_false(square[closure], k, priors)
     odometry = np.flatnonzero(graph.is_odometry)
-    log_odds[odometry] -= log_slipped(square[odometry], own[odometry], 0.0, k, priors)
-    log_odds[odometry] -= log_slip_odds(problem, graph.own_steps[odometry], 1)
-    return np.asarray(log_odds > 0, dtype=np.float64)
+    otherwise[odometry] = log_slipped(square[odometry], own[odometry], 0.0, k, priors)
+    otherwise[odometry] += log_slip_odds(problem, graph.own_steps[odometry], 1)
+    return good, otherwise

@@ -158,14 +158,14 @@ STRUCTURAL = {
     "inference": {"_GAIN", "_BEAM"},
     "labels": {"_SHARES", "_STAY", "_NEAR_SHARES", "_FAR_SHARES", "_REPEAT_DEG", "_LEAST", "_GRID_SIZE"}
     | {"_LOG_FIRST", "_LOG_FOLLOWS", "_LOG_STEPS"},
-    "left_out": {"_LEAST_REST"},
+    "left_out": {"CERTAIN", "_LEAST_REST"},
     "modes": {"_FAR", "_LIKELY", "_FAR_TURN", "_SURELY_FALSE", "_ROUNDS"},
     "moves/flips": {"_PART", "_LEAST_GAIN"},
     "moves/groups": {"_AGREE", "_TIGHTER", "_SETTLING", "_MAX_DENSE"},
     "moves/noise": {"_GRIDS", "_MIN_SPREAD"},
-    "moves/slips": {"_AGREE", "_AGREE_ANGLE", "_SETTLING"},
+    "moves/slips": {"_AGREE", "_AGREE_ANGLE", "_OPTIMISM", "_SETTLING"},
     "moves/starts": {"_INLIER_SQUARE", "_SHARP", "_STEP_LEVELS", "_CLOSURE_LEVEL", "_ROBUST_POWER"}
-    | {"_ANNEALED_SLIPS", "_LEAST_WEIGHT"},
+    | {"_ANNEALED_SLIPS", "_LEAST_WEIGHT", "_SAME_TURN"},
     "problem": {"_NONE"},
     "rows": {"_NOTHING", "_MAX_TURN"},
     "system": {"_NUM_PROBES", "_MAX_LEVERAGE"},

@@ -10,11 +10,13 @@ import numpy as np
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.posterior.em import settle
-from rotavg_ros.solver.slam.posterior.left_out import relabelled
+from rotavg_ros.solver.slam.posterior.left_out import CERTAIN, relabelled, rough_cost
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.state import State
 
 _SETTLING = 4
+# What relabelling and bending may gain beyond what residuals tell of a part that is turned back, nats.
+_OPTIMISM = 10.0
 # A turn explains a closure that is off by it to so many standard deviations, or to this angle, rad.
 _AGREE, _AGREE_ANGLE = 3.0, np.radians(2.0)
 
@@ -40,7 +42,7 @@ def propose_slips(mode: Mode) -> Iterator[Proposal]:
     last = np.searchsorted(start, problem.ends[:, 1] - 1e-9)
     tolerance = 2 * _AGREE**2 * problem.components * state.noise.closure_variance + _AGREE_ANGLE**2
     # What closures gain if they come out good, and lose if they come out wrong.
-    worth = np.maximum(mode.left_out.worth[closure], 0.0)
+    worth = np.clip(mode.left_out.worth[closure], 0.0, CERTAIN)
     lost = np.where(within & ~is_false, -worth, 0.0)
     price = -mode.left_out.log_odds[segment]
     left = within & is_false
@@ -65,12 +67,16 @@ def propose_slips(mode: Mode) -> Iterator[Proposal]:
 def propose_mending(mode: Mode) -> Iterator[Proposal]:
     """Take back each slip: with all that follows, up to the next slip, or bending what is between."""
     slipped = mode.slipped
+    before = rough_cost(mode.problem, mode.state)
     for number, edge in enumerate(slipped[: mode.problem.limits.slips]):
         following = int(slipped[number + 1]) if number + 1 < len(slipped) else None
-        yield Proposal("mend and reject", 0.0, partial(_mended, mode, int(edge), None))
-        if following is not None:
-            yield Proposal("turn a part back", 0.0, partial(_mended, mode, int(edge), following))
-        yield Proposal("mend and bend", 0.0, partial(_bent, mode, int(edge)))
+        for name, end in (("mend and reject", None), ("turn a part back", following)):
+            if end is not None or name == "mend and reject":
+                state = _mended(mode, int(edge), end)
+                predicted = rough_cost(mode.problem, state) - before - _OPTIMISM
+                yield Proposal(name, predicted, partial(settle, mode.problem, state, _SETTLING))
+        bends = -float(mode.left_out.log_odds[edge])
+        yield Proposal("mend and bend", bends - _OPTIMISM, partial(_bent, mode, int(edge)))
 
 
 def _after(mode: Mode, edge: int) -> np.ndarray:
@@ -114,7 +120,7 @@ def _mended(mode: Mode, edge: int, following: int | None) -> State:
     kept = mode.state.trusted[odometry]
     trusted[odometry] = np.maximum(kept, trusted[odometry])
     trusted[edge] = 1.0
-    return settle(mode.problem, replace(state, trusted=trusted), _SETTLING)
+    return replace(state, trusted=trusted)
 
 
 def _bent(mode: Mode, edge: int) -> State:

@@ -6,8 +6,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.algebra.spanning_forest import compose_orientations, shortest_path_forest
 from rotavg_ros.solver.slam.moves.jumps import jump_to_optimum
 from rotavg_ros.solver.slam.moves.slip_search import no_slip_log_odds
 from rotavg_ros.solver.slam.moves.truncated_cost import TruncatedCost
@@ -20,6 +23,7 @@ from rotavg_ros.solver.slam.posterior.rows import moved, residuals, variances
 from rotavg_ros.solver.slam.posterior.state import Noise, State
 from rotavg_ros.solver.slam.preparation import Prepared
 from rotavg_ros.solver.slam.stages import CleanedClosures, bootstrap
+from rotavg_ros.view_graph import ViewGraph
 
 # The 99 % quantile of χ² in k components: what is farther off is no inlier of truncated least squares.
 _INLIER_SQUARE = {1: 6.63, 3: 11.34}
@@ -32,17 +36,21 @@ _ROBUST_POWER = -0.75
 # Chances of a slip per step under which parts are turned, first as dear as none.
 _ANNEALED_SLIPS = (0.5, 0.01)
 _LEAST_WEIGHT = 1e-9
+# Closures between two chains agree if their turns differ by less than this, rad: what chains drift until they meet.
+_SAME_TURN = np.radians(15.0)
 
 
 def starts(problem: Problem, prepared: Prepared, cleaned: CleanedClosures) -> Iterator[tuple[str, State]]:
     """Name and state of each start that is switched on; CleanNet's tree always is one."""
     noise = noise_of(problem, prepared.noise)
     tree = bootstrap(prepared, cleaned)
+    joined = _joined_chains(problem)
     yield "tree", settle(problem, at(problem, tree, cleaned.inlier_probability, noise))
     if "annealing" not in problem.without:
         for step_variance, closure_variance in _prior_levels(problem.priors):
             level = replace(noise, step_variance=step_variance, closure_variance=closure_variance)
-            yield "annealing", annealed(problem, at(problem, tree, np.ones(len(problem.graph.source)), level))
+            start = at(problem, tree if joined is None else joined, np.ones(len(problem.graph.source)), level)
+            yield "annealing", annealed(problem, start)
     if "robust-start" not in problem.without:
         yield "robust start", _robust(problem, at(problem, tree, np.ones(len(problem.graph.source)), noise))
     if len(prepared.pairs.first) and not problem.without & {"minimum-cuts", "slips"}:
@@ -91,6 +99,33 @@ def _prior_levels(priors: SlamPriors) -> list[tuple[float, float]]:
     closure = np.radians(priors.closure_deg * np.exp(_CLOSURE_LEVEL * priors.noise_spread)) ** 2
     steps = np.radians(priors.step_deg * np.exp(priors.noise_spread * np.array(_STEP_LEVELS))) ** 2
     return [(float(step), float(closure)) for step in steps]
+
+
+def _joined_chains(problem: Problem) -> Tensor | None:
+    """Chains of odometry that closures alone connect, each turned as a whole; corrections ``(K, 4)``.
+
+    None with one chain. Of all closures between two the turn is taken that most others agree with; chains are joined
+    along the maximum spanning tree by the number that agree.
+    """
+    graph, closure = problem.graph, problem.closure
+    _, chain = np.unique(graph.paths.chain[graph.nodes], return_inverse=True)
+    ends = np.stack((chain[graph.source[closure]], chain[graph.target[closure]]))
+    between = np.flatnonzero(ends[0] != ends[1])
+    if len(between) == 0:
+        return None
+    # A closure u → v between chains as they were drawn says C_v ≈ e C_u for all of both; from the lower chain on.
+    turned = problem.measured[:, closure[between]]
+    turned = np.where(ends[0, between] < ends[1, between], turned, quaternion_rows.inverse(turned))
+    low, high = np.sort(ends[:, between], axis=0)
+    count = int(chain.max()) + 1
+    agrees = (np.abs(turned.T @ turned) > np.cos(_SAME_TURN / 2)) & (low[:, None] == low) & (high[:, None] == high)
+    votes = agrees.sum(axis=1)
+    order = np.lexsort((-votes, high, low))
+    _, first = np.unique(low[order] * count + high[order], return_index=True)
+    best = order[first]
+    chains = ViewGraph.create(low[best], high[best], torch.from_numpy(turned[:, best].T.copy()), num_nodes=count)
+    forest = shortest_path_forest(chains, torch.from_numpy(1.0 / votes[best] ** 2), root="first")
+    return compose_orientations(forest, chains)[torch.from_numpy(chain)]
 
 
 def _robust(problem: Problem, state: State) -> State:
