@@ -14,7 +14,7 @@ from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.state import State
 
 # No labelling counts that is less likely by so many nats.
-_FAR = 12.0
+_FAR = 5.0
 # Rivals as likely as this that turn a node by more than this, rad, are worth a warning.
 _LIKELY, _FAR_TURN = 0.05, np.radians(5.0)
 # What is less likely good than this does not pull at all.

@@ -47,7 +47,7 @@ class SlamPriors:
     near_miss_share: float = 0.2
     near_miss_deg: float = 20.0
     elsewhere_count: float = 10.0
-    slip_count: float = 0.2
+    slip_count: float = 1.0
     slip_steps: float = 2000.0
     slip_deg: float = 60.0
     run_gap_steps: float = 30.0
