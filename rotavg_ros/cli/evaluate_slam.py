@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from rotavg_ros.cli.data_folder import data_folder
@@ -58,14 +59,17 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
     scores = score_all(drawings(kinds, seeds), chosen, watch)
     diagnoses: list[Diagnosis] = []
     if arguments.search_or_model and not scores.interrupted:
-        cases_again = progress(drawings(kinds, seeds), total=len(kinds) * len(seeds), description="from the truth")
-        diagnoses = [diagnose(case) for case in cases_again]
+        with suppress(KeyboardInterrupt):  # what is done is written
+            cases_again = progress(drawings(kinds, seeds), total=len(kinds) * len(seeds), description="from the truth")
+            diagnoses.extend(map(diagnose, cases_again))
     return stress_report.report(arguments.output, scores, calibrations, arguments.command_line, diagnoses)
 
 
 def _run_recorded(arguments: argparse.Namespace) -> Path:
     if arguments.kinds is not None:
         raise SlamOptionsError("--kinds chooses from the stress suite; add --suite stress")
+    if arguments.search_or_model:
+        raise SlamOptionsError("--search-or-model needs cases of which all is known; add --suite stress")
     seeds = arguments.seeds or _RECORDED_SEEDS
     names = _methods(arguments, [name for name in ROWS if name not in _STRESS_ONLY])
     chosen = contenders(names, ROSTER, keep=arguments.keep)

@@ -70,7 +70,7 @@ def compare_with_truth(
     network = None if "cleannet" in without else Networks("cpu", weights).load(SlamCleanNet)
     cleaned = slam_stages.clean(network, prepared, graph.label)
     problem = problem_of(prepared, cleaned, without)
-    modes = Search(problem).run(prepared, cleaned)
+    modes = Search(problem).run(prepared, cleaned, slam_stages.bootstrap(prepared, cleaned))
     published = publish(problem, modes)
 
     closure_graph = prepared.closure_graph

@@ -106,3 +106,10 @@ def test_stress_tells_why_answers_are_wrong_and_what_parts_earn(tmp_path: Path) 
     assert (everything["kind"], everything["drawings"]) == ("all", "1")
     assert sum(float(kind[f"{cause} %"]) for cause in ("right", "search", "model", "divided")) == pytest.approx(100)
     assert (tmp_path / "stress-calibration-neurora-posterior.csv").exists()
+
+
+def test_why_answers_are_wrong_is_known_of_the_stress_suite_alone(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", "slam", "--data", str(data), "--output", str(data / "results"), "--search-or-model"]) == 2
+    assert "--search-or-model needs cases of which all is known; add --suite stress" in capsys.readouterr().err

@@ -36,7 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--device", default="auto", choices=DEVICES, help="default: auto")
     parser.add_argument(
-        "--refine", type=whole_number, metavar="N", help="at most N refinement steps; 0 skips (default: the method's)"
+        "--refine",
+        type=whole_number,
+        metavar="N",
+        help="at most N refinement steps; 0 skips (default: the method's); of the posterior's search, 0 or all",
     )
     parser.add_argument(
         "--weights", type=Path, metavar="DIR", help="networks of `rotavg train`; what DIR lacks comes from the package"

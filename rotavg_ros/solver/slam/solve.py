@@ -16,6 +16,7 @@ from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.passes.alternation import Verdicts
+from rotavg_ros.solver.slam.posterior.modes import Published
 from rotavg_ros.solver.slam.posterior.solve import solve_posterior
 from rotavg_ros.solver.slam.preparation import prepare
 from rotavg_ros.solver.slam.update.memory import SlamMemory
@@ -41,16 +42,6 @@ def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
         has_network = stages.clean and "cleannet" not in stages.without
         network = run.networks.load(SlamCleanNet) if has_network else None
         cleaned = slam_stages.clean(network, prepared, graph.label)
-    if stages.posterior:
-        with watch.stage("refine"):
-            published = solve_posterior(prepared, cleaned, stages.without)
-        closure_graph = prepared.closure_graph
-        return Estimate(
-            closure_graph.orientations(torch.from_numpy(np.ascontiguousarray(published.correction.T))),
-            torch.from_numpy(slam_stages.outlier_scores(closure_graph, published.outlier_probability)),
-            torch.from_numpy(published.variance),
-            warnings=published.warnings,
-        )
     with watch.stage("bootstrap"):
         if run.warm_start is not None:
             correction = prepared.closure_graph.corrections(run.warm_start.double())
@@ -61,6 +52,11 @@ def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     steps = run.refinement_steps
     if steps is None:
         steps = slam_refinement.MAX_PASSES if stages.refine else 0
+    if steps > 0 and stages.posterior:
+        with watch.stage("refine"):
+            published = solve_posterior(prepared, cleaned, correction, stages.without)
+        with watch.stage("expand"):
+            return _published_estimate(prepared.closure_graph, published)
     if steps > 0:
         with watch.stage("refine"):
             estimate = slam_stages.refine_and_search(prepared, cleaned, correction, steps, stages=stages)
@@ -74,6 +70,16 @@ def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
         score = slam_stages.outlier_scores(prepared.closure_graph, 1 - cleaned.inlier_probability)
         orientations = prepared.closure_graph.orientations(correction)
     return Estimate(orientations, torch.from_numpy(score), torch.full((graph.num_nodes,), torch.nan))
+
+
+def _published_estimate(graph: ClosureGraph, published: Published) -> Estimate:
+    """The posterior's answer on the view-graph's nodes and edges."""
+    return Estimate(
+        graph.orientations(torch.from_numpy(np.ascontiguousarray(published.correction.T))),
+        torch.from_numpy(slam_stages.outlier_scores(graph, published.outlier_probability)),
+        torch.from_numpy(published.variance),
+        warnings=published.warnings,
+    )
 
 
 def _slam_estimate(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from torch import Tensor
+
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.moves import groups, noise, slips
@@ -32,9 +34,16 @@ class Search:
         self.modes: list[Mode] = []
         self._tried = 0
 
-    def run(self, prepared: Prepared, cleaned: CleanedClosures) -> list[Mode]:
-        """From all starts, move on from the best modes until no move is predicted to lower F."""
-        begun = [self.polished(state, name) for name, state in starts(self.problem, prepared, cleaned)]
+    def run(self, prepared: Prepared, cleaned: CleanedClosures, correction: Tensor) -> list[Mode]:
+        """From all starts, move on from the best modes until no move is predicted to lower F.
+
+        Args:
+            prepared: the graph drawn together.
+            cleaned: what CleanNet says of its closures.
+            correction: ``(K, 4)`` of the tree, or of an earlier answer to begin with.
+        """
+        found = starts(self.problem, prepared, cleaned, correction)
+        begun = [self.polished(state, name) for name, state in found]
         least = min(mode.cost for mode in begun)
         for mode in {mode.key: mode for mode in begun if mode.cost < least + self.problem.limits.hopeless}.values():
             self.keep(flipped(mode))

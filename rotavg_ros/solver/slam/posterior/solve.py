@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
+from torch import Tensor
+
 from rotavg_ros.solver.slam.posterior.inference import Search
 from rotavg_ros.solver.slam.posterior.modes import Published, publish
 from rotavg_ros.solver.slam.posterior.problem import Problem
@@ -11,16 +13,19 @@ from rotavg_ros.solver.slam.preparation import Prepared
 from rotavg_ros.solver.slam.stages import CleanedClosures
 
 
-def solve_posterior(prepared: Prepared, cleaned: CleanedClosures, without: Collection[str] = ()) -> Published:
+def solve_posterior(
+    prepared: Prepared, cleaned: CleanedClosures, correction: Tensor, without: Collection[str] = ()
+) -> Published:
     """What is published of a prepared graph.
 
     Args:
         prepared: the graph drawn together.
         cleaned: what CleanNet says of its closures.
+        correction: ``(K, 4)`` of the tree, or of an earlier answer to begin with.
         without: terms and moves that are switched off.
     """
     problem = problem_of(prepared, cleaned, without)
-    return publish(problem, Search(problem).run(prepared, cleaned))
+    return publish(problem, Search(problem).run(prepared, cleaned, correction))
 
 
 def problem_of(prepared: Prepared, cleaned: CleanedClosures, without: Collection[str] = ()) -> Problem:

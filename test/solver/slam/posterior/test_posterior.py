@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from itertools import product
 
@@ -11,8 +12,15 @@ import torch
 from scipy.special import expit, logsumexp
 from scipy.stats import multivariate_normal
 
+from rotavg_ros.solver.slam.posterior.densities import log_false
 from rotavg_ros.solver.slam.posterior.em import polish
-from rotavg_ros.solver.slam.posterior.labels import label_log_odds, log_label_prior
+from rotavg_ros.solver.slam.posterior.labels import (
+    FalseDensity,
+    false_density,
+    label_log_odds,
+    log_label_prior,
+    log_slip_prior,
+)
 from rotavg_ros.solver.slam.posterior.left_out import leave_one_out
 from rotavg_ros.solver.slam.posterior.objective import evaluate
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
@@ -50,10 +58,12 @@ def _planar(seed: int, num_closures: int, false_share: float, length: int = 60) 
     return graph, off
 
 
-def _problem(graph: ViewGraph) -> Problem:
+def _problem(graph: ViewGraph, priors: SlamPriors = _PRIORS, without: Collection[str] = ()) -> Problem:
     prepared = prepare(graph)
     closure_graph = prepared.closure_graph
-    return Problem.of(closure_graph, prepared.pairs, 1, np.zeros(len(closure_graph.source)), priors=_PRIORS)
+    return Problem.of(
+        closure_graph, prepared.pairs, 1, np.zeros(len(closure_graph.source)), priors=priors, without=without
+    )
 
 
 def _state(problem: Problem, is_false: np.ndarray) -> State:
@@ -166,3 +176,57 @@ def test_a_part_that_nothing_holds_weighs_as_one_that_may_be_turned_by_anything(
     # Nothing contradicts the closure, so its residual tells nothing: only the labels' prior does.
     evidence = [sum(terms.values()) - terms["labels"] for terms in (good, false)]
     assert evidence[0] == pytest.approx(evidence[1], abs=0.05)
+
+
+def test_priors_are_normalised() -> None:
+    """Of labels over all labellings, of false closures over all turns, of slips over all sets of steps."""
+    graph, _ = _planar(0, 8, 0.0)
+    problem = _problem(graph)
+    labels = [np.array(bits) for bits in product([False, True], repeat=len(problem.closure))]
+    assert logsumexp([log_label_prior(problem, is_false) for is_false in labels]) == pytest.approx(0.0, abs=1e-9)
+    angle = np.linspace(-np.pi, np.pi, 20_001)
+    assert np.trapezoid(np.exp(log_false(angle**2, 1, SlamPriors())), angle) == pytest.approx(1.0, abs=1e-3)
+    # A second false closure, new or repeating the first by any turn.
+    is_false = np.arange(len(problem.closure)) == problem.detection[0]
+    second = problem.detection[1:2]
+    densities = []
+    for turn in angle[::20]:
+        residual = np.zeros((len(problem.closure), 3))
+        residual[second, 2] = turn
+        densities.append(np.exp(false_density(problem, is_false, residual, second).mixed()[:, 0]))
+    np.testing.assert_allclose(np.trapezoid(densities, angle[::20], axis=0), 1.0, atol=0.02)
+    chain = _problem(ViewGraph.create(np.arange(6), np.arange(1, 7), _yaw(np.zeros(6)), kind=[0] * 6))
+    # Every node an end of closures would make six segments of one step; here their prior is asked for as if.
+    steps = replace(chain, graph=replace(chain.graph, own_steps=np.ones(6), is_odometry=np.ones(6, dtype=bool)))
+    sets = [np.flatnonzero(bits) for bits in product([False, True], repeat=6)]
+    assert logsumexp([log_slip_prior(steps, slipped) for slipped in sets]) == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "is_off"),
+    [
+        ("tails", lambda problem: problem.priors.tail_share < 1e-9),
+        ("near-misses", lambda problem: problem.priors.near_miss_share < 1e-9),
+        ("common-errors", lambda problem: problem.system.num_runs == 0),
+        ("slips", lambda problem: bool(np.isposinf(problem.log_odds[problem.graph.is_odometry]).all())),
+        ("repeats", lambda problem: np.ptp(_repeated(problem).mixed()[:, 0]) == 0),
+        ("label-runs", lambda problem: _stickiness(problem) == pytest.approx(0.0, abs=1e-9)),
+    ],
+)
+def test_a_term_is_there_until_it_is_switched_off(name: str, is_off: Callable[[Problem], bool]) -> None:
+    graph, _ = _planar(0, 8, 0.0)
+    assert not is_off(_problem(graph, SlamPriors()))
+    assert is_off(_problem(graph, SlamPriors(), without={name}))
+
+
+def _repeated(problem: Problem) -> FalseDensity:
+    """The density of a closure that repeats the turn of the one before it."""
+    first, second = problem.detection[:2]
+    is_false = np.arange(len(problem.closure)) == first
+    return false_density(problem, is_false, np.zeros((len(problem.closure), 3)), np.array([second]))
+
+
+def _stickiness(problem: Problem) -> float:
+    """How far the odds of good closures differ, of which one follows a false one."""
+    is_false = np.arange(len(problem.closure)) == problem.follows.max()
+    return float(np.ptp(label_log_odds(problem, is_false)[~is_false]))

@@ -97,11 +97,28 @@ def test_order_and_direction_of_edges_change_nothing(kind: str) -> None:
 
 
 @pytest.mark.parametrize("name", SWITCHES)
-def test_every_switch_has_an_effect_or_none_but_always_an_answer(name: str) -> None:
+def test_there_is_an_answer_without_any_part(name: str) -> None:
     case = drawn("building: 15 closures", 0)
     solution = solve(case.graph, profile="slam", method=without(name))
-    assert error_deg(case.graph, solution, case.body_from_world) < 10
+    assert error_deg(case.graph, solution, case.body_from_world) < 3
     assert bool(((solution.outlier_score >= 0) & (solution.outlier_score <= 1)).all())
+
+
+def test_without_repeats_slips_are_invented() -> None:
+    case = drawn("building: 30 % grouped", 0)
+    solution = solve(case.graph, profile="slam", method=without("repeats"))
+    assert error_deg(case.graph, solution, case.body_from_world) > 10
+    assert error_deg(case.graph, solved("building: 30 % grouped", 0), case.body_from_world) < 1.5
+
+
+def test_it_begins_where_it_is_told_or_does_not_search() -> None:
+    case = drawn("building: 50 % random", 0)
+    begun = solve(case.graph, profile="slam", method=f"chatterjee+{POSTERIOR}")
+    assert error_deg(case.graph, begun, case.body_from_world) < 2
+    skipped = solve(case.graph, profile="slam", method=POSTERIOR, refinement_steps=0)
+    tree = solve(case.graph, profile="slam", method="cleannet-spt")
+    torch.testing.assert_close(skipped.body_from_world, tree.body_from_world)
+    torch.testing.assert_close(skipped.outlier_score, tree.outlier_score)
 
 
 def test_a_switch_that_does_not_exist_is_an_error() -> None:

@@ -22,7 +22,7 @@ from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import moved, residuals, variances
 from rotavg_ros.solver.slam.posterior.state import Noise, State
 from rotavg_ros.solver.slam.preparation import Prepared
-from rotavg_ros.solver.slam.stages import CleanedClosures, bootstrap
+from rotavg_ros.solver.slam.stages import CleanedClosures
 from rotavg_ros.view_graph import ViewGraph
 
 # The 99 % quantile of χ² in k components: what is farther off is no inlier of truncated least squares.
@@ -40,10 +40,16 @@ _LEAST_WEIGHT = 1e-9
 _SAME_TURN = np.radians(15.0)
 
 
-def starts(problem: Problem, prepared: Prepared, cleaned: CleanedClosures) -> Iterator[tuple[str, State]]:
-    """Name and state of each start that is switched on; CleanNet's tree always is one."""
+def starts(problem: Problem, prepared: Prepared, cleaned: CleanedClosures, tree: Tensor) -> Iterator[tuple[str, State]]:
+    """Name and state of each start that is switched on; the tree always is one.
+
+    Args:
+        problem: the graph.
+        prepared: the same, drawn together.
+        cleaned: what CleanNet says of its closures.
+        tree: corrections ``(K, 4)`` along CleanNet's tree, or of an earlier answer.
+    """
     noise = noise_of(problem, prepared.noise)
-    tree = bootstrap(prepared, cleaned)
     joined = _joined_chains(problem)
     yield "tree", settle(problem, at(problem, tree, cleaned.inlier_probability, noise))
     if "annealing" not in problem.without:
