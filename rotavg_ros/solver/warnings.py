@@ -49,7 +49,8 @@ _SHARE_AS_STATED, _SHARE_OTHERWISE = 0.3, 0.6
 # Of hypotheses whose shares differ by no more than such a factor, the first is stated.
 _NEARLY = 0.9
 # An odometry edge turns by less than the first in the median, rad, and by more than the second if its quaternion's
-# order is mistaken: w = cos(θ/2) in x's place makes a turn by θ one by 180° - θ or more.
+# order is mistaken: w = cos(θ/2) in x's place makes a turn by θ one by 180° - θ or more. Fewer edges than closures that
+# are compared tell nothing: one random rotation in seventeen looks like that.
 _SMALL_STEP, _LARGE_STEP = math.radians(60.0), math.radians(120.0)
 # So few believed closures may be false together; they turn the answer far from odometry's if by more than this, rad.
 _FEW_BELIEVED, _FAR = 10, math.radians(30.0)
@@ -247,7 +248,8 @@ def _mistaken_convention(odometry: _Odometry, closures: ViewGraph) -> str | None
     tells = odometry.component[closures.source] == odometry.component[closures.target]
     closures = closures.select_edges(tells.nonzero()[:, 0])
     stated, reordered = (odometry.median_angle(reading) for reading in (_as_stated, _reordered))
-    is_reordered = stated > _LARGE_STEP and reordered < _SMALL_STEP
+    is_enough = odometry.graph.num_edges >= _MIN_COMPARED
+    is_reordered = is_enough and stated > _LARGE_STEP and reordered < _SMALL_STEP
     agreements = []
     if closures.num_edges >= _MIN_COMPARED:
         agreements = list(_agreements(odometry, closures, is_reordered))
