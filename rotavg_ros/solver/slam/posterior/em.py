@@ -28,7 +28,7 @@ def step(problem: Problem, state: State) -> tuple[State, float, Factorised]:
     """One Gauss–Newton step on the corrections; also its largest component, rad, and the factor."""
     residual = residuals(problem, state)
     square = (residual**2).sum(axis=1)
-    factorised = problem.system.factorise(weights(problem, state, square, variances(problem, state.noise)))
+    factorised = problem.system(state.noise).factorise(weights(problem, state, square, variances(problem, state.noise)))
     turn = factorised.fit(residual)
     return moved(state, turn), float(np.abs(turn).max(initial=0.0)), factorised
 

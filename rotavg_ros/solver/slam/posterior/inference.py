@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
 from torch import Tensor
 
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.moves import groups, noise, slips
 from rotavg_ros.solver.slam.posterior.moves.flips import flipped
-from rotavg_ros.solver.slam.posterior.moves.starts import starts
+from rotavg_ros.solver.slam.posterior.moves.starts import starts, turned_parts
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.state import State
 from rotavg_ros.solver.slam.preparation import Prepared
@@ -35,19 +36,29 @@ class Search:
         self._tried = 0
 
     def run(self, prepared: Prepared, cleaned: CleanedClosures, correction: Tensor) -> list[Mode]:
-        """From all starts, move on from the best modes until no move is predicted to lower F.
+        """From starts until two end alike, move on from the best modes until no move is predicted to lower F.
 
         Args:
             prepared: the graph drawn together.
             cleaned: what CleanNet says of its closures.
             correction: ``(K, 4)`` of the tree, or of an earlier answer to begin with.
         """
-        found = starts(self.problem, prepared, cleaned, correction)
-        begun = [self.polished(state, name) for name, state in found]
-        least = min(mode.cost for mode in begun)
-        for mode in {mode.key: mode for mode in begun if mode.cost < least + self.problem.limits.hopeless}.values():
-            self.keep(flipped(mode))
+        begun = []
+        for name, state in starts(self.problem, prepared, cleaned, correction):
+            begun.append(flipped(self.polished(state, name)))
+            self.keep(begun[-1])
+            alike = sum(mode.labels == self.modes[0].labels for mode in begun)
+            if len(begun) >= self.problem.limits.starts and alike >= self.problem.limits.alike:
+                break
+        if "minimum-cuts" not in self.problem.without and self._seems_slipped(self.modes[0]):
+            self.keep(flipped(self.polished(turned_parts(self.problem, prepared, correction), "minimum cuts")))
         return self.move_on()
+
+    def _seems_slipped(self, mode: Mode) -> bool:
+        if "slips" in self.problem.without:
+            return False
+        promised = (proposal.predicted for proposal in slips.propose_slips(mode))
+        return len(mode.slipped) > 0 or min(promised, default=np.inf) <= self.problem.limits.slack
 
     def move_on(self) -> list[Mode]:
         """The search from the modes that are kept."""

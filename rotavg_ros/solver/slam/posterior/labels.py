@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import betaln, logsumexp
+from scipy.special import betaln
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.posterior.densities import log_false
@@ -82,14 +82,14 @@ def false_density(
     square = np.where(there, (2 * np.arccos(np.minimum(cosine, 1.0))) ** 2, np.inf)
     newer = problem.ends[:, 1]
     is_near = np.abs(newer[other] - newer[rows, None]) <= problem.priors.run_gap_steps
-    square_near = np.where(is_near, square, np.inf)
     count, count_near = there.sum(axis=1), (there & is_near).sum(axis=1)
     near, far = nothing.copy(), nothing.copy()
     with np.errstate(divide="ignore"):
         for number, width in enumerate(np.radians(_REPEAT_DEG)):
             height = (2 * np.pi * width**2) ** (-k / 2)
-            for result, squares, counted in ((near, square_near, count_near), (far, square, count)):
-                mean = height * np.exp(-squares / (2 * width**2)).sum(axis=1) / np.maximum(counted, 1)
+            kernel = np.exp(-square / (2 * width**2))
+            for result, chosen, counted in ((near, is_near, count_near), (far, there, count)):
+                mean = height * (kernel * chosen).sum(axis=1) / np.maximum(counted, 1)
                 result[number] = np.where(counted > 0, np.log(np.maximum(mean, _LEAST)), -np.inf)
     return FalseDensity(alone, near, far)
 
@@ -98,18 +98,18 @@ def _log_repeat_prior(problem: Problem) -> np.ndarray:
     """``(G,)`` of the grid's points: Beta(1, count) on the share that repeats a turn elsewhere, all else as likely."""
     far = (problem.priors.elsewhere_count - 1) * np.log1p(-_FAR_SHARES) + np.log(np.gradient(_FAR_SHARES))
     grid = np.broadcast_to(far[:, None], (len(_NEAR_SHARES), len(_FAR_SHARES), len(_REPEAT_DEG))).ravel()
-    return np.asarray(grid - logsumexp(grid))
+    return np.asarray(grid - np.logaddexp.reduce(grid))
 
 
 def repeat_rates(problem: Problem, density: FalseDensity) -> np.ndarray:
     """``(G,)`` log posterior of the grid's points, given false closures."""
     rates = density.mixed().sum(axis=1) + _log_repeat_prior(problem)
-    return np.asarray(rates - logsumexp(rates))
+    return np.asarray(rates - np.logaddexp.reduce(rates))
 
 
 def log_false_set(problem: Problem, density: FalseDensity) -> float:
     """Of all false closures together, rates and width integrated."""
-    return float(logsumexp(density.mixed().sum(axis=1) + _log_repeat_prior(problem)))
+    return float(np.logaddexp.reduce(density.mixed().sum(axis=1) + _log_repeat_prior(problem)))
 
 
 def _log_transitions() -> tuple[np.ndarray, np.ndarray]:
@@ -133,7 +133,7 @@ def _log_grid_prior(problem: Problem) -> np.ndarray:
     log = (a - 1) * np.log(_SHARES) + (b - 1) * np.log1p(-_SHARES) + np.log(np.gradient(_SHARES))
     stay = np.where(_STAY > 0, -np.inf, 0.0) if "label-runs" in problem.without else np.zeros(len(_STAY))
     log = (log[:, None] + stay).ravel()
-    return np.asarray(log - logsumexp(log))
+    return np.asarray(log - np.logaddexp.reduce(log))
 
 
 def _kind_of_step(last: np.ndarray, label: np.ndarray) -> np.ndarray:
@@ -152,7 +152,7 @@ def log_label_prior(problem: Problem, is_false: np.ndarray) -> float:
     counts = np.bincount(_kind_of_step(_last(problem, label), label), minlength=_LOG_STEPS.shape[1])
     told = problem.log_odds[problem.closure]
     finite = np.where(np.isfinite(told), told, 0.0)
-    return float(logsumexp(_LOG_STEPS @ counts + _log_grid_prior(problem)) - finite[is_false].sum())
+    return float(np.logaddexp.reduce(_LOG_STEPS @ counts + _log_grid_prior(problem)) - finite[is_false].sum())
 
 
 def label_log_odds(problem: Problem, is_false: np.ndarray) -> np.ndarray:
@@ -178,7 +178,7 @@ def label_log_odds(problem: Problem, is_false: np.ndarray) -> np.ndarray:
             changed += sign * _LOG_STEPS[:, _kind_of_step(last, given)]
             for count, next_label in ((good, 0), (false, 1)):
                 changed += sign * count * _LOG_STEPS[:, _kind_of_step(given, np.full(len(own), next_label))]
-        return np.asarray(logsumexp(changed, axis=0))
+        return np.asarray(np.logaddexp.reduce(changed, axis=0))
 
     odds = (log_with(0) - log_with(1))[which.reshape(-1)]
     return np.asarray(odds + problem.log_odds[problem.closure])

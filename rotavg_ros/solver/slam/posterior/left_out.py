@@ -30,13 +30,13 @@ class LeftOut:
         log_odds: ``(E,)`` of being good, or of not having slipped: by how much F rises if that label flips.
         square: ``(E,)`` rad², of the discrepancy with what the rest predicts.
         predicted: ``(E,)`` rad², variance of that prediction.
-        worth: ``(E,)`` the log-odds of an edge that errs as a good one does: what it gains to be so.
+        if_good: ``(E,)`` nats, log density of an edge that errs as a good one does.
     """
 
     log_odds: np.ndarray
     square: np.ndarray
     predicted: np.ndarray
-    worth: np.ndarray
+    if_good: np.ndarray
 
 
 def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> LeftOut:
@@ -62,8 +62,8 @@ def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> Lef
     odds[odometry] -= log_slipped(square[odometry], own[odometry], predicted[odometry], k, priors)
 
     log_odds = log_good(square, own, predicted, k, priors)[0] + odds
-    worth = log_good(k * (own + predicted), own, predicted, k, priors)[0] + odds
-    return LeftOut(log_odds, square, predicted, worth)
+    if_good = log_good(k * (own + predicted), own, predicted, k, priors)[0]
+    return LeftOut(log_odds, square, predicted, if_good)
 
 
 def scores(problem: Problem, state: State, left_out: LeftOut) -> tuple[np.ndarray, np.ndarray]:
@@ -77,7 +77,8 @@ def scores(problem: Problem, state: State, left_out: LeftOut) -> tuple[np.ndarra
     score, trust = 1 - good, good.copy()
     square, predicted = left_out.square[closure], left_out.predicted[closure]
     # A shared error is part of a closure's noise, too.
-    shared = problem.system.shared[closure] * state.noise.common_share * state.noise.closure_variance
+    is_shared = problem.system(state.noise).shared[closure]
+    shared = is_shared * state.noise.common_share * state.noise.closure_variance
     total = variances(problem, state.noise)[closure] + shared
     part = total / (total + predicted)
     exceeds = exceedance(part * np.sqrt(square), part * predicted, OUTLIER_ANGLE, k)

@@ -41,9 +41,9 @@ class Mode:
         return np.packbits(self.state.is_good).tobytes()
 
     @property
-    def key(self) -> tuple[bytes, float, float]:
-        """Equal for equal labels under equal α and κ."""
-        return self.labels, self.state.noise.exponent, self.state.noise.common_share
+    def key(self) -> tuple[bytes, tuple[float, float, float]]:
+        """Equal for equal labels under equal α, κ and length of runs."""
+        return self.labels, self.state.noise.chosen
 
     @cached_property
     def is_false(self) -> np.ndarray:

@@ -63,7 +63,8 @@ def publish(problem: Problem, modes: list[Mode]) -> Published:
         spread = (1 - graph.fraction) * off[graph.above] + graph.fraction * off[graph.below]
         variance += weight * (answer.variance + spread**2)
     warnings = _warnings(problem, rivals, share, turns)
-    return Published(correction, np.asarray(score), variance, tuple(share.tolist()), warnings)
+    # Shares add up to one but for rounding.
+    return Published(correction, np.clip(score, 0.0, 1.0), variance, tuple(share.tolist()), warnings)
 
 
 def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: list[np.ndarray]) -> tuple[str, ...]:
@@ -102,7 +103,7 @@ def distinct(problem: Problem, modes: list[Mode]) -> list[Mode]:
 
 
 def _is_rival(problem: Problem, state: State, other: State) -> bool:
-    if (state.noise.exponent, state.noise.common_share) != (other.noise.exponent, other.noise.common_share):
+    if state.noise.chosen != other.noise.chosen:
         return True
     differs = state.is_good != other.is_good
     if differs[problem.graph.is_odometry].any():

@@ -23,6 +23,11 @@ from rotavg_ros.solver.slam.posterior.rows import residuals, variances, weights
 from rotavg_ros.solver.slam.posterior.state import Noise, State
 from rotavg_ros.solver.slam.posterior.system import Factorised
 
+# Nodes of the sums that stand for integrals over α, κ and the length of runs; 0: closures err independently.
+EXPONENTS = (0.0, 0.5, 1.0)
+COMMON_SHARES = (0.15, 0.3, 0.6, 0.85)
+RUN_STEPS = (0.0, 30.0, 100.0, 300.0)
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -53,7 +58,8 @@ def evaluate(problem: Problem, state: State) -> Evaluation:
     variance, residual = variances(problem, state.noise), residuals(problem, state)
     square = (residual**2).sum(axis=1)
     weight = weights(problem, state, square, variance)
-    factorised = problem.system.factorise(weight)
+    system = problem.system(state.noise)
+    factorised = system.factorise(weight)
     num_edges, good = len(graph.source), state.is_good
     own, common = np.split(variance, [num_edges])
     log_if_good = log_good(square[:num_edges], own, 0.0, k, priors)[0]
@@ -61,7 +67,7 @@ def evaluate(problem: Problem, state: State) -> Evaluation:
     log_if_slipped = log_slipped(square[slipped], own[slipped], 0.0, k, priors)
     is_false = ~good[problem.closure]
     false = false_density(problem, is_false, residual[problem.closure], np.flatnonzero(is_false))
-    unknowns = problem.system.size - len(graph.roots)
+    unknowns = system.size - len(graph.roots)
     terms = {
         "odometry": -float(log_if_good[graph.is_odometry & good].sum()),
         "slips": -float(log_if_slipped.sum()) - log_slip_prior(problem, slipped),
@@ -76,8 +82,11 @@ def evaluate(problem: Problem, state: State) -> Evaluation:
 
 
 def log_noise_prior(noise: Noise, priors: SlamPriors) -> float:
-    """Of θ: log-normal in both standard deviations, a share for α above 0; all κ are as likely."""
+    """Of θ: log-normal in both standard deviations; shares for α = 0 and for no common errors, all else as likely."""
     step = np.log(noise.step_variance) / 2 - np.log(np.radians(priors.step_deg))
     closure = np.log(noise.closure_variance) / 2 - np.log(np.radians(priors.closure_deg))
-    believed = np.log(priors.stated_share if noise.exponent > 0 else 1 - priors.stated_share)
-    return float(believed - (step**2 + closure**2) / (2 * priors.noise_spread**2))
+    some = priors.stated_share / (len(EXPONENTS) - 1)
+    believed = np.log(some if noise.exponent > 0 else 1 - priors.stated_share)
+    some = priors.common_errors / (len(COMMON_SHARES) * (len(RUN_STEPS) - 1))
+    common = np.log(some if noise.run_steps > 0 else 1 - priors.common_errors)
+    return float(believed + common - (step**2 + closure**2) / (2 * priors.noise_spread**2))

@@ -29,9 +29,10 @@ class SlamPriors:
         slip_deg: standard deviation of what a step is off by where it slipped.
         run_gap_steps: closures follow each other in a run if their ends are at most so many steps of odometry apart,
             both ends summed, …
-        run_steps: … and no run is longer than this at its older end.
-        common_share: share of a good closure's error variance that its run has in common, to begin with; the values
-            that are compared are those of :mod:`rotavg_ros.solver.slam.posterior.moves.noise`.
+        run_steps: … and no run is longer than this at its older end, to begin with.
+        common_errors: probability that closures of a run err alike.
+        common_share: share of a good closure's error variance that its run has in common, to begin with. The values of
+            both that are compared are those of :mod:`rotavg_ros.solver.slam.posterior.objective`.
         stated_share: probability that stated variances say anything.
         least_stated_ratio: no closure is believed to be more exact than this share of the typical variance.
         largest_stated_ratio: a stated variance farther from the typical one than by this factor says nothing.
@@ -52,6 +53,7 @@ class SlamPriors:
     slip_deg: float = 60.0
     run_gap_steps: float = 30.0
     run_steps: float = 300.0
+    common_errors: float = 0.5
     common_share: float = 0.3
     stated_share: float = 0.5
     least_stated_ratio: float = 0.25
@@ -67,10 +69,10 @@ class SearchLimits:
         settling_solves: the same while labels are probabilities.
         converged: such a part of a step's standard deviation is no movement.
         flip_rounds: batches of single flips.
-        annealing_solves: of graduated non-convexity …
-        annealing_factor: … and by how much its loss is sharpened from solve to solve.
+        annealing_factor: by how much the loss of graduated non-convexity is sharpened from solve to solve.
         robust_solves: of the ℓ½ start.
-        hopeless: nats by which a start may be worse than the best to be gone on from.
+        starts: that are gone on from, at least, …
+        alike: … and until so many end in the labelling of least F.
         tried: moves that are tried, at most.
         slack: a move is tried if F is predicted to rise by no more than this, nats.
         rival: modes within so many nats of the best are moved on from.
@@ -84,10 +86,10 @@ class SearchLimits:
     settling_solves: int = 15
     converged: float = 0.05
     flip_rounds: int = 8
-    annealing_solves: int = 40
     annealing_factor: float = 1.6
     robust_solves: int = 12
-    hopeless: float = 200.0
+    starts: int = 3
+    alike: int = 2
     tried: int = 60
     slack: float = 1.0
     rival: float = 6.0

@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs, closure_ends
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.posterior.priors import SearchLimits, SlamPriors
+from rotavg_ros.solver.slam.posterior.state import Noise
 from rotavg_ros.solver.slam.posterior.system import NormalEquations
 
 # A share that is none; the logarithm stays finite.
@@ -27,7 +28,7 @@ class Problem:
         graph: the closure graph.
         components: k, 1 where all rotations share an axis, else 3.
         log_odds: ``(E,)`` of each edge to be good by networks and labels, beyond what is common to all; ±inf decide.
-        run: ``(C,)`` number of the run of each closure; closures of a run may err alike.
+        chain: ``(C,)`` number of the chain of closures, each near the next, that each is one of.
         follows: ``(C,)`` the nearest closure that was detected before and is near enough for the same label, or -1.
         priors: all that is believed beforehand.
         limits: of the search.
@@ -37,11 +38,12 @@ class Problem:
     graph: ClosureGraph
     components: int
     log_odds: np.ndarray
-    run: np.ndarray
+    chain: np.ndarray
     follows: np.ndarray
     priors: SlamPriors
     limits: SearchLimits = field(default_factory=SearchLimits)
     without: frozenset[str] = frozenset()
+    _systems: dict[float, NormalEquations] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @classmethod
     def of(
@@ -54,7 +56,7 @@ class Problem:
         priors: SlamPriors | None = None,
         without: Collection[str] = (),
     ) -> Problem:
-        """Find the runs: closures that follow each other closely.
+        """Find the chains of closures that follow each other closely.
 
         Args:
             pairs: the graph's neighbouring closures.
@@ -66,14 +68,15 @@ class Problem:
             priors = replace(priors, tail_share=_NONE)
         if "near-misses" in without:
             priors = replace(priors, near_miss_share=_NONE)
-        run = _runs(graph, pairs, priors)
+        chain = _chains(graph, pairs, priors)
         told = log_odds.copy()
-        if len(run):
+        if len(chain):
+            run = runs_of(graph, chain, priors.run_steps)
             told[graph.is_closure] /= np.bincount(run)[run]
         if "slips" in without:
             told[graph.is_odometry] = np.inf
         follows = _predecessors(graph, pairs, priors)
-        return cls(graph, components, told, run, follows, priors, without=frozenset(without))
+        return cls(graph, components, told, chain, follows, priors, without=frozenset(without))
 
     @cached_property
     def closure(self) -> np.ndarray:
@@ -121,16 +124,34 @@ class Problem:
         return np.where(is_sane, np.maximum(ratio, np.log(self.priors.least_stated_ratio)), 0.0)
 
     @cached_property
-    def system(self) -> NormalEquations:
+    def run(self) -> np.ndarray:
+        """``(C,)`` number of the run of each closure, none of them longer than the prior's."""
+        return runs_of(self.graph, self.chain, self.priors.run_steps)
+
+    def system(self, noise: Noise) -> NormalEquations:
         """Normal equations; runs of two and more closures have a common error."""
+        if noise.run_steps not in self._systems:
+            self._systems[noise.run_steps] = self._system(noise.run_steps)
+        return self._systems[noise.run_steps]
+
+    def _system(self, run_steps: float) -> NormalEquations:
         graph = self.graph
-        run = np.full(len(graph.source), -1, dtype=np.int64)
-        if len(self.run) and "common-errors" not in self.without:
-            is_shared = np.bincount(self.run)[self.run] >= 2
-            run[self.closure[is_shared]] = np.unique(self.run[is_shared], return_inverse=True)[1].reshape(-1)
+        column = np.full(len(graph.source), -1, dtype=np.int64)
+        if len(self.chain) and run_steps > 0 and "common-errors" not in self.without:
+            run = runs_of(graph, self.chain, run_steps)
+            is_shared = np.bincount(run)[run] >= 2
+            column[self.closure[is_shared]] = np.unique(run[is_shared], return_inverse=True)[1].reshape(-1)
         sign = np.zeros(len(graph.source))
         sign[self.closure] = self.sign
-        return NormalEquations(graph.num_nodes, graph.source, graph.target, run, sign, roots=graph.roots)
+        return NormalEquations(graph.num_nodes, graph.source, graph.target, column, sign, roots=graph.roots)
+
+    @cached_property
+    def is_held(self) -> bool:
+        """Whether odometry alone connects all that the graph connects."""
+        graph = self.graph
+        ends = graph.source[graph.is_odometry], graph.target[graph.is_odometry]
+        links = coo_array((np.ones(len(ends[0])), ends), shape=(graph.num_nodes,) * 2)
+        return bool(connected_components(links, directed=False)[0] == len(graph.roots))
 
     @cached_property
     def total_steps(self) -> float:
@@ -138,20 +159,20 @@ class Problem:
         return float(self.graph.own_steps[self.graph.is_odometry].sum())
 
 
-def _runs(graph: ClosureGraph, pairs: AgreementPairs, priors: SlamPriors) -> np.ndarray:
-    """``(C,)`` number of each closure's run."""
-    closure = np.flatnonzero(graph.is_closure)
-    if len(closure) == 0:
-        return np.empty(0, dtype=np.int64)
+def _chains(graph: ClosureGraph, pairs: AgreementPairs, priors: SlamPriors) -> np.ndarray:
+    """``(C,)`` number of the chain of closures that each is one of."""
+    count = int(graph.is_closure.sum())
     linked = pairs.steps <= priors.run_gap_steps
-    links = coo_array(
-        (np.ones(int(linked.sum())), (pairs.first[linked], pairs.second[linked])), shape=(len(closure),) * 2
-    )
-    chain = connected_components(links, directed=False)[1]
-    older = closure_ends(graph, closure)[:, 0]
-    start = np.full(int(chain.max()) + 1, np.inf)
+    links = coo_array((np.ones(int(linked.sum())), (pairs.first[linked], pairs.second[linked])), shape=(count,) * 2)
+    return np.asarray(connected_components(links, directed=False)[1])
+
+
+def runs_of(graph: ClosureGraph, chain: np.ndarray, run_steps: float) -> np.ndarray:
+    """``(C,)`` number of each closure's run: its chain, cut at the older end after every ``run_steps`` of odometry."""
+    older = closure_ends(graph, np.flatnonzero(graph.is_closure))[:, 0]
+    start = np.full(int(chain.max(initial=-1)) + 1, np.inf)
     np.minimum.at(start, chain, older)
-    stretch = np.stack((chain, (older - start[chain]) // priors.run_steps), axis=1)
+    stretch = np.stack((chain, (older - start[chain]) // run_steps), axis=1)
     return np.asarray(np.unique(stretch, axis=0, return_inverse=True)[1], dtype=np.int64).reshape(-1)
 
 

@@ -21,7 +21,7 @@ _MAX_TURN = 1.0
 
 def variances(problem: Problem, noise: Noise) -> np.ndarray:
     """``(E + R,)`` rad² of every row's own noise if it is good; of closures, what their run does not share."""
-    graph, system = problem.graph, problem.system
+    graph, system = problem.graph, problem.system(noise)
     variance = graph.own_steps * noise.step_variance
     closure = problem.closure
     own = np.where(system.shared[closure], 1 - noise.common_share, 1.0)
@@ -32,12 +32,19 @@ def variances(problem: Problem, noise: Noise) -> np.ndarray:
 
 def residuals(problem: Problem, state: State) -> np.ndarray:
     """``(E + R, 3)`` rad, of all rows."""
-    graph, system = problem.graph, problem.system
+    graph, system = problem.graph, problem.system(state.noise)
     turned = quaternion_rows.residual(state.correction, problem.measured, graph.source, graph.target)
     vectors = quaternion_rows.log(turned).T
     edges = np.flatnonzero(system.shared)
     vectors[edges] -= system.sign[edges, None] * state.common[system.run[edges]]
     return np.concatenate((vectors, -state.common))
+
+
+def with_noise(problem: Problem, state: State, noise: Noise) -> State:
+    """The state under another θ; where runs are other ones their common errors begin at zero."""
+    if noise.run_steps == state.noise.run_steps:
+        return replace(state, noise=noise)
+    return replace(state, noise=noise, common=np.zeros((problem.system(noise).num_runs, 3)))
 
 
 def moved(state: State, step: np.ndarray) -> State:
@@ -72,6 +79,8 @@ def _bridged(problem: Problem, state: State, weight: np.ndarray) -> np.ndarray:
 
     A part that nothing holds may be turned by anything; a normal density of the same volume stands for that.
     """
+    if problem.is_held:
+        return weight
     graph = problem.graph
     holds = graph.is_odometry | state.is_good
     ends = graph.source[holds], graph.target[holds]

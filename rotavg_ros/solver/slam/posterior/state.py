@@ -16,12 +16,19 @@ class Noise:
         closure_variance: rad² per component, of a good closure that states what is typical.
         exponent: α, how far the ratios of stated variances are believed.
         common_share: κ, share of a closure's error variance that its run has in common.
+        run_steps: no run is longer at its older end, in steps of odometry; 0 where closures err independently.
     """
 
     step_variance: float
     closure_variance: float
     exponent: float
     common_share: float
+    run_steps: float
+
+    @property
+    def chosen(self) -> tuple[float, float, float]:
+        """What is chosen from grids: α, κ and the length of runs."""
+        return self.exponent, self.common_share, self.run_steps
 
 
 @dataclass(frozen=True)

@@ -75,21 +75,27 @@ class NormalEquations:
         first, second = np.repeat(column, 3, axis=1), np.tile(column, 3)
         keys = np.concatenate(((second * self.size + first).ravel(), self._rank * (self.size + 1)))
         occupied, slot = np.unique(keys, return_inverse=True)
-        self._slot, diagonal = np.split(slot, [first.size])
+        slot, diagonal = np.split(slot, [first.size])
         self._root_slot = diagonal[self.roots]
-        self._product = (np.repeat(self.value, 3, axis=1) * np.tile(self.value, 3)).ravel()
-        self._row = (occupied % self.size).astype(np.int32)
-        self._first = np.searchsorted(occupied, np.arange(self.size + 1) * self.size).astype(np.int32)
+        product = (np.repeat(self.value, 3, axis=1) * np.tile(self.value, 3)).ravel()
+        row = np.repeat(np.arange(len(column)), 9)
+        # Entries of H as a linear map of the weights.
+        self._entries: csr_array = csr_array((product, (slot, row)), shape=(len(occupied), len(column)))
+        first_of_column = np.searchsorted(occupied, np.arange(self.size + 1) * self.size)
+        self._matrix: csc_array = csc_array(
+            (np.ones(len(occupied)), (occupied % self.size).astype(np.int32), first_of_column.astype(np.int32)),
+            shape=(self.size, self.size),
+        )
 
     def factorise(self, weight: np.ndarray) -> Factorised:
         """With weights ``(E + R,)``, rad⁻²."""
         stop_if_abandoned()
-        values = np.bincount(self._slot, self._product * np.repeat(weight, 9), len(self._row))
+        values = self._entries @ weight
         stiffness = root_stiffness(weight)
         values[self._root_slot] += stiffness
-        matrix = csc_array((values, self._row, self._first), shape=(self.size, self.size))
+        self._matrix.data = values
         factor = splu(
-            matrix,
+            self._matrix,
             permc_spec="NATURAL" if self._is_ordered else "MMD_AT_PLUS_A",
             diag_pivot_thresh=0.0,
             relax=1,

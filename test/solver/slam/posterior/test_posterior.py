@@ -31,7 +31,7 @@ from rotavg_ros.view_graph import ViewGraph
 
 # Gaussian where a mixture would be integrated approximately only.
 _PRIORS = replace(SlamPriors(), tail_share=1e-12, near_miss_share=1e-12)
-_NOISE = Noise(np.radians(1.0) ** 2, np.radians(1.5) ** 2, 0.0, 0.4)
+_NOISE = Noise(np.radians(1.0) ** 2, np.radians(1.5) ** 2, 0.0, 0.4, 300.0)
 
 
 def _yaw(angle: np.ndarray) -> np.ndarray:
@@ -71,7 +71,7 @@ def _state(problem: Problem, is_false: np.ndarray) -> State:
     trusted[problem.closure[is_false]] = 0.0
     correction = np.zeros((4, problem.graph.num_nodes))
     correction[3] = 1.0
-    return State(correction, np.zeros((problem.system.num_runs, 3)), trusted, _NOISE)
+    return State(correction, np.zeros((problem.system(_NOISE).num_runs, 3)), trusted, _NOISE)
 
 
 def _log_evidence(problem: Problem, is_false: np.ndarray) -> float:
@@ -80,7 +80,7 @@ def _log_evidence(problem: Problem, is_false: np.ndarray) -> float:
     discrepancy = 2 * np.arctan2(measured[2], measured[3]) * problem.sign
     older, newer = problem.ends.T
     passed = np.maximum(np.minimum(newer[:, None], newer) - np.maximum(older[:, None], older), 0.0)
-    shared = problem.system.shared[problem.closure]
+    shared = problem.system(_NOISE).shared[problem.closure]
     common = (problem.run[:, None] == problem.run) & shared[:, None] & shared
     own = np.where(shared, 1 - _NOISE.common_share, 1.0) * _NOISE.closure_variance
     covariance = passed * _NOISE.step_variance + common * _NOISE.common_share * _NOISE.closure_variance + np.diag(own)
@@ -207,7 +207,7 @@ def test_priors_are_normalised() -> None:
     [
         ("tails", lambda problem: problem.priors.tail_share < 1e-9),
         ("near-misses", lambda problem: problem.priors.near_miss_share < 1e-9),
-        ("common-errors", lambda problem: problem.system.num_runs == 0),
+        ("common-errors", lambda problem: problem.system(_NOISE).num_runs == 0),
         ("slips", lambda problem: bool(np.isposinf(problem.log_odds[problem.graph.is_odometry]).all())),
         ("repeats", lambda problem: np.ptp(_repeated(problem).mixed()[:, 0]) == 0),
         ("label-runs", lambda problem: _stickiness(problem) == pytest.approx(0.0, abs=1e-9)),

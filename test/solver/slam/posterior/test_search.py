@@ -180,9 +180,10 @@ STRUCTURAL = {
     "moves/flips": {"_PART", "_LEAST_GAIN"},
     "moves/groups": {"_AGREE", "_TIGHTER", "_SETTLING", "_MAX_DENSE"},
     "moves/noise": {"_GRIDS", "_MIN_SPREAD"},
-    "moves/slips": {"_AGREE", "_AGREE_ANGLE", "_OPTIMISM", "_SETTLING"},
+    "moves/slips": {"_AGREE", "_AGREE_ANGLE", "_OPTIMISM", "_SETTLING", "_SAME_PLACE"},
     "moves/starts": {"_INLIER_SQUARE", "_SHARP", "_STEP_LEVELS", "_CLOSURE_LEVEL", "_ROBUST_POWER"}
     | {"_ANNEALED_SLIPS", "_LEAST_WEIGHT", "_SAME_TURN"},
+    "objective": {"EXPONENTS", "COMMON_SHARES", "RUN_STEPS"},
     "problem": {"_NONE"},
     "rows": {"_NOTHING", "_MAX_TURN"},
     "system": {"_NUM_PROBES", "_MAX_LEVERAGE"},

@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.special import logsumexp
 
 from rotavg_ros.solver.slam.posterior.em import settle
 from rotavg_ros.solver.slam.posterior.labels import false_density, log_label_prior, repeat_rates
@@ -43,7 +42,7 @@ def propose(mode: Mode) -> Iterator[Proposal]:
         residuals[members] = residual
         # Given all other false closures; those after them gain as much as those before.
         density = false_density(problem, is_false, residuals, members).mixed().sum(axis=1)
-        log_false = float(logsumexp(density + rates))
+        log_false = float(np.logaddexp.reduce(density + rates))
         is_false[members] = rejects
         log_prior = log_label_prior(problem, is_false) - before
         predicted = (log_good - log_false if rejects else log_false - log_good) - log_prior

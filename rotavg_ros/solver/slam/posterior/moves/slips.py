@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.slam.posterior.densities import log_false
 from rotavg_ros.solver.slam.posterior.em import settle
-from rotavg_ros.solver.slam.posterior.left_out import CERTAIN, relabelled, rough_cost
+from rotavg_ros.solver.slam.posterior.labels import false_density, log_false_set, log_label_prior
+from rotavg_ros.solver.slam.posterior.left_out import relabelled, rough_cost
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.state import State
 
@@ -19,49 +21,94 @@ _SETTLING = 4
 _OPTIMISM = 10.0
 # A turn explains a closure that is off by it to so many standard deviations, or to this angle, rad.
 _AGREE, _AGREE_ANGLE = 3.0, np.radians(2.0)
+# Positions that differ by less, in steps, are the same.
+_SAME_PLACE = 1e-9
+
+
+@dataclass(frozen=True)
+class _Witnesses:
+    """What closures say of slips (C closures, S sound segments in the order of the path).
+
+    Attributes:
+        turned: ``(4, C)`` residuals, from older to newer end.
+        can_tell: ``(C,)`` bool, one chain of odometry has both ends.
+        first, last: ``(C,)`` segments that each lies across: first ≤ s < last.
+        gain: ``(C,)`` nats, what each gains by itself if it comes out good.
+        segment: ``(S,)`` edges.
+        price: ``(S,)`` nats, what a slip of each costs by itself.
+    """
+
+    turned: np.ndarray
+    can_tell: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+    gain: np.ndarray
+    segment: np.ndarray
+    price: np.ndarray
+
+    @classmethod
+    def of(cls, mode: Mode) -> _Witnesses:
+        problem, state, graph, closure = mode.problem, mode.state, mode.problem.graph, mode.problem.closure
+        turned = quaternion_rows.residual(state.correction, problem.measured, graph.source, graph.target)[:, closure]
+        turned = np.where(problem.sign > 0, turned, quaternion_rows.inverse(turned))
+        chain = graph.paths.chain[graph.nodes]
+        can_tell = chain[graph.source[closure]] == chain[graph.target[closure]]
+        segment = np.flatnonzero(state.is_good[: graph.num_segments])
+        start = np.minimum(graph.position[graph.source[segment]], graph.position[graph.target[segment]])
+        order = np.argsort(start, kind="stable")
+        first, last = np.searchsorted(start[order], problem.ends.T - _SAME_PLACE)
+        square = (mode.evaluation.residual[closure] ** 2).sum(axis=1)
+        alone = log_false(square, problem.components, problem.priors)
+        gain = np.maximum(mode.left_out.if_good[closure] - alone, 0.0)
+        segment = segment[order]
+        return cls(turned, can_tell, first, last, gain, segment, -mode.left_out.log_odds[segment])
+
+    def agreeing(self, closure: np.integer, mode: Mode) -> np.ndarray:
+        """``(C,)`` bool, false closures that one turn explains together with this one."""
+        tolerance = 2 * _AGREE**2 * mode.problem.components * mode.state.noise.closure_variance + _AGREE_ANGLE**2
+        difference = 2 * np.arccos(np.minimum(np.abs(self.turned[:, closure] @ self.turned), 1.0))
+        return np.asarray((difference**2 < tolerance) & self.can_tell & mode.is_false)
+
+    def best_place(self, agrees: np.ndarray, disagrees: np.ndarray) -> tuple[int, np.ndarray, float]:
+        """Where a slip gains most, which closures it makes good ``(C,)``, and what it costs by itself, nats."""
+        change = np.where(agrees, self.gain, np.where(disagrees, -self.gain, 0.0))
+        across = np.zeros(len(self.segment) + 1)
+        np.add.at(across, self.first, change)
+        np.add.at(across, self.last, -change)
+        best = int(np.argmin(self.price - np.cumsum(across)[:-1]))
+        is_across = (self.first <= best) & (best < self.last)
+        return best, is_across & agrees, float(self.price[best] + self.gain[is_across & disagrees].sum())
 
 
 def propose_slips(mode: Mode) -> Iterator[Proposal]:
     """Segments where a turn would explain most of the closures that are held false."""
-    problem, state = mode.problem, mode.state
-    graph, closure, is_false = problem.graph, problem.closure, mode.is_false
-    rejected = np.flatnonzero(is_false)
-    if len(rejected) < 2:
+    if mode.is_false.sum() < 2 or not mode.state.is_good[: mode.problem.graph.num_segments].any():
         return
-    turned = quaternion_rows.residual(state.correction, problem.measured, graph.source, graph.target)[:, closure]
-    turned = np.where(problem.sign > 0, turned, quaternion_rows.inverse(turned))
-    chain = graph.paths.chain[graph.nodes]
-    within = chain[graph.source[closure]] == chain[graph.target[closure]]
-    segment = np.flatnonzero(state.is_good[: graph.num_segments])
-    if len(segment) == 0:
-        return
-    start = np.minimum(graph.position[graph.source[segment]], graph.position[graph.target[segment]])
-    order = np.argsort(start, kind="stable")
-    segment, start = segment[order], start[order]
-    first = np.searchsorted(start, problem.ends[:, 0] - 1e-9)
-    last = np.searchsorted(start, problem.ends[:, 1] - 1e-9)
-    tolerance = 2 * _AGREE**2 * problem.components * state.noise.closure_variance + _AGREE_ANGLE**2
-    # What closures gain if they come out good, and lose if they come out wrong.
-    worth = np.clip(mode.left_out.worth[closure], 0.0, CERTAIN)
-    lost = np.where(within & ~is_false, -worth, 0.0)
-    price = -mode.left_out.log_odds[segment]
-    left = within & is_false
+    witnesses = _Witnesses.of(mode)
+    left = witnesses.can_tell & mode.is_false
+    disagrees = witnesses.can_tell & ~mode.is_false
     found = []
-    for seed in rejected:
-        if not left[seed]:
-            continue
-        difference = 2 * np.arccos(np.minimum(np.abs(turned[:, seed] @ turned), 1.0))
-        agrees = (difference**2 < tolerance) & within & is_false
-        left[agrees] = False
-        gain = np.where(agrees, worth, lost)
-        across = np.zeros(len(segment) + 1)
-        np.add.at(across, first, gain)
-        np.add.at(across, last, -gain)
-        predicted = -(np.cumsum(across)[:-1] + price)
-        best = int(np.argmin(predicted))
-        found.append((float(predicted[best]), int(segment[best]), turned[:, [seed]]))
-    for predicted, edge, turn in sorted(found, key=lambda slip: slip[0])[: problem.limits.slips]:
-        yield Proposal("slip", predicted, partial(_with_slip, mode, edge, turn))
+    for closure in np.flatnonzero(left):
+        if left[closure]:
+            agrees = witnesses.agreeing(closure, mode)
+            left &= ~agrees
+            place, freed, cost = witnesses.best_place(agrees, disagrees)
+            found.append((cost - float(witnesses.gain[freed].sum()), closure, place, freed, cost))
+    before = _log_labelled(mode, mode.is_false)
+    for _, closure, place, freed, cost in sorted(found, key=lambda slip: slip[0])[: mode.problem.limits.slips]:
+        # Together they gain less than one by one: false closures that repeat a turn are cheap.
+        after = _log_labelled(mode, mode.is_false & ~freed)
+        after += float(mode.left_out.if_good[mode.problem.closure[freed]].sum())
+        edge, turn = int(witnesses.segment[place]), witnesses.turned[:, [closure]]
+        yield Proposal("slip", cost + before - after, partial(_with_slip, mode, edge, turn))
+
+
+def _log_labelled(mode: Mode, is_false: np.ndarray) -> float:
+    """Log density of false closures and of all labels, residuals as they are."""
+    problem = mode.problem
+    residual = mode.evaluation.residual[problem.closure]
+    density = false_density(problem, is_false, residual, np.flatnonzero(is_false))
+    return log_false_set(problem, density) + log_label_prior(problem, is_false)
 
 
 def propose_mending(mode: Mode) -> Iterator[Proposal]:

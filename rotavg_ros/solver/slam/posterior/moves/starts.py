@@ -29,8 +29,9 @@ from rotavg_ros.view_graph import ViewGraph
 _INLIER_SQUARE = {1: 6.63, 3: 11.34}
 # Annealing has ended once the loss is as sharp as this.
 _SHARP = 1e3
-# Steps of this many prior standard deviations above (below) the median are tried, closures of half one below it.
-_STEP_LEVELS, _CLOSURE_LEVEL = (-1.0, 0.0, 1.0, 2.0), -0.5
+# Steps of this many prior standard deviations above (below) the median are tried, closures of half one below it. In
+# this order two starts soonest agree on what is likeliest.
+_STEP_LEVELS, _CLOSURE_LEVEL = (1.0, -1.0, 0.0, 2.0), -0.5
 # ρ(r) = |r|^½ beyond a standard deviation: weights are (1 + r²/σ²)^-¾.
 _ROBUST_POWER = -0.75
 # Chances of a slip per step under which parts are turned, first as dear as none.
@@ -41,7 +42,7 @@ _SAME_TURN = np.radians(15.0)
 
 
 def starts(problem: Problem, prepared: Prepared, cleaned: CleanedClosures, tree: Tensor) -> Iterator[tuple[str, State]]:
-    """Name and state of each start that is switched on; the tree always is one.
+    """Name and state of each start that is switched on, made when it is asked for; the tree always is one.
 
     Args:
         problem: the graph.
@@ -51,41 +52,45 @@ def starts(problem: Problem, prepared: Prepared, cleaned: CleanedClosures, tree:
     """
     noise = noise_of(problem, prepared.noise)
     joined = _joined_chains(problem)
+    everything = np.ones(len(problem.graph.source))
     yield "tree", settle(problem, at(problem, tree, cleaned.inlier_probability, noise))
+    if "robust-start" not in problem.without:
+        yield "robust start", _robust(problem, at(problem, tree, everything, noise))
     if "annealing" not in problem.without:
         for step_variance, closure_variance in _prior_levels(problem.priors):
             level = replace(noise, step_variance=step_variance, closure_variance=closure_variance)
-            start = at(problem, tree if joined is None else joined, np.ones(len(problem.graph.source)), level)
-            yield "annealing", annealed(problem, start)
-    if "robust-start" not in problem.without:
-        yield "robust start", _robust(problem, at(problem, tree, np.ones(len(problem.graph.source)), noise))
-    if len(prepared.pairs.first) and not problem.without & {"minimum-cuts", "slips"}:
-        near = noise_between_neighbours(prepared.pairs, problem.components)
-        found = _turned_parts(problem, prepared, tree, near)
-        yield "minimum cuts", _labelled(problem, at(problem, found, np.ones(0), noise_of(problem, near)))
+            yield "annealing", annealed(problem, at(problem, tree if joined is None else joined, everything, level))
+
+
+def turned_parts(problem: Problem, prepared: Prepared, tree: Tensor) -> State:
+    """Parts turned where odometry slips as it seems, many at once."""
+    near = noise_between_neighbours(prepared.pairs, problem.components)
+    found = _turned_parts(problem, prepared, tree, near)
+    return _labelled(problem, at(problem, found, np.ones(0), noise_of(problem, near)))
 
 
 def noise_of(problem: Problem, model: NoiseModel) -> Noise:
     """θ to begin with."""
-    return Noise(model.step_variance, model.closure_variance, 0.0, problem.priors.common_share)
+    priors = problem.priors
+    return Noise(model.step_variance, model.closure_variance, 0.0, priors.common_share, priors.run_steps)
 
 
 def at(problem: Problem, correction: Tensor, trusted: np.ndarray, noise: Noise) -> State:
     """A state at corrections ``(K, 4)``."""
     rows = np.ascontiguousarray(correction.numpy().T)
-    return State(rows, np.zeros((problem.system.num_runs, 3)), trusted.astype(np.float64), noise)
+    return State(rows, np.zeros((problem.system(noise).num_runs, 3)), trusted.astype(np.float64), noise)
 
 
 def annealed(problem: Problem, state: State) -> State:
     """Graduated non-convexity (Yang et al. 2020, truncated least squares) on closures, odometry trusted."""
-    variance, closure = variances(problem, state.noise), problem.closure
+    variance, closure, system = variances(problem, state.noise), problem.closure, problem.system(state.noise)
     told = problem.log_odds[closure]
     limit = _INLIER_SQUARE[problem.components]
     sharpness = 0.0
-    for number in range(problem.limits.annealing_solves):
+    while sharpness < _SHARP:
         residual = residuals(problem, state)
         square = (residual**2).sum(axis=1)[closure] / variance[closure]
-        if number == 0:
+        if sharpness == 0:
             sharpness = limit / max(2 * float(square.max(initial=0.0)) - limit, _LEAST_WEIGHT)
         else:
             weight = np.sqrt(limit * sharpness * (sharpness + 1) / np.maximum(square, _LEAST_WEIGHT)) - sharpness
@@ -93,15 +98,13 @@ def annealed(problem: Problem, state: State) -> State:
             trusted[closure] = np.where(np.isinf(told), told > 0, np.clip(weight, 0.0, 1.0))
             state = replace(state, trusted=trusted)
             sharpness *= problem.limits.annealing_factor
-        trust = np.concatenate((state.trusted, np.ones(problem.system.num_runs)))
-        state = moved(state, problem.system.factorise(np.maximum(trust, _LEAST_WEIGHT) / variance).fit(residual))
-        if sharpness > _SHARP:
-            break
+        trust = np.concatenate((state.trusted, np.ones(system.num_runs)))
+        state = moved(state, system.factorise(np.maximum(trust, _LEAST_WEIGHT) / variance).fit(residual))
     return replace(state, trusted=state.is_good.astype(np.float64))
 
 
 def _prior_levels(priors: SlamPriors) -> list[tuple[float, float]]:
-    """Step and closure variances, rad², from the lower to the far upper end of what is likely beforehand."""
+    """Step and closure variances, rad², that are likely beforehand."""
     closure = np.radians(priors.closure_deg * np.exp(_CLOSURE_LEVEL * priors.noise_spread)) ** 2
     steps = np.radians(priors.step_deg * np.exp(priors.noise_spread * np.array(_STEP_LEVELS))) ** 2
     return [(float(step), float(closure)) for step in steps]
@@ -140,7 +143,7 @@ def _robust(problem: Problem, state: State) -> State:
     for _ in range(problem.limits.robust_solves):
         residual = residuals(problem, state)
         weight = (1 + (residual**2).sum(axis=1) / own) ** _ROBUST_POWER / own
-        state = moved(state, problem.system.factorise(weight).fit(residual))
+        state = moved(state, problem.system(state.noise).factorise(weight).fit(residual))
     return _labelled(problem, state)
 
 
