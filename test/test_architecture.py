@@ -89,7 +89,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "moves": {"graph", "noise", "passes", "preparation"},
         "update": {"graph", "network", "noise", "passes", "preparation", "refinement", "stages"},
         "stages": {"graph", "moves", "network", "noise", "options", "passes", "preparation", "refinement"},
-        "posterior": {"graph", "moves", "noise", "preparation", "stages"},
+        "posterior": {"graph", "moves", "network", "noise", "preparation", "stages"},
         "solve": {
             "graph",
             "network",
@@ -107,7 +107,8 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "priors": set(),
         "state": set(),
         "system": set(),
-        "problem": {"priors", "state", "system"},
+        "bias": {"priors", "state", "system"},
+        "problem": {"bias", "priors", "state", "system"},
         "densities": {"priors"},
         "labels": {"densities", "problem"},
         "rows": {"densities", "problem", "state"},
@@ -118,7 +119,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "moves": {"densities", "em", "labels", "left_out", "mode", "objective", "priors", "problem", "rows", "state"},
         "inference": {"em", "mode", "moves", "problem", "state"},
         "modes": {"em", "left_out", "mode", "problem", "state"},
-        "solve": {"inference", "modes", "problem"},
+        "solve": {"bias", "inference", "mode", "moves", "problem", "state"},
     },
     "online": {
         "free_memory": set(),

@@ -19,8 +19,7 @@ from rotavg_ros.solver.slam.posterior.modes import of_mode, publish
 from rotavg_ros.solver.slam.posterior.moves.flips import flipped
 from rotavg_ros.solver.slam.posterior.moves.noise import tuned
 from rotavg_ros.solver.slam.posterior.moves.starts import at, noise_of
-from rotavg_ros.solver.slam.posterior.solve import problem_of
-from rotavg_ros.solver.slam.preparation import Prepared, prepare
+from rotavg_ros.solver.slam.posterior.solve import Drawn, Found, search
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -66,34 +65,38 @@ def compare_with_truth(
     if repeats is not None:
         first = torch.from_numpy(repeats[0])
         graph, is_wrong = graph.select_edges(first), is_wrong[first]
-    prepared = prepare(graph)
     network = None if "cleannet" in without else Networks("cpu", weights).load(SlamCleanNet)
-    cleaned = slam_stages.clean(network, prepared, graph.label)
-    problem = problem_of(prepared, cleaned, without)
-    modes = Search(problem).run(prepared, cleaned, slam_stages.bootstrap(prepared, cleaned))
+    found = search(graph, network, slam_stages.bootstrap, without)
+    problem, modes = found.drawn.problem, found.modes
     published = publish(problem, modes)
 
-    closure_graph = prepared.closure_graph
-    trusted = np.ones(len(closure_graph.source))
-    trusted[closure_graph.num_segments :] = ~is_wrong.numpy()[closure_graph.view_graph_edge]
-    slipped = closure_graph.segment_of_edge[is_wrong.numpy() & (closure_graph.segment_of_edge >= 0)]
-    trusted[slipped] = 0.0
-    search = Search(problem)
-    correction = closure_graph.corrections(body_from_world)
-    start = search.polished(at(problem, correction, trusted, noise_of(problem, prepared.noise)), "truth")
-    search.keep(flipped(start))
-    for mode in tuned(search.modes[0]):
-        search.keep(mode)
-    truth = search.modes[0]
-    terms = {name: nats - truth.evaluation.terms[name] for name, nats in modes[0].evaluation.terms.items()}
+    from_truth = _from_truth(found.drawn, body_from_world, is_wrong)
+    if problem.bias is not None:
+        # The odometry may as well be without a bias.
+        as_it_is = _from_truth(Drawn.of(graph, network, without), body_from_world, is_wrong)
+        from_truth = min(from_truth, as_it_is, key=lambda either: either.cost)
+    truth = from_truth.modes[0]
+    terms = {name: nats - truth.evaluation.terms.get(name, 0.0) for name, nats in modes[0].evaluation.terms.items()}
     return Comparison(
-        _orientations(prepared, published.correction),
-        _orientations(prepared, of_mode(problem, truth.state).correction),
+        found.drawn.orientations(published.correction),
+        from_truth.drawn.orientations(of_mode(truth.problem, truth.state).correction),
         modes[0].cost - truth.cost,
         terms,
         len(published.rivals),
     )
 
 
-def _orientations(prepared: Prepared, correction: np.ndarray) -> Tensor:
-    return prepared.closure_graph.orientations(torch.from_numpy(np.ascontiguousarray(correction.T)))
+def _from_truth(drawn: Drawn, body_from_world: Tensor, is_wrong: Tensor) -> Found:
+    """What single flips and other noise find from the true labels ``(M,)`` and orientations ``(N, 4)``."""
+    problem, closure_graph = drawn.problem, drawn.prepared.closure_graph
+    trusted = np.ones(len(closure_graph.source))
+    trusted[closure_graph.num_segments :] = ~is_wrong.numpy()[closure_graph.view_graph_edge]
+    slipped = closure_graph.segment_of_edge[is_wrong.numpy() & (closure_graph.segment_of_edge >= 0)]
+    trusted[slipped] = 0.0
+    from_truth = Search(problem)
+    correction = closure_graph.corrections(body_from_world)
+    start = at(problem, correction, trusted, noise_of(problem, drawn.prepared.noise))
+    from_truth.keep(flipped(from_truth.polished(start, "truth")))
+    for mode in tuned(from_truth.modes[0]):
+        from_truth.keep(mode)
+    return Found(drawn, from_truth.modes)

@@ -14,6 +14,7 @@ SWITCHES: dict[str, str] = {
     "common-errors": "every closure errs by itself",
     "stated-precisions": "all closures are alike, whatever they state",
     "slips": "odometry does not slip",
+    "bias": "no gyroscope has a bias",
     "groups": "labels are flipped one by one",
     "mending": "a slip, once found, is not taken back together with what it explains",
     "annealing": "no start anneals the closures",

@@ -46,6 +46,7 @@ class Prepared:
         path_steps: ``(C,)`` odometry steps between its ends; inf where odometry does not connect them.
         pairs: which closures agree.
         noise: estimated scales.
+        forest: along which the chains were drawn together.
         is_unbiased: whether a gyroscope bias was taken out of the odometry beforehand.
     """
 
@@ -54,6 +55,7 @@ class Prepared:
     path_steps: np.ndarray
     pairs: AgreementPairs
     noise: NoiseModel
+    forest: SpanningForest
     is_unbiased: bool = False
 
     @property
@@ -69,12 +71,36 @@ def prepare(graph: ViewGraph, *, scale_estimation: bool = True) -> Prepared:
     Args:
         scale_estimation: if not, the noise is what edges of either kind state in the median.
     """
-    prepared, forest = _contract(graph, scale_estimation)
-    if scale_estimation and prepared.noise.outlier_share > _BIASED_SHARE and _may_be_biased(prepared):
-        unbiased = _without_bias(graph, prepared, forest)
-        if unbiased is not None and unbiased.noise.step_variance < prepared.noise.step_variance:
-            return replace(unbiased, is_unbiased=True)
-    return prepared
+    prepared = _contract(graph, scale_estimation)
+    bias = likely_bias(graph, prepared) if scale_estimation else None
+    if bias is None:
+        return prepared
+    unbiased = prepare_as_it_is(without_bias(graph, bias))
+    fewer_disagree = unbiased.noise.outlier_share < prepared.noise.outlier_share - _BIAS_GAIN
+    is_better = fewer_disagree and unbiased.noise.step_variance < prepared.noise.step_variance
+    return replace(unbiased, is_unbiased=True) if is_better else prepared
+
+
+def prepare_as_it_is(graph: ViewGraph) -> Prepared:
+    """The same whatever the odometry's bias."""
+    return _contract(graph, scale_estimation=True)
+
+
+def likely_bias(graph: ViewGraph, prepared: Prepared) -> np.ndarray | None:
+    """``(3,)`` rad per step, what may be wrong with all steps alike; None if most closures agree with the odometry."""
+    if prepared.noise.outlier_share <= _BIASED_SHARE or not _may_be_biased(prepared):
+        return None
+    noise = noise_between_neighbours(prepared.pairs, prepared.noise.components)
+    bias, closure_graph, forest, corrected = np.zeros(3), prepared.closure_graph, prepared.forest, graph
+    for number in range(_BIAS_ROUNDS):
+        if number > 0:
+            closure_graph, forest = draw_together(corrected)
+        estimate = estimate_bias(corrected, forest, closure_graph, noise)
+        if number == 0 and estimate.explained < _BIAS_EXPLAINED * _BIAS_GAIN:
+            return None
+        bias = bias + estimate.bias
+        corrected = without_bias(graph, bias)
+    return bias
 
 
 def _may_be_biased(prepared: Prepared) -> bool:
@@ -85,24 +111,8 @@ def _may_be_biased(prepared: Prepared) -> bool:
     return bool((disagrees & is_confirmed).mean() > _BIAS_CONFIRMED * _BIAS_GAIN)
 
 
-def _without_bias(graph: ViewGraph, prepared: Prepared, forest: SpanningForest) -> Prepared | None:
-    """The graph prepared with the likeliest bias taken out of its odometry; None if that explains too few closures."""
-    noise = noise_between_neighbours(prepared.pairs, prepared.noise.components)
-    corrected, closure_graph = graph, prepared.closure_graph
-    for number in range(_BIAS_ROUNDS):
-        if number > 0:
-            closure_graph, forest = draw_together(corrected)
-        estimate = estimate_bias(corrected, forest, closure_graph, noise)
-        if number == 0 and estimate.explained < _BIAS_EXPLAINED * _BIAS_GAIN:
-            return None
-        corrected = without_bias(corrected, estimate.bias)
-    unbiased, _ = _contract(corrected, scale_estimation=True)
-    fewer_disagree = unbiased.noise.outlier_share < prepared.noise.outlier_share - _BIAS_GAIN
-    return unbiased if fewer_disagree else None
-
-
-def _contract(graph: ViewGraph, scale_estimation: bool) -> tuple[Prepared, SpanningForest]:
-    """As :func:`prepare`, believing the odometry, and the forest along which the chains were drawn together."""
+def _contract(graph: ViewGraph, scale_estimation: bool) -> Prepared:
+    """As :func:`prepare`, believing the odometry."""
     closure_graph, forest = draw_together(graph)
     closure = closure_graph.is_closure
     squared_angle = (rotations.log(closure_graph.residual) ** 2).sum(dim=1).numpy()[closure]
@@ -113,7 +123,7 @@ def _contract(graph: ViewGraph, scale_estimation: bool) -> tuple[Prepared, Spann
         noise = estimate_noise(discrepancies(squared_angle, path_steps, pairs), components)
     else:
         noise = _stated_noise(graph, components)
-    return Prepared(closure_graph, squared_angle, path_steps, pairs, noise), forest
+    return Prepared(closure_graph, squared_angle, path_steps, pairs, noise, forest)
 
 
 def draw_together(graph: ViewGraph) -> tuple[ClosureGraph, SpanningForest]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.estimate import Estimate, Run
@@ -16,9 +17,9 @@ from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.passes.alternation import Verdicts
-from rotavg_ros.solver.slam.posterior.modes import Published
-from rotavg_ros.solver.slam.posterior.solve import solve_posterior
-from rotavg_ros.solver.slam.preparation import prepare
+from rotavg_ros.solver.slam.posterior.modes import Published, publish
+from rotavg_ros.solver.slam.posterior.solve import search
+from rotavg_ros.solver.slam.preparation import Prepared, prepare
 from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.view_graph import ViewGraph
 
@@ -36,11 +37,15 @@ def solve_slam(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
 def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     """The same for a graph without repetitions."""
     watch = run.watch
+    steps = run.refinement_steps
+    if steps is None:
+        steps = slam_refinement.MAX_PASSES if stages.refine else 0
+    if steps > 0 and stages.posterior:
+        return _solve_by_posterior(graph, stages, run)
     with watch.stage("contract"):
         prepared = prepare(graph, scale_estimation=stages.scale_estimation)
     with watch.stage("clean"):
-        has_network = stages.clean and "cleannet" not in stages.without
-        network = run.networks.load(SlamCleanNet) if has_network else None
+        network = run.networks.load(SlamCleanNet) if stages.clean else None
         cleaned = slam_stages.clean(network, prepared, graph.label)
     with watch.stage("bootstrap"):
         if run.warm_start is not None:
@@ -49,14 +54,6 @@ def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
             correction = slam_stages.bootstrap(prepared, cleaned)
         else:
             correction = rotations.identity(prepared.closure_graph.num_nodes)
-    steps = run.refinement_steps
-    if steps is None:
-        steps = slam_refinement.MAX_PASSES if stages.refine else 0
-    if steps > 0 and stages.posterior:
-        with watch.stage("refine"):
-            published = solve_posterior(prepared, cleaned, correction, stages.without)
-        with watch.stage("expand"):
-            return _published_estimate(prepared.closure_graph, published)
     if steps > 0:
         with watch.stage("refine"):
             estimate = slam_stages.refine_and_search(prepared, cleaned, correction, steps, stages=stages)
@@ -70,6 +67,22 @@ def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
         score = slam_stages.outlier_scores(prepared.closure_graph, 1 - cleaned.inlier_probability)
         orientations = prepared.closure_graph.orientations(correction)
     return Estimate(orientations, torch.from_numpy(score), torch.full((graph.num_nodes,), torch.nan))
+
+
+def _solve_by_posterior(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
+    """The same by one posterior, which draws the graph together and cleans it as often as odometry may be biased."""
+
+    def begin(prepared: Prepared, cleaned: slam_stages.CleanedClosures) -> Tensor:
+        if run.warm_start is not None:
+            return prepared.closure_graph.corrections(run.warm_start.double())
+        return slam_stages.bootstrap(prepared, cleaned)
+
+    network = None if "cleannet" in stages.without else run.networks.load(SlamCleanNet)
+    with run.watch.stage("refine"):
+        found = search(graph, network, begin, stages.without)
+        published = publish(found.drawn.problem, found.modes)
+    with run.watch.stage("expand"):
+        return _published_estimate(found.drawn.prepared.closure_graph, published)
 
 
 def _published_estimate(graph: ClosureGraph, published: Published) -> Estimate:

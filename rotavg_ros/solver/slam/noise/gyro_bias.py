@@ -59,7 +59,7 @@ def estimate_bias(
     if len(closure) == 0:
         return BiasEstimate(np.zeros(3), 0.0)
     nodes = closure_graph.nodes
-    drift = _drift_per_bias(graph, forest, closure_graph)
+    drift = drift_per_bias(graph, forest, closure_graph)
     ends = nodes[closure_graph.source[closure]], nodes[closure_graph.target[closure]]
     design = drift[ends[0]] - drift[ends[1]]
     measured = closure_graph.residual.numpy()[closure]
@@ -121,7 +121,7 @@ def without_bias(graph: ViewGraph, bias: np.ndarray) -> ViewGraph:
     return replace(graph, target_from_source=rotations.canonical(rotations.normalize(corrected)))
 
 
-def _drift_per_bias(graph: ViewGraph, forest: SpanningForest, closure_graph: ClosureGraph) -> np.ndarray:
+def drift_per_bias(graph: ViewGraph, forest: SpanningForest, closure_graph: ClosureGraph) -> np.ndarray:
     """``(N, 3, 3)``: world-frame rotation vector of each node's odometry error per bias, from its root on."""
     child = np.flatnonzero(forest.parent_edge >= 0)
     edge = forest.parent_edge[child]

@@ -17,8 +17,8 @@ from rotavg_ros.solver.slam.posterior.system import Factorised
 # Residuals say nothing of noise or labels while orientations still turn by more than this; but not for ever.
 _SETTLED_TURN = np.radians(3.0)
 _MAX_UNSETTLED = 5
-# Noise is estimated anew in the first solves, and until it changes by less than this, in the logarithm of a variance.
-_NOISE_SOLVES, _NOISE_CONVERGED = 4, 0.05
+# Noise is estimated anew in the first solves, and until that lowers F by less than this, nats.
+_NOISE_SOLVES, _NOISE_CONVERGED = 4, 0.1
 _PROBABILITY_CONVERGED = 0.02
 # Newton's steps to the likeliest variance, and how far from its prior it may end, in standard deviations.
 _NEWTON_STEPS, _FARTHEST = 20, 5.0
@@ -41,7 +41,7 @@ def polish(problem: Problem, state: State, *, hold_noise: bool = False) -> tuple
         if not hold_noise and turned < _SETTLED_TURN and (number < _NOISE_SOLVES or is_settled):
             before = state.noise
             state = replace(state, noise=estimate_noise(problem, state, factorised))
-            is_settled &= _log_change(before, state.noise) < _NOISE_CONVERGED
+            is_settled &= _gained(problem, before, state.noise) < _NOISE_CONVERGED
         if is_settled:
             break
     return state, evaluate(problem, state)
@@ -107,6 +107,8 @@ def _likeliest(squares: float, freedom: float, log_variance: float, log_prior: f
     return float(np.exp(np.clip(x, log_prior - 2 * _FARTHEST * spread, log_prior + 2 * _FARTHEST * spread)))
 
 
-def _log_change(before: Noise, after: Noise) -> float:
-    steps, closures = after.step_variance / before.step_variance, after.closure_variance / before.closure_variance
-    return float(max(abs(np.log(steps)), abs(np.log(closures))))
+def _gained(problem: Problem, before: Noise, after: Noise) -> float:
+    """By how much F fell, nats, about: each of n components tells the logarithm of its variance to ½ n."""
+    steps = np.log(after.step_variance / before.step_variance) ** 2 * problem.graph.num_segments
+    closures = np.log(after.closure_variance / before.closure_variance) ** 2 * len(problem.closure)
+    return float(problem.components / 4 * (steps + closures))

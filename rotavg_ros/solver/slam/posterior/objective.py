@@ -5,8 +5,9 @@ With r_e the residuals at the best corrections Ĉ and H the Hessian there,
     F = − Σ_sound log p(r_e | sound)  − Σ_slipped log p(r_e | slipped)  − Σ_good log p(r_e | good)  − Σ_runs log p(b)
         − log p(false closures)  − log p(labels)  − log p(θ)  + ½ k (log det H − d log 2π)
 
-d is the number of unknowns: key nodes but for the roots, and runs' common errors b. Two labellings are compared by F
-and by nothing else.
+d is the number of unknowns: key nodes but for the roots, and runs' common errors b. Where a gyroscope's bias was taken
+out, − log p of it is added (:mod:`rotavg_ros.solver.slam.posterior.bias`). Two labellings are compared by F and by
+nothing else.
 """
 
 from __future__ import annotations
@@ -20,13 +21,8 @@ from rotavg_ros.solver.slam.posterior.labels import false_density, log_false_set
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import residuals, variances, weights
-from rotavg_ros.solver.slam.posterior.state import Noise, State
+from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, EXPONENTS, RUN_STEPS, Noise, State
 from rotavg_ros.solver.slam.posterior.system import Factorised
-
-# Nodes of the sums that stand for integrals over α, κ and the length of runs; 0: closures err independently.
-EXPONENTS = (0.0, 0.5, 1.0)
-COMMON_SHARES = (0.15, 0.3, 0.6, 0.85)
-RUN_STEPS = (0.0, 30.0, 100.0, 300.0)
 
 
 @dataclass(frozen=True)
@@ -78,6 +74,9 @@ def evaluate(problem: Problem, state: State) -> Evaluation:
         "noise": -log_noise_prior(state.noise, priors),
         "orientations": k / 2 * (factorised.log_det - unknowns * np.log(2 * np.pi)),
     }
+    if problem.bias is not None:
+        information, _ = problem.bias.information(graph.source, state, residual, factorised, priors)
+        terms["bias"] = problem.bias.cost(information, priors)
     return Evaluation(terms, residual, weight, factorised)
 
 

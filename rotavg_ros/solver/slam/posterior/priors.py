@@ -27,12 +27,11 @@ class SlamPriors:
         slip_count: the share of slipping steps has the prior Beta(slip_count, slip_steps), …
         slip_steps: … so the first slip is dear and later ones are cheaper.
         slip_deg: standard deviation of what a step is off by where it slipped.
+        bias_deg: standard deviation of a component of a gyroscope's bias, per step.
         run_gap_steps: closures follow each other in a run if their ends are at most so many steps of odometry apart,
             both ends summed, …
-        run_steps: … and no run is longer than this at its older end, to begin with.
-        common_errors: probability that closures of a run err alike.
-        common_share: share of a good closure's error variance that its run has in common, to begin with. The values of
-            both that are compared are those of :mod:`rotavg_ros.solver.slam.posterior.objective`.
+        common_errors: probability that closures of a run err alike; for how long and how far, all values that are
+            summed over are as likely (:mod:`rotavg_ros.solver.slam.posterior.objective`).
         stated_share: probability that stated variances say anything.
         least_stated_ratio: no closure is believed to be more exact than this share of the typical variance.
         largest_stated_ratio: a stated variance farther from the typical one than by this factor says nothing.
@@ -51,10 +50,9 @@ class SlamPriors:
     slip_count: float = 1.0
     slip_steps: float = 2000.0
     slip_deg: float = 60.0
+    bias_deg: float = 1.0
     run_gap_steps: float = 30.0
-    run_steps: float = 300.0
     common_errors: float = 0.5
-    common_share: float = 0.3
     stated_share: float = 0.5
     least_stated_ratio: float = 0.25
     largest_stated_ratio: float = 100.0
@@ -82,7 +80,7 @@ class SearchLimits:
         averaged: labellings that are averaged, at most.
     """
 
-    polish_solves: int = 8
+    polish_solves: int = 20
     settling_solves: int = 15
     converged: float = 0.05
     flip_rounds: int = 8

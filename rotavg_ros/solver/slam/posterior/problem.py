@@ -12,9 +12,11 @@ from scipy.sparse.csgraph import connected_components
 
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs, closure_ends
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
+from rotavg_ros.solver.slam.posterior.bias import Bias
 from rotavg_ros.solver.slam.posterior.priors import SearchLimits, SlamPriors
-from rotavg_ros.solver.slam.posterior.state import Noise
+from rotavg_ros.solver.slam.posterior.state import RUN_STEPS, Noise
 from rotavg_ros.solver.slam.posterior.system import NormalEquations
+from rotavg_ros.solver.slam.preparation import Prepared
 
 # A share that is none; the logarithm stays finite.
 _NONE = 1e-12
@@ -33,6 +35,7 @@ class Problem:
         priors: all that is believed beforehand.
         limits: of the search.
         without: names of terms and moves that are switched off (:data:`rotavg_ros.solver.slam.options.SWITCHES`).
+        bias: what was taken out of all odometry beforehand, if anything.
     """
 
     graph: ClosureGraph
@@ -43,27 +46,28 @@ class Problem:
     priors: SlamPriors
     limits: SearchLimits = field(default_factory=SearchLimits)
     without: frozenset[str] = frozenset()
+    bias: Bias | None = None
     _systems: dict[float, NormalEquations] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @classmethod
     def of(
         cls,
-        graph: ClosureGraph,
-        pairs: AgreementPairs,
-        components: int,
+        prepared: Prepared,
         log_odds: np.ndarray,
         *,
         priors: SlamPriors | None = None,
         without: Collection[str] = (),
+        bias: Bias | None = None,
     ) -> Problem:
         """Find the chains of closures that follow each other closely.
 
         Args:
-            pairs: the graph's neighbouring closures.
+            prepared: the graph drawn together, with its neighbouring closures.
             log_odds: ``(E,)`` of each edge by itself. A network judges the closures of a run by the same evidence, so
                 that together they count once.
         """
         priors = SlamPriors() if priors is None else priors
+        graph, pairs, components = prepared.closure_graph, prepared.pairs, prepared.noise.components
         if "tails" in without:
             priors = replace(priors, tail_share=_NONE)
         if "near-misses" in without:
@@ -71,12 +75,12 @@ class Problem:
         chain = _chains(graph, pairs, priors)
         told = log_odds.copy()
         if len(chain):
-            run = runs_of(graph, chain, priors.run_steps)
+            run = runs_of(graph, chain, RUN_STEPS[-1])
             told[graph.is_closure] /= np.bincount(run)[run]
         if "slips" in without:
             told[graph.is_odometry] = np.inf
         follows = _predecessors(graph, pairs, priors)
-        return cls(graph, components, told, chain, follows, priors, without=frozenset(without))
+        return cls(graph, components, told, chain, follows, priors, without=frozenset(without), bias=bias)
 
     @cached_property
     def closure(self) -> np.ndarray:
@@ -125,8 +129,8 @@ class Problem:
 
     @cached_property
     def run(self) -> np.ndarray:
-        """``(C,)`` number of the run of each closure, none of them longer than the prior's."""
-        return runs_of(self.graph, self.chain, self.priors.run_steps)
+        """``(C,)`` number of the run of each closure, none of them longer than any run."""
+        return runs_of(self.graph, self.chain, RUN_STEPS[-1])
 
     def system(self, noise: Noise) -> NormalEquations:
         """Normal equations; runs of two and more closures have a common error."""

@@ -1,34 +1,134 @@
-"""A robot's graph by its posterior: starts, moves, and the average over the labellings that are left."""
+"""A robot's graph by its posterior: starts and moves, with a gyroscope's bias or without, and what is published."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
 
+import numpy as np
+import torch
 from torch import Tensor
 
+from rotavg_ros.solver.slam.network import SlamCleanNet
+from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
+from rotavg_ros.solver.slam.posterior.bias import Bias
 from rotavg_ros.solver.slam.posterior.inference import Search
-from rotavg_ros.solver.slam.posterior.modes import Published, publish
+from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.solver.slam.posterior.moves.flips import flipped
 from rotavg_ros.solver.slam.posterior.problem import Problem
-from rotavg_ros.solver.slam.preparation import Prepared
-from rotavg_ros.solver.slam.stages import CleanedClosures
+from rotavg_ros.solver.slam.posterior.state import State
+from rotavg_ros.solver.slam.preparation import Prepared, likely_bias, prepare_as_it_is
+from rotavg_ros.solver.slam.stages import CleanedClosures, clean
+from rotavg_ros.view_graph import ViewGraph
+
+# A bias is made better so many times at most, as long as F falls by more than this, nats.
+_BIAS_ROUNDS, _LEAST_GAIN = 3, 0.5
 
 
-def solve_posterior(
-    prepared: Prepared, cleaned: CleanedClosures, correction: Tensor, without: Collection[str] = ()
-) -> Published:
-    """What is published of a prepared graph.
+@dataclass(frozen=True)
+class Drawn:
+    """A graph drawn together, and its problem.
+
+    Attributes:
+        prepared: without the bias, if there is one.
+        cleaned: what CleanNet says of its closures.
+        problem: the posterior's view of it.
+    """
+
+    prepared: Prepared
+    cleaned: CleanedClosures
+    problem: Problem
+
+    @classmethod
+    def of(
+        cls,
+        graph: ViewGraph,
+        network: SlamCleanNet | None,
+        without: Collection[str] = (),
+        bias: np.ndarray | None = None,
+    ) -> Drawn:
+        """After ``bias`` ``(3,)`` rad per step is taken out of the odometry."""
+        corrected = graph if bias is None else without_bias(graph, bias)
+        prepared = prepare_as_it_is(corrected)
+        cleaned = clean(network, prepared, graph.label)
+        of_bias = None if bias is None else Bias.of(corrected, prepared, bias)
+        problem = Problem.of(prepared, cleaned.network_log_odds, without=without, bias=of_bias)
+        return cls(prepared, cleaned, problem)
+
+    def orientations(self, correction: np.ndarray) -> Tensor:
+        """``(N, 4)`` body_from_world from corrections ``(4, K)``."""
+        return self.prepared.closure_graph.orientations(torch.from_numpy(np.ascontiguousarray(correction.T)))
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the search found, the least F first."""
+
+    drawn: Drawn
+    modes: list[Mode]
+
+    @property
+    def cost(self) -> float:
+        """F of the best mode, nats."""
+        return self.modes[0].cost
+
+
+Begin = Callable[[Prepared, CleanedClosures], Tensor]
+
+
+def search(graph: ViewGraph, network: SlamCleanNet | None, begin: Begin, without: Collection[str] = ()) -> Found:
+    """The labellings of least F of a graph that states nothing twice.
 
     Args:
-        prepared: the graph drawn together.
-        cleaned: what CleanNet says of its closures.
-        correction: ``(K, 4)`` of the tree, or of an earlier answer to begin with.
+        graph: N nodes.
+        network: CleanNet, or None without it.
+        begin: corrections ``(K, 4)`` to begin with: along CleanNet's tree, or of an earlier answer.
         without: terms and moves that are switched off.
     """
-    problem = problem_of(prepared, cleaned, without)
-    return publish(problem, Search(problem).run(prepared, cleaned, correction))
+
+    def from_starts(drawn: Drawn) -> Found:
+        correction = begin(drawn.prepared, drawn.cleaned)
+        return Found(drawn, Search(drawn.problem).run(drawn.prepared, drawn.cleaned, correction))
+
+    found = from_starts(Drawn.of(graph, network, without))
+    if "bias" in without:
+        return found
+    if (bias := likely_bias(graph, found.drawn.prepared)) is not None:
+        found = min(found, from_starts(Drawn.of(graph, network, without, bias)), key=lambda either: either.cost)
+    for better in _with_better_bias(graph, network, found, without):
+        found = better
+    return found
 
 
-def problem_of(prepared: Prepared, cleaned: CleanedClosures, without: Collection[str] = ()) -> Problem:
-    """The posterior's view of a prepared graph."""
-    graph, components = prepared.closure_graph, prepared.noise.components
-    return Problem.of(graph, prepared.pairs, components, cleaned.network_log_odds, without=without)
+def _with_better_bias(
+    graph: ViewGraph, network: SlamCleanNet | None, found: Found, without: Collection[str]
+) -> Iterator[Found]:
+    """What is found from the best mode with Newton's step on the bias, as long as F falls."""
+    for _ in range(_BIAS_ROUNDS):
+        best, drawn = found.modes[0], found.drawn
+        problem, evaluation = best.problem, best.evaluation
+        bias = problem.bias or Bias.of(graph, drawn.prepared, np.zeros(3))
+        information, change = bias.information(
+            problem.graph.source, best.state, evaluation.residual, evaluation.factorised, problem.priors
+        )
+        predicted = -float(change @ information @ change) / 2
+        if problem.bias is None:
+            predicted += bias.cost(information, problem.priors)
+        if predicted > -_LEAST_GAIN:
+            return
+        again = Drawn.of(graph, network, without, bias.vector + change @ bias.axes)
+        moved = _moved(best, drawn, again)
+        goes_on = Search(again.problem)
+        goes_on.keep(flipped(goes_on.polished(moved, "bias")))
+        better = Found(again, goes_on.move_on())
+        if better.cost > found.cost - _LEAST_GAIN:
+            return
+        yield better
+        found = better
+
+
+def _moved(mode: Mode, before: Drawn, after: Drawn) -> State:
+    """A mode's labels, noise and orientations on the same graph drawn together anew."""
+    correction = after.prepared.closure_graph.corrections(before.orientations(mode.state.correction))
+    state = mode.state
+    return State(np.ascontiguousarray(correction.numpy().T), state.common, state.trusted, state.noise)

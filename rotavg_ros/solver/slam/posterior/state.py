@@ -6,6 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+# Nodes of the sums that stand for integrals over α, κ and the length of runs, in steps of odometry; with 0 closures err
+# independently.
+EXPONENTS = (0.0, 0.5, 1.0)
+COMMON_SHARES = (0.15, 0.3, 0.6, 0.85)
+RUN_STEPS = (0.0, 20.0, 60.0)
+
 
 @dataclass(frozen=True)
 class Noise:

@@ -12,6 +12,8 @@ import torch
 from scipy.special import expit, logsumexp
 from scipy.stats import multivariate_normal
 
+from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
+from rotavg_ros.solver.slam.posterior.bias import Bias
 from rotavg_ros.solver.slam.posterior.densities import log_false
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.labels import (
@@ -25,13 +27,13 @@ from rotavg_ros.solver.slam.posterior.left_out import leave_one_out
 from rotavg_ros.solver.slam.posterior.objective import evaluate
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
-from rotavg_ros.solver.slam.posterior.state import Noise, State
-from rotavg_ros.solver.slam.preparation import prepare
+from rotavg_ros.solver.slam.posterior.state import RUN_STEPS, Noise, State
+from rotavg_ros.solver.slam.preparation import prepare_as_it_is
 from rotavg_ros.view_graph import ViewGraph
 
 # Gaussian where a mixture would be integrated approximately only.
 _PRIORS = replace(SlamPriors(), tail_share=1e-12, near_miss_share=1e-12)
-_NOISE = Noise(np.radians(1.0) ** 2, np.radians(1.5) ** 2, 0.0, 0.4, 300.0)
+_NOISE = Noise(np.radians(1.0) ** 2, np.radians(1.5) ** 2, 0.0, 0.4, RUN_STEPS[-1])
 
 
 def _yaw(angle: np.ndarray) -> np.ndarray:
@@ -58,12 +60,16 @@ def _planar(seed: int, num_closures: int, false_share: float, length: int = 60) 
     return graph, off
 
 
-def _problem(graph: ViewGraph, priors: SlamPriors = _PRIORS, without: Collection[str] = ()) -> Problem:
-    prepared = prepare(graph)
-    closure_graph = prepared.closure_graph
-    return Problem.of(
-        closure_graph, prepared.pairs, 1, np.zeros(len(closure_graph.source)), priors=priors, without=without
-    )
+def _problem(
+    graph: ViewGraph, priors: SlamPriors = _PRIORS, without: Collection[str] = (), rate: float | None = None
+) -> Problem:
+    """A problem whose network has no opinion, after a bias of ``rate`` about z, rad per step, was taken out."""
+    vector = np.array([0.0, 0.0, rate or 0.0])
+    corrected = without_bias(graph, vector)
+    prepared = prepare_as_it_is(corrected)
+    bias = None if rate is None else Bias.of(corrected, prepared, vector)
+    no_opinion = np.zeros(len(prepared.closure_graph.source))
+    return Problem.of(prepared, no_opinion, priors=priors, without=without, bias=bias)
 
 
 def _state(problem: Problem, is_false: np.ndarray) -> State:
@@ -74,7 +80,7 @@ def _state(problem: Problem, is_false: np.ndarray) -> State:
     return State(correction, np.zeros((problem.system(_NOISE).num_runs, 3)), trusted, _NOISE)
 
 
-def _log_evidence(problem: Problem, is_false: np.ndarray) -> float:
+def _log_evidence(problem: Problem, is_false: np.ndarray, bias_deg: float = 0.0) -> float:
     """Of the data given labels: the good closures' residuals are jointly normal, by what they pass and share."""
     measured = problem.measured[:, problem.closure]
     discrepancy = 2 * np.arctan2(measured[2], measured[3]) * problem.sign
@@ -84,6 +90,7 @@ def _log_evidence(problem: Problem, is_false: np.ndarray) -> float:
     common = (problem.run[:, None] == problem.run) & shared[:, None] & shared
     own = np.where(shared, 1 - _NOISE.common_share, 1.0) * _NOISE.closure_variance
     covariance = passed * _NOISE.step_variance + common * _NOISE.common_share * _NOISE.closure_variance + np.diag(own)
+    covariance += np.radians(bias_deg) ** 2 * (newer - older)[:, None] * (newer - older)
     good = ~is_false
     if not good.any():
         return 0.0
@@ -108,6 +115,31 @@ def test_marginals_are_those_of_dense_integrals(seed: int) -> None:
     marginals = [(np.exp(np.array(log) - logsumexp(log))[:, None] * is_false).sum(axis=0) for log in (by_f, densely)]
     np.testing.assert_allclose(marginals[0], marginals[1], atol=0.01)
     assert marginals[0].max() > 0.02 and marginals[0].min() < 0.98
+
+
+@pytest.mark.parametrize(("seed", "planted_deg"), [(0, 0.0), (1, 0.05), (2, -0.3), (3, 1.0)])
+def test_a_bias_has_the_evidence_of_a_dense_integral(seed: int, planted_deg: float) -> None:
+    graph, _ = _planar(seed, 8, 0.0, length=40)
+    graph = without_bias(graph, np.radians([0.0, 0.0, -planted_deg]))
+    good = np.zeros(8, dtype=bool)
+    plain = _problem(graph)
+    _, before = polish(plain, _state(plain, good), hold_noise=True)
+    rate, totals = 0.0, []
+    for _ in range(3):
+        problem = _problem(graph, rate=rate)
+        state, after = polish(problem, _state(problem, good), hold_noise=True)
+        assert problem.bias is not None
+        information, change = problem.bias.information(
+            problem.graph.source, state, after.residual, after.factorised, _PRIORS
+        )
+        # What F falls by until the likeliest bias is known from wherever it is looked for.
+        totals.append(after.total - float(change @ information @ change) / 2)
+        rate += float((change @ problem.bias.axes)[2])
+    densely = _log_evidence(plain, good, _PRIORS.bias_deg) - _log_evidence(plain, good)
+    assert before.total - totals[-1] == pytest.approx(densely, abs=0.02)
+    np.testing.assert_allclose(totals, totals[-1], atol=0.02)
+    # Forty steps of 1° tell it to 0.16°.
+    assert abs(np.degrees(rate) - planted_deg) < 0.5
 
 
 @pytest.mark.parametrize("seed", range(6))

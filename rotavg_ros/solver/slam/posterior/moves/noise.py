@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode
-from rotavg_ros.solver.slam.posterior.objective import COMMON_SHARES, EXPONENTS, RUN_STEPS
 from rotavg_ros.solver.slam.posterior.rows import with_noise
+from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, EXPONENTS, RUN_STEPS
 
 _GRIDS = {"exponent": EXPONENTS, "run_steps": RUN_STEPS, "common_share": COMMON_SHARES}
 # Where the logarithms of stated variances spread by less, weights could gain 4 % of variance at most.

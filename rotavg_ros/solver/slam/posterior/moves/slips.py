@@ -61,7 +61,7 @@ class _Witnesses:
         alone = log_false(square, problem.components, problem.priors)
         gain = np.maximum(mode.left_out.if_good[closure] - alone, 0.0)
         segment = segment[order]
-        return cls(turned, can_tell, first, last, gain, segment, -mode.left_out.log_odds[segment])
+        return cls(turned, can_tell, first, last, gain, segment, mode.left_out.log_odds[segment])
 
     def agreeing(self, closure: np.integer, mode: Mode) -> np.ndarray:
         """``(C,)`` bool, false closures that one turn explains together with this one."""

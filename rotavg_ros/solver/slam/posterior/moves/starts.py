@@ -20,7 +20,7 @@ from rotavg_ros.solver.slam.posterior.left_out import relabelled
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import moved, residuals, variances
-from rotavg_ros.solver.slam.posterior.state import Noise, State
+from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, EXPONENTS, RUN_STEPS, Noise, State
 from rotavg_ros.solver.slam.preparation import Prepared
 from rotavg_ros.solver.slam.stages import CleanedClosures
 from rotavg_ros.view_graph import ViewGraph
@@ -71,8 +71,7 @@ def turned_parts(problem: Problem, prepared: Prepared, tree: Tensor) -> State:
 
 def noise_of(problem: Problem, model: NoiseModel) -> Noise:
     """θ to begin with."""
-    priors = problem.priors
-    return Noise(model.step_variance, model.closure_variance, 0.0, priors.common_share, priors.run_steps)
+    return Noise(model.step_variance, model.closure_variance, EXPONENTS[0], COMMON_SHARES[1], RUN_STEPS[-1])
 
 
 def at(problem: Problem, correction: Tensor, trusted: np.ndarray, noise: Noise) -> State:
