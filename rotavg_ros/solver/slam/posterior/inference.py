@@ -36,7 +36,7 @@ class Search:
         self._tried = 0
 
     def run(self, prepared: Prepared, cleaned: CleanedClosures, correction: Tensor) -> list[Mode]:
-        """From starts until two end alike, move on from the best modes until no move is predicted to lower F.
+        """From starts until some end alike, move on from the best modes until no move is predicted to lower F.
 
         Args:
             prepared: the graph drawn together.
@@ -47,8 +47,7 @@ class Search:
         for name, state in starts(self.problem, prepared, cleaned, correction):
             begun.append(flipped(self.polished(state, name)))
             self.keep(begun[-1])
-            alike = sum(mode.labels == self.modes[0].labels for mode in begun)
-            if len(begun) >= self.problem.limits.starts and alike >= self.problem.limits.alike:
+            if sum(mode.labels == self.modes[0].labels for mode in begun) >= self.problem.limits.alike:
                 break
         if "minimum-cuts" not in self.problem.without and self._seems_slipped(self.modes[0]):
             self.keep(flipped(self.polished(turned_parts(self.problem, prepared, correction), "minimum cuts")))

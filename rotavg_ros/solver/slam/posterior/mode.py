@@ -13,6 +13,9 @@ from rotavg_ros.solver.slam.posterior.objective import Evaluation
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.state import State
 
+# Noise is another one if the ratio of a step's variance and a closure's differs by this, in the logarithm.
+OTHER_NOISE = 1.0
+
 
 @dataclass(frozen=True)
 class Mode:
@@ -41,9 +44,10 @@ class Mode:
         return np.packbits(self.state.is_good).tobytes()
 
     @property
-    def key(self) -> tuple[bytes, tuple[float, float, float]]:
-        """Equal for equal labels under equal α, κ and length of runs."""
-        return self.labels, self.state.noise.chosen
+    def key(self) -> tuple[bytes, tuple[float, float, float], int]:
+        """Equal for equal labels under equal α, κ and length of runs, and about the same ratio of variances."""
+        noise = self.state.noise
+        return self.labels, noise.chosen, round(noise.log_ratio / OTHER_NOISE)
 
     @cached_property
     def is_false(self) -> np.ndarray:

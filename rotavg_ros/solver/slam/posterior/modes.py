@@ -9,7 +9,7 @@ import numpy as np
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.posterior.em import step
 from rotavg_ros.solver.slam.posterior.left_out import leave_one_out, scores
-from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.solver.slam.posterior.mode import OTHER_NOISE, Mode
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.state import State
 
@@ -103,7 +103,8 @@ def distinct(problem: Problem, modes: list[Mode]) -> list[Mode]:
 
 
 def _is_rival(problem: Problem, state: State, other: State) -> bool:
-    if state.noise.chosen != other.noise.chosen:
+    other_noise = abs(state.noise.log_ratio - other.noise.log_ratio) > OTHER_NOISE
+    if other_noise or state.noise.chosen != other.noise.chosen:
         return True
     differs = state.is_good != other.is_good
     if differs[problem.graph.is_odometry].any():

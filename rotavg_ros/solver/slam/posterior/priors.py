@@ -69,8 +69,7 @@ class SearchLimits:
         flip_rounds: batches of single flips.
         annealing_factor: by how much the loss of graduated non-convexity is sharpened from solve to solve.
         robust_solves: of the ℓ½ start.
-        starts: that are gone on from, at least, …
-        alike: … and until so many end in the labelling of least F.
+        alike: starts are gone on from until so many end in the labelling of least F.
         tried: moves that are tried, at most.
         slack: a move is tried if F is predicted to rise by no more than this, nats.
         rival: modes within so many nats of the best are moved on from.
@@ -86,8 +85,7 @@ class SearchLimits:
     flip_rounds: int = 8
     annealing_factor: float = 1.6
     robust_solves: int = 12
-    starts: int = 3
-    alike: int = 2
+    alike: int = 3
     tried: int = 60
     slack: float = 1.0
     rival: float = 6.0

@@ -32,6 +32,11 @@ class Noise:
     run_steps: float
 
     @property
+    def log_ratio(self) -> float:
+        """Logarithm of a step's variance over a closure's: how far odometry bends before closures do."""
+        return float(np.log(self.step_variance / self.closure_variance))
+
+    @property
     def chosen(self) -> tuple[float, float, float]:
         """What is chosen from grids: α, κ and the length of runs."""
         return self.exponent, self.common_share, self.run_steps

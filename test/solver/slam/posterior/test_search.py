@@ -205,7 +205,8 @@ STRUCTURAL = {
     "modes": {"_FAR", "_LIKELY", "_FAR_TURN", "_SURELY_FALSE", "_ROUNDS"},
     "moves/flips": {"_PART", "_LEAST_GAIN"},
     "moves/groups": {"_AGREE", "_TIGHTER", "_SETTLING", "_MAX_DENSE"},
-    "moves/noise": {"_GRIDS", "_MIN_SPREAD"},
+    "mode": {"OTHER_NOISE"},
+    "moves/noise": {"_GRIDS", "_MIN_SPREAD", "_OTHER_RATIO"},
     "moves/slips": {"_AGREE", "_AGREE_ANGLE", "_OPTIMISM", "_SETTLING", "_SAME_PLACE"},
     "moves/starts": {"_INLIER_SQUARE", "_SHARP", "_STEP_LEVELS", "_CLOSURE_LEVEL", "_ROBUST_POWER"}
     | {"_ANNEALED_SLIPS", "_LEAST_WEIGHT", "_SAME_TURN"},

@@ -13,10 +13,16 @@ from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, EXPONENTS, RUN
 _GRIDS = {"exponent": EXPONENTS, "run_steps": RUN_STEPS, "common_share": COMMON_SHARES}
 # Where the logarithms of stated variances spread by less, weights could gain 4 % of variance at most.
 _MIN_SPREAD = 0.2
+# By so much both variances are off where another optimum is looked for.
+_OTHER_RATIO = 8.0
 
 
 def tuned(mode: Mode) -> Iterator[Mode]:
-    """Modes of the same labels with other α, κ and length of runs: each name's values, from the best so far."""
+    """Modes of the same labels with other noise.
+
+    Each value of α, κ and the length of runs, from the best so far; and what is found where a step's variance over a
+    closure's is far larger or smaller: F may have an optimum where odometry takes up what closures err, and another.
+    """
     for name, grid in _GRIDS.items():
         if not _tells(mode, name):
             continue
@@ -28,6 +34,12 @@ def tuned(mode: Mode) -> Iterator[Mode]:
             found = Mode(mode.problem, *polish(mode.problem, with_noise(mode.problem, begun.state, noise)), "noise")
             yield found
             mode = min(mode, found, key=lambda either: either.cost)
+    for factor in (_OTHER_RATIO, 1 / _OTHER_RATIO):
+        noise = mode.state.noise
+        noise = replace(
+            noise, step_variance=noise.step_variance * factor, closure_variance=noise.closure_variance / factor
+        )
+        yield Mode(mode.problem, *polish(mode.problem, replace(mode.state, noise=noise)), "noise")
 
 
 def _tells(mode: Mode, name: str) -> bool:
