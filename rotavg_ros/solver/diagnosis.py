@@ -78,8 +78,8 @@ def compare_with_truth(
     truth = from_truth.modes[0]
     terms = {name: nats - truth.evaluation.terms.get(name, 0.0) for name, nats in modes[0].evaluation.terms.items()}
     return Comparison(
-        found.drawn.orientations(published.correction),
-        from_truth.drawn.orientations(of_mode(truth.problem, truth.state).correction),
+        published.body_from_world,
+        of_mode(truth.problem, truth.state).body_from_world,
         modes[0].cost - truth.cost,
         terms,
         len(published.rivals),

@@ -15,6 +15,7 @@ SWITCHES: dict[str, str] = {
     "stated-precisions": "all closures are alike, whatever they state",
     "slips": "odometry does not slip",
     "bias": "no gyroscope has a bias",
+    "turns": "odometry errs alike however far it turns",
     "groups": "labels are flipped one by one",
     "mending": "a slip, once found, is not taken back together with what it explains",
     "annealing": "no start anneals the closures",

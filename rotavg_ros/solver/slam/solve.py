@@ -82,14 +82,14 @@ def _solve_by_posterior(graph: ViewGraph, stages: SlamStages, run: Run) -> Estim
         found = search(graph, network, begin, stages.without)
         published = publish(found.drawn.problem, found.modes)
     with run.watch.stage("expand"):
-        return _published_estimate(found.drawn.prepared.closure_graph, published)
+        return _published_estimate(published)
 
 
-def _published_estimate(graph: ClosureGraph, published: Published) -> Estimate:
+def _published_estimate(published: Published) -> Estimate:
     """The posterior's answer on the view-graph's nodes and edges."""
     return Estimate(
-        graph.orientations(torch.from_numpy(np.ascontiguousarray(published.correction.T))),
-        torch.from_numpy(slam_stages.outlier_scores(graph, published.outlier_probability)),
+        published.body_from_world,
+        torch.from_numpy(slam_stages.outlier_scores(published.graph, published.outlier_probability)),
         torch.from_numpy(published.variance),
         warnings=published.warnings,
     )

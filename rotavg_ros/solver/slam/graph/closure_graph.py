@@ -12,7 +12,7 @@ the least-squares solution turns in proportion to the variance passed, which mak
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -120,6 +120,13 @@ class ClosureGraph:
         out[on_segment] = value[: self.num_segments][self.segment_of_edge[on_segment]]
         out[self.view_graph_edge] = value[self.num_segments :]
         return out
+
+    def passing(self, passed: np.ndarray) -> ClosureGraph:
+        """The graph in which a node lies as far along its segment as it has ``passed`` ``(N,)``, counted from roots."""
+        start, end = passed[self.nodes[self.above]], passed[self.nodes[self.below]]
+        length = end - start
+        fraction = np.divide(passed - start, length, out=self.fraction.copy(), where=length > 0)
+        return replace(self, fraction=fraction, length=length)
 
 
 def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:

@@ -44,8 +44,8 @@ class Mode:
         return np.packbits(self.state.is_good).tobytes()
 
     @property
-    def key(self) -> tuple[bytes, tuple[float, float, float], int]:
-        """Equal for equal labels under equal α, κ and length of runs, and about the same ratio of variances."""
+    def key(self) -> tuple[bytes, tuple[float, ...], int]:
+        """Equal for equal labels under the same values of all grids, and about the same ratio of variances."""
         noise = self.state.noise
         return self.labels, noise.chosen, round(noise.log_ratio / OTHER_NOISE)
 

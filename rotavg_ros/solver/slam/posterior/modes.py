@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.posterior.em import step
 from rotavg_ros.solver.slam.posterior.left_out import leave_one_out, scores
 from rotavg_ros.solver.slam.posterior.mode import OTHER_NOISE, Mode
@@ -27,6 +30,7 @@ class Published:
     """Of a closure graph (K key nodes, E edges).
 
     Attributes:
+        graph: with nodes along segments as the likeliest noise has it.
         correction: ``(4, K)``.
         outlier_probability: ``(E,)``.
         variance: ``(N,)`` rad², of the view-graph's nodes.
@@ -34,11 +38,17 @@ class Published:
         warnings: where rivals are likely and differ.
     """
 
+    graph: ClosureGraph
     correction: np.ndarray
     outlier_probability: np.ndarray
     variance: np.ndarray
     rivals: tuple[float, ...]
     warnings: tuple[str, ...] = ()
+
+    @property
+    def body_from_world(self) -> Tensor:
+        """``(N, 4)``, of the view-graph's nodes."""
+        return self.graph.orientations(torch.from_numpy(np.ascontiguousarray(self.correction.T)))
 
 
 def publish(problem: Problem, modes: list[Mode]) -> Published:
@@ -56,7 +66,7 @@ def publish(problem: Problem, modes: list[Mode]) -> Published:
     mean = sum(weight * turn for weight, turn in zip(share, turns, strict=True))
     correction = quaternion_rows.multiply(first.correction, quaternion_rows.exp(np.asarray(mean)))
     score = sum(weight * answer.outlier_probability for weight, answer in zip(share, answers, strict=True))
-    graph, k = problem.graph, problem.components
+    graph, k = first.graph, problem.components
     variance = np.zeros(len(first.variance))
     for weight, answer, turn in zip(share, answers, turns, strict=True):
         off = np.sqrt(((turn - mean) ** 2).sum(axis=0) / k)
@@ -64,7 +74,7 @@ def publish(problem: Problem, modes: list[Mode]) -> Published:
         variance += weight * (answer.variance + spread**2)
     warnings = _warnings(problem, rivals, share, turns)
     # Shares add up to one but for rounding.
-    return Published(correction, np.clip(score, 0.0, 1.0), variance, tuple(share.tolist()), warnings)
+    return Published(graph, correction, np.clip(score, 0.0, 1.0), variance, tuple(share.tolist()), warnings)
 
 
 def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: list[np.ndarray]) -> tuple[str, ...]:
@@ -123,5 +133,6 @@ def of_mode(problem: Problem, state: State) -> Published:
         trusted = np.where(np.isinf(problem.log_odds), problem.log_odds > 0, trusted)
         state, _, factorised = step(problem, replace(state, trusted=trusted.astype(np.float64)))
     samples = factorised.samples[: problem.graph.num_nodes]
-    variance = problem.graph.variance(samples, state.noise.step_variance)
-    return Published(state.correction, score, variance, (1.0,))
+    graph = problem.drawn(state.noise)
+    variance = graph.variance(samples, state.noise.step_variance)
+    return Published(graph, state.correction, score, variance, (1.0,))

@@ -21,7 +21,7 @@ from rotavg_ros.solver.slam.posterior.labels import false_density, log_false_set
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import residuals, variances, weights
-from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, EXPONENTS, RUN_STEPS, Noise, State
+from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, EXPONENTS, RUN_STEPS, TURN_SHARES, Noise, State
 from rotavg_ros.solver.slam.posterior.system import Factorised
 
 
@@ -81,11 +81,13 @@ def evaluate(problem: Problem, state: State) -> Evaluation:
 
 
 def log_noise_prior(noise: Noise, priors: SlamPriors) -> float:
-    """Of θ: log-normal in both standard deviations; shares for α = 0 and for no common errors, all else as likely."""
+    """Of θ: log-normal in both standard deviations; probabilities that grids are left at 0, all else as likely."""
     step = np.log(noise.step_variance) / 2 - np.log(np.radians(priors.step_deg))
     closure = np.log(noise.closure_variance) / 2 - np.log(np.radians(priors.closure_deg))
     some = priors.stated_share / (len(EXPONENTS) - 1)
     believed = np.log(some if noise.exponent > 0 else 1 - priors.stated_share)
     some = priors.common_errors / (len(COMMON_SHARES) * (len(RUN_STEPS) - 1))
     common = np.log(some if noise.run_steps > 0 else 1 - priors.common_errors)
-    return float(believed + common - (step**2 + closure**2) / (2 * priors.noise_spread**2))
+    some = priors.turn_errors / (len(TURN_SHARES) - 1)
+    turns = np.log(some if noise.turn_share > 0 else 1 - priors.turn_errors)
+    return float(believed + common + turns - (step**2 + closure**2) / (2 * priors.noise_spread**2))

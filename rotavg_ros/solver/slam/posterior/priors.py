@@ -32,6 +32,7 @@ class SlamPriors:
             both ends summed, …
         common_errors: probability that closures of a run err alike; for how long and how far, all values that are
             summed over are as likely (:mod:`rotavg_ros.solver.slam.posterior.objective`).
+        turn_errors: probability that odometry errs more where it turns; all shares that are summed over are as likely.
         stated_share: probability that stated variances say anything.
         least_stated_ratio: no closure is believed to be more exact than this share of the typical variance.
         largest_stated_ratio: a stated variance farther from the typical one than by this factor says nothing.
@@ -53,6 +54,7 @@ class SlamPriors:
     bias_deg: float = 1.0
     run_gap_steps: float = 30.0
     common_errors: float = 0.5
+    turn_errors: float = 0.5
     stated_share: float = 0.5
     least_stated_ratio: float = 0.25
     largest_stated_ratio: float = 100.0

@@ -20,6 +20,8 @@ from rotavg_ros.solver.slam.preparation import Prepared
 
 # A share that is none; the logarithm stays finite.
 _NONE = 1e-12
+# Turns that differ by less, relative, tell nothing of what they do.
+_SAME_TURNS = 0.1
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,7 @@ class Problem:
         limits: of the search.
         without: names of terms and moves that are switched off (:data:`rotavg_ros.solver.slam.options.SWITCHES`).
         bias: what was taken out of all odometry beforehand, if anything.
+        turned: ``(N,)`` rad², squares of the turns of odometry's steps from each node's root on; None if unknown.
     """
 
     graph: ClosureGraph
@@ -47,6 +50,7 @@ class Problem:
     limits: SearchLimits = field(default_factory=SearchLimits)
     without: frozenset[str] = frozenset()
     bias: Bias | None = None
+    turned: np.ndarray | None = None
     _systems: dict[float, NormalEquations] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @classmethod
@@ -58,6 +62,7 @@ class Problem:
         priors: SlamPriors | None = None,
         without: Collection[str] = (),
         bias: Bias | None = None,
+        turned: np.ndarray | None = None,
     ) -> Problem:
         """Find the chains of closures that follow each other closely.
 
@@ -80,7 +85,9 @@ class Problem:
         if "slips" in without:
             told[graph.is_odometry] = np.inf
         follows = _predecessors(graph, pairs, priors)
-        return cls(graph, components, told, chain, follows, priors, without=frozenset(without), bias=bias)
+        return cls(
+            graph, components, told, chain, follows, priors, without=frozenset(without), bias=bias, turned=turned
+        )
 
     @cached_property
     def closure(self) -> np.ndarray:
@@ -161,6 +168,41 @@ class Problem:
     def total_steps(self) -> float:
         """Of all odometry."""
         return float(self.graph.own_steps[self.graph.is_odometry].sum())
+
+    @cached_property
+    def _passed(self) -> np.ndarray:
+        """``(2, N)`` steps and turn steps of odometry from each node's root on."""
+        graph = self.graph
+        steps = np.asarray(graph.paths.depth, dtype=np.float64)
+        segments = slice(graph.num_segments)
+        turned = np.zeros_like(steps) if self.turned is None or "turns" in self.without else self.turned
+        of_segments = turned[graph.nodes[graph.target[segments]]] - turned[graph.nodes[graph.source[segments]]]
+        total = float(of_segments.sum())
+        scaled = turned * float(graph.own_steps[segments].sum()) / total if total > 0 else steps
+        return np.stack((steps, scaled))
+
+    @cached_property
+    def turn_steps(self) -> np.ndarray:
+        """``(E,)`` as many steps in all, shared out among segments by the squares of their turns."""
+        graph = self.graph
+        segments = np.arange(graph.num_segments)
+        passed = self._passed[1][graph.nodes]
+        steps = graph.own_steps.copy()
+        steps[segments] = passed[graph.target[segments]] - passed[graph.source[segments]]
+        return np.asarray(steps)
+
+    def drawn(self, noise: Noise) -> ClosureGraph:
+        """The graph whose nodes lie along their segments as odometry's variance does under ``noise``."""
+        if noise.turn_share == 0:
+            return self.graph
+        steps, turns = self._passed
+        return self.graph.passing(steps + noise.turn_share * (turns - steps))
+
+    @cached_property
+    def turns_vary(self) -> bool:
+        """Whether some odometry turns more than other."""
+        odometry = self.graph.is_odometry
+        return not np.allclose(self.turn_steps[odometry], self.graph.own_steps[odometry], rtol=_SAME_TURNS)
 
 
 def _chains(graph: ClosureGraph, pairs: AgreementPairs, priors: SlamPriors) -> np.ndarray:

@@ -22,7 +22,8 @@ _MAX_TURN = 1.0
 def variances(problem: Problem, noise: Noise) -> np.ndarray:
     """``(E + R,)`` rad² of every row's own noise if it is good; of closures, what their run does not share."""
     graph, system = problem.graph, problem.system(noise)
-    variance = graph.own_steps * noise.step_variance
+    steps = graph.own_steps + noise.turn_share * (problem.turn_steps - graph.own_steps)
+    variance = steps * noise.step_variance
     closure = problem.closure
     own = np.where(system.shared[closure], 1 - noise.common_share, 1.0)
     variance[closure] = own * np.exp(noise.exponent * problem.stated_ratio) * noise.closure_variance

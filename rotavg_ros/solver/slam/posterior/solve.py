@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.posterior.bias import Bias
@@ -52,12 +54,13 @@ class Drawn:
         prepared = prepare_as_it_is(corrected)
         cleaned = clean(network, prepared, graph.label)
         of_bias = None if bias is None else Bias.of(corrected, prepared, bias)
-        problem = Problem.of(prepared, cleaned.network_log_odds, without=without, bias=of_bias)
+        turned = _turned(corrected, prepared)
+        problem = Problem.of(prepared, cleaned.network_log_odds, without=without, bias=of_bias, turned=turned)
         return cls(prepared, cleaned, problem)
 
-    def orientations(self, correction: np.ndarray) -> Tensor:
-        """``(N, 4)`` body_from_world from corrections ``(4, K)``."""
-        return self.prepared.closure_graph.orientations(torch.from_numpy(np.ascontiguousarray(correction.T)))
+    def orientations(self, state: State) -> Tensor:
+        """``(N, 4)`` body_from_world."""
+        return self.problem.drawn(state.noise).orientations(torch.from_numpy(np.ascontiguousarray(state.correction.T)))
 
 
 @dataclass(frozen=True)
@@ -127,8 +130,15 @@ def _with_better_bias(
         found = better
 
 
+def _turned(graph: ViewGraph, prepared: Prepared) -> np.ndarray:
+    """``(N,)`` rad², squares of the turns of odometry's steps from each node's root on."""
+    square = ((rotations.log(graph.target_from_source) ** 2).sum(dim=1) * graph.is_odometry).numpy()
+    parent_edge = prepared.forest.parent_edge
+    return accumulate_to_root(prepared.forest, np.where(parent_edge >= 0, square[parent_edge], 0.0))
+
+
 def _moved(mode: Mode, before: Drawn, after: Drawn) -> State:
     """A mode's labels, noise and orientations on the same graph drawn together anew."""
-    correction = after.prepared.closure_graph.corrections(before.orientations(mode.state.correction))
+    correction = after.prepared.closure_graph.corrections(before.orientations(mode.state))
     state = mode.state
     return State(np.ascontiguousarray(correction.numpy().T), state.common, state.trusted, state.noise)

@@ -11,6 +11,9 @@ import numpy as np
 EXPONENTS = (0.0, 0.5, 1.0)
 COMMON_SHARES = (0.15, 0.3, 0.6, 0.85)
 RUN_STEPS = (0.0, 20.0, 60.0)
+# … and over the share of odometry's variance that goes with how far it turns: half at most, since what real closures
+# err in turns is otherwise put down to odometry.
+TURN_SHARES = (0.0, 0.5)
 
 
 @dataclass(frozen=True)
@@ -22,6 +25,7 @@ class Noise:
         closure_variance: rad² per component, of a good closure that states what is typical.
         exponent: α, how far the ratios of stated variances are believed.
         common_share: κ, share of a closure's error variance that its run has in common.
+        turn_share: share of odometry's variance that goes with the squares of the turns of its steps, not their number.
         run_steps: no run is longer at its older end, in steps of odometry; 0 where closures err independently.
     """
 
@@ -30,6 +34,7 @@ class Noise:
     exponent: float
     common_share: float
     run_steps: float
+    turn_share: float = 0.0
 
     @property
     def log_ratio(self) -> float:
@@ -37,9 +42,9 @@ class Noise:
         return float(np.log(self.step_variance / self.closure_variance))
 
     @property
-    def chosen(self) -> tuple[float, float, float]:
-        """What is chosen from grids: α, κ and the length of runs."""
-        return self.exponent, self.common_share, self.run_steps
+    def chosen(self) -> tuple[float, ...]:
+        """What is chosen from grids: α, κ, the length of runs and the share that goes with turns."""
+        return self.exponent, self.common_share, self.run_steps, self.turn_share
 
 
 @dataclass(frozen=True)

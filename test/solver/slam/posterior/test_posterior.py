@@ -68,8 +68,9 @@ def _problem(
     corrected = without_bias(graph, vector)
     prepared = prepare_as_it_is(corrected)
     bias = None if rate is None else Bias.of(corrected, prepared, vector)
+    turned = np.arange(graph.num_nodes) ** 2.0
     no_opinion = np.zeros(len(prepared.closure_graph.source))
-    return Problem.of(prepared, no_opinion, priors=priors, without=without, bias=bias)
+    return Problem.of(prepared, no_opinion, priors=priors, without=without, bias=bias, turned=turned)
 
 
 def _state(problem: Problem, is_false: np.ndarray) -> State:
@@ -240,6 +241,7 @@ def test_priors_are_normalised() -> None:
         ("tails", lambda problem: problem.priors.tail_share < 1e-9),
         ("near-misses", lambda problem: problem.priors.near_miss_share < 1e-9),
         ("common-errors", lambda problem: problem.system(_NOISE).num_runs == 0),
+        ("turns", lambda problem: not problem.turns_vary),
         ("slips", lambda problem: bool(np.isposinf(problem.log_odds[problem.graph.is_odometry]).all())),
         ("repeats", lambda problem: np.ptp(_repeated(problem).mixed()[:, 0]) == 0),
         ("label-runs", lambda problem: _stickiness(problem) == pytest.approx(0.0, abs=1e-9)),
@@ -262,3 +264,20 @@ def _stickiness(problem: Problem) -> float:
     """How far the odds of good closures differ, of which one follows a false one."""
     is_false = np.arange(len(problem.closure)) == problem.follows.max()
     return float(np.ptp(label_log_odds(problem, is_false)[~is_false]))
+
+
+def test_turn_steps_are_as_many_as_steps_and_lie_where_odometry_turns() -> None:
+    graph, _ = _planar(0, 8, 0.0)
+    problem = _problem(graph, SlamPriors())
+    segments = slice(problem.graph.num_segments)
+    assert problem.turn_steps[segments].sum() == pytest.approx(problem.graph.own_steps[segments].sum())
+    # Turns grow along this path, node n has turned by n² in all.
+    nodes = problem.graph.nodes
+    passed = nodes[problem.graph.target[segments]] ** 2.0 - nodes[problem.graph.source[segments]] ** 2.0
+    ratio = problem.turn_steps[segments] / passed
+    np.testing.assert_allclose(ratio, ratio[0])
+    assert problem.drawn(_NOISE) is problem.graph
+    half = problem.drawn(replace(_NOISE, turn_share=0.5))
+    inside = (problem.graph.fraction > 0) & (problem.graph.fraction < 1)
+    assert (half.fraction[inside] < problem.graph.fraction[inside]).all()
+    np.testing.assert_array_equal(half.fraction[~inside], problem.graph.fraction[~inside])

@@ -125,10 +125,21 @@ def test_a_bias_is_taken_out_and_told_better_than_without_it(world: str) -> None
         as_it_is = search(case.graph, Networks("cpu").load(SlamCleanNet), bootstrap, without={"bias"})
     assert found.drawn.problem.bias is not None
     assert np.degrees(np.linalg.norm(found.drawn.problem.bias.vector)) > 0.1
-    orientations = found.drawn.orientations(of_mode(found.drawn.problem, found.modes[0].state).correction)
+    orientations = of_mode(found.drawn.problem, found.modes[0].state).body_from_world
     solution = replace(solved(f"{world}: gyroscope bias, 30 % random", 0), body_from_world=orientations)
     assert error_deg(case.graph, solution, case.body_from_world) < 0.6
     assert found.cost < as_it_is.cost - 5
+
+
+@pytest.mark.parametrize("world", ["hills", "city"])
+def test_odometry_that_errs_in_turns_is_recognised(world: str) -> None:
+    name = f"{world}: odometry worse in turns"
+    case = drawn(name, 3)
+    found = search(case.graph, Networks("cpu").load(SlamCleanNet), bootstrap)
+    assert found.modes[0].state.noise.turn_share > 0
+    blind = solve(case.graph, profile="slam", method=without("turns"))
+    told = error_deg(case.graph, solved(name, 3), case.body_from_world)
+    assert told < 0.95 * error_deg(case.graph, blind, case.body_from_world)
 
 
 def test_no_bias_is_invented_to_save_false_closures_that_agree() -> None:
@@ -210,10 +221,10 @@ STRUCTURAL = {
     "moves/slips": {"_AGREE", "_AGREE_ANGLE", "_OPTIMISM", "_SETTLING", "_SAME_PLACE"},
     "moves/starts": {"_INLIER_SQUARE", "_SHARP", "_STEP_LEVELS", "_CLOSURE_LEVEL", "_ROBUST_POWER"}
     | {"_ANNEALED_SLIPS", "_LEAST_WEIGHT", "_SAME_TURN"},
-    "problem": {"_NONE"},
+    "problem": {"_NONE", "_SAME_TURNS"},
     "rows": {"_NOTHING", "_MAX_TURN"},
     "solve": {"Begin", "_BIAS_ROUNDS", "_LEAST_GAIN"},
-    "state": {"EXPONENTS", "COMMON_SHARES", "RUN_STEPS"},
+    "state": {"EXPONENTS", "COMMON_SHARES", "RUN_STEPS", "TURN_SHARES"},
     "system": {"_NUM_PROBES", "_MAX_LEVERAGE"},
 }
 

@@ -8,9 +8,14 @@ from dataclasses import replace
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.rows import with_noise
-from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, EXPONENTS, RUN_STEPS
+from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, EXPONENTS, RUN_STEPS, TURN_SHARES
 
-_GRIDS = {"exponent": EXPONENTS, "run_steps": RUN_STEPS, "common_share": COMMON_SHARES}
+_GRIDS = {
+    "turn_share": TURN_SHARES,
+    "exponent": EXPONENTS,
+    "run_steps": RUN_STEPS,
+    "common_share": COMMON_SHARES,
+}
 # Where the logarithms of stated variances spread by less, weights could gain 4 % of variance at most.
 _MIN_SPREAD = 0.2
 # By so much both variances are off where another optimum is looked for.
@@ -20,7 +25,7 @@ _OTHER_RATIO = 8.0
 def tuned(mode: Mode) -> Iterator[Mode]:
     """Modes of the same labels with other noise.
 
-    Each value of α, κ and the length of runs, from the best so far; and what is found where a step's variance over a
+    Each value of the grids, one after the other, from the best so far; and what is found where a step's variance over a
     closure's is far larger or smaller: F may have an optimum where odometry takes up what closures err, and another.
     """
     for name, grid in _GRIDS.items():
@@ -43,7 +48,9 @@ def tuned(mode: Mode) -> Iterator[Mode]:
 
 
 def _tells(mode: Mode, name: str) -> bool:
-    """Whether the good closures have anything to say of it."""
+    """Whether the graph has anything to say of it."""
+    if name == "turn_share":
+        return mode.problem.turns_vary
     good = ~mode.is_false
     if good.sum() < 2:
         return False
