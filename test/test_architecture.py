@@ -119,7 +119,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "moves": {"densities", "em", "labels", "left_out", "mode", "objective", "priors", "problem", "rows", "state"},
         "inference": {"em", "mode", "moves", "problem", "state"},
         "modes": {"em", "left_out", "mode", "problem", "state"},
-        "solve": {"bias", "inference", "mode", "moves", "problem", "state"},
+        "solve": {"bias", "inference", "mode", "moves", "priors", "problem", "state"},
     },
     "online": {
         "free_memory": set(),

@@ -17,7 +17,7 @@ from rotavg_ros.evaluation.common.named_peers import is_available
 from rotavg_ros.evaluation.common.scoring import Step, score_all
 from rotavg_ros.evaluation.live import incremental
 from rotavg_ros.evaluation.names import SLAM_GRAPHS, SLAM_SHARES
-from rotavg_ros.evaluation.slam import cases, report, stress, stress_report, uncertainty
+from rotavg_ros.evaluation.slam import cases, report, sensitivity, stress, stress_report, uncertainty
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS, ROSTER, ROWS
 from rotavg_ros.evaluation.slam.search_or_model import Diagnosis, diagnose
 from rotavg_ros.evaluation.slam.stress_calibration import Calibration
@@ -62,14 +62,22 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
         with suppress(KeyboardInterrupt):  # what is done is written
             cases_again = progress(drawings(kinds, seeds), total=len(kinds) * len(seeds), description="from the truth")
             diagnoses.extend(map(diagnose, cases_again))
-    return stress_report.report(arguments.output, scores, calibrations, arguments.command_line, diagnoses)
+    priors: list[list[sensitivity.Answer]] = []
+    if arguments.sensitivity and not scores.interrupted:
+        with suppress(KeyboardInterrupt):
+            cases_again = progress(drawings(kinds, seeds), total=len(kinds) * len(seeds), description="other priors")
+            priors.extend([*sensitivity.answers(case)] for case in cases_again)
+    findings = stress_report.Findings(calibrations, diagnoses, priors)
+    return stress_report.report(arguments.output, scores, findings, arguments.command_line)
 
 
 def _run_recorded(arguments: argparse.Namespace) -> Path:
     if arguments.kinds is not None:
         raise SlamOptionsError("--kinds chooses from the stress suite; add --suite stress")
-    if arguments.search_or_model:
-        raise SlamOptionsError("--search-or-model needs cases of which all is known; add --suite stress")
+    for name in ("search_or_model", "sensitivity"):
+        if getattr(arguments, name):
+            option = name.replace("_", "-")
+            raise SlamOptionsError(f"--{option} needs cases of which all is known; add --suite stress")
     seeds = arguments.seeds or _RECORDED_SEEDS
     names = _methods(arguments, [name for name in ROWS if name not in _STRESS_ONLY])
     chosen = contenders(names, ROSTER, keep=arguments.keep)

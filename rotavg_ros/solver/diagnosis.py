@@ -19,8 +19,11 @@ from rotavg_ros.solver.slam.posterior.modes import of_mode, publish
 from rotavg_ros.solver.slam.posterior.moves.flips import flipped
 from rotavg_ros.solver.slam.posterior.moves.noise import tuned
 from rotavg_ros.solver.slam.posterior.moves.starts import at, noise_of
+from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.solve import Drawn, Found, search
 from rotavg_ros.view_graph import ViewGraph
+
+__all__ = ["Comparison", "SlamPriors", "compare_with_truth", "orientations_under"]
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,21 @@ def compare_with_truth(
         terms,
         len(published.rivals),
     )
+
+
+@torch.no_grad()
+def orientations_under(graph: ViewGraph, priors: SlamPriors, *, weights: Path | None = None) -> Tensor:
+    """``(N, 4)`` body_from_world that the posterior publishes under other priors than usual.
+
+    Args:
+        graph: N nodes.
+        priors: all that is believed beforehand.
+        weights: folder of networks to use in place of the package's.
+    """
+    repeats = first_of_each(graph)
+    graph = graph if repeats is None else graph.select_edges(torch.from_numpy(repeats[0]))
+    found = search(graph, Networks("cpu", weights).load(SlamCleanNet), slam_stages.bootstrap, priors=priors)
+    return publish(found.drawn.problem, found.modes).body_from_world
 
 
 def _from_truth(drawn: Drawn, body_from_world: Tensor, is_wrong: Tensor) -> Found:

@@ -78,6 +78,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="stress suite: also solve every case from its true labels and tell why answers are wrong",
     )
     parser.add_argument(
+        "--sensitivity",
+        action="store_true",
+        help="stress suite: also solve every case with each prior of the posterior halved and doubled",
+    )
+    parser.add_argument(
         "--peers",
         action=argparse.BooleanOptionalAction,
         default=True,

@@ -11,7 +11,7 @@ import numpy as np
 from rotavg_ros.evaluation.common.score_tables import Figure, per_case
 from rotavg_ros.evaluation.common.scoring import Scores, geometric_mean
 from rotavg_ros.evaluation.common.tables import Cell, Column, Report, Table
-from rotavg_ros.evaluation.slam import search_or_model, stress_calibration
+from rotavg_ros.evaluation.slam import search_or_model, sensitivity, stress_calibration
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS, ROSTER, ROWS
 from rotavg_ros.evaluation.slam.search_or_model import Diagnosis
 from rotavg_ros.evaluation.slam.stress_calibration import Calibration
@@ -52,19 +52,32 @@ class Rival:
     num_cases: int
 
 
+@dataclass(frozen=True)
+class Findings:
+    """What was looked at besides errors.
+
+    Attributes:
+        calibrations: of ours, by method.
+        diagnoses: of the posterior's answers.
+        priors: answers under other priors, of every case.
+    """
+
+    calibrations: Mapping[str, Calibration]
+    diagnoses: Sequence[Diagnosis] = ()
+    priors: Sequence[Sequence[sensitivity.Answer]] = ()
+
+
 def report(
     folder: Path,
     scores: Scores,
-    calibrations: Mapping[str, Calibration],
+    findings: Findings,
     command: str,
-    diagnoses: Sequence[Diagnosis] = (),
 ) -> Path:
     """Write the tables; returns the Markdown file.
 
     Args:
-        calibrations: of ours, by method.
+        findings: what was looked at besides errors.
         command: how to get the same figures again.
-        diagnoses: of the posterior's answers.
     """
     names = scores.contenders
     tables = {
@@ -77,14 +90,16 @@ def report(
         "stress-kinds": _kinds(scores, names),
         "stress-cases": per_case("Every case", scores, _CASE_FIGURES, _CASE_KEY),
     }
-    for name, calibration in calibrations.items():
+    for name, calibration in findings.calibrations.items():
         of_kinds, title = calibration.of_kinds(scores.cases), f"Calibration of {ROWS[name].replace('**', '')}"
         stem = "stress-calibration" if name == OURS else f"stress-calibration-{name}"
         tables[stem] = stress_calibration.table(title, of_kinds, every_kind=False)
         long[f"{stem}-kinds"] = stress_calibration.table(title, of_kinds, every_kind=True)
-    if diagnoses:
+    if diagnoses := findings.diagnoses:
         tables["stress-causes"] = search_or_model.shares("Why the posterior's answers are wrong", diagnoses)
         tables["stress-failures"] = search_or_model.failures("Wrong answers that are not divided", diagnoses)
+    if findings.priors:
+        tables["stress-priors"] = sensitivity.table("Priors of the posterior halved and doubled", findings.priors)
     introduction = (
         f"`{command}`. Simulated pose graphs that are hard in one known way each. Error: mean angle between estimated "
         "and true orientations after one robust global rotation of each component; below 0.1° it counts as 0.1°. The "

@@ -17,6 +17,7 @@ from rotavg_ros.solver.slam.posterior.bias import Bias
 from rotavg_ros.solver.slam.posterior.inference import Search
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.moves.flips import flipped
+from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.state import State
 from rotavg_ros.solver.slam.preparation import Prepared, likely_bias, prepare_as_it_is
@@ -48,6 +49,7 @@ class Drawn:
         network: SlamCleanNet | None,
         without: Collection[str] = (),
         bias: np.ndarray | None = None,
+        priors: SlamPriors | None = None,
     ) -> Drawn:
         """After ``bias`` ``(3,)`` rad per step is taken out of the odometry."""
         corrected = graph if bias is None else without_bias(graph, bias)
@@ -55,7 +57,9 @@ class Drawn:
         cleaned = clean(network, prepared, graph.label)
         of_bias = None if bias is None else Bias.of(corrected, prepared, bias)
         turned = _turned(corrected, prepared)
-        problem = Problem.of(prepared, cleaned.network_log_odds, without=without, bias=of_bias, turned=turned)
+        problem = Problem.of(
+            prepared, cleaned.network_log_odds, priors=priors, without=without, bias=of_bias, turned=turned
+        )
         return cls(prepared, cleaned, problem)
 
     def orientations(self, state: State) -> Tensor:
@@ -79,7 +83,13 @@ class Found:
 Begin = Callable[[Prepared, CleanedClosures], Tensor]
 
 
-def search(graph: ViewGraph, network: SlamCleanNet | None, begin: Begin, without: Collection[str] = ()) -> Found:
+def search(
+    graph: ViewGraph,
+    network: SlamCleanNet | None,
+    begin: Begin,
+    without: Collection[str] = (),
+    priors: SlamPriors | None = None,
+) -> Found:
     """The labellings of least F of a graph that states nothing twice.
 
     Args:
@@ -87,17 +97,18 @@ def search(graph: ViewGraph, network: SlamCleanNet | None, begin: Begin, without
         network: CleanNet, or None without it.
         begin: corrections ``(K, 4)`` to begin with: along CleanNet's tree, or of an earlier answer.
         without: terms and moves that are switched off.
+        priors: other ones than usual.
     """
 
     def from_starts(drawn: Drawn) -> Found:
         correction = begin(drawn.prepared, drawn.cleaned)
         return Found(drawn, Search(drawn.problem).run(drawn.prepared, drawn.cleaned, correction))
 
-    found = from_starts(Drawn.of(graph, network, without))
+    found = from_starts(Drawn.of(graph, network, without, None, priors))
     if "bias" in without:
         return found
     if (bias := likely_bias(graph, found.drawn.prepared)) is not None:
-        found = min(found, from_starts(Drawn.of(graph, network, without, bias)), key=lambda either: either.cost)
+        found = min(found, from_starts(Drawn.of(graph, network, without, bias, priors)), key=lambda either: either.cost)
     for better in _with_better_bias(graph, network, found, without):
         found = better
     return found
@@ -119,7 +130,7 @@ def _with_better_bias(
             predicted += bias.cost(information, problem.priors)
         if predicted > -_LEAST_GAIN:
             return
-        again = Drawn.of(graph, network, without, bias.vector + change @ bias.axes)
+        again = Drawn.of(graph, network, without, bias.vector + change @ bias.axes, problem.priors)
         moved = _moved(best, drawn, again)
         goes_on = Search(again.problem)
         goes_on.keep(flipped(goes_on.polished(moved, "bias")))
