@@ -87,7 +87,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "passes": {"graph", "noise"},
         "refinement": {"graph", "moves", "noise", "passes"},
         "moves": {"graph", "noise", "passes", "preparation"},
-        "update": {"graph", "network", "noise", "passes", "preparation", "refinement", "stages"},
+        "update": {"graph", "network", "noise", "passes", "posterior", "preparation", "refinement", "stages"},
         "stages": {"graph", "moves", "network", "noise", "options", "passes", "preparation", "refinement"},
         "posterior": {"graph", "moves", "network", "noise", "preparation", "stages"},
         "solve": {

@@ -17,6 +17,7 @@ from rotavg_ros.solver.methods import (
     DEFAULT_METHOD,
     DEVICES,
     METHODS,
+    POSTERIOR,
     PROFILES,
     is_method,
     method_named,
@@ -28,6 +29,7 @@ from rotavg_ros.solver.slam import refinement
 from rotavg_ros.solver.slam.noise import judging
 from rotavg_ros.solver.slam.solve import solve_slam, update_slam
 from rotavg_ros.solver.slam.update.memory import SlamMemory
+from rotavg_ros.solver.slam.update.posterior_memory import PosteriorMemory
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel, HoldsViewGraph, ViewGraph, view_graph_of
 
@@ -95,7 +97,7 @@ def solve(
     graph = graph.to("cpu")
     job = _Job(graph, graph.components(), names, profile)
     steps = refinement_steps
-    goes_on_from = memory if names == [DEFAULT_METHOD] and steps is None and isinstance(memory, SlamMemory) else None
+    goes_on_from = _memory_of(names, memory) if steps is None else None
     watch = Stopwatch()
     try:
         estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start), goes_on_from)
@@ -132,7 +134,14 @@ class _Job:
     profile: str
 
 
-def _run(job: _Job, run: Run, memory: SlamMemory | None) -> Estimate:
+def _memory_of(names: list[str], memory: object | None) -> SlamMemory | PosteriorMemory | None:
+    """What a method by these names can go on from, if it is that."""
+    if names == [DEFAULT_METHOD] and isinstance(memory, SlamMemory):
+        return memory
+    return memory if names == [POSTERIOR] and isinstance(memory, PosteriorMemory) else None
+
+
+def _run(job: _Job, run: Run, memory: SlamMemory | PosteriorMemory | None) -> Estimate:
     """Every link of the method; the last may go on from what an earlier solve of the graph remembers."""
     device, last_steps = run.networks.device, run.refinement_steps
     if last_steps is None and run.warm_start is not None and _refines_slam(job):
@@ -154,7 +163,7 @@ def _with_warnings(graph: ViewGraph, estimate: Estimate) -> Estimate:
     found = warnings.of_whole_solve(graph, estimate.body_from_world, estimate.outlier_score)
     found = (*estimate.warnings, *found)
     goes_on = estimate.memory
-    if isinstance(goes_on, SlamMemory):
+    if isinstance(goes_on, (SlamMemory, PosteriorMemory)):
         goes_on = replace(goes_on, warnings=found)
     return replace(estimate, warnings=found, memory=goes_on)
 

@@ -21,6 +21,7 @@ from rotavg_ros.solver.slam.posterior.modes import Published, publish
 from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.preparation import Prepared, prepare
 from rotavg_ros.solver.slam.update.memory import SlamMemory
+from rotavg_ros.solver.slam.update.posterior_memory import PosteriorMemory
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -82,16 +83,17 @@ def _solve_by_posterior(graph: ViewGraph, stages: SlamStages, run: Run) -> Estim
         found = search(graph, network, begin, stages.without)
         published = publish(found.drawn.problem, found.modes)
     with run.watch.stage("expand"):
-        return _published_estimate(published)
+        return _published_estimate(published, None if stages.without else PosteriorMemory.of(graph, found))
 
 
-def _published_estimate(published: Published) -> Estimate:
+def _published_estimate(published: Published, memory: PosteriorMemory | None) -> Estimate:
     """The posterior's answer on the view-graph's nodes and edges."""
     return Estimate(
         published.body_from_world,
         torch.from_numpy(slam_stages.outlier_scores(published.graph, published.outlier_probability)),
         torch.from_numpy(published.variance),
-        warnings=published.warnings,
+        memory,
+        published.warnings,
     )
 
 
@@ -107,12 +109,16 @@ def _slam_estimate(
     )
 
 
-def update_slam(graph: ViewGraph, memory: SlamMemory, run: Run) -> Estimate | None:
+def update_slam(graph: ViewGraph, memory: SlamMemory | PosteriorMemory, run: Run) -> Estimate | None:
     """The solve of a graph that has grown by a few edges since ``memory``; None if the whole of it is due.
 
     ``run`` has the warm start.
     """
     assert run.warm_start is not None
+    network, start = run.networks.load(SlamCleanNet), run.warm_start.double()
     with run.watch.stage("update"):
-        updated = memory.updated(graph, run.networks.load(SlamCleanNet), run.warm_start.double())
+        if isinstance(memory, PosteriorMemory):
+            published = memory.updated(graph, network, start)
+            return None if published is None else _published_estimate(*published)
+        updated = memory.updated(graph, network, start)
         return None if updated is None else _slam_estimate(*updated)

@@ -1,0 +1,90 @@
+"""What a solve by the posterior remembers for the next one of the same graph, grown by a few edges.
+
+The labelling that was found, its noise and its bias are where the next search begins and, but for single flips, where
+it ends. The whole search runs again once the graph has grown by some percent, after a number of updates, or when a new
+closure turns the labels of others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from torch import Tensor
+
+from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
+from rotavg_ros.solver.slam.network import SlamCleanNet
+from rotavg_ros.solver.slam.posterior.inference import Search
+from rotavg_ros.solver.slam.posterior.left_out import relabelled
+from rotavg_ros.solver.slam.posterior.modes import Published, publish
+from rotavg_ros.solver.slam.posterior.moves.flips import flipped
+from rotavg_ros.solver.slam.posterior.solve import Drawn, Found
+from rotavg_ros.solver.slam.posterior.state import Noise, State
+from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over
+from rotavg_ros.view_graph import ViewGraph
+
+# The whole search runs after so many updates, once there are more closures by this share, or if more old labels turn.
+_MAX_UPDATES, _MAX_GROWTH, _MAX_TURNED = 60, 0.05, 2
+# In the place of labels that are not known; more than any.
+_NEW = 2.0
+
+
+@dataclass(frozen=True)
+class PosteriorMemory:
+    """Of a graph of M edges.
+
+    Attributes:
+        graph: the view-graph.
+        trusted: ``(M,)`` 1 for good closures and sound odometry, 0 for others; all of a segment have its label.
+        noise: of the likeliest labelling.
+        bias: ``(3,)`` rad per step that was taken out of the odometry; None if none was.
+        closures: how many there were when the whole search ran.
+        updates: how many there have been since.
+        warnings: about the answer of the whole search.
+    """
+
+    graph: ViewGraph
+    trusted: np.ndarray
+    noise: Noise
+    bias: np.ndarray | None
+    closures: int
+    updates: int = 0
+    warnings: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, graph: ViewGraph, found: Found) -> PosteriorMemory:
+        """After a whole search."""
+        problem, state = found.drawn.problem, found.modes[0].state
+        bias = None if problem.bias is None else problem.bias.vector
+        return cls(graph, problem.graph.edge_values(state.trusted), state.noise, bias, len(problem.closure))
+
+    def updated(
+        self, graph: ViewGraph, network: SlamCleanNet, body_from_world: Tensor
+    ) -> tuple[Published, PosteriorMemory] | None:
+        """Solve a graph that has grown from this one; None if it has not, or the whole search should run.
+
+        Args:
+            graph: N nodes.
+            network: CleanNet.
+            body_from_world: ``(N, 4)`` start.
+        """
+        num_closures = int((~graph.is_odometry).sum())
+        is_due = self.updates >= _MAX_UPDATES or num_closures > (1 + _MAX_GROWTH) * self.closures
+        if is_due or not begins_with(graph, self.graph) or first_of_each(graph) is not None:
+            return None
+        drawn = Drawn.of(graph, network, bias=self.bias)
+        problem = drawn.problem
+        before = carried_over(self.trusted, problem.graph, _NEW)
+        is_new = before == _NEW
+        correction = problem.graph.corrections(body_from_world).numpy().T
+        common = np.zeros((problem.system(self.noise).num_runs, 3))
+        start = State(np.ascontiguousarray(correction), common, np.minimum(before, 1.0), self.noise)
+        start = replace(start, trusted=np.where(is_new, relabelled(problem, start), before))
+        search = Search(problem)
+        mode = flipped(search.polished(start, "update"))
+        is_old_closure = problem.graph.is_closure & ~is_new
+        if (mode.state.trusted != start.trusted)[is_old_closure].sum() > _MAX_TURNED:
+            return None
+        trusted = problem.graph.edge_values(mode.state.trusted)
+        memory = replace(self, graph=graph, trusted=trusted, noise=mode.state.noise, updates=self.updates + 1)
+        return publish(problem, [mode]), memory

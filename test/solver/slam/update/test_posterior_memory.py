@@ -1,0 +1,82 @@
+"""A graph that grows, solved by updates of the posterior's last answer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros import rotations
+from rotavg_ros.datasets.simulation.stress.drawn import DrawnGraph
+from rotavg_ros.datasets.simulation.stress.kinds import KINDS
+from rotavg_ros.metrics import orientation_errors
+from rotavg_ros.solver import Solution, solve
+from rotavg_ros.solver.methods import POSTERIOR, without
+from rotavg_ros.solver.slam.update.posterior_memory import PosteriorMemory
+from rotavg_ros.view_graph import ViewGraph
+
+
+def drawn(kind: str, seed: int) -> DrawnGraph:
+    return next(one for one in KINDS if one.name == kind).drawn(seed)
+
+
+def until(graph: ViewGraph, count: int) -> ViewGraph:
+    """The graph of the first nodes, edges in the order in which they came."""
+    newer = torch.maximum(graph.source, graph.target)
+    order = torch.argsort(newer, stable=True)
+    return replace(graph.select_edges(order[newer[order] < count]), num_nodes=count)
+
+
+def grown(graph: ViewGraph, solution: Solution) -> torch.Tensor:
+    """Orientations of all nodes, those of new ones along the odometry."""
+    orientation = torch.cat((solution.body_from_world, rotations.identity(graph.num_nodes)))[: graph.num_nodes].clone()
+    for edge in torch.nonzero(graph.is_odometry & (graph.target >= len(solution.body_from_world)))[:, 0].tolist():
+        source, target = int(graph.source[edge]), int(graph.target[edge])
+        orientation[target] = rotations.multiply(graph.target_from_source[edge], orientation[source])
+    return orientation
+
+
+def error_deg(graph: ViewGraph, orientation: torch.Tensor, truth: np.ndarray) -> float:
+    errors = orientation_errors(orientation, torch.from_numpy(truth[: graph.num_nodes]), graph.components())
+    return float(np.degrees(errors.numpy().mean()))
+
+
+@pytest.mark.parametrize("kind", ["building: 30 % random", "hills: gyroscope bias, 30 % random"])
+def test_updates_end_where_the_whole_search_does(kind: str) -> None:
+    case = drawn(kind, 1)
+    count = case.graph.num_nodes - 40
+    graph = until(case.graph, count)
+    solution = solve(graph, profile="slam", method=POSTERIOR)
+    updates = 0
+    for number in range(count + 5, case.graph.num_nodes + 1, 5):
+        graph = until(case.graph, number)
+        start = grown(graph, solution)
+        solution = solve(graph, profile="slam", method=POSTERIOR, warm_start=start, memory=solution.memory)
+        updates += set(solution.stage_seconds) == {"update"}
+        assert isinstance(solution.memory, PosteriorMemory)
+    cold = solve(graph, profile="slam", method=POSTERIOR)
+    assert updates >= 4
+    errors = [error_deg(graph, one.body_from_world, case.body_from_world) for one in (solution, cold)]
+    assert errors[0] < 1.2 * errors[1] + 0.1
+    flagged = (solution.outlier_score > 0.5) != (cold.outlier_score > 0.5)
+    assert int(flagged.sum()) <= 1
+
+
+def test_what_has_not_grown_is_solved_anew() -> None:
+    case = drawn("building: 15 closures", 1)
+    solution = solve(case.graph, profile="slam", method=POSTERIOR)
+    start = solution.body_from_world
+
+    def stages(graph: ViewGraph, method: str = POSTERIOR) -> set[str]:
+        return set(solve(graph, profile="slam", method=method, warm_start=start, memory=solution.memory).stage_seconds)
+
+    assert stages(case.graph) == {"update"}
+    turned = rotations.exp(torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64))
+    measured = case.graph.target_from_source.clone()
+    measured[0] = rotations.multiply(measured[0], turned)
+    assert stages(replace(case.graph, target_from_source=measured)) != {"update"}
+    assert stages(case.graph, without("slips")) != {"update"}
+    assert stages(case.graph, "neurora") != {"update"}
+    assert stages(case.graph.select_edges(torch.arange(case.graph.num_edges - 1))) != {"update"}
