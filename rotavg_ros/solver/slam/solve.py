@@ -46,7 +46,8 @@ def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     with watch.stage("contract"):
         prepared = prepare(graph, scale_estimation=stages.scale_estimation)
     with watch.stage("clean"):
-        network = run.networks.load(SlamCleanNet) if stages.clean else None
+        has_network = stages.clean and "cleannet" not in stages.without
+        network = run.networks.load(SlamCleanNet) if has_network else None
         cleaned = slam_stages.clean(network, prepared, graph.label)
     with watch.stage("bootstrap"):
         if run.warm_start is not None:

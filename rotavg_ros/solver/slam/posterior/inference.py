@@ -49,7 +49,8 @@ class Search:
             self.keep(begun[-1])
             if sum(mode.labels == self.modes[0].labels for mode in begun) >= self.problem.limits.alike:
                 break
-        if "minimum-cuts" not in self.problem.without and self._seems_slipped(self.modes[0]):
+        may_cut = "minimum-cuts" not in self.problem.without and len(prepared.pairs.first) > 0
+        if may_cut and self._seems_slipped(self.modes[0]):
             self.keep(flipped(self.polished(turned_parts(self.problem, prepared, correction), "minimum cuts")))
         return self.move_on()
 

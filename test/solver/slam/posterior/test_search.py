@@ -241,3 +241,22 @@ def test_beliefs_and_bounds_stand_in_two_classes() -> None:
             if isinstance(name, ast.Name)
         }
         assert names <= STRUCTURAL.get(str(file.relative_to(folder).with_suffix("")), set()), file
+
+
+def test_closures_without_neighbours_have_an_answer() -> None:
+    """Three closures far from each other across one step that slipped by 90°, which nothing else tells of."""
+    length = 1500
+    measured = np.zeros((length - 1 + 3, 4))
+    measured[:, 3] = 1.0
+    rng = np.random.default_rng(0)
+    half = np.radians(rng.normal(size=len(measured))) * 0.05 / 2
+    half[749] += np.radians(45.0)
+    measured[:, 2], measured[:, 3] = np.sin(half), np.cos(half)
+    closures = np.array([[100, 1400], [350, 1150], [600, 900]])
+    source = np.concatenate((np.arange(length - 1), closures[:, 0]))
+    target = np.concatenate((np.arange(1, length), closures[:, 1]))
+    kind = [0] * (length - 1) + [1] * 3
+    graph = ViewGraph.create(source, target, measured, num_nodes=length, kind=kind)
+    solution = solve(graph, profile="slam", method=POSTERIOR)
+    assert bool(torch.isfinite(solution.body_from_world).all())
+    assert float(solution.outlier_score.max()) <= 1
