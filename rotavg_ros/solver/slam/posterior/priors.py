@@ -31,7 +31,7 @@ class SlamPriors:
         run_gap_steps: closures follow each other in a run if their ends are at most so many steps of odometry apart,
             both ends summed, …
         common_errors: probability that closures of a run err alike; for how long and how far, all values that are
-            summed over are as likely (:mod:`rotavg_ros.solver.slam.posterior.objective`).
+            summed over are as likely (:mod:`rotavg_ros.solver.slam.posterior.state`).
         turn_errors: probability that odometry errs more where it turns; all shares that are summed over are as likely.
         stated_share: probability that stated variances say anything.
         least_stated_ratio: no closure is believed to be more exact than this share of the typical variance.

@@ -11,8 +11,8 @@ import numpy as np
 EXPONENTS = (0.0, 0.5, 1.0)
 COMMON_SHARES = (0.15, 0.3, 0.6, 0.85)
 RUN_STEPS = (0.0, 20.0, 60.0)
-# … and over the share of odometry's variance that goes with how far it turns: half at most, since what real closures
-# err in turns is otherwise put down to odometry.
+# … and over the share of odometry's variance that goes with how far it turns: half at most, since with
+# more F falls on B25b while its error grows.
 TURN_SHARES = (0.0, 0.5)
 
 

@@ -259,4 +259,5 @@ def test_closures_without_neighbours_have_an_answer() -> None:
     graph = ViewGraph.create(source, target, measured, num_nodes=length, kind=kind)
     solution = solve(graph, profile="slam", method=POSTERIOR)
     assert bool(torch.isfinite(solution.body_from_world).all())
-    assert float(solution.outlier_score.max()) <= 1
+    # Odometry and closures contradict each other by 90°: one or the other is false, and the scores say so.
+    assert float(solution.outlier_score.sum()) > 0.9
