@@ -14,7 +14,7 @@ from rotavg_ros.solver.diagnosis import SlamPriors, orientations_under
 
 # Of probabilities the odds are halved and doubled.
 _PROBABILITIES = frozenset(
-    ("tail_share", "outlier_share", "near_miss_share", "common_errors", "turn_errors", "stated_share")
+    ("tails", "outlier_share", "near_miss_share", "common_errors", "turn_errors", "stated_share")
 )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
@@ -14,7 +16,12 @@ def log_normal(square: np.ndarray, variance: np.ndarray | float, components: int
 
 
 def log_good(
-    square: np.ndarray, variance: np.ndarray, predicted: np.ndarray | float, components: int, priors: SlamPriors
+    square: np.ndarray,
+    variance: np.ndarray,
+    predicted: np.ndarray | float,
+    components: int,
+    tails: np.ndarray,
+    tail_ratio: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Of good edges: log [(1 − t) N(r; v + p) + t N(r; τ v + p)], and the share of the first.
 
@@ -23,12 +30,58 @@ def log_good(
         variance: ``(n,)`` rad², v, of the edge's own noise.
         predicted: rad², p, of what r is compared with.
         components: k.
-        priors: of t and τ.
+        tails: ``(n,)`` t.
+        tail_ratio: τ.
     """
-    exact = log_normal(square, variance + predicted, components) + np.log1p(-priors.tail_share)
-    tail = log_normal(square, priors.tail_ratio * variance + predicted, components) + np.log(priors.tail_share)
+    exact = log_normal(square, variance + predicted, components) + np.log1p(-tails)
+    with np.errstate(divide="ignore"):
+        tail = log_normal(square, tail_ratio * variance + predicted, components) + np.log(tails)
     both = np.logaddexp(exact, tail)
     return both, np.exp(exact - both)
+
+
+@dataclass(frozen=True)
+class Sites:
+    """The normal density that stands for a good edge's own one (n edges).
+
+    What all other edges say of a residual is N(μ, p). Were the edge's density N(0, 1/w), the residual would come out as
+    μ / (1 + w p). Of a mixture of normal densities of variances v_z, which hold with chances π_z given μ and p, it
+    comes out as μ Σ π_z v_z / (v_z + p). w is chosen so that both agree (expectation propagation, Minka 2001, by the
+    mean): where nothing else tells of an edge 1/w is the mean variance, where all is told w is the mean precision.
+
+    Attributes:
+        square: ``(n,)`` rad², ‖μ‖².
+        predicted: ``(n,)`` rad², p.
+        weight: ``(n,)`` rad⁻², w.
+        shrinkage: ``(n,)`` Σ π_z v_z / (v_z + p).
+        misfit: ``(n,)`` Σ π_z ‖μ v_z / (v_z + p)‖² / v_z, in units of what v_z has in common.
+        log_density: ``(n,)`` nats, log ∫ N(r; μ, p) p(r) dr.
+    """
+
+    square: np.ndarray
+    predicted: np.ndarray
+    weight: np.ndarray
+    shrinkage: np.ndarray
+    misfit: np.ndarray
+    log_density: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        square: np.ndarray,
+        variance: np.ndarray,
+        predicted: np.ndarray,
+        components: int,
+        tails: np.ndarray,
+        tail_ratio: float,
+    ) -> Sites:
+        """Of densities of :func:`log_good`."""
+        log_density, exact = log_good(square, variance, predicted, components, tails, tail_ratio)
+        near = exact / (variance + predicted)
+        far = (1 - exact) / (tail_ratio * variance + predicted)
+        shrinkage = variance * (near + tail_ratio * far)
+        misfit = near / (variance + predicted) + tail_ratio * far / (tail_ratio * variance + predicted)
+        return cls(square, predicted, (near + far) / shrinkage, shrinkage, square * variance * misfit, log_density)
 
 
 def log_false(square: np.ndarray, components: int, priors: SlamPriors) -> np.ndarray:

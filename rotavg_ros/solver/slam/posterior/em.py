@@ -10,7 +10,15 @@ from scipy.special import expit
 from rotavg_ros.solver.slam.posterior.left_out import leave_one_out
 from rotavg_ros.solver.slam.posterior.objective import Evaluation, evaluate
 from rotavg_ros.solver.slam.posterior.problem import Problem
-from rotavg_ros.solver.slam.posterior.rows import moved, residuals, variances, weights
+from rotavg_ros.solver.slam.posterior.rows import (
+    moved,
+    residuals,
+    sites,
+    variances,
+    weights,
+    weights_if_good,
+    with_others,
+)
 from rotavg_ros.solver.slam.posterior.state import Noise, State
 from rotavg_ros.solver.slam.posterior.system import Factorised
 
@@ -26,11 +34,13 @@ _NEWTON_STEPS, _FARTHEST = 20, 5.0
 
 def step(problem: Problem, state: State) -> tuple[State, float, Factorised]:
     """One Gauss–Newton step on the corrections; also its largest component, rad, and the factor."""
-    residual = residuals(problem, state)
-    square = (residual**2).sum(axis=1)
-    factorised = problem.system(state.noise).factorise(weights(problem, state, square, variances(problem, state.noise)))
+    residual, variance = residuals(problem, state), variances(problem, state.noise)
+    own = variance[: len(problem.graph.source)]
+    if_good = weights_if_good(state, own, sites(problem, state, residual, variance))
+    factorised = problem.system(state.noise).factorise(weights(problem, state, if_good, variance))
     turn = factorised.fit(residual)
-    return moved(state, turn), float(np.abs(turn).max(initial=0.0)), factorised
+    state = with_others(moved(state, turn), factorised, if_good, own)
+    return state, float(np.abs(turn).max(initial=0.0)), factorised
 
 
 def polish(problem: Problem, state: State, *, hold_noise: bool = False) -> tuple[State, Evaluation]:
@@ -75,16 +85,16 @@ def settle(problem: Problem, state: State, solves: int | None = None) -> State:
 
 def estimate_noise(problem: Problem, state: State, factorised: Factorised) -> Noise:
     """Both variances by the redundancy that residuals leave (Gull 1989, MacKay 1992), under their priors."""
-    priors, noise = problem.priors, state.noise
+    priors, noise, k = problem.priors, state.noise, problem.components
     num_edges = len(problem.graph.source)
     variance, residual = variances(problem, noise), residuals(problem, state)
-    num_runs = len(variance) - num_edges
-    weight = factorised.weight
-    trusted = np.concatenate((state.trusted, np.ones(num_runs)))
-    redundancy = problem.components * trusted * (1 - np.minimum(weight * factorised.resistance, 1.0))
-    # Of residuals in the tails as much counts as they weigh.
-    square = trusted * np.minimum(weight * variance, 1.0) * (residual**2).sum(axis=1) / variance
-    is_step = np.concatenate((problem.graph.is_odometry, np.zeros(num_runs, dtype=bool)))
+    site = sites(problem, state, residual, variance)
+    common = variance[num_edges:]
+    # A run's prior is a row like others, and has no tails.
+    of_runs = 1 - np.minimum(factorised.resistance[num_edges:] / common, 1.0)
+    redundancy = k * np.concatenate((state.trusted * site.shrinkage, of_runs))
+    square = np.concatenate((state.trusted * site.misfit, (residual[num_edges:] ** 2).sum(axis=1) / common))
+    is_step = np.concatenate((problem.graph.is_odometry, np.zeros(len(common), dtype=bool)))
 
     def likeliest(rows: np.ndarray, before: float, prior_deg: float) -> float:
         squares, freedom = before * float(square[rows].sum()), float(redundancy[rows].sum())

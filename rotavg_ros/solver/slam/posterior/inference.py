@@ -13,6 +13,7 @@ from rotavg_ros.solver.slam.posterior.moves import groups, noise, slips
 from rotavg_ros.solver.slam.posterior.moves.flips import flipped
 from rotavg_ros.solver.slam.posterior.moves.starts import starts, turned_parts
 from rotavg_ros.solver.slam.posterior.problem import Problem
+from rotavg_ros.solver.slam.posterior.rows import with_noise
 from rotavg_ros.solver.slam.posterior.state import State
 from rotavg_ros.solver.slam.preparation import Prepared
 from rotavg_ros.solver.slam.stages import CleanedClosures
@@ -33,6 +34,7 @@ class Search:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.modes: list[Mode] = []
+        self._tuned: set[bytes] = set()
         self._tried = 0
 
     def run(self, prepared: Prepared, cleaned: CleanedClosures, correction: Tensor) -> list[Mode]:
@@ -43,10 +45,14 @@ class Search:
             cleaned: what CleanNet says of its closures.
             correction: ``(K, 4)`` of the tree, or of an earlier answer to begin with.
         """
-        begun = []
+        begun: list[Mode] = []
         for name, state in starts(self.problem, prepared, cleaned, correction):
+            if begun:
+                state = with_noise(self.problem, state, state.noise.chosen_as(self.modes[0].state.noise))
             begun.append(flipped(self.polished(state, name)))
             self.keep(begun[-1])
+            if len(begun) == 1:
+                self._tune(begun[0])
             if sum(mode.labels == self.modes[0].labels for mode in begun) >= self.problem.limits.alike:
                 break
         may_cut = "minimum-cuts" not in self.problem.without and len(prepared.pairs.first) > 0
@@ -65,9 +71,6 @@ class Search:
         done: set[bytes] = set()
         while (mode := self._next(done)) is not None:
             done.add(mode.labels)
-            for found in noise.tuned(mode):
-                self.keep(found)
-                mode = min(mode, found, key=lambda either: either.cost)
             for proposal in sorted(proposals(mode), key=lambda proposal: proposal.predicted):
                 if proposal.predicted > self.problem.limits.slack or self._tried >= self.problem.limits.tried:
                     break
@@ -76,7 +79,26 @@ class Search:
                 self.keep(found)
                 if found.cost < mode.cost - _GAIN:
                     break
+            if self._next(done) is None:
+                self._tune(self.modes[0])
         return self.modes
+
+    def _tune(self, mode: Mode) -> None:
+        """The labels of a mode under their best noise, and what other labels cost under that."""
+        if mode.labels in self._tuned:
+            return
+        self._tuned.add(mode.labels)
+        best, near = mode, self._near()
+        for found in noise.tuned(mode):
+            self.keep(found)
+            best = min(best, found, key=lambda either: either.cost)
+        if best is not mode:
+            self.keep(flipped(best))
+        chosen = best.state.noise
+        for other in near:
+            if other.labels != mode.labels and other.state.noise.chosen != chosen.chosen:
+                state = with_noise(self.problem, other.state, other.state.noise.chosen_as(chosen))
+                self.keep(flipped(self.polished(state, other.origin)))
 
     def polished(self, state: State, origin: str) -> Mode:
         """The mode of a state's labels."""
@@ -90,10 +112,12 @@ class Search:
         self.modes = sorted(known.values(), key=lambda other: other.cost)
 
     def _next(self, done: set[bytes]) -> Mode | None:
-        # Of the same labels the best noise stands for all.
+        return next((mode for mode in self._near() if mode.labels not in done), None)
+
+    def _near(self) -> list[Mode]:
+        """The best modes, one for each labelling: of the same labels the best noise stands for all."""
         best = list({mode.labels: mode for mode in reversed(self.modes)}.values())[::-1][:_BEAM]
-        near = (mode for mode in best if mode.cost < self.modes[0].cost + self.problem.limits.rival)
-        return next((mode for mode in near if mode.labels not in done), None)
+        return [mode for mode in best if mode.cost < self.modes[0].cost + self.problem.limits.rival]
 
 
 def proposals(mode: Mode) -> Iterator[Proposal]:

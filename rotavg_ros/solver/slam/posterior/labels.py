@@ -21,7 +21,7 @@ _SHARES = np.array([0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0
 _STAY = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 0.97])
 _NEAR_SHARES = np.array([0.02, 0.3, 0.7, 0.95])
 _FAR_SHARES = np.array([0.01, 0.05, 0.2, 0.5, 0.9])
-_REPEAT_DEG = np.array([0.2, 1.0, 3.0])
+_REPEAT_DEG = np.array([0.05, 0.3, 1.0, 3.0, 10.0])
 _GRID_SIZE = len(_NEAR_SHARES) * len(_FAR_SHARES) * len(_REPEAT_DEG)
 # The least density that counts.
 _LEAST = 1e-300

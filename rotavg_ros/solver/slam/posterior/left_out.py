@@ -12,12 +12,10 @@ from rotavg_ros.solver.slam.noise.judging import OUTLIER_ANGLE
 from rotavg_ros.solver.slam.posterior.densities import log_false, log_good, log_slipped
 from rotavg_ros.solver.slam.posterior.labels import false_density, label_log_odds, log_slip_odds, repeat_rates
 from rotavg_ros.solver.slam.posterior.problem import Problem
-from rotavg_ros.solver.slam.posterior.rows import residuals, variances
+from rotavg_ros.solver.slam.posterior.rows import residuals, sites, tails, variances, with_others
 from rotavg_ros.solver.slam.posterior.state import State
 from rotavg_ros.solver.slam.posterior.system import Factorised
 
-# What is left of an edge without itself, at least; one that alone holds two parts together tells nothing of them.
-_LEAST_REST = 1e-6
 # Log-odds of what a user has decided.
 CERTAIN = 1e6
 
@@ -43,12 +41,10 @@ def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> Lef
     """What the rest of the graph says of every edge, the labels of all others given."""
     graph, k, priors, closure = problem.graph, problem.components, problem.priors, problem.closure
     num_edges = len(graph.source)
-    residual = residuals(problem, state)[:num_edges]
-    resistance = factorised.resistance[:num_edges]
-    rest = np.maximum(1 - factorised.weight[:num_edges] * resistance, _LEAST_REST)
-    square = np.minimum((residual**2).sum(axis=1) / rest**2, np.pi**2)
-    predicted = resistance / rest
-    own = variances(problem, state.noise)[:num_edges]
+    residual, variance = residuals(problem, state), variances(problem, state.noise)
+    own = variance[:num_edges]
+    site = sites(problem, with_others(state, factorised, state.others.relative / own, own), residual, variance)
+    square, predicted = site.square, site.predicted
 
     # The prior's log-odds, less the density of what an edge is if it is not good.
     odds = problem.log_odds.copy()
@@ -61,9 +57,8 @@ def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> Lef
     odds[odometry] -= log_slip_odds(problem, graph.own_steps[odometry], slips)
     odds[odometry] -= log_slipped(square[odometry], own[odometry], predicted[odometry], k, priors)
 
-    log_odds = log_good(square, own, predicted, k, priors)[0] + odds
-    if_good = log_good(k * (own + predicted), own, predicted, k, priors)[0]
-    return LeftOut(log_odds, square, predicted, if_good)
+    if_good = log_good(k * (own + predicted), own, predicted, k, tails(problem, state.noise), priors.tail_ratio)[0]
+    return LeftOut(site.log_density + odds, square, predicted, if_good)
 
 
 def scores(problem: Problem, state: State, left_out: LeftOut) -> tuple[np.ndarray, np.ndarray]:
@@ -107,7 +102,8 @@ def _log_densities(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarr
     square = (residuals(problem, without_common) ** 2).sum(axis=1)[:num_edges]
     own = variances(problem, state.noise)[:num_edges]
     slack = np.where(graph.is_odometry, 0.0, state.noise.closure_variance)
-    good = log_good(square, own, slack, k, priors)[0] + np.clip(problem.log_odds, -CERTAIN, CERTAIN)
+    good = log_good(square, own, slack, k, tails(problem, state.noise), priors.tail_ratio)[0]
+    good += np.clip(problem.log_odds, -CERTAIN, CERTAIN)
     otherwise = np.empty(num_edges)
     otherwise[closure] = log_false(square[closure], k, priors)
     odometry = np.flatnonzero(graph.is_odometry)

@@ -15,6 +15,8 @@ from rotavg_ros.solver.slam.posterior.state import State
 
 # Noise is another one if the ratio of a step's variance and a closure's differs by this, in the logarithm.
 OTHER_NOISE = 1.0
+# Covariances of up to so many closures are computed all at once.
+_MAX_DENSE = 500
 
 
 @dataclass(frozen=True)
@@ -60,9 +62,14 @@ class Mode:
         return leave_one_out(self.problem, self.state, self.evaluation.factorised)
 
     @cached_property
-    def covariance(self) -> np.ndarray:
-        """``(C, C)`` rad², of what is estimated of closures."""
+    def _covariance(self) -> np.ndarray:
         return self.evaluation.factorised.covariance(self.problem.closure)
+
+    def covariance_of(self, members: np.ndarray) -> np.ndarray:
+        """``(n, n)`` rad², of what is estimated of some closures."""
+        if len(self.problem.closure) <= _MAX_DENSE:
+            return np.asarray(self._covariance[np.ix_(members, members)])
+        return self.evaluation.factorised.covariance(self.problem.closure[members])
 
     @cached_property
     def slipped(self) -> np.ndarray:

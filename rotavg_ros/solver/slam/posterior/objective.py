@@ -16,12 +16,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rotavg_ros.solver.slam.posterior.densities import log_good, log_normal, log_slipped
+from rotavg_ros.solver.slam.posterior.densities import log_normal, log_slipped
 from rotavg_ros.solver.slam.posterior.labels import false_density, log_false_set, log_label_prior, log_slip_prior
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
-from rotavg_ros.solver.slam.posterior.rows import residuals, variances, weights
-from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, EXPONENTS, RUN_STEPS, TURN_SHARES, Noise, State
+from rotavg_ros.solver.slam.posterior.rows import residuals, sites, variances, weights, weights_if_good, with_others
+from rotavg_ros.solver.slam.posterior.state import (
+    COMMON_SHARES,
+    EXPONENTS,
+    RUN_STEPS,
+    TAIL_SHARES,
+    TURN_SHARES,
+    Noise,
+    State,
+)
 from rotavg_ros.solver.slam.posterior.system import Factorised
 
 
@@ -52,13 +60,16 @@ def evaluate(problem: Problem, state: State) -> Evaluation:
     graph, priors, k = problem.graph, problem.priors, problem.components
     state = replace(state, trusted=state.is_good.astype(np.float64))
     variance, residual = variances(problem, state.noise), residuals(problem, state)
-    square = (residual**2).sum(axis=1)
-    weight = weights(problem, state, square, variance)
     system = problem.system(state.noise)
-    factorised = system.factorise(weight)
     num_edges, good = len(graph.source), state.is_good
     own, common = np.split(variance, [num_edges])
-    log_if_good = log_good(square[:num_edges], own, 0.0, k, priors)[0]
+    if_good = weights_if_good(state, own, sites(problem, state, residual, variance))
+    factorised = system.factorise(weights(problem, state, if_good, variance))
+    site = sites(problem, with_others(state, factorised, if_good, own), residual, variance)
+    weight, square = factorised.weight, (residual**2).sum(axis=1)
+    # Each as the normal density that stands for it, and by how much more its own density makes of what others say.
+    log_if_good = log_normal(square[:num_edges], 1 / weight[:num_edges], k) + site.log_density
+    log_if_good -= log_normal(site.square, 1 / weight[:num_edges] + site.predicted, k)
     slipped = np.flatnonzero(graph.is_odometry & ~good)
     log_if_slipped = log_slipped(square[slipped], own[slipped], 0.0, k, priors)
     is_false = ~good[problem.closure]
@@ -90,4 +101,6 @@ def log_noise_prior(noise: Noise, priors: SlamPriors) -> float:
     common = np.log(some if noise.run_steps > 0 else 1 - priors.common_errors)
     some = priors.turn_errors / (len(TURN_SHARES) - 1)
     turns = np.log(some if noise.turn_share > 0 else 1 - priors.turn_errors)
-    return float(believed + common + turns - (step**2 + closure**2) / (2 * priors.noise_spread**2))
+    some = priors.tails / (len(TAIL_SHARES) - 1)
+    tailed = sum(np.log(some if share > 0 else 1 - priors.tails) for share in (noise.step_tails, noise.closure_tails))
+    return float(believed + common + turns + tailed - (step**2 + closure**2) / (2 * priors.noise_spread**2))

@@ -16,8 +16,9 @@ class SlamPriors:
         step_deg: median of the standard deviation of one step of odometry.
         closure_deg: the same of a good closure.
         noise_spread: standard deviation of the logarithm of both.
-        tail_share: this share of the good edges, closures and segments, …
-        tail_ratio: … has so many times the variance (Huber's contaminated normal).
+        tails: probability that some of the sound segments err by far more than others; and that good closures do;
+            all shares that are summed over are as likely (:mod:`rotavg_ros.solver.slam.posterior.state`), …
+        tail_ratio: … and these have so many times the variance (Huber's contaminated normal).
         outlier_share: mean of the Beta prior of the share of false closures, …
         outlier_count: … and how many closures it counts for.
         near_miss_share: this share of the false closures is wrong by a normal turn …
@@ -41,7 +42,7 @@ class SlamPriors:
     step_deg: float = 0.3
     closure_deg: float = 2.0
     noise_spread: float = 1.2
-    tail_share: float = 0.1
+    tails: float = 0.5
     tail_ratio: float = 16.0
     outlier_share: float = 0.25
     outlier_count: float = 4.0

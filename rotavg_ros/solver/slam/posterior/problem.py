@@ -73,8 +73,6 @@ class Problem:
         """
         priors = SlamPriors() if priors is None else priors
         graph, pairs, components = prepared.closure_graph, prepared.pairs, prepared.noise.components
-        if "tails" in without:
-            priors = replace(priors, tail_share=_NONE)
         if "near-misses" in without:
             priors = replace(priors, near_miss_share=_NONE)
         chain = _chains(graph, pairs, priors)

@@ -9,12 +9,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from rotavg_ros.solver.algebra import quaternion_rows
-from rotavg_ros.solver.slam.posterior.densities import log_good
+from rotavg_ros.solver.slam.posterior.densities import Sites
 from rotavg_ros.solver.slam.posterior.problem import Problem
-from rotavg_ros.solver.slam.posterior.state import Noise, State
+from rotavg_ros.solver.slam.posterior.state import Noise, Others, State
+from rotavg_ros.solver.slam.posterior.system import Factorised
 
 # What a false closure weighs, of a good one: nothing, but the system stays solvable.
 _NOTHING = 1e-10
+# What is left of an edge without itself, at least; one that alone holds two parts together tells nothing of them.
+_LEAST_REST = 1e-6
 # A step turns nothing by more than this, rad; beyond, the linear system says nothing.
 _MAX_TURN = 1.0
 
@@ -29,6 +32,11 @@ def variances(problem: Problem, noise: Noise) -> np.ndarray:
     variance[closure] = own * np.exp(noise.exponent * problem.stated_ratio) * noise.closure_variance
     common = np.full(system.num_runs, noise.common_share * noise.closure_variance)
     return np.concatenate((variance, common))
+
+
+def tails(problem: Problem, noise: Noise) -> np.ndarray:
+    """``(E,)`` chance of each edge to be in the tails of its kind if it is good."""
+    return np.where(problem.graph.is_odometry, noise.step_tails, noise.closure_tails)
 
 
 def residuals(problem: Problem, state: State) -> np.ndarray:
@@ -56,20 +64,55 @@ def moved(state: State, step: np.ndarray) -> State:
     return replace(state, correction=quaternion_rows.normalize(turned), common=state.common + step[num_nodes:])
 
 
-def weights(problem: Problem, state: State, square: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """``(E + R,)`` rad⁻²: the mean of 1/variance over what a row's residual may be of.
+def sites(problem: Problem, state: State, residual: np.ndarray, variance: np.ndarray) -> Sites:
+    """Of all edges, with what others said of them in the last solve.
+
+    Args:
+        problem: the graph.
+        state: after that solve.
+        residual: ``(E + R, 3)`` rad.
+        variance: ``(E + R,)`` rad² of :func:`variances`.
+    """
+    others = state.others
+    num_edges = len(others.rest)
+    square = np.minimum((residual[:num_edges] ** 2).sum(axis=1) / others.rest**2, np.pi**2)
+    own, tailed = variance[:num_edges], tails(problem, state.noise)
+    return Sites.of(square, own, others.predicted, problem.components, tailed, problem.priors.tail_ratio)
+
+
+def weights_if_good(state: State, own: np.ndarray, site: Sites) -> np.ndarray:
+    """``(E,)`` rad⁻²: from the last ones (those of normal noise before any) halfway to those of the sites.
+
+    Edges that answer each other would swing between two answers without end. Halfway in the logarithm.
+    """
+    return np.asarray(np.sqrt(state.others.relative / own * site.weight))
+
+
+def with_others(state: State, factorised: Factorised, if_good: np.ndarray, own: np.ndarray) -> State:
+    """The state after a solve, with what that tells of each edge from all others.
+
+    Args:
+        state: before.
+        factorised: H of the solve.
+        if_good: ``(E,)`` rad⁻², what edges weighed in it as good ones.
+        own: ``(E,)`` rad², their variances.
+    """
+    resistance = factorised.resistance[: len(own)]
+    rest = np.maximum(1 - factorised.weight[: len(own)] * resistance, _LEAST_REST)
+    return replace(state, others=Others(rest, resistance / rest, if_good * own))
+
+
+def weights(problem: Problem, state: State, good: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """``(E + R,)`` rad⁻² of all rows.
 
     Args:
         problem: the graph.
         state: labels.
-        square: ``(E + R,)`` rad² of the residuals.
+        good: ``(E,)`` rad⁻², of edges as good ones.
         variance: ``(E + R,)`` rad² of :func:`variances`.
     """
-    priors, num_edges = problem.priors, len(problem.graph.source)
-    own = variance[:num_edges]
-    exact = log_good(square[:num_edges], own, 0.0, problem.components, priors)[1]
-    good = (exact + (1 - exact) / priors.tail_ratio) / own
-    slipped = 1 / (own + np.radians(priors.slip_deg) ** 2)
+    num_edges = len(problem.graph.source)
+    slipped = 1 / (variance[:num_edges] + np.radians(problem.priors.slip_deg) ** 2)
     otherwise = np.where(problem.graph.is_odometry, slipped, _NOTHING * good)
     weight = state.trusted * good + (1 - state.trusted) * otherwise
     return np.concatenate((_bridged(problem, state, weight), 1 / variance[num_edges:]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -151,5 +151,4 @@ def _turned(graph: ViewGraph, prepared: Prepared) -> np.ndarray:
 def _moved(mode: Mode, before: Drawn, after: Drawn) -> State:
     """A mode's labels, noise and orientations on the same graph drawn together anew."""
     correction = after.prepared.closure_graph.corrections(before.orientations(mode.state))
-    state = mode.state
-    return State(np.ascontiguousarray(correction.numpy().T), state.common, state.trusted, state.noise)
+    return replace(mode.state, correction=np.ascontiguousarray(correction.numpy().T))

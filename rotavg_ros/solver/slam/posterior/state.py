@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,8 @@ RUN_STEPS = (0.0, 20.0, 60.0)
 # … and over the share of odometry's variance that goes with how far it turns: half at most, since with
 # more F falls on B25b while its error grows.
 TURN_SHARES = (0.0, 0.5)
+# … and over the share of edges of a kind that are in its tails.
+TAIL_SHARES = (0.0, 0.02, 0.1, 0.3)
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,7 @@ class Noise:
         exponent: α, how far the ratios of stated variances are believed.
         common_share: κ, share of a closure's error variance that its run has in common.
         turn_share: share of odometry's variance that goes with the squares of the turns of its steps, not their number.
+        step_tails, closure_tails: share of sound segments, and of good closures, that err by far more than others.
         run_steps: no run is longer at its older end, in steps of odometry; 0 where closures err independently.
     """
 
@@ -35,6 +38,12 @@ class Noise:
     common_share: float
     run_steps: float
     turn_share: float = 0.0
+    step_tails: float = TAIL_SHARES[2]
+    closure_tails: float = TAIL_SHARES[2]
+
+    def chosen_as(self, other: Noise) -> Noise:
+        """The same variances with what another one has chosen from grids."""
+        return replace(other, step_variance=self.step_variance, closure_variance=self.closure_variance)
 
     @property
     def log_ratio(self) -> float:
@@ -43,8 +52,35 @@ class Noise:
 
     @property
     def chosen(self) -> tuple[float, ...]:
-        """What is chosen from grids: α, κ, the length of runs and the share that goes with turns."""
-        return self.exponent, self.common_share, self.run_steps, self.turn_share
+        """What is chosen from grids: α, κ, the length of runs, the share that goes with turns, and of tails."""
+        return (
+            self.exponent,
+            self.common_share,
+            self.run_steps,
+            self.turn_share,
+            self.step_tails,
+            self.closure_tails,
+        )
+
+
+@dataclass(frozen=True)
+class Others:
+    """What all other edges say of the residual of each of E.
+
+    Attributes:
+        rest: ``(E,)`` what the edge itself leaves of that, 1 − w R.
+        predicted: ``(E,)`` rad², its variance.
+        relative: ``(E,)`` what the edge weighed as a good one, times its variance.
+    """
+
+    rest: np.ndarray
+    predicted: np.ndarray
+    relative: np.ndarray
+
+    @classmethod
+    def before_any(cls, num_edges: int) -> Others:
+        """Before any solve: residuals are what others say, and all noise is normal."""
+        return cls(np.ones(num_edges), np.zeros(num_edges), np.ones(num_edges))
 
 
 @dataclass(frozen=True)
@@ -56,12 +92,14 @@ class State:
         common: ``(R, 3)`` common errors of runs, rad.
         trusted: ``(E,)`` 1 for good closures and sound segments, 0 for others; between while labels are probabilities.
         noise: θ.
+        others: what all other edges said of each in the last solve.
     """
 
     correction: np.ndarray
     common: np.ndarray
     trusted: np.ndarray
     noise: Noise
+    others: Others
 
     @property
     def is_good(self) -> np.ndarray:

@@ -19,7 +19,7 @@ from rotavg_ros.solver.slam.posterior.left_out import relabelled
 from rotavg_ros.solver.slam.posterior.modes import Published, publish
 from rotavg_ros.solver.slam.posterior.moves.flips import flipped
 from rotavg_ros.solver.slam.posterior.solve import Drawn, Found
-from rotavg_ros.solver.slam.posterior.state import Noise, State
+from rotavg_ros.solver.slam.posterior.state import Noise, Others, State
 from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over
 from rotavg_ros.view_graph import ViewGraph
 
@@ -78,7 +78,8 @@ class PosteriorMemory:
         is_new = before == _NEW
         correction = problem.graph.corrections(body_from_world).numpy().T
         common = np.zeros((problem.system(self.noise).num_runs, 3))
-        start = State(np.ascontiguousarray(correction), common, np.minimum(before, 1.0), self.noise)
+        trusted, others = np.minimum(before, 1.0), Others.before_any(len(before))
+        start = State(np.ascontiguousarray(correction), common, trusted, self.noise, others)
         start = replace(start, trusted=np.where(is_new, relabelled(problem, start), before))
         search = Search(problem)
         mode = flipped(search.polished(start, "update"))

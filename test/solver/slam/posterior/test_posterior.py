@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import product
 
 import numpy as np
@@ -24,16 +24,19 @@ from rotavg_ros.solver.slam.posterior.labels import (
     log_slip_prior,
 )
 from rotavg_ros.solver.slam.posterior.left_out import leave_one_out
+from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.solver.slam.posterior.moves.noise import tuned
 from rotavg_ros.solver.slam.posterior.objective import evaluate
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
-from rotavg_ros.solver.slam.posterior.state import RUN_STEPS, Noise, State
+from rotavg_ros.solver.slam.posterior.rows import with_noise
+from rotavg_ros.solver.slam.posterior.state import RUN_STEPS, Noise, Others, State
 from rotavg_ros.solver.slam.preparation import prepare_as_it_is
 from rotavg_ros.view_graph import ViewGraph
 
 # Gaussian where a mixture would be integrated approximately only.
-_PRIORS = replace(SlamPriors(), tail_share=1e-12, near_miss_share=1e-12)
-_NOISE = Noise(np.radians(1.0) ** 2, np.radians(1.5) ** 2, 0.0, 0.4, RUN_STEPS[-1])
+_PRIORS = replace(SlamPriors(), near_miss_share=1e-12)
+_NOISE = Noise(np.radians(1.0) ** 2, np.radians(1.5) ** 2, 0.0, 0.4, RUN_STEPS[-1], step_tails=0.0, closure_tails=0.0)
 
 
 def _yaw(angle: np.ndarray) -> np.ndarray:
@@ -73,12 +76,27 @@ def _problem(
     return Problem.of(prepared, no_opinion, priors=priors, without=without, bias=bias, turned=turned)
 
 
+def _tuned(problem: Problem) -> set[str]:
+    """Names of what other values are looked at of."""
+    state, evaluation = polish(problem, _state(problem, np.zeros(len(problem.closure), dtype=bool)))
+    mode = Mode(problem, state, evaluation, "test")
+    names = [field.name for field in fields(Noise)]
+    return {
+        name
+        for other in tuned(mode)
+        for name in names
+        if getattr(other.state.noise, name) != getattr(state.noise, name)
+    }
+
+
 def _state(problem: Problem, is_false: np.ndarray) -> State:
     trusted = np.ones(len(problem.graph.source))
     trusted[problem.closure[is_false]] = 0.0
     correction = np.zeros((4, problem.graph.num_nodes))
     correction[3] = 1.0
-    return State(correction, np.zeros((problem.system(_NOISE).num_runs, 3)), trusted, _NOISE)
+    return State(
+        correction, np.zeros((problem.system(_NOISE).num_runs, 3)), trusted, _NOISE, Others.before_any(len(trusted))
+    )
 
 
 def _log_evidence(problem: Problem, is_false: np.ndarray, bias_deg: float = 0.0) -> float:
@@ -116,6 +134,44 @@ def test_marginals_are_those_of_dense_integrals(seed: int) -> None:
     marginals = [(np.exp(np.array(log) - logsumexp(log))[:, None] * is_false).sum(axis=0) for log in (by_f, densely)]
     np.testing.assert_allclose(marginals[0], marginals[1], atol=0.01)
     assert marginals[0].max() > 0.02 and marginals[0].min() < 0.98
+
+
+def _log_evidence_of_tails(problem: Problem, noise: Noise) -> float:
+    """The same of good closures by themselves, summed over which segments and which closures are in the tails."""
+    graph, closure = problem.graph, problem.closure
+    discrepancy = (2 * np.arctan2(problem.measured[2], problem.measured[3]))[closure] * problem.sign
+    segment = np.flatnonzero(graph.is_odometry)
+    ends = np.sort(np.stack((graph.position[graph.source[segment]], graph.position[graph.target[segment]])), axis=0)
+    older, newer = problem.ends.T
+    across = ((ends[0] >= older[:, None] - 1e-9) & (ends[1] <= newer[:, None] + 1e-9)).astype(np.float64)
+    segment, across = segment[across.any(axis=0)], across[:, across.any(axis=0)]
+    variance = np.append(graph.own_steps[segment] * noise.step_variance, np.full(len(closure), noise.closure_variance))
+    share = np.append(np.full(len(segment), noise.step_tails), np.full(len(closure), noise.closure_tails))
+    design = np.hstack((across, np.eye(len(closure))))
+    logs = []
+    for tail in map(np.array, product([False, True], repeat=len(variance))):
+        inflated = variance * np.where(tail, problem.priors.tail_ratio, 1.0)
+        normal = multivariate_normal(np.zeros(len(closure)), (design * inflated) @ design.T)
+        with np.errstate(divide="ignore"):
+            logs.append(normal.logpdf(discrepancy) + np.log(np.where(tail, share, 1 - share)).sum())
+    return float(logsumexp(logs))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_tails_have_the_evidence_of_the_sum_over_what_is_in_them(seed: int) -> None:
+    graph, _ = _planar(seed, 4, 0.0, length=40)
+    problem = _problem(graph)
+    state = _state(problem, np.zeros(4, dtype=bool))
+    by_f, exactly = [], []
+    for share in (0.0, 0.1):
+        noise = replace(_NOISE, run_steps=0.0, step_tails=share, closure_tails=share)
+        _, evaluation = polish(problem, with_noise(problem, state, noise), hold_noise=True)
+        terms = evaluation.terms
+        by_f.append(terms["odometry"] + terms["good closures"] + terms["orientations"])
+        exactly.append(-_log_evidence_of_tails(problem, noise))
+    assert by_f[1] - by_f[0] == pytest.approx(exactly[1] - exactly[0], abs=0.1)
+    # Laplace's method is off by as much as that.
+    assert abs(exactly[1] - exactly[0]) > 0.15
 
 
 @pytest.mark.parametrize(("seed", "planted_deg"), [(0, 0.0), (1, 0.05), (2, -0.3), (3, 1.0)])
@@ -238,7 +294,7 @@ def test_priors_are_normalised() -> None:
 @pytest.mark.parametrize(
     ("name", "is_off"),
     [
-        ("tails", lambda problem: problem.priors.tail_share < 1e-9),
+        ("tails", lambda problem: not {"step_tails", "closure_tails"} & _tuned(problem)),
         ("near-misses", lambda problem: problem.priors.near_miss_share < 1e-9),
         ("common-errors", lambda problem: problem.system(_NOISE).num_runs == 0),
         ("turns", lambda problem: not problem.turns_vary),

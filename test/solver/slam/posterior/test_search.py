@@ -212,19 +212,19 @@ STRUCTURAL = {
     "inference": {"_GAIN", "_BEAM"},
     "labels": {"_SHARES", "_STAY", "_NEAR_SHARES", "_FAR_SHARES", "_REPEAT_DEG", "_LEAST", "_GRID_SIZE"}
     | {"_LOG_FIRST", "_LOG_FOLLOWS", "_LOG_STEPS"},
-    "left_out": {"CERTAIN", "_LEAST_REST"},
+    "left_out": {"CERTAIN"},
     "modes": {"_FAR", "_LIKELY", "_FAR_TURN", "_SURELY_FALSE", "_ROUNDS"},
     "moves/flips": {"_PART", "_LEAST_GAIN"},
-    "moves/groups": {"_AGREE", "_TIGHTER", "_SETTLING", "_MAX_DENSE"},
-    "mode": {"OTHER_NOISE"},
-    "moves/noise": {"_GRIDS", "_MIN_SPREAD", "_OTHER_RATIO"},
+    "moves/groups": {"_AGREE", "_TIGHTER", "_SETTLING"},
+    "mode": {"OTHER_NOISE", "_MAX_DENSE"},
+    "moves/noise": {"_GRIDS", "_UNORDERED", "_MIN_SPREAD", "_OTHER_RATIO"},
     "moves/slips": {"_AGREE", "_AGREE_ANGLE", "_OPTIMISM", "_SETTLING", "_SAME_PLACE"},
     "moves/starts": {"_INLIER_SQUARE", "_SHARP", "_STEP_LEVELS", "_CLOSURE_LEVEL", "_ROBUST_POWER"}
     | {"_ANNEALED_SLIPS", "_LEAST_WEIGHT", "_SAME_TURN"},
     "problem": {"_NONE", "_SAME_TURNS"},
-    "rows": {"_NOTHING", "_MAX_TURN"},
+    "rows": {"_NOTHING", "_MAX_TURN", "_LEAST_REST"},
     "solve": {"Begin", "_BIAS_ROUNDS", "_LEAST_GAIN"},
-    "state": {"EXPONENTS", "COMMON_SHARES", "RUN_STEPS", "TURN_SHARES"},
+    "state": {"EXPONENTS", "COMMON_SHARES", "RUN_STEPS", "TURN_SHARES", "TAIL_SHARES"},
     "system": {"_NUM_PROBES", "_MAX_LEVERAGE"},
 }
 

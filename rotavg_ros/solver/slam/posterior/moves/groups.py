@@ -22,8 +22,6 @@ _AGREE = 3.0
 _SETTLING = 3
 # Groups that agree to half of that are looked at, too.
 _TIGHTER = 0.25
-# Covariances of up to so many closures are computed all at once.
-_MAX_DENSE = 500
 
 
 def propose(mode: Mode) -> Iterator[Proposal]:
@@ -108,10 +106,7 @@ def _evidence(mode: Mode, members: np.ndarray, believed: bool) -> tuple[float, n
     problem, k = mode.problem, mode.problem.components
     rows = problem.closure[members]
     residual = mode.evaluation.residual[rows]
-    if len(problem.closure) <= _MAX_DENSE:
-        covariance = mode.covariance[np.ix_(members, members)]
-    else:
-        covariance = mode.evaluation.factorised.covariance(rows)
+    covariance = mode.covariance_of(members)
     if believed:
         weight = mode.evaluation.weight[rows]
         left = np.eye(len(rows)) - covariance * weight

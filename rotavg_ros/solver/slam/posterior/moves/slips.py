@@ -11,9 +11,10 @@ import numpy as np
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.posterior.densities import log_false
 from rotavg_ros.solver.slam.posterior.em import settle
-from rotavg_ros.solver.slam.posterior.labels import false_density, log_false_set, log_label_prior
+from rotavg_ros.solver.slam.posterior.labels import false_density, log_false_set, log_label_prior, log_slip_odds
 from rotavg_ros.solver.slam.posterior.left_out import relabelled, rough_cost
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
+from rotavg_ros.solver.slam.posterior.rows import variances
 from rotavg_ros.solver.slam.posterior.state import State
 
 _SETTLING = 4
@@ -69,15 +70,15 @@ class _Witnesses:
         difference = 2 * np.arccos(np.minimum(np.abs(self.turned[:, closure] @ self.turned), 1.0))
         return np.asarray((difference**2 < tolerance) & self.can_tell & mode.is_false)
 
-    def best_place(self, agrees: np.ndarray, disagrees: np.ndarray) -> tuple[int, np.ndarray, float]:
-        """Where a slip gains most, which closures it makes good ``(C,)``, and what it costs by itself, nats."""
+    def best_place(self, agrees: np.ndarray, disagrees: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
+        """Where a slip gains most, which closures ``(C,)`` it makes good, and which it turns away."""
         change = np.where(agrees, self.gain, np.where(disagrees, -self.gain, 0.0))
         across = np.zeros(len(self.segment) + 1)
         np.add.at(across, self.first, change)
         np.add.at(across, self.last, -change)
         best = int(np.argmin(self.price - np.cumsum(across)[:-1]))
         is_across = (self.first <= best) & (best < self.last)
-        return best, is_across & agrees, float(self.price[best] + self.gain[is_across & disagrees].sum())
+        return best, is_across & agrees, is_across & disagrees
 
 
 def propose_slips(mode: Mode) -> Iterator[Proposal]:
@@ -92,15 +93,29 @@ def propose_slips(mode: Mode) -> Iterator[Proposal]:
         if left[closure]:
             agrees = witnesses.agreeing(closure, mode)
             left &= ~agrees
-            place, freed, cost = witnesses.best_place(agrees, disagrees)
-            found.append((cost - float(witnesses.gain[freed].sum()), closure, place, freed, cost))
+            place, freed, lost = witnesses.best_place(agrees, disagrees)
+            gained = float(witnesses.gain[freed].sum() - witnesses.gain[lost].sum() - witnesses.price[place])
+            found.append((gained, closure, place, freed, lost))
     before = _log_labelled(mode, mode.is_false)
-    for _, closure, place, freed, cost in sorted(found, key=lambda slip: slip[0])[: mode.problem.limits.slips]:
-        # Together they gain less than one by one: false closures that repeat a turn are cheap.
-        after = _log_labelled(mode, mode.is_false & ~freed)
-        after += float(mode.left_out.if_good[mode.problem.closure[freed]].sum())
+    for _, closure, place, freed, lost in sorted(found, key=lambda slip: -slip[0])[: mode.problem.limits.slips]:
         edge, turn = int(witnesses.segment[place]), witnesses.turned[:, [closure]]
-        yield Proposal("slip", cost + before - after, partial(_with_slip, mode, edge, turn))
+        # Together they gain less than one by one: false closures that repeat a turn are cheap.
+        after = _log_labelled(mode, mode.is_false & ~freed) + _log_turned(mode, np.flatnonzero(freed))
+        after += float(log_slip_odds(mode.problem, mode.problem.graph.own_steps[[edge]], len(mode.slipped))[0])
+        predicted = before - after + float(witnesses.gain[lost].sum())
+        yield Proposal("slip", predicted, partial(_with_slip, mode, edge, turn))
+
+
+def _log_turned(mode: Mode, members: np.ndarray) -> float:
+    """Log density of false closures if they are good and one slip turned all of them."""
+    problem, k = mode.problem, mode.problem.components
+    rows, sign = problem.closure[members], problem.sign[members]
+    residual = mode.evaluation.residual[rows]
+    total = mode.covariance_of(members) + np.diag(variances(problem, mode.state.noise)[rows])
+    total += np.radians(problem.priors.slip_deg) ** 2 * np.outer(sign, sign)
+    square = float((residual * np.linalg.solve(total, residual)).sum())
+    log_det = float(np.linalg.slogdet(total)[1])
+    return float(-square / 2 - k / 2 * (log_det + len(rows) * np.log(2 * np.pi)))
 
 
 def _log_labelled(mode: Mode, is_false: np.ndarray) -> float:

@@ -20,7 +20,15 @@ from rotavg_ros.solver.slam.posterior.left_out import relabelled
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import moved, residuals, variances
-from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, EXPONENTS, RUN_STEPS, Noise, State
+from rotavg_ros.solver.slam.posterior.state import (
+    COMMON_SHARES,
+    EXPONENTS,
+    RUN_STEPS,
+    TAIL_SHARES,
+    Noise,
+    Others,
+    State,
+)
 from rotavg_ros.solver.slam.preparation import Prepared
 from rotavg_ros.solver.slam.stages import CleanedClosures
 from rotavg_ros.view_graph import ViewGraph
@@ -71,13 +79,23 @@ def turned_parts(problem: Problem, prepared: Prepared, tree: Tensor) -> State:
 
 def noise_of(problem: Problem, model: NoiseModel) -> Noise:
     """θ to begin with."""
-    return Noise(model.step_variance, model.closure_variance, EXPONENTS[0], COMMON_SHARES[1], RUN_STEPS[-1])
+    tails = TAIL_SHARES[0 if "tails" in problem.without else 2]
+    return Noise(
+        model.step_variance,
+        model.closure_variance,
+        EXPONENTS[0],
+        COMMON_SHARES[1],
+        RUN_STEPS[-1],
+        step_tails=tails,
+        closure_tails=tails,
+    )
 
 
 def at(problem: Problem, correction: Tensor, trusted: np.ndarray, noise: Noise) -> State:
     """A state at corrections ``(K, 4)``."""
     rows = np.ascontiguousarray(correction.numpy().T)
-    return State(rows, np.zeros((problem.system(noise).num_runs, 3)), trusted.astype(np.float64), noise)
+    common = np.zeros((problem.system(noise).num_runs, 3))
+    return State(rows, common, trusted.astype(np.float64), noise, Others.before_any(len(problem.graph.source)))
 
 
 def annealed(problem: Problem, state: State) -> State:
