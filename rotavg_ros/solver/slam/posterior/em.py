@@ -25,8 +25,8 @@ from rotavg_ros.solver.slam.posterior.system import Factorised
 # Residuals say nothing of noise or labels while orientations still turn by more than this; but not for ever.
 _SETTLED_TURN = np.radians(3.0)
 _MAX_UNSETTLED = 5
-# Noise is estimated anew in the first solves, and until that lowers F by less than this, nats.
-_NOISE_SOLVES, _NOISE_CONVERGED = 4, 0.1
+# Noise is estimated anew until that lowers F by less than this, nats.
+_NOISE_CONVERGED = 0.1
 _PROBABILITY_CONVERGED = 0.02
 # Newton's steps to the likeliest variance, and how far from its prior it may end, in standard deviations.
 _NEWTON_STEPS, _FARTHEST = 20, 5.0
@@ -43,12 +43,21 @@ def step(problem: Problem, state: State) -> tuple[State, float, Factorised]:
     return state, float(np.abs(turn).max(initial=0.0)), factorised
 
 
-def polish(problem: Problem, state: State, *, hold_noise: bool = False) -> tuple[State, Evaluation]:
-    """Corrections and noise at their optimum for labels as they are."""
-    for number in range(problem.limits.polish_solves):
+def polish(
+    problem: Problem, state: State, solves: int | None = None, *, hold_noise: bool = False
+) -> tuple[State, Evaluation]:
+    """Corrections and noise at their optimum for labels as they are.
+
+    Args:
+        problem: the graph.
+        state: where to begin.
+        solves: at most; default: those of the limits.
+        hold_noise: leave the noise as it is.
+    """
+    for _ in range(problem.limits.polish_solves if solves is None else solves):
         state, turned, factorised = step(problem, state)
         is_settled = turned < problem.limits.converged * np.sqrt(state.noise.step_variance)
-        if not hold_noise and turned < _SETTLED_TURN and (number < _NOISE_SOLVES or is_settled):
+        if not hold_noise and turned < _SETTLED_TURN:
             before = state.noise
             state = replace(state, noise=estimate_noise(problem, state, factorised))
             is_settled &= _gained(problem, before, state.noise) < _NOISE_CONVERGED

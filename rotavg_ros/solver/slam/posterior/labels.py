@@ -22,7 +22,11 @@ _STAY = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 0.97])
 _NEAR_SHARES = np.array([0.02, 0.3, 0.7, 0.95])
 _FAR_SHARES = np.array([0.01, 0.05, 0.2, 0.5, 0.9])
 _REPEAT_DEG = np.array([0.05, 0.3, 1.0, 3.0, 10.0])
-_GRID_SIZE = len(_NEAR_SHARES) * len(_FAR_SHARES) * len(_REPEAT_DEG)
+# One width for all, or each as likely for every closure.
+_KERNELS = len(_REPEAT_DEG) + 1
+_GRID_SIZE = len(_NEAR_SHARES) * len(_FAR_SHARES) * _KERNELS
+# Of closures detected at about the same time, one from about the same older place counts for so many others.
+_IN_RUN = 10.0
 # The least density that counts.
 _LEAST = 1e-300
 
@@ -33,7 +37,7 @@ class FalseDensity:
 
     Attributes:
         alone: ``(n,)`` wrong by themselves.
-        near, far: ``(S, n)`` for each kernel width, repeats of near and of any false closures; -inf without any.
+        near, far: ``(S, n)`` for each kernel, repeats of near and of any false closures; -inf without any.
     """
 
     alone: np.ndarray
@@ -55,7 +59,8 @@ def false_density(
     """Closures wrong by themselves, or by the same turn of the world as other false ones.
 
     Places that look alike are mistaken for each other again and again. The density of a repeat is a kernel estimate
-    over the false closures detected before (a Pólya urn), those near weighing apart from all.
+    over the false closures detected before (a Pólya urn), those detected shortly before weighing apart from all, and
+    among these most those of the same run.
 
     Args:
         is_false: ``(C,)`` bool, of the others.
@@ -65,7 +70,7 @@ def false_density(
     """
     k = problem.components
     alone = log_false((residual[rows] ** 2).sum(axis=1), k, problem.priors)
-    nothing = np.full((len(_REPEAT_DEG), len(rows)), -np.inf)
+    nothing = np.full((_KERNELS, len(rows)), -np.inf)
     false = problem.detection[is_false[problem.detection]]
     if len(false) == 0 or len(rows) == 0 or "repeats" in problem.without:
         return FalseDensity(alone, nothing, nothing)
@@ -80,24 +85,28 @@ def false_density(
     turn = quaternion_rows.exp(np.ascontiguousarray((residual * problem.sign[:, None]).T)).T
     cosine = np.abs(np.einsum("ni,nwi->nw", turn[rows], turn[other]))
     square = np.where(there, (2 * np.arccos(np.minimum(cosine, 1.0))) ** 2, np.inf)
-    newer = problem.ends[:, 1]
-    is_near = np.abs(newer[other] - newer[rows, None]) <= problem.priors.run_gap_steps
-    count, count_near = there.sum(axis=1), (there & is_near).sum(axis=1)
+    apart = np.abs(problem.ends[other] - problem.ends[rows, None])
+    is_near = there & (apart[:, :, 1] <= problem.priors.run_gap_steps)
+    in_run = apart.sum(axis=2) <= problem.priors.run_gap_steps
+    weights = is_near * np.where(in_run, _IN_RUN, 1.0), there.astype(np.float64)
     near, far = nothing.copy(), nothing.copy()
     with np.errstate(divide="ignore"):
         for number, width in enumerate(np.radians(_REPEAT_DEG)):
             height = (2 * np.pi * width**2) ** (-k / 2)
             kernel = np.exp(-square / (2 * width**2))
-            for result, chosen, counted in ((near, is_near, count_near), (far, there, count)):
-                mean = height * (kernel * chosen).sum(axis=1) / np.maximum(counted, 1)
-                result[number] = np.where(counted > 0, np.log(np.maximum(mean, _LEAST)), -np.inf)
+            for result, weight in zip((near, far), weights, strict=True):
+                total = weight.sum(axis=1)
+                mean = height * np.einsum("nw,nw->n", kernel, weight) / np.maximum(total, 1.0)
+                result[number] = np.where(total > 0, np.log(np.maximum(mean, _LEAST)), -np.inf)
+    for result in (near, far):
+        result[-1] = np.logaddexp.reduce(result[:-1], axis=0) - np.log(len(_REPEAT_DEG))
     return FalseDensity(alone, near, far)
 
 
 def _log_repeat_prior(problem: Problem) -> np.ndarray:
     """``(G,)`` of the grid's points: Beta(1, count) on the share that repeats a turn elsewhere, all else as likely."""
     far = (problem.priors.elsewhere_count - 1) * np.log1p(-_FAR_SHARES) + np.log(np.gradient(_FAR_SHARES))
-    grid = np.broadcast_to(far[:, None], (len(_NEAR_SHARES), len(_FAR_SHARES), len(_REPEAT_DEG))).ravel()
+    grid = np.broadcast_to(far[:, None], (len(_NEAR_SHARES), len(_FAR_SHARES), _KERNELS)).ravel()
     return np.asarray(grid - np.logaddexp.reduce(grid))
 
 

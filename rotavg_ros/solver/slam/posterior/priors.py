@@ -67,6 +67,7 @@ class SearchLimits:
 
     Attributes:
         polish_solves: sparse solves at most to bring a labelling to its optimum.
+        trial_solves: the same where other noise is tried.
         settling_solves: the same while labels are probabilities.
         converged: such a part of a step's standard deviation is no movement.
         flip_rounds: batches of single flips.
@@ -83,8 +84,9 @@ class SearchLimits:
     """
 
     polish_solves: int = 20
+    trial_solves: int = 5
     settling_solves: int = 15
-    converged: float = 0.05
+    converged: float = 0.1
     flip_rounds: int = 8
     annealing_factor: float = 1.6
     robust_solves: int = 12

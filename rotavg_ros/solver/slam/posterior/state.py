@@ -38,8 +38,8 @@ class Noise:
     common_share: float
     run_steps: float
     turn_share: float = 0.0
-    step_tails: float = TAIL_SHARES[2]
-    closure_tails: float = TAIL_SHARES[2]
+    step_tails: float = TAIL_SHARES[0]
+    closure_tails: float = TAIL_SHARES[0]
 
     def chosen_as(self, other: Noise) -> Noise:
         """The same variances with what another one has chosen from grids."""

@@ -8,7 +8,7 @@ from dataclasses import replace
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.rows import with_noise
-from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, EXPONENTS, RUN_STEPS, TAIL_SHARES, TURN_SHARES
+from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, EXPONENTS, RUN_STEPS, TAIL_SHARES, TURN_SHARES, Noise
 
 _GRIDS = {
     "turn_share": TURN_SHARES,
@@ -18,38 +18,33 @@ _GRIDS = {
     "run_steps": RUN_STEPS,
     "common_share": COMMON_SHARES,
 }
-# Errors in common are a matter by themselves; of all else the next value tells of those beyond.
-_UNORDERED = ("run_steps",)
 # Where the logarithms of stated variances spread by less, weights could gain 4 % of variance at most.
 _MIN_SPREAD = 0.2
-# By so much both variances are off where another optimum is looked for.
-_OTHER_RATIO = 8.0
+# Values of a grid so many places from the best one are looked at.
+_REACH = 2
 
 
 def tuned(mode: Mode) -> Iterator[Mode]:
-    """Modes of the same labels with other noise.
-
-    Each value of the grids, one after the other, from the best so far; and what is found where a step's variance over a
-    closure's is far larger or smaller: F may have an optimum where odometry takes up what closures err, and another.
-    """
+    """Modes of the same labels with other noise: values of one grid after the other, from the best so far."""
+    begun = mode
     for name, grid in _GRIDS.items():
         if not _tells(mode, name):
             continue
-        begun = grid.index(getattr(mode.state.noise, name))
-        for number in (*range(begun + 1, len(grid)), *range(begun - 1, -1, -1)):
-            at = grid.index(getattr(mode.state.noise, name))
-            if abs(number - at) > 1 and name not in _UNORDERED:
-                continue
-            noise = replace(mode.state.noise, **{name: grid[number]})
-            found = Mode(mode.problem, *polish(mode.problem, with_noise(mode.problem, mode.state, noise)), "noise")
-            yield found
-            mode = min(mode, found, key=lambda either: either.cost)
-    for factor in (_OTHER_RATIO, 1 / _OTHER_RATIO):
-        noise = mode.state.noise
-        noise = replace(
-            noise, step_variance=noise.step_variance * factor, closure_variance=noise.closure_variance / factor
-        )
-        yield Mode(mode.problem, *polish(mode.problem, replace(mode.state, noise=noise)), "noise")
+        at = grid.index(getattr(mode.state.noise, name))
+        for number in sorted(set(range(len(grid))) - {at}, key=lambda number: abs(number - at)):
+            best = getattr(mode.state.noise, name)
+            if abs(number - grid.index(best)) <= _REACH:
+                noise = replace(mode.state.noise, **{name: grid[number]})
+                found = _polished(mode, noise, mode.problem.limits.trial_solves)
+                yield found
+                mode = min(mode, found, key=lambda either: either.cost)
+    if mode is not begun:
+        yield _polished(mode, mode.state.noise, mode.problem.limits.polish_solves)
+
+
+def _polished(mode: Mode, noise: Noise, solves: int) -> Mode:
+    state = with_noise(mode.problem, mode.state, noise)
+    return Mode(mode.problem, *polish(mode.problem, state, solves), "noise")
 
 
 def _tells(mode: Mode, name: str) -> bool:

@@ -24,7 +24,6 @@ from rotavg_ros.solver.slam.posterior.state import (
     COMMON_SHARES,
     EXPONENTS,
     RUN_STEPS,
-    TAIL_SHARES,
     Noise,
     Others,
     State,
@@ -79,16 +78,7 @@ def turned_parts(problem: Problem, prepared: Prepared, tree: Tensor) -> State:
 
 def noise_of(problem: Problem, model: NoiseModel) -> Noise:
     """θ to begin with."""
-    tails = TAIL_SHARES[0 if "tails" in problem.without else 2]
-    return Noise(
-        model.step_variance,
-        model.closure_variance,
-        EXPONENTS[0],
-        COMMON_SHARES[1],
-        RUN_STEPS[-1],
-        step_tails=tails,
-        closure_tails=tails,
-    )
+    return Noise(model.step_variance, model.closure_variance, EXPONENTS[0], COMMON_SHARES[1], RUN_STEPS[0])
 
 
 def at(problem: Problem, correction: Tensor, trusted: np.ndarray, noise: Noise) -> State:
