@@ -16,7 +16,6 @@ from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.posterior.inference import Search
 from rotavg_ros.solver.slam.posterior.modes import of_mode, publish
-from rotavg_ros.solver.slam.posterior.moves.flips import flipped
 from rotavg_ros.solver.slam.posterior.moves.noise import tuned
 from rotavg_ros.solver.slam.posterior.moves.starts import at, noise_of
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
@@ -114,7 +113,7 @@ def _from_truth(drawn: Drawn, body_from_world: Tensor, is_wrong: Tensor) -> Foun
     from_truth = Search(problem)
     correction = closure_graph.corrections(body_from_world)
     start = at(problem, correction, trusted, noise_of(problem, drawn.prepared.noise))
-    from_truth.keep(flipped(from_truth.polished(start, "truth")))
+    from_truth.keep(from_truth.flipped(from_truth.polished(start, "truth")))
     for mode in tuned(from_truth.modes[0]):
         from_truth.keep(mode)
     return Found(drawn, from_truth.modes)

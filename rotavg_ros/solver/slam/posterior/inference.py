@@ -34,7 +34,7 @@ class Search:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.modes: list[Mode] = []
-        self._tuned: set[bytes] = set()
+        self._tuned: list[Mode] = []
         self._tried = 0
 
     def run(self, prepared: Prepared, cleaned: CleanedClosures, correction: Tensor) -> list[Mode]:
@@ -49,33 +49,33 @@ class Search:
         for name, state in starts(self.problem, prepared, cleaned, correction):
             if begun:
                 state = with_noise(self.problem, state, state.noise.chosen_as(self.modes[0].state.noise))
-            begun.append(flipped(self.polished(state, name)))
+            begun.append(self.flipped(self.polished(state, name)))
             self.keep(begun[-1])
             if len(begun) == 1:
                 self._tune(begun[0])
-            if sum(mode.labels == self.modes[0].labels for mode in begun) >= self.problem.limits.alike:
+            if sum(mode.is_like(self.modes[0]) for mode in begun) >= self.problem.limits.alike:
                 break
         may_cut = "minimum-cuts" not in self.problem.without and len(prepared.pairs.first) > 0
         if may_cut and self._seems_slipped(self.modes[0]):
-            self.keep(flipped(self.polished(turned_parts(self.problem, prepared, correction), "minimum cuts")))
+            self.keep(self.flipped(self.polished(turned_parts(self.problem, prepared, correction), "minimum cuts")))
         return self.move_on()
 
     def _seems_slipped(self, mode: Mode) -> bool:
         if "slips" in self.problem.without:
             return False
-        promised = (proposal.predicted for proposal in slips.propose_slips(mode))
-        return len(mode.slipped) > 0 or min(promised, default=np.inf) <= self.problem.limits.slack
+        return len(mode.slipped) > 0 or any(slip.predicted <= slip.slack for slip in slips.propose_slips(mode))
 
     def move_on(self) -> list[Mode]:
         """The search from the modes that are kept."""
-        done: set[bytes] = set()
+        done: list[Mode] = []
         while (mode := self._next(done)) is not None:
-            done.add(mode.labels)
-            for proposal in sorted(proposals(mode), key=lambda proposal: proposal.predicted):
-                if proposal.predicted > self.problem.limits.slack or self._tried >= self.problem.limits.tried:
+            done.append(mode)
+            promising = (proposal for proposal in proposals(mode) if proposal.predicted <= proposal.slack)
+            for proposal in sorted(promising, key=lambda proposal: proposal.predicted):
+                if self._tried >= self.problem.limits.tried:
                     break
                 self._tried += 1
-                found = flipped(self.polished(proposal.make(), proposal.name))
+                found = self.flipped(self.polished(proposal.make(), proposal.name))
                 self.keep(found)
                 if found.cost < mode.cost - _GAIN:
                     break
@@ -85,24 +85,28 @@ class Search:
 
     def _tune(self, mode: Mode) -> None:
         """The labels of a mode under their best noise, and what other labels cost under that."""
-        if mode.labels in self._tuned:
+        if any(mode.is_like(tuned) for tuned in self._tuned):
             return
-        self._tuned.add(mode.labels)
+        self._tuned.append(mode)
         best, near = mode, self._near()
         for found in noise.tuned(mode):
             self.keep(found)
             best = min(best, found, key=lambda either: either.cost)
         if best is not mode:
-            self.keep(flipped(best))
+            self.keep(self.flipped(best))
         chosen = best.state.noise
         for other in near:
             if other.labels != mode.labels and other.state.noise.chosen != chosen.chosen:
                 state = with_noise(self.problem, other.state, other.state.noise.chosen_as(chosen))
-                self.keep(flipped(self.polished(state, other.origin)))
+                self.keep(self.flipped(self.polished(state, other.origin)))
 
     def polished(self, state: State, origin: str) -> Mode:
         """The mode of a state's labels."""
         return Mode(self.problem, *polish(self.problem, state), origin)
+
+    def flipped(self, mode: Mode) -> Mode:
+        """The mode with single labels flipped as long as F falls, and may come near the least."""
+        return flipped(mode, self.modes[0].cost + self.problem.limits.rival if self.modes else np.inf)
 
     def keep(self, mode: Mode) -> None:
         """Among the modes, in the place of the same labels at a higher F."""
@@ -111,13 +115,18 @@ class Search:
             known[mode.key] = mode
         self.modes = sorted(known.values(), key=lambda other: other.cost)
 
-    def _next(self, done: set[bytes]) -> Mode | None:
-        return next((mode for mode in self._near() if mode.labels not in done), None)
+    def _next(self, done: list[Mode]) -> Mode | None:
+        return next((mode for mode in self._near() if not any(mode.is_like(other) for other in done)), None)
 
     def _near(self) -> list[Mode]:
-        """The best modes, one for each labelling: of the same labels the best noise stands for all."""
-        best = list({mode.labels: mode for mode in reversed(self.modes)}.values())[::-1][:_BEAM]
-        return [mode for mode in best if mode.cost < self.modes[0].cost + self.problem.limits.rival]
+        """The best modes that are not alike; of those alike the best stands for all."""
+        best: list[Mode] = []
+        for mode in self.modes:
+            if mode.cost > self.modes[0].cost + self.problem.limits.rival or len(best) == _BEAM:
+                break
+            if not any(mode.is_like(other) for other in best):
+                best.append(mode)
+        return best
 
 
 def proposals(mode: Mode) -> Iterator[Proposal]:

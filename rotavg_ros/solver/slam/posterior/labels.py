@@ -19,14 +19,16 @@ from rotavg_ros.solver.slam.posterior.problem import Problem
 # differ by, as a kernel's width.
 _SHARES = np.array([0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98])
 _STAY = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 0.97])
-_NEAR_SHARES = np.array([0.02, 0.3, 0.7, 0.95])
-_FAR_SHARES = np.array([0.01, 0.05, 0.2, 0.5, 0.9])
-_REPEAT_DEG = np.array([0.05, 0.3, 1.0, 3.0, 10.0])
+_NEAR_SHARES = np.array([0.05, 0.5, 0.95])
+_FAR_SHARES = np.array([0.01, 0.05, 0.2, 0.5])
+_REPEAT_DEG = 0.05 * 2.0 ** np.arange(9)
 # One width for all, or each as likely for every closure.
 _KERNELS = len(_REPEAT_DEG) + 1
 _GRID_SIZE = len(_NEAR_SHARES) * len(_FAR_SHARES) * _KERNELS
 # Of closures detected at about the same time, one from about the same older place counts for so many others.
 _IN_RUN = 10.0
+# A kernel ends at so many widths, where it is 4e-6 of its height.
+_FARTHEST = 5.0
 # The least density that counts.
 _LEAST = 1e-300
 
@@ -84,20 +86,22 @@ def false_density(
     other = false[np.clip(place, 0, len(false) - 1)]
     turn = quaternion_rows.exp(np.ascontiguousarray((residual * problem.sign[:, None]).T)).T
     cosine = np.abs(np.einsum("ni,nwi->nw", turn[rows], turn[other]))
-    square = np.where(there, (2 * np.arccos(np.minimum(cosine, 1.0))) ** 2, np.inf)
+    square = (2 * np.arccos(np.minimum(cosine, 1.0))) ** 2
     apart = np.abs(problem.ends[other] - problem.ends[rows, None])
     is_near = there & (apart[:, :, 1] <= problem.priors.run_gap_steps)
     in_run = apart.sum(axis=2) <= problem.priors.run_gap_steps
-    weights = is_near * np.where(in_run, _IN_RUN, 1.0), there.astype(np.float64)
+    weights = [is_near * np.where(in_run, _IN_RUN, 1.0), there.astype(np.float64)]
+    totals = [weight.sum(axis=1) for weight in weights]
     near, far = nothing.copy(), nothing.copy()
-    with np.errstate(divide="ignore"):
-        for number, width in enumerate(np.radians(_REPEAT_DEG)):
-            height = (2 * np.pi * width**2) ** (-k / 2)
-            kernel = np.exp(-square / (2 * width**2))
-            for result, weight in zip((near, far), weights, strict=True):
-                total = weight.sum(axis=1)
-                mean = height * np.einsum("nw,nw->n", kernel, weight) / np.maximum(total, 1.0)
-                result[number] = np.where(total > 0, np.log(np.maximum(mean, _LEAST)), -np.inf)
+    alike = there & (square < (_FARTHEST * np.radians(_REPEAT_DEG[-1])) ** 2)
+    row, square = np.nonzero(alike)[0], square[alike]
+    weights = [weight[alike] for weight in weights]
+    for number, width in enumerate(np.radians(_REPEAT_DEG)):
+        height = (2 * np.pi * width**2) ** (-k / 2)
+        kernel = np.exp(-square / (2 * width**2))
+        for result, weight, total in zip((near, far), weights, totals, strict=True):
+            mean = height * np.bincount(row, kernel * weight, len(rows)) / np.maximum(total, 1.0)
+            result[number] = np.where(total > 0, np.log(np.maximum(mean, _LEAST)), -np.inf)
     for result in (near, far):
         result[-1] = np.logaddexp.reduce(result[:-1], axis=0) - np.log(len(_REPEAT_DEG))
     return FalseDensity(alone, near, far)

@@ -51,6 +51,14 @@ class Mode:
         noise = self.state.noise
         return self.labels, noise.chosen, round(noise.log_ratio / OTHER_NOISE)
 
+    def is_like(self, other: Mode) -> bool:
+        """Whether only single closures have another label: no slip differs, nor two closures of a run."""
+        differs = self.state.is_good != other.state.is_good
+        if differs[self.problem.graph.is_odometry].any():
+            return False
+        in_run = np.bincount(self.problem.run[differs[self.problem.closure]])
+        return bool(in_run.max(initial=0) < 2)
+
     @cached_property
     def is_false(self) -> np.ndarray:
         """``(C,)`` bool."""
@@ -86,9 +94,11 @@ class Proposal:
     Attributes:
         name: of the move.
         predicted: by how much F changes, nats, as far as it can be told before the work.
+        slack: tried if F is predicted to rise by no more than this, nats.
         make: the state to polish.
     """
 
     name: str
     predicted: float
     make: Callable[[], State]
+    slack: float

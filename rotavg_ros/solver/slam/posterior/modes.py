@@ -53,10 +53,7 @@ class Published:
 
 def publish(problem: Problem, modes: list[Mode]) -> Published:
     """The average of distinct modes (the best first), weighted by exp(−F)."""
-    rivals = modes[:1] if "rivals" in problem.without else distinct(problem, modes)
-    cost = np.array([mode.cost for mode in rivals])
-    share = np.exp(cost.min() - cost)
-    share /= share.sum()
+    rivals, share = (modes[:1], np.ones(1)) if "rivals" in problem.without else distinct(problem, modes)
     answers = [of_mode(problem, mode.state) for mode in rivals]
     first = answers[0]
     turns = [
@@ -83,7 +80,7 @@ def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: li
     others = [
         number
         for number in range(1, len(rivals))
-        if share[number] >= _LIKELY and largest[number] > _FAR_TURN and rivals[number].labels != rivals[0].labels
+        if share[number] >= _LIKELY and largest[number] > _FAR_TURN and not rivals[number].is_like(rivals[0])
     ]
     if not others:
         return ()
@@ -97,30 +94,36 @@ def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: li
     )
 
 
-def distinct(problem: Problem, modes: list[Mode]) -> list[Mode]:
-    """Modes that are no neighbours of a better one.
+def distinct(problem: Problem, modes: list[Mode]) -> tuple[list[Mode], np.ndarray]:
+    """Modes that are no neighbours of a better one, and their probabilities; the best first.
 
-    They differ by a slip, by two closures of a run, or by how far stated precisions are believed and what runs share.
-    Single closures are probabilities within each.
+    Labellings differ by a slip or by two closures of a run; single closures are probabilities within each. A labelling
+    is as likely as under its best noise, so that one under which more noise was tried is no likelier for that.
     """
-    kept: list[Mode] = []
+    labellings: list[list[Mode]] = []
     for mode in modes:
-        if kept and (mode.cost > kept[0].cost + _FAR or len(kept) >= problem.limits.averaged):
+        if mode.cost > modes[0].cost + _FAR:
             break
-        if all(_is_rival(problem, mode.state, other.state) for other in kept):
-            kept.append(mode)
-    return kept
+        alike = next((others for others in labellings if mode.is_like(others[0])), None)
+        if alike is None:
+            labellings.append([mode])
+        elif all(_has_other_noise(mode, other) for other in alike):
+            alike.append(mode)
+    least = np.array([others[0].cost for others in labellings[: problem.limits.averaged]])
+    share = np.exp(least[0] - least)
+    share /= share.sum()
+    first = [(others[0], number) for number, others in enumerate(labellings)]
+    more = [(mode, number) for number, others in enumerate(labellings) for mode in others[1:]]
+    kept = (first + sorted(more, key=lambda other: other[0].cost))[: problem.limits.averaged]
+    within = np.exp([least[number] - mode.cost for mode, number in kept])
+    number = np.array([number for _, number in kept])
+    shares = share[number] * within / np.bincount(number, within)[number]
+    return [mode for mode, _ in kept], shares
 
 
-def _is_rival(problem: Problem, state: State, other: State) -> bool:
-    other_noise = abs(state.noise.log_ratio - other.noise.log_ratio) > OTHER_NOISE
-    if other_noise or state.noise.chosen != other.noise.chosen:
-        return True
-    differs = state.is_good != other.is_good
-    if differs[problem.graph.is_odometry].any():
-        return True
-    in_run = np.bincount(problem.run[differs[problem.closure]])
-    return bool(in_run.max(initial=0) >= 2)
+def _has_other_noise(mode: Mode, other: Mode) -> bool:
+    noise, other_noise = mode.state.noise, other.state.noise
+    return abs(noise.log_ratio - other_noise.log_ratio) > OTHER_NOISE or noise.chosen != other_noise.chosen
 
 
 def of_mode(problem: Problem, state: State) -> Published:

@@ -67,13 +67,13 @@ class SearchLimits:
 
     Attributes:
         polish_solves: sparse solves at most to bring a labelling to its optimum.
-        trial_solves: the same where other noise is tried.
+        trial_solves: the same while other noise is tried, or flips of single labels.
         settling_solves: the same while labels are probabilities.
         converged: such a part of a step's standard deviation is no movement.
         flip_rounds: batches of single flips.
         annealing_factor: by how much the loss of graduated non-convexity is sharpened from solve to solve.
         robust_solves: of the ℓ½ start.
-        alike: starts are gone on from until so many end in the labelling of least F.
+        alike: starts are gone on from until so many end in the mode of least F.
         tried: moves that are tried, at most.
         slack: a move is tried if F is predicted to rise by no more than this, nats.
         rival: modes within so many nats of the best are moved on from.

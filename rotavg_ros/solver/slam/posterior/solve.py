@@ -16,7 +16,6 @@ from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.posterior.bias import Bias
 from rotavg_ros.solver.slam.posterior.inference import Search
 from rotavg_ros.solver.slam.posterior.mode import Mode
-from rotavg_ros.solver.slam.posterior.moves.flips import flipped
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.state import State
@@ -133,7 +132,7 @@ def _with_better_bias(
         again = Drawn.of(graph, network, without, bias.vector + change @ bias.axes, problem.priors)
         moved = _moved(best, drawn, again)
         goes_on = Search(again.problem)
-        goes_on.keep(flipped(goes_on.polished(moved, "bias")))
+        goes_on.keep(goes_on.flipped(goes_on.polished(moved, "bias")))
         better = Found(again, goes_on.move_on())
         if better.cost > found.cost - _LEAST_GAIN:
             return

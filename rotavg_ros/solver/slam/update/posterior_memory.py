@@ -17,7 +17,6 @@ from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.posterior.inference import Search
 from rotavg_ros.solver.slam.posterior.left_out import relabelled
 from rotavg_ros.solver.slam.posterior.modes import Published, publish
-from rotavg_ros.solver.slam.posterior.moves.flips import flipped
 from rotavg_ros.solver.slam.posterior.solve import Drawn, Found
 from rotavg_ros.solver.slam.posterior.state import Noise, Others, State
 from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over
@@ -82,7 +81,7 @@ class PosteriorMemory:
         start = State(np.ascontiguousarray(correction), common, trusted, self.noise, others)
         start = replace(start, trusted=np.where(is_new, relabelled(problem, start), before))
         search = Search(problem)
-        mode = flipped(search.polished(start, "update"))
+        mode = search.flipped(search.polished(start, "update"))
         is_old_closure = problem.graph.is_closure & ~is_new
         if (mode.state.trusted != start.trusted)[is_old_closure].sum() > _MAX_TURNED:
             return None

@@ -45,7 +45,8 @@ def propose(mode: Mode) -> Iterator[Proposal]:
         log_prior = log_label_prior(problem, is_false) - before
         predicted = (log_good - log_false if rejects else log_false - log_good) - log_prior
         name = "reject a group" if rejects else "believe a group"
-        yield Proposal(name, predicted, partial(_flipped, problem, mode.state, members, rejects))
+        make = partial(_flipped, problem, mode.state, members, rejects)
+        yield Proposal(name, predicted, make, problem.limits.slack)
 
 
 def _flipped(problem: Problem, state: State, members: np.ndarray, rejects: bool) -> State:

@@ -22,6 +22,8 @@ _SETTLING = 4
 _OPTIMISM = 10.0
 # A turn explains a closure that is off by it to so many standard deviations, or to this angle, rad.
 _AGREE, _AGREE_ANGLE = 3.0, np.radians(2.0)
+# One false closure costs less than a slip.
+_LEAST_WITNESSES = 2
 # Positions that differ by less, in steps, are the same.
 _SAME_PLACE = 1e-9
 
@@ -95,7 +97,8 @@ def propose_slips(mode: Mode) -> Iterator[Proposal]:
             left &= ~agrees
             place, freed, lost = witnesses.best_place(agrees, disagrees)
             gained = float(witnesses.gain[freed].sum() - witnesses.gain[lost].sum() - witnesses.price[place])
-            found.append((gained, closure, place, freed, lost))
+            if freed.sum() >= _LEAST_WITNESSES:
+                found.append((gained, closure, place, freed, lost))
     before = _log_labelled(mode, mode.is_false)
     for _, closure, place, freed, lost in sorted(found, key=lambda slip: -slip[0])[: mode.problem.limits.slips]:
         edge, turn = int(witnesses.segment[place]), witnesses.turned[:, [closure]]
@@ -103,7 +106,8 @@ def propose_slips(mode: Mode) -> Iterator[Proposal]:
         after = _log_labelled(mode, mode.is_false & ~freed) + _log_turned(mode, np.flatnonzero(freed))
         after += float(log_slip_odds(mode.problem, mode.problem.graph.own_steps[[edge]], len(mode.slipped))[0])
         predicted = before - after + float(witnesses.gain[lost].sum())
-        yield Proposal("slip", predicted, partial(_with_slip, mode, edge, turn))
+        # A slip turns a part of the map, so it is tried where it would be a rival only.
+        yield Proposal("slip", predicted, partial(_with_slip, mode, edge, turn), mode.problem.limits.rival)
 
 
 def _log_turned(mode: Mode, members: np.ndarray) -> float:
@@ -129,16 +133,16 @@ def _log_labelled(mode: Mode, is_false: np.ndarray) -> float:
 def propose_mending(mode: Mode) -> Iterator[Proposal]:
     """Take back each slip: with all that follows, up to the next slip, or bending what is between."""
     slipped = mode.slipped
-    before = rough_cost(mode.problem, mode.state)
+    before, slack = rough_cost(mode.problem, mode.state), mode.problem.limits.slack
     for number, edge in enumerate(slipped[: mode.problem.limits.slips]):
         following = int(slipped[number + 1]) if number + 1 < len(slipped) else None
         for name, end in (("mend and reject", None), ("turn a part back", following)):
             if end is not None or name == "mend and reject":
                 state = _mended(mode, int(edge), end)
                 predicted = rough_cost(mode.problem, state) - before - _OPTIMISM
-                yield Proposal(name, predicted, partial(settle, mode.problem, state, _SETTLING))
+                yield Proposal(name, predicted, partial(settle, mode.problem, state, _SETTLING), slack)
         bends = -float(mode.left_out.log_odds[edge])
-        yield Proposal("mend and bend", bends - _OPTIMISM, partial(_bent, mode, int(edge)))
+        yield Proposal("mend and bend", bends - _OPTIMISM, partial(_bent, mode, int(edge)), slack)
 
 
 def _after(mode: Mode, edge: int) -> np.ndarray:
