@@ -52,7 +52,11 @@ class Search:
             begun.append(self.flipped(self.polished(state, name)))
             self.keep(begun[-1])
             if len(begun) == 1:
-                self._tune(begun[0])
+                if "tails" not in self.problem.without:
+                    # Where noise has tails, labels that are right under them may not be found under normal noise.
+                    tailed = with_noise(self.problem, state, noise.with_tails(state.noise))
+                    self.keep(self.flipped(self.polished(tailed, name)))
+                self._tune(self.modes[0])
             if sum(mode.is_like(self.modes[0]) for mode in begun) >= self.problem.limits.alike:
                 break
         may_cut = "minimum-cuts" not in self.problem.without and len(prepared.pairs.first) > 0
@@ -80,7 +84,8 @@ class Search:
                 if found.cost < mode.cost - _GAIN:
                     break
             if self._next(done) is None:
-                self._tune(self.modes[0])
+                for near in self._near():
+                    self._tune(near)
         return self.modes
 
     def _tune(self, mode: Mode) -> None:

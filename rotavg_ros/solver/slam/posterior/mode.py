@@ -15,6 +15,8 @@ from rotavg_ros.solver.slam.posterior.state import State
 
 # Noise is another one if the ratio of a step's variance and a closure's differs by this, in the logarithm.
 OTHER_NOISE = 1.0
+# Orientations are the same up to so many standard deviations of a closure.
+_SAME = 3.0
 # Covariances of up to so many closures are computed all at once.
 _MAX_DENSE = 500
 
@@ -52,12 +54,18 @@ class Mode:
         return self.labels, noise.chosen, round(noise.log_ratio / OTHER_NOISE)
 
     def is_like(self, other: Mode) -> bool:
-        """Whether only single closures have another label: no slip differs, nor two closures of a run."""
+        """Whether only single closures have another label, and turn nothing by more than closures err.
+
+        No slip differs, nor two closures of a run.
+        """
         differs = self.state.is_good != other.state.is_good
         if differs[self.problem.graph.is_odometry].any():
             return False
         in_run = np.bincount(self.problem.run[differs[self.problem.closure]])
-        return bool(in_run.max(initial=0) < 2)
+        if in_run.max(initial=0) >= 2:
+            return False
+        cosine = np.abs((self.state.correction * other.state.correction).sum(axis=0)).min()
+        return bool(2 * np.arccos(min(float(cosine), 1.0)) < _SAME * np.sqrt(self.state.noise.closure_variance))
 
     @cached_property
     def is_false(self) -> np.ndarray:

@@ -231,10 +231,10 @@ STRUCTURAL = {
     | {"_LOG_FIRST", "_LOG_FOLLOWS", "_LOG_STEPS"},
     "left_out": {"CERTAIN"},
     "modes": {"_FAR", "_LIKELY", "_FAR_TURN", "_SURELY_FALSE", "_ROUNDS"},
-    "moves/flips": {"_PART", "_DECIDED", "_LEAST_GAIN"},
+    "moves/flips": {"_PART", "_DECIDED", "_HOPE", "_LEAST_GAIN"},
     "moves/groups": {"_AGREE", "_TIGHTER", "_SETTLING"},
-    "mode": {"OTHER_NOISE", "_MAX_DENSE"},
-    "moves/noise": {"_GRIDS", "_REACH", "_MIN_SPREAD"},
+    "mode": {"OTHER_NOISE", "_SAME", "_MAX_DENSE"},
+    "moves/noise": {"_GRIDS", "_REACH", "_JOINT", "_SCALES", "_TAILS", "_MIN_SPREAD"},
     "moves/slips": {"_LEAST_WITNESSES", "_AGREE", "_AGREE_ANGLE", "_OPTIMISM", "_SETTLING", "_SAME_PLACE"},
     "moves/starts": {"_INLIER_SQUARE", "_SHARP", "_STEP_LEVELS", "_CLOSURE_LEVEL", "_ROBUST_POWER"}
     | {"_ANNEALED_SLIPS", "_LEAST_WEIGHT", "_SAME_TURN"},

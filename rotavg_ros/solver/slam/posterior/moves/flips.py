@@ -13,6 +13,8 @@ from rotavg_ros.solver.slam.posterior.mode import Mode
 _PART = 0.25
 # Labels are flipped that log-odds speak against by so many nats; the others are undecided either way.
 _DECIDED = 1.0
+# F may fall so many times as fast as in the last round.
+_HOPE = 3
 # F that falls by less, in nats, has not fallen.
 _LEAST_GAIN = 0.1
 
@@ -22,7 +24,7 @@ def flipped(mode: Mode, limit: float = np.inf) -> Mode:
 
     Args:
         mode: where to begin.
-        limit: nats. It is given up where F, falling as fast as in the last round, would not come below in all others.
+        limit: nats. It is given up where F, falling a few times as fast as in the last round, would not come below.
     """
     problem, begun = mode.problem, mode
     is_told = np.isinf(problem.log_odds)
@@ -41,7 +43,7 @@ def flipped(mode: Mode, limit: float = np.inf) -> Mode:
         gain = mode.cost - tried.cost
         if gain > _LEAST_GAIN:
             mode, share = tried, 1.0
-            if mode.cost - rounds_left * gain > limit:
+            if mode.cost - _HOPE * rounds_left * gain > limit:
                 return mode
         elif len(wrong) == 1:
             break

@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
+
+from rotavg_ros.solver.slam.posterior.densities import log_good
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode
-from rotavg_ros.solver.slam.posterior.rows import with_noise
+from rotavg_ros.solver.slam.posterior.objective import log_noise_prior
+from rotavg_ros.solver.slam.posterior.rows import tails, variances, with_noise
 from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, EXPONENTS, RUN_STEPS, TAIL_SHARES, TURN_SHARES, Noise
 
 _GRIDS = {
@@ -22,6 +26,12 @@ _GRIDS = {
 _MIN_SPREAD = 0.2
 # Values of a grid so many places from the best one are looked at.
 _REACH = 2
+# What errors have in common is no matter of single edges.
+_JOINT = ("run_steps", "common_share")
+# By what a variance changes when other noise is believed, at most and in steps.
+_SCALES = np.exp(np.linspace(-2.0, 1.2, 17))
+# Of edges are in the tails where it is tried whether there are any.
+_TAILS = TAIL_SHARES[2]
 
 
 def tuned(mode: Mode) -> Iterator[Mode]:
@@ -33,13 +43,40 @@ def tuned(mode: Mode) -> Iterator[Mode]:
         at = grid.index(getattr(mode.state.noise, name))
         for number in sorted(set(range(len(grid))) - {at}, key=lambda number: abs(number - at)):
             best = getattr(mode.state.noise, name)
-            if abs(number - grid.index(best)) <= _REACH:
-                noise = replace(mode.state.noise, **{name: grid[number]})
+            noise = replace(mode.state.noise, **{name: grid[number]})
+            is_near = abs(number - grid.index(best)) <= _REACH
+            if is_near and (name in _JOINT or _predicted(mode, noise) <= mode.problem.limits.slack):
                 found = _polished(mode, noise, mode.problem.limits.trial_solves)
                 yield found
                 mode = min(mode, found, key=lambda either: either.cost)
     if mode is not begun:
         yield _polished(mode, mode.state.noise, mode.problem.limits.polish_solves)
+
+
+def _predicted(mode: Mode, noise: Noise) -> float:
+    """By how much F changes, nats, if what others say of each edge stays, and each kind has its best variance.
+
+    At the optimum that is the slope of F along the noise.
+    """
+    problem, told, good = mode.problem, mode.left_out, mode.state.is_good
+    before = mode.state.noise
+    changed = log_noise_prior(before, problem.priors) - log_noise_prior(noise, problem.priors)
+    own, others = variances(problem, noise)[: len(good)], variances(problem, before)[: len(good)]
+    share, share_before = tails(problem, noise), tails(problem, before)
+
+    def log_density(kind: np.ndarray, variance: np.ndarray, tailed: np.ndarray) -> float:
+        square, predicted, ratio = told.square[kind], told.predicted[kind], problem.priors.tail_ratio
+        return float(log_good(square, variance[kind], predicted, problem.components, tailed[kind], ratio)[0].sum())
+
+    for kind in (problem.graph.is_odometry & good, problem.graph.is_closure & good):
+        changed += log_density(kind, others, share_before)
+        changed -= max(log_density(kind, scale * own, share) for scale in _SCALES)
+    return changed
+
+
+def with_tails(noise: Noise) -> Noise:
+    """The same with some of all edges in tails."""
+    return replace(noise, step_tails=_TAILS, closure_tails=_TAILS)
 
 
 def _polished(mode: Mode, noise: Noise, solves: int) -> Mode:
