@@ -47,22 +47,28 @@ class Search:
         """
         begun: list[Mode] = []
         for name, state in starts(self.problem, prepared, cleaned, correction):
-            if begun:
-                state = with_noise(self.problem, state, state.noise.chosen_as(self.modes[0].state.noise))
-            begun.append(self.flipped(self.polished(state, name)))
-            self.keep(begun[-1])
-            if len(begun) == 1:
-                if "tails" not in self.problem.without:
-                    # Where noise has tails, labels that are right under them may not be found under normal noise.
-                    tailed = with_noise(self.problem, state, noise.with_tails(state.noise))
-                    self.keep(self.flipped(self.polished(tailed, name)))
-                self._tune(self.modes[0])
+            begun.append(self._begun(name, state))
             if sum(mode.is_like(self.modes[0]) for mode in begun) >= self.problem.limits.alike:
                 break
         may_cut = "minimum-cuts" not in self.problem.without and len(prepared.pairs.first) > 0
         if may_cut and self._seems_slipped(self.modes[0]):
-            self.keep(self.flipped(self.polished(turned_parts(self.problem, prepared, correction), "minimum cuts")))
+            self._begun("minimum cuts", turned_parts(self.problem, prepared, correction))
         return self.move_on()
+
+    def _begun(self, name: str, state: State) -> Mode:
+        """The mode of a start, under such noise as the best one has; the first one tells what noise that is."""
+        is_first = not self.modes
+        if not is_first:
+            state = with_noise(self.problem, state, state.noise.chosen_as(self.modes[0].state.noise))
+        mode = self.flipped(self.polished(state, name))
+        self.keep(mode)
+        if is_first:
+            if "tails" not in self.problem.without:
+                # Where noise has tails, labels that are right under them may not be found under normal noise.
+                tailed = with_noise(self.problem, state, noise.with_tails(state.noise))
+                self.keep(self.flipped(self.polished(tailed, name)))
+            self._tune(self.modes[0])
+        return mode
 
     def _seems_slipped(self, mode: Mode) -> bool:
         if "slips" in self.problem.without:
