@@ -9,12 +9,14 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.special import expit, logsumexp
 from scipy.stats import multivariate_normal
 
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.posterior.bias import Bias
-from rotavg_ros.solver.slam.posterior.densities import log_false
+from rotavg_ros.solver.slam.posterior.densities import Sites, log_false, log_good, log_normal
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.labels import (
     FalseDensity,
@@ -174,6 +176,34 @@ def test_tails_have_the_evidence_of_the_sum_over_what_is_in_them(seed: int) -> N
     assert abs(exactly[1] - exactly[0]) > 0.15
 
 
+@pytest.mark.parametrize(("predicted", "told"), [(1e-9, "all"), (1e9, "nothing")])
+def test_a_site_is_the_mean_precision_where_all_is_told_and_the_mean_variance_where_nothing_is(
+    predicted: float, told: str
+) -> None:
+    variance, ratio, share = np.array([0.5, 2.0]), 16.0, 0.1
+    site = Sites.of(np.zeros(2), variance, np.full(2, predicted), 3, np.full(2, share), ratio)
+    exact = log_good(np.zeros(2), variance, np.full(2, predicted), 3, np.full(2, share), ratio)[1]
+    mean_precision = (exact + (1 - exact) / ratio) / variance
+    mean_variance = (exact + (1 - exact) * ratio) * variance
+    np.testing.assert_allclose(site.weight, mean_precision if told == "all" else 1 / mean_variance, rtol=1e-6)
+
+
+@given(st.floats(0.0, 9.0), st.floats(1e-6, 1.0), st.floats(0.0, 10.0), st.sampled_from([1, 3]), st.floats(0.0, 0.99))
+def test_a_site_gives_a_residual_the_mean_that_its_mixture_has(
+    square: float, variance: float, predicted: float, components: int, share: float
+) -> None:
+    """Against Bayes' rule for each variance by itself."""
+    one = np.ones(1)
+    site = Sites.of(square * one, variance * one, predicted * one, components, share * one, 16.0)
+    variances = np.array([variance, 16.0 * variance])
+    with np.errstate(divide="ignore"):
+        log_chance = np.log([1 - share, share]) + log_normal(square, variances + predicted, components)
+    chance = np.exp(log_chance - logsumexp(log_chance))
+    expected = (chance * variances / (variances + predicted)).sum()
+    assert 1 / (1 + site.weight[0] * predicted) == pytest.approx(expected, rel=1e-6)
+    assert 1 / (16 * variance) * (1 - 1e-9) <= site.weight[0] <= 1 / variance * (1 + 1e-9)
+
+
 @pytest.mark.parametrize(("seed", "planted_deg"), [(0, 0.0), (1, 0.05), (2, -0.3), (3, 1.0)])
 def test_a_bias_has_the_evidence_of_a_dense_integral(seed: int, planted_deg: float) -> None:
     graph, _ = _planar(seed, 8, 0.0, length=40)
@@ -245,8 +275,8 @@ def test_f_does_not_depend_on_order_and_direction_of_edges(seed: int) -> None:
         target_from_source=torch.where(turned[:, None], inverse, shuffled.target_from_source),
     )
     totals = []
-    for given in (graph, changed):
-        problem = _problem(given)
+    for drawn in (graph, changed):
+        problem = _problem(drawn)
         is_false = expit(np.abs(2 * np.arctan2(problem.measured[2], problem.measured[3]))[problem.closure]) > 0.55
         totals.append(polish(problem, _state(problem, is_false), hold_noise=True)[1].total)
     assert totals[0] == pytest.approx(totals[1], abs=1e-6)

@@ -23,6 +23,7 @@ from rotavg_ros.solver.neurora.network_store import Networks
 from rotavg_ros.solver.slam import posterior
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.posterior.modes import of_mode
+from rotavg_ros.solver.slam.posterior.moves.slips import propose_slips
 from rotavg_ros.solver.slam.posterior.priors import SearchLimits, SlamPriors
 from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.stages import bootstrap
@@ -107,6 +108,18 @@ def test_there_is_an_answer_without_any_part(name: str) -> None:
     solution = solve(case.graph, profile="slam", method=without(name))
     assert error_deg(case.graph, solution, case.body_from_world) < 3
     assert bool(((solution.outlier_score >= 0) & (solution.outlier_score <= 1)).all())
+
+
+def test_a_slip_is_predicted_by_what_its_witnesses_tell_together() -> None:
+    """Each by itself is told of by the odometry alone, which has drifted."""
+    case = drawn("lone slip: 20 witnesses, one pair of places", 1)
+    with torch.no_grad():
+        found = search(case.graph, Networks("cpu").load(SlamCleanNet), bootstrap)
+    grouped = next(mode for mode in found.modes if len(mode.slipped) == 0 and mode.is_false.sum() >= 15)
+    predicted = min(slip.predicted for slip in propose_slips(grouped))
+    slipped = next(mode for mode in found.modes if len(mode.slipped) == 1)
+    assert slipped.cost < grouped.cost
+    assert predicted == pytest.approx(slipped.cost - grouped.cost, abs=4.0)
 
 
 def test_without_repeats_slips_are_invented() -> None:
