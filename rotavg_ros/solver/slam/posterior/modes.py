@@ -16,8 +16,8 @@ from rotavg_ros.solver.slam.posterior.mode import OTHER_NOISE, Mode
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.state import State
 
-# No labelling counts that is less likely by so many nats.
-_FAR = 5.0
+# No labelling counts that is less likely by so many nats, and no other noise of the same labels.
+_FAR, _FAR_NOISE = 5.0, 2.0
 # Rivals as likely as this that turn a node by more than this, rad, are worth a warning.
 _LIKELY, _FAR_TURN = 0.05, np.radians(5.0)
 # What is less likely good than this does not pull at all.
@@ -107,7 +107,7 @@ def distinct(problem: Problem, modes: list[Mode]) -> tuple[list[Mode], np.ndarra
         alike = next((others for others in labellings if mode.is_like(others[0])), None)
         if alike is None:
             labellings.append([mode])
-        elif all(_has_other_noise(mode, other) for other in alike):
+        elif mode.cost <= alike[0].cost + _FAR_NOISE and all(_has_other_noise(mode, other) for other in alike):
             alike.append(mode)
     least = np.array([others[0].cost for others in labellings[: problem.limits.averaged]])
     share = np.exp(least[0] - least)

@@ -243,7 +243,7 @@ STRUCTURAL = {
     }
     | {"_LOG_FIRST", "_LOG_FOLLOWS", "_LOG_STEPS"},
     "left_out": {"CERTAIN"},
-    "modes": {"_FAR", "_LIKELY", "_FAR_TURN", "_SURELY_FALSE", "_ROUNDS"},
+    "modes": {"_FAR", "_FAR_NOISE", "_LIKELY", "_FAR_TURN", "_SURELY_FALSE", "_ROUNDS"},
     "moves/flips": {"_PART", "_DECIDED", "_HOPE", "_LEAST_GAIN"},
     "moves/groups": {"_AGREE", "_TIGHTER", "_SETTLING"},
     "mode": {"OTHER_NOISE", "_SAME", "_MAX_DENSE"},
