@@ -1,13 +1,14 @@
-"""F(labels, θ) = −log p(labels, θ | data) in nats, the corrections integrated out by Laplace's method.
+"""F(labels, θ) = −log p(labels, θ | data) in nats, the corrections integrated out.
 
 With r_e the residuals at the best corrections Ĉ and H the Hessian there,
 
     F = − Σ_sound log p(r_e | sound)  − Σ_slipped log p(r_e | slipped)  − Σ_good log p(r_e | good)  − Σ_runs log p(b)
         − log p(false closures)  − log p(labels)  − log p(θ)  + ½ k (log det H − d log 2π)
 
-d is the number of unknowns: key nodes but for the roots, and runs' common errors b. Where a gyroscope's bias was taken
-out, − log p of it is added (:mod:`rotavg_ros.solver.slam.posterior.bias`). Two labellings are compared by F and by
-nothing else.
+d is the number of unknowns: key nodes but for the roots, and runs' common errors b. That is exact where densities are
+normal; those with tails are integrated by expectation propagation
+(:class:`rotavg_ros.solver.slam.posterior.densities.Sites`). Where a gyroscope's bias was taken out, − log p of it is
+added (:mod:`rotavg_ros.solver.slam.posterior.bias`). Two labellings are compared by F and by nothing else.
 """
 
 from __future__ import annotations
