@@ -54,7 +54,7 @@ class Sites:
         predicted: ``(n,)`` rad², p.
         weight: ``(n,)`` rad⁻², w.
         shrinkage: ``(n,)`` Σ π_z v_z / (v_z + p).
-        misfit: ``(n,)`` Σ π_z ‖μ v_z / (v_z + p)‖² / v_z, in units of what v_z has in common.
+        misfit: ``(n,)`` Σ π_z ‖μ v_z / (v_z + p)‖² / v_z.
         log_density: ``(n,)`` nats, log ∫ N(r; μ, p) p(r) dr.
     """
 

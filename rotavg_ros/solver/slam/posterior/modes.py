@@ -97,8 +97,9 @@ def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: li
 def distinct(problem: Problem, modes: list[Mode]) -> tuple[list[Mode], np.ndarray]:
     """Modes that are no neighbours of a better one, and their probabilities; the best first.
 
-    Labellings differ by a slip or by two closures of a run; single closures are probabilities within each. A labelling
-    is as likely as under its best noise, so that one under which more noise was tried is no likelier for that.
+    Labellings differ by a slip, by two closures of a run or by orientations; single closures are probabilities within
+    each. A labelling is as likely as under its best noise, so that one under which more noise was tried is no likelier
+    for that.
     """
     labellings: list[list[Mode]] = []
     for mode in modes:
