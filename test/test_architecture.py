@@ -110,7 +110,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "bias": {"priors", "state", "system"},
         "problem": {"bias", "priors", "state", "system"},
         "densities": {"priors"},
-        "labels": {"densities", "problem"},
+        "labels": {"densities", "priors", "problem"},
         "rows": {"densities", "problem", "state", "system"},
         "objective": {"densities", "labels", "priors", "problem", "rows", "state", "system"},
         "left_out": {"densities", "labels", "problem", "rows", "state", "system"},

@@ -81,7 +81,7 @@ def compare_with_truth(
     terms = {name: nats - truth.evaluation.terms.get(name, 0.0) for name, nats in modes[0].evaluation.terms.items()}
     return Comparison(
         published.body_from_world,
-        of_mode(truth.problem, truth.state).body_from_world,
+        of_mode(truth).body_from_world,
         modes[0].cost - truth.cost,
         terms,
         len(published.rivals),

@@ -16,7 +16,6 @@ SWITCHES: dict[str, str] = {
     "slips": "odometry does not slip",
     "bias": "no gyroscope has a bias",
     "turns": "odometry errs alike however far it turns",
-    "groups": "labels are flipped one by one",
     "mending": "a slip, once found, is not taken back together with what it explains",
     "annealing": "no start anneals the closures",
     "robust-start": "no start weighs odometry down as it does closures",

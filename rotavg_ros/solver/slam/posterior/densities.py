@@ -84,10 +84,20 @@ class Sites:
         return cls(square, predicted, (near + far) / shrinkage, shrinkage, square * variance * misfit, log_density)
 
 
-def log_false(square: np.ndarray, components: int, priors: SlamPriors) -> np.ndarray:
-    """Of closures that are false by themselves: log [(1 − m) u(r) + m N(r; near misses)], u uniform over rotations."""
-    uniform = log_uniform_density(np.sqrt(square), components) + np.log1p(-priors.near_miss_share)
-    near = log_normal(square, np.radians(priors.near_miss_deg) ** 2, components) + np.log(priors.near_miss_share)
+def log_false(
+    square: np.ndarray, components: int, priors: SlamPriors, near_miss_share: np.ndarray | float | None = None
+) -> np.ndarray:
+    """Of closures that are false by themselves: log [(1 − m) u(r) + m N(r; near misses)], u uniform over rotations.
+
+    Args:
+        square: rad², ‖r‖².
+        components: k.
+        priors: the near misses' width, and m where it is not given.
+        near_miss_share: m, broadcast against ``square``.
+    """
+    share = priors.near_miss_share if near_miss_share is None else near_miss_share
+    uniform = log_uniform_density(np.sqrt(square), components) + np.log1p(-share)
+    near = log_normal(square, np.radians(priors.near_miss_deg) ** 2, components) + np.log(share)
     return np.asarray(np.logaddexp(uniform, near))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -28,8 +29,11 @@ _MAX_UNSETTLED = 5
 # Noise is estimated anew until that lowers F by less than this, nats.
 _NOISE_CONVERGED = 0.1
 _PROBABILITY_CONVERGED = 0.02
-# Newton's steps to the likeliest variance, and how far from its prior it may end, in standard deviations.
-_NEWTON_STEPS, _FARTHEST = 20, 5.0
+# Noise that comes nearer by a constant factor from solve to solve, by this at most, is set to where that leads.
+_SLOWEST = 0.85
+# Newton's steps to the logarithm of the likeliest variance, up to a change of this, and how far from its prior it may
+# end, in standard deviations.
+_NEWTON_STEPS, _NEWTON_CONVERGED, _FARTHEST = 20, 1e-9, 5.0
 
 
 def step(problem: Problem, state: State) -> tuple[State, float, Factorised]:
@@ -51,19 +55,46 @@ def polish(
     Args:
         problem: the graph.
         state: where to begin.
-        solves: at most; default: those of the limits.
+        solves: at most, unless corrections still move by more than a step errs; default: those of the limits.
         hold_noise: leave the noise as it is.
     """
-    for _ in range(problem.limits.polish_solves if solves is None else solves):
+    enough = problem.limits.polish_solves if solves is None else solves
+    last = np.zeros(2)
+    turned, at_rest = np.inf, 0.0
+    for number in range(problem.limits.polish_solves):
+        if number >= enough and turned < at_rest:
+            break
         state, turned, factorised = step(problem, state)
-        is_settled = turned < problem.limits.converged * np.sqrt(state.noise.step_variance)
+        at_rest = float(np.sqrt(state.noise.step_variance))
+        is_settled = turned < problem.limits.converged * at_rest
         if not hold_noise and turned < _SETTLED_TURN:
             before = state.noise
-            state = replace(state, noise=estimate_noise(problem, state, factorised))
-            is_settled &= _gained(problem, before, state.noise) < _NOISE_CONVERGED
+            noise, last = _extrapolated(before, estimate_noise(problem, state, factorised), last)
+            state = replace(state, noise=noise)
+            is_settled &= _gained(problem, before, noise) < _NOISE_CONVERGED
         if is_settled:
             break
-    return state, evaluate(problem, state)
+    return state, evaluate(problem, state, is_moving=turned > at_rest)
+
+
+def _extrapolated(before: Noise, after: Noise, last: np.ndarray) -> tuple[Noise, np.ndarray]:
+    """Where a sequence of noise leads (Aitken 1926), and the change that it went on by.
+
+    Args:
+        before: of the last solve.
+        after: estimated from it.
+        last: ``(2,)`` changes of the logarithms of both variances before; zero where those are not to be gone on from.
+    """
+    change = np.log([after.step_variance / before.step_variance, after.closure_variance / before.closure_variance])
+    ratio = float(change @ last) / max(float(last @ last), np.finfo(np.float64).tiny)
+    if not ratio < _SLOWEST:
+        return after, change
+    # Where it swings the ratio is negative, and that leads to between the last two.
+    step, closure = np.exp(change * ratio / (1 - ratio)).tolist()
+    farther = replace(
+        after, step_variance=after.step_variance * step, closure_variance=after.closure_variance * closure
+    )
+    return farther, np.zeros(2)
 
 
 def settle(problem: Problem, state: State, solves: int | None = None) -> State:
@@ -120,9 +151,12 @@ def _likeliest(squares: float, freedom: float, log_variance: float, log_prior: f
     """The variance e^x that maximises −n/2 x − S/2 e⁻ˣ − (x − prior)²/(8 spread²), by Newton's steps."""
     x = log_variance
     for _ in range(_NEWTON_STEPS):
-        curved = squares / 2 * np.exp(-x)
+        curved = squares / 2 * math.exp(-x)
         slope = curved - freedom / 2 - (x - log_prior) / (4 * spread**2)
-        x += float(np.clip(slope / (curved + 1 / (4 * spread**2)), -1.0, 1.0))
+        change = max(-1.0, min(1.0, slope / (curved + 1 / (4 * spread**2))))
+        x += change
+        if abs(change) < _NEWTON_CONVERGED:
+            break
     return float(np.exp(np.clip(x, log_prior - 2 * _FARTHEST * spread, log_prior + 2 * _FARTHEST * spread)))
 
 

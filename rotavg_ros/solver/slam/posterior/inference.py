@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from torch import Tensor
 
-from rotavg_ros.solver.slam.posterior.em import polish
+from rotavg_ros.solver.slam.posterior.em import polish, step
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
-from rotavg_ros.solver.slam.posterior.moves import groups, noise, slips
+from rotavg_ros.solver.slam.posterior.moves import noise, slips
 from rotavg_ros.solver.slam.posterior.moves.flips import flipped
 from rotavg_ros.solver.slam.posterior.moves.starts import starts, turned_parts
 from rotavg_ros.solver.slam.posterior.problem import Problem
@@ -48,7 +48,7 @@ class Search:
         begun: list[Mode] = []
         for name, state in starts(self.problem, prepared, cleaned, correction):
             begun.append(self._begun(name, state))
-            if sum(mode.is_like(self.modes[0]) for mode in begun) >= self.problem.limits.alike:
+            if sum(mode.is_like(self.modes[0].state) for mode in begun) >= self.problem.limits.alike:
                 break
         may_cut = "minimum-cuts" not in self.problem.without and len(prepared.pairs.first) > 0
         if may_cut and self._seems_slipped(self.modes[0]):
@@ -57,17 +57,21 @@ class Search:
 
     def _begun(self, name: str, state: State) -> Mode:
         """The mode of a start, under such noise as the best one has; the first one tells what noise that is."""
-        is_first = not self.modes
-        if not is_first:
-            state = with_noise(self.problem, state, state.noise.chosen_as(self.modes[0].state.noise))
+        if self.modes:
+            best = self.modes[0]
+            state = step(self.problem, with_noise(self.problem, state, best.state.noise))[0]
+            if best.is_turned_like(state):  # and labels follow from orientations
+                return best
+            mode = self.flipped(self.polished(state, name))
+            self.keep(mode)
+            return mode
         mode = self.flipped(self.polished(state, name))
         self.keep(mode)
-        if is_first:
-            if "tails" not in self.problem.without:
-                # Where noise has tails, labels that are right under them may not be found under normal noise.
-                tailed = with_noise(self.problem, state, noise.with_tails(state.noise))
-                self.keep(self.flipped(self.polished(tailed, name)))
-            self._tune(self.modes[0])
+        uneven = noise.uneven(self.problem, state.noise)
+        if uneven != state.noise:
+            # Labels that are right where odometry errs more here than there may not be found where it does not.
+            self.keep(self.flipped(self.polished(with_noise(self.problem, state, uneven), name)))
+        self._tune(self.modes[0])
         return mode
 
     def _seems_slipped(self, mode: Mode) -> bool:
@@ -96,7 +100,7 @@ class Search:
 
     def _tune(self, mode: Mode) -> None:
         """The labels of a mode under their best noise, and what other labels cost under that."""
-        if any(mode.is_like(tuned) for tuned in self._tuned):
+        if any(mode.is_like(tuned.state) for tuned in self._tuned):
             return
         self._tuned.append(mode)
         best, near = mode, self._near()
@@ -127,7 +131,7 @@ class Search:
         self.modes = sorted(known.values(), key=lambda other: other.cost)
 
     def _next(self, done: list[Mode]) -> Mode | None:
-        return next((mode for mode in self._near() if not any(mode.is_like(other) for other in done)), None)
+        return next((mode for mode in self._near() if not any(mode.is_like(other.state) for other in done)), None)
 
     def _near(self) -> list[Mode]:
         """The best modes that are not alike; of those alike the best stands for all."""
@@ -135,7 +139,7 @@ class Search:
         for mode in self.modes:
             if mode.cost > self.modes[0].cost + self.problem.limits.rival or len(best) == _BEAM:
                 break
-            if not any(mode.is_like(other) for other in best):
+            if not any(mode.is_like(other.state) for other in best):
                 best.append(mode)
         return best
 
@@ -143,8 +147,6 @@ class Search:
 def proposals(mode: Mode) -> Iterator[Proposal]:
     """Of all moves that are switched on."""
     without = mode.problem.without
-    if "groups" not in without:
-        yield from groups.propose(mode)
     if "slips" not in without:
         yield from slips.propose_slips(mode)
     if not without & {"slips", "mending"}:

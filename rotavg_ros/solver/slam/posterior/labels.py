@@ -5,26 +5,31 @@ Rates that are not known are integrated over a grid, so that no labelling is jud
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.special import betaln
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.posterior.densities import log_false
+from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 
 # Nodes of the sums that stand for integrals over rates: the share of false closures and the probability that a label is
-# its predecessor's; the shares of false closures that repeat a near one's turn and any one's; and what such repeats
-# differ by, as a kernel's width.
+# its predecessor's; the shares of false closures that repeat a near one's turn and any one's; of those that repeat none
+# but are near misses; and what repeats differ by, as a kernel's width.
 _SHARES = np.array([0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98])
 _STAY = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 0.97])
 _NEAR_SHARES = np.array([0.05, 0.5, 0.95])
 _FAR_SHARES = np.array([0.01, 0.05, 0.2, 0.5])
+_NEAR_MISS_QUANTILES = np.array([1.0, 3.0, 5.0]) / 6
 _REPEAT_DEG = 0.05 * 2.0 ** np.arange(9)
 # One width for all, or each as likely for every closure.
 _KERNELS = len(_REPEAT_DEG) + 1
-_GRID_SIZE = len(_NEAR_SHARES) * len(_FAR_SHARES) * _KERNELS
+_GRID = len(_NEAR_SHARES), len(_FAR_SHARES), len(_NEAR_MISS_QUANTILES), _KERNELS
 # Of closures detected at about the same time, one from about the same older place counts for so many others.
 _IN_RUN = 10.0
 # A kernel ends at so many widths, where it is 4e-6 of its height.
@@ -35,24 +40,28 @@ _LEAST = 1e-300
 
 @dataclass(frozen=True)
 class FalseDensity:
-    """Of n closures if they are false, in nats.
+    """Of n closures if they are false, none of them as a logarithm.
 
     Attributes:
-        alone: ``(n,)`` wrong by themselves.
-        near, far: ``(S, n)`` for each kernel, repeats of near and of any false closures; -inf without any.
+        alone: ``(M, n)`` wrong by themselves, for each share of near misses.
+        near, far: ``(S, n)`` for each kernel, repeats of near and of any false closures.
+        has_near, has_far: ``(n,)`` bool, whether there are such.
     """
 
     alone: np.ndarray
     near: np.ndarray
     far: np.ndarray
+    has_near: np.ndarray
+    has_far: np.ndarray
 
+    @property
     def mixed(self) -> np.ndarray:
-        """``(G, n)`` log [(1 − c) ((1 − g) alone + g far) + c near], over the grid of c, g and the width."""
-        far_share = np.where(np.isfinite(self.far), _FAR_SHARES[:, None, None], 0.0)
-        near_share = np.where(np.isfinite(self.near), _NEAR_SHARES[:, None, None, None], 0.0)
-        any_one = (1 - far_share) * np.exp(self.alone) + far_share * np.exp(self.far)
-        both = (1 - near_share) * any_one + near_share * np.exp(self.near)
-        return np.asarray(np.log(np.maximum(both, _LEAST)).reshape(_GRID_SIZE, len(self.alone)))
+        """``(G, n)`` (1 − c) ((1 − g) alone + g far) + c near, over the grid of c, g, near misses and the width."""
+        far_share = _FAR_SHARES[:, None, None, None] * self.has_far
+        near_share = _NEAR_SHARES[:, None, None, None, None] * self.has_near
+        any_one = (1 - far_share) * self.alone[:, None] + far_share * self.far
+        both = (1 - near_share) * any_one + near_share * self.near
+        return np.asarray(np.maximum(both, _LEAST).reshape(math.prod(_GRID), self.alone.shape[1]))
 
 
 def false_density(
@@ -70,59 +79,89 @@ def false_density(
         rows: ``(n,)`` closures to be told of.
         both_sides: given all others, not those before alone.
     """
-    k = problem.components
-    alone = log_false((residual[rows] ** 2).sum(axis=1), k, problem.priors)
-    nothing = np.full((_KERNELS, len(rows)), -np.inf)
-    false = problem.detection[is_false[problem.detection]]
-    if len(false) == 0 or len(rows) == 0 or "repeats" in problem.without:
-        return FalseDensity(alone, nothing, nothing)
-    when = problem.detected
+    k, count = problem.components, len(rows)
+    square = (residual[rows] ** 2).sum(axis=1)
+    alone = np.exp(log_false(square, k, problem.priors, _near_miss_shares(problem.priors)[:, None]))
+    if count == 0 or not is_false.any() or "repeats" in problem.without:
+        nothing, none = np.zeros((_KERNELS, count)), np.zeros(count, dtype=bool)
+        return FalseDensity(alone, nothing, nothing, none, none)
+    other, there = _others(problem, is_false, rows, both_sides)
+    older, newer = problem.ends.T
+    between = np.abs(newer.take(other) - newer[rows, None])
+    is_near = there & (between <= problem.priors.run_gap_steps)
+    between += np.abs(older.take(other) - older[rows, None])
+    weights = is_near * np.where(between <= problem.priors.run_gap_steps, _IN_RUN, 1.0), there.astype(np.float64)
+    turn = quaternion_rows.exp((residual * problem.sign[:, None]).T)
+    cosine = np.abs(sum(part.take(other) * part[rows, None] for part in turn))
+    alike = np.nonzero(there & (cosine > np.cos(_FARTHEST * np.radians(_REPEAT_DEG[-1]) / 2)))
+    kernel = _kernels((2 * np.arccos(np.minimum(cosine[alike], 1.0))) ** 2, k)
+    near, far = _mean_kernels(weights, alike, kernel)
+    has_near, has_far = (np.asarray(some.any(axis=1)) for some in (is_near, there))
+    return FalseDensity(alone, near, far, has_near, has_far)
+
+
+def _others(
+    problem: Problem, is_false: np.ndarray, rows: np.ndarray, both_sides: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """``(n, W)`` false closures detected not long before (or after) each of n, and whether there is such a one."""
+    false, when = problem.detection[is_false[problem.detection]], problem.detected
     window = min(problem.limits.window, len(false))
     earlier = np.searchsorted(when[false], when[rows])
     place = earlier[:, None] + np.arange(-window, 0)
     if both_sides:
         place = np.concatenate((place, (earlier + is_false[rows])[:, None] + np.arange(window)), axis=1)
-    there = (place >= 0) & (place < len(false))
-    other = false[np.clip(place, 0, len(false) - 1)]
-    turn = quaternion_rows.exp(np.ascontiguousarray((residual * problem.sign[:, None]).T)).T
-    cosine = np.abs(np.einsum("ni,nwi->nw", turn[rows], turn[other]))
-    square = (2 * np.arccos(np.minimum(cosine, 1.0))) ** 2
-    apart = np.abs(problem.ends[other] - problem.ends[rows, None])
-    is_near = there & (apart[:, :, 1] <= problem.priors.run_gap_steps)
-    in_run = apart.sum(axis=2) <= problem.priors.run_gap_steps
-    weights = [is_near * np.where(in_run, _IN_RUN, 1.0), there.astype(np.float64)]
-    totals = [weight.sum(axis=1) for weight in weights]
-    near, far = nothing.copy(), nothing.copy()
-    alike = there & (square < (_FARTHEST * np.radians(_REPEAT_DEG[-1])) ** 2)
-    row, square = np.nonzero(alike)[0], square[alike]
-    weights = [weight[alike] for weight in weights]
-    for number, width in enumerate(np.radians(_REPEAT_DEG)):
-        height = (2 * np.pi * width**2) ** (-k / 2)
-        kernel = np.exp(-square / (2 * width**2))
-        for result, weight, total in zip((near, far), weights, totals, strict=True):
-            mean = height * np.bincount(row, kernel * weight, len(rows)) / np.maximum(total, 1.0)
-            result[number] = np.where(total > 0, np.log(np.maximum(mean, _LEAST)), -np.inf)
-    for result in (near, far):
-        result[-1] = np.logaddexp.reduce(result[:-1], axis=0) - np.log(len(_REPEAT_DEG))
-    return FalseDensity(alone, near, far)
+    return false.take(place, mode="clip"), (place >= 0) & (place < len(false))
 
 
-def _log_repeat_prior(problem: Problem) -> np.ndarray:
+def _kernels(square: np.ndarray, components: int) -> np.ndarray:
+    """``(m, S − 1)`` normal densities of squared angles, rad², of all widths."""
+    width = np.radians(_REPEAT_DEG)
+    kernel = np.empty((len(width), len(square)))
+    np.exp(-square / (2 * width[-1] ** 2), out=kernel[-1])
+    for number in range(len(width) - 2, -1, -1):  # half as wide: to the fourth power
+        np.square(np.square(kernel[number + 1]), out=kernel[number])
+    return np.asarray(np.ascontiguousarray(kernel.T) * (2 * np.pi * width**2) ** (-components / 2))
+
+
+def _mean_kernels(
+    weights: tuple[np.ndarray, ...], alike: tuple[np.ndarray, ...], kernel: np.ndarray
+) -> list[np.ndarray]:
+    """``(S, n)`` for each of the weights ``(n, W)``: means over the others of each; of all widths alike at the end."""
+    count, places = len(weights[0]), len(kernel)
+    end = np.searchsorted(alike[0], np.arange(count), side="right")
+    ends = np.concatenate(([0], *(end + number * places for number in range(len(weights)))))
+    columns = np.tile(np.arange(places), len(weights))
+    spread = csr_array(
+        (np.concatenate([weight[alike] for weight in weights]), columns, ends), shape=(len(weights) * count, places)
+    )
+    total = np.maximum(np.concatenate([weight.sum(axis=1) for weight in weights]), 1.0)
+    mean = (spread @ kernel).T / total
+    return np.split(np.concatenate((mean, mean.mean(axis=0, keepdims=True))), len(weights), axis=1)
+
+
+def _near_miss_shares(priors: SlamPriors) -> np.ndarray:
+    """``(M,)`` equally likely under Beta(1, b), whose mean is the share that is believed: 1 − (1 − u)^(1/b)."""
+    mean = priors.near_miss_share
+    return np.asarray(-np.expm1(mean / (1 - mean) * np.log1p(-_NEAR_MISS_QUANTILES)))
+
+
+@cache
+def _log_repeat_prior(priors: SlamPriors) -> np.ndarray:
     """``(G,)`` of the grid's points: Beta(1, count) on the share that repeats a turn elsewhere, all else as likely."""
-    far = (problem.priors.elsewhere_count - 1) * np.log1p(-_FAR_SHARES) + np.log(np.gradient(_FAR_SHARES))
-    grid = np.broadcast_to(far[:, None], (len(_NEAR_SHARES), len(_FAR_SHARES), _KERNELS)).ravel()
+    far = (priors.elsewhere_count - 1) * np.log1p(-_FAR_SHARES) + np.log(np.gradient(_FAR_SHARES))
+    grid = np.broadcast_to(far[:, None, None], _GRID).ravel()
     return np.asarray(grid - np.logaddexp.reduce(grid))
 
 
 def repeat_rates(problem: Problem, density: FalseDensity) -> np.ndarray:
     """``(G,)`` log posterior of the grid's points, given false closures."""
-    rates = density.mixed().sum(axis=1) + _log_repeat_prior(problem)
+    rates = np.log(density.mixed).sum(axis=1) + _log_repeat_prior(problem.priors)
     return np.asarray(rates - np.logaddexp.reduce(rates))
 
 
 def log_false_set(problem: Problem, density: FalseDensity) -> float:
     """Of all false closures together, rates and width integrated."""
-    return float(np.logaddexp.reduce(density.mixed().sum(axis=1) + _log_repeat_prior(problem)))
+    return float(np.logaddexp.reduce(np.log(density.mixed).sum(axis=1) + _log_repeat_prior(problem.priors)))
 
 
 def _log_transitions() -> tuple[np.ndarray, np.ndarray]:
@@ -138,13 +177,13 @@ _LOG_FIRST, _LOG_FOLLOWS = _log_transitions()
 _LOG_STEPS = np.concatenate((_LOG_FIRST, _LOG_FOLLOWS.reshape(-1, 4)), axis=1)
 
 
-def _log_grid_prior(problem: Problem) -> np.ndarray:
-    """``(G,)`` of the grid's points: a Beta density on the shares, all stickiness as likely."""
-    priors = problem.priors
+@cache
+def _log_grid_prior(priors: SlamPriors, has_runs: bool) -> np.ndarray:
+    """``(G,)`` of the grid's points: a Beta density on the shares, all stickiness as likely, or none."""
     a = priors.outlier_share * priors.outlier_count
     b = (1 - priors.outlier_share) * priors.outlier_count
     log = (a - 1) * np.log(_SHARES) + (b - 1) * np.log1p(-_SHARES) + np.log(np.gradient(_SHARES))
-    stay = np.where(_STAY > 0, -np.inf, 0.0) if "label-runs" in problem.without else np.zeros(len(_STAY))
+    stay = np.zeros(len(_STAY)) if has_runs else np.where(_STAY > 0, -np.inf, 0.0)
     log = (log[:, None] + stay).ravel()
     return np.asarray(log - np.logaddexp.reduce(log))
 
@@ -165,7 +204,10 @@ def log_label_prior(problem: Problem, is_false: np.ndarray) -> float:
     counts = np.bincount(_kind_of_step(_last(problem, label), label), minlength=_LOG_STEPS.shape[1])
     told = problem.log_odds[problem.closure]
     finite = np.where(np.isfinite(told), told, 0.0)
-    return float(np.logaddexp.reduce(_LOG_STEPS @ counts + _log_grid_prior(problem)) - finite[is_false].sum())
+    return float(
+        np.logaddexp.reduce(_LOG_STEPS @ counts + _log_grid_prior(problem.priors, "label-runs" not in problem.without))
+        - finite[is_false].sum()
+    )
 
 
 def label_log_odds(problem: Problem, is_false: np.ndarray) -> np.ndarray:
@@ -175,7 +217,7 @@ def label_log_odds(problem: Problem, is_false: np.ndarray) -> np.ndarray:
         return np.zeros(0)
     last = _last(problem, label)
     log_rates = _LOG_STEPS @ np.bincount(_kind_of_step(last, label), minlength=_LOG_STEPS.shape[1])
-    log_rates = log_rates + _log_grid_prior(problem)
+    log_rates = log_rates + _log_grid_prior(problem.priors, "label-runs" not in problem.without)
     follower = np.flatnonzero(problem.follows >= 0)
     good, false = (
         np.bincount(problem.follows[follower], label[follower] == value, len(label)).astype(np.int64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import expit, logsumexp
+from scipy.special import expit
 
 from rotavg_ros.solver.slam.noise.exceedance import exceedance
 from rotavg_ros.solver.slam.noise.judging import OUTLIER_ANGLE
@@ -51,7 +51,7 @@ def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> Lef
     is_false = ~state.is_good[closure]
     rates = repeat_rates(problem, false_density(problem, is_false, residual[closure], np.flatnonzero(is_false)))
     each = false_density(problem, is_false, residual[closure], np.arange(len(closure)), both_sides=True)
-    odds[closure] = label_log_odds(problem, is_false) - logsumexp(each.mixed() + rates[:, None], axis=0)
+    odds[closure] = label_log_odds(problem, is_false) - np.log(np.exp(rates) @ each.mixed)
     odometry = np.flatnonzero(graph.is_odometry)
     slips = int((~state.is_good[odometry]).sum())
     odds[odometry] -= log_slip_odds(problem, graph.own_steps[odometry], slips)

@@ -53,18 +53,20 @@ class Mode:
         noise = self.state.noise
         return self.labels, noise.chosen, round(noise.log_ratio / OTHER_NOISE)
 
-    def is_like(self, other: Mode) -> bool:
+    def is_like(self, other: State) -> bool:
         """Whether only single closures have another label, and turn nothing by more than closures err.
 
         No slip differs, nor two closures of a run.
         """
-        differs = self.state.is_good != other.state.is_good
+        differs = self.state.is_good != other.is_good
         if differs[self.problem.graph.is_odometry].any():
             return False
         in_run = np.bincount(self.problem.run[differs[self.problem.closure]])
-        if in_run.max(initial=0) >= 2:
-            return False
-        cosine = np.abs((self.state.correction * other.state.correction).sum(axis=0)).min()
+        return in_run.max(initial=0) < 2 and self.is_turned_like(other)
+
+    def is_turned_like(self, other: State) -> bool:
+        """Whether orientations are the same up to what closures err."""
+        cosine = np.abs((self.state.correction * other.correction).sum(axis=0)).min()
         return bool(2 * np.arccos(min(float(cosine), 1.0)) < _SAME * np.sqrt(self.state.noise.closure_variance))
 
     @cached_property

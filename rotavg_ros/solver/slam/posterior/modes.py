@@ -14,7 +14,6 @@ from rotavg_ros.solver.slam.posterior.em import step
 from rotavg_ros.solver.slam.posterior.left_out import leave_one_out, scores
 from rotavg_ros.solver.slam.posterior.mode import OTHER_NOISE, Mode
 from rotavg_ros.solver.slam.posterior.problem import Problem
-from rotavg_ros.solver.slam.posterior.state import State
 
 # No labelling counts that is less likely by so many nats, and no other noise of the same labels.
 _FAR, _FAR_NOISE = 5.0, 2.0
@@ -22,7 +21,7 @@ _FAR, _FAR_NOISE = 5.0, 2.0
 _LIKELY, _FAR_TURN = 0.05, np.radians(5.0)
 # What is less likely good than this does not pull at all.
 _SURELY_FALSE = 0.05
-_ROUNDS = 3
+_ROUNDS = 2
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class Published:
 def publish(problem: Problem, modes: list[Mode]) -> Published:
     """The average of distinct modes (the best first), weighted by exp(−F)."""
     rivals, share = (modes[:1], np.ones(1)) if "rivals" in problem.without else distinct(problem, modes)
-    answers = [of_mode(problem, mode.state) for mode in rivals]
+    answers = [of_mode(mode) for mode in rivals]
     first = answers[0]
     turns = [
         quaternion_rows.log(quaternion_rows.multiply(quaternion_rows.inverse(first.correction), answer.correction))
@@ -80,7 +79,7 @@ def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: li
     others = [
         number
         for number in range(1, len(rivals))
-        if share[number] >= _LIKELY and largest[number] > _FAR_TURN and not rivals[number].is_like(rivals[0])
+        if share[number] >= _LIKELY and largest[number] > _FAR_TURN and not rivals[number].is_like(rivals[0].state)
     ]
     if not others:
         return ()
@@ -105,7 +104,7 @@ def distinct(problem: Problem, modes: list[Mode]) -> tuple[list[Mode], np.ndarra
     for mode in modes:
         if mode.cost > modes[0].cost + _FAR:
             break
-        alike = next((others for others in labellings if mode.is_like(others[0])), None)
+        alike = next((others for others in labellings if mode.is_like(others[0].state)), None)
         if alike is None:
             labellings.append([mode])
         elif mode.cost <= alike[0].cost + _FAR_NOISE and all(_has_other_noise(mode, other) for other in alike):
@@ -127,15 +126,22 @@ def _has_other_noise(mode: Mode, other: Mode) -> bool:
     return abs(noise.log_ratio - other_noise.log_ratio) > OTHER_NOISE or noise.chosen != other_noise.chosen
 
 
-def of_mode(problem: Problem, state: State) -> Published:
-    """One labelling's answer, single closures and slips weighed by their leave-one-out probabilities."""
-    factorised = step(problem, state)[2]
-    for _ in range(_ROUNDS):
-        left_out = leave_one_out(problem, state, factorised)
+def of_mode(mode: Mode) -> Published:
+    """One labelling's answer, single closures weighed by their leave-one-out probabilities.
+
+    Whether a segment slipped is another labelling's matter: what closures say of that they say together.
+    """
+    problem, state, left_out = mode.problem, mode.state, mode.left_out
+    is_decided, decided = np.isinf(problem.log_odds) | problem.graph.is_odometry, state.is_good
+    for number in range(_ROUNDS):
         score, trust = scores(problem, state, left_out)
+        if number > 0:  # closures that answer each other would swing from round to round
+            trust = (trust + state.trusted) / 2
         trusted = np.where(trust < _SURELY_FALSE, 0.0, trust)
-        trusted = np.where(np.isinf(problem.log_odds), problem.log_odds > 0, trusted)
-        state, _, factorised = step(problem, replace(state, trusted=trusted.astype(np.float64)))
+        trusted = np.where(is_decided, decided, trusted).astype(np.float64)
+        state, _, factorised = step(problem, replace(state, trusted=trusted))
+        if number < _ROUNDS - 1:
+            left_out = leave_one_out(problem, state, factorised)
     samples = factorised.samples[: problem.graph.num_nodes]
     graph = problem.drawn(state.noise)
     variance = graph.variance(samples, state.noise.step_variance)

@@ -33,6 +33,9 @@ from rotavg_ros.solver.slam.posterior.state import (
 )
 from rotavg_ros.solver.slam.posterior.system import Factorised
 
+# In the place of an F that is not known, nats.
+_UNKNOWN = 1e9
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -43,21 +46,29 @@ class Evaluation:
         residual: ``(E + R, 3)`` rad, of all rows.
         weight: ``(E + R,)`` rad⁻².
         factorised: H.
+        is_moving: whether corrections were not at their optimum yet, where F says nothing: it may come out as anything.
     """
 
     terms: dict[str, float]
     residual: np.ndarray
     weight: np.ndarray
     factorised: Factorised
+    is_moving: bool = False
 
     @property
     def total(self) -> float:
-        """F, nats."""
-        return sum(self.terms.values())
+        """F, nats; more than any other where corrections still move."""
+        return sum(self.terms.values()) + self.is_moving * _UNKNOWN
 
 
-def evaluate(problem: Problem, state: State) -> Evaluation:
-    """F where corrections are at their optimum; labels are rounded."""
+def evaluate(problem: Problem, state: State, *, is_moving: bool = False) -> Evaluation:
+    """F where corrections are at their optimum; labels are rounded.
+
+    Args:
+        problem: the graph.
+        state: where to.
+        is_moving: they are not yet.
+    """
     graph, priors, k = problem.graph, problem.priors, problem.components
     state = replace(state, trusted=state.is_good.astype(np.float64))
     variance, residual = variances(problem, state.noise), residuals(problem, state)
@@ -89,7 +100,7 @@ def evaluate(problem: Problem, state: State) -> Evaluation:
     if problem.bias is not None:
         information, _ = problem.bias.information(graph.source, state, residual, factorised, priors)
         terms["bias"] = problem.bias.cost(information, priors)
-    return Evaluation(terms, residual, weight, factorised)
+    return Evaluation(terms, residual, weight, factorised, is_moving)
 
 
 def log_noise_prior(noise: Noise, priors: SlamPriors) -> float:

@@ -21,8 +21,8 @@ class SlamPriors:
         tail_ratio: … and these have so many times the variance (Huber's contaminated normal).
         outlier_share: mean of the Beta prior of the share of false closures, …
         outlier_count: … and how many closures it counts for.
-        near_miss_share: this share of the false closures is wrong by a normal turn …
-        near_miss_deg: … of this standard deviation, and by any turn else.
+        near_miss_share: mean of the Beta(1, ·) prior of the share of false closures wrong by a normal turn …
+        near_miss_deg: … of this standard deviation; the others are wrong by any turn.
         elsewhere_count: the share of false closures that repeat the wrong turn of others elsewhere on the path has the
             prior Beta(1, elsewhere_count); that of repeats nearby, uniform.
         slip_count: the share of slipping steps has the prior Beta(slip_count, slip_steps), …
@@ -77,7 +77,6 @@ class SearchLimits:
         tried: moves that are tried, at most.
         slack: a move is tried if F is predicted to rise by no more than this, nats.
         rival: modes within so many nats of the best are moved on from.
-        groups: groups of closures that are looked at, of either label.
         slips: places for a slip that are looked at.
         window: false closures before (and after) one that it is compared with.
         averaged: labellings that are averaged, at most.
@@ -85,7 +84,7 @@ class SearchLimits:
 
     polish_solves: int = 20
     trial_solves: int = 5
-    settling_solves: int = 15
+    settling_solves: int = 8
     converged: float = 0.1
     flip_rounds: int = 8
     annealing_factor: float = 1.6
@@ -94,7 +93,6 @@ class SearchLimits:
     tried: int = 60
     slack: float = 1.0
     rival: float = 6.0
-    groups: int = 64
     slips: int = 12
     window: int = 48
     averaged: int = 8

@@ -105,6 +105,10 @@ def with_others(state: State, factorised: Factorised, if_good: np.ndarray, own: 
 def weights(problem: Problem, state: State, good: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """``(E + R,)`` rad⁻² of all rows.
 
+    Where a label is a probability P, the residual comes out as it would in the mean over both labels: of what all
+    others say of it, with variance p, a weight w leaves 1 / (1 + w p). So an edge that is good with one in four moves
+    what it alone tells of by a quarter of what it would as a good one, while P w would move it nearly as far.
+
     Args:
         problem: the graph.
         state: labels.
@@ -114,7 +118,9 @@ def weights(problem: Problem, state: State, good: np.ndarray, variance: np.ndarr
     num_edges = len(problem.graph.source)
     slipped = 1 / (variance[:num_edges] + np.radians(problem.priors.slip_deg) ** 2)
     otherwise = np.where(problem.graph.is_odometry, slipped, _NOTHING * good)
-    weight = state.trusted * good + (1 - state.trusted) * otherwise
+    if_good = state.trusted / (1 + good * state.others.predicted)
+    if_not = (1 - state.trusted) / (1 + otherwise * state.others.predicted)
+    weight = (if_good * good + if_not * otherwise) / (if_good + if_not)
     return np.concatenate((_bridged(problem, state, weight), 1 / variance[num_edges:]))
 
 

@@ -11,6 +11,7 @@ from rotavg_ros.solver.slam.posterior.densities import log_good
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.objective import log_noise_prior
+from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import tails, variances, with_noise
 from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, EXPONENTS, RUN_STEPS, TAIL_SHARES, TURN_SHARES, Noise
 
@@ -30,8 +31,8 @@ _REACH = 2
 _JOINT = ("run_steps", "common_share")
 # By what a variance changes when other noise is believed, at most and in steps.
 _SCALES = np.exp(np.linspace(-2.0, 1.2, 17))
-# Of edges are in the tails where it is tried whether there are any.
-_TAILS = TAIL_SHARES[2]
+# After so many solves F is about what it will be.
+_FIRST_SOLVES = 2
 
 
 def tuned(mode: Mode) -> Iterator[Mode]:
@@ -46,11 +47,11 @@ def tuned(mode: Mode) -> Iterator[Mode]:
             noise = replace(mode.state.noise, **{name: grid[number]})
             is_near = abs(number - grid.index(best)) <= _REACH
             if is_near and (name in _JOINT or _predicted(mode, noise) <= mode.problem.limits.slack):
-                found = _polished(mode, noise, mode.problem.limits.trial_solves)
+                found = _tried(mode, noise)
                 yield found
                 mode = min(mode, found, key=lambda either: either.cost)
     if mode is not begun:
-        yield _polished(mode, mode.state.noise, mode.problem.limits.polish_solves)
+        yield _polished(mode, mode.state.noise)
 
 
 def _predicted(mode: Mode, noise: Noise) -> float:
@@ -74,12 +75,22 @@ def _predicted(mode: Mode, noise: Noise) -> float:
     return changed
 
 
-def with_tails(noise: Noise) -> Noise:
-    """The same with some of all edges in tails."""
-    return replace(noise, step_tails=_TAILS, closure_tails=_TAILS)
+def uneven(problem: Problem, noise: Noise) -> Noise:
+    """The same but for odometry that errs by more now and then, and where it turns."""
+    tailed = noise.step_tails if "tails" in problem.without else TAIL_SHARES[1]
+    return replace(noise, step_tails=tailed, turn_share=TURN_SHARES[1] if problem.turns_vary else noise.turn_share)
 
 
-def _polished(mode: Mode, noise: Noise, solves: int) -> Mode:
+def _tried(mode: Mode, noise: Noise) -> Mode:
+    """The mode's labels under other noise; given up after a few solves where F is far above the mode's."""
+    limits = mode.problem.limits
+    found = _polished(mode, noise, _FIRST_SOLVES)
+    if found.cost > mode.cost + limits.rival:
+        return found
+    return _polished(found, found.state.noise, limits.trial_solves - _FIRST_SOLVES)
+
+
+def _polished(mode: Mode, noise: Noise, solves: int | None = None) -> Mode:
     state = with_noise(mode.problem, mode.state, noise)
     return Mode(mode.problem, *polish(mode.problem, state, solves), "noise")
 
