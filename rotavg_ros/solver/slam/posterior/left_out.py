@@ -29,12 +29,14 @@ class LeftOut:
         square: ``(E,)`` rad², of the discrepancy with what the rest predicts.
         predicted: ``(E,)`` rad², variance of that prediction.
         if_good: ``(E,)`` nats, log density of an edge that errs as a good one does.
+        unrepeated: ``(E,)`` the log-odds of closures if no false one repeated another's turn.
     """
 
     log_odds: np.ndarray
     square: np.ndarray
     predicted: np.ndarray
     if_good: np.ndarray
+    unrepeated: np.ndarray
 
 
 def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> LeftOut:
@@ -51,14 +53,18 @@ def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> Lef
     is_false = ~state.is_good[closure]
     rates = repeat_rates(problem, false_density(problem, is_false, residual[closure], np.flatnonzero(is_false)))
     each = false_density(problem, is_false, residual[closure], np.arange(len(closure)), both_sides=True)
-    odds[closure] = label_log_odds(problem, is_false) - np.log(np.exp(rates) @ each.mixed)
+    label_odds = label_log_odds(problem, is_false)
+    odds[closure] = label_odds - np.log(np.exp(rates) @ each.mixed)
     odometry = np.flatnonzero(graph.is_odometry)
     slips = int((~state.is_good[odometry]).sum())
     odds[odometry] -= log_slip_odds(problem, graph.own_steps[odometry], slips)
     odds[odometry] -= log_slipped(square[odometry], own[odometry], predicted[odometry], k, priors)
 
     if_good = log_good(k * (own + predicted), own, predicted, k, tails(problem, state.noise), priors.tail_ratio)[0]
-    return LeftOut(site.log_density + odds, square, predicted, if_good)
+    log_odds = site.log_density + odds
+    unrepeated = log_odds.copy()
+    unrepeated[closure] = site.log_density[closure] + label_odds - np.log(each.alone.mean(axis=0))
+    return LeftOut(log_odds, square, predicted, if_good, unrepeated)
 
 
 def scores(problem: Problem, state: State, left_out: LeftOut) -> tuple[np.ndarray, np.ndarray]:

@@ -28,6 +28,7 @@ from rotavg_ros.solver.slam.posterior.labels import (
 )
 from rotavg_ros.solver.slam.posterior.left_out import leave_one_out
 from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.solver.slam.posterior.moves.flips import flipped
 from rotavg_ros.solver.slam.posterior.moves.noise import tuned
 from rotavg_ros.solver.slam.posterior.objective import evaluate
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
@@ -282,6 +283,38 @@ def test_prior_log_odds_of_labels_are_differences_of_their_prior(seed: int) -> N
             changed[number] = value
             with_label.append(log_label_prior(problem, changed))
         assert log_odds[number] == pytest.approx(with_label[0] - with_label[1], abs=1e-9)
+
+
+def test_closures_that_only_each_other_make_false_are_believed_together() -> None:
+    """Three good ones 3.5° off: as false ones they repeat each other's turn, so that each by itself stays false."""
+    rng = np.random.default_rng(0)
+    count, older = 240, np.arange(0, 100, 4)
+    off = np.radians(rng.normal(0, 1.5, len(older)))
+    doubted = np.arange(1, 13, 4)
+    off[doubted] = np.radians(3.5) + np.radians(rng.normal(0, 0.2, len(doubted)))
+    graph = ViewGraph.create(
+        np.concatenate((np.arange(count), older)),
+        np.concatenate((np.arange(1, count + 1), older + 120)),
+        _yaw(np.concatenate((np.radians(rng.normal(0, 0.05, count)), off))),
+        num_nodes=count + 1,
+        kind=[0] * count + [1] * len(older),
+    )
+    problem = _problem(graph)
+    is_false = np.isin(np.arange(len(older)), doubted)
+    mode = Mode(problem, *polish(problem, _state(problem, is_false)), "test")
+    assert (mode.left_out.log_odds[problem.closure[doubted]] < 0).all()
+    believed = flipped(mode)
+    assert not believed.is_false.any()
+    assert believed.cost < mode.cost - 5
+
+
+def test_f_of_corrections_that_still_move_is_no_gain() -> None:
+    graph, _ = _planar(0, 8, 0.3)
+    problem = _problem(graph)
+    state = _state(problem, np.zeros(8, dtype=bool))
+    at_rest, moving = evaluate(problem, polish(problem, state)[0]), evaluate(problem, state, is_moving=True)
+    assert moving.total > at_rest.total + 1e6
+    assert not polish(problem, state, 1)[1].is_moving  # it goes on until nothing does
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -1,7 +1,8 @@
-"""Flip single labels, many at once."""
+"""Flip single labels, many at once; and false closures that only each other make false."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -26,30 +27,46 @@ def flipped(mode: Mode, limit: float = np.inf) -> Mode:
         mode: where to begin.
         limit: nats. It is given up where F, falling a few times as fast as in the last round, would not come below.
     """
-    problem, begun = mode.problem, mode
-    is_told = np.isinf(problem.log_odds)
-    share = 1.0
-    for rounds_left in range(problem.limits.flip_rounds - 1, -1, -1):
-        good = mode.state.is_good
-        log_odds = mode.left_out.log_odds
-        wrong = np.flatnonzero(~is_told & np.where(good, log_odds < -_DECIDED, log_odds > _DECIDED))
-        if len(wrong) == 0:
+    limits, begun, batches = mode.problem.limits, mode, _batches(mode)
+    for rounds_left in range(limits.flip_rounds - 1, -1, -1):
+        if (batch := next(batches, None)) is None:
             break
-        wrong = wrong[np.argsort(-np.abs(log_odds[wrong]), kind="stable")]
-        wrong = wrong[: max(1, int(share * len(wrong)))]
         trusted = mode.state.trusted.copy()
-        trusted[wrong] = ~good[wrong]
-        tried = _polished(mode, trusted, problem.limits.trial_solves)
+        trusted[batch] = ~mode.state.is_good[batch]
+        tried = _polished(mode, trusted, limits.trial_solves)
         gain = mode.cost - tried.cost
         if gain > _LEAST_GAIN:
-            mode, share = tried, 1.0
+            mode, batches = tried, _batches(tried)
             if mode.cost - _HOPE * rounds_left * gain > limit:
                 return mode
-        elif len(wrong) == 1:
-            break
-        else:
-            share *= _PART
-    return mode if mode is begun else _polished(mode, mode.state.trusted, problem.limits.polish_solves)
+    return mode if mode is begun else _polished(mode, mode.state.trusted, limits.polish_solves)
+
+
+def _batches(mode: Mode) -> Iterator[np.ndarray]:
+    """Edges to be flipped together, until F falls by it."""
+    wrong = _wrong(mode)
+    while len(wrong):
+        yield wrong
+        wrong = wrong[: max(1, int(_PART * len(wrong)))] if len(wrong) > 1 else wrong[:0]
+    if len(alone := _believed_alone(mode)):
+        yield alone
+
+
+def _wrong(mode: Mode) -> np.ndarray:
+    """Edges whose label log-odds speak against, the surest first."""
+    log_odds, good = mode.left_out.log_odds, mode.state.is_good
+    against = np.where(good, -log_odds, log_odds)
+    wrong = np.flatnonzero(~np.isinf(mode.problem.log_odds) & (against > _DECIDED))
+    return wrong[np.argsort(-against[wrong], kind="stable")]
+
+
+def _believed_alone(mode: Mode) -> np.ndarray:
+    """False closures that would be good if none repeated another's turn.
+
+    What errs by little more than good closures do agrees with others that do, so one keeps the other false.
+    """
+    is_false = ~mode.state.is_good & mode.problem.graph.is_closure & ~np.isinf(mode.problem.log_odds)
+    return np.flatnonzero(is_false & (mode.left_out.unrepeated > 0))
 
 
 def _polished(mode: Mode, trusted: np.ndarray, solves: int) -> Mode:
