@@ -17,11 +17,11 @@ from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.passes.alternation import Verdicts
-from rotavg_ros.solver.slam.posterior.modes import Published, publish
+from rotavg_ros.solver.slam.posterior.modes import publish
 from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.preparation import Prepared, prepare
 from rotavg_ros.solver.slam.update.memory import SlamMemory
-from rotavg_ros.solver.slam.update.posterior_memory import PosteriorMemory
+from rotavg_ros.solver.slam.update.posterior_memory import PosteriorMemory, estimate_of
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -84,18 +84,8 @@ def _solve_by_posterior(graph: ViewGraph, stages: SlamStages, run: Run) -> Estim
         found = search(graph, network, begin, stages.without)
         published = publish(found.drawn.problem, found.modes)
     with run.watch.stage("expand"):
-        return _published_estimate(published, None if stages.without else PosteriorMemory.of(graph, found))
-
-
-def _published_estimate(published: Published, memory: PosteriorMemory | None) -> Estimate:
-    """The posterior's answer on the view-graph's nodes and edges."""
-    return Estimate(
-        published.body_from_world,
-        torch.from_numpy(slam_stages.outlier_scores(published.graph, published.outlier_probability)),
-        torch.from_numpy(published.variance),
-        memory,
-        published.warnings,
-    )
+        estimate = estimate_of(published)
+        return estimate if stages.without else replace(estimate, memory=PosteriorMemory.of(graph, found, estimate))
 
 
 def _slam_estimate(
@@ -119,7 +109,6 @@ def update_slam(graph: ViewGraph, memory: SlamMemory | PosteriorMemory, run: Run
     network, start = run.networks.load(SlamCleanNet), run.warm_start.double()
     with run.watch.stage("update"):
         if isinstance(memory, PosteriorMemory):
-            published = memory.updated(graph, network, start)
-            return None if published is None else _published_estimate(*published)
+            return memory.updated(graph, network, start)
         updated = memory.updated(graph, network, start)
         return None if updated is None else _slam_estimate(*updated)

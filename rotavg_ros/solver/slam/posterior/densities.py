@@ -9,6 +9,9 @@ import numpy as np
 from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 
+# An angle of less, rad, has the density of this one.
+_LEAST_ANGLE = 1e-3
+
 
 def log_normal(square: np.ndarray, variance: np.ndarray | float, components: int) -> np.ndarray:
     """Log N(r; variance) in k components for ‖r‖² = ``square``."""
@@ -87,7 +90,10 @@ class Sites:
 def log_false(
     square: np.ndarray, components: int, priors: SlamPriors, near_miss_share: np.ndarray | float | None = None
 ) -> np.ndarray:
-    """Of closures that are false by themselves: log [(1 − m) u(r) + m N(r; near misses)], u uniform over rotations.
+    """Of closures that are false by themselves: log [(1 − m) u(r) + ½ m N(r; near miss) + ½ m h(r)].
+
+    u is uniform over rotations. A place is mistaken for one that looks alike and is seen at nearly the same angle, or
+    from the other end, as a corridor is: h is as wide about half a turn, about any axis.
 
     Args:
         square: rad², ‖r‖².
@@ -96,9 +102,14 @@ def log_false(
         near_miss_share: m, broadcast against ``square``.
     """
     share = priors.near_miss_share if near_miss_share is None else near_miss_share
+    variance = np.radians(priors.near_miss_deg) ** 2
     uniform = log_uniform_density(np.sqrt(square), components) + np.log1p(-share)
-    near = log_normal(square, np.radians(priors.near_miss_deg) ** 2, components) + np.log(share)
-    return np.asarray(np.logaddexp(uniform, near))
+    near = log_normal(square, variance, components)
+    angle = np.minimum(np.sqrt(square), np.pi)
+    half_turn = log_normal((np.pi - angle) ** 2, variance, 1)
+    if components == 3:  # from the angle's density, all axes alike
+        half_turn = half_turn + np.log(2.0) - np.log(4 * np.pi * np.maximum(angle, _LEAST_ANGLE) ** 2)
+    return np.asarray(np.logaddexp(uniform, np.logaddexp(near, half_turn) + np.log(share / 2)))
 
 
 def log_slipped(

@@ -21,7 +21,8 @@ class SlamPriors:
         tail_ratio: … and these have so many times the variance (Huber's contaminated normal).
         outlier_share: mean of the Beta prior of the share of false closures, …
         outlier_count: … and how many closures it counts for.
-        near_miss_share: mean of the Beta(1, ·) prior of the share of false closures wrong by a normal turn …
+        near_miss_share: mean of the Beta(1, ·) prior of the share of false closures wrong by a normal turn, or by
+            such a turn more than half a turn, …
         near_miss_deg: … of this standard deviation; the others are wrong by any turn.
         elsewhere_count: the share of false closures that repeat the wrong turn of others elsewhere on the path has the
             prior Beta(1, elsewhere_count); that of repeats nearby, uniform.

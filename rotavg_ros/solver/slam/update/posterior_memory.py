@@ -2,7 +2,7 @@
 
 The labelling that was found, its noise and its bias are where the next search begins and, but for single flips, where
 it ends. The whole search runs again once the graph has grown by some percent, after a number of updates, or when a new
-closure turns the labels of others.
+closure turns the labels of others. Odometry that no closure judges yet says nothing of what was there.
 """
 
 from __future__ import annotations
@@ -10,15 +10,21 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from rotavg_ros.solver.algebra.pointer_jumping import follow
+from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root
+from rotavg_ros.solver.estimate import Estimate
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.posterior.inference import Search
 from rotavg_ros.solver.slam.posterior.left_out import relabelled
 from rotavg_ros.solver.slam.posterior.modes import Published, publish
+from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.solve import Drawn, Found
 from rotavg_ros.solver.slam.posterior.state import Noise, Others, State
+from rotavg_ros.solver.slam.stages import outlier_scores
 from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over
 from rotavg_ros.view_graph import ViewGraph
 
@@ -30,14 +36,16 @@ _NEW = 2.0
 
 @dataclass(frozen=True)
 class PosteriorMemory:
-    """Of a graph of M edges.
+    """Of a graph of N nodes and M edges, C of them closures.
 
     Attributes:
         graph: the view-graph.
         trusted: ``(M,)`` 1 for good closures and sound odometry, 0 for others; all of a segment have its label.
         noise: of the likeliest labelling.
         bias: ``(3,)`` rad per step that was taken out of the odometry; None if none was.
-        closures: how many there were when the whole search ran.
+        outlier_score: ``(M,)`` that was published.
+        variance: ``(N,)`` rad², likewise.
+        searched: C when the whole search ran.
         updates: how many there have been since.
         warnings: about the answer of the whole search.
     """
@@ -46,31 +54,35 @@ class PosteriorMemory:
     trusted: np.ndarray
     noise: Noise
     bias: np.ndarray | None
-    closures: int
+    outlier_score: Tensor
+    variance: Tensor
+    searched: int
     updates: int = 0
     warnings: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, graph: ViewGraph, found: Found) -> PosteriorMemory:
+    def of(cls, graph: ViewGraph, found: Found, estimate: Estimate) -> PosteriorMemory:
         """After a whole search."""
         problem, state = found.drawn.problem, found.modes[0].state
         bias = None if problem.bias is None else problem.bias.vector
-        return cls(graph, problem.graph.edge_values(state.trusted), state.noise, bias, len(problem.closure))
+        trusted = problem.graph.edge_values(state.trusted)
+        told = estimate.outlier_score, estimate.variance
+        return cls(graph, trusted, state.noise, bias, *told, searched=len(problem.closure))
 
-    def updated(
-        self, graph: ViewGraph, network: SlamCleanNet, body_from_world: Tensor
-    ) -> tuple[Published, PosteriorMemory] | None:
+    def updated(self, graph: ViewGraph, network: SlamCleanNet, body_from_world: Tensor) -> Estimate | None:
         """Solve a graph that has grown from this one; None if it has not, or the whole search should run.
 
         Args:
             graph: N nodes.
             network: CleanNet.
-            body_from_world: ``(N, 4)`` start.
+            body_from_world: ``(N, 4)`` start: the last answer, new nodes along the odometry.
         """
         num_closures = int((~graph.is_odometry).sum())
-        is_due = self.updates >= _MAX_UPDATES or num_closures > (1 + _MAX_GROWTH) * self.closures
+        is_due = self.updates >= _MAX_UPDATES or num_closures > (1 + _MAX_GROWTH) * self.searched
         if is_due or not begins_with(graph, self.graph) or first_of_each(graph) is not None:
             return None
+        if (appended := self._appended(graph, body_from_world)) is not None:
+            return appended
         drawn = Drawn.of(graph, network, bias=self.bias)
         problem = drawn.problem
         before = carried_over(self.trusted, problem.graph, _NEW)
@@ -85,6 +97,55 @@ class PosteriorMemory:
         is_old_closure = problem.graph.is_closure & ~is_new
         if (mode.state.trusted != start.trusted)[is_old_closure].sum() > _MAX_TURNED:
             return None
-        trusted = problem.graph.edge_values(mode.state.trusted)
-        memory = replace(self, graph=graph, trusted=trusted, noise=mode.state.noise, updates=self.updates + 1)
-        return publish(problem, [mode]), memory
+        estimate = estimate_of(publish(problem, [mode]))
+        memory = replace(
+            self,
+            graph=graph,
+            trusted=problem.graph.edge_values(mode.state.trusted),
+            noise=mode.state.noise,
+            outlier_score=estimate.outlier_score,
+            variance=estimate.variance,
+            updates=self.updates + 1,
+        )
+        return replace(estimate, memory=memory)
+
+    def _appended(self, graph: ViewGraph, body_from_world: Tensor) -> Estimate | None:
+        """The answer if each new node hangs on an older one by one edge of odometry, and nothing else is new."""
+        known, edge = self.graph.num_nodes, np.arange(self.graph.num_edges, graph.num_edges)
+        if not bool(graph.is_odometry[edge].all()):
+            return None
+        ends = np.stack((graph.source.numpy()[edge], graph.target.numpy()[edge]))
+        parent, child = np.sort(ends, axis=0)
+        order = np.argsort(child)
+        parent, child, steps = parent[order], child[order], graph.steps.numpy()[edge]
+        if not np.array_equal(child, np.arange(known, graph.num_nodes)):
+            return None
+        # The new nodes as a forest of their own, rooted at the older ones that they hang on.
+        is_rooted = parent < known
+        root, root_of = np.unique(parent[is_rooted], return_inverse=True)
+        above = np.concatenate((np.arange(len(root)), parent - known + len(root)))
+        above[len(root) :][is_rooted] = root_of
+        forest = SpanningForest(above, np.append(np.full(len(root), -1), np.arange(len(child))), above)
+        passed = accumulate_to_root(forest, np.append(np.zeros(len(root)), steps[order]))[len(root) :]
+        anchor = root[follow(above)[len(root) :]]
+        variance = self.variance[anchor] + torch.from_numpy(passed * self.noise.step_variance)
+        priors = SlamPriors()
+        slipped = torch.from_numpy(steps * priors.slip_count / (priors.slip_steps + steps))
+        memory = replace(
+            self,
+            graph=graph,
+            trusted=np.append(self.trusted, np.ones(len(edge))),
+            outlier_score=torch.cat((self.outlier_score, slipped)),
+            variance=torch.cat((self.variance, variance)),
+        )
+        return Estimate(body_from_world, memory.outlier_score, memory.variance, memory)
+
+
+def estimate_of(published: Published) -> Estimate:
+    """The posterior's answer on the view-graph's nodes and edges."""
+    return Estimate(
+        published.body_from_world,
+        torch.from_numpy(outlier_scores(published.graph, published.outlier_probability)),
+        torch.from_numpy(published.variance),
+        warnings=published.warnings,
+    )

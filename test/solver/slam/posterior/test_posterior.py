@@ -362,6 +362,9 @@ def test_priors_are_normalised() -> None:
     assert logsumexp([log_label_prior(problem, is_false) for is_false in labels]) == pytest.approx(0.0, abs=1e-9)
     angle = np.linspace(-np.pi, np.pi, 20_001)
     assert np.trapezoid(np.exp(log_false(angle**2, 1, SlamPriors())), angle) == pytest.approx(1.0, abs=1e-3)
+    length = np.linspace(1e-6, np.pi, 20_001)
+    shells = 4 * np.pi * length**2 * np.exp(log_false(length**2, 3, SlamPriors()))
+    assert np.trapezoid(shells, length) == pytest.approx(1.0, abs=1e-3)
     # A second false closure, new or repeating the first by any turn.
     is_false = np.arange(len(problem.closure)) == problem.detection[0]
     second = problem.detection[1:2]

@@ -80,3 +80,44 @@ def test_what_has_not_grown_is_solved_anew() -> None:
     assert stages(case.graph, without("slips")) != {"update"}
     assert stages(case.graph, "neurora") != {"update"}
     assert stages(case.graph.select_edges(torch.arange(case.graph.num_edges - 1))) != {"update"}
+
+
+def test_odometry_alone_says_nothing_of_what_was_there() -> None:
+    case = drawn("building: 30 % random", 1)
+    count = case.graph.num_nodes - 40
+    before = solve(until(case.graph, count), profile="slam", method=POSTERIOR)
+    graph = until(case.graph, count + 20)
+    num_known = before.outlier_score.shape[0]
+    is_known = torch.arange(graph.num_edges) < num_known
+    graph = graph.select_edges(is_known | graph.is_odometry)
+    after = solve(graph, profile="slam", method=POSTERIOR, warm_start=grown(graph, before), memory=before.memory)
+    assert set(after.stage_seconds) == {"update"}
+    torch.testing.assert_close(after.body_from_world[:count], before.body_from_world, rtol=0, atol=1e-9)
+    torch.testing.assert_close(after.outlier_score[:num_known], before.outlier_score)
+    torch.testing.assert_close(after.uncertainty[:count], before.uncertainty)
+    assert float(after.outlier_score[num_known:].max()) < 0.01
+    variance = after.uncertainty[count - 1 :].numpy() ** 2
+    np.testing.assert_allclose(np.diff(variance), np.diff(variance)[0])  # a random walk
+    assert variance[1] > variance[0]
+
+
+@pytest.mark.parametrize("has_closure", [False, True])
+def test_a_second_robot_begins(has_closure: bool) -> None:
+    case = drawn("building: 30 % random", 1)
+    known = until(case.graph, 500)
+    before = solve(known, profile="slam", method=POSTERIOR)
+    first = 504 if has_closure else 500
+    chain = until(case.graph, 4)
+    chain = chain.select_edges(chain.is_odometry)
+    both = until(case.graph, first)
+    later = both.select_edges(torch.arange(known.num_edges, both.num_edges))
+    parts = known, later, replace(chain, source=chain.source + first, target=chain.target + first)
+    names = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
+    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    graph = ViewGraph(first + 4, **columns)
+    start = grown(graph, before)
+    after = solve(graph, profile="slam", method=POSTERIOR, warm_start=start, memory=before.memory)
+    whole = solve(graph, profile="slam", method=POSTERIOR)
+    assert set(after.stage_seconds) == {"update"}
+    angle = rotations.angle_between(after.body_from_world, whole.body_from_world)
+    assert np.degrees(float(angle.mean())) < 0.3
