@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -35,6 +35,8 @@ AS_RECORDED, GROUPED = "as recorded", "30 % grouped"
 SLIPS, LOCATABLE_SLIPS = "slips + 30 %", "locatable slips + 30 %"
 SLIP_RULES = {SLIPS: CROSSED, LOCATABLE_SLIPS: LOCATABLE}
 RANDOM = "% random"
+# Of graphs that stay as they were recorded also the beginnings, where closures are few: what a node has to answer from.
+BEGINNINGS = {f"first {100 * share:g} %": share for share in (0.2, 0.3, 0.4, 0.6)}
 
 
 class SlamSuiteError(UserError):
@@ -93,6 +95,8 @@ def share_condition(share: float) -> str:
 def kinds(data: Path, graphs: Sequence[str], shares: Sequence[float], hard: bool = True) -> list[Kind]:
     """Every graph under every condition; where nothing is random, one drawing tells all. Named twice is named once.
 
+    Graphs with false closures of their own stay as they are, whole and, with ``hard``, their first parts.
+
     Odometry slips only where good closures are dense enough (:data:`SLIP_RULES`); graphs without such places have no
     case of that kind.
 
@@ -118,6 +122,9 @@ def kinds(data: Path, graphs: Sequence[str], shares: Sequence[float], hard: bool
         source = _SOURCES[name]
         if not source.is_spoiled:
             found.append(Kind(AS_RECORDED, partial(_draw_recorded, data / "slam", name), is_random=False))
+            for beginning, share in BEGINNINGS.items() if hard else ():
+                begin = partial(_draw_beginning, data / "slam", name, beginning, share)
+                found.append(Kind(beginning, begin, is_random=False))
             continue
         for condition, share in conditions.items():
             draw = partial(_draw_spoiled, data / "slam", name, condition, share)
@@ -127,6 +134,14 @@ def kinds(data: Path, graphs: Sequence[str], shares: Sequence[float], hard: bool
 
 def _draw_recorded(folder: Path, name: str, _: int) -> Case:
     return recorded_case(name, _SOURCES[name].read(folder, np.random.default_rng(0)))
+
+
+def _draw_beginning(folder: Path, name: str, kind: str, share: float, _: int) -> Case:
+    whole = _draw_recorded(folder, name, 0)
+    count = round(share * whole.graph.num_nodes)
+    has_come = torch.maximum(whole.graph.source, whole.graph.target) < count
+    graph = replace(whole.graph.select_edges(has_come), num_nodes=count)
+    return replace(whole, key=CaseKey(name, kind), graph=graph, truth=whole.truth[:count])
 
 
 def _draw_spoiled(folder: Path, name: str, condition: str, share: float, seed: int) -> Case | None:

@@ -89,3 +89,15 @@ def test_b25b_oracle(shared_data: Path) -> None:
     assert closures.sum() == 390
     assert (case.noise[closures] > np.radians(10)).sum() == 90
     assert score(case, "oracle", answer_of("oracle", case)).mean_deg == pytest.approx(2.33, abs=0.01)
+
+
+def test_what_was_recorded_is_also_judged_from_its_beginnings(shared_data: Path) -> None:
+    kinds = cases.kinds(shared_data, ["B25b_0.000"], [])
+    assert [kind.name for kind in kinds] == [cases.AS_RECORDED, *cases.BEGINNINGS]
+    whole, early = kinds[0].draw(0), kinds[1].draw(0)
+    assert whole is not None and early is not None
+    count = round(0.2 * whole.graph.num_nodes)
+    assert early.graph.num_nodes == len(early.truth) == count
+    newest = torch.maximum(whole.graph.source, whole.graph.target)
+    assert early.graph.num_edges == int((newest < count).sum())
+    torch.testing.assert_close(early.truth, whole.truth[:count], equal_nan=True)
