@@ -308,6 +308,28 @@ def test_closures_that_only_each_other_make_false_are_believed_together() -> Non
     assert believed.cost < mode.cost - 5
 
 
+def test_closures_that_alone_join_two_parts_are_believed_together() -> None:
+    """Each by itself tells nothing: its log-odds are those of the labels of the others, all false."""
+    rng = np.random.default_rng(1)
+    length, joins = 30, 12
+    chain = np.concatenate((np.arange(length - 1), length + np.arange(length - 1)))
+    ends = rng.permutation(length)[:joins], length + rng.permutation(length)[:joins]
+    angle = np.concatenate((rng.normal(0, np.radians(0.1), len(chain)), rng.normal(0, np.radians(1.5), joins)))
+    graph = ViewGraph.create(
+        np.concatenate((chain, ends[0])),
+        np.concatenate((chain + 1, ends[1])),
+        _yaw(angle),
+        num_nodes=2 * length,
+        kind=[0] * len(chain) + [1] * joins,
+    )
+    problem = _problem(graph)
+    mode = Mode(problem, *polish(problem, _state(problem, np.ones(joins, dtype=bool))), "test")
+    assert (mode.left_out.log_odds[problem.closure] < 0).all()
+    believed = flipped(mode)
+    assert not believed.is_false.any()
+    assert believed.cost < mode.cost - 5
+
+
 def test_f_of_corrections_that_still_move_is_no_gain() -> None:
     graph, _ = _planar(0, 8, 0.3)
     problem = _problem(graph)

@@ -1,4 +1,4 @@
-"""Flip single labels, many at once; and false closures that only each other make false."""
+"""Flip single labels, many at once; and false closures that only together can be good."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from rotavg_ros.solver.slam.posterior.em import polish
+from rotavg_ros.solver.slam.posterior.left_out import relabelled
 from rotavg_ros.solver.slam.posterior.mode import Mode
 
 # If a batch does not lower F, the surest part of it is tried.
@@ -48,8 +49,9 @@ def _batches(mode: Mode) -> Iterator[np.ndarray]:
     while len(wrong):
         yield wrong
         wrong = wrong[: max(1, int(_PART * len(wrong)))] if len(wrong) > 1 else wrong[:0]
-    if len(alone := _believed_alone(mode)):
-        yield alone
+    for together in (_believed_alone(mode), _fitting(mode)):
+        if len(together):
+            yield together
 
 
 def _wrong(mode: Mode) -> np.ndarray:
@@ -67,6 +69,15 @@ def _believed_alone(mode: Mode) -> np.ndarray:
     """
     is_false = ~mode.state.is_good & mode.problem.graph.is_closure & ~np.isinf(mode.problem.log_odds)
     return np.flatnonzero(is_false & (mode.left_out.unrepeated > 0))
+
+
+def _fitting(mode: Mode) -> np.ndarray:
+    """False closures that fit orientations as they are.
+
+    Where nothing else joins two parts, none of those between them tells anything by itself; all together do.
+    """
+    is_false = ~mode.state.is_good & mode.problem.graph.is_closure & ~np.isinf(mode.problem.log_odds)
+    return np.flatnonzero(is_false & (relabelled(mode.problem, mode.state) > 0))
 
 
 def _polished(mode: Mode, trusted: np.ndarray, solves: int) -> Mode:
