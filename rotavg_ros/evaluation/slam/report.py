@@ -121,6 +121,7 @@ def _recorded(title: str, scores: Scores, names: Sequence[str], graphs: Sequence
                 rows.append(
                     (
                         graph,
+                        row.case.kind,
                         ROWS.get(name, name),
                         row.mean_deg,
                         counts.precision,
@@ -131,6 +132,7 @@ def _recorded(title: str, scores: Scores, names: Sequence[str], graphs: Sequence
                 )
     columns = (
         Column("graph"),
+        Column("condition"),
         Column("method"),
         Column("mean °", ".2f"),
         Column("precision", ".3f"),

@@ -70,45 +70,28 @@ class OdometryPaths:
         It does if each new node hangs on an older one by one odometry edge, and the other new edges are closures within
         components.
         """
-        num_known, num_edges = len(self.depth), len(self.outside) + int(self.hangs_on_odometry.sum())
+        num_edges = len(self.outside) + int(self.hangs_on_odometry.sum())
         edge = np.arange(num_edges, graph.num_edges)
         is_odometry = graph.is_odometry.numpy()[num_edges:]
         source, target = graph.source.numpy()[edge], graph.target.numpy()[edge]
-        child, parent = np.maximum(source, target)[is_odometry], np.minimum(source, target)[is_odometry]
-        order = np.argsort(child)
-        child, parent, parent_edge = child[order], parent[order], edge[is_odometry][order]
-        if not np.array_equal(child, np.arange(num_known, graph.num_nodes)):
+        new = Growth.of(graph, edge[is_odometry], len(self.depth))
+        if new is None:
             return None
-        # The new nodes as a graph of their own, rooted at the older ones that they hang on.
-        is_rooted = parent < num_known
-        root, root_of = np.unique(parent[is_rooted], return_inverse=True)
-        local_parent = np.concatenate((np.arange(len(root)), parent - num_known + len(root)))
-        local_parent[len(root) :][is_rooted] = root_of
-        forest = SpanningForest(local_parent, np.append(np.full(len(root), -1), np.arange(len(child))), local_parent)
-        measured = graph.target_from_source[torch.from_numpy(parent_edge)]
-        enters = torch.from_numpy(graph.target.numpy()[parent_edge] == child)[:, None]
-        local = ViewGraph.create(
-            local_parent[len(root) :],
-            np.arange(len(root), len(local_parent)),
-            torch.where(enters, measured, rotations.inverse(measured)),
-            num_nodes=len(local_parent),
-        )
-        anchor = root[follow(local_parent)[len(root) :]]
-        steps = np.append(np.zeros(len(root)), graph.steps.numpy()[parent_edge])
-        orientation = rotations.multiply(compose_orientations(forest, local)[len(root) :], self.orientation[anchor])
+        anchor = new.anchor
+        orientation = rotations.multiply(new.turn, self.orientation[anchor])
         paths = replace(
             self,
             forest=SpanningForest(
-                np.append(self.forest.parent, parent),
-                np.append(self.forest.parent_edge, parent_edge),
+                np.append(self.forest.parent, new.parent),
+                np.append(self.forest.parent_edge, new.edge),
                 np.append(self.forest.component, self.forest.component[anchor]),
             ),
             orientation=torch.cat((self.orientation, rotations.normalize(orientation))),
-            hangs_on_odometry=np.append(self.hangs_on_odometry, np.ones(len(child), dtype=bool)),
-            depth=np.append(self.depth, self.depth[anchor] + accumulate_to_root(forest, steps)[len(root) :]),
+            hangs_on_odometry=np.append(self.hangs_on_odometry, np.ones(len(anchor), dtype=bool)),
+            depth=np.append(self.depth, self.depth[anchor] + new.along(graph.steps.numpy()[new.edge])),
             level=np.append(
                 self.level,
-                self.level[anchor] + accumulate_to_root(forest, np.ones(len(steps))).astype(np.int64)[len(root) :],
+                self.level[anchor] + new.along(np.ones(len(anchor))).astype(np.int64),
             ),
             chain=np.append(self.chain, self.chain[anchor]),
         )
@@ -136,6 +119,55 @@ class OdometryPaths:
             residual=torch.cat((self.residual, rotations.canonical(residual)))[torch.from_numpy(order)],
             path_steps=np.concatenate((self.path_steps, path_steps))[order],
         )
+
+
+@dataclass(frozen=True)
+class Growth:
+    """New nodes (n), each of which hangs on an older one by one edge of odometry.
+
+    Attributes:
+        edge: ``(n,)`` that edge, in the order of nodes.
+        parent: ``(n,)`` its other end.
+        anchor: ``(n,)`` the known node that the way back leads to.
+        turn: ``(n, 4)`` orientations, if anchors' were the identity.
+    """
+
+    edge: np.ndarray
+    parent: np.ndarray
+    anchor: np.ndarray
+    turn: Tensor
+    _forest: SpanningForest
+
+    @classmethod
+    def of(cls, graph: ViewGraph, edge: np.ndarray, num_known: int) -> Growth | None:
+        """By new edges ``(n,)`` of odometry; None where nodes after the known ones hang otherwise."""
+        source, target = graph.source.numpy()[edge], graph.target.numpy()[edge]
+        child, parent = np.maximum(source, target), np.minimum(source, target)
+        order = np.argsort(child)
+        child, parent, edge = child[order], parent[order], edge[order]
+        if not np.array_equal(child, np.arange(num_known, graph.num_nodes)):
+            return None
+        # The new nodes as a graph of their own, rooted at the older ones that they hang on.
+        is_rooted = parent < num_known
+        root, root_of = np.unique(parent[is_rooted], return_inverse=True)
+        above = np.concatenate((np.arange(len(root)), parent - num_known + len(root)))
+        above[len(root) :][is_rooted] = root_of
+        forest = SpanningForest(above, np.append(np.full(len(root), -1), np.arange(len(child))), above)
+        measured = graph.target_from_source[torch.from_numpy(edge)]
+        enters = torch.from_numpy(graph.target.numpy()[edge] == child)[:, None]
+        local = ViewGraph.create(
+            above[len(root) :],
+            np.arange(len(root), len(above)),
+            torch.where(enters, measured, rotations.inverse(measured)),
+            num_nodes=len(above),
+        )
+        turn = compose_orientations(forest, local)[len(root) :]
+        return cls(edge, parent, root[follow(above)[len(root) :]], turn, forest)
+
+    def along(self, value: np.ndarray) -> np.ndarray:
+        """Sums of edges' values ``(n,)`` from the anchors on."""
+        num_roots = len(self._forest.parent) - len(value)
+        return accumulate_to_root(self._forest, np.append(np.zeros(num_roots), value))[num_roots:]
 
 
 def _canonical_order(graph: ViewGraph, edges: np.ndarray) -> np.ndarray:

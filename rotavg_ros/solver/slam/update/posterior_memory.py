@@ -13,11 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rotavg_ros.solver.algebra.pointer_jumping import follow
-from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root
+from rotavg_ros import rotations
 from rotavg_ros.solver.estimate import Estimate
+from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
+from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.posterior.inference import Search
 from rotavg_ros.solver.slam.posterior.left_out import relabelled
 from rotavg_ros.solver.slam.posterior.modes import Published, publish
@@ -43,6 +44,7 @@ class PosteriorMemory:
         trusted: ``(M,)`` 1 for good closures and sound odometry, 0 for others; all of a segment have its label.
         noise: of the likeliest labelling.
         bias: ``(3,)`` rad per step that was taken out of the odometry; None if none was.
+        body_from_world: ``(N, 4)`` that was found, in its own gauge.
         outlier_score: ``(M,)`` that was published.
         variance: ``(N,)`` rad², likewise.
         searched: C when the whole search ran.
@@ -54,6 +56,7 @@ class PosteriorMemory:
     trusted: np.ndarray
     noise: Noise
     bias: np.ndarray | None
+    body_from_world: Tensor
     outlier_score: Tensor
     variance: Tensor
     searched: int
@@ -66,7 +69,7 @@ class PosteriorMemory:
         problem, state = found.drawn.problem, found.modes[0].state
         bias = None if problem.bias is None else problem.bias.vector
         trusted = problem.graph.edge_values(state.trusted)
-        told = estimate.outlier_score, estimate.variance
+        told = estimate.body_from_world, estimate.outlier_score, estimate.variance
         return cls(graph, trusted, state.noise, bias, *told, searched=len(problem.closure))
 
     def updated(self, graph: ViewGraph, network: SlamCleanNet, body_from_world: Tensor) -> Estimate | None:
@@ -75,13 +78,13 @@ class PosteriorMemory:
         Args:
             graph: N nodes.
             network: CleanNet.
-            body_from_world: ``(N, 4)`` start: the last answer, new nodes along the odometry.
+            body_from_world: ``(N, 4)`` start, where a closure is new.
         """
         num_closures = int((~graph.is_odometry).sum())
         is_due = self.updates >= _MAX_UPDATES or num_closures > (1 + _MAX_GROWTH) * self.searched
         if is_due or not begins_with(graph, self.graph) or first_of_each(graph) is not None:
             return None
-        if (appended := self._appended(graph, body_from_world)) is not None:
+        if (appended := self._appended(graph)) is not None:
             return appended
         drawn = Drawn.of(graph, network, bias=self.bias)
         problem = drawn.problem
@@ -103,42 +106,38 @@ class PosteriorMemory:
             graph=graph,
             trusted=problem.graph.edge_values(mode.state.trusted),
             noise=mode.state.noise,
+            body_from_world=estimate.body_from_world,
             outlier_score=estimate.outlier_score,
             variance=estimate.variance,
             updates=self.updates + 1,
         )
         return replace(estimate, memory=memory)
 
-    def _appended(self, graph: ViewGraph, body_from_world: Tensor) -> Estimate | None:
-        """The answer if each new node hangs on an older one by one edge of odometry, and nothing else is new."""
-        known, edge = self.graph.num_nodes, np.arange(self.graph.num_edges, graph.num_edges)
+    def _appended(self, graph: ViewGraph) -> Estimate | None:
+        """The answer if each new node hangs on an older one by one edge of odometry, and nothing else is new.
+
+        Variances grow by the steps passed, whatever odometry does in turns.
+        """
+        edge = np.arange(self.graph.num_edges, graph.num_edges)
         if not bool(graph.is_odometry[edge].all()):
             return None
-        ends = np.stack((graph.source.numpy()[edge], graph.target.numpy()[edge]))
-        parent, child = np.sort(ends, axis=0)
-        order = np.argsort(child)
-        parent, child, steps = parent[order], child[order], graph.steps.numpy()[edge]
-        if not np.array_equal(child, np.arange(known, graph.num_nodes)):
+        new = Growth.of(graph if self.bias is None else without_bias(graph, self.bias), edge, self.graph.num_nodes)
+        if new is None:
             return None
-        # The new nodes as a forest of their own, rooted at the older ones that they hang on.
-        is_rooted = parent < known
-        root, root_of = np.unique(parent[is_rooted], return_inverse=True)
-        above = np.concatenate((np.arange(len(root)), parent - known + len(root)))
-        above[len(root) :][is_rooted] = root_of
-        forest = SpanningForest(above, np.append(np.full(len(root), -1), np.arange(len(child))), above)
-        passed = accumulate_to_root(forest, np.append(np.zeros(len(root)), steps[order]))[len(root) :]
-        anchor = root[follow(above)[len(root) :]]
-        variance = self.variance[anchor] + torch.from_numpy(passed * self.noise.step_variance)
+        steps = graph.steps.numpy()
+        orientation = rotations.normalize(rotations.multiply(new.turn, self.body_from_world[new.anchor]))
+        passed = torch.from_numpy(new.along(steps[new.edge]) * self.noise.step_variance)
         priors = SlamPriors()
-        slipped = torch.from_numpy(steps * priors.slip_count / (priors.slip_steps + steps))
+        slipped = torch.from_numpy(steps[edge] * priors.slip_count / (priors.slip_steps + steps[edge]))
         memory = replace(
             self,
             graph=graph,
             trusted=np.append(self.trusted, np.ones(len(edge))),
+            body_from_world=torch.cat((self.body_from_world, orientation)),
             outlier_score=torch.cat((self.outlier_score, slipped)),
-            variance=torch.cat((self.variance, variance)),
+            variance=torch.cat((self.variance, self.variance[new.anchor] + passed)),
         )
-        return Estimate(body_from_world, memory.outlier_score, memory.variance, memory)
+        return Estimate(memory.body_from_world, memory.outlier_score, memory.variance, memory)
 
 
 def estimate_of(published: Published) -> Estimate:
