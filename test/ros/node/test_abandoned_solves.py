@@ -19,7 +19,8 @@ pytestmark = pytest.mark.ros
 
 EVERY_MESSAGE = ("keyframe_angle_deg:=0.0", "keyframe_distance_m:=0.0", "solve_period_s:=0.1")
 
-# The node with a solver that notes what becomes of it; while a file says "block" it goes on until it is abandoned.
+# The node with a solver that notes what becomes of it. While a file says "block" it waits until it is abandoned; while
+# it says "repeat" it solves again and again, so that it is in the middle of a solve whenever it is abandoned.
 NOTING = """
 import sys, time
 from pathlib import Path
@@ -39,6 +40,8 @@ def noting(*arguments, **options):
             stop_if_abandoned()
             time.sleep(0.01)
         solution = solve(*arguments, **options)
+        while order.read_text() == "repeat":
+            solve(*arguments, **options)
     except Abandoned:
         note("abandoned")
         raise
@@ -124,11 +127,16 @@ def test_who_waits_for_an_answer_is_told_that_it_was_abandoned(noting: NotingNod
     assert nothing.success and "no keyframes" in nothing.message
 
 
-def test_a_large_solve_stops(noting: NotingNode, closures_without_end: Callable[[], RelativeRotationArray]) -> None:
+def test_a_large_solve_stops(noting: NotingNode, large_array: Callable[[], RelativeRotationArray]) -> None:
     live = noting.live
-    noting.start("keyframe_source:=edges", "solve_period_s:=0.05")
-    live.arrays.publish(closures_without_end())
+    noting.start("keyframe_source:=edges", "solve_period_s:=3600.0")
+    live.arrays.publish(large_array())
     live.spin_until(lambda: live.status.get("edges") == "12000")
+    live.spin_until(lambda: noting.notes()[-1:] != ["begun"])  # a first tick may have met the first edges
+    noting.order.write_text("repeat")
+    client = live.probe.create_client(Trigger, "/rotavg/solve_now")
+    live.spin_until(client.service_is_ready)
+    client.call_async(Trigger.Request())
     live.spin_until(lambda: noting.notes()[-1:] == ["begun"])
     assert live.call("reset").success
     live.spin_until(lambda: noting.notes()[-1] == "abandoned")
@@ -137,8 +145,8 @@ def test_a_large_solve_stops(noting: NotingNode, closures_without_end: Callable[
 
 
 @pytest.fixture
-def closures_without_end() -> Callable[[], RelativeRotationArray]:
-    """A function that makes 4000 poses with 8000 closures between any two of them, all of it noise."""
+def large_array() -> Callable[[], RelativeRotationArray]:
+    """A function that makes an array of 4000 poses with 8000 closures between any two of them, all of it noise."""
 
     def make() -> RelativeRotationArray:
         draw = np.random.default_rng(0)
