@@ -62,6 +62,8 @@ class ViewGraph:
         label: ``(M,)`` int64 :class:`EdgeLabel`.
         steps: ``(M,)`` float64, odometry steps that an odometry edge stands for: its variance in units of one. 1 but
             for edges that several were drawn together into; of loop closures without meaning.
+        translation: ``(M, 3)`` float64, position of the target in the source's frame, metres; NaN where unknown. None
+            where no edge has one.
     """
 
     num_nodes: int
@@ -72,6 +74,7 @@ class ViewGraph:
     precision: Tensor
     label: Tensor
     steps: Tensor
+    translation: Tensor | None = None
 
     @classmethod
     def create(
@@ -86,6 +89,7 @@ class ViewGraph:
         precision: ArrayLike | None = None,
         label: ArrayLike | None = None,
         steps: ArrayLike | None = None,
+        translation: ArrayLike | None = None,
     ) -> ViewGraph:
         """Check the arrays and bring them into the graph's types.
 
@@ -104,6 +108,8 @@ class ViewGraph:
             precision: rad⁻²; default: unknown. Values that are not positive and finite count as unknown.
             label: :class:`EdgeLabel` codes; default: automatic.
             steps: default: 1.
+            translation: ``(M, 3)`` metres, position of the target in the source's frame, the same whichever way the
+                rotation is given; default: none is known. Rows that are not finite count as unknown.
 
         Raises:
             ViewGraphError: none or both of the two rotations, arrays that are not numbers or whose shapes do not fit,
@@ -126,7 +132,8 @@ class ViewGraph:
         _refuse(unknown_label, "label {}; 0 is automatic, 1 accepted, 2 rejected", label)
         _refuse(~(torch.isfinite(steps) & (steps > 0)), "{:g} steps; they must be positive and finite", steps)
         precision = torch.where(torch.isfinite(precision) & (precision > 0), precision, torch.nan)
-        return cls(num_nodes, source, target, quaternions, kind, precision, label, steps)
+        places = None if translation is None else _translations(translation, num_edges)
+        return cls(num_nodes, source, target, quaternions, kind, precision, label, steps, places)
 
     @property
     def num_edges(self) -> int:
@@ -145,13 +152,17 @@ class ViewGraph:
         """The same graph on another device; itself if it is there."""
         if self.device == torch.device(device):
             return self
-        moved = {f.name: getattr(self, f.name).to(device) for f in fields(self) if f.name != "num_nodes"}
-        return replace(self, **moved)
+        return replace(self, **{name: column.to(device) for name, column in self._columns.items()})
 
     def select_edges(self, edges: Tensor) -> ViewGraph:
         """The graph of all nodes and the edges chosen by a mask or by indices, in that order."""
-        chosen = {f.name: getattr(self, f.name)[edges] for f in fields(self) if f.name != "num_nodes"}
-        return replace(self, **chosen)
+        return replace(self, **{name: column[edges] for name, column in self._columns.items()})
+
+    @property
+    def _columns(self) -> dict[str, Any]:
+        """What there is of each edge, by name."""
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "num_nodes"}
+        return {name: column for name, column in values.items() if column is not None}
 
     def components(self, edges: Tensor | None = None) -> Tensor:
         """Connected component of every node, ``(N,)`` int64, numbered by their first node.
@@ -198,6 +209,14 @@ def view_graph_of(holder: ViewGraph | HoldsViewGraph) -> ViewGraph:
         what = type(holder).__name__
         raise ViewGraphError(f"a {what} is no view-graph; make one with ViewGraph.create or read one with read_graph")
     return graph
+
+
+def _translations(values: ArrayLike, num_edges: int) -> Tensor:
+    """``(M, 3)`` metres; rows that are not finite become NaN."""
+    places = _as_tensor("translation", values, torch.float64)
+    if places.shape != (num_edges, 3):
+        raise ViewGraphError(f"translation has shape {tuple(places.shape)}; it must be ({num_edges}, 3), metres")
+    return torch.where(torch.isfinite(places).all(dim=1, keepdim=True), places, torch.nan)
 
 
 def _quaternions(target_from_source: ArrayLike | None, source_from_target: ArrayLike | None, num_edges: int) -> Tensor:

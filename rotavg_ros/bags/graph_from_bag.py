@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION
 from rotavg_ros.bags.messages import Edge, Keyframe, read_edge, read_odometry
 from rotavg_ros.bags.reader import BagReader, BagReadError
-from rotavg_ros.bags.topics import EDGE_TOPIC, GRAPH_NOTE, ODOM_TOPIC, TRANSLATION_TOPIC, TRUTH_TOPIC
+from rotavg_ros.bags.topics import EDGE_TOPIC, GRAPH_NOTE, ODOM_TOPIC, TRUTH_TOPIC
 from rotavg_ros.datasets.files.graph_file import MAX_NODE_ID, GraphFile
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, ViewGraphError
 
@@ -35,7 +36,6 @@ class _Content:
     """What the known topics of a bag hold, in the order of recording."""
 
     edges: list[Edge] = field(default_factory=list)
-    translations: list[list[float]] = field(default_factory=list)
     odometry: list[_Pose] = field(default_factory=list)
     truth: list[_Pose] = field(default_factory=list)
     note: dict[str, Any] = field(default_factory=dict)
@@ -48,7 +48,7 @@ class _Content:
     @property
     def has_translations(self) -> bool:
         """Whether there is one for every edge."""
-        return len(self.translations) == len(self.edges)
+        return any(edge.translation is not None for edge in self.edges)
 
 
 def read_graph_bag(path: str | Path) -> GraphFile:
@@ -81,13 +81,9 @@ def _read(bag: BagReader) -> _Content:
     content = _Content(note=note)
     known = {EDGE_TOPIC: RELATIVE_ROTATION, ODOM_TOPIC: ODOMETRY, TRUTH_TOPIC: ODOMETRY}
     topics = [topic for topic, kind in known.items() if bag.topics.get(topic) == kind]
-    if TRANSLATION_TOPIC in bag.topics:
-        topics.append(TRANSLATION_TOPIC)
     for topic, _, message in bag.decoded(topics):
         if topic == EDGE_TOPIC:
             content.edges.append(read_edge(message))
-        elif topic == TRANSLATION_TOPIC:
-            content.translations.append([message.vector.x, message.vector.y, message.vector.z])
         elif topic == ODOM_TOPIC:
             content.odometry.append(read_odometry(message))
         else:
@@ -126,7 +122,7 @@ def _from_ids(content: _Content) -> GraphFile:
         kind=np.array([edge.kind for edge in edges]),
         precision=np.array([edge.precision for edge in edges]),
         planar=bool(note.get("planar", _is_planar(source_from_target))),
-        edge_translation=_in_order(content.translations, order) if content.has_translations else None,
+        edge_translation=_translations(edges) if content.has_translations else None,
         skipped={"self-edges": len(content.edges) - len(proper)} if len(proper) < len(content.edges) else {},
     )
     stamp_of = {end.id: end.stamp_ns for edge in edges for end in (edge.source, edge.target)}
@@ -156,7 +152,7 @@ def _from_stamps(content: _Content) -> GraphFile:
     order = np.argsort(np.maximum(source, target), kind="stable")
     translations = None
     if content.has_translations:
-        translations = np.concatenate((steps, np.array(content.translations).reshape(-1, 3)[usable]))[order]
+        translations = np.concatenate((steps, _translations(closures)))[order]
     skipped = {
         "odometry messages without a pose": len(content.odometry) - len(sound),
         "edges without odometry at their stamps, or with both ends at one": int((~usable).sum()),
@@ -181,8 +177,10 @@ def _is_sound(message: _Pose) -> bool:
     return off <= UNIT_NORM_TOLERANCE and bool(np.isfinite(position).all())
 
 
-def _in_order(rows: list[list[float]], order: list[int]) -> NDArray[np.float64]:
-    return np.array(rows)[order].reshape(-1, 3)
+def _translations(edges: Sequence[Edge]) -> NDArray[np.float64]:
+    """``(n, 3)`` metres; NaN where unknown."""
+    rows = [np.full(3, np.nan) if edge.translation is None else edge.translation for edge in edges]
+    return np.array(rows).reshape(-1, 3)
 
 
 def _nearest(stamps_ns: NDArray[np.int64], end: Keyframe) -> int:

@@ -1,8 +1,7 @@
 """A view-graph file as a bag, from which :mod:`rotavg_ros.bags.graph_from_bag` reads it back without loss.
 
 Topics: ``/relative_rotations`` carries every edge, odometry included, by the id and the stamp of both ends;
-``/odom`` is odometry chained (where there is odometry); ``/ground_truth`` and ``/relative_translations`` (one per edge,
-in the edges' order of publication) are there if the file has them.
+``/odom`` is odometry chained (where there is odometry); ``/ground_truth`` is there if the file has it.
 """
 
 from __future__ import annotations
@@ -15,15 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION, VECTOR
+from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION
 from rotavg_ros.bags.messages import (
     Edge,
     Keyframe,
     edge_message,
     odometry_message,
-    vector_message,
 )
-from rotavg_ros.bags.topics import EDGE_TOPIC, GRAPH_NOTE, ODOM_TOPIC, TRANSLATION_TOPIC, TRUTH_TOPIC
+from rotavg_ros.bags.topics import EDGE_TOPIC, GRAPH_NOTE, ODOM_TOPIC, TRUTH_TOPIC
 from rotavg_ros.bags.writer import BagWriter
 from rotavg_ros.datasets.dead_reckoning import chain_poses
 from rotavg_ros.datasets.files.graph_file import GraphFile
@@ -65,8 +63,6 @@ def write_graph_bag(path: str | Path, graph_file: GraphFile, *, overwrite: bool 
             bag.add_topic(ODOM_TOPIC, ODOMETRY)
         if truth_known.any():
             bag.add_topic(TRUTH_TOPIC, ODOMETRY)
-        if graph_file.edge_translation is not None:
-            bag.add_topic(TRANSLATION_TOPIC, VECTOR)
         odom_position, odom_orientation = _dead_reckoning(graph_file) if has_odometry else (None, None)
         truth_position, truth_orientation = _truth(graph_file, truth_known)
         edges = _edges(graph_file, stamps_ns, published_ns)
@@ -82,9 +78,6 @@ def write_graph_bag(path: str | Path, graph_file: GraphFile, *, overwrite: bool 
             else:
                 sequence += 1
                 bag.write(EDGE_TOPIC, stamp, edge_message(replace(edges[index], sequence=sequence)))
-                if graph_file.edge_translation is not None:
-                    translation = vector_message(stamp, graph_file.edge_translation[index], "")
-                    bag.write(TRANSLATION_TOPIC, stamp, translation)
 
 
 def _note(graph_file: GraphFile) -> dict[str, object]:
@@ -122,8 +115,19 @@ def _edges(graph_file: GraphFile, stamps_ns: NDArray[np.int64], published_ns: ND
     keyframes = list(map(Keyframe, graph_file.node_ids.tolist(), stamps_ns.tolist()))
     source_from_target = graph.target_from_source.cpu().numpy() * [-1, -1, -1, 1]
     columns = (graph.source, graph.target, graph.precision, graph.kind)
+    translation = graph_file.edge_translation
     return [
-        Edge(stamp, index, 0, keyframes[source], keyframes[target], rotation, precision, kind)
+        Edge(
+            stamp,
+            index,
+            0,
+            keyframes[source],
+            keyframes[target],
+            rotation,
+            precision,
+            kind,
+            None if translation is None else translation[index],
+        )
         for index, (stamp, rotation, source, target, precision, kind) in enumerate(
             zip(published_ns.tolist(), source_from_target, *(column.tolist() for column in columns), strict=True)
         )

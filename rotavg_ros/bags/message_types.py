@@ -16,7 +16,6 @@ from rotavg_ros.errors import UserError
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 RELATIVE_ROTATION = "rotavg_msgs/msg/RelativeRotation"
-VECTOR = "geometry_msgs/msg/Vector3Stamped"
 
 
 class MessageTypeError(UserError):

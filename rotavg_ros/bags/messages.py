@@ -42,6 +42,7 @@ class Edge:
         source_from_target: ``(4,)`` xyzw, orientation of the target in the source frame.
         precision: rad⁻²; NaN: unknown.
         kind: :class:`rotavg_ros.view_graph.EdgeKind`.
+        translation: ``(3,)`` position of the target in the source frame, metres; None: unknown.
     """
 
     stamp_ns: int
@@ -52,6 +53,7 @@ class Edge:
     source_from_target: NDArray[np.float64]
     precision: float
     kind: int
+    translation: NDArray[np.float64] | None = None
 
 
 def _time(stamp_ns: int) -> Any:
@@ -104,14 +106,6 @@ def read_odometry(message: Any) -> tuple[int, list[float], list[float]]:
     )
 
 
-def vector_message(stamp_ns: int, vector: NDArray[np.float64], frame_id: str) -> Any:
-    """A ``geometry_msgs/msg/Vector3Stamped`` of ``(3,)``."""
-    x, y, z = vector.tolist()
-    return _type("geometry_msgs/msg/Vector3Stamped")(
-        header=_header(stamp_ns, frame_id), vector=_type("geometry_msgs/msg/Vector3")(x=x, y=y, z=z)
-    )
-
-
 def edge_message(edge: Edge) -> Any:
     """A ``rotavg_msgs/msg/RelativeRotation``."""
     return _type("rotavg_msgs/msg/RelativeRotation")(
@@ -122,8 +116,17 @@ def edge_message(edge: Edge) -> Any:
         target=_keyframe_message(edge.target),
         rotation=_quaternion(edge.source_from_target),
         precision=edge.precision if np.isfinite(edge.precision) else 0.0,
+        translation=_translation(edge.translation),
+        translation_precision=0.0,
         kind=edge.kind,
     )
+
+
+def _translation(translation: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """Nothing where it is unknown."""
+    if translation is None or not np.isfinite(translation).all():
+        return np.empty(0)
+    return np.asarray(translation, dtype=np.float64)
 
 
 def read_edge(message: Any) -> Edge:
@@ -138,6 +141,7 @@ def read_edge(message: Any) -> Edge:
         source_from_target=np.array([rotation.x, rotation.y, rotation.z, rotation.w]),
         precision=float(message.precision) if message.precision > 0 else float("nan"),
         kind=int(message.kind),
+        translation=np.array(message.translation, dtype=np.float64) if len(message.translation) == 3 else None,
     )
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION, VECTOR
-from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_message, vector_message
-from rotavg_ros.bags.topics import EDGE_TOPIC, ODOM_TOPIC, TRANSLATION_TOPIC, TRUTH_TOPIC
+from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION
+from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_message
+from rotavg_ros.bags.topics import EDGE_TOPIC, ODOM_TOPIC, TRUTH_TOPIC
 from rotavg_ros.bags.writer import BagWriter
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 
@@ -33,7 +33,6 @@ def write_run_bag(path: str | Path, run: SimulatedRun, *, overwrite: bool = Fals
     with BagWriter(path, overwrite=overwrite) as bag:
         bag.add_topic(ODOM_TOPIC, ODOMETRY)
         bag.add_topic(EDGE_TOPIC, RELATIVE_ROTATION)
-        bag.add_topic(TRANSLATION_TOPIC, VECTOR)
         bag.add_topic(TRUTH_TOPIC, ODOMETRY)
         for pose, stamp in enumerate(stamps_ns):
             odometry = run.odometry_position[pose], run.odometry_world_from_body[pose]
@@ -49,7 +48,6 @@ def write_run_bag(path: str | Path, run: SimulatedRun, *, overwrite: bool = Fals
                     source_from_target=source_from_target[index],
                     precision=float(precision[index]),
                     kind=int(graph.kind[closures[index]]),
+                    translation=run.edge_translation[closures[index]],
                 )
                 bag.write(EDGE_TOPIC, stamp, edge_message(edge))
-                translation = run.edge_translation[closures[index]]
-                bag.write(TRANSLATION_TOPIC, stamp, vector_message(stamp, translation, ""))

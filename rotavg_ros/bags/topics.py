@@ -2,7 +2,6 @@
 
 ODOM_TOPIC = "/odom"
 EDGE_TOPIC = "/relative_rotations"
-TRANSLATION_TOPIC = "/relative_translations"
 TRUTH_TOPIC = "/ground_truth"
 
 # Key of the bag's own metadata that says what messages cannot: that it was a graph, and what was missing in it.

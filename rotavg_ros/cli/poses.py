@@ -15,7 +15,11 @@ POSE_FILES = ("graph.g2o", "trajectory.kitti", "trajectory.tum")
 
 
 def write_corrected_poses(
-    folder: Path, graph_file: GraphFile, world_from_body: np.ndarray, outlier_score: np.ndarray
+    folder: Path,
+    graph_file: GraphFile,
+    world_from_body: np.ndarray,
+    outlier_score: np.ndarray,
+    position: np.ndarray | None = None,
 ) -> None:
     """Write ``graph.g2o``, ``trajectory.kitti``, and ``trajectory.tum`` where the graph has stamps.
 
@@ -24,10 +28,22 @@ def write_corrected_poses(
         graph_file: N nodes, M edges.
         world_from_body: ``(N, 4)`` xyzw, the answer.
         outlier_score: ``(M,)``.
+        position: ``(N, 3)`` metres, the answer's; default: fitted to the edges' translations.
 
     Raises:
         GraphFileError: a file cannot be written.
     """
+    if position is None:
+        position = _fitted(graph_file, world_from_body, outlier_score)
+    write_corrected_graph(folder / "graph.g2o", graph_file, world_from_body, position, outlier_score > 0.5)
+    write_kitti(folder / "trajectory.kitti", position, world_from_body)
+    if graph_file.stamps_ns is not None:
+        order = np.argsort(graph_file.stamps_ns, kind="stable")
+        write_tum(folder / "trajectory.tum", graph_file.stamps_ns[order], position[order], world_from_body[order])
+
+
+def _fitted(graph_file: GraphFile, world_from_body: np.ndarray, outlier_score: np.ndarray) -> np.ndarray:
+    """``(N, 3)`` metres, along orientations as they are."""
     graph = graph_file.graph
     translation = graph_file.edge_translation
     edges = Translations(
@@ -38,9 +54,4 @@ def write_corrected_poses(
         outlier_score,
         graph.steps.cpu().numpy(),
     )
-    position = np.nan_to_num(fit_positions(world_from_body, edges, np.zeros((graph.num_nodes, 3))))
-    write_corrected_graph(folder / "graph.g2o", graph_file, world_from_body, position, outlier_score > 0.5)
-    write_kitti(folder / "trajectory.kitti", position, world_from_body)
-    if graph_file.stamps_ns is not None:
-        order = np.argsort(graph_file.stamps_ns, kind="stable")
-        write_tum(folder / "trajectory.tum", graph_file.stamps_ns[order], position[order], world_from_body[order])
+    return np.nan_to_num(fit_positions(world_from_body, edges, np.zeros((graph.num_nodes, 3))))

@@ -116,7 +116,9 @@ def solve_file(
     write_answer(job.output, graph_file, solution, summary, edges)
     if poses:
         world_from_body = solution.world_from_body.cpu().numpy()
-        write_corrected_poses(job.output, graph_file, world_from_body, solution.outlier_score.cpu().numpy())
+        position = None if solution.position is None else solution.position.cpu().numpy()
+        score = solution.outlier_score.cpu().numpy()
+        write_corrected_poses(job.output, graph_file, world_from_body, score, position)
     return summary
 
 

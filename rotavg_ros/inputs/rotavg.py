@@ -8,9 +8,11 @@ from typing import Any
 
 from rotavg_ros.inputs.fields import target_from_source, to_nanoseconds, to_tuple
 from rotavg_ros.inputs.records import EdgeRecord, Source
-from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason
+from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason, quaternion
 from rotavg_ros.online.measurements import RejectedInputError
+from rotavg_ros.online.quaternion import Vector
 
+_AXES = 3
 # KeyframeReference.by
 _BY_ID, _BY_STAMP = 0, 1
 
@@ -55,7 +57,16 @@ def edge_from_message(message: Any, source: Source) -> EdgeMeasurement:
         target_from_source=target_from_source(to_tuple(message.rotation), source.body_from_sensor),
         kind=int(message.kind),
         precision=float(message.precision),
+        translation=_translation(message, source),
     )
+
+
+def _translation(message: Any, source: Source) -> Vector | None:
+    """Between bodies, as far as a sensor's orientation tells; None where the message has none."""
+    if len(message.translation) != _AXES:
+        return None
+    x, y, z = (float(part) for part in message.translation)
+    return quaternion.rotate(source.body_from_sensor, (x, y, z))
 
 
 def _reference(message: Any, default_robot: str) -> KeyframeReference:

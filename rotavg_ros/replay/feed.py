@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -22,7 +21,7 @@ from rotavg_ros.inputs import (
 from rotavg_ros.online import EstimatorOptions, OnlineEstimator, RejectReason
 from rotavg_ros.online.measurements import OdometryMessage, RejectedInputError
 from rotavg_ros.online.odometry.time_jumps import KEEPS_TIME_LINE, BackwardJumps
-from rotavg_ros.online.quaternion import IDENTITY, Quaternion, Vector
+from rotavg_ros.online.quaternion import IDENTITY, Quaternion
 from rotavg_ros.replay.plan import Input, Plan
 from rotavg_ros.replay.record import Reference
 from rotavg_ros.settings.parameters import NodeParameters
@@ -37,17 +36,12 @@ class Feed:
     Args:
         estimator: gets everything.
         plan: which topic is what.
-        translations: of the single edges in the order of their messages; empty where they have none.
         on_odometry: is told of every odometry message that was taken.
     """
 
-    def __init__(
-        self, estimator: OnlineEstimator, plan: Plan, translations: list[Vector], on_odometry: OnOdometry
-    ) -> None:
+    def __init__(self, estimator: OnlineEstimator, plan: Plan, on_odometry: OnOdometry) -> None:
         self._estimator = estimator
         self._on_odometry = on_odometry
-        self._translations = iter(translations)
-        self._single = plan.translations[1] if plan.translations and translations else None
         self._generation = estimator.generation
         self._edge_converters: list[EdgeConverter] = []
         self._handlers: dict[str, list[Callable[[Any], None]]] = {}
@@ -58,7 +52,7 @@ class Feed:
         for source, about in zip(plan.edges, parameters.edge_sources(), strict=True):
             convert = EDGE_CONVERTERS[source.type_name](about)
             self._edge_converters.append(convert)
-            edges = partial(self._take_edges, convert, source.topic == self._single)
+            edges = partial(self._take_edges, convert)
             self._handlers.setdefault(source.topic, []).append(edges)
 
     @property
@@ -80,40 +74,18 @@ class Feed:
         if self._estimator.add_odometry(robot, record.stamp_ns, record.world_from_body, record.position) is None:
             self._on_odometry(robot, record)
 
-    def _take_edges(self, convert: EdgeConverter, has_translation: bool, message: Any) -> None:
+    def _take_edges(self, convert: EdgeConverter, message: Any) -> None:
         if self._generation != self._estimator.generation:  # time went back: what is sent again is new
             self._generation = self._estimator.generation
             for converter in self._edge_converters:
                 converter.forget()
-        translation = next(self._translations, None) if has_translation else None
         for record in convert(message):
             if isinstance(record, EdgeVerdict):
                 self._estimator.label_edge(record.source_robot, record.edge_id, record.label)
             elif isinstance(record.edge, RejectReason):
                 self._estimator.reject(record.edge)
-            elif translation is None:
-                self._estimator.add_edge(record.edge)
             else:
-                self._estimator.add_edge(replace(record.edge, translation=translation))
-
-
-def read_translations(bag: BagReader, plan: Plan, start_ns: int, stop_ns: int) -> list[Vector]:
-    """The positions that belong to the single edges between two moments, in the order of both their messages.
-
-    Empty where there are none, or not as many as edges.
-    """
-    if plan.translations is None:
-        return []
-    topic, edge_topic = plan.translations
-    vectors = [
-        (float(message.vector.x), float(message.vector.y), float(message.vector.z))
-        for _, _, message in Sound(bag.decoded([topic], start_ns, stop_ns))
-    ]
-    whole = start_ns <= bag.start_ns and stop_ns >= bag.end_ns
-    edges = (
-        bag.num_messages([edge_topic]) if whole else sum(1 for _ in Sound(bag.decoded([edge_topic], start_ns, stop_ns)))
-    )
-    return vectors if len(vectors) == edges else []
+                self._estimator.add_edge(record.edge)
 
 
 def read_references(

@@ -8,7 +8,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rotavg_ros.bags.message_types import RELATIVE_ROTATION
 from rotavg_ros.bags.reader import RECORDING_SUFFIXES, BagReader
 from rotavg_ros.datasets.files.pose_files import read_pose_file
 from rotavg_ros.errors import UserError
@@ -59,7 +58,6 @@ class Plan:
         parameters: the node's, their topics those of the bag; ``odometry_topics`` may name one that is not there.
         odometry: one per robot, in the order of ``parameters.robots``; none where the bag has no odometry.
         edges: in the order of ``parameters.edge_topics``.
-        translations: topic of the positions that belong to the edges, and the edges' topic.
         references: topic or file by robot.
         topics: every topic of the bag and its use.
     """
@@ -67,7 +65,6 @@ class Plan:
     parameters: NodeParameters
     odometry: tuple[Input, ...]
     edges: tuple[Input, ...]
-    translations: tuple[str, str] | None
     references: dict[str, Input | Path]
     topics: tuple[TopicUse, ...]
 
@@ -107,8 +104,7 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
         settings.setdefault("unknown_keyframes", "create")
     parameters = NodeParameters().changed(settings)
     references = _references(bag, found, wishes.references, parameters.robots, odometry)
-    translations = _translations(found, edges)
-    plan = Plan(parameters, odometry, edges, translations, references, topics=())
+    plan = Plan(parameters, odometry, edges, references, topics=())
     return replace(plan, topics=_uses(bag, found, plan))
 
 
@@ -210,14 +206,6 @@ def _references(
     return references
 
 
-def _translations(found: Candidates, edges: Sequence[Input]) -> tuple[str, str] | None:
-    """Only messages of single edges come one by one with their translations."""
-    single = [source.topic for source in edges if source.type_name == RELATIVE_ROTATION]
-    if len(found.translations) == 1 and len(single) == 1:
-        return found.translations[0].topic, single[0]
-    return None
-
-
 def _uses(bag: BagReader, found: Candidates, plan: Plan) -> tuple[TopicUse, ...]:
     """Every topic of the bag, and its part in the plan."""
     roles: dict[str, list[str]] = {}
@@ -226,9 +214,6 @@ def _uses(bag: BagReader, found: Candidates, plan: Plan) -> tuple[TopicUse, ...]
     for source in plan.edges:
         brings = plan.parameters.estimator.keyframe_source == "edges"
         roles.setdefault(source.topic, []).append("keyframes and loop closures" if brings else "loop closures")
-    if plan.translations:
-        translations, edges = plan.translations
-        roles.setdefault(translations, []).append(f"translations of {edges}")
     for robot, reference in plan.references.items():
         if isinstance(reference, Input):
             roles.setdefault(reference.topic, []).append(f"reference for {robot}")

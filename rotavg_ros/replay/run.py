@@ -16,7 +16,7 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.inputs import OdometryRecord
 from rotavg_ros.online import Answer, OnlineEstimator
 from rotavg_ros.online.measurements import OWN_EDGE_ID
-from rotavg_ros.replay.feed import Feed, read_translations
+from rotavg_ros.replay.feed import Feed
 from rotavg_ros.replay.plan import Plan
 from rotavg_ros.replay.record import TickRecord
 from rotavg_ros.replay.recording import Recording
@@ -108,7 +108,7 @@ def replay(
     estimator = OnlineEstimator(plan.parameters.estimator)
     with Recording(recording, plan.parameters, estimator, answer_period_ns) as recorder:
         loop = _Loop(estimator, plan.parameters.solve_period_s, recorder)
-        feed = Feed(estimator, plan, read_translations(bag, plan, start_ns, stop_ns), loop.on_odometry)
+        feed = Feed(estimator, plan, loop.on_odometry)
         end_ns, interrupted = start_ns, False
         is_whole = start_ns == bag.start_ns and stop_ns == bag.end_ns
         records = Sound(bag.decoded(feed.topics, *((None, None) if is_whole else (start_ns, stop_ns))))

@@ -6,9 +6,7 @@ import re
 from dataclasses import dataclass, field
 from itertools import islice
 
-from rotavg_ros.bags.message_types import VECTOR
 from rotavg_ros.bags.reader import BagReader
-from rotavg_ros.bags.topics import TRANSLATION_TOPIC
 from rotavg_ros.inputs import BRINGS_KEYFRAMES, EDGE_CONVERTERS, ODOMETRY_CONVERTERS, EdgeRecord, Source
 from rotavg_ros.online import EdgeMeasurement
 from rotavg_ros.online.measurements import RejectedInputError, checked_rotation
@@ -43,7 +41,6 @@ class Candidates:
         odometry: could carry a robot on from moment to moment.
         references: could be compared with; ground truth, then poses, then IMUs.
         edges: relative rotations.
-        translations: topics with the positions that belong to the edges of a simulated or converted bag.
         brings_keyframes: the edges' sender chooses the keyframes.
         why_not: by topic, why one that looks useful is not.
     """
@@ -51,7 +48,6 @@ class Candidates:
     odometry: tuple[Candidate, ...]
     references: tuple[Candidate, ...]
     edges: tuple[Candidate, ...]
-    translations: tuple[Candidate, ...]
     brings_keyframes: bool
     why_not: dict[str, str] = field(default_factory=dict)
 
@@ -63,7 +59,7 @@ def find_candidates(bag: BagReader) -> Candidates:
         BagReadError: a damaged bag.
     """
     why_not: dict[str, str] = {}
-    poses, edges, translations = [], [], []
+    poses, edges = [], []
     for topic, type_name in bag.topics.items():
         messages = bag.num_messages([topic])
         candidate = Candidate(topic, type_name, messages)
@@ -74,8 +70,6 @@ def find_candidates(bag: BagReader) -> Candidates:
                 poses.append(candidate)
         elif type_name in EDGE_CONVERTERS and messages:
             edges.append(candidate)
-        elif type_name == VECTOR and topic.endswith(TRANSLATION_TOPIC) and messages:
-            translations.append(candidate)
         if not messages:
             why_not[topic] = "no messages"
     return Candidates(
@@ -84,7 +78,6 @@ def find_candidates(bag: BagReader) -> Candidates:
             sorted((pose for pose in poses if pose.is_truth or pose.type_name != _ODOMETRY), key=_as_reference)
         ),
         edges=tuple(edges),
-        translations=tuple(translations),
         brings_keyframes=any(edge.type_name in BRINGS_KEYFRAMES or _has_odometry_edges(bag, edge) for edge in edges),
         why_not=why_not,
     )

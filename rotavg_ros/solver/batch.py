@@ -60,8 +60,9 @@ def solve_batch(
 
 
 def _union(graphs: Sequence[ViewGraph]) -> ViewGraph:
-    """All graphs side by side."""
-    columns = {f.name: [getattr(graph, f.name) for graph in graphs] for f in fields(ViewGraph) if f.name != "num_nodes"}
+    """All graphs side by side, but for translations, which the SfM profile does not read."""
+    names = [f.name for f in fields(ViewGraph) if f.name not in {"num_nodes", "translation"}]
+    columns = {name: [getattr(graph, name) for graph in graphs] for name in names}
     starts = _starts([graph.num_nodes for graph in graphs])
     for end in ("source", "target"):
         columns[end] = [column + start for column, start in zip(columns[end], starts, strict=False)]

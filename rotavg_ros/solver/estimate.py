@@ -17,7 +17,7 @@ class Estimate:
     """What a profile's solve gives: orientations in any gauge, scores, variance in rad² (NaN: unknown).
 
     ``memory`` is what makes the profile's next solve of the same graph, grown a little, cheaper; nobody else reads it.
-    ``warnings`` say why it should not be trusted, a sentence each.
+    ``warnings`` say why it should not be trusted, a sentence each. ``places`` are there where translations are known.
     """
 
     body_from_world: Tensor
@@ -25,6 +25,22 @@ class Estimate:
     variance: Tensor
     memory: object | None = None
     warnings: tuple[str, ...] = ()
+    places: Places | None = None
+
+
+@dataclass(frozen=True)
+class Places:
+    """What translations add (N nodes, M edges): positions in the orientations' frame, and each edge's rotation alone.
+
+    Attributes:
+        position: ``(N, 3)`` metres; NaN where nothing tells.
+        variance: ``(N,)`` m² per component, relative to the component's first node.
+        rotation_score: ``(M,)`` probability that an edge's rotation is wrong; its outlier score counts its place, too.
+    """
+
+    position: Tensor
+    variance: Tensor
+    rotation_score: Tensor
 
 
 @dataclass

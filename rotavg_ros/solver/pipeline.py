@@ -110,6 +110,7 @@ def solve(
         estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start), None)
     score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, estimate.outlier_score.cpu())
     score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
+    places = estimate.places
     return Solution(
         _root_at_identity(estimate.body_from_world.cpu(), job.component),
         score,
@@ -121,6 +122,9 @@ def solve(
         where,
         estimate.memory,
         (*estimate.warnings, *warnings.mostly_flagged(graph, score)),
+        None if places is None else _root_at_origin(places.position, estimate.body_from_world, job.component),
+        None if places is None else places.variance.sqrt(),
+        None if places is None else places.rotation_score,
     )
 
 
@@ -198,13 +202,23 @@ def _solve_baseline(job: _Job, name: str, run: Run) -> Estimate:
     return Estimate(orientations, score, torch.full((graph.num_nodes,), torch.nan))
 
 
+def _root_at_origin(position: Tensor, body_from_world: Tensor, component: Tensor) -> Tensor:
+    """Positions ``(N, 3)`` in the frame of each component's first node."""
+    first = _first_nodes(component)
+    return rotations.rotate(body_from_world[first][component], position - position[first][component])
+
+
+def _first_nodes(component: Tensor) -> Tensor:
+    """``(C,)`` of every component."""
+    first = torch.full((int(component.max()) + 1,), len(component))
+    return first.scatter_reduce(0, component, torch.arange(len(component)), "amin")
+
+
 def _root_at_identity(body_from_world: Tensor, component: Tensor) -> Tensor:
     """The same orientations in the gauge where the first node of every component is the identity."""
     if len(component) == 0:
         return body_from_world
-    first = torch.full((int(component.max()) + 1,), len(component))
-    first = first.scatter_reduce(0, component, torch.arange(len(component)), "amin")
-    gauge = rotations.inverse(body_from_world[first])[component]
+    gauge = rotations.inverse(body_from_world[_first_nodes(component)])[component]
     return rotations.normalize(rotations.multiply(body_from_world, gauge))
 
 

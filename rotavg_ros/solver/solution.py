@@ -15,7 +15,8 @@ class Solution:
 
     Attributes:
         body_from_world: ``(N, 4)`` float64 xyzw, w ≥ 0; the first node of every component is the identity.
-        outlier_score: ``(M,)`` float64, probability that the edge's true noise exceeds 20° (SfM) or 10° (SLAM).
+        outlier_score: ``(M,)`` float64, probability that the edge's true noise exceeds 20° (SfM) or 10° (SLAM), or,
+            where ``position`` is known, that its translation errs by more than 2 m.
         component: ``(N,)`` int64, connected component, numbered by first node.
         uncertainty: ``(N,)`` float64 radians, standard deviation of each component of the orientation error relative
             to the component's first node; NaN where the method gives none.
@@ -23,6 +24,10 @@ class Solution:
         method, profile, device: what was run, with "auto" resolved.
         memory: what makes the next solve of the same graph cheaper once it has grown a little, to be handed to it as it
             is; None if there is none.
+        position: ``(N, 3)`` float64 metres, each component's first node at the origin, in the frame of its orientation;
+            None where translations are unknown or were not used.
+        position_uncertainty: ``(N,)`` metres, standard deviation of each component; None likewise.
+        rotation_score: ``(M,)`` probability that the edge's rotation alone errs by more than 10°; None likewise.
         warnings: why it should not be trusted, a sentence each: what was seen, what may be the cause, what to do.
     """
 
@@ -36,6 +41,9 @@ class Solution:
     device: str
     memory: object | None = None
     warnings: tuple[str, ...] = ()
+    position: Tensor | None = None
+    position_uncertainty: Tensor | None = None
+    rotation_score: Tensor | None = None
 
     @property
     def world_from_body(self) -> Tensor:

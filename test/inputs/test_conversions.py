@@ -329,6 +329,8 @@ RELATIVE_ROTATIONS = st.builds(
     target=REFERENCES,
     rotation=QUATERNIONS,
     precision=NUMBERS,
+    translation=st.lists(NUMBERS, max_size=3),
+    translation_precision=NUMBERS,
     kind=st.integers(0, 4),
 )
 MESSAGES = {
@@ -377,6 +379,8 @@ def test_whatever_a_message_says_what_comes_out_is_sound(type_name: str, data) -
     assert not (graph.source == graph.target).any()
     precision = graph.precision.numpy()
     assert (np.isnan(precision) | ((precision > 0) & np.isfinite(precision))).all()
+    known = np.isfinite(graph.translation.numpy())
+    assert (known.all(axis=1) == known.any(axis=1)).all()
 
 
 def test_what_is_remembered_is_bounded(monkeypatch) -> None:

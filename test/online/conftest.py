@@ -24,6 +24,9 @@ class TreeSolution:
     device: str = "cpu"
     memory: None = None
     warnings: tuple[str, ...] = ()
+    position: None = None
+    position_uncertainty: None = None
+    rotation_score: None = None
 
 
 @dataclass

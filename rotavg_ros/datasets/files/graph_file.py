@@ -13,10 +13,11 @@ import os
 import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.view_graph import ViewGraph
@@ -65,6 +66,12 @@ class GraphFile:
     position_gt: np.ndarray | None = None
     skipped: dict[str, int] = field(default_factory=dict)
     edge_information: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        """The graph has the translations, too: a solver sees nothing else."""
+        if self.edge_translation is not None and self.graph.translation is None:
+            translation = torch.as_tensor(self.edge_translation, dtype=torch.float64)
+            object.__setattr__(self, "graph", replace(self.graph, translation=translation))
 
     @property
     def consecutive(self) -> np.ndarray:

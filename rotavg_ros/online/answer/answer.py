@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -48,6 +49,10 @@ class Answer:
         stage_seconds: of the solver's stages.
         method, profile, device: as the solver resolved them.
         warnings: why it should not be trusted, a sentence each.
+        position: ``(N, 3)`` metres in the component's gauge, its first keyframe at the origin; None where translations
+            were unknown or not used.
+        position_uncertainty: ``(N,)`` metres, one sigma of each component; None likewise.
+        rotation_score: ``(M,)`` in [0, 1], that the edge's rotation alone is wrong; None likewise.
     """
 
     version: int
@@ -76,6 +81,9 @@ class Answer:
     profile: str
     device: str
     warnings: tuple[str, ...] = ()
+    position: NDArray[np.float64] | None = None
+    position_uncertainty: NDArray[np.float64] | None = None
+    rotation_score: NDArray[np.float64] | None = None
 
     @classmethod
     def of_solution(
@@ -123,7 +131,31 @@ class Answer:
             profile=solution.profile,
             device=solution.device,
             warnings=solution.warnings,
+            position=_in_gauge(solution, body_from_world),
+            position_uncertainty=_numbers(solution.position_uncertainty),
+            rotation_score=_numbers(solution.rotation_score),
         )
+
+    @cached_property
+    def residual_deg(self) -> NDArray[np.float64]:
+        """``(M,)`` how far each edge's measured rotation is from the answer's."""
+        body_from_world = rotations.inverse(torch.from_numpy(self.world_from_body))
+        source, target = torch.from_numpy(self.source), torch.from_numpy(self.target)
+        estimated = rotations.multiply(body_from_world[target], rotations.inverse(body_from_world[source]))
+        off = rotations.angle_between(torch.from_numpy(self.target_from_source), estimated)
+        return np.asarray(torch.rad2deg(off).numpy())
+
+    @cached_property
+    def residual_m(self) -> NDArray[np.float64] | None:
+        """``(M,)`` the same of translations, metres; NaN where an edge has none. None without positions."""
+        if self.position is None:
+            return None
+        step = torch.from_numpy(self.translation)
+        turned = rotations.rotate(torch.from_numpy(self.world_from_body[self.source]), step).numpy()
+        off: NDArray[np.float64] = np.linalg.norm(
+            self.position[self.target] - self.position[self.source] - turned, axis=1
+        )
+        return off
 
     @property
     def num_components(self) -> int:
@@ -143,3 +175,18 @@ class Answer:
             name: value[:0] for name, value in vars(self).items() if isinstance(value, np.ndarray)
         }
         return replace(self, robots=(), warnings=(), **arrays)
+
+
+def _in_gauge(solution: Solution, body_from_world: Tensor) -> NDArray[np.float64] | None:
+    """Positions ``(N, 3)``, which the solution has in the frame of each component's first keyframe."""
+    if solution.position is None:
+        return None
+    component = solution.component.cpu()
+    first = torch.full((int(component.max()) + 1,), len(component))
+    first = first.scatter_reduce(0, component, torch.arange(len(component)), "amin")
+    turn = rotations.inverse(body_from_world[first])[component]
+    return np.asarray(rotations.rotate(turn, solution.position.cpu()).numpy())
+
+
+def _numbers(values: Tensor | None) -> NDArray[np.float64] | None:
+    return None if values is None else np.asarray(values.cpu().numpy())

@@ -73,7 +73,11 @@ def corrected_trajectories(answer: Answer, tracks: Mapping[str, OdometryTrack]) 
         np.where(answer.outlier, 1.0, answer.outlier_score),
         answer.steps,
     )
-    position = fit_positions(answer.world_from_body, edges, reckoned)
+    if answer.position is None:
+        position = fit_positions(answer.world_from_body, edges, reckoned)
+    else:
+        _, first = np.unique(answer.component, return_index=True)
+        position = answer.position + np.nan_to_num(reckoned[first])[answer.component]
     position = np.where(np.isnan(position), reckoned, position)
     return {
         robot: Trajectory(

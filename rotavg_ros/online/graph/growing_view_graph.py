@@ -191,6 +191,7 @@ class GrowingViewGraph:
         """The graph now. Only the labels and moments, which alone can change later, are copied."""
         columns = {name: self._edge[name].view for name in _SOLVED_COLUMNS}
         columns["label"] = columns["label"].copy()
+        columns["translation"] = self._edge["translation"].view
         return GraphSnapshot(
             graph=ViewGraph(self.num_keyframes, **{name: torch.from_numpy(values) for name, values in columns.items()}),
             robots=tuple(self.robots),

@@ -20,6 +20,7 @@ SWITCHES: dict[str, str] = {
     "annealing": "no start anneals the closures",
     "robust-start": "no start weighs odometry down as it does closures",
     "minimum-cuts": "no start turns whole parts",
+    "translations": "closures are judged by their rotations alone",
     "rivals": "the best labelling alone is published",
 }
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.estimate import Estimate, Run
+from rotavg_ros.solver.estimate import Estimate, Places, Run
 from rotavg_ros.solver.slam import refinement as slam_refinement
 from rotavg_ros.solver.slam import stages as slam_stages
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
@@ -17,6 +17,8 @@ from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.passes.alternation import Verdicts
+from rotavg_ros.solver.slam.poses.answer import Poses
+from rotavg_ros.solver.slam.poses.solve import has_places, poses_after_passes, poses_after_search
 from rotavg_ros.solver.slam.posterior.modes import publish
 from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.preparation import Prepared, prepare
@@ -32,7 +34,10 @@ def solve_slam(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
         return _solve_once(graph, stages, run)
     first, says_as = (torch.from_numpy(edges) for edges in repeats)
     estimate = _solve_once(graph.select_edges(first), stages, run)
-    return replace(estimate, outlier_score=estimate.outlier_score[says_as], memory=None)
+    places = estimate.places
+    if places is not None:
+        places = replace(places, rotation_score=places.rotation_score[says_as])
+    return replace(estimate, outlier_score=estimate.outlier_score[says_as], memory=None, places=places)
 
 
 def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
@@ -64,7 +69,11 @@ def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
             variance = closure_graph.variance(estimate.samples, estimate.stated_step_variance)
             is_default = stages == SlamStages()
             memory = SlamMemory.of(graph, prepared, cleaned, estimate, variance) if is_default else None
-            return _slam_estimate(closure_graph, estimate, variance, memory)
+        rotations_alone = _slam_estimate(closure_graph, estimate, variance, memory)
+        if not is_default or not has_places(graph):
+            return rotations_alone
+        with watch.stage("poses"):
+            return _with_poses(rotations_alone, closure_graph, poses_after_passes(graph, prepared, cleaned, estimate))
     with watch.stage("expand"):
         score = slam_stages.outlier_scores(prepared.closure_graph, 1 - cleaned.inlier_probability)
         orientations = prepared.closure_graph.orientations(correction)
@@ -85,7 +94,28 @@ def _solve_by_posterior(graph: ViewGraph, stages: SlamStages, run: Run) -> Estim
         published = publish(found.drawn.problem, found.modes)
     with run.watch.stage("expand"):
         estimate = estimate_of(published)
-        return estimate if stages.without else replace(estimate, memory=PosteriorMemory.of(graph, found, estimate))
+        if not stages.without:
+            estimate = replace(estimate, memory=PosteriorMemory.of(graph, found, estimate))
+    if "translations" in stages.without or not has_places(graph):
+        return estimate
+    with run.watch.stage("poses"):
+        return _with_poses(estimate, published.graph, poses_after_search(graph, found))
+
+
+def _with_poses(estimate: Estimate, graph: ClosureGraph, poses: Poses) -> Estimate:
+    """The estimate of rotations alone, with orientations, scores and positions by translations as well."""
+    places = Places(
+        torch.from_numpy(poses.position),
+        torch.from_numpy(poses.position_variance),
+        torch.from_numpy(slam_stages.outlier_scores(graph, poses.rotation_probability)),
+    )
+    return replace(
+        estimate,
+        body_from_world=torch.from_numpy(np.ascontiguousarray(poses.body_from_world)),
+        outlier_score=torch.from_numpy(slam_stages.outlier_scores(graph, poses.outlier_probability)),
+        variance=torch.from_numpy(poses.variance),
+        places=places,
+    )
 
 
 def _slam_estimate(

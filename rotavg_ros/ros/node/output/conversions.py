@@ -56,7 +56,14 @@ def flags_message(answer: Answer, frame_id: str) -> OutlierFlags:
         kinds=_array("B", answer.kind, np.uint8),
         scores=_array("f", answer.outlier_score, np.float32),
         outliers=answer.outlier.tolist(),
+        rotation_scores=_array("f", _or_nothing(answer.rotation_score), np.float32),
+        residuals_deg=_array("f", answer.residual_deg, np.float32),
+        residuals_m=_array("f", _or_nothing(answer.residual_m), np.float32),
     )
+
+
+def _or_nothing(values: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    return np.empty(0) if values is None else values
 
 
 def _header(answer: Answer, frame_id: str) -> Header:

@@ -20,7 +20,8 @@ _DECIMALS = 9
 def first_of_each(graph: ViewGraph) -> tuple[np.ndarray, np.ndarray] | None:
     """The edges that say something new, and which of these says the same as each edge.
 
-    Two edges say the same if they are of one kind and label, between the same nodes, and measure the same rotation.
+    Two edges say the same if they are of one kind and label, between the same nodes, and measure the same
+    rotation and translation.
     Independent measurements of a pair of nodes differ, be it by little.
 
     Returns:
@@ -36,6 +37,10 @@ def first_of_each(graph: ViewGraph) -> tuple[np.ndarray, np.ndarray] | None:
     forwards = (chosen.source < chosen.target)[:, None]
     measured = torch.where(forwards, chosen.target_from_source, rotations.inverse(chosen.target_from_source))
     said = np.column_stack((pair[parallel], chosen.kind, chosen.label, chosen.steps, measured.numpy().round(_DECIMALS)))
+    if chosen.translation is not None:
+        turned = -rotations.rotate(chosen.target_from_source, chosen.translation)
+        shift = torch.where(forwards, chosen.translation, turned)
+        said = np.column_stack((said, shift.nan_to_num().numpy().round(_DECIMALS)))
     _, first, number = np.unique(said, axis=0, return_index=True, return_inverse=True)
     says_as = np.arange(graph.num_edges)
     says_as[parallel] = parallel[first[number.reshape(-1)]]

@@ -138,7 +138,9 @@ def estimate_noise(problem: Problem, state: State, factorised: Factorised) -> No
 
     def likeliest(rows: np.ndarray, before: float, prior_deg: float) -> float:
         squares, freedom = before * float(square[rows].sum()), float(redundancy[rows].sum())
-        return _likeliest(squares, freedom, np.log(before), 2 * np.log(np.radians(prior_deg)), priors.noise_spread)
+        return likeliest_variance(
+            squares, freedom, np.log(before), 2 * np.log(np.radians(prior_deg)), priors.noise_spread
+        )
 
     return replace(
         noise,
@@ -147,8 +149,16 @@ def estimate_noise(problem: Problem, state: State, factorised: Factorised) -> No
     )
 
 
-def _likeliest(squares: float, freedom: float, log_variance: float, log_prior: float, spread: float) -> float:
-    """The variance e^x that maximises −n/2 x − S/2 e⁻ˣ − (x − prior)²/(8 spread²), by Newton's steps."""
+def likeliest_variance(squares: float, freedom: float, log_variance: float, log_prior: float, spread: float) -> float:
+    """The variance e^x that maximises −n/2 x − S/2 e⁻ˣ − (x − prior)²/(8 spread²), by Newton's steps.
+
+    Args:
+        squares: S.
+        freedom: n.
+        log_variance: x to begin with.
+        log_prior: logarithm of the median variance.
+        spread: standard deviation of the logarithm of its root.
+    """
     x = log_variance
     for _ in range(_NEWTON_STEPS):
         curved = squares / 2 * math.exp(-x)

@@ -1,0 +1,168 @@
+"""What is published where translations are known: poses of all keyframes, and how likely each closure is false."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.slam.noise.exceedance import exceedance
+from rotavg_ros.solver.slam.noise.judging import OUTLIER_ANGLE
+from rotavg_ros.solver.slam.poses.estimate import PoseMode, estimate_poses
+from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.posterior.left_out import scores
+from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.view_graph import ViewGraph
+
+# A closure whose translation errs by more than this, metres, is false.
+FALSE_METRES = 2.0
+# Rival labellings are compared by their translations if rotations make them less likely by no more nats, and so many
+# at most; and averaged if both do so.
+_RIVAL, _MAX_RIVALS, _FAR = 20.0, 5, 5.0
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Of N nodes and E edges of a closure graph.
+
+    Attributes:
+        body_from_world: ``(N, 4)`` xyzw.
+        position: ``(N, 3)`` metres, in the frame of the odometry's orientations; roots at the origin.
+        variance: ``(N,)`` rad² per component, of orientations.
+        position_variance: ``(N,)`` m² per component.
+        outlier_probability: ``(E,)`` that a closure is false, in rotation or place, or that a segment slipped.
+        rotation_probability: ``(E,)`` that its rotation is.
+        rivals: probabilities of the labellings that were averaged.
+    """
+
+    body_from_world: np.ndarray
+    position: np.ndarray
+    variance: np.ndarray
+    position_variance: np.ndarray
+    outlier_probability: np.ndarray
+    rotation_probability: np.ndarray
+    rivals: tuple[float, ...]
+
+
+def rival_poses(graph: ViewGraph, translation: np.ndarray, modes: list[Mode]) -> list[tuple[PoseMode, float]]:
+    """Poses of labellings that translations do not rule out, with their probabilities; the likeliest first.
+
+    Args:
+        graph: whose odometry was drawn together, without its bias.
+        translation: ``(M, 3)`` metres.
+        modes: the least F by rotations first.
+    """
+    rivals: list[Mode] = []
+    for mode in modes:
+        if mode.cost > modes[0].cost + _RIVAL or len(rivals) == _MAX_RIVALS:
+            break
+        if not any(mode.is_turned_like(other.state) for other in rivals):
+            rivals.append(mode)
+    problems = [PoseProblem(graph, translation, mode) for mode in rivals]
+    if len(problems) == 1:
+        return [(estimate_poses(problems[0]), 1.0)]
+    held = [estimate_poses(problem, hold=True) for problem in problems]
+    cost = np.array([rival.cost + pose.cost for rival, pose in zip(rivals, held, strict=True)])
+    order = [number for number in np.argsort(cost, kind="stable") if cost[number] <= cost.min() + _FAR]
+    share = np.exp(cost.min() - cost[order])
+    return [
+        (estimate_poses(problems[number], start=held[number]), float(each))
+        for number, each in zip(order, share / share.sum(), strict=True)
+    ]
+
+
+def answer(rivals: list[tuple[PoseMode, float]]) -> Poses:
+    """The average over rival labellings."""
+    single = [_of_mode(pose) for pose, _ in rivals]
+    share = np.array([each for _, each in rivals])
+    first = single[0]
+    base = np.ascontiguousarray(first.body_from_world.T)
+    turns = np.array(
+        [
+            quaternion_rows.log(
+                quaternion_rows.multiply(quaternion_rows.inverse(base), np.ascontiguousarray(other.body_from_world.T))
+            )
+            for other in single
+        ]
+    )
+    mean = np.tensordot(share, turns, 1)
+    shift = np.array([other.position for other in single])
+    position = np.tensordot(share, shift, 1)
+    k, m = rivals[0][0].problem.turns, rivals[0][0].problem.shifts
+
+    def mixed(name: str) -> np.ndarray:
+        return np.tensordot(share, np.array([getattr(other, name) for other in single]), 1)
+
+    return Poses(
+        quaternion_rows.normalize(quaternion_rows.multiply(base, quaternion_rows.exp(mean))).T,
+        position,
+        mixed("variance") + np.tensordot(share, ((turns - mean) ** 2).sum(axis=1), 1) / k,
+        mixed("position_variance") + np.tensordot(share, ((shift - position) ** 2).sum(axis=2), 1) / m,
+        np.clip(mixed("outlier_probability"), 0.0, 1.0),
+        np.clip(mixed("rotation_probability"), 0.0, 1.0),
+        tuple(share.tolist()),
+    )
+
+
+def _of_mode(pose: PoseMode) -> Poses:
+    """One labelling's answer."""
+    problem, drawn, k = pose.problem, pose.problem.drawn, pose.problem.turns
+    orientation, position, passed = _within_segments(pose)
+    samples = pose.solved.factor.samples[: drawn.num_nodes]
+    turns = np.moveaxis(samples[:, :k], 1, 2).reshape(drawn.num_nodes, -1)
+    variance = drawn.variance(turns, pose.state.noise.turn)
+    shifts = (samples[:, k:] ** 2).mean(axis=(1, 2))
+    between = (1 - passed) * shifts[drawn.above] + passed * shifts[drawn.below]
+    segment = problem.segment_of_node
+    length = np.where(segment >= 0, pose.solved.way.length[np.maximum(segment, 0)], 0.0)
+    between += passed * (1 - passed) * length * pose.state.noise.way
+    score, rotation = _scores(pose)
+    return Poses(np.ascontiguousarray(orientation.T), position, variance, between, score, rotation, (1.0,))
+
+
+def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """``(4, N)`` and ``(N, 3)`` poses of all nodes, and how far along its segment each lies, ``(N,)`` in metres passed.
+
+    What a segment's shift is off by bends it: of a Brownian bridge b with z = −∫ d × dε, E[b | z] = σ² G × Cov(z)⁻¹ z,
+    G the lever up to there. What is left then goes with the way passed.
+    """
+    problem, state, drawn = pose.problem, pose.state, pose.problem.drawn
+    segments, shifts = slice(drawn.num_segments), problem.bases[1]
+    orientation = problem.orientations(state)
+    inner = np.flatnonzero(problem.segment_of_node >= 0)
+    segment = problem.segment_of_node[inner]
+    way = problem.displacements(orientation)
+    ends = state.position[drawn.target[segments]] - state.position[drawn.source[segments]]
+    off = (way.displacement[segments] - ends) @ shifts
+    pulled = np.linalg.solve(pose.solved.covariance[segments], off[:, :, None])[:, :, 0] @ shifts.T
+    bent = np.zeros((3, drawn.paths.forest.parent.shape[0]))
+    turns = problem.bases[0]
+    lever = np.cross(way.lever[inner], pulled[segment])
+    bent[:, inner] = (problem.bridge_variance(state.noise)[segment, None] * lever @ turns @ turns.T).T
+    orientation = quaternion_rows.normalize(quaternion_rows.multiply(orientation, quaternion_rows.exp(bent)))
+    way = problem.displacements(orientation)
+    position = state.position[drawn.above] + way.way
+    passed = np.zeros(len(position))
+    passed[inner] = way.passed[inner] / np.maximum(way.length[segment], np.finfo(np.float64).tiny)
+    position[inner] += passed[inner, None] * (ends - way.displacement[segments])[segment]
+    return orientation, position, passed
+
+
+def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
+    """``(E,)`` each: probability that an edge is false, and that its rotation is."""
+    problem, places, mode = pose.problem, pose.solved.places, pose.problem.mode
+    predictions = pose.solved.predictions
+    closure, k = mode.problem.closure, problem.turns
+    own = problem.rotation_variance(pose.state.noise)[closure]
+    turn = np.sqrt((predictions.mean[:, :k] ** 2).sum(axis=1))
+    predicted = np.trace(predictions.covariance[:, :k, :k], axis1=1, axis2=2) / k
+    part = own / (own + predicted)
+    exceeds = exceedance(part * turn, part * predicted, OUTLIER_ANGLE, k)
+    good = places.rotation_good
+    rotation, _ = scores(mode.problem, mode.state, mode.left_out)
+    rotation[closure] = good * exceeds + (1 - good) * exceedance(turn, predicted, OUTLIER_ANGLE, k)
+    score = rotation.copy()
+    wrong = places.false(FALSE_METRES)
+    score[closure] = np.maximum(1 - (1 - exceeds) * (1 - wrong), rotation[closure])
+    return score, rotation

@@ -1,0 +1,167 @@
+"""Poses by expectation–maximisation around the joint solve.
+
+It begins with the orientations that rotations alone give and no closure's translation believed. What odometry and turns
+predict of each, lever arms included, tells which may be; a closure pulls as far as its classes' mean lets it, so that
+those near by come in first, and what they tie down judges the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.slam.poses.block_system import BlockFactor
+from rotavg_ros.solver.slam.poses.evidence import translation_cost
+from rotavg_ros.solver.slam.poses.noise import likeliest_noise
+from rotavg_ros.solver.slam.poses.places import Judge, Places, Predictions, Scale
+from rotavg_ros.solver.slam.poses.rows import PoseNoise, PoseProblem, PoseState
+from rotavg_ros.solver.slam.poses.solved import Solved
+
+_MAX_SOLVES = 24
+# A step turns nothing by more than this, rad.
+_MAX_TURN = 0.3
+# Noise goes down by no more than this factor from solve to solve; most of it stays while places are sorted out.
+_SLOWEST, _HELD = 4.0, 3
+# Noise that comes nearer by a constant factor from solve to solve, by this at most, is set to where that leads.
+_SLOWEST_GAIN = 0.85
+# At rest: turns, rad; chances of classes; logarithms of variances.
+_TURN_CONVERGED, _CHANCE_CONVERGED, _NOISE_CONVERGED = 1e-4, 0.02, 0.02
+# No two places are nearer than so many typical steps.
+_LEAST_EXTENT = 3.0
+
+
+@dataclass(frozen=True)
+class PoseMode:
+    """A labelling's poses.
+
+    Attributes:
+        problem: the graph.
+        solved: the last solve.
+        cost: −log p of translations given what rotations say, nats; where rotations' labels were held.
+    """
+
+    problem: PoseProblem
+    solved: Solved
+    cost: float
+
+    @property
+    def state(self) -> PoseState:
+        """Where the key nodes are, and the noise."""
+        return self.solved.state
+
+
+def estimate_poses(problem: PoseProblem, *, hold: bool = False, start: PoseMode | None = None) -> PoseMode:
+    """Poses of a labelling.
+
+    Args:
+        problem: the labelling, and translations.
+        hold: leave the labels of rotations as they are.
+        start: what an earlier estimate of the same came to.
+    """
+    is_good = problem.mode.state.is_good[problem.mode.problem.closure]
+    judge = Judge(problem.told, problem.turns, problem.priors, is_good if hold else None)
+    state = _begin(problem) if start is None else start.state
+    places = judge.nothing_known(is_good, _scale(problem, state)) if start is None else start.solved.places
+    change = np.zeros(4)
+    number, held = 0, _HELD if start is None else 0
+    while True:
+        solved = _solve(problem, state, places, judge)
+        # Closures that answer each other would swing: halfway, in the logarithm.
+        weight = np.sqrt(solved.places.weight * places.weight)
+        is_first = number == 0 and start is None
+        after = solved.places if is_first else replace(solved.places, weight=weight)
+        noise = likeliest_noise(problem, solved).logarithms
+        changed = np.abs(after.chance - places.chance).max(initial=0.0)
+        is_at_rest = solved.turned < _TURN_CONVERGED and changed < _CHANCE_CONVERGED
+        number += 1
+        if number == _MAX_SOLVES or (
+            number > held and is_at_rest and np.abs(noise - state.noise.logarithms).max() < _NOISE_CONVERGED
+        ):
+            break
+        places = after
+        state, change = _with_noise(solved.state, noise, change, is_held=number <= held)
+    used = problem.rotation_variance(solved.state.noise)[problem.mode.problem.closure]
+    judge = replace(judge, told=replace(judge.told, rotation_variance=used))
+    in_order = judge(solved.predictions, solved.places.chance, solved.scale, in_order=True)
+    return PoseMode(problem, solved, translation_cost(problem, solved, in_order))
+
+
+def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge) -> Solved:
+    """One Gauss–Newton step, and classes of closures by what it tells."""
+    closure, k, num_nodes = problem.mode.problem.closure, problem.turns, problem.drawn.num_nodes
+    way = problem.displacements(problem.orientations(state))
+    residual, covariance = problem.residuals(state, way), problem.shift_covariance(state, way)
+    rotation_variance = problem.rotation_variance(state.noise)
+    rotation_weight = 1 / rotation_variance
+    rotation_weight[closure] = places.rotation_weight
+    root = problem.whitening(covariance, rotation_weight, places.weight, state)
+    jacobian = np.matmul(root, problem.jacobian(way))
+    factor = problem.equations.factorise(jacobian, problem.root_weight(rotation_weight, state))
+    whitened = np.matmul(root, residual[:, :, None])
+    step = factor.fit(whitened)
+    turns, shifts = problem.bases
+    moved = np.concatenate((step[:, :k, 0] @ turns.T, step[:, k:, 0] @ shifts.T), axis=1)
+    turned = float(np.abs(moved[:num_nodes, :3]).max(initial=0.0))
+    moved /= max(1.0, turned / _MAX_TURN)
+    correction = quaternion_rows.multiply(state.correction, quaternion_rows.exp(moved[:num_nodes, :3].T))
+    state = replace(
+        state,
+        correction=quaternion_rows.normalize(correction),
+        position=state.position + moved[:num_nodes, 3:],
+        common=state.common + moved[num_nodes:],
+    )
+    left = whitened - factor.predicted(step)
+    predictions, scale = _left_out(factor, root, left, closure), _scale(problem, state)
+    judge = replace(judge, told=replace(judge.told, rotation_variance=rotation_variance[closure]))
+    judged = judge(predictions, places.chance, scale)
+    return Solved(
+        state, way, covariance, rotation_weight, places.weight, left, factor, turned, scale, predictions, judged
+    )
+
+
+def _begin(problem: PoseProblem) -> PoseState:
+    """Orientations by rotations alone, positions along odometry."""
+    mode = problem.mode
+    common = np.zeros((problem.num_runs, 6))
+    if problem.turns_share:
+        common[:, :3] = mode.state.common
+    nowhere = np.zeros((problem.drawn.num_nodes, 3))
+    state = PoseState(mode.state.correction, nowhere, common, problem.turn_noise)
+    return replace(state, position=problem.along_odometry(problem.displacements(problem.orientations(state))))
+
+
+def _scale(problem: PoseProblem, state: PoseState) -> Scale:
+    spread = float(np.var(state.position @ problem.bases[1], axis=0).mean())
+    return Scale(state.noise.closure, 2 * spread + (_LEAST_EXTENT * problem.typical) ** 2)
+
+
+def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.ndarray) -> Predictions:
+    """What all else says of some rows, by what is left of them and their leverages."""
+    leverage, root = factor.leverage[rows], root[rows]
+    inverse = np.linalg.inv(root)
+    rest = np.linalg.inv(np.eye(root.shape[1]) - leverage)
+    mean = np.matmul(inverse, np.matmul(rest, left[rows]))[:, :, 0]
+    covariance = np.matmul(inverse, np.matmul(np.matmul(rest, leverage), inverse.transpose(0, 2, 1)))
+    return Predictions(mean, (covariance + covariance.transpose(0, 2, 1)) / 2)
+
+
+def _with_noise(
+    state: PoseState, noise: np.ndarray, last: np.ndarray, *, is_held: bool
+) -> tuple[PoseState, np.ndarray]:
+    """The state with other variances, where their sequence leads (Aitken 1926), and by how much they changed.
+
+    Args:
+        state: before.
+        noise: ``(4,)`` logarithms of variances as estimated.
+        last: ``(4,)`` how they changed before; zero where that is not to be gone on from.
+        is_held: all but closures' shifts stay.
+    """
+    before = state.noise.logarithms
+    change = noise - before
+    change[:-1] *= not is_held
+    ratio = float(change @ last) / max(float(last @ last), np.finfo(np.float64).tiny)
+    is_steady = 0 < ratio < _SLOWEST_GAIN
+    reached = before + np.maximum(change / (1 - ratio) if is_steady else change, -np.log(_SLOWEST))
+    return replace(state, noise=PoseNoise.of(reached)), np.zeros(4) if is_steady else change

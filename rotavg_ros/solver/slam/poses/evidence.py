@@ -1,0 +1,75 @@
+"""How likely a labelling of rotations makes the translations, in nats: what rival labellings are compared by."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rotavg_ros.solver.slam.poses.noise import log_noise_prior
+from rotavg_ros.solver.slam.poses.places import Places
+from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.solved import Solved
+
+
+def translation_cost(problem: PoseProblem, solved: Solved, in_order: Places) -> float:
+    """−log p of all translations, given rotations and their labels.
+
+    That of the normal densities that stand for all rows, poses integrated out, and by how much more each closure's own
+    density makes of what all else says (as :mod:`rotavg_ros.solver.slam.posterior.objective` has it for rotations);
+    less the same of rotations alone.
+
+    Args:
+        problem: the labelling.
+        solved: at rest, rotations' labels held.
+        in_order: classes of closures given those before alone.
+    """
+    gained = in_order.log_density - _as_normal(problem, solved) - _gained_by_rotations(problem)
+    believed = log_noise_prior(problem, solved.state.noise) - log_noise_prior(problem, problem.turn_noise)
+    return _normal(problem, solved) - _normal_of_rotations(problem) - float(gained.sum()) - believed
+
+
+def _normal(problem: PoseProblem, solved: Solved) -> float:
+    """−log evidence of the normal densities, but for what both have in common."""
+    k, m, drawn = problem.turns, problem.shifts, problem.drawn
+    odometry = np.flatnonzero(drawn.is_odometry)
+    cost = float((solved.left**2).sum() + solved.factor.log_det) / 2
+    cost += float(np.linalg.slogdet(solved.covariance[odometry])[1].sum()) / 2
+    cost -= (float(np.log(solved.closure_weight).sum()) * m + float(np.log(solved.rotation_weight).sum()) * k) / 2
+    cost += m / 2 * problem.num_runs * float(np.log(problem.priors.common * solved.state.noise.closure))
+    if not problem.turns_share:
+        cost += k / 2 * problem.num_runs * float(np.log(problem.common_turn(solved.state.noise)))
+    # Rows less unknowns, per component of a shift.
+    redundant = len(drawn.source) - drawn.num_nodes + len(drawn.roots)
+    return cost + m / 2 * redundant * float(np.log(2 * np.pi))
+
+
+def _normal_of_rotations(problem: PoseProblem) -> float:
+    """The same of rotations alone, at the labelling's optimum."""
+    evaluation, k = problem.mode.evaluation, problem.turns
+    weight = evaluation.weight[:, None]
+    cost = float((weight * evaluation.residual**2).sum() + k * evaluation.factorised.log_det) / 2
+    return cost - k / 2 * float(np.log(evaluation.weight[: len(problem.drawn.source)]).sum())
+
+
+def _as_normal(problem: PoseProblem, solved: Solved) -> np.ndarray:
+    """``(C,)`` nats, what the densities that stand for closures make of what all else says."""
+    k, m, closure = problem.turns, problem.shifts, problem.mode.problem.closure
+    total = solved.predictions.covariance.copy()
+    total[:, :k, :k] += (1 / solved.rotation_weight[closure])[:, None, None] * np.eye(k)
+    total[:, k:, k:] += (1 / solved.closure_weight)[:, None, None] * np.eye(m)
+    mean = solved.predictions.mean
+    square = (mean * np.linalg.solve(total, mean[:, :, None])[:, :, 0]).sum(axis=1)
+    return np.asarray(-(square + np.linalg.slogdet(total)[1] + (k + m) * np.log(2 * np.pi)) / 2)
+
+
+def _gained_by_rotations(problem: PoseProblem) -> np.ndarray:
+    """``(C,)`` nats, by how much more closures' own densities make of what rotations alone say."""
+    k, closure, left_out = problem.turns, problem.mode.problem.closure, problem.mode.left_out
+    square, predicted = left_out.square[closure], left_out.predicted[closure]
+
+    def log_normal(variance: np.ndarray) -> np.ndarray:
+        return np.asarray(-(square / variance + k * np.log(2 * np.pi * variance)) / 2)
+
+    is_good = problem.mode.state.is_good[closure]
+    own = log_normal(problem.rotation_variance(problem.turn_noise)[closure] + predicted)
+    stands = log_normal(1 / problem.mode.evaluation.weight[closure] + predicted)
+    return np.asarray(np.where(is_good, own, problem.told.false_odds) - stands)

@@ -1,0 +1,60 @@
+"""How far odometry and closures err, by the redundancy that residuals leave (restricted maximum likelihood)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rotavg_ros.solver.slam.poses.rows import PoseNoise, PoseProblem
+from rotavg_ros.solver.slam.poses.solved import Solved
+from rotavg_ros.solver.slam.posterior.em import likeliest_variance
+
+# Each variance's own prior: median and standard deviation of the logarithm of its root.
+_Prior = tuple[float, float]
+
+
+def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
+    """All variances, each from its part of what is left over (Harville 1977), under their priors."""
+    noise, places = solved.state.noise, solved.places
+    k, segments = problem.turns, np.flatnonzero(~problem.slipped)
+    leverage = solved.factor.leverage[segments]
+    inverse = np.linalg.inv(solved.covariance[segments])
+    half = np.linalg.cholesky(inverse)
+    pulled = np.matmul(half, solved.left[segments, k:])
+    told = np.matmul(half, np.matmul(leverage[:, k:, k:], half.transpose(0, 2, 1)))
+
+    def by_shifts(own: np.ndarray) -> np.ndarray:
+        """``(2,)`` squares and freedom of a part ``(S, m, m)`` m² of segments' covariance."""
+        squares = np.matmul(pulled.transpose(0, 2, 1), np.matmul(own, pulled)).sum()
+        return np.array([squares, np.trace(np.matmul(own, inverse - told), axis1=1, axis2=2).sum()])
+
+    unit = np.eye(problem.shifts)
+    by_way = by_shifts(noise.way * solved.way.length[segments, None, None] * unit)
+    by_turns = by_shifts(noise.turn * problem.bent(solved.way)[segments])
+    redundant = k * len(segments) - np.trace(leverage[:, :k, :k], axis1=1, axis2=2).sum()
+    by_turns += np.array([(solved.left[segments, :k] ** 2).sum(), redundant])
+    by_closures = np.stack((places.squares, places.freedom), axis=1)
+    found = (by_turns, by_closures[0], by_way, by_closures[1])
+    logarithms = [
+        likeliest_variance(before * squares, max(freedom, 0.0), np.log(before), median, spread)
+        for (squares, freedom), before, (median, spread) in zip(
+            found, np.exp(noise.logarithms).tolist(), priors_of(problem), strict=True
+        )
+    ]
+    return PoseNoise.of(np.log(logarithms))
+
+
+def log_noise_prior(problem: PoseProblem, noise: PoseNoise) -> float:
+    """Of all variances, nats, but for a constant."""
+    median, spread = np.array(priors_of(problem)).T
+    return -float(((noise.logarithms - median) ** 2 / (8 * spread**2)).sum())
+
+
+def priors_of(problem: PoseProblem) -> tuple[_Prior, _Prior, _Prior, _Prior]:
+    """Logarithms of median variances, and how far those of their roots spread."""
+    of_turns, of_shifts, typical = problem.mode.problem.priors, problem.priors, problem.typical
+    return (
+        (2 * float(np.log(np.radians(of_turns.step_deg))), of_turns.noise_spread),
+        (2 * float(np.log(np.radians(of_turns.closure_deg))), of_turns.noise_spread),
+        (float(np.log(of_shifts.step**2 * typical)), of_shifts.step_spread),
+        (2 * float(np.log(of_shifts.closure * typical)), of_shifts.closure_spread),
+    )

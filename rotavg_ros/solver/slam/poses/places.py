@@ -1,0 +1,303 @@
+"""How a closure's translation errs: well, in tails, or because it joins wrong places; and whether its rotation does.
+
+All of these are one mixture of normal densities of one error ε. What everything else says of a closure's residual,
+N(μ, P) in k turns and m shifts together, gives each class its chance, and the weight with which the closure pulls.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from rotavg_ros.solver.slam.noise.exceedance import exceedance
+from rotavg_ros.solver.slam.poses.priors import PlacePriors
+
+# Classes of good closures, and of those of wrong places of their own; one more repeats another's.
+_GOOD, _WRONG = 2, 6
+_ELSEWHERE = _WRONG + 1
+# In which errors are longer than a limit: in a plane, too, where that is a little too often.
+_DIMENSIONS = 3
+# What pulls least, of a good closure's weight: nothing, but the system stays solvable.
+_NOTHING = 1e-8
+_LOG_NOTHING = -1e6
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """What all else says of C closures' residuals.
+
+    Attributes:
+        mean: ``(C, k + m)`` μ, rad and metres.
+        covariance: ``(C, k + m, k + m)`` P.
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+
+
+@dataclass(frozen=True)
+class Told:
+    """What rotations alone say of C closures.
+
+    Attributes:
+        rotation_variance: ``(C,)`` rad² per component, of a good one's turn.
+        false_odds: ``(C,)`` nats: density of the turn if it is false, and how likely that is beforehand.
+        is_known: ``(C,)`` bool, whether a translation is stated.
+        label: ``(C,)`` +1 if somebody has accepted it, −1 if rejected, 0 else.
+        run: ``(C,)`` number of its run.
+        own_share: ``(C,)`` share of its error's variance that it does not share with its run.
+        follows: ``(C,)`` the closure before each, or -1.
+    """
+
+    rotation_variance: np.ndarray
+    false_odds: np.ndarray
+    is_known: np.ndarray
+    label: np.ndarray
+    run: np.ndarray
+    own_share: np.ndarray
+    follows: np.ndarray
+
+
+@dataclass(frozen=True)
+class Places:
+    """Of C closures and J classes of translations (good ones first).
+
+    Attributes:
+        chance: ``(J + 1, C)`` of each class; the last is a false rotation.
+        weight: ``(C,)`` m⁻², with which each translation pulls.
+        rotation_weight: ``(C,)`` rad⁻², likewise.
+        squares, freedom: ``(2,)`` sums over good closures for the variances of their turns and translations, in those.
+        log_density: ``(C,)`` nats, of each with its classes summed over.
+        error, error_variance: ``(J, C)`` m and m² per component, of ε in each class: length of its mean, and variance.
+    """
+
+    chance: np.ndarray
+    weight: np.ndarray
+    rotation_weight: np.ndarray
+    squares: np.ndarray
+    freedom: np.ndarray
+    log_density: np.ndarray
+    error: np.ndarray
+    error_variance: np.ndarray
+
+    @property
+    def rotation_good(self) -> np.ndarray:
+        """``(C,)`` probability that a closure's rotation is no false one."""
+        return np.asarray(1 - self.chance[-1])
+
+    def false(self, metres: float) -> np.ndarray:
+        """``(C,)`` probability that the rotation is false or the translation errs by more than some metres."""
+        beyond = [
+            exceedance(length, variance, metres, _DIMENSIONS)
+            for length, variance in zip(self.error, self.error_variance, strict=True)
+        ]
+        return np.asarray(self.chance[-1] + (self.chance[:-1] * np.array(beyond)).sum(axis=0))
+
+
+@dataclass(frozen=True)
+class Scale:
+    """m² per component: how far a good closure errs, and how far two places of the map are apart."""
+
+    closure: float
+    extent: float
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Tells the classes of all closures by what all else says of them.
+
+    Attributes:
+        told: what rotations alone say.
+        turns: k.
+        priors: of places.
+        held: ``(C,)`` bool, which rotations are good; None: by their densities.
+    """
+
+    told: Told
+    turns: int
+    priors: PlacePriors
+    held: np.ndarray | None = None
+
+    def __call__(self, predictions: Predictions, before: np.ndarray, scale: Scale, *, in_order: bool = False) -> Places:
+        """Classes under one choice of noise.
+
+        Args:
+            predictions: what all else says.
+            before: ``(J + 1, C)`` chances as they were, for how common wrong places are.
+            scale: of errors.
+            in_order: given the closures before alone, so that densities multiply to that of all; else given all others.
+        """
+        k, told, known = self.turns, self.told, self.told.is_known
+        seen_alike = told.rotation_variance + np.radians(self.priors.turned_deg) ** 2
+        here = _given_turn(predictions, told.rotation_variance, k)
+        elsewhere = _given_turn(predictions, seen_alike, k)
+        spread = np.stack([here.spread] * _GOOD + [elsewhere.spread] * _ELSEWHERE)
+        along = np.stack([here.along] * _GOOD + [elsewhere.along] * _ELSEWHERE)
+        log_turn = np.stack([here.log_turn] * _GOOD + [elsewhere.log_turn] * _ELSEWHERE)
+        variance = self._variances(scale)
+        total = spread + variance[:, :, None]
+        log_shift = -(along**2 / total + np.log(2 * np.pi * total)).sum(axis=2) / 2
+        log_shift[-1] = _log_repeated(predictions.mean[:, k:], before, told, scale.closure, in_order)
+        log_false = told.false_odds + np.where(known, self._log_unrelated(predictions, scale, log_shift[-1]), 0.0)
+        # A closure without a translation may be any class, which says nothing.
+        log_class = np.where(known, log_shift + self._log_classes(before), -np.log(_GOOD + _ELSEWHERE))
+        log_all = self._as_labelled(np.concatenate((log_turn + log_class, log_false[None])))
+        log_density = logsumexp(log_all, axis=0)
+        chance = np.exp(log_all - log_density)
+
+        each = chance[:-1, :, None]
+        pull = (each / total).mean(axis=2).sum(axis=0)
+        shrunk = (each * variance[:, :, None] / total).mean(axis=2).sum(axis=0) + chance[-1]
+        right, alike = chance[:_GOOD].sum(axis=0), chance[_GOOD:-1].sum(axis=0)
+        p = np.trace(predictions.covariance[:, :k, :k], axis1=1, axis2=2) / k
+        turn_pull = right / (told.rotation_variance + p) + alike / (seen_alike + p)
+        turn_shrunk = right / (1 + p / told.rotation_variance) + alike / (1 + p / seen_alike) + chance[-1]
+        square, turn_total = (predictions.mean[:, :k] ** 2).sum(axis=1), told.rotation_variance + p
+        turn_squares = right * square * told.rotation_variance / turn_total**2
+        turn_freedom = right * k * told.rotation_variance / turn_total
+        good, at_good = slice(_GOOD), each[:_GOOD] * known[:, None]
+        own = variance[good, :, None]
+        return Places(
+            chance,
+            np.maximum(np.where(known, pull / shrunk, 0.0), _NOTHING / scale.closure),
+            np.maximum(turn_pull / turn_shrunk, _NOTHING / told.rotation_variance),
+            np.array([turn_squares.sum(), (at_good * own * along[good] ** 2 / total[good] ** 2).sum()]),
+            np.array([turn_freedom.sum(), (at_good * own / total[good]).sum()]),
+            log_density,
+            np.sqrt(((variance[:, :, None] * along / total) ** 2).sum(axis=2)),
+            (variance[:, :, None] * spread / total).mean(axis=2),
+        )
+
+    def nothing_known(self, is_good: np.ndarray, scale: Scale) -> Places:
+        """Before any solve: no translation pulls, and rotations do as labelled ``(C,)``."""
+        count = len(is_good)
+        chance = np.zeros((_GOOD + _ELSEWHERE + 1, count))
+        chance[-1] = ~is_good
+        none = np.zeros((_GOOD + _ELSEWHERE, count))
+        turn = np.where(is_good, 1.0, _NOTHING) / self.told.rotation_variance
+        return Places(
+            chance,
+            np.full(count, _NOTHING / scale.closure),
+            turn,
+            np.zeros(2),
+            np.zeros(2),
+            np.zeros(count),
+            none,
+            none,
+        )
+
+    def _variances(self, scale: Scale) -> np.ndarray:
+        """``(J, C)`` m² per component, of ε in each class."""
+        good = scale.closure * self.told.own_share * np.array([[1.0], [self.priors.tail_ratio]])
+        wrong = np.append(self._wrong(scale), scale.extent)
+        return np.concatenate((good, np.broadcast_to(wrong[:, None], (_ELSEWHERE, good.shape[1]))))
+
+    def _wrong(self, scale: Scale) -> np.ndarray:
+        """m², from the least that a wrong place is off by to the map's extent."""
+        return np.geomspace(min(self.priors.least_wrong**2 * scale.closure, scale.extent), scale.extent, _WRONG)
+
+    def _log_classes(self, before: np.ndarray) -> np.ndarray:
+        """``(J, C)`` nats, of each class if the rotation is no false one."""
+        priors, share = self.priors, _wrong_share(before, self.told, self.priors)
+        right, wrong = np.log1p(-share), np.log(share)
+        by_itself = wrong + np.log1p(-priors.repeats) - np.log(_WRONG)
+        return np.stack(
+            (
+                right + np.log1p(-priors.tails),
+                right + np.log(priors.tails),
+                *[by_itself] * _WRONG,
+                wrong + np.log(priors.repeats),
+            )
+        )
+
+    def _log_unrelated(self, predictions: Predictions, scale: Scale, log_repeated: np.ndarray) -> np.ndarray:
+        """``(C,)`` nats, of shifts of closures whose rotation is false: wrong places whatever the turn."""
+        k, repeats = self.turns, self.priors.repeats
+        spread, axes = np.linalg.eigh(predictions.covariance[:, k:, k:])
+        along = np.matmul(axes.transpose(0, 2, 1), predictions.mean[:, k:, None])[:, :, 0]
+        total = np.maximum(spread, 0.0) + self._wrong(scale)[:, None, None]
+        log_each = -(along**2 / total + np.log(2 * np.pi * total)).sum(axis=2) / 2
+        log_alone = logsumexp(log_each, axis=0) - np.log(_WRONG)
+        return np.asarray(np.logaddexp(log_alone + np.log1p(-repeats), log_repeated + np.log(repeats)))
+
+    def _as_labelled(self, log_all: np.ndarray) -> np.ndarray:
+        """Without the classes that somebody's label, or that of rotations, rules out."""
+        accepted = self.told.label > 0
+        is_good = accepted if self.held is None else self.held
+        is_false = self.told.label < 0 if self.held is None else ~self.held
+        log_all[-1, is_good] = _LOG_NOTHING
+        log_all[:-1, is_false] = _LOG_NOTHING
+        log_all[_GOOD:, accepted & self.told.is_known] = _LOG_NOTHING
+        return log_all
+
+
+@dataclass(frozen=True)
+class _GivenTurn:
+    """What all else and a closure's turn say of its shift, along axes of their own.
+
+    Attributes:
+        log_turn: ``(C,)`` nats, of the turn.
+        along: ``(C, m)`` metres, mean.
+        spread: ``(C, m)`` m², variance.
+    """
+
+    log_turn: np.ndarray
+    along: np.ndarray
+    spread: np.ndarray
+
+
+def _given_turn(predictions: Predictions, variance: np.ndarray, turns: int) -> _GivenTurn:
+    """With the variance ``(C,)`` of the turn's own noise, rad²."""
+    k, mean, covariance = turns, predictions.mean, predictions.covariance
+    turn = covariance[:, :k, :k] + variance[:, None, None] * np.eye(k)
+    gain = np.linalg.solve(turn, covariance[:, :k, k:]).transpose(0, 2, 1)
+    log_turn = -(mean[:, :k] * np.linalg.solve(turn, mean[:, :k, None])[:, :, 0]).sum(axis=1) / 2
+    log_turn -= np.linalg.slogdet(turn)[1] / 2 + k / 2 * np.log(2 * np.pi)
+    given = mean[:, k:] - np.matmul(gain, mean[:, :k, None])[:, :, 0]
+    spread, axes = np.linalg.eigh(covariance[:, k:, k:] - np.matmul(gain, covariance[:, :k, k:]))
+    return _GivenTurn(log_turn, np.matmul(axes.transpose(0, 2, 1), given[:, :, None])[:, :, 0], np.maximum(spread, 0.0))
+
+
+def _wrong_share(before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndarray:
+    """``(C,)`` how likely each is to join wrong places, by all others and by its run most (Beta, Bernoulli)."""
+    wrong = before[_GOOD:-1].sum(axis=0) * told.is_known
+    any_one = (1 - before[-1]) * told.is_known
+    overall = (wrong.sum() + priors.wrong_place) / (any_one.sum() + priors.counted)
+    in_run, of_run = np.bincount(told.run, wrong)[told.run] - wrong, np.bincount(told.run, any_one)[told.run] - any_one
+    return np.asarray(np.clip((overall + in_run) / (1 + of_run), _SHARE, 1 - _SHARE))
+
+
+def _log_repeated(
+    mean: np.ndarray, before: np.ndarray, told: Told, closure_variance: float, in_order: bool
+) -> np.ndarray:
+    """``(C,)`` nats, density of each closure's shift if it joins the same wrong place as the one before or after.
+
+    Args:
+        mean: ``(C, m)`` metres, what each is off by.
+        before: ``(J + 1, C)`` chances of classes.
+        told: which follows which.
+        closure_variance: m² per component, of good closures: of the difference of two, twice that.
+        in_order: of the one before alone.
+    """
+    later = np.flatnonzero((told.follows >= 0) & told.is_known & told.is_known[told.follows])
+    earlier = told.follows[later]
+    wrong = before[_GOOD:].sum(axis=0)
+    square = ((mean[later] - mean[earlier]) ** 2).sum(axis=1)
+    variance = 2 * closure_variance * _KERNELS[:, None]
+    density = np.exp(-square / (2 * variance)) / (2 * np.pi * variance) ** (mean.shape[1] / 2)
+    density = density.mean(axis=0)
+    count = len(mean)
+    total = np.bincount(later, density * wrong[earlier], count)
+    neighbours = np.bincount(later, minlength=count)
+    if not in_order:
+        total = total + np.bincount(earlier, density * wrong[later], count)
+        neighbours = neighbours + np.bincount(earlier, minlength=count)
+    return np.asarray(np.log(np.maximum(total / np.maximum(neighbours, 1), _LEAST_DENSITY)))
+
+
+# Squared widths of what repeats differ by, in those of two good closures; the least density that counts.
+_KERNELS, _LEAST_DENSITY = np.array([1.0, 16.0]), 1e-300
+# No share is less than this, or nearer to one.
+_SHARE = 0.01

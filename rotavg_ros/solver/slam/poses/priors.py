@@ -1,0 +1,44 @@
+"""What is believed of translations before a graph is seen, in one frozen class; beside ``posterior/priors.py``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class PlacePriors:
+    """Lengths are in typical steps of odometry, the median of those that go anywhere, so that no unit matters.
+
+    Attributes:
+        step: median of the standard deviation of where one typical step of odometry ends, per component; its variance
+            grows with the way passed.
+        step_spread: standard deviation of its logarithm: small, since odometry that may err by anything makes room for
+            every false closure.
+        closure: median of the standard deviation of a good closure's translation, …
+        closure_spread: … and that of its logarithm.
+        slip: standard deviation of how far a step is off by where it slipped, beside what its turn bends.
+        common: share of a closure's variance that it has in common with those near it.
+        tails: share of good closures whose translation errs by far more than others', …
+        tail_ratio: … by so many times the variance.
+        turned_deg: standard deviation of how much another place that looks alike is seen turned.
+        wrong_place: closures of a plausible rotation that join wrong places: a priori that many in as many as are
+            counted beforehand, …
+        counted: … in all, and within one run.
+        repeats: share of wrong places that repeat the one of the closure before or after, where there is one.
+        least_wrong: a wrong place is off by so many standard deviations of a good closure at least, and by the map's
+            extent at most; all scales between are as likely.
+    """
+
+    step: float = 0.05
+    step_spread: float = 0.7
+    closure: float = 1.0
+    closure_spread: float = 1.0
+    slip: float = 3.0
+    common: float = 0.5
+    tails: float = 0.1
+    tail_ratio: float = 16.0
+    turned_deg: float = 5.0
+    wrong_place: float = 0.5
+    counted: float = 3.0
+    repeats: float = 0.5
+    least_wrong: float = 4.0

@@ -1,0 +1,328 @@
+"""The rows of the joint system: residuals of turns and shifts, what they depend on, and how far each errs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
+from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
+from rotavg_ros.solver.slam.poses.block_system import BlockEquations
+from rotavg_ros.solver.slam.poses.displacements import Displacements, typical_length
+from rotavg_ros.solver.slam.poses.places import Told
+from rotavg_ros.solver.slam.poses.priors import PlacePriors
+from rotavg_ros.solver.slam.posterior.densities import log_good
+from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.solver.slam.posterior.rows import tails, variances
+from rotavg_ros.solver.slam.posterior.state import RUN_STEPS
+from rotavg_ros.solver.slam.posterior.system import NormalEquations
+from rotavg_ros.view_graph import ViewGraph
+
+# Shifts off the plane of motion by less than this share of the longest are none.
+_PLANAR = 1e-6
+# A segment in which nothing moves errs by this share of a typical step at least.
+_LEAST_LENGTH = 1e-3
+# The share of an error that is not shared; the system stays solvable.
+_NONE = 1e-6
+# Roots are tied down so many times more stiffly than any row.
+_GROUNDING = 1e6
+
+
+@dataclass(frozen=True)
+class PoseNoise:
+    """Variances per component.
+
+    Attributes:
+        turn: rad², of one step of odometry.
+        closure_turn: rad², of a good closure that states what is typical.
+        way: m² per metre passed, of odometry.
+        closure: m², of a good closure's translation.
+    """
+
+    turn: float
+    closure_turn: float
+    way: float
+    closure: float
+
+    @property
+    def logarithms(self) -> np.ndarray:
+        """``(4,)``."""
+        return np.log([self.turn, self.closure_turn, self.way, self.closure])
+
+    @classmethod
+    def of(cls, logarithms: np.ndarray) -> PoseNoise:
+        """From ``(4,)``."""
+        return cls(*np.exp(logarithms).tolist())
+
+
+@dataclass(frozen=True)
+class PoseState:
+    """Of K key nodes and R runs; d = k + m unknowns each.
+
+    Attributes:
+        correction: ``(4, K)`` C, world-frame corrections of the odometry's orientations.
+        position: ``(K, 3)`` metres.
+        common: ``(R, 6)`` common errors of runs: rad, metres.
+        noise: how far everything errs.
+    """
+
+    correction: np.ndarray
+    position: np.ndarray
+    common: np.ndarray
+    noise: PoseNoise
+
+
+@dataclass(frozen=True)
+class PoseProblem:
+    """A labelling of a robot's graph, with translations (E edges: S segments first; C closures).
+
+    Attributes:
+        graph: the view-graph whose odometry was drawn together, N nodes and M edges.
+        translation: ``(M, 3)`` position of the target in the source's frame, metres; NaN where unknown, of closures.
+        mode: what rotations alone make of it.
+        priors: of translations.
+    """
+
+    graph: ViewGraph
+    translation: np.ndarray
+    mode: Mode
+    priors: PlacePriors = field(default_factory=PlacePriors)
+
+    @cached_property
+    def drawn(self) -> ClosureGraph:
+        """Nodes lie along segments as odometry's variance does."""
+        return self.mode.problem.drawn(self.mode.state.noise)
+
+    @cached_property
+    def lengths(self) -> np.ndarray:
+        """``(M, 3)`` translations, 0 where unknown."""
+        return np.asarray(np.nan_to_num(self.translation))
+
+    @cached_property
+    def typical(self) -> float:
+        """Metres, of a step of odometry."""
+        return typical_length(self.graph, self.lengths)
+
+    @cached_property
+    def bases(self) -> tuple[np.ndarray, np.ndarray]:
+        """``(3, k)`` axes of turns and ``(3, m)`` of shifts: one and two where all motion is in a plane, else three."""
+        if self.mode.problem.components == 3:
+            return np.eye(3), np.eye(3)
+        vectors = rotations.log(self.graph.target_from_source).numpy()
+        axes = np.linalg.eigh(vectors.T @ vectors)[1]
+        off = np.abs(self.lengths @ axes[:, 2]).max(initial=0.0)
+        is_planar = off <= _PLANAR * np.abs(self.lengths).max(initial=0.0)
+        return axes[:, 2:], axes[:, :2] if is_planar else np.eye(3)
+
+    @property
+    def turns(self) -> int:
+        """How many components a turn has, k."""
+        return int(self.bases[0].shape[1])
+
+    @property
+    def shifts(self) -> int:
+        """How many components a shift has, m."""
+        return int(self.bases[1].shape[1])
+
+    @cached_property
+    def own(self) -> np.ndarray:
+        """``(E,)`` rad², of the noise of each turn."""
+        return variances(self.mode.problem, self.mode.state.noise)[: len(self.drawn.source)]
+
+    @cached_property
+    def runs(self) -> NormalEquations:
+        """Which closures err alike: translations always do, for as long as turns if these do."""
+        noise = self.mode.state.noise
+        return self.mode.problem.system(noise if noise.run_steps > 0 else replace(noise, run_steps=RUN_STEPS[-1]))
+
+    @property
+    def turns_share(self) -> bool:
+        """Whether turns of closures that are near each other err alike."""
+        return self.mode.state.noise.run_steps > 0
+
+    @cached_property
+    def run(self) -> np.ndarray:
+        """``(E,)`` number of the run whose error each edge shares, or -1."""
+        return np.where(self.runs.shared, self.runs.run, -1)
+
+    @cached_property
+    def sign(self) -> np.ndarray:
+        """``(E,)`` the direction in which each has it, 0 without."""
+        return np.where(self.run >= 0, self.runs.sign, 0.0)
+
+    @property
+    def num_runs(self) -> int:
+        return self.runs.num_runs
+
+    def common_turn(self, noise: PoseNoise) -> float:
+        """rad², variance of the turn that a run has in common; next to none where turns err by themselves."""
+        return noise.closure_turn * (self.mode.state.noise.common_share if self.turns_share else _NONE)
+
+    @cached_property
+    def turn_noise(self) -> PoseNoise:
+        """Turns' as rotations alone have it, shifts' as it is believed to be."""
+        noise, priors, typical = self.mode.state.noise, self.priors, self.typical
+        way, closure = priors.step**2 * typical, (priors.closure * typical) ** 2
+        return PoseNoise(noise.step_variance, noise.closure_variance, way, closure)
+
+    @cached_property
+    def slipped(self) -> np.ndarray:
+        """``(S,)`` bool, segments that slipped."""
+        return np.asarray(~self.mode.state.is_good[: self.drawn.num_segments])
+
+    def rotation_variance(self, noise: PoseNoise) -> np.ndarray:
+        """``(E,)`` rad², of odometry as labelled and of closures as good ones, tails as the last solve weighed them."""
+        state, priors, is_odometry = self.mode.state, self.mode.problem.priors, self.drawn.is_odometry
+        turn, closure = noise.turn / state.noise.step_variance, noise.closure_turn / state.noise.closure_variance
+        own = self.own * np.where(is_odometry, turn, closure)
+        slip = np.radians(priors.slip_deg) ** 2
+        return np.asarray(np.where(is_odometry & ~state.is_good, own + slip, own / state.others.relative))
+
+    def bridge_variance(self, noise: PoseNoise) -> np.ndarray:
+        """``(S,)`` rad² a step, within segments; one that slipped did so anywhere."""
+        slip = np.radians(self.mode.problem.priors.slip_deg) ** 2
+        steps = np.maximum(self.steps, 1.0)
+        return np.asarray(noise.turn + np.where(self.slipped, slip / steps, 0.0))
+
+    @cached_property
+    def segment_of_node(self) -> np.ndarray:
+        """``(N,)`` the segment within which each node lies; -1 of key nodes."""
+        drawn = self.drawn
+        inner = np.flatnonzero(drawn.paths.hangs_on_odometry & (drawn.above != drawn.below))
+        segment = np.full(self.graph.num_nodes, -1)
+        segment[inner] = drawn.segment_of_edge[drawn.paths.forest.parent_edge[inner]]
+        return segment
+
+    @cached_property
+    def steps(self) -> np.ndarray:
+        """``(S,)`` variance of each segment's turn in that of one step."""
+        return self.own[: self.drawn.num_segments] / self.mode.state.noise.step_variance
+
+    @cached_property
+    def told(self) -> Told:
+        """What rotations alone say of closures."""
+        problem, state, left_out = self.mode.problem, self.mode.state, self.mode.left_out
+        closure, k = problem.closure, problem.components
+        tailed = tails(problem, state.noise)[closure]
+        square, predicted = left_out.square[closure], left_out.predicted[closure]
+        good, _ = log_good(square, self.own[closure], predicted, k, tailed, problem.priors.tail_ratio)
+        odds = problem.log_odds[closure]
+        label = np.where(np.isinf(odds), np.sign(odds), 0.0)
+        with np.errstate(invalid="ignore"):
+            false_odds = np.where(label == 0, good - left_out.log_odds[closure], 0.0)
+        known = np.isfinite(self.translation).all(axis=1)
+        is_known = known[self.drawn.view_graph_edge[closure - self.drawn.num_segments]]
+        shared = np.where(self.run[closure] >= 0, self.priors.common, 0.0)
+        own = self.rotation_variance(self.turn_noise)[closure]
+        return Told(own, false_odds, is_known, label, problem.run, 1 - shared, problem.follows)
+
+    @cached_property
+    def equations(self) -> BlockEquations:
+        """The pattern of the joint system."""
+        drawn = self.drawn
+        ends = np.stack((drawn.source, drawn.target), axis=1)
+        return BlockEquations(self.turns + self.shifts, drawn.num_nodes, ends, self.run, drawn.roots)
+
+    def orientations(self, state: PoseState) -> np.ndarray:
+        """``(4, N)`` body_from_world of all nodes."""
+        correction = torch.from_numpy(np.ascontiguousarray(state.correction.T))
+        return np.ascontiguousarray(self.drawn.orientations(correction).numpy().T)
+
+    def displacements(self, body_from_world: np.ndarray) -> Displacements:
+        """At orientations ``(4, N)``."""
+        return Displacements.of(self.graph, self.lengths, self.drawn, self.steps, body_from_world)
+
+    def along_odometry(self, way: Displacements) -> np.ndarray:
+        """``(K, 3)`` metres, positions of the key nodes by odometry's displacements from its roots on."""
+        drawn = self.drawn
+        forest = drawn.paths.forest
+        step = np.zeros((self.graph.num_nodes, 3))
+        segments = slice(drawn.num_segments)
+        step[drawn.nodes[drawn.target[segments]]] = way.displacement[segments]
+        from_root = [accumulate_to_root(forest, column) for column in step.T]
+        return np.asarray(np.stack(from_root, axis=1)[drawn.nodes])
+
+    def residuals(self, state: PoseState, way: Displacements) -> np.ndarray:
+        """``(E + R, k + m)`` measured less predicted."""
+        drawn, (turns, shifts) = self.drawn, self.bases
+        measured = self.mode.problem.measured
+        turn = quaternion_rows.log(quaternion_rows.residual(state.correction, measured, drawn.source, drawn.target)).T
+        shift = way.displacement - (state.position[drawn.target] - state.position[drawn.source])
+        both = np.concatenate((turn, shift), axis=1)
+        shared = np.flatnonzero(self.run >= 0)
+        both[shared] -= self.sign[shared, None] * state.common[self.run[shared]]
+        both = np.concatenate((both, -state.common))
+        return np.concatenate((both[:, :3] @ turns, both[:, 3:] @ shifts), axis=1)
+
+    def jacobian(self, way: Displacements) -> np.ndarray:
+        """``(E + R, d, 3 d)`` by the blocks of target, source and run."""
+        k, d = self.turns, self.turns + self.shifts
+        num_edges = len(self.drawn.source)
+        rows = np.zeros((num_edges + self.num_runs, d, 3 * d))
+        edges, unit = rows[:num_edges], np.eye(d)
+        edges[:, :, :d], edges[:, :, d : 2 * d] = unit, -unit
+        edges[:, k:, :k] = -self._crossed(way.at_target)
+        edges[:, k:, d : d + k] = -self._crossed(way.at_source)
+        edges[:, :, 2 * d :] = self.sign[:, None, None] * unit
+        rows[num_edges:, :, :d] = unit
+        return rows
+
+    def _crossed(self, vector: np.ndarray) -> np.ndarray:
+        """``(E, m, k)`` of v × in the bases."""
+        turns, shifts = self.bases
+        return np.stack([np.cross(vector, axis) @ shifts for axis in turns.T], axis=2)
+
+    def shift_covariance(self, state: PoseState, way: Displacements) -> np.ndarray:
+        """``(E, m, m)`` m², of the noise of odometry's shifts; of closures, what they do not share as good ones."""
+        drawn, num_segments = self.drawn, self.drawn.num_segments
+        unit = np.eye(self.shifts)
+        noise = state.noise
+        variance = noise.way * np.maximum(way.length, _LEAST_LENGTH * self.typical)
+        variance[:num_segments] += np.where(self.slipped, (self.priors.slip * self.typical) ** 2, 0.0)
+        variance[self.mode.problem.closure] = noise.closure * self.told.own_share
+        covariance = variance[:, None, None] * unit
+        covariance[: drawn.num_segments] += self.bridge_variance(noise)[:, None, None] * self.bent(way)
+        return np.asarray(covariance)
+
+    def bent(self, way: Displacements) -> np.ndarray:
+        """``(S, m, m)`` m² per rad² a step, of segments' shifts by what bends them."""
+        shifts = self.bases[1]
+        return np.asarray(np.einsum("ia,eij,jb->eab", shifts, way.bridge[: self.drawn.num_segments], shifts))
+
+    def whitening(
+        self,
+        covariance: np.ndarray,
+        rotation_weight: np.ndarray,
+        closure_weight: np.ndarray,
+        state: PoseState,
+    ) -> np.ndarray:
+        """``(E + R, d, d)`` W^½ of all rows.
+
+        Args:
+            covariance: ``(E, m, m)`` of shifts.
+            rotation_weight: ``(E,)`` rad⁻².
+            closure_weight: ``(C,)`` m⁻², in the place of closures' covariances.
+            state: noise.
+        """
+        k, m = self.turns, self.shifts
+        num_edges = len(covariance)
+        root = np.zeros((num_edges + self.num_runs, k + m, k + m))
+        edges, common = root[:num_edges], root[num_edges:]
+        edges[:, :k, :k] = np.sqrt(rotation_weight)[:, None, None] * np.eye(k)
+        edges[:, k:, k:] = np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)
+        edges[self.mode.problem.closure, k:, k:] = np.sqrt(closure_weight)[:, None, None] * np.eye(m)
+        if self.num_runs:
+            common[:, :k, :k] = np.eye(k) / np.sqrt(self.common_turn(state.noise))
+            common[:, k:, k:] = np.eye(m) / np.sqrt(self.priors.common * state.noise.closure)
+        return root
+
+    def root_weight(self, rotation_weight: np.ndarray, state: PoseState) -> np.ndarray:
+        """``(d,)`` what ties roots down."""
+        shift = max(1 / (state.noise.way * self.typical * _LEAST_LENGTH), 1 / state.noise.closure)
+        tied = np.full(self.turns, float(rotation_weight.max())), np.full(self.shifts, shift)
+        return _GROUNDING * np.concatenate(tied)

@@ -1,0 +1,43 @@
+"""One joint solve, and what it tells of each closure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rotavg_ros.solver.slam.poses.block_system import BlockFactor
+from rotavg_ros.solver.slam.poses.displacements import Displacements
+from rotavg_ros.solver.slam.poses.places import Places, Predictions, Scale
+from rotavg_ros.solver.slam.poses.rows import PoseState
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Of E edges, R runs and C closures; d = k + m.
+
+    Attributes:
+        state: after the step, with the noise that it was done with.
+        way: displacements before it.
+        covariance: ``(E, m, m)`` m², of shifts.
+        rotation_weight: ``(E,)`` rad⁻², of turns.
+        closure_weight: ``(C,)`` m⁻², of closures' translations.
+        left: ``(E + R, d, 1)`` what it leaves of whitened rows.
+        factor: of its normal equations.
+        turned: rad, its largest turn.
+        scale: of closures' errors.
+        predictions: what all else says of closures.
+        places: their classes, by that.
+    """
+
+    state: PoseState
+    way: Displacements
+    covariance: np.ndarray
+    rotation_weight: np.ndarray
+    closure_weight: np.ndarray
+    left: np.ndarray
+    factor: BlockFactor
+    turned: float
+    scale: Scale
+    predictions: Predictions
+    places: Places

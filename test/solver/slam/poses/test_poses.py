@@ -1,0 +1,320 @@
+"""Orientations and positions together: against gtsam on the whole graph, and in whatever unit, order and direction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros import rotations
+from rotavg_ros.datasets.simulation.slam_config import SlamSimulationConfig
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, simulate_slam_graph
+from rotavg_ros.metrics import orientation_errors
+from rotavg_ros.metrics.positions import position_errors
+from rotavg_ros.solver import Solution, solve
+from rotavg_ros.solver.neurora.network_store import Networks
+from rotavg_ros.solver.slam.network import SlamCleanNet
+from rotavg_ros.solver.slam.passes.alternation import SlamEstimate
+from rotavg_ros.solver.slam.poses.answer import answer
+from rotavg_ros.solver.slam.poses.estimate import PoseMode, estimate_poses
+from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.solve import mode_of_passes
+from rotavg_ros.solver.slam.preparation import prepare_as_it_is
+from rotavg_ros.solver.slam.stages import bootstrap, clean, refine_and_search
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
+
+HILLS = {"dimensions": 3, "terrain_tilt_deg": 10.0, "sway_deg": 3.0}
+
+
+def simulated(seed: int = 0, **options: object) -> SimulatedRun:
+    config = {"num_keyframes": 400, "laps": 3.0, "closures_per_keyframe": 0.15, "false_share": 0.0} | options
+    return simulate_slam_graph(SlamSimulationConfig(**config), np.random.default_rng(seed))
+
+
+def graph_of(run: SimulatedRun) -> ViewGraph:
+    return replace(run.graph, translation=torch.from_numpy(run.edge_translation))
+
+
+def errors(run: SimulatedRun, solution: Solution) -> tuple[float, float]:
+    """Mean degrees and RMS metres."""
+    truth = torch.from_numpy(Rotation.from_quat(run.world_from_body).inv().as_quat())
+    degrees = torch.rad2deg(orientation_errors(solution.body_from_world, truth)).mean()
+    assert solution.position is not None
+    return float(degrees), float(np.sqrt((position_errors(solution.position.numpy(), run.position) ** 2).mean()))
+
+
+@torch.no_grad()
+def pose_mode(graph: ViewGraph) -> PoseMode:
+    prepared = prepare_as_it_is(graph)
+    cleaned = clean(Networks("cpu").load(SlamCleanNet), prepared, graph.label)
+    verdicts: SlamEstimate = refine_and_search(prepared, cleaned, bootstrap(prepared, cleaned))
+    assert graph.translation is not None
+    return estimate_poses(PoseProblem(graph, graph.translation.numpy(), mode_of_passes(prepared, cleaned, verdicts)))
+
+
+@pytest.mark.parametrize("backward", [False, True])
+@pytest.mark.parametrize("hills", [False, True])
+def test_what_is_drawn_together_is_the_whole_graphs_optimum(hills: bool, backward: bool) -> None:
+    """Every keyframe where gtsam puts it, by the same noise, from levers and bridges alone."""
+    gtsam = pytest.importorskip("gtsam")
+    run = simulated(
+        **(HILLS if hills else {}),
+        odometry_backward=backward,
+        num_keyframes=150,
+        closures_per_keyframe=0.1,
+        odometry_noise_deg=0.3,
+        closure_noise_deg=1.0,
+    )
+    graph = graph_of(run)
+    # Far from each other: neighbours share an error, which gtsam is not told of.
+    closure = np.flatnonzero(~graph.is_odometry.numpy())
+    kept = graph.is_odometry.clone()
+    kept[closure[:: len(closure) // 2]] = True
+    graph, translation = graph.select_edges(kept), run.edge_translation[kept.numpy()]
+    mode = pose_mode(graph)
+    problem, solved = mode.problem, mode.solved
+    odometry, closures = graph.is_odometry.numpy(), mode.problem.mode.problem.closure
+    assert problem.num_runs == 0
+    factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    source, target = graph.source.numpy(), graph.target.numpy()
+    turn = Rotation.from_quat(graph.target_from_source.numpy()).inv().as_matrix()
+    rotation_sigma = np.full(graph.num_edges, np.sqrt(solved.state.noise.turn))
+    length = np.linalg.norm(translation, axis=1)
+    shift_sigma = np.sqrt(solved.state.noise.way * np.maximum(length, 0.05 * problem.typical))
+    edges = problem.drawn.view_graph_edge[closures - problem.drawn.num_segments]
+    rotation_sigma[edges] = solved.rotation_weight[closures] ** -0.5
+    shift_sigma[edges] = solved.closure_weight**-0.5
+    found = answer([(mode, 1.0)])
+    world_from_body = Rotation.from_quat(found.body_from_world).inv()
+    for node in range(graph.num_nodes):
+        start.insert(node, gtsam.Pose3(gtsam.Rot3(world_from_body[node].as_matrix()), found.position[node]))
+    for edge in range(graph.num_edges):
+        sigmas = np.repeat([rotation_sigma[edge], shift_sigma[edge]], 3)
+        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        measured = gtsam.Pose3(gtsam.Rot3(turn[edge]), translation[edge])
+        factors.add(gtsam.BetweenFactorPose3(int(source[edge]), int(target[edge]), measured, noise))
+    factors.add(gtsam.PriorFactorPose3(0, start.atPose3(0), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+    best = gtsam.LevenbergMarquardtOptimizer(factors, start).optimize()
+    assert odometry.sum() + len(edges) == graph.num_edges
+    expected = [best.atPose3(node) for node in range(graph.num_nodes)]
+    off = (Rotation.from_matrix([pose.rotation().matrix() for pose in expected]).inv() * world_from_body).magnitude()
+    apart = np.linalg.norm(np.array([pose.translation() for pose in expected]) - found.position, axis=1)
+    drift = np.abs(world_from_body.magnitude()).max()
+    assert drift > np.radians(10)
+    assert np.degrees(off.max()) < 0.05 and apart.max() < 0.01
+
+
+@pytest.mark.parametrize("hills", [False, True])
+def test_translations_make_orientations_better(hills: bool) -> None:
+    gained = []
+    for seed in range(4):
+        run = simulated(seed, **(HILLS if hills else {}), false_share=0.3)
+        together, metres = errors(run, solve(graph_of(run)))
+        truth = torch.from_numpy(Rotation.from_quat(run.world_from_body).inv().as_quat())
+        alone = torch.rad2deg(orientation_errors(solve(run.graph).body_from_world, truth)).mean()
+        gained.append(np.log(together / float(alone)))
+        assert metres < 0.3
+    assert np.exp(np.mean(gained)) < 0.95
+
+
+def displaced(run: SimulatedRun, share: float, seed: int) -> tuple[ViewGraph, np.ndarray]:
+    """Parallel corridors: closures whose rotation is right join places 5–20 m from each other; and which these are."""
+    draw = np.random.default_rng(seed)
+    graph = graph_of(run)
+    closure = np.flatnonzero(~graph.is_odometry.numpy())
+    wrong = closure[draw.random(len(closure)) < share]
+    direction = draw.normal(size=(len(wrong), 3)) * [1, 1, 0]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    translation = run.edge_translation.copy()
+    translation[wrong] += direction * draw.uniform(5, 20, (len(wrong), 1))
+    return replace(graph, translation=torch.from_numpy(translation)), np.isin(np.arange(graph.num_edges), wrong)
+
+
+def test_right_rotation_wrong_place() -> None:
+    found, flagged, right = 0, 0, 0
+    for seed in range(4):
+        run = simulated(seed)
+        graph, is_wrong = displaced(run, 0.3, seed)
+        solution = solve(graph)
+        closure = ~graph.is_odometry.numpy()
+        is_flagged = solution.outlier_score.numpy() > 0.5
+        assert solution.rotation_score is not None
+        assert (solution.rotation_score.numpy()[is_wrong] < 0.5).mean() > 0.9
+        found += int((is_flagged & is_wrong).sum())
+        flagged += int((is_flagged & closure).sum())
+        right += int(is_wrong.sum())
+        assert errors(run, solution)[1] < 0.3
+    assert found >= 0.97 * right and found >= 0.98 * flagged
+
+
+def test_a_corridor_mistaken_again_and_again() -> None:
+    """One wrong place that many closures in a row agree on: neither odometry nor the rest is bent for it."""
+    run = simulated(1)
+    graph = graph_of(run)
+    closure = np.flatnonzero(~graph.is_odometry.numpy())
+    wrong = closure[20:32]
+    assert run.graph.translation is None and graph.translation is not None
+    world_from_source = Rotation.from_quat(run.world_from_body[graph.source.numpy()[wrong]])
+    translation = run.edge_translation.copy()
+    translation[wrong] += world_from_source.inv().apply([9.0, 4.0, 0.0])
+    solution = solve(replace(graph, translation=torch.from_numpy(translation)))
+    assert (solution.outlier_score.numpy()[wrong] > 0.5).all()
+    assert errors(run, solution)[1] < 0.3
+
+
+def as_answered(graph: ViewGraph) -> Solution:
+    solution = solve(graph)
+    assert solution.position is not None
+    return solution
+
+
+def same_orientations(a: Solution, b: Solution, degrees: float) -> None:
+    off = torch.rad2deg(rotations.angle_between(a.body_from_world, b.body_from_world))
+    assert float(off.max()) < degrees
+
+
+def test_the_unit_of_length_does_not_matter() -> None:
+    run = simulated(2, false_share=0.3)
+    graph = graph_of(run)
+    assert graph.translation is not None
+    first, second = as_answered(graph), as_answered(replace(graph, translation=graph.translation * 20))
+    same_orientations(first, second, 1e-6)
+    assert first.position is not None and second.position is not None
+    torch.testing.assert_close(first.position * 20, second.position, rtol=1e-6, atol=1e-6)
+
+
+def test_the_order_of_edges_does_not_matter() -> None:
+    graph = graph_of(simulated(3, false_share=0.3))
+    order = torch.from_numpy(np.random.default_rng(0).permutation(graph.num_edges))
+    first, second = as_answered(graph), as_answered(graph.select_edges(order))
+    same_orientations(first, second, 1e-6)
+    torch.testing.assert_close(first.outlier_score[order], second.outlier_score, rtol=1e-6, atol=1e-6)
+
+
+def test_the_direction_of_closures_hardly_matters() -> None:
+    """A closure's lever is that of the end at which it was measured."""
+    graph = graph_of(simulated(4, false_share=0.3))
+    assert graph.translation is not None
+    turned = (torch.arange(graph.num_edges) % 2 == 0) & ~graph.is_odometry
+    column = turned[:, None]
+    reversed_graph = replace(
+        graph,
+        source=torch.where(turned, graph.target, graph.source),
+        target=torch.where(turned, graph.source, graph.target),
+        target_from_source=torch.where(column, rotations.inverse(graph.target_from_source), graph.target_from_source),
+        translation=torch.where(
+            column, -rotations.rotate(graph.target_from_source, graph.translation), graph.translation
+        ),
+    )
+    first, second = as_answered(graph), as_answered(reversed_graph)
+    same_orientations(first, second, 0.3)
+    assert ((first.outlier_score > 0.5) == (second.outlier_score > 0.5)).float().mean() > 0.995
+
+
+def test_without_translations_nothing_changes() -> None:
+    run = simulated(5, false_share=0.3)
+    plain = solve(run.graph)
+    assert plain.position is None and plain.rotation_score is None
+    for useless in (
+        torch.full((run.graph.num_edges, 3), torch.nan),
+        torch.zeros((run.graph.num_edges, 3)),
+        torch.where(run.graph.is_odometry[:, None], torch.nan, torch.from_numpy(run.edge_translation)),
+        torch.where(run.graph.is_odometry[:, None], torch.from_numpy(run.edge_translation), torch.nan),
+    ):
+        solution = solve(replace(run.graph, translation=useless.double()))
+        assert solution.position is None
+        assert torch.equal(solution.body_from_world, plain.body_from_world)
+        assert torch.equal(solution.outlier_score, plain.outlier_score)
+
+
+def test_closures_without_a_translation_are_judged_by_their_rotation() -> None:
+    run = simulated(6, false_share=0.3)
+    graph = graph_of(run)
+    assert graph.translation is not None
+    unknown = ~graph.is_odometry & (torch.arange(graph.num_edges) % 3 == 0)
+    solution = as_answered(replace(graph, translation=torch.where(unknown[:, None], torch.nan, graph.translation)))
+    score, is_false = solution.outlier_score.numpy() > 0.5, run.closure_is_false
+    assert (score == is_false)[unknown.numpy()].mean() > 0.9
+    assert solution.rotation_score is not None
+    assert torch.equal(solution.rotation_score[unknown] > 0.5, solution.outlier_score[unknown] > 0.5)
+
+
+def test_labels_decide() -> None:
+    run = simulated(7)
+    graph, is_wrong = displaced(run, 0.3, 7)
+    wrong = int(np.flatnonzero(is_wrong)[0])
+    right = int(np.flatnonzero(~is_wrong & ~graph.is_odometry.numpy())[0])
+    label = graph.label.clone()
+    label[wrong], label[right] = EdgeLabel.ACCEPTED, EdgeLabel.REJECTED
+    solution = as_answered(replace(graph, label=label))
+    assert solution.rotation_score is not None
+    assert solution.outlier_score[wrong] == 0.0 and solution.outlier_score[right] == 1.0
+    before = as_answered(graph).outlier_score
+    same = ((solution.outlier_score > 0.5) == (before > 0.5)).numpy()
+    assert set(np.flatnonzero(~same)) <= {wrong, right}
+
+
+def test_repeated_edges_count_once() -> None:
+    graph = graph_of(simulated(8, false_share=0.2))
+    twice = torch.cat((torch.arange(graph.num_edges), torch.arange(graph.num_edges // 3)))
+    first, second = as_answered(graph), as_answered(graph.select_edges(twice))
+    same_orientations(first, second, 1e-9)
+    assert first.rotation_score is not None and second.rotation_score is not None
+    torch.testing.assert_close(first.rotation_score[twice], second.rotation_score)
+
+
+def test_components_lie_at_their_own_origins() -> None:
+    run = simulated(9)
+    graph = graph_of(run)
+    assert graph.translation is not None
+    two = ViewGraph.create(
+        torch.cat((graph.source, graph.source + graph.num_nodes)),
+        torch.cat((graph.target, graph.target + graph.num_nodes)),
+        torch.cat((graph.target_from_source, graph.target_from_source)),
+        kind=torch.cat((graph.kind, graph.kind)),
+        translation=torch.cat((graph.translation, graph.translation)),
+    )
+    solution = as_answered(two)
+    assert solution.position is not None and solution.position_uncertainty is not None
+    first, second = solution.position.split(graph.num_nodes)
+    assert torch.equal(first[0], torch.zeros(3).double()) and torch.equal(second[0], torch.zeros(3).double())
+    torch.testing.assert_close(first, second, rtol=0, atol=0.05)
+    assert solution.position_uncertainty[0] < 1e-3 < float(solution.position_uncertainty.median()) < 1.0
+
+
+def test_robots_that_closures_alone_join() -> None:
+    run = simulated(10, num_keyframes=400)
+    graph = graph_of(run)
+    assert graph.translation is not None
+    cut = graph.is_odometry & (torch.minimum(graph.source, graph.target) == 200)
+    parted = graph.select_edges(~cut)
+    solution = as_answered(parted)
+    assert len(solution.component.unique()) == 1
+    truth = torch.from_numpy(Rotation.from_quat(run.world_from_body).inv().as_quat())
+    assert float(torch.rad2deg(orientation_errors(solution.body_from_world, truth)).mean()) < 2.0
+    assert solution.position is not None
+    assert np.sqrt((position_errors(solution.position.numpy(), run.position) ** 2).mean()) < 0.3
+
+
+def test_what_is_stated_covers_the_error() -> None:
+    covered, total = 0, 0
+    for seed in range(4):
+        run = simulated(seed + 20, false_share=0.2)
+        solution = as_answered(graph_of(run))
+        truth = Rotation.from_quat(run.world_from_body)
+        mine = Rotation.from_quat(solution.world_from_body.numpy())
+        off = (truth[0].inv() * truth).inv() * (mine[0].inv() * mine)
+        covered += int((off.magnitude() < 2 * solution.uncertainty.numpy() + 1e-6).sum())
+        total += run.graph.num_nodes
+    assert covered > 0.85 * total
+
+
+def test_kinds_of_edges_are_kept() -> None:
+    """A sound graph: nothing is flagged, and odometry's slips stay slips."""
+    graph = graph_of(simulated(11))
+    solution = as_answered(graph)
+    assert (solution.outlier_score[graph.kind == EdgeKind.LOOP_CLOSURE] < 0.5).all()
+    assert (solution.outlier_score[graph.is_odometry] < 0.1).all()
