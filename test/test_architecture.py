@@ -113,7 +113,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "rows": {"block_system", "displacements", "places", "priors"},
         "solved": {"block_system", "displacements", "places", "rows"},
         "noise": {"rows", "solved"},
-        "evidence": {"places", "rows", "solved"},
+        "evidence": {"noise", "places", "rows", "solved"},
         "estimate": {"block_system", "evidence", "noise", "places", "rows", "solved"},
         "answer": {"estimate", "rows"},
         "solve": {"answer"},

@@ -26,6 +26,7 @@ from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.errors import UserError
 from rotavg_ros.solver import Solution, methods, solve
 from rotavg_ros.solver.networks import WEIGHTS_FOLDER
+from rotavg_ros.solver.solution import residual_deg, residual_m
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
 
@@ -223,12 +224,19 @@ def _orientation_columns(graph_file: GraphFile, solution: Solution) -> list[Colu
 def _edge_columns(graph_file: GraphFile, solution: Solution) -> list[Column]:
     graph, ids = graph_file.graph, graph_file.node_ids
     score = solution.outlier_score.cpu().numpy()
-    return [
+    columns = [
         Column("source", ids[graph.source.cpu().numpy()]),
         Column("target", ids[graph.target.cpu().numpy()]),
         Column("outlier_score", score, decimals=6),
         Column("outlier", (score > OUTLIER_THRESHOLD).astype(np.int64)),
     ]
+    if solution.rotation_score is not None:
+        columns += [
+            Column("rotation_score", solution.rotation_score.cpu().numpy(), decimals=6),
+            Column("residual_deg", residual_deg(graph, solution), decimals=4),
+            Column("residual_m", residual_m(graph, solution), decimals=4),
+        ]
+    return columns
 
 
 def _warm_up_graph(has_odometry: bool) -> ViewGraph:

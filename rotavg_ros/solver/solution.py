@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+import torch
 from torch import Tensor
 
-from rotavg_ros.rotations import canonical, inverse
+from rotavg_ros.rotations import angle_between, canonical, inverse, multiply, rotate
+from rotavg_ros.view_graph import ViewGraph
 
 
 @dataclass(frozen=True)
@@ -49,3 +52,20 @@ class Solution:
     def world_from_body(self) -> Tensor:
         """``(N, 4)`` float64 xyzw, w ≥ 0: the orientations as ROS states them."""
         return canonical(inverse(self.body_from_world))
+
+
+def residual_deg(graph: ViewGraph, solution: Solution) -> np.ndarray:
+    """``(M,)`` degrees, between each edge's measured rotation and the solution's."""
+    orientation = solution.body_from_world.cpu()
+    source, target = graph.source.cpu(), graph.target.cpu()
+    estimated = multiply(orientation[target], inverse(orientation[source]))
+    return np.asarray(torch.rad2deg(angle_between(graph.target_from_source.cpu(), estimated)).numpy())
+
+
+def residual_m(graph: ViewGraph, solution: Solution) -> np.ndarray:
+    """``(M,)`` metres, between each edge's measured translation and the solution's; NaN without either."""
+    if solution.position is None or graph.translation is None:
+        return np.full(graph.num_edges, np.nan)
+    source, position = graph.source.cpu(), solution.position.cpu()
+    measured = rotate(solution.world_from_body.cpu()[source], graph.translation.cpu())
+    return np.asarray((position[graph.target.cpu()] - position[source] - measured).norm(dim=1).numpy())

@@ -11,7 +11,10 @@ _BLOCK_ROWS = 1 << 16
 
 
 class Column(NamedTuple):
-    """A named column of ``(K,)`` numbers. ``decimals`` is 0 for integers and at most 12, for values below 10⁶."""
+    """A named column of ``(K,)`` numbers. ``decimals`` is 0 for integers and at most 12, for values below 10⁶.
+
+    NaN leaves a field empty.
+    """
 
     name: str
     values: np.ndarray
@@ -22,7 +25,7 @@ def write_csv(file: BinaryIO, columns: Sequence[Column]) -> None:
     """Write a header and one line per row.
 
     Raises:
-        ValueError: a value that is not finite.
+        ValueError: an infinite value.
     """
     file.write((",".join(column.name for column in columns) + "\n").encode("ascii"))
     for start in range(0, len(columns[0].values), _BLOCK_ROWS):
@@ -38,10 +41,12 @@ def write_csv(file: BinaryIO, columns: Sequence[Column]) -> None:
 
 def _digits(values: np.ndarray, decimals: int) -> tuple[np.ndarray, np.ndarray]:
     """``(K, W)`` characters of right-aligned numbers, and which of them to keep (not the leading zeros)."""
+    known = np.ones((len(values), 1), dtype=bool)
     if decimals:
-        if not np.isfinite(values).all():
-            raise ValueError("a csv column holds a value that is not finite")
-        values = np.rint(np.asarray(values, dtype=np.float64) * 10.0**decimals)
+        if np.isinf(values).any():
+            raise ValueError("a csv column holds an infinite value")
+        known = ~np.isnan(values)[:, None]
+        values = np.rint(np.nan_to_num(values, nan=0.0).astype(np.float64) * 10.0**decimals)
     number = values.astype(np.int64)
     rest = np.abs(number)
     num_digits = max(decimals + 1, len(str(rest.max(initial=0))))
@@ -57,7 +62,7 @@ def _digits(values: np.ndarray, decimals: int) -> tuple[np.ndarray, np.ndarray]:
         keep.append(significant[:, None])
     characters.append(_literal(b"-", len(number))[0])
     keep.append((number < 0)[:, None])
-    return np.concatenate(characters[::-1], axis=1), np.concatenate(keep[::-1], axis=1)
+    return np.concatenate(characters[::-1], axis=1), np.concatenate(keep[::-1], axis=1) & known
 
 
 def _literal(character: bytes, num_rows: int) -> tuple[np.ndarray, np.ndarray]:

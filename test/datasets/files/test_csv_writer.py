@@ -33,6 +33,10 @@ def test_rows(rows: list[tuple[int, float, int]], decimals: int, block: int) -> 
         assert float(cells[1]) == pytest.approx(real, abs=0.5 * 10**-decimals + 1e-12)
 
 
-def test_refuses_what_is_not_finite() -> None:
-    with pytest.raises(ValueError, match="not finite"):
-        write_csv(io.BytesIO(), [Column("a", np.array([np.nan]), decimals=3)])
+def test_refuses_what_is_infinite_and_leaves_what_is_unknown_empty() -> None:
+    with pytest.raises(ValueError, match="infinite"):
+        write_csv(io.BytesIO(), [Column("a", np.array([np.inf]), decimals=3)])
+    file = io.BytesIO()
+    columns = Column("a", np.array([1, 2])), Column("b", np.array([np.nan, -0.5]), decimals=3)
+    write_csv(file, [*columns, columns[0]._replace(name="c")])
+    assert file.getvalue() == b"a,b,c\n1,,1\n2,-0.500,2\n"
