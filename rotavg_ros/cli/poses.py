@@ -20,6 +20,7 @@ def write_corrected_poses(
     world_from_body: np.ndarray,
     outlier_score: np.ndarray,
     position: np.ndarray | None = None,
+    precision: np.ndarray | None = None,
 ) -> None:
     """Write ``graph.g2o``, ``trajectory.kitti``, and ``trajectory.tum`` where the graph has stamps.
 
@@ -29,13 +30,14 @@ def write_corrected_poses(
         world_from_body: ``(N, 4)`` xyzw, the answer.
         outlier_score: ``(M,)``.
         position: ``(N, 3)`` metres, the answer's; default: fitted to the edges' translations.
+        precision: ``(M, 2)`` rad⁻² and m⁻², the answer's; default: what edges state.
 
     Raises:
         GraphFileError: a file cannot be written.
     """
     if position is None:
         position = _fitted(graph_file, world_from_body, outlier_score)
-    write_corrected_graph(folder / "graph.g2o", graph_file, world_from_body, position, outlier_score > 0.5)
+    write_corrected_graph(folder / "graph.g2o", graph_file, world_from_body, position, outlier_score > 0.5, precision)
     write_kitti(folder / "trajectory.kitti", position, world_from_body)
     if graph_file.stamps_ns is not None:
         order = np.argsort(graph_file.stamps_ns, kind="stable")

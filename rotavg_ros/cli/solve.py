@@ -118,8 +118,9 @@ def solve_file(
     if poses:
         world_from_body = solution.world_from_body.cpu().numpy()
         position = None if solution.position is None else solution.position.cpu().numpy()
+        precision = None if solution.edge_precision is None else solution.edge_precision.cpu().numpy()
         score = solution.outlier_score.cpu().numpy()
-        write_corrected_poses(job.output, graph_file, world_from_body, score, position)
+        write_corrected_poses(job.output, graph_file, world_from_body, score, position, precision)
     return summary
 
 

@@ -44,7 +44,9 @@ def write_graph_of_run(path: Path, record: RunRecord) -> None:
         steps=answer.steps,
     )
     order = np.argsort(ids)
-    write_corrected_graph(path, graph_file, answer.world_from_body[order], position[order], answer.outlier)
+    write_corrected_graph(
+        path, graph_file, answer.world_from_body[order], position[order], answer.outlier, answer.edge_precision
+    )
 
 
 def keyframe_ids(answer: Answer) -> np.ndarray:

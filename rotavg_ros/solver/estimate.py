@@ -36,11 +36,13 @@ class Places:
         position: ``(N, 3)`` metres; NaN where nothing tells.
         variance: ``(N,)`` m² per component, relative to the component's first node.
         rotation_score: ``(M,)`` probability that an edge's rotation is wrong; its outlier score counts its place, too.
+        precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count; 0 where nothing is known.
     """
 
     position: Tensor
     variance: Tensor
     rotation_score: Tensor
+    precision: Tensor
 
 
 @dataclass

@@ -125,6 +125,7 @@ def solve(
         None if places is None else _root_at_origin(places.position, estimate.body_from_world, job.component),
         None if places is None else places.variance.sqrt(),
         None if places is None else places.rotation_score,
+        None if places is None else places.precision,
     )
 
 

@@ -31,6 +31,8 @@ class Solution:
             None where translations are unknown or were not used.
         position_uncertainty: ``(N,)`` metres, standard deviation of each component; None likewise.
         rotation_score: ``(M,)`` probability that the edge's rotation alone errs by more than 10°; None likewise.
+        edge_precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count in the answer, 0 where a
+            translation is unknown; None likewise.
         warnings: why it should not be trusted, a sentence each: what was seen, what may be the cause, what to do.
     """
 
@@ -47,6 +49,7 @@ class Solution:
     position: Tensor | None = None
     position_uncertainty: Tensor | None = None
     rotation_score: Tensor | None = None
+    edge_precision: Tensor | None = None
 
     @property
     def world_from_body(self) -> Tensor:

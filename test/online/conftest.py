@@ -27,6 +27,7 @@ class TreeSolution:
     position: None = None
     position_uncertainty: None = None
     rotation_score: None = None
+    edge_precision: None = None
 
 
 @dataclass

@@ -17,7 +17,12 @@ _NO_INFORMATION = 1e-9
 
 
 def write_corrected_graph(
-    path: Path, graph_file: GraphFile, world_from_body: np.ndarray, position: np.ndarray, outlier: np.ndarray
+    path: Path,
+    graph_file: GraphFile,
+    world_from_body: np.ndarray,
+    position: np.ndarray,
+    outlier: np.ndarray,
+    precision: np.ndarray | None = None,
 ) -> None:
     """Write corrected vertices and the edges that are not outliers, so that plain least squares can go on from there.
 
@@ -29,6 +34,7 @@ def write_corrected_graph(
         graph_file: N nodes, M edges; translations that are NaN are not known.
         world_from_body, position: ``(N, 4)`` xyzw and ``(N, 3)`` metres.
         outlier: ``(M,)`` bool.
+        precision: ``(M, 2)`` rad⁻² and m⁻² per component as estimated; default: what edges state.
 
     Raises:
         GraphFileError: the file cannot be written.
@@ -37,7 +43,7 @@ def write_corrected_graph(
     graph = graph_file.graph.select_edges(torch.from_numpy(kept).to(graph_file.graph.device))
     translation = graph_file.edge_translation
     translation = np.full((len(kept), 3), np.nan) if translation is None else translation[kept]
-    stated = graph_file.edge_information
+    stated = graph_file.edge_information if precision is None else _isotropic(precision)
     information = np.zeros((len(kept), 21)) if stated is None else stated[kept]
     unstated = ~np.any(information, axis=1, keepdims=True)
     known = np.isfinite(translation).all(axis=1)
@@ -54,3 +60,11 @@ def write_corrected_graph(
         edge_information=np.where(unstated, defaults, information),
     )
     g2o.write(path, chosen, world_from_body * [-1.0, -1.0, -1.0, 1.0], position)
+
+
+def _isotropic(precision: np.ndarray) -> np.ndarray:
+    """``(M, 21)`` information of edges that err alike in every direction."""
+    information = np.zeros((len(precision), 21))
+    information[:, ANGULAR_DIAGONAL] = precision[:, [0]]
+    information[:, POSITION_DIAGONAL] = np.maximum(precision[:, [1]], _NO_INFORMATION)
+    return information

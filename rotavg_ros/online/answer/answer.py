@@ -53,6 +53,7 @@ class Answer:
             were unknown or not used.
         position_uncertainty: ``(N,)`` metres, one sigma of each component; None likewise.
         rotation_score: ``(M,)`` in [0, 1], that the edge's rotation alone is wrong; None likewise.
+        edge_precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count; None likewise.
     """
 
     version: int
@@ -84,6 +85,7 @@ class Answer:
     position: NDArray[np.float64] | None = None
     position_uncertainty: NDArray[np.float64] | None = None
     rotation_score: NDArray[np.float64] | None = None
+    edge_precision: NDArray[np.float64] | None = None
 
     @classmethod
     def of_solution(
@@ -134,6 +136,7 @@ class Answer:
             position=_in_gauge(solution, body_from_world),
             position_uncertainty=_numbers(solution.position_uncertainty),
             rotation_score=_numbers(solution.rotation_score),
+            edge_precision=_numbers(solution.edge_precision),
         )
 
     @cached_property

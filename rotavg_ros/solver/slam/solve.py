@@ -36,7 +36,7 @@ def solve_slam(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     estimate = _solve_once(graph.select_edges(first), stages, run)
     places = estimate.places
     if places is not None:
-        places = replace(places, rotation_score=places.rotation_score[says_as])
+        places = replace(places, rotation_score=places.rotation_score[says_as], precision=places.precision[says_as])
     return replace(estimate, outlier_score=estimate.outlier_score[says_as], memory=None, places=places)
 
 
@@ -108,6 +108,7 @@ def _with_poses(estimate: Estimate, graph: ClosureGraph, poses: Poses) -> Estima
         torch.from_numpy(poses.position),
         torch.from_numpy(poses.position_variance),
         torch.from_numpy(slam_stages.outlier_scores(graph, poses.rotation_probability)),
+        torch.from_numpy(poses.precision),
     )
     return replace(
         estimate,

@@ -33,6 +33,8 @@ class Poses:
         position_variance: ``(N,)`` m² per component.
         outlier_probability: ``(E,)`` that a closure is false, in rotation or place, or that a segment slipped.
         rotation_probability: ``(E,)`` that its rotation is.
+        precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which the view-graph's edges count; 0 of translations
+            that are not known.
         rivals: probabilities of the labellings that were averaged.
     """
 
@@ -42,6 +44,7 @@ class Poses:
     position_variance: np.ndarray
     outlier_probability: np.ndarray
     rotation_probability: np.ndarray
+    precision: np.ndarray
     rivals: tuple[float, ...]
 
 
@@ -101,6 +104,7 @@ def answer(rivals: list[tuple[PoseMode, float]]) -> Poses:
         mixed("position_variance") + np.tensordot(share, ((shift - position) ** 2).sum(axis=2), 1) / m,
         np.clip(mixed("outlier_probability"), 0.0, 1.0),
         np.clip(mixed("rotation_probability"), 0.0, 1.0),
+        mixed("precision"),
         tuple(share.tolist()),
     )
 
@@ -118,7 +122,21 @@ def _of_mode(pose: PoseMode) -> Poses:
     length = np.where(segment >= 0, pose.solved.way.length[np.maximum(segment, 0)], 0.0)
     between += passed * (1 - passed) * length * pose.state.noise.way
     score, rotation = _scores(pose)
-    return Poses(np.ascontiguousarray(orientation.T), position, variance, between, score, rotation, (1.0,))
+    return Poses(
+        np.ascontiguousarray(orientation.T), position, variance, between, score, rotation, _precision(pose), (1.0,)
+    )
+
+
+def _precision(pose: PoseMode) -> np.ndarray:
+    """``(M, 2)`` rad⁻² and m⁻², with which the view-graph's edges count in the answer."""
+    problem, noise, drawn = pose.problem, pose.state.noise, pose.problem.drawn
+    graph, closure = problem.graph, problem.mode.problem.closure
+    edges = drawn.view_graph_edge[closure - drawn.num_segments]
+    variance = np.stack((noise.turn * graph.steps.numpy(), noise.way * problem.lengths_passed), axis=1)
+    variance[edges, 0] = 1 / pose.solved.rotation_weight[closure]
+    variance[edges, 1] = 1 / pose.solved.closure_weight
+    known = np.isfinite(problem.translation).all(axis=1)
+    return np.asarray(np.stack((1 / variance[:, 0], known / variance[:, 1]), axis=1))
 
 
 def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -38,6 +38,12 @@ def typical_length(graph: ViewGraph, translation: np.ndarray) -> float:
     return float(np.median(moving)) if len(moving) else 1.0
 
 
+def lengths_passed(graph: ViewGraph, translation: np.ndarray) -> np.ndarray:
+    """``(M,)`` metres that each edge's variance goes with."""
+    shortest = _SHORTEST_STEP * typical_length(graph, translation)
+    return np.asarray(np.maximum(np.linalg.norm(translation, axis=1), shortest * graph.steps.numpy()))
+
+
 @dataclass(frozen=True)
 class Displacements:
     """Of a closure graph (E edges between K key nodes, N nodes) at some orientations; lengths in metres.
@@ -82,8 +88,7 @@ class Displacements:
         forest, num_segments = drawn.paths.forest, drawn.num_segments
         source = graph.source.numpy()
         num_nodes, num_edges = graph.num_nodes, len(drawn.source)
-        shortest = _SHORTEST_STEP * typical_length(graph, translation)
-        length = np.maximum(np.linalg.norm(translation, axis=1), shortest * graph.steps.numpy())
+        length = lengths_passed(graph, translation)
         world = rotate_back(body_from_world.take(source, axis=1), translation)
 
         node = np.flatnonzero(drawn.paths.hangs_on_odometry)

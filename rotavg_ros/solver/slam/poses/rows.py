@@ -13,7 +13,7 @@ from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.poses.block_system import BlockEquations
-from rotavg_ros.solver.slam.poses.displacements import Displacements, typical_length
+from rotavg_ros.solver.slam.poses.displacements import Displacements, lengths_passed, typical_length
 from rotavg_ros.solver.slam.poses.places import Told
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 from rotavg_ros.solver.slam.posterior.densities import log_good
@@ -107,6 +107,11 @@ class PoseProblem:
     def typical(self) -> float:
         """Metres, of a step of odometry."""
         return typical_length(self.graph, self.lengths)
+
+    @cached_property
+    def lengths_passed(self) -> np.ndarray:
+        """``(M,)`` metres that each edge's variance goes with."""
+        return lengths_passed(self.graph, self.lengths)
 
     @cached_property
     def bases(self) -> tuple[np.ndarray, np.ndarray]:
