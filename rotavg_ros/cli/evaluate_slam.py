@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> Path:
 def _run_stress(arguments: argparse.Namespace) -> Path:
     if arguments.graphs != SLAM_GRAPHS or arguments.shares != SLAM_SHARES:
         raise SlamOptionsError("--graphs and --shares choose from the recorded suite; with --suite stress use --kinds")
-    kinds = stress.kinds(arguments.kinds or ())
+    kinds = stress.kinds(arguments.kinds or (), translations=arguments.translations)
     seeds = arguments.seeds or stress.REPORTING_SEEDS
     names = _methods(arguments, ROWS)
     chosen = contenders(names, ROSTER, keep=arguments.keep)
@@ -74,7 +74,7 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
 def _run_recorded(arguments: argparse.Namespace) -> Path:
     if arguments.kinds is not None:
         raise SlamOptionsError("--kinds chooses from the stress suite; add --suite stress")
-    for name in ("search_or_model", "sensitivity"):
+    for name in ("search_or_model", "sensitivity", "translations"):
         if getattr(arguments, name):
             option = name.replace("_", "-")
             raise SlamOptionsError(f"--{option} needs cases of which all is known; add --suite stress")

@@ -73,6 +73,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"also {POSTERIOR} without each of these: {', '.join(SWITCHES)}",
     )
     parser.add_argument(
+        "--translations",
+        action="store_true",
+        help="stress suite: tell the translations of all edges, too, to the methods that use them",
+    )
+    parser.add_argument(
         "--search-or-model",
         action="store_true",
         help="stress suite: also solve every case from its true labels and tell why answers are wrong",

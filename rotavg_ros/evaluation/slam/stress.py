@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -23,11 +24,12 @@ class StressSuiteError(UserError):
     """No kind is called so; the message names some that are."""
 
 
-def kinds(names: Sequence[str] = ()) -> list[Kind]:
+def kinds(names: Sequence[str] = (), *, translations: bool = False) -> list[Kind]:
     """Those whose names contain one of the given texts, in the order of the list; without any, all.
 
     Args:
         names: parts of names, upper or lower case.
+        translations: graphs have those of their edges.
 
     Raises:
         StressSuiteError: a text that is in no name.
@@ -37,7 +39,7 @@ def kinds(names: Sequence[str] = ()) -> list[Kind]:
             worlds = ", ".join(dict.fromkeys(kind.world for kind in KINDS))
             raise StressSuiteError(f"no kind's name contains {text!r}; names begin with {worlds}")
     chosen = [kind for kind in KINDS if not names or any(_matches(text, kind) for text in names)]
-    return [Kind(kind.name, partial(_drawn, kind)) for kind in chosen]
+    return [Kind(kind.name, partial(_drawn, kind, translations)) for kind in chosen]
 
 
 def ablation_cases() -> Iterator[Case]:
@@ -49,11 +51,12 @@ def _matches(text: str, kind: StressKind) -> bool:
     return text.casefold() in kind.name.casefold()
 
 
-def _drawn(kind: StressKind, seed: int) -> Case:
+def _drawn(kind: StressKind, translations: bool, seed: int) -> Case:
     drawn = kind.drawn(seed)
+    translation = torch.from_numpy(drawn.edge_translation) if translations else None
     return Case(
         CaseKey(kind.world, kind.name, seed),
-        drawn.graph,
+        replace(drawn.graph, translation=translation),
         torch.from_numpy(drawn.body_from_world),
         SLAM,
         torch.from_numpy(drawn.is_intact),
