@@ -55,7 +55,14 @@ def flags_message(answer: Answer, frame_id: str) -> Any:
         kinds=answer.kind.astype(np.uint8),
         scores=answer.outlier_score.astype(np.float32),
         outliers=answer.outlier,
+        rotation_scores=_or_nothing(answer.rotation_score),
+        residuals_deg=answer.residual_deg.astype(np.float32),
+        residuals_m=_or_nothing(answer.residual_m),
     )
+
+
+def _or_nothing(values: NDArray[np.float64] | None) -> NDArray[np.float32]:
+    return np.empty(0, dtype=np.float32) if values is None else values.astype(np.float32)
 
 
 def orientation_message(stamp_ns: int, world_from_body: Quaternion, frame_id: str) -> Any:

@@ -99,7 +99,7 @@ def test_every_field_of_a_message_is_commented(definition: Path) -> None:
 def test_message_is_importable_with_its_fields(definition: Path) -> None:
     message = getattr(importlib.import_module(f"rotavg_msgs.{definition.parent.name}"), definition.stem)
     text = definition.read_text(encoding="utf-8").partition("---")[0]
-    fields = re.findall(r"^[a-z_0-9/]+(?:\[\])? ([a-z_]+)$", text, re.MULTILINE | re.IGNORECASE)
+    fields = re.findall(r"^[a-z_0-9/]+(?:\[(?:<=\d+)?\])? ([a-z_]+)$", text, re.MULTILINE | re.IGNORECASE)
     request = getattr(message, "Request", message)
     assert list(request.get_fields_and_field_types()) == fields
     constants = re.findall(r"^uint8 ([A-Z_]+)=(\d+)$", text, re.MULTILINE)

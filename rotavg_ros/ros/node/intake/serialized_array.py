@@ -76,11 +76,14 @@ def _elements(content: memoryview, at: int, element_type: str, order: str) -> It
 
 @cache
 def _reader(type_name: str, order: str) -> _Read:
-    """Of a field type as ``get_fields_and_field_types`` names it: a primitive, a string, or another message."""
+    """Of a field type as ``get_fields_and_field_types`` names it: a primitive, string, sequence, or message."""
     if type_name in _PRIMITIVES:
         return _primitive_reader(struct.Struct(order + _PRIMITIVES[type_name]))
     if type_name == "string":
         return _string_reader(_reader("uint32", order))
+    if type_name.startswith("sequence<"):
+        element_type, _, _ = type_name.removeprefix("sequence<").removesuffix(">").partition(",")
+        return _sequence_reader(_reader("uint32", order), _reader(element_type, order))
     package, _, name = type_name.partition("/")
     fields = getattr(importlib.import_module(f"{package}.msg"), name).get_fields_and_field_types()
     return _message_reader(name, {field: _reader(field_type, order) for field, field_type in fields.items()})
@@ -100,6 +103,18 @@ def _string_reader(read_length: _Read) -> _Read:
     def read(content: memoryview, at: int) -> tuple[str, int]:
         length, at = read_length(content, at)  # with the zero at its end
         return str(content[at : at + length - 1], "utf-8", "replace"), at + length
+
+    return read
+
+
+def _sequence_reader(read_length: _Read, read_element: _Read) -> _Read:
+    def read(content: memoryview, at: int) -> tuple[list[Any], int]:
+        length, at = read_length(content, at)
+        elements = []
+        for _ in range(length):
+            element, at = read_element(content, at)
+            elements.append(element)
+        return elements, at
 
     return read
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import struct
+from array import array
 
 import pytest
 
@@ -39,6 +40,8 @@ def some_edges(number: int) -> RelativeRotationArray:
             target=end(),
             rotation=Quaternion(x=x, y=y, z=z, w=w),
             precision=draw.choice((0.0, 1e300, float("inf"))),
+            translation=[draw.uniform(-9, 9) for _ in range(draw.choice((0, 3)))],
+            translation_precision=draw.uniform(0, 9),
             kind=draw.randrange(256),
         )
 
@@ -48,6 +51,8 @@ def some_edges(number: int) -> RelativeRotationArray:
 def plain(message: object) -> object:
     """Fields and their values, of a message or what stands for one."""
     names = getattr(message, "_fields", None) or getattr(message, "get_fields_and_field_types", dict)()
+    if isinstance(message, (list, array)):
+        return list(message)
     return {name: plain(getattr(message, name)) for name in names} if names else message
 
 
@@ -55,9 +60,9 @@ def plain(message: object) -> object:
 def test_what_is_read_is_what_rclpy_unpacks(number: int) -> None:
     serialized = serialize_message(some_edges(number))
     expected = deserialize_message(serialized, RelativeRotationArray)
-    array = SerializedArray(serialized, RelativeRotationArray)
-    assert plain(array.header) == plain(expected.header)
-    assert [plain(edge) for edge in array.edges] == [plain(edge) for edge in expected.edges]
+    read = SerializedArray(serialized, RelativeRotationArray)
+    assert plain(read.header) == plain(expected.header)
+    assert [plain(edge) for edge in read.edges] == [plain(edge) for edge in expected.edges]
 
 
 def test_edges_of_it_are_converted_as_those_of_a_message() -> None:
@@ -69,9 +74,9 @@ def test_edges_of_it_are_converted_as_those_of_a_message() -> None:
 
 def test_both_byte_orders_are_read_and_other_representations_are_left_to_rclpy(monkeypatch: pytest.MonkeyPatch) -> None:
     big = b"\x00\x00\x00\x00" + struct.pack(">iII4sI", 7, 9, 4, b"cam\0", 0)
-    array = SerializedArray(big, RelativeRotationArray)
-    assert (array.header.stamp.sec, array.header.stamp.nanosec, array.header.frame_id) == (7, 9, "cam")
-    assert list(array.edges) == []
+    read = SerializedArray(big, RelativeRotationArray)
+    assert (read.header.stamp.sec, read.header.stamp.nanosec, read.header.frame_id) == (7, 9, "cam")
+    assert list(read.edges) == []
     other = b"\x00\x07" + serialize_message(some_edges(2))[2:]
     monkeypatch.setattr("rotavg_ros.ros.node.intake.serialized_array.deserialize_message", lambda *_: some_edges(2))
     assert [plain(edge) for edge in SerializedArray(other, RelativeRotationArray).edges] == [
