@@ -47,7 +47,7 @@ class _Content:
 
     @property
     def has_translations(self) -> bool:
-        """Whether there is one for every edge."""
+        """Whether there is one for any edge."""
         return any(edge.translation is not None for edge in self.edges)
 
 

@@ -33,7 +33,7 @@ class Places:
     """What translations add (N nodes, M edges): positions in the orientations' frame, and each edge's rotation alone.
 
     Attributes:
-        position: ``(N, 3)`` metres; NaN where nothing tells.
+        position: ``(N, 3)`` metres.
         variance: ``(N,)`` m² per component, relative to the component's first node.
         rotation_score: ``(M,)`` probability that an edge's rotation is wrong; its outlier score counts its place, too.
         precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count; 0 where nothing is known.

@@ -71,6 +71,7 @@ class GraphFile:
         """The graph has the translations, too: a solver sees nothing else."""
         if self.edge_translation is not None and self.graph.translation is None:
             translation = torch.as_tensor(self.edge_translation, dtype=torch.float64)
+            translation = torch.where(translation.isfinite().all(dim=1, keepdim=True), translation, torch.nan)
             object.__setattr__(self, "graph", replace(self.graph, translation=translation))
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -175,7 +175,7 @@ class Answer:
     def without_content(self) -> Answer:
         """The same answer about no keyframes and no edges."""
         arrays: dict[str, Any] = {
-            name: value[:0] for name, value in vars(self).items() if isinstance(value, np.ndarray)
+            each.name: value[:0] for each in fields(self) if isinstance(value := getattr(self, each.name), np.ndarray)
         }
         return replace(self, robots=(), warnings=(), **arrays)
 

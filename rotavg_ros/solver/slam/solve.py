@@ -116,6 +116,8 @@ def _with_poses(estimate: Estimate, graph: ClosureGraph, poses: Poses) -> Estima
         outlier_score=torch.from_numpy(slam_stages.outlier_scores(graph, poses.outlier_probability)),
         variance=torch.from_numpy(poses.variance),
         places=places,
+        # The posterior's is of answers that rotations alone do not tell apart.
+        warnings=estimate.warnings if len(poses.rivals) > 1 else (),
     )
 
 

@@ -22,7 +22,8 @@ def first_of_each(graph: ViewGraph) -> tuple[np.ndarray, np.ndarray] | None:
 
     Two edges say the same if they are of one kind and label, between the same nodes, and measure the same
     rotation and translation.
-    Independent measurements of a pair of nodes differ, be it by little.
+    Independent measurements of a pair of nodes differ, be it by little. One without a translation differs from one
+    with.
 
     Returns:
         ``(U,)`` edges, ascending, and ``(M,)`` numbers in 0 … U-1; None if there are no repetitions.

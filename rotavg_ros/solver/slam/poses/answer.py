@@ -133,6 +133,9 @@ def _precision(pose: PoseMode) -> np.ndarray:
     graph, closure = problem.graph, problem.mode.problem.closure
     edges = drawn.view_graph_edge[closure - drawn.num_segments]
     variance = np.stack((noise.turn * graph.steps.numpy(), noise.way * problem.lengths_passed), axis=1)
+    slipped = drawn.edge_values((drawn.is_odometry & ~problem.mode.state.is_good).astype(np.float64))
+    slip = np.radians(problem.mode.problem.priors.slip_deg), problem.priors.slip * problem.typical
+    variance += (slipped * drawn.share_of_segment)[:, None] * np.square(slip)
     variance[edges, 0] = 1 / pose.solved.rotation_weight[closure]
     variance[edges, 1] = 1 / pose.solved.closure_weight
     known = np.isfinite(problem.translation).all(axis=1)
@@ -181,6 +184,6 @@ def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
     rotation, _ = scores(mode.problem, mode.state, mode.left_out)
     rotation[closure] = good * exceeds + (1 - good) * exceedance(turn, predicted, OUTLIER_ANGLE, k)
     score = rotation.copy()
-    wrong = places.false(FALSE_METRES)
+    wrong = np.where(problem.told.is_known, places.false(FALSE_METRES), 1 - good)
     score[closure] = np.maximum(1 - (1 - exceeds) * (1 - wrong), rotation[closure])
     return score, rotation

@@ -7,6 +7,7 @@ those near by come in first, and what they tie down judges the others.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,7 +40,7 @@ class PoseMode:
     Attributes:
         problem: the graph.
         solved: the last solve.
-        cost: −log p of translations given what rotations say, nats; where rotations' labels were held.
+        cost: −log p of translations given what rotations say, nats; NaN unless rotations' labels were held.
     """
 
     problem: PoseProblem
@@ -82,6 +83,8 @@ def estimate_poses(problem: PoseProblem, *, hold: bool = False, start: PoseMode 
             break
         places = after
         state, change = _with_noise(solved.state, noise, change, is_held=number <= held)
+    if not hold:
+        return PoseMode(problem, solved, math.nan)
     used = problem.rotation_variance(solved.state.noise)[problem.mode.problem.closure]
     judge = replace(judge, told=replace(judge.told, rotation_variance=used))
     in_order = judge(solved.predictions, solved.places.chance, solved.scale, in_order=True)

@@ -35,8 +35,7 @@ def _normal(problem: PoseProblem, solved: Solved) -> float:
     cost += float(np.linalg.slogdet(solved.covariance[odometry])[1].sum()) / 2
     cost -= (float(np.log(solved.closure_weight).sum()) * m + float(np.log(solved.rotation_weight).sum()) * k) / 2
     cost += m / 2 * problem.num_runs * float(np.log(problem.priors.common * solved.state.noise.closure))
-    if not problem.turns_share:
-        cost += k / 2 * problem.num_runs * float(np.log(problem.common_turn(solved.state.noise)))
+    cost += k / 2 * problem.num_runs * float(np.log(problem.common_turn(solved.state.noise)))
     # Rows less unknowns, per component of a shift.
     redundant = len(drawn.source) - drawn.num_nodes + len(drawn.roots)
     return cost + m / 2 * redundant * float(np.log(2 * np.pi))
@@ -47,7 +46,7 @@ def _normal_of_rotations(problem: PoseProblem) -> float:
     evaluation, k = problem.mode.evaluation, problem.turns
     weight = evaluation.weight[:, None]
     cost = float((weight * evaluation.residual**2).sum() + k * evaluation.factorised.log_det) / 2
-    return cost - k / 2 * float(np.log(evaluation.weight[: len(problem.drawn.source)]).sum())
+    return cost - k / 2 * float(np.log(evaluation.weight).sum())
 
 
 def _as_normal(problem: PoseProblem, solved: Solved) -> np.ndarray:

@@ -49,6 +49,7 @@ class Told:
         run: ``(C,)`` number of its run.
         own_share: ``(C,)`` share of its error's variance that it does not share with its run.
         follows: ``(C,)`` the closure before each, or -1.
+        sign: ``(C,)`` +1 where it runs from its older to its newer end, else −1.
     """
 
     rotation_variance: np.ndarray
@@ -58,6 +59,15 @@ class Told:
     run: np.ndarray
     own_share: np.ndarray
     follows: np.ndarray
+    sign: np.ndarray
+
+    @property
+    def has_neighbour(self) -> np.ndarray:
+        """``(C,)`` bool, whether the place of the closure before or after it is told as well."""
+        later = np.flatnonzero((self.follows >= 0) & self.is_known & self.is_known[self.follows])
+        found = np.zeros(len(self.follows), dtype=bool)
+        found[later] = found[self.follows[later]] = True
+        return found
 
 
 @dataclass(frozen=True)
@@ -88,7 +98,7 @@ class Places:
         return np.asarray(1 - self.chance[-1])
 
     def false(self, metres: float) -> np.ndarray:
-        """``(C,)`` probability that the rotation is false or the translation errs by more than some metres."""
+        """``(C,)`` probability that the rotation is false or a known translation errs by more than some metres."""
         beyond = [
             exceedance(length, variance, metres, _DIMENSIONS)
             for length, variance in zip(self.error, self.error_variance, strict=True)
@@ -139,10 +149,13 @@ class Judge:
         variance = self._variances(scale)
         total = spread + variance[:, :, None]
         log_shift = -(along**2 / total + np.log(2 * np.pi * total)).sum(axis=2) / 2
-        log_shift[-1] = _log_repeated(predictions.mean[:, k:], before, told, scale.closure, in_order)
+        shift = told.sign[:, None] * predictions.mean[:, k:]
+        log_shift[-1] = _log_repeated(shift, before, told, scale.closure, in_order)
         log_false = told.false_odds + np.where(known, self._log_unrelated(predictions, scale, log_shift[-1]), 0.0)
-        # A closure without a translation may be any class, which says nothing.
-        log_class = np.where(known, log_shift + self._log_classes(before), -np.log(_GOOD + _ELSEWHERE))
+        log_class = log_shift + self._log_classes(before)
+        # Without a translation nothing tells of a place: a closure whose rotation is right is good.
+        log_class[:, ~known] = _LOG_NOTHING
+        log_class[0, ~known] = 0.0
         log_all = self._as_labelled(np.concatenate((log_turn + log_class, log_false[None])))
         log_density = logsumexp(log_all, axis=0)
         chance = np.exp(log_all - log_density)
@@ -202,25 +215,31 @@ class Judge:
         """``(J, C)`` nats, of each class if the rotation is no false one."""
         priors, share = self.priors, _wrong_share(before, self.told, self.priors)
         right, wrong = np.log1p(-share), np.log(share)
-        by_itself = wrong + np.log1p(-priors.repeats) - np.log(_WRONG)
+        log_alone, log_repeat = self._log_repeats()
+        by_itself = wrong + log_alone - np.log(_WRONG)
         return np.stack(
             (
                 right + np.log1p(-priors.tails),
                 right + np.log(priors.tails),
                 *[by_itself] * _WRONG,
-                wrong + np.log(priors.repeats),
+                wrong + log_repeat,
             )
         )
 
+    def _log_repeats(self) -> tuple[np.ndarray, np.ndarray]:
+        """``(C,)`` nats each, that a wrong place is no neighbour's, and that it is."""
+        may_repeat, share = self.told.has_neighbour, self.priors.repeats
+        return np.where(may_repeat, np.log1p(-share), 0.0), np.where(may_repeat, np.log(share), _LOG_NOTHING)
+
     def _log_unrelated(self, predictions: Predictions, scale: Scale, log_repeated: np.ndarray) -> np.ndarray:
         """``(C,)`` nats, of shifts of closures whose rotation is false: wrong places whatever the turn."""
-        k, repeats = self.turns, self.priors.repeats
+        k, (log_itself, log_repeat) = self.turns, self._log_repeats()
         spread, axes = np.linalg.eigh(predictions.covariance[:, k:, k:])
         along = np.matmul(axes.transpose(0, 2, 1), predictions.mean[:, k:, None])[:, :, 0]
         total = np.maximum(spread, 0.0) + self._wrong(scale)[:, None, None]
         log_each = -(along**2 / total + np.log(2 * np.pi * total)).sum(axis=2) / 2
         log_alone = logsumexp(log_each, axis=0) - np.log(_WRONG)
-        return np.asarray(np.logaddexp(log_alone + np.log1p(-repeats), log_repeated + np.log(repeats)))
+        return np.asarray(np.logaddexp(log_alone + log_itself, log_repeated + log_repeat))
 
     def _as_labelled(self, log_all: np.ndarray) -> np.ndarray:
         """Without the classes that somebody's label, or that of rotations, rules out."""
@@ -275,7 +294,7 @@ def _log_repeated(
     """``(C,)`` nats, density of each closure's shift if it joins the same wrong place as the one before or after.
 
     Args:
-        mean: ``(C, m)`` metres, what each is off by.
+        mean: ``(C, m)`` metres, what each is off by, from its older to its newer end.
         before: ``(J + 1, C)`` chances of classes.
         told: which follows which.
         closure_variance: m² per component, of good closures: of the difference of two, twice that.

@@ -23,7 +23,7 @@ class PlacePriors:
         turned_deg: standard deviation of how much another place that looks alike is seen turned.
         wrong_place: closures of a plausible rotation that join wrong places: a priori that many in as many as are
             counted beforehand, …
-        counted: … in all, and within one run.
+        counted: … in all; what all tell counts for one closure within a run.
         repeats: share of wrong places that repeat the one of the closure before or after, where there is one.
         least_wrong: a wrong place is off by so many standard deviations of a good closure at least, and by the map's
             extent at most; all scales between are as likely.

@@ -29,6 +29,8 @@ _PLANAR = 1e-6
 _LEAST_LENGTH = 1e-3
 # The share of an error that is not shared; the system stays solvable.
 _NONE = 1e-6
+# The weight of what does not pull, in that of what does.
+_NOTHING = 1e-8
 # Roots are tied down so many times more stiffly than any row.
 _GROUNDING = 1e6
 
@@ -101,7 +103,8 @@ class PoseProblem:
     @cached_property
     def lengths(self) -> np.ndarray:
         """``(M, 3)`` translations, 0 where unknown."""
-        return np.asarray(np.nan_to_num(self.translation))
+        known = np.isfinite(self.translation).all(axis=1, keepdims=True)
+        return np.where(known, self.translation, 0.0)
 
     @cached_property
     def typical(self) -> float:
@@ -224,7 +227,7 @@ class PoseProblem:
         is_known = known[self.drawn.view_graph_edge[closure - self.drawn.num_segments]]
         shared = np.where(self.run[closure] >= 0, self.priors.common, 0.0)
         own = self.rotation_variance(self.turn_noise)[closure]
-        return Told(own, false_odds, is_known, label, problem.run, 1 - shared, problem.follows)
+        return Told(own, false_odds, is_known, label, problem.run, 1 - shared, problem.follows, problem.sign)
 
     @cached_property
     def equations(self) -> BlockEquations:
@@ -288,7 +291,10 @@ class PoseProblem:
         unit = np.eye(self.shifts)
         noise = state.noise
         variance = noise.way * np.maximum(way.length, _LEAST_LENGTH * self.typical)
-        variance[:num_segments] += np.where(self.slipped, (self.priors.slip * self.typical) ** 2, 0.0)
+        slipped = drawn.is_odometry & ~self.mode.state.is_good
+        variance += np.where(slipped, (self.priors.slip * self.typical) ** 2, 0.0)
+        # Odometry beside the chain that is not believed, which nothing hangs on, does not pull.
+        variance[num_segments:] = np.where(slipped, variance / _NOTHING, variance)[num_segments:]
         variance[self.mode.problem.closure] = noise.closure * self.told.own_share
         covariance = variance[:, None, None] * unit
         covariance[: drawn.num_segments] += self.bridge_variance(noise)[:, None, None] * self.bent(way)

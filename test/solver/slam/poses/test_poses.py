@@ -242,6 +242,37 @@ def test_closures_without_a_translation_are_judged_by_their_rotation() -> None:
     assert torch.equal(solution.rotation_score[unknown] > 0.5, solution.outlier_score[unknown] > 0.5)
 
 
+def test_a_closure_without_a_translation_may_be_long() -> None:
+    """Nothing tells where it leads, so metres between its ends say nothing."""
+    run = simulated(12, closure_radius_m=6.0)
+    graph = graph_of(run)
+    assert graph.translation is not None
+    unknown = ~graph.is_odometry & (torch.arange(graph.num_edges) % 2 == 0)
+    solution = as_answered(replace(graph, translation=torch.where(unknown[:, None], torch.nan, graph.translation)))
+    assert solution.position is not None
+    apart = (solution.position[graph.source] - solution.position[graph.target]).norm(dim=1)
+    assert (unknown & (apart > 2.5)).sum() > 3
+    assert (solution.outlier_score[unknown] < 0.5).all()
+
+
+def test_rejected_odometry_beside_the_chain_does_not_pull() -> None:
+    run = simulated(13)
+    graph = graph_of(run)
+    assert graph.translation is not None
+    wrong = ViewGraph.create(
+        torch.cat((graph.source, torch.tensor([50]))),
+        torch.cat((graph.target, torch.tensor([60]))),
+        torch.cat((graph.target_from_source, torch.tensor([[0.0, 0.0, 0.7, 0.714142842854285]]).double())),
+        kind=torch.cat((graph.kind, torch.tensor([int(EdgeKind.ODOMETRY)]))),
+        label=torch.cat((graph.label, torch.tensor([int(EdgeLabel.REJECTED)]))),
+        translation=torch.cat((graph.translation, torch.tensor([[30.0, 0.0, 0.0]]).double())),
+    )
+    first, second = as_answered(graph), as_answered(wrong)
+    same_orientations(first, second, 0.2)
+    assert first.position is not None and second.position is not None
+    assert (first.position - second.position).norm(dim=1).max() < 0.05
+
+
 def test_labels_decide() -> None:
     run = simulated(7)
     graph, is_wrong = displaced(run, 0.3, 7)
