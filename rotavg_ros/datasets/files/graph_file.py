@@ -69,7 +69,7 @@ class GraphFile:
 
     def __post_init__(self) -> None:
         """The graph has the translations, too: a solver sees nothing else."""
-        if self.edge_translation is not None and self.graph.translation is None:
+        if self.edge_translation is not None:
             translation = torch.as_tensor(self.edge_translation, dtype=torch.float64)
             translation = torch.where(translation.isfinite().all(dim=1, keepdim=True), translation, torch.nan)
             object.__setattr__(self, "graph", replace(self.graph, translation=translation))

@@ -172,7 +172,9 @@ def spoiled_case(key: CaseKey, graph_file: GraphFile, share: float) -> Case:
         spoiled = insert_slips(spoiled.graph_file, truth, _SLIP_SHARE, rng, rule=SLIP_RULES[key.kind])
         was_spoiled = was_spoiled | spoiled.spoiled
     intact = torch.from_numpy(~was_spoiled)
-    return Case(key, spoiled.graph_file.graph, torch.from_numpy(truth), SLAM, intact, floor)
+    # Rotations were replaced, and translations would tell which.
+    graph = replace(spoiled.graph_file.graph, translation=None)
+    return Case(key, graph, torch.from_numpy(truth), SLAM, intact, floor)
 
 
 def _reference(graph_file: GraphFile) -> tuple[np.ndarray, float]:

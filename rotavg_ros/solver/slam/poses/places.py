@@ -232,14 +232,18 @@ class Judge:
         return np.where(may_repeat, np.log1p(-share), 0.0), np.where(may_repeat, np.log(share), _LOG_NOTHING)
 
     def _log_unrelated(self, predictions: Predictions, scale: Scale, log_repeated: np.ndarray) -> np.ndarray:
-        """``(C,)`` nats, of shifts of closures whose rotation is false: wrong places whatever the turn."""
+        """``(C,)`` nats, of shifts of closures whose rotation is false: wrong places, or the right one turned."""
         k, (log_itself, log_repeat) = self.turns, self._log_repeats()
         spread, axes = np.linalg.eigh(predictions.covariance[:, k:, k:])
         along = np.matmul(axes.transpose(0, 2, 1), predictions.mean[:, k:, None])[:, :, 0]
         total = np.maximum(spread, 0.0) + self._wrong(scale)[:, None, None]
         log_each = -(along**2 / total + np.log(2 * np.pi * total)).sum(axis=2) / 2
         log_alone = logsumexp(log_each, axis=0) - np.log(_WRONG)
-        return np.asarray(np.logaddexp(log_alone + log_itself, log_repeated + log_repeat))
+        log_wrong = np.logaddexp(log_alone + log_itself, log_repeated + log_repeat)
+        right = np.maximum(spread, 0.0) + (scale.closure * self.told.own_share)[:, None]
+        log_right = -(along**2 / right + np.log(2 * np.pi * right)).sum(axis=1) / 2
+        share = self.priors.turned_in_place
+        return np.asarray(np.logaddexp(log_wrong + np.log1p(-share), log_right + np.log(share)))
 
     def _as_labelled(self, log_all: np.ndarray) -> np.ndarray:
         """Without the classes that somebody's label, or that of rotations, rules out."""

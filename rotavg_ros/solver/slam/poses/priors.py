@@ -21,6 +21,7 @@ class PlacePriors:
         tails: share of good closures whose translation errs by far more than others', …
         tail_ratio: … by so many times the variance.
         turned_deg: standard deviation of how much another place that looks alike is seen turned.
+        turned_in_place: share of false rotations at the right place: symmetric rooms, registrations that flip.
         wrong_place: closures of a plausible rotation that join wrong places: a priori that many in as many as are
             counted beforehand, …
         counted: … in all; what all tell counts for one closure within a run.
@@ -38,6 +39,7 @@ class PlacePriors:
     tails: float = 0.1
     tail_ratio: float = 16.0
     turned_deg: float = 5.0
+    turned_in_place: float = 0.5
     wrong_place: float = 0.5
     counted: float = 3.0
     repeats: float = 0.5
