@@ -73,7 +73,8 @@ def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
         if not is_default or not has_places(graph):
             return rotations_alone
         with watch.stage("poses"):
-            return _with_poses(rotations_alone, closure_graph, poses_after_passes(graph, prepared, cleaned, estimate))
+            poses = poses_after_passes(graph, prepared, cleaned, estimate)
+            return _with_poses(graph, rotations_alone, closure_graph, poses)
     with watch.stage("expand"):
         score = slam_stages.outlier_scores(prepared.closure_graph, 1 - cleaned.inlier_probability)
         orientations = prepared.closure_graph.orientations(correction)
@@ -99,21 +100,29 @@ def _solve_by_posterior(graph: ViewGraph, stages: SlamStages, run: Run) -> Estim
     if "translations" in stages.without or not has_places(graph):
         return estimate
     with run.watch.stage("poses"):
-        return _with_poses(estimate, published.graph, poses_after_search(graph, found))
+        return _with_poses(graph, estimate, published.graph, poses_after_search(graph, found))
 
 
-def _with_poses(estimate: Estimate, graph: ClosureGraph, poses: Poses) -> Estimate:
-    """The estimate of rotations alone, with orientations, scores and positions by translations as well."""
+def _with_poses(graph: ViewGraph, estimate: Estimate, drawn: ClosureGraph, poses: Poses) -> Estimate:
+    """The estimate of rotations alone, with orientations, positions and closures' scores by translations as well.
+
+    Whether odometry slipped is told by rotations.
+    """
+    by_both = (poses.outlier_probability, poses.rotation_probability)
+    score, rotation_score = (
+        torch.where(graph.is_odometry, estimate.outlier_score, torch.from_numpy(drawn.edge_values(probability)))
+        for probability in by_both
+    )
     places = Places(
         torch.from_numpy(poses.position),
         torch.from_numpy(poses.position_variance),
-        torch.from_numpy(slam_stages.outlier_scores(graph, poses.rotation_probability)),
+        rotation_score,
         torch.from_numpy(poses.precision),
     )
     return replace(
         estimate,
         body_from_world=torch.from_numpy(np.ascontiguousarray(poses.body_from_world)),
-        outlier_score=torch.from_numpy(slam_stages.outlier_scores(graph, poses.outlier_probability)),
+        outlier_score=score,
         variance=torch.from_numpy(poses.variance),
         places=places,
         # The posterior's is of answers that rotations alone do not tell apart.

@@ -11,7 +11,6 @@ from rotavg_ros.solver.slam.noise.exceedance import exceedance
 from rotavg_ros.solver.slam.noise.judging import OUTLIER_ANGLE
 from rotavg_ros.solver.slam.poses.estimate import PoseMode, estimate_poses
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
-from rotavg_ros.solver.slam.posterior.left_out import scores
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
 
@@ -31,8 +30,8 @@ class Poses:
         position: ``(N, 3)`` metres, in the frame of the odometry's orientations; roots at the origin.
         variance: ``(N,)`` rad² per component, of orientations.
         position_variance: ``(N,)`` m² per component.
-        outlier_probability: ``(E,)`` that a closure is false, in rotation or place, or that a segment slipped.
-        rotation_probability: ``(E,)`` that its rotation is.
+        outlier_probability: ``(E,)`` that a closure is false, in rotation or place; of odometry its label.
+        rotation_probability: ``(E,)`` that its rotation is; of odometry likewise.
         precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which the view-graph's edges count; 0 of translations
             that are not known.
         rivals: probabilities of the labellings that were averaged.
@@ -181,7 +180,7 @@ def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
     part = own / (own + predicted)
     exceeds = exceedance(part * turn, part * predicted, OUTLIER_ANGLE, k)
     good = places.rotation_good
-    rotation, _ = scores(mode.problem, mode.state, mode.left_out)
+    rotation = 1 - mode.state.trusted
     rotation[closure] = good * exceeds + (1 - good) * exceedance(turn, predicted, OUTLIER_ANGLE, k)
     score = rotation.copy()
     wrong = np.where(problem.told.is_known, places.false(FALSE_METRES), 1 - good)
