@@ -13,24 +13,35 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rotavg_ros.bags.message_types import ODOMETRY, VECTOR
-from rotavg_ros.bags.messages import odometry_message, vector_message
+from rotavg_ros.bags.message_types import ODOMETRY, typestore
+from rotavg_ros.bags.messages import odometry_message
 from rotavg_ros.bags.writer import BagWriter
 from rotavg_ros.cli.main import main
 
 ROTAVG = [sys.executable, "-m", "rotavg_ros.cli.main"]
+
+WIND = "geometry_msgs/msg/Vector3Stamped"
+
+
+def wind_message(stamp_ns: int):
+    """Of a type that a replay has no use for."""
+    types, header = (
+        typestore().types,
+        odometry_message(stamp_ns, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), "map").header,
+    )
+    return types[WIND](header=header, vector=types["geometry_msgs/msg/Vector3"](x=1.0, y=1.0, z=1.0))
 
 
 def make_bag(folder: Path, count: int = 50, topic: str = "/odom", period_ns: int = 100_000_000) -> Path:
     """Odometry that drives straight on, and a topic of vectors."""
     with BagWriter(folder) as bag:
         bag.add_topic(topic, ODOMETRY)
-        bag.add_topic("/wind", VECTOR)
+        bag.add_topic("/wind", WIND)
         for index in range(count):
             stamp = 10**9 + index * period_ns
             pose = np.array([0.1 * index, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0])
             bag.write(topic, stamp, odometry_message(stamp, *pose, "odom"))
-            bag.write("/wind", stamp, vector_message(stamp, np.ones(3), "map"))
+            bag.write("/wind", stamp, wind_message(stamp))
     return folder
 
 
@@ -64,8 +75,8 @@ def without_messages(folder: Path, small: Path) -> Path:
 
 def without_odometry(folder: Path, small: Path) -> Path:
     with BagWriter(folder / "wind") as bag:
-        bag.add_topic("/wind", VECTOR)
-        bag.write("/wind", 10**9, vector_message(10**9, np.ones(3), "map"))
+        bag.add_topic("/wind", WIND)
+        bag.write("/wind", 10**9, wind_message(10**9))
     return folder / "wind"
 
 

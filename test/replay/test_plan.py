@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rotavg_ros.bags.answer_messages import orientation_message
-from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION, VECTOR, typestore
-from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_message, vector_message
+from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION, typestore
+from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_message
 from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.bags.writer import BagWriter
 from rotavg_ros.replay.options import ReplayOptionError, read_parameter_file
@@ -19,6 +19,7 @@ from rotavg_ros.settings.parameters import NodeParameters
 from rotavg_ros.settings.text import to_yaml
 
 IMU = "sensor_msgs/msg/Imu"
+VECTOR = "geometry_msgs/msg/Vector3Stamped"
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -37,6 +38,13 @@ def imu_message(orientation_is_known: bool):
     )
 
 
+def wind_message():
+    """Of a type that a replay has no use for."""
+    types = typestore().types
+    header = odometry_message(10**9, np.zeros(3), IDENTITY, "map").header
+    return types[VECTOR](header=header, vector=types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0))
+
+
 def relative_rotation(kind: int):
     ends = Keyframe(3, 10**9), Keyframe(4, 10**9 + 5)
     return edge_message(Edge(10**9, 1, 1, *ends, IDENTITY, 100.0, kind))
@@ -45,7 +53,7 @@ def relative_rotation(kind: int):
 ODOM = (ODOMETRY, lambda: odometry_message(10**9, np.zeros(3), IDENTITY, "odom"))
 CLOSURE = (RELATIVE_ROTATION, lambda: relative_rotation(1))
 STEP = (RELATIVE_ROTATION, lambda: relative_rotation(0))
-WIND = (VECTOR, lambda: vector_message(10**9, np.zeros(3), "map"))
+WIND = (VECTOR, wind_message)
 GOOD_IMU, BLIND_IMU = (IMU, lambda: imu_message(True)), (IMU, lambda: imu_message(False))
 
 

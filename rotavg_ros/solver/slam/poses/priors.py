@@ -38,7 +38,7 @@ class PlacePriors:
     common: float = 0.5
     tails: float = 0.1
     tail_ratio: float = 16.0
-    turned_deg: float = 5.0
+    turned_deg: float = 10.0
     turned_in_place: float = 0.5
     wrong_place: float = 0.5
     counted: float = 3.0
