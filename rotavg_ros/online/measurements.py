@@ -107,8 +107,8 @@ class EdgeMeasurement:
         kind: an :class:`EdgeKind` value.
         precision: rad⁻²; 0 is unknown; negative or not finite refuses the edge (a sender that gets its own
             covariance wrong is not to be trusted with the rotation).
-        translation: of the target's body in the source's body frame, metres; None unknown. It has no part in the
-            rotations, only in the positions along them, so one that is not finite merely counts as unknown.
+        translation: of the target's body in the source's body frame, metres; None unknown. An edge may well have none,
+            so one that is not finite merely counts as unknown.
     """
 
     edge_id: int

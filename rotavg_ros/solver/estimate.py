@@ -67,9 +67,11 @@ class Run:
         watch: for the seconds of the stages.
         refinement_steps: at most, 0 for none; None: as many as the stages like.
         warm_start: ``(N, 4)`` body_from_world to begin with instead of the tree's.
+        memory: of the profile's last solve, if the method is the same; the graph may be another one.
     """
 
     networks: Networks
     watch: Stopwatch
     refinement_steps: int | None = None
     warm_start: Tensor | None = None
+    memory: object | None = None

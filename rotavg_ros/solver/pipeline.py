@@ -97,17 +97,17 @@ def solve(
     graph = graph.to("cpu")
     job = _Job(graph, graph.components(), names, profile)
     steps = refinement_steps
-    goes_on_from = _memory_of(names, memory) if steps is None else None
+    goes_on_from = _memory_of(names, memory) if steps is None and warm_start is not None else None
     watch = Stopwatch()
     try:
-        estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start), goes_on_from)
+        estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start, goes_on_from))
     except devices.GPU_ERRORS as error:
         if where == "cpu":
             raise
         devices.fall_back(error)
         where = "cpu"
         watch = Stopwatch()
-        estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start), None)
+        estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start))
     score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, estimate.outlier_score.cpu())
     score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
     places = estimate.places
@@ -146,7 +146,7 @@ def _memory_of(names: list[str], memory: object | None) -> SlamMemory | Posterio
     return memory if names == [POSTERIOR] and isinstance(memory, PosteriorMemory) else None
 
 
-def _run(job: _Job, run: Run, memory: SlamMemory | PosteriorMemory | None) -> Estimate:
+def _run(job: _Job, run: Run) -> Estimate:
     """Every link of the method; the last may go on from what an earlier solve of the graph remembers."""
     device, last_steps = run.networks.device, run.refinement_steps
     if last_steps is None and run.warm_start is not None and _refines_slam(job):
@@ -155,7 +155,8 @@ def _run(job: _Job, run: Run, memory: SlamMemory | PosteriorMemory | None) -> Es
     for name in job.names[:-1]:
         before = _solve_once(job, name, replace(run, refinement_steps=None))
         run = replace(run, warm_start=before.body_from_world)
-    if memory is not None and run.warm_start is not None and job.profile == "slam":
+    memory = run.memory
+    if isinstance(memory, (SlamMemory, PosteriorMemory)) and run.warm_start is not None and job.profile == "slam":
         estimate = update_slam(job.graph, memory, run)
         if estimate is not None:
             return replace(estimate, warnings=memory.warnings)

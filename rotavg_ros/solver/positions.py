@@ -16,11 +16,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.solver.algebra.laplacian import LaplacianPattern
+from rotavg_ros.solver.odometry_lengths import lengths_passed, typical_length
 
 # A closure is worth as much as this many typical steps of odometry in a row.
 _CLOSURE_STEPS = 30.0
-# A step's variance grows with its length, and is that of this share of a typical one at least: wheels slip on the spot.
-_SHORTEST_STEP = 0.05
 _PASSES = 5
 # Geman & McClure's weight is a quarter at this many standard deviations; squared normal errors have about this median.
 _SCALE_SIGMAS = 3.0
@@ -82,10 +81,9 @@ def fit_positions(
     num_nodes = len(world_from_body)
     component, roots = _components(num_nodes, source, target)
     step = Rotation.from_quat(world_from_body[source]).apply(edges.translation) if len(source) else np.empty((0, 3))
-    length = np.linalg.norm(step, axis=1)
-    typical = _typical((length / steps)[is_odometry] if is_odometry.any() else length)
-    shortest = _SHORTEST_STEP * typical * steps
-    weight = np.where(is_odometry, typical / np.maximum(length, shortest), edges.trust / _CLOSURE_STEPS)
+    counts = is_odometry if is_odometry.any() else np.ones(len(source), dtype=bool)
+    typical = typical_length(step, steps, counts)
+    weight = np.where(is_odometry, typical / lengths_passed(step, steps, counts), edges.trust / _CLOSURE_STEPS)
 
     pattern = LaplacianPattern(num_nodes, source, target, roots)
 
@@ -114,9 +112,3 @@ def _components(
     _, component = connected_components(adjacency, directed=False)
     _, roots = np.unique(component, return_index=True)
     return component.astype(np.int64), roots.astype(np.int64)
-
-
-def _typical(length: NDArray[np.float64]) -> float:
-    """Median of the lengths that are not zero; 1 where all are."""
-    moving = length[length > 0]
-    return float(np.median(moving)) if len(moving) else 1.0

@@ -79,6 +79,7 @@ def play(
     source, target = graph.source.tolist(), graph.target.tolist()
     rotation, kind = graph.target_from_source.tolist(), graph.kind.tolist()
     precision = torch.nan_to_num(graph.precision).tolist()
+    translation = [None] * graph.num_edges if graph.translation is None else graph.translation.tolist()
     flags, orientations = np.zeros(graph.num_edges, dtype=bool), rotations.identity(0)
     given, rows = 0, []
     ends = [*range(KEYFRAMES_PER_TICK, graph.num_nodes, KEYFRAMES_PER_TICK), graph.num_nodes]
@@ -92,6 +93,7 @@ def play(
                     rotation[edge],
                     kind[edge],
                     precision[edge],
+                    translation[edge],
                 )
             )
             given += 1

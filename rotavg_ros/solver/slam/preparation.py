@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -114,16 +115,32 @@ def _may_be_biased(prepared: Prepared) -> bool:
 def _contract(graph: ViewGraph, scale_estimation: bool) -> Prepared:
     """As :func:`prepare`, believing the odometry."""
     closure_graph, forest = draw_together(graph)
+    components = rotation_components(graph)
+
+    def noise(squared_angle: np.ndarray, path_steps: np.ndarray, pairs: AgreementPairs) -> NoiseModel:
+        if scale_estimation:
+            return estimate_noise(discrepancies(squared_angle, path_steps, pairs), components)
+        return _stated_noise(graph, components)
+
+    return _prepared(closure_graph, forest, noise)
+
+
+def prepared_with(closure_graph: ClosureGraph, forest: SpanningForest, noise: NoiseModel) -> Prepared:
+    """A graph that has been drawn together along ``forest``, whose noise is known."""
+    return _prepared(closure_graph, forest, lambda *_: noise)
+
+
+def _prepared(
+    closure_graph: ClosureGraph,
+    forest: SpanningForest,
+    noise: Callable[[np.ndarray, np.ndarray, AgreementPairs], NoiseModel],
+) -> Prepared:
     closure = closure_graph.is_closure
     squared_angle = (rotations.log(closure_graph.residual) ** 2).sum(dim=1).numpy()[closure]
     path_steps = closure_graph.path_steps[closure]
     pairs = agreement_pairs(closure_graph)
-    components = rotation_components(graph)
-    if scale_estimation:
-        noise = estimate_noise(discrepancies(squared_angle, path_steps, pairs), components)
-    else:
-        noise = _stated_noise(graph, components)
-    return Prepared(closure_graph, squared_angle, path_steps, pairs, noise, forest)
+    found = noise(squared_angle, path_steps, pairs)
+    return Prepared(closure_graph, squared_angle, path_steps, pairs, found, forest)
 
 
 def draw_together(graph: ViewGraph) -> tuple[ClosureGraph, SpanningForest]:

@@ -12,19 +12,30 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.estimate import Estimate, Places, Run
 from rotavg_ros.solver.slam import refinement as slam_refinement
 from rotavg_ros.solver.slam import stages as slam_stages
-from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
+from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract_along
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
+from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.passes.alternation import Verdicts
-from rotavg_ros.solver.slam.poses.answer import Poses
-from rotavg_ros.solver.slam.poses.solve import has_places, poses_after_passes, poses_after_search
+from rotavg_ros.solver.slam.poses.memory import PoseMemory
+from rotavg_ros.solver.slam.poses.solve import (
+    has_places,
+    mode_of_passes,
+    poses_after_passes,
+    poses_after_search,
+    poses_of_update,
+)
 from rotavg_ros.solver.slam.posterior.modes import publish
 from rotavg_ros.solver.slam.posterior.solve import search
-from rotavg_ros.solver.slam.preparation import Prepared, prepare
+from rotavg_ros.solver.slam.preparation import Prepared, prepare, prepared_with
+from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over
 from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.solver.slam.update.posterior_memory import PosteriorMemory, estimate_of
 from rotavg_ros.view_graph import ViewGraph
+
+# A graph of more key nodes is updated by rotations alone.
+_MAX_JOINT_UPDATE = 2000
 
 
 def solve_slam(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
@@ -73,8 +84,11 @@ def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
         if not is_default or not has_places(graph):
             return rotations_alone
         with watch.stage("poses"):
-            poses = poses_after_passes(graph, prepared, cleaned, estimate)
-            return _with_poses(graph, rotations_alone, closure_graph, poses)
+            before = run.memory
+            goes_on = isinstance(before, SlamMemory) and begins_with(graph, before.graph)
+            begin = before.poses if isinstance(before, SlamMemory) and goes_on else None
+            found = poses_after_passes(graph, prepared, cleaned.network_log_odds, estimate, begin)
+            return _with_poses(graph, rotations_alone, found)
     with watch.stage("expand"):
         score = slam_stages.outlier_scores(prepared.closure_graph, 1 - cleaned.inlier_probability)
         orientations = prepared.closure_graph.orientations(correction)
@@ -100,18 +114,18 @@ def _solve_by_posterior(graph: ViewGraph, stages: SlamStages, run: Run) -> Estim
     if "translations" in stages.without or not has_places(graph):
         return estimate
     with run.watch.stage("poses"):
-        return _with_poses(graph, estimate, published.graph, poses_after_search(graph, found))
+        return _with_poses(graph, estimate, poses_after_search(graph, found.modes))
 
 
-def _with_poses(graph: ViewGraph, estimate: Estimate, drawn: ClosureGraph, poses: Poses) -> Estimate:
+def _with_poses(graph: ViewGraph, estimate: Estimate, memory: PoseMemory) -> Estimate:
     """The estimate of rotations alone, with orientations, positions and closures' scores by translations as well.
 
     Whether odometry slipped is told by rotations.
     """
+    poses = memory.poses
     by_both = (poses.outlier_probability, poses.rotation_probability)
     score, rotation_score = (
-        torch.where(graph.is_odometry, estimate.outlier_score, torch.from_numpy(drawn.edge_values(probability)))
-        for probability in by_both
+        torch.where(graph.is_odometry, estimate.outlier_score, torch.from_numpy(probability)) for probability in by_both
     )
     places = Places(
         torch.from_numpy(poses.position),
@@ -125,9 +139,15 @@ def _with_poses(graph: ViewGraph, estimate: Estimate, drawn: ClosureGraph, poses
         outlier_score=score,
         variance=torch.from_numpy(poses.variance),
         places=places,
+        memory=_remembering(estimate.memory, memory),
         # The posterior's is of answers that rotations alone do not tell apart.
         warnings=estimate.warnings if len(poses.rivals) > 1 else (),
     )
+
+
+def _remembering(memory: object | None, poses: PoseMemory) -> object | None:
+    """The memory of rotations with that of poses."""
+    return replace(memory, poses=poses) if isinstance(memory, (SlamMemory, PosteriorMemory)) else memory
 
 
 def _slam_estimate(
@@ -148,9 +168,42 @@ def update_slam(graph: ViewGraph, memory: SlamMemory | PosteriorMemory, run: Run
     ``run`` has the warm start.
     """
     assert run.warm_start is not None
-    network, start = run.networks.load(SlamCleanNet), run.warm_start.double()
+    network, before = run.networks.load(SlamCleanNet), memory.poses
+    start = run.warm_start.double() if before is None else before.start_alone(graph)
+    if start is None or (before is None) is has_places(graph):
+        return None
+    if isinstance(memory, PosteriorMemory):
+        with run.watch.stage("update"):
+            found = memory.updated(graph, network, start)
+        if found is None or before is None:
+            return None if found is None else found.estimate
+        with run.watch.stage("poses"):
+            graph = graph if memory.bias is None else without_bias(graph, memory.bias)
+            poses = before.extended(graph) if found.mode is None else poses_of_update(graph, found.mode, before)
+            return None if poses is None else _with_poses(graph, found.estimate, poses)
     with run.watch.stage("update"):
-        if isinstance(memory, PosteriorMemory):
-            return memory.updated(graph, network, start)
         updated = memory.updated(graph, network, start)
-        return None if updated is None else _slam_estimate(*updated)
+        if updated is None:
+            return None
+        estimate = _slam_estimate(*updated)
+    if before is None:
+        return estimate
+    with run.watch.stage("poses"):
+        if (extended := before.extended(graph)) is not None:
+            return _with_poses(graph, estimate, extended)
+        if updated.closure_graph.num_nodes > _MAX_JOINT_UPDATE:
+            return _with_places_of_before(estimate, before)
+        goes_on = updated.memory
+        prepared = prepared_with(contract_along(graph, goes_on.paths), goes_on.paths.forest, goes_on.chain_noise)
+        told = carried_over(goes_on.network_log_odds, prepared.closure_graph, 0.0)
+        mode = mode_of_passes(prepared, told, updated.verdicts)
+        poses = poses_of_update(graph, mode, before)
+        return None if poses is None else _with_poses(graph, estimate, poses)
+
+
+def _with_places_of_before(estimate: Estimate, before: PoseMemory) -> Estimate:
+    """With what was known of closures' places; new ones are judged by their rotations until the next whole solve."""
+    wrong = torch.zeros(len(estimate.outlier_score), dtype=torch.float64)
+    wrong[: before.num_edges] = torch.from_numpy(before.wrong_place)
+    score = 1 - (1 - estimate.outlier_score) * (1 - wrong)
+    return replace(estimate, outlier_score=score)

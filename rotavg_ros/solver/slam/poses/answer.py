@@ -9,7 +9,7 @@ import numpy as np
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.noise.exceedance import exceedance
 from rotavg_ros.solver.slam.noise.judging import OUTLIER_ANGLE
-from rotavg_ros.solver.slam.poses.estimate import PoseMode, estimate_poses
+from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart, estimate_poses
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
@@ -23,17 +23,16 @@ _RIVAL, _MAX_RIVALS, _FAR = 20.0, 5, 5.0
 
 @dataclass(frozen=True)
 class Poses:
-    """Of N nodes and E edges of a closure graph.
+    """Of N nodes and M edges.
 
     Attributes:
         body_from_world: ``(N, 4)`` xyzw.
         position: ``(N, 3)`` metres, in the frame of the odometry's orientations; roots at the origin.
         variance: ``(N,)`` rad² per component, of orientations.
         position_variance: ``(N,)`` m² per component.
-        outlier_probability: ``(E,)`` that a closure is false, in rotation or place; of odometry its label.
-        rotation_probability: ``(E,)`` that its rotation is; of odometry likewise.
-        precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which the view-graph's edges count; 0 of translations
-            that are not known.
+        outlier_probability: ``(M,)`` that a closure is false, in rotation or place; of odometry its label.
+        rotation_probability: ``(M,)`` that its rotation is; of odometry likewise.
+        precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count; 0 of translations that are not known.
         rivals: probabilities of the labellings that were averaged.
     """
 
@@ -69,7 +68,7 @@ def rival_poses(graph: ViewGraph, translation: np.ndarray, modes: list[Mode]) ->
     order = [number for number in np.argsort(cost, kind="stable") if cost[number] <= cost.min() + _FAR]
     share = np.exp(cost.min() - cost[order])
     return [
-        (estimate_poses(problems[number], start=held[number]), float(each))
+        (estimate_poses(problems[number], start=PoseStart.at(held[number])), float(each))
         for number, each in zip(order, share / share.sum(), strict=True)
     ]
 
@@ -120,7 +119,7 @@ def _of_mode(pose: PoseMode) -> Poses:
     segment = problem.segment_of_node
     length = np.where(segment >= 0, pose.solved.way.length[np.maximum(segment, 0)], 0.0)
     between += passed * (1 - passed) * length * pose.state.noise.way
-    score, rotation = _scores(pose)
+    score, rotation = (drawn.edge_values(value) for value in _scores(pose))
     return Poses(
         np.ascontiguousarray(orientation.T), position, variance, between, score, rotation, _precision(pose), (1.0,)
     )
@@ -129,8 +128,7 @@ def _of_mode(pose: PoseMode) -> Poses:
 def _precision(pose: PoseMode) -> np.ndarray:
     """``(M, 2)`` rad⁻² and m⁻², with which the view-graph's edges count in the answer."""
     problem, noise, drawn = pose.problem, pose.state.noise, pose.problem.drawn
-    graph, closure = problem.graph, problem.mode.problem.closure
-    edges = drawn.view_graph_edge[closure - drawn.num_segments]
+    graph, closure, edges = problem.graph, problem.mode.problem.closure, problem.closures
     variance = np.stack((noise.turn * graph.steps.numpy(), noise.way * problem.lengths_passed), axis=1)
     slipped = drawn.edge_values((drawn.is_odometry & ~problem.mode.state.is_good).astype(np.float64))
     slip = np.radians(problem.mode.problem.priors.slip_deg), problem.priors.slip * problem.typical

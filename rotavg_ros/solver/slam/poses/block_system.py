@@ -17,9 +17,7 @@ from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
 from rotavg_ros.solver.algebra.laplacian import solve_in_parts
 
 _NUM_PROBES, _SEED = 48, 0
-# What ties the roots down, relative to the largest entry of H.
-_GROUND = 1e3
-# Keeps a leverage from being 0 or 1 where samples say so.
+# What a row decides itself is no more than all but this: nothing else may tell of it.
 _LEAST = 1e-9
 
 
@@ -78,8 +76,7 @@ class BlockEquations:
         values = np.bincount(self._slot, blocks, self._num_entries)
         values[self._diagonal] += np.finfo(np.float64).tiny
         d = self.size
-        for root in self.roots:
-            values[self._diagonal[self._rank[root * d + np.arange(d)]]] += root_weight
+        values[self._diagonal[self._rank[self.roots[:, None] * d + np.arange(d)]]] += root_weight
         self._matrix.data = values
         options = {"SymmetricMode": True}
         order = "NATURAL" if self._is_ordered else "MMD_AT_PLUS_A"
@@ -129,17 +126,24 @@ class BlockFactor:
 
     @cached_property
     def leverage(self) -> np.ndarray:
-        """``(E + R, d, d)`` Λ, what of a whitened row its own measurement decides; eigenvalues in (0, 1).
+        """``(E + R, d, d)`` Λ, what of a whitened row its own measurement decides.
 
         Of a row's own probe z ~ N(0, I) the fit takes up y, and y ~ N(0, Λ), z − y ~ N(0, I − Λ) are independent. Their
-        moments A and B make (A + B)^-½ A (A + B)^-½ (a matrix-variate beta), near which Λ is, at both ends.
+        moments A and B make L⁻¹ A L⁻ᵀ with L Lᵀ = A + B (a matrix-variate beta), near which Λ is, at both ends.
         """
+        return self._shares[0]
+
+    @cached_property
+    def redundancy(self) -> np.ndarray:
+        """``(E + R, d, d)`` I − Λ, positive definite."""
+        return self._shares[1]
+
+    @cached_property
+    def _shares(self) -> tuple[np.ndarray, np.ndarray]:
         taken = self.predicted(self.samples)
         left = self._system.probes - taken
-        first = np.matmul(taken, taken.transpose(0, 2, 1)) / _NUM_PROBES
-        both = first + np.matmul(left, left.transpose(0, 2, 1)) / _NUM_PROBES
-        value, vector = np.linalg.eigh(both)
-        root = np.matmul(vector / np.sqrt(np.maximum(value, _LEAST))[:, None, :], vector.transpose(0, 2, 1))
-        value, vector = np.linalg.eigh(np.matmul(root, np.matmul(first, root)))
-        value = np.clip(value, 0.0, 1 - _LEAST)
-        return np.asarray(np.matmul(vector * value[:, None, :], vector.transpose(0, 2, 1)))
+        unit = np.eye(self._system.size)
+        moments = [np.matmul(part, part.transpose(0, 2, 1)) / _NUM_PROBES for part in (taken, left)]
+        root = np.linalg.inv(np.linalg.cholesky(moments[0] + moments[1]))
+        of_taken, of_left = (np.matmul(root, np.matmul(part, root.transpose(0, 2, 1))) for part in moments)
+        return of_taken, of_left + _LEAST * unit

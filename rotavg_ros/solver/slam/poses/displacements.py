@@ -14,34 +14,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
+from rotavg_ros import rotations
+from rotavg_ros.solver.odometry_lengths import lengths_passed
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.view_graph import ViewGraph
-
-# A step's variance grows with its length, and is that of this share of a typical one at least: wheels slip on the spot.
-_SHORTEST_STEP = 0.05
-
-
-def rotate_back(body_from_world: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """``(n, 3)`` from the body's frame to the world's; orientations are ``(4, n)``."""
-    imaginary, real = -body_from_world[:3].T, body_from_world[3][:, None]
-    twice = 2 * np.cross(imaginary, vector)
-    return np.asarray(vector + real * twice + np.cross(imaginary, twice))
-
-
-def typical_length(graph: ViewGraph, translation: np.ndarray) -> float:
-    """Median length of the steps of odometry that go anywhere, metres; 1 where none does."""
-    is_odometry = graph.is_odometry.numpy()
-    length = np.linalg.norm(translation[is_odometry], axis=1) / graph.steps.numpy()[is_odometry]
-    moving = length[length > 0]
-    return float(np.median(moving)) if len(moving) else 1.0
-
-
-def lengths_passed(graph: ViewGraph, translation: np.ndarray) -> np.ndarray:
-    """``(M,)`` metres that each edge's variance goes with."""
-    shortest = _SHORTEST_STEP * typical_length(graph, translation)
-    return np.asarray(np.maximum(np.linalg.norm(translation, axis=1), shortest * graph.steps.numpy()))
 
 
 @dataclass(frozen=True)
@@ -67,72 +46,78 @@ class Displacements:
     passed: np.ndarray
     way: np.ndarray
 
-    @classmethod
-    def of(
-        cls,
-        graph: ViewGraph,
-        translation: np.ndarray,
-        drawn: ClosureGraph,
-        steps: np.ndarray,
-        body_from_world: np.ndarray,
-    ) -> Displacements:
-        """At some orientations.
 
-        Args:
-            graph: of N nodes and M edges.
-            translation: ``(M, 3)`` position of the target in the source's frame, metres.
-            drawn: the same graph, drawn together into S segments.
-            steps: ``(S,)`` their variance, in that of one step.
-            body_from_world: ``(4, N)``.
-        """
-        forest, num_segments = drawn.paths.forest, drawn.num_segments
-        source = graph.source.numpy()
-        num_nodes, num_edges = graph.num_nodes, len(drawn.source)
-        length = lengths_passed(graph, translation)
-        world = rotate_back(body_from_world.take(source, axis=1), translation)
+class DrawnSteps:
+    """The steps of odometry in the order in which segments take them; what orientations do not change.
 
+    Args:
+        graph: of N nodes and M edges.
+        translation: ``(M, 3)`` position of the target in the source's frame, metres.
+        drawn: the same graph, drawn together into S segments.
+        steps: ``(S,)`` their variance, in that of one step.
+    """
+
+    def __init__(self, graph: ViewGraph, translation: np.ndarray, drawn: ClosureGraph, steps: np.ndarray) -> None:
+        forest, self._num_nodes, self._num_segments = drawn.paths.forest, graph.num_nodes, drawn.num_segments
         node = np.flatnonzero(drawn.paths.hangs_on_odometry)
-        parent, edge = forest.parent[node], forest.parent_edge[node]
-        segment, is_forward = drawn.segment_of_edge[edge], source[edge] == parent
-        step = np.where(is_forward[:, None], world[edge], -world[edge])
-        end = drawn.nodes[drawn.target[:num_segments]]
-        of_parent, of_node = drawn.fraction[parent], np.where(end[segment] == node, 1.0, drawn.fraction[node])
-        variance_steps = steps[segment] * (of_node - of_parent)
+        segment = drawn.segment_of_edge[forest.parent_edge[node]]
+        order = np.lexsort((drawn.paths.level[node], segment))
+        self._node, self._segment = node[order], segment[order]
+        self._edge, parent = forest.parent_edge[self._node], forest.parent[self._node]
+        self._first = np.searchsorted(self._segment, np.arange(self._num_segments))
+        self._is_forward = graph.source.numpy()[self._edge] == parent
+        self._is_last = drawn.nodes[drawn.target[self._segment]] == self._node
+        of_parent = drawn.fraction[parent]
+        of_node = np.where(self._is_last, 1.0, drawn.fraction[self._node])
+        self._variance_steps = (steps[self._segment] * (of_node - of_parent))[:, None]
+        # Where along its segment a step's translation was measured.
+        self._measured_at = np.where(self._is_forward, of_parent, of_node)[:, None]
+        self._source, self._translation = graph.source, torch.from_numpy(translation)
+        self._outside = drawn.view_graph_edge
+        length = lengths_passed(translation, graph.steps.numpy(), graph.is_odometry.numpy())
+        passed = self._so_far(length[self._edge, None])
+        self._passed = self._at_nodes(passed)[:, 0]
+        self._length = np.concatenate((self._whole(length[self._edge, None])[:, 0], length[self._outside]))
 
-        def summed(value: np.ndarray) -> np.ndarray:
-            return np.stack([np.bincount(segment, column, num_segments) for column in value.T], axis=1)
-
-        def along(value: np.ndarray) -> np.ndarray:
-            """From the key node above up to each node."""
-            out = np.zeros((num_nodes, value.shape[1]))
-            out[node] = value
-            total = np.stack([accumulate_to_root(forest, column) for column in out.T], axis=1)
-            return np.asarray(total - total[drawn.nodes[drawn.above]])
-
-        whole = summed(step)
-        at_target = summed(np.where(is_forward, of_parent, of_node)[:, None] * step)
-        way = along(step)
-        passed_by = np.where(
-            is_forward[:, None], _at_ends(way[node], whole[segment], end[segment] == node), way[parent]
-        )
-        d = whole[segment] - passed_by - at_target[segment]
-        second = summed((variance_steps[:, None, None] * d[:, :, None] * d[:, None, :]).reshape(len(d), 9))
-        second = second.reshape(-1, 3, 3)
+    def displacements(self, body_from_world: Tensor) -> Displacements:
+        """At orientations ``(N, 4)``."""
+        world_from_body = rotations.inverse(body_from_world)
+        world = rotations.rotate(world_from_body.index_select(0, self._source), self._translation).numpy()
+        step = np.where(self._is_forward[:, None], world[self._edge], -world[self._edge])
+        whole, after = self._whole(step), self._so_far(step)
+        at_target = self._whole(self._measured_at * step)
+        passed_by = np.where(self._is_forward[:, None], after, after - step)
+        d = (whole - at_target)[self._segment] - passed_by
+        weighted = self._variance_steps * d
+        second = self._whole((weighted[:, :, None] * d[:, None, :]).reshape(len(d), 9)).reshape(-1, 3, 3)
         trace = np.trace(second, axis1=1, axis2=2)[:, None, None]
-        other = drawn.view_graph_edge
-        nothing = np.zeros((len(other), 3))
-        return cls(
-            np.concatenate((whole, world[other])),
-            np.concatenate((whole - at_target, world[other])),
+        outside = world[self._outside]
+        nothing = np.zeros((len(outside), 3))
+        return Displacements(
+            np.concatenate((whole, outside)),
+            np.concatenate((whole - at_target, outside)),
             np.concatenate((at_target, nothing)),
-            np.concatenate((trace * np.eye(3) - second, np.zeros((num_edges - num_segments, 3, 3)))),
-            np.concatenate((np.bincount(segment, length[edge], num_segments), length[other])),
-            along(variance_steps[:, None] * d),
-            along(length[edge][:, None])[:, 0],
-            way,
+            np.concatenate((trace * np.eye(3) - second, np.zeros((len(outside), 3, 3)))),
+            self._length,
+            self._at_nodes(self._so_far(weighted)),
+            self._passed,
+            self._at_nodes(after),
         )
 
+    def _whole(self, value: np.ndarray) -> np.ndarray:
+        """``(S, …)`` sums over segments."""
+        if not self._num_segments:
+            return np.zeros((0, value.shape[1]))
+        return np.asarray(np.add.reduceat(value, self._first, axis=0))
 
-def _at_ends(way: np.ndarray, whole: np.ndarray, is_end: np.ndarray) -> np.ndarray:
-    """A key node is its own key node above, though it is the end of the segment before, too."""
-    return np.asarray(np.where(is_end[:, None], whole, way))
+    def _so_far(self, value: np.ndarray) -> np.ndarray:
+        """Sums from each step's segment's start, its own included."""
+        total = np.cumsum(value, axis=0)
+        before = np.concatenate((np.zeros((1, value.shape[1])), total))[self._first]
+        return np.asarray(total - before[self._segment])
+
+    def _at_nodes(self, value: np.ndarray) -> np.ndarray:
+        """``(N, …)`` sums from the key node above; a key node is its own."""
+        out = np.zeros((self._num_nodes, value.shape[1]))
+        out[self._node] = np.where(self._is_last[:, None], 0.0, value)
+        return out

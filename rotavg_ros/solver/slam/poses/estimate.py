@@ -21,14 +21,16 @@ from rotavg_ros.solver.slam.poses.rows import PoseNoise, PoseProblem, PoseState
 from rotavg_ros.solver.slam.poses.solved import Solved
 
 _MAX_SOLVES = 24
+# An update goes no further: the next one goes on from there.
+_MAX_UPDATE_SOLVES = 6
 # A step turns nothing by more than this, rad.
 _MAX_TURN = 0.3
 # Noise goes down by no more than this factor from solve to solve; most of it stays while places are sorted out.
 _SLOWEST, _HELD = 4.0, 3
 # Noise that comes nearer by a constant factor from solve to solve, by this at most, is set to where that leads.
 _SLOWEST_GAIN = 0.85
-# At rest: turns, rad; chances of classes; logarithms of variances.
-_TURN_CONVERGED, _CHANCE_CONVERGED, _NOISE_CONVERGED = 1e-4, 0.02, 0.02
+# At rest: a step's root mean square in standard errors; chances of classes; logarithms of variances.
+_STEP_CONVERGED, _CHANCE_CONVERGED, _NOISE_CONVERGED = 0.02, 0.05, 0.05
 # No two places are nearer than so many typical steps.
 _LEAST_EXTENT = 3.0
 
@@ -53,31 +55,63 @@ class PoseMode:
         return self.solved.state
 
 
-def estimate_poses(problem: PoseProblem, *, hold: bool = False, start: PoseMode | None = None) -> PoseMode:
+@dataclass(frozen=True)
+class PoseStart:
+    """What an earlier estimate came to.
+
+    Attributes:
+        state: key nodes and noise.
+        column: ``(C,)`` where the places of each closure are, -1 of those that are new.
+        places: as they were judged.
+        solves: at most from there.
+    """
+
+    state: PoseState
+    column: np.ndarray
+    places: Places
+    solves: int = _MAX_UPDATE_SOLVES
+
+    @classmethod
+    def at(cls, pose: PoseMode) -> PoseStart:
+        """Of the same labelling."""
+        return cls(pose.state, np.arange(len(pose.solved.places.weight)), pose.solved.places, _MAX_SOLVES)
+
+    def over(self, places: Places) -> Places:
+        """These, and others' ``places`` of what is new."""
+        is_new, column = self.column < 0, self.column
+        return replace(
+            places,
+            chance=np.where(is_new, places.chance, self.places.chance[:, column]),
+            weight=np.where(is_new, places.weight, self.places.weight[column]),
+            rotation_weight=np.where(is_new, places.rotation_weight, self.places.rotation_weight[column]),
+        )
+
+
+def estimate_poses(problem: PoseProblem, *, hold: bool = False, start: PoseStart | None = None) -> PoseMode:
     """Poses of a labelling.
 
     Args:
         problem: the labelling, and translations.
         hold: leave the labels of rotations as they are.
-        start: what an earlier estimate of the same came to.
+        start: where to begin; default: at what rotations say, no closure's translation believed.
     """
     is_good = problem.mode.state.is_good[problem.mode.problem.closure]
     judge = Judge(problem.told, problem.turns, problem.priors, is_good if hold else None)
     state = _begin(problem) if start is None else start.state
-    places = judge.nothing_known(is_good, _scale(problem, state)) if start is None else start.solved.places
-    change = np.zeros(4)
-    number, held = 0, _HELD if start is None else 0
+    places, is_new = judge.nothing_known(is_good, _scale(problem, state)), np.ones(len(is_good), dtype=bool)
+    if start is not None:
+        places, is_new = start.over(places), start.column < 0
+    change, sorted_by = np.zeros(4), np.zeros_like(places.chance)
+    number, held, most = 0, *((_HELD, _MAX_SOLVES) if start is None else (0, start.solves))
     while True:
         solved = _solve(problem, state, places, judge)
-        # Closures that answer each other would swing: halfway, in the logarithm.
-        weight = np.sqrt(solved.places.weight * places.weight)
-        is_first = number == 0 and start is None
-        after = solved.places if is_first else replace(solved.places, weight=weight)
+        chance, sorted_by = _settling(solved.places.chance, places.chance, sorted_by)
+        after = _halfway(replace(solved.places, chance=chance), places, is_new & (number == 0))
         noise = likeliest_noise(problem, solved).logarithms
         changed = np.abs(after.chance - places.chance).max(initial=0.0)
-        is_at_rest = solved.turned < _TURN_CONVERGED and changed < _CHANCE_CONVERGED
+        is_at_rest = solved.moved < _STEP_CONVERGED and changed < _CHANCE_CONVERGED
         number += 1
-        if number == _MAX_SOLVES or (
+        if number == most or (
             number > held and is_at_rest and np.abs(noise - state.noise.logarithms).max() < _NOISE_CONVERGED
         ):
             break
@@ -115,12 +149,25 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
         position=state.position + moved[:num_nodes, 3:],
         common=state.common + moved[num_nodes:],
     )
-    left = whitened - factor.predicted(step)
+    explained = factor.predicted(step)
+    left = whitened - explained
+    # xᵀ H x of a step x, whose mean is one for each unknown where x is drawn from N(0, H⁻¹).
+    moved_by = math.sqrt(float((explained**2).sum()) / max(step.size, 1))
     predictions, scale = _left_out(factor, root, left, closure), _scale(problem, state)
     judge = replace(judge, told=replace(judge.told, rotation_variance=rotation_variance[closure]))
     judged = judge(predictions, places.chance, scale)
     return Solved(
-        state, way, covariance, rotation_weight, places.weight, left, factor, turned, scale, predictions, judged
+        state,
+        way,
+        covariance,
+        rotation_weight,
+        places.weight,
+        left,
+        factor,
+        moved_by,
+        scale,
+        predictions,
+        judged,
     )
 
 
@@ -144,10 +191,33 @@ def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.
     """What all else says of some rows, by what is left of them and their leverages."""
     leverage, root = factor.leverage[rows], root[rows]
     inverse = np.linalg.inv(root)
-    rest = np.linalg.inv(np.eye(root.shape[1]) - leverage)
+    rest = np.linalg.inv(factor.redundancy[rows])
     mean = np.matmul(inverse, np.matmul(rest, left[rows]))[:, :, 0]
     covariance = np.matmul(inverse, np.matmul(np.matmul(rest, leverage), inverse.transpose(0, 2, 1)))
     return Predictions(mean, (covariance + covariance.transpose(0, 2, 1)) / 2)
+
+
+def _halfway(places: Places, before: Places, at_once: np.ndarray) -> Places:
+    """With weights between theirs and those before, in the logarithm: closures that answer each other would swing.
+
+    Args:
+        places, before: of C closures.
+        at_once: ``(C,)`` bool, which take theirs.
+    """
+    between = np.sqrt(places.weight * before.weight), np.sqrt(places.rotation_weight * before.rotation_weight)
+    weight, rotation_weight = (
+        np.where(at_once, theirs, halfway)
+        for theirs, halfway in zip((places.weight, places.rotation_weight), between, strict=True)
+    )
+    return replace(places, weight=weight, rotation_weight=rotation_weight)
+
+
+def _settling(chance: np.ndarray, before: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Chances ``(J + 1, C)`` to go on with, and by how much they change: halfway for closures that go to and fro."""
+    change = chance - before
+    swings = (change * last).sum(axis=0) < 0
+    change = np.where(swings, change / 2, change)
+    return before + change, change
 
 
 def _with_noise(

@@ -16,21 +16,21 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     """All variances, each from its part of what is left over (Harville 1977), under their priors."""
     noise, places = solved.state.noise, solved.places
     k, segments = problem.turns, np.flatnonzero(~problem.slipped)
-    leverage = solved.factor.leverage[segments]
+    redundancy = solved.factor.redundancy[segments]
     inverse = np.linalg.inv(solved.covariance[segments])
     half = np.linalg.cholesky(inverse)
     pulled = np.matmul(half, solved.left[segments, k:])
-    told = np.matmul(half, np.matmul(leverage[:, k:, k:], half.transpose(0, 2, 1)))
+    left_over = np.matmul(half, np.matmul(redundancy[:, k:, k:], half.transpose(0, 2, 1)))
 
     def by_shifts(own: np.ndarray) -> np.ndarray:
         """``(2,)`` squares and freedom of a part ``(S, m, m)`` m² of segments' covariance."""
         squares = np.matmul(pulled.transpose(0, 2, 1), np.matmul(own, pulled)).sum()
-        return np.array([squares, np.trace(np.matmul(own, inverse - told), axis1=1, axis2=2).sum()])
+        return np.array([squares, np.trace(np.matmul(own, left_over), axis1=1, axis2=2).sum()])
 
     unit = np.eye(problem.shifts)
     by_way = by_shifts(noise.way * solved.way.length[segments, None, None] * unit)
     by_turns = by_shifts(noise.turn * problem.bent(solved.way)[segments])
-    redundant = k * len(segments) - np.trace(leverage[:, :k, :k], axis1=1, axis2=2).sum()
+    redundant = np.trace(redundancy[:, :k, :k], axis1=1, axis2=2).sum()
     by_turns += np.array([(solved.left[segments, :k] ** 2).sum(), redundant])
     by_closures = np.stack((places.squares, places.freedom), axis=1)
     found = (by_turns, by_closures[0], by_way, by_closures[1])

@@ -11,9 +11,10 @@ import torch
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
+from rotavg_ros.solver.odometry_lengths import lengths_passed, typical_length
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.poses.block_system import BlockEquations
-from rotavg_ros.solver.slam.poses.displacements import Displacements, lengths_passed, typical_length
+from rotavg_ros.solver.slam.poses.displacements import Displacements, DrawnSteps
 from rotavg_ros.solver.slam.poses.places import Told
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 from rotavg_ros.solver.slam.posterior.densities import log_good
@@ -109,12 +110,12 @@ class PoseProblem:
     @cached_property
     def typical(self) -> float:
         """Metres, of a step of odometry."""
-        return typical_length(self.graph, self.lengths)
+        return typical_length(self.lengths, self.graph.steps.numpy(), self.graph.is_odometry.numpy())
 
     @cached_property
     def lengths_passed(self) -> np.ndarray:
         """``(M,)`` metres that each edge's variance goes with."""
-        return lengths_passed(self.graph, self.lengths)
+        return lengths_passed(self.lengths, self.graph.steps.numpy(), self.graph.is_odometry.numpy())
 
     @cached_property
     def bases(self) -> tuple[np.ndarray, np.ndarray]:
@@ -212,6 +213,11 @@ class PoseProblem:
         return self.own[: self.drawn.num_segments] / self.mode.state.noise.step_variance
 
     @cached_property
+    def closures(self) -> np.ndarray:
+        """``(C,)`` the view-graph's edges that they are."""
+        return np.asarray(self.drawn.view_graph_edge[self.mode.problem.closure - self.drawn.num_segments])
+
+    @cached_property
     def told(self) -> Told:
         """What rotations alone say of closures."""
         problem, state, left_out = self.mode.problem, self.mode.state, self.mode.left_out
@@ -223,8 +229,7 @@ class PoseProblem:
         label = np.where(np.isinf(odds), np.sign(odds), 0.0)
         with np.errstate(invalid="ignore"):
             false_odds = np.where(label == 0, good - left_out.log_odds[closure], 0.0)
-        known = np.isfinite(self.translation).all(axis=1)
-        is_known = known[self.drawn.view_graph_edge[closure - self.drawn.num_segments]]
+        is_known = np.isfinite(self.translation).all(axis=1)[self.closures]
         shared = np.where(self.run[closure] >= 0, self.priors.common, 0.0)
         own = self.rotation_variance(self.turn_noise)[closure]
         return Told(own, false_odds, is_known, label, problem.run, 1 - shared, problem.follows, problem.sign)
@@ -241,9 +246,14 @@ class PoseProblem:
         correction = torch.from_numpy(np.ascontiguousarray(state.correction.T))
         return np.ascontiguousarray(self.drawn.orientations(correction).numpy().T)
 
+    @cached_property
+    def drawn_steps(self) -> DrawnSteps:
+        """Odometry's, in the order of the segments."""
+        return DrawnSteps(self.graph, self.lengths, self.drawn, self.steps)
+
     def displacements(self, body_from_world: np.ndarray) -> Displacements:
         """At orientations ``(4, N)``."""
-        return Displacements.of(self.graph, self.lengths, self.drawn, self.steps, body_from_world)
+        return self.drawn_steps.displacements(torch.from_numpy(np.ascontiguousarray(body_from_world.T)))
 
     def along_odometry(self, way: Displacements) -> np.ndarray:
         """``(K, 3)`` metres, positions of the key nodes by odometry's displacements from its roots on."""

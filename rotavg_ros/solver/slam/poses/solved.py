@@ -24,7 +24,7 @@ class Solved:
         closure_weight: ``(C,)`` m⁻², of closures' translations.
         left: ``(E + R, d, 1)`` what it leaves of whitened rows.
         factor: of its normal equations.
-        turned: rad, its largest turn.
+        moved: root mean square of the step, in standard errors of the answer.
         scale: of closures' errors.
         predictions: what all else says of closures.
         places: their classes, by that.
@@ -37,7 +37,7 @@ class Solved:
     closure_weight: np.ndarray
     left: np.ndarray
     factor: BlockFactor
-    turned: float
+    moved: float
     scale: Scale
     predictions: Predictions
     places: Places

@@ -29,6 +29,7 @@ from rotavg_ros.solver.slam.noise.model import NoiseModel
 from rotavg_ros.solver.slam.noise.stated_precision import StatedTrust, believing
 from rotavg_ros.solver.slam.passes.alternation import SlamEstimate, Verdicts
 from rotavg_ros.solver.slam.passes.system import ITERATING_PAYS, StaleFactorError
+from rotavg_ros.solver.slam.poses.memory import PoseMemory
 from rotavg_ros.solver.slam.preparation import Prepared, draw_together
 from rotavg_ros.solver.slam.stages import CleanedClosures
 from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over
@@ -99,6 +100,7 @@ class SlamMemory:
         updates: how many there have been since.
         limits: of the updates.
         warnings: about the answer of the whole solve.
+        poses: where translations are known.
     """
 
     graph: ViewGraph
@@ -120,6 +122,7 @@ class SlamMemory:
     updates: int = 0
     limits: UpdateLimits = field(default_factory=UpdateLimits)
     warnings: tuple[str, ...] = ()
+    poses: PoseMemory | None = None
 
     @classmethod
     def of(

@@ -8,6 +8,7 @@ closure turns the labels of others. Odometry that no closure judges yet says not
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,8 +20,10 @@ from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
+from rotavg_ros.solver.slam.poses.memory import PoseMemory
 from rotavg_ros.solver.slam.posterior.inference import Search
 from rotavg_ros.solver.slam.posterior.left_out import relabelled
+from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.modes import Published, publish
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.solve import Drawn, Found
@@ -33,6 +36,13 @@ from rotavg_ros.view_graph import ViewGraph
 _MAX_UPDATES, _MAX_GROWTH, _MAX_TURNED = 60, 0.05, 2
 # In the place of labels that are not known; more than any.
 _NEW = 2.0
+
+
+class SearchedOn(NamedTuple):
+    """The outcome of an update: the answer, and the labelling; None if only odometry was appended."""
+
+    estimate: Estimate
+    mode: Mode | None
 
 
 @dataclass(frozen=True)
@@ -50,6 +60,7 @@ class PosteriorMemory:
         searched: C when the whole search ran.
         updates: how many there have been since.
         warnings: about the answer of the whole search.
+        poses: where translations are known.
     """
 
     graph: ViewGraph
@@ -62,6 +73,7 @@ class PosteriorMemory:
     searched: int
     updates: int = 0
     warnings: tuple[str, ...] = ()
+    poses: PoseMemory | None = None
 
     @classmethod
     def of(cls, graph: ViewGraph, found: Found, estimate: Estimate) -> PosteriorMemory:
@@ -72,7 +84,7 @@ class PosteriorMemory:
         told = estimate.body_from_world, estimate.outlier_score, estimate.variance
         return cls(graph, trusted, state.noise, bias, *told, searched=len(problem.closure))
 
-    def updated(self, graph: ViewGraph, network: SlamCleanNet, body_from_world: Tensor) -> Estimate | None:
+    def updated(self, graph: ViewGraph, network: SlamCleanNet, body_from_world: Tensor) -> SearchedOn | None:
         """Solve a graph that has grown from this one; None if it has not, or the whole search should run.
 
         Args:
@@ -85,7 +97,7 @@ class PosteriorMemory:
         if is_due or not begins_with(graph, self.graph) or first_of_each(graph) is not None:
             return None
         if (appended := self._appended(graph)) is not None:
-            return appended
+            return SearchedOn(appended, None)
         drawn = Drawn.of(graph, network, bias=self.bias)
         problem = drawn.problem
         before = carried_over(self.trusted, problem.graph, _NEW)
@@ -111,7 +123,7 @@ class PosteriorMemory:
             variance=estimate.variance,
             updates=self.updates + 1,
         )
-        return replace(estimate, memory=memory)
+        return SearchedOn(replace(estimate, memory=memory), mode)
 
     def _appended(self, graph: ViewGraph) -> Estimate | None:
         """The answer if each new node hangs on an older one by one edge of odometry, and nothing else is new.

@@ -52,7 +52,9 @@ def pose_mode(graph: ViewGraph) -> PoseMode:
     cleaned = clean(Networks("cpu").load(SlamCleanNet), prepared, graph.label)
     verdicts: SlamEstimate = refine_and_search(prepared, cleaned, bootstrap(prepared, cleaned))
     assert graph.translation is not None
-    return estimate_poses(PoseProblem(graph, graph.translation.numpy(), mode_of_passes(prepared, cleaned, verdicts)))
+    return estimate_poses(
+        PoseProblem(graph, graph.translation.numpy(), mode_of_passes(prepared, cleaned.network_log_odds, verdicts))
+    )
 
 
 @pytest.mark.parametrize("backward", [False, True])

@@ -1,0 +1,164 @@
+"""What poses remember for the next solve of the same graph, grown by a few edges.
+
+Odometry that no closure judges yet says nothing of what was there: what is new is placed along it. Where closures are
+new, the joint solve begins at the poses, the noise and the classes that were found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.odometry_lengths import lengths_passed
+from rotavg_ros.solver.slam.graph.odometry_paths import Growth
+from rotavg_ros.solver.slam.poses.answer import Poses
+from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart
+from rotavg_ros.solver.slam.poses.places import Places
+from rotavg_ros.solver.slam.poses.rows import PoseNoise, PoseProblem, PoseState
+from rotavg_ros.view_graph import ViewGraph
+
+# Places are judged from nothing again once there are more closures by this share: the fewer there were, the more each
+# new one may change what is believed of the others.
+_MAX_GROWTH = 0.25
+
+
+@dataclass(frozen=True)
+class PoseMemory:
+    """Of a graph of N nodes and M edges, of which C are closures between key nodes.
+
+    Attributes:
+        poses: what was published.
+        alone: ``(N, 4)`` body_from_world by rotations alone, where their next solve goes on.
+        noise: of the poses, variances.
+        roots: nodes that stayed where they were.
+        edge: ``(C,)`` the view-graph's edges of closures.
+        places: their classes.
+        from_nothing: C when places were last judged from nothing.
+    """
+
+    poses: Poses
+    alone: torch.Tensor
+    noise: PoseNoise
+    roots: np.ndarray
+    edge: np.ndarray
+    places: Places
+    from_nothing: int
+
+    @classmethod
+    def of(cls, pose: PoseMode, poses: Poses, before: PoseMemory | None = None) -> PoseMemory:
+        """After a solve; ``before``: where it began."""
+        edge = pose.problem.closures
+        from_nothing = len(edge) if before is None else before.from_nothing
+        drawn, mode = pose.problem.drawn, pose.problem.mode
+        alone = drawn.orientations(torch.from_numpy(np.ascontiguousarray(mode.state.correction.T)))
+        return cls(poses, alone, pose.state.noise, drawn.nodes[drawn.roots], edge, pose.solved.places, from_nothing)
+
+    @property
+    def num_nodes(self) -> int:
+        """N."""
+        return len(self.poses.position)
+
+    @property
+    def num_edges(self) -> int:
+        """M."""
+        return len(self.poses.precision)
+
+    @property
+    def wrong_place(self) -> np.ndarray:
+        """``(M,)`` probability that an edge's place is wrong if its rotation is right, as far as it is remembered."""
+        right = (1 - self.poses.outlier_probability) / np.maximum(1 - self.poses.rotation_probability, _TINY)
+        return np.asarray(np.clip(1 - right, 0.0, 1.0))
+
+    def start_alone(self, graph: ViewGraph) -> torch.Tensor | None:
+        """``(N, 4)`` where rotations alone go on in a graph that has grown; None where new nodes hang otherwise."""
+        new = np.arange(self.num_edges, graph.num_edges)
+        growth = Growth.of(graph, new[graph.is_odometry[new].numpy()], self.num_nodes)
+        return None if growth is None else _laid_on(self.alone, growth)
+
+    def start(self, graph: ViewGraph, problem: PoseProblem) -> PoseStart | None:
+        """Where the joint solve of a graph that has grown from this one begins; None: from nothing.
+
+        Args:
+            graph: whose odometry was drawn together, without its bias.
+            problem: the same.
+        """
+        drawn, closures = problem.drawn, problem.closures
+        grown = self._grown(graph)
+        is_merged = not np.array_equal(drawn.nodes[drawn.roots], self.roots)
+        if grown is None or is_merged or len(closures) > (1 + _MAX_GROWTH) * self.from_nothing:
+            return None
+        orientation, position, _ = grown
+        correction = drawn.corrections(orientation).numpy().T
+        common = np.zeros((problem.num_runs, 6))
+        state = PoseState(np.ascontiguousarray(correction), position[drawn.nodes], common, self.noise)
+        column = np.full(graph.num_edges, -1)
+        column[self.edge] = np.arange(len(self.edge))
+        return PoseStart(state, column[closures], self.places)
+
+    def extended(self, graph: ViewGraph) -> PoseMemory | None:
+        """With odometry alone, on which each new node hangs by one edge; None if something else is new."""
+        new = np.arange(self.num_edges, graph.num_edges)
+        grown = self._grown(graph) if bool(graph.is_odometry[new].all()) else None
+        if grown is None:
+            return None
+        orientation, position, growth = grown
+        poses, noise = self.poses, self.noise
+        steps, length = graph.steps.numpy(), _lengths_passed(graph)
+        # Beyond its anchor a node's way turns with the anchor's heading, and with its own steps'.
+        way = np.linalg.norm(position[self.num_nodes :] - position[growth.anchor], axis=1)
+        turned = noise.turn * growth.along(steps[growth.edge])
+        lever = (poses.variance[growth.anchor] + turned / _WALK) * way**2 * _ACROSS
+        shifted = lever + noise.way * growth.along(length[growth.edge])
+        variance = np.append(poses.variance, poses.variance[growth.anchor] + turned)
+        position_variance = np.append(poses.position_variance, poses.position_variance[growth.anchor] + shifted)
+        precision = np.stack((1 / (noise.turn * steps[new]), 1 / (noise.way * length[new])), axis=1)
+        nothing = np.zeros(len(new))
+        alone = _laid_on(self.alone, growth)
+        grown_poses = replace(
+            poses,
+            body_from_world=orientation.numpy(),
+            position=position,
+            variance=variance,
+            position_variance=position_variance,
+            outlier_probability=np.append(poses.outlier_probability, nothing),
+            rotation_probability=np.append(poses.rotation_probability, nothing),
+            precision=np.concatenate((poses.precision, precision)),
+        )
+        return replace(self, poses=grown_poses, alone=alone)
+
+    def _grown(self, graph: ViewGraph) -> tuple[torch.Tensor, np.ndarray, Growth] | None:
+        """Poses of all nodes, ``(N, 4)`` body_from_world and ``(N, 3)``; None where new ones hang otherwise."""
+        new = np.arange(self.num_edges, graph.num_edges)
+        odometry = new[graph.is_odometry[new].numpy()]
+        growth = Growth.of(graph, odometry, self.num_nodes)
+        if growth is None or graph.translation is None:
+            return None
+        orientation = _laid_on(torch.from_numpy(np.ascontiguousarray(self.poses.body_from_world)), growth)
+        edge = torch.from_numpy(growth.edge)
+        source = graph.source[edge]
+        step = rotations.rotate(rotations.inverse(orientation[source]), graph.translation[edge]).numpy()
+        step = np.where((source.numpy() == growth.parent)[:, None], step, -step)
+        way = np.stack([growth.along(column) for column in step.T], axis=1)
+        position = np.concatenate((self.poses.position, self.poses.position[growth.anchor] + way))
+        return orientation, position, growth
+
+
+def _laid_on(orientation: torch.Tensor, growth: Growth) -> torch.Tensor:
+    """Orientations of known nodes, and of new ones along the odometry from them."""
+    anchor = torch.from_numpy(growth.anchor)
+    return torch.cat((orientation, rotations.normalize(rotations.multiply(growth.turn, orientation[anchor]))))
+
+
+def _lengths_passed(graph: ViewGraph) -> np.ndarray:
+    assert graph.translation is not None
+    translation = np.nan_to_num(graph.translation.numpy())
+    return np.asarray(lengths_passed(translation, graph.steps.numpy(), graph.is_odometry.numpy()))
+
+
+_TINY = 1e-12
+# A walk's heading errs along its way by a third of the variance at its end; of a lever's two or three components one
+# lies along the way, which it does not move.
+_WALK, _ACROSS = 3.0, 0.5

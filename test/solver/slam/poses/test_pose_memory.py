@@ -1,0 +1,141 @@
+"""Poses of a graph that grows: what odometry adds, where the joint solve goes on, and when it begins from nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from rotavg_ros import ViewGraph, rotations, solve
+from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
+from rotavg_ros.solver.solution import Solution
+from rotavg_ros.view_graph import EdgeLabel
+
+from .test_poses import displaced, graph_of, simulated
+
+
+def run_of(seed: int = 0) -> SimulatedRun:
+    return simulated(seed, num_keyframes=400, laps=3.0, closures_per_keyframe=0.3, false_share=0.2)
+
+
+def up_to(graph: ViewGraph, num_nodes: int, closures_up_to: int | None = None) -> ViewGraph:
+    """The first nodes and their edges in the order in which a robot meets them."""
+    latest = torch.maximum(graph.source, graph.target)
+    limit = num_nodes if closures_up_to is None else closures_up_to
+    chosen = torch.nonzero(latest < torch.where(graph.is_odometry, num_nodes, limit))[:, 0]
+    order = torch.argsort(2 * latest[chosen] + (~graph.is_odometry[chosen]), stable=True)
+    return replace(graph.select_edges(chosen[order]), num_nodes=num_nodes)
+
+
+def go_on(graph: ViewGraph, before: Solution, method: str = "neurora") -> Solution:
+    """The next answer of a graph that has grown; new nodes start where they may."""
+    more = graph.num_nodes - len(before.body_from_world)
+    start = torch.cat((before.body_from_world, rotations.identity(more)))
+    return solve(graph, method=method, warm_start=start, memory=before.memory)
+
+
+def apart(first: Solution, second: Solution) -> tuple[float, float]:
+    """Largest difference of orientations, degrees, and of positions, metres."""
+    assert first.position is not None and second.position is not None
+    turned = rotations.angle_between(first.body_from_world, second.body_from_world)
+    return float(torch.rad2deg(turned.max())), float((first.position - second.position).norm(dim=1).max())
+
+
+def test_odometry_alone_is_laid_on_as_a_whole_solve_has_it() -> None:
+    graph = graph_of(run_of())
+    for method in ("neurora", "neurora-posterior"):
+        before = solve(up_to(graph, 300), method=method)
+        grown = up_to(graph, 330, closures_up_to=300)
+        found, whole = go_on(grown, before, method), solve(grown, method=method)
+        assert "refine" not in found.stage_seconds
+        turned, moved = apart(found, whole)
+        assert turned < 0.05 and moved < 0.05
+        assert (found.outlier_score[: before.outlier_score.numel()] == before.outlier_score).all()
+        assert found.position_uncertainty is not None and whole.position_uncertainty is not None
+        ratio = (found.position_uncertainty / whole.position_uncertainty)[310:]
+        assert float(ratio.min()) > 0.6 and float(ratio.max()) < 1.6
+        assert found.edge_precision is not None and whole.edge_precision is not None
+        added = slice(before.outlier_score.numel(), None)
+        torch.testing.assert_close(found.edge_precision[added], whole.edge_precision[added], rtol=0.3, atol=0)
+
+
+def test_updates_say_what_a_whole_solve_says() -> None:
+    """And no closure's flag goes to and fro between an update, which judges by both, and a whole solve."""
+    graph, _ = displaced(run_of(1), 0.3, 1)
+    answer = solve(up_to(graph, 250))
+    flips, last, updates = 0, answer.outlier_score > 0.5, 0
+    for nodes in range(252, 401, 2):
+        answer = go_on(up_to(graph, nodes), answer)
+        updates += "update" in answer.stage_seconds and "refine" not in answer.stage_seconds
+        flags = answer.outlier_score > 0.5
+        flips += int((flags[: len(last)] != last).sum())
+        last = flags
+    whole = solve(up_to(graph, 400))
+    assert updates > 5
+    assert answer.position is not None and answer.rotation_score is not None
+    assert flips < 10
+    turned, moved = apart(answer, whole)
+    assert turned < 0.5 and moved < 0.3
+    assert ((answer.outlier_score > 0.5) != (whole.outlier_score > 0.5)).sum() <= 1
+
+
+def test_a_label_makes_places_anew() -> None:
+    """Memory of other labels is of another graph: the answer is that of a solve without it, given the same start."""
+    graph = up_to(graph_of(run_of(2)), 400)
+    before = solve(graph)
+    closure = int(torch.nonzero(~graph.is_odometry)[3, 0])
+    label = graph.label.clone()
+    label[closure] = EdgeLabel.REJECTED
+    labelled = replace(graph, label=label)
+    with_memory, without = (
+        solve(labelled, warm_start=before.body_from_world, memory=memory) for memory in (before.memory, None)
+    )
+    turned, moved = apart(with_memory, without)
+    assert turned == 0.0 and moved == 0.0
+    assert float(with_memory.outlier_score[closure]) == 1.0
+
+
+def test_robots_that_meet_are_placed_anew() -> None:
+    """A closure between two chains moves one of them into the other's frame."""
+    run = run_of(3)
+    graph = graph_of(run)
+    cut = 200
+    crosses = (torch.minimum(graph.source, graph.target) < cut) & (torch.maximum(graph.source, graph.target) >= cut)
+    two = graph.select_edges(~crosses)
+    bridges = torch.nonzero(crosses & ~graph.is_odometry)[:, 0]
+    good = bridges[torch.from_numpy(~run.closure_is_false[bridges.numpy()])]
+    joined = torch.cat((torch.nonzero(~crosses)[:, 0], good[:12]))
+    before = solve(two)
+    assert int(before.component.max()) == 1
+    found, whole = (
+        solve(graph.select_edges(joined), **more)
+        for more in ({"warm_start": before.body_from_world, "memory": before.memory}, {})
+    )
+    assert int(found.component.max()) == 0
+    turned, moved = apart(found, whole)
+    assert turned < 0.5 and moved < 0.5
+
+
+def test_translations_that_come_later_are_used_at_once() -> None:
+    graph = graph_of(run_of(4))
+    alone = solve(replace(up_to(graph, 300), translation=None))
+    assert alone.position is None
+    assert go_on(up_to(graph, 305), alone).position is not None
+
+
+def test_a_large_graphs_update_keeps_what_places_said(monkeypatch) -> None:
+    """Beyond some size an update has no joint solve; closures of wrong places stay flagged."""
+    monkeypatch.setattr("rotavg_ros.solver.slam.solve._MAX_JOINT_UPDATE", 10)
+    graph, wrong = displaced(run_of(5), 0.3, 5)
+    for nodes in range(380, 398):
+        first, grown = up_to(graph, nodes), up_to(graph, nodes + 2)
+        before = solve(first)
+        found = go_on(grown, before)
+        if "refine" not in found.stage_seconds and grown.num_edges > first.num_edges + 2:
+            break
+    else:
+        raise AssertionError("no update took in a closure")
+    closures = torch.nonzero(~first.is_odometry)[:, 0]
+    flags = found.outlier_score[closures] > 0.5
+    assert torch.equal(flags, before.outlier_score[closures] > 0.5) and int(flags.sum()) > 10
+    assert wrong.sum() > 10
