@@ -37,7 +37,7 @@ INWARD: dict[str, set[str]] = {
 # Inside a wing, the rooms (modules and folders) that a room may import; "" is what the folder's own name gives.
 ROOMS: dict[str, dict[str, set[str]]] = {
     "solver": {
-        "solution": set(),
+        "solution": {"algebra"},
         "devices": set(),
         "algebra": set(),
         "estimate": {"neurora"},

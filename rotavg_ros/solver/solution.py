@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rotavg_ros.rotations import angle_between, canonical, inverse, multiply, rotate
+from rotavg_ros.rotations import angle, canonical, inverse, rotate
+from rotavg_ros.solver.algebra.residuals import edge_residual
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -59,16 +60,27 @@ class Solution:
 
 def residual_deg(graph: ViewGraph, solution: Solution) -> np.ndarray:
     """``(M,)`` degrees, between each edge's measured rotation and the solution's."""
-    orientation = solution.body_from_world.cpu()
-    source, target = graph.source.cpu(), graph.target.cpu()
-    estimated = multiply(orientation[target], inverse(orientation[source]))
-    return np.asarray(torch.rad2deg(angle_between(graph.target_from_source.cpu(), estimated)).numpy())
+    ends = graph.source.cpu(), graph.target.cpu()
+    return angles_off(solution.body_from_world.cpu(), graph.target_from_source.cpu(), *ends)
 
 
 def residual_m(graph: ViewGraph, solution: Solution) -> np.ndarray:
     """``(M,)`` metres, between each edge's measured translation and the solution's; NaN without either."""
     if solution.position is None or graph.translation is None:
         return np.full(graph.num_edges, np.nan)
-    source, position = graph.source.cpu(), solution.position.cpu()
-    measured = rotate(solution.world_from_body.cpu()[source], graph.translation.cpu())
-    return np.asarray((position[graph.target.cpu()] - position[source] - measured).norm(dim=1).numpy())
+    ends = graph.source.cpu(), graph.target.cpu()
+    return distances_off(solution.body_from_world.cpu(), solution.position.cpu(), graph.translation.cpu(), *ends)
+
+
+def angles_off(body_from_world: Tensor, target_from_source: Tensor, source: Tensor, target: Tensor) -> np.ndarray:
+    """``(M,)`` degrees, between measured rotations ``(M, 4)`` and those of N orientations."""
+    residual = edge_residual(body_from_world, target_from_source, source, target)
+    return np.asarray(torch.rad2deg(angle(residual)).numpy())
+
+
+def distances_off(
+    body_from_world: Tensor, position: Tensor, translation: Tensor, source: Tensor, target: Tensor
+) -> np.ndarray:
+    """``(M,)`` metres, between measured translations ``(M, 3)`` and those of N poses; NaN where none is known."""
+    measured = rotate(inverse(body_from_world)[source], translation)
+    return np.asarray((position[target] - position[source] - measured).norm(dim=1).numpy())

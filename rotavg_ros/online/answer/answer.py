@@ -13,6 +13,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.online.graph.snapshot import GraphSnapshot
+from rotavg_ros.solver.solution import angles_off, distances_off
 from rotavg_ros.view_graph import EdgeLabel
 
 if TYPE_CHECKING:
@@ -142,23 +143,23 @@ class Answer:
     @cached_property
     def residual_deg(self) -> NDArray[np.float64]:
         """``(M,)`` how far each edge's measured rotation is from the answer's."""
-        body_from_world = rotations.inverse(torch.from_numpy(self.world_from_body))
-        source, target = torch.from_numpy(self.source), torch.from_numpy(self.target)
-        estimated = rotations.multiply(body_from_world[target], rotations.inverse(body_from_world[source]))
-        off = rotations.angle_between(torch.from_numpy(self.target_from_source), estimated)
-        return np.asarray(torch.rad2deg(off).numpy())
+        return angles_off(self._body_from_world, torch.from_numpy(self.target_from_source), *self._ends)
 
     @cached_property
     def residual_m(self) -> NDArray[np.float64] | None:
         """``(M,)`` the same of translations, metres; NaN where an edge has none. None without positions."""
         if self.position is None:
             return None
-        step = torch.from_numpy(self.translation)
-        turned = rotations.rotate(torch.from_numpy(self.world_from_body[self.source]), step).numpy()
-        off: NDArray[np.float64] = np.linalg.norm(
-            self.position[self.target] - self.position[self.source] - turned, axis=1
-        )
-        return off
+        position, translation = torch.from_numpy(self.position), torch.from_numpy(self.translation)
+        return distances_off(self._body_from_world, position, translation, *self._ends)
+
+    @property
+    def _body_from_world(self) -> Tensor:
+        return rotations.inverse(torch.from_numpy(self.world_from_body))
+
+    @property
+    def _ends(self) -> tuple[Tensor, Tensor]:
+        return torch.from_numpy(self.source), torch.from_numpy(self.target)
 
     @property
     def num_components(self) -> int:

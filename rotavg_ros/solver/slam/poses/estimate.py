@@ -98,7 +98,7 @@ def estimate_poses(problem: PoseProblem, *, hold: bool = False, start: PoseStart
     is_good = problem.mode.state.is_good[problem.mode.problem.closure]
     judge = Judge(problem.told, problem.turns, problem.priors, is_good if hold else None)
     state = _begin(problem) if start is None else start.state
-    places, is_new = judge.nothing_known(is_good, _scale(problem, state)), np.ones(len(is_good), dtype=bool)
+    places, is_new = _nothing_known(problem, state, judge), np.ones(len(is_good), dtype=bool)
     if start is not None:
         places, is_new = start.over(places), start.column < 0
     change, sorted_by = np.zeros(4), np.zeros_like(places.chance)
@@ -180,6 +180,13 @@ def _begin(problem: PoseProblem) -> PoseState:
     nowhere = np.zeros((problem.drawn.num_nodes, 3))
     state = PoseState(mode.state.correction, nowhere, common, problem.turn_noise)
     return replace(state, position=problem.along_odometry(problem.displacements(problem.orientations(state))))
+
+
+def _nothing_known(problem: PoseProblem, state: PoseState, judge: Judge) -> Places:
+    closure = problem.mode.problem.closure
+    residual = problem.residuals(state, problem.displacements(problem.orientations(state)))
+    square = (residual[closure, problem.turns :] ** 2).sum(axis=1)
+    return judge.nothing_known(problem.mode.state.is_good[closure], square, _scale(problem, state))
 
 
 def _scale(problem: PoseProblem, state: PoseState) -> Scale:

@@ -174,7 +174,7 @@ class Judge:
         own = variance[good, :, None]
         return Places(
             chance,
-            np.maximum(np.where(known, pull / shrunk, 0.0), _NOTHING / scale.closure),
+            np.maximum(np.where(known, pull / shrunk, 0.0), _least_weight((shift**2).sum(axis=1), scale)),
             np.maximum(turn_pull / turn_shrunk, _NOTHING / told.rotation_variance),
             np.array([turn_squares.sum(), (at_good * own * along[good] ** 2 / total[good] ** 2).sum()]),
             np.array([turn_freedom.sum(), (at_good * own / total[good]).sum()]),
@@ -183,8 +183,14 @@ class Judge:
             (variance[:, :, None] * spread / total).mean(axis=2),
         )
 
-    def nothing_known(self, is_good: np.ndarray, scale: Scale) -> Places:
-        """Before any solve: no translation pulls, and rotations do as labelled ``(C,)``."""
+    def nothing_known(self, is_good: np.ndarray, square: np.ndarray, scale: Scale) -> Places:
+        """Before any solve: no translation pulls, and rotations do as labelled.
+
+        Args:
+            is_good: ``(C,)`` labels.
+            square: ``(C,)`` m², by what translations are off.
+            scale: of errors.
+        """
         count = len(is_good)
         chance = np.zeros((_GOOD + _ELSEWHERE + 1, count))
         chance[-1] = ~is_good
@@ -192,7 +198,7 @@ class Judge:
         turn = np.where(is_good, 1.0, _NOTHING) / self.told.rotation_variance
         return Places(
             chance,
-            np.full(count, _NOTHING / scale.closure),
+            _least_weight(square, scale),
             turn,
             np.zeros(2),
             np.zeros(2),
@@ -254,6 +260,11 @@ class Judge:
         log_all[:-1, is_false] = _LOG_NOTHING
         log_all[_GOOD:, accepted & self.told.is_known] = _LOG_NOTHING
         return log_all
+
+
+def _least_weight(square: np.ndarray, scale: Scale) -> np.ndarray:
+    """``(C,)`` m⁻², of closures that are off by ``square`` m²: however far that is, they pull next to nothing."""
+    return np.asarray(_NOTHING / (scale.closure + square))
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,8 @@ _PLANAR = 1e-6
 _LEAST_LENGTH = 1e-3
 # The share of an error that is not shared; the system stays solvable.
 _NONE = 1e-6
+# A closure that is longer than so many times all of odometry is as wrong as if it were as long.
+_FARTHEST = 1e3
 # The weight of what does not pull, in that of what does.
 _NOTHING = 1e-8
 # Roots are tied down so many times more stiffly than any row.
@@ -103,9 +105,12 @@ class PoseProblem:
 
     @cached_property
     def lengths(self) -> np.ndarray:
-        """``(M, 3)`` translations, 0 where unknown."""
+        """``(M, 3)`` translations, 0 where unknown; closures' no longer than what no odometry passes."""
         known = np.isfinite(self.translation).all(axis=1, keepdims=True)
-        return np.where(known, self.translation, 0.0)
+        lengths = np.where(known, self.translation, 0.0)
+        is_odometry = self.graph.is_odometry.numpy()
+        farthest = _FARTHEST * float(np.abs(lengths[is_odometry]).sum())
+        return np.where(is_odometry[:, None], lengths, np.clip(lengths, -farthest, farthest))
 
     @cached_property
     def typical(self) -> float:
