@@ -19,22 +19,28 @@ from rotavg_ros.solver.algebra.laplacian import solve_in_parts
 _NUM_PROBES, _SEED = 48, 0
 # What a row decides itself is no more than all but this: nothing else may tell of it.
 _LEAST = 1e-9
+# What is left of a turn and of a shift has less in common than this share, squared.
+_CORRELATED = 0.9
+_TINY = np.finfo(np.float64).tiny
 
 
 class BlockEquations:
     """The pattern of H for E rows between K nodes and R runs, d unknowns each.
 
     Args:
-        size: d.
+        size: (k, m) with d = k + m, components of a turn and of a shift.
         num_nodes: K.
         ends: ``(E, 2)`` sources and targets.
         run: ``(E,)`` in 0 … R − 1, or -1.
         roots: nodes that stay where they are.
     """
 
-    def __init__(self, size: int, num_nodes: int, ends: np.ndarray, run: np.ndarray, roots: np.ndarray) -> None:
+    def __init__(
+        self, size: tuple[int, int], num_nodes: int, ends: np.ndarray, run: np.ndarray, roots: np.ndarray
+    ) -> None:
         num_runs = int(run.max(initial=-1)) + 1
-        self.size, self.num_blocks, self.roots = size, num_nodes + num_runs, roots
+        self.turns, self.size = size[0], sum(size)
+        self.num_blocks, self.roots = num_nodes + num_runs, roots
         nowhere = self.num_blocks
         source, target = ends.T
         self.block = np.stack((target, source, np.where(run >= 0, num_nodes + run, nowhere)), axis=1)
@@ -44,10 +50,10 @@ class BlockEquations:
         # Sums over rows go block by block: in this order, from these places on.
         self._by_block = np.argsort(self.block.ravel(), kind="stable")
         self._used_blocks, self._first = np.unique(self.block.ravel()[self._by_block], return_index=True)
-        self._rank = np.arange(self.num_blocks * size)
+        self._rank = np.arange(self.num_blocks * self.size)
         self._is_ordered = False
         self._lay_out()
-        self.probes = np.random.default_rng(_SEED).standard_normal((len(self.block), size, _NUM_PROBES))
+        self.probes = np.random.default_rng(_SEED).standard_normal((len(self.block), self.size, _NUM_PROBES))
 
     def _lay_out(self) -> None:
         d, count = self.size, self.num_blocks * self.size
@@ -128,8 +134,9 @@ class BlockFactor:
     def leverage(self) -> np.ndarray:
         """``(E + R, d, d)`` Λ, what of a whitened row its own measurement decides.
 
-        Of a row's own probe z ~ N(0, I) the fit takes up y, and y ~ N(0, Λ), z − y ~ N(0, I − Λ) are independent. Their
-        moments A and B make L⁻¹ A L⁻ᵀ with L Lᵀ = A + B (a matrix-variate beta), near which Λ is, at both ends.
+        Of a row's own probe z ~ N(0, I) the fit takes up y, and y ~ N(0, Λ), z − y ~ N(0, I − Λ) are independent. Of
+        turns and of shifts by themselves their moments A and B make L⁻¹ A L⁻ᵀ with L Lᵀ = A + B (a matrix-variate
+        beta), near which Λ is, at both ends.
         """
         return self._shares[0]
 
@@ -140,10 +147,33 @@ class BlockFactor:
 
     @cached_property
     def _shares(self) -> tuple[np.ndarray, np.ndarray]:
+        k, d = self._system.turns, self._system.size
         taken = self.predicted(self.samples)
         left = self._system.probes - taken
-        unit = np.eye(self._system.size)
         moments = [np.matmul(part, part.transpose(0, 2, 1)) / _NUM_PROBES for part in (taken, left)]
-        root = np.linalg.inv(np.linalg.cholesky(moments[0] + moments[1]))
+        both = moments[0] + moments[1]
+        # A turn's moments with a shift's are noise where one of the two hardly counts, and it is as slight as that in y
+        # or in z − y by itself, but not in their sum: nothing of the one's leverage may get into the other's.
+        both[:, :k, k:] = both[:, k:, :k] = 0
+        root = np.linalg.inv(np.linalg.cholesky(both))
         of_taken, of_left = (np.matmul(root, np.matmul(part, root.transpose(0, 2, 1))) for part in moments)
-        return of_taken, of_left + _LEAST * unit
+        of_left += _LEAST * np.eye(d)
+        across = _slighter(of_taken[:, :k, k:], -of_left[:, :k, k:])
+        room = _least_value(of_left[:, :k, :k]) * _least_value(of_left[:, k:, k:])
+        square = (across**2).sum(axis=(1, 2))
+        across *= np.sqrt(np.minimum(_CORRELATED * room / np.maximum(square, _TINY), 1.0))[:, None, None]
+        for share, sign in ((of_taken, 1), (of_left, -1)):
+            share[:, :k, k:] = sign * across
+            share[:, k:, :k] = share[:, :k, k:].transpose(0, 2, 1)
+        return of_taken, of_left
+
+
+def _slighter(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of two matrices ``(n, k, m)`` each, that of fewer squares."""
+    is_first = (a**2).sum(axis=(1, 2)) <= (b**2).sum(axis=(1, 2))
+    return np.where(is_first[:, None, None], a, b)
+
+
+def _least_value(matrix: np.ndarray) -> np.ndarray:
+    """``(n,)`` no more than the least eigenvalues of ``(n, k, k)``."""
+    return np.asarray(1 / np.trace(np.linalg.inv(matrix), axis1=1, axis2=2))

@@ -25,10 +25,12 @@ _MAX_SOLVES = 24
 _MAX_UPDATE_SOLVES = 6
 # A step turns nothing by more than this, rad.
 _MAX_TURN = 0.3
-# Noise goes down by no more than this factor from solve to solve; most of it stays while places are sorted out.
+# Variances change by no more than this factor from solve to solve; most of them stay while places are sorted out.
 _SLOWEST, _HELD = 4.0, 3
-# Noise that comes nearer by a constant factor from solve to solve, by this at most, is set to where that leads.
-_SLOWEST_GAIN = 0.85
+# Variances before this one are not those of closures' shifts.
+_OF_CLOSURES = 3
+# A variance that comes nearer by a constant factor from solve to solve is set to where that leads; by this at most.
+_SLOWEST_GAIN = 0.6
 # At rest: a step's root mean square in standard errors; chances of classes; logarithms of variances.
 _STEP_CONVERGED, _CHANCE_CONVERGED, _NOISE_CONVERGED = 0.02, 0.05, 0.05
 # No two places are nearer than so many typical steps.
@@ -101,7 +103,7 @@ def estimate_poses(problem: PoseProblem, *, hold: bool = False, start: PoseStart
     places, is_new = _nothing_known(problem, state, judge), np.ones(len(is_good), dtype=bool)
     if start is not None:
         places, is_new = start.over(places), start.column < 0
-    change, sorted_by = np.zeros(4), np.zeros_like(places.chance)
+    change, sorted_by = np.zeros(len(state.noise.logarithms)), np.zeros_like(places.chance)
     number, held, most = 0, *((_HELD, _MAX_SOLVES) if start is None else (0, start.solves))
     while True:
         solved = _solve(problem, state, places, judge)
@@ -191,7 +193,8 @@ def _nothing_known(problem: PoseProblem, state: PoseState, judge: Judge) -> Plac
 
 def _scale(problem: PoseProblem, state: PoseState) -> Scale:
     spread = float(np.var(state.position @ problem.bases[1], axis=0).mean())
-    return Scale(state.noise.closure, 2 * spread + (_LEAST_EXTENT * problem.typical) ** 2)
+    good = problem.closure_variance(state.noise)
+    return Scale(good, state.noise.closure / good, 2 * spread + (_LEAST_EXTENT * problem.typical) ** 2)
 
 
 def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.ndarray) -> Predictions:
@@ -234,14 +237,15 @@ def _with_noise(
 
     Args:
         state: before.
-        noise: ``(4,)`` logarithms of variances as estimated.
-        last: ``(4,)`` how they changed before; zero where that is not to be gone on from.
+        noise: ``(5,)`` logarithms of variances as estimated.
+        last: ``(5,)`` how they changed before; zero where that is not to be gone on from.
         is_held: all but closures' shifts stay.
     """
     before = state.noise.logarithms
     change = noise - before
-    change[:-1] *= not is_held
-    ratio = float(change @ last) / max(float(last @ last), np.finfo(np.float64).tiny)
-    is_steady = 0 < ratio < _SLOWEST_GAIN
-    reached = before + np.maximum(change / (1 - ratio) if is_steady else change, -np.log(_SLOWEST))
-    return replace(state, noise=PoseNoise.of(reached)), np.zeros(4) if is_steady else change
+    change[:_OF_CLOSURES] *= not is_held
+    ratio = change * last / np.maximum(last * last, np.finfo(np.float64).tiny)
+    is_steady = ratio > 0
+    reached = np.where(is_steady, change / (1 - np.minimum(ratio, _SLOWEST_GAIN)), change)
+    reached = before + np.clip(reached, -np.log(_SLOWEST), np.log(_SLOWEST))
+    return replace(state, noise=PoseNoise.of(reached)), np.where(is_steady, 0.0, change)

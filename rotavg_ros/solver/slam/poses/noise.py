@@ -33,7 +33,7 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     redundant = np.trace(redundancy[:, :k, :k], axis1=1, axis2=2).sum()
     by_turns += np.array([(solved.left[segments, :k] ** 2).sum(), redundant])
     by_closures = np.stack((places.squares, places.freedom), axis=1)
-    found = (by_turns, by_closures[0], by_way, by_closures[1])
+    found = (by_turns, by_closures[0], by_way, *by_closures[1:])
     logarithms = [
         likeliest_variance(before * squares, max(freedom, 0.0), np.log(before), median, spread)
         for (squares, freedom), before, (median, spread) in zip(
@@ -49,7 +49,7 @@ def log_noise_prior(problem: PoseProblem, noise: PoseNoise) -> float:
     return -float(((noise.logarithms - median) ** 2 / (8 * spread**2)).sum())
 
 
-def priors_of(problem: PoseProblem) -> tuple[_Prior, _Prior, _Prior, _Prior]:
+def priors_of(problem: PoseProblem) -> tuple[_Prior, ...]:
     """Logarithms of median variances, and how far those of their roots spread."""
     of_turns, of_shifts, typical = problem.mode.problem.priors, problem.priors, problem.typical
     return (
@@ -57,4 +57,5 @@ def priors_of(problem: PoseProblem) -> tuple[_Prior, _Prior, _Prior, _Prior]:
         (2 * float(np.log(np.radians(of_turns.closure_deg))), of_turns.noise_spread),
         (float(np.log(of_shifts.step**2 * typical)), of_shifts.step_spread),
         (2 * float(np.log(of_shifts.closure * typical)), of_shifts.closure_spread),
+        (2 * float(np.log(of_shifts.relative)), of_shifts.relative_spread),
     )

@@ -78,7 +78,8 @@ class Places:
         chance: ``(J + 1, C)`` of each class; the last is a false rotation.
         weight: ``(C,)`` m⁻², with which each translation pulls.
         rotation_weight: ``(C,)`` rad⁻², likewise.
-        squares, freedom: ``(2,)`` sums over good closures for the variances of their turns and translations, in those.
+        squares, freedom: ``(3,)`` sums over good closures for the variances of their turns, of their translations
+            whatever their length, and of what goes with that, in those.
         log_density: ``(C,)`` nats, of each with its classes summed over.
         error, error_variance: ``(J, C)`` m and m² per component, of ε in each class: length of its mean, and variance.
     """
@@ -108,10 +109,22 @@ class Places:
 
 @dataclass(frozen=True)
 class Scale:
-    """m² per component: how far a good closure errs, and how far two places of the map are apart."""
+    """How far C closures err, m² per component.
 
-    closure: float
+    Attributes:
+        good: ``(C,)`` each, if it is good.
+        floor_share: ``(C,)`` the share of that which does not go with its length.
+        extent: how far two places of the map are apart.
+    """
+
+    good: np.ndarray
+    floor_share: np.ndarray
     extent: float
+
+    @property
+    def closure(self) -> float:
+        """A typical good one."""
+        return float(np.median(self.good)) if len(self.good) else self.extent
 
 
 @dataclass(frozen=True)
@@ -171,13 +184,14 @@ class Judge:
         turn_squares = right * square * told.rotation_variance / turn_total**2
         turn_freedom = right * k * told.rotation_variance / turn_total
         good, at_good = slice(_GOOD), each[:_GOOD] * known[:, None]
-        own = variance[good, :, None]
+        own = variance[good, :, None] * np.stack((scale.floor_share, 1 - scale.floor_share))[:, None, :, None]
+        axes = (1, 2, 3)
         return Places(
             chance,
             np.maximum(np.where(known, pull / shrunk, 0.0), _least_weight((shift**2).sum(axis=1), scale)),
             np.maximum(turn_pull / turn_shrunk, _NOTHING / told.rotation_variance),
-            np.array([turn_squares.sum(), (at_good * own * along[good] ** 2 / total[good] ** 2).sum()]),
-            np.array([turn_freedom.sum(), (at_good * own / total[good]).sum()]),
+            np.append(turn_squares.sum(), (at_good * own * along[good] ** 2 / total[good] ** 2).sum(axis=axes)),
+            np.append(turn_freedom.sum(), (at_good * own / total[good]).sum(axis=axes)),
             log_density,
             np.sqrt(((variance[:, :, None] * along / total) ** 2).sum(axis=2)),
             (variance[:, :, None] * spread / total).mean(axis=2),
@@ -200,8 +214,8 @@ class Judge:
             chance,
             _least_weight(square, scale),
             turn,
-            np.zeros(2),
-            np.zeros(2),
+            np.zeros(3),
+            np.zeros(3),
             np.zeros(count),
             none,
             none,
@@ -209,7 +223,7 @@ class Judge:
 
     def _variances(self, scale: Scale) -> np.ndarray:
         """``(J, C)`` m² per component, of ε in each class."""
-        good = scale.closure * self.told.own_share * np.array([[1.0], [self.priors.tail_ratio]])
+        good = scale.good * self.told.own_share * np.array([[1.0], [self.priors.tail_ratio]])
         wrong = np.append(self._wrong(scale), scale.extent)
         return np.concatenate((good, np.broadcast_to(wrong[:, None], (_ELSEWHERE, good.shape[1]))))
 
@@ -246,7 +260,7 @@ class Judge:
         log_each = -(along**2 / total + np.log(2 * np.pi * total)).sum(axis=2) / 2
         log_alone = logsumexp(log_each, axis=0) - np.log(_WRONG)
         log_wrong = np.logaddexp(log_alone + log_itself, log_repeated + log_repeat)
-        right = np.maximum(spread, 0.0) + (scale.closure * self.told.own_share)[:, None]
+        right = np.maximum(spread, 0.0) + (scale.good * self.told.own_share)[:, None]
         log_right = -(along**2 / right + np.log(2 * np.pi * right)).sum(axis=1) / 2
         share = self.priors.turned_in_place
         return np.asarray(np.logaddexp(log_wrong + np.log1p(-share), log_right + np.log(share)))

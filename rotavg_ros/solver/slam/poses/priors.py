@@ -16,6 +16,8 @@ class PlacePriors:
             every false closure.
         closure: median of the standard deviation of a good closure's translation, …
         closure_spread: … and that of its logarithm.
+        relative: median of what a good closure's translation errs by, of its own length, …
+        relative_spread: … and standard deviation of its logarithm: most front ends measure lengths, some guess them.
         slip: standard deviation of how far a step is off by where it slipped, beside what its turn bends.
         common: share of a closure's variance that it has in common with those near it.
         tails: share of good closures whose translation errs by far more than others', …
@@ -34,6 +36,8 @@ class PlacePriors:
     step_spread: float = 0.7
     closure: float = 1.0
     closure_spread: float = 1.0
+    relative: float = 0.05
+    relative_spread: float = 1.5
     slip: float = 3.0
     common: float = 0.5
     tails: float = 0.1

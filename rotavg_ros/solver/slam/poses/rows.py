@@ -46,22 +46,24 @@ class PoseNoise:
         turn: rad², of one step of odometry.
         closure_turn: rad², of a good closure that states what is typical.
         way: m² per metre passed, of odometry.
-        closure: m², of a good closure's translation.
+        closure: m², of a good closure's translation, and …
+        relative: … by what of its squared length that grows: some front ends tell directions rather than lengths.
     """
 
     turn: float
     closure_turn: float
     way: float
     closure: float
+    relative: float
 
     @property
     def logarithms(self) -> np.ndarray:
-        """``(4,)``."""
-        return np.log([self.turn, self.closure_turn, self.way, self.closure])
+        """``(5,)``."""
+        return np.log([self.turn, self.closure_turn, self.way, self.closure, self.relative])
 
     @classmethod
     def of(cls, logarithms: np.ndarray) -> PoseNoise:
-        """From ``(4,)``."""
+        """From ``(5,)``."""
         return cls(*np.exp(logarithms).tolist())
 
 
@@ -182,7 +184,7 @@ class PoseProblem:
         """Turns' as rotations alone have it, shifts' as it is believed to be."""
         noise, priors, typical = self.mode.state.noise, self.priors, self.typical
         way, closure = priors.step**2 * typical, (priors.closure * typical) ** 2
-        return PoseNoise(noise.step_variance, noise.closure_variance, way, closure)
+        return PoseNoise(noise.step_variance, noise.closure_variance, way, closure, priors.relative**2)
 
     @cached_property
     def slipped(self) -> np.ndarray:
@@ -222,6 +224,10 @@ class PoseProblem:
         """``(C,)`` the view-graph's edges that they are."""
         return np.asarray(self.drawn.view_graph_edge[self.mode.problem.closure - self.drawn.num_segments])
 
+    def closure_variance(self, noise: PoseNoise) -> np.ndarray:
+        """``(C,)`` m² per component, of good closures' translations."""
+        return np.asarray(noise.closure + noise.relative * (self.lengths[self.closures] ** 2).sum(axis=1))
+
     @cached_property
     def told(self) -> Told:
         """What rotations alone say of closures."""
@@ -244,7 +250,7 @@ class PoseProblem:
         """The pattern of the joint system."""
         drawn = self.drawn
         ends = np.stack((drawn.source, drawn.target), axis=1)
-        return BlockEquations(self.turns + self.shifts, drawn.num_nodes, ends, self.run, drawn.roots)
+        return BlockEquations((self.turns, self.shifts), drawn.num_nodes, ends, self.run, drawn.roots)
 
     def orientations(self, state: PoseState) -> np.ndarray:
         """``(4, N)`` body_from_world of all nodes."""
@@ -310,7 +316,7 @@ class PoseProblem:
         variance += np.where(slipped, (self.priors.slip * self.typical) ** 2, 0.0)
         # Odometry beside the chain that is not believed, which nothing hangs on, does not pull.
         variance[num_segments:] = np.where(slipped, variance / _NOTHING, variance)[num_segments:]
-        variance[self.mode.problem.closure] = noise.closure * self.told.own_share
+        variance[self.mode.problem.closure] = self.closure_variance(noise) * self.told.own_share
         covariance = variance[:, None, None] * unit
         covariance[: drawn.num_segments] += self.bridge_variance(noise)[:, None, None] * self.bent(way)
         return np.asarray(covariance)

@@ -1,0 +1,81 @@
+"""How far closures' translations err: absurdly, or in proportion to their length."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros import ViewGraph, solve
+
+from .test_poses import errors, graph_of, pose_mode, simulated
+
+
+def with_closures(graph: ViewGraph, factor: np.ndarray | float) -> ViewGraph:
+    """Closures' translations times a factor, one for all or ``(M, 1)``."""
+    assert graph.translation is not None
+    times = torch.as_tensor(factor, dtype=torch.float64).reshape(-1, 1)
+    return replace(
+        graph, translation=torch.where(graph.is_odometry[:, None], graph.translation, times * graph.translation)
+    )
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("metres", [1e4, 1e12, 1e300])
+def test_one_absurd_closure_is_flagged_and_no_other(metres: float) -> None:
+    run = simulated(3, false_share=0.2)
+    graph = graph_of(run)
+    assert graph.translation is not None
+    before = solve(graph).outlier_score > 0.5
+    good = int(torch.nonzero(~graph.is_odometry & ~before)[0, 0])
+    translation = graph.translation.clone()
+    translation[good] = torch.tensor([metres, 0.0, 0.0], dtype=torch.float64)
+    answer = solve(replace(graph, translation=translation))
+    flagged = answer.outlier_score > 0.5
+    expected = before.clone()
+    expected[good] = True
+    assert torch.equal(flagged, expected)
+    assert answer.rotation_score is not None and answer.rotation_score[good] < 0.5
+    assert errors(run, answer)[1] < 0.3
+
+
+def test_closures_that_tell_directions_rather_than_lengths() -> None:
+    """Each is short by a factor of its own, as those of two views by one camera are: odometry tells lengths."""
+    short, told = [], []
+    for seed in range(4):
+        run = simulated(seed, closure_radius_m=5.0)
+        graph = graph_of(run)
+        factor = np.random.default_rng(seed).uniform(0.1, 1.5, (graph.num_edges, 1))
+        guessed = with_closures(graph, factor)
+        relative = [np.sqrt(pose_mode(each).state.noise.relative) for each in (graph, guessed)]
+        assert relative[1] > 2 * relative[0]
+        short.append(errors(run, solve(guessed)))
+        told.append(errors(run, solve(graph)))
+        flagged = (solve(guessed).outlier_score > 0.5).numpy()
+        off = np.linalg.norm((1 - factor) * run.edge_translation, axis=1)
+        clear = ~run.closure_is_false & ~graph.is_odometry.numpy() & (off < 1.0)
+        assert flagged[clear].mean() < 0.02
+    assert np.exp(np.log(np.array(short)[:, 0] / np.array(told)[:, 0]).mean()) < 1.3
+    assert np.mean(np.array(short)[:, 1]) < 0.5
+
+
+def test_what_is_told_of_a_closure_does_not_grow_as_it_pulls_less() -> None:
+    """Its turn's leverage is none of its shift's: what is predicted of a place stays where others put it."""
+    run = simulated(3, false_share=0.2)
+    graph = graph_of(run)
+    assert graph.translation is not None
+    closure = torch.nonzero(~graph.is_odometry)[:, 0]
+    translation = graph.translation.clone()
+    translation[closure[::4]] = torch.nan
+    mode = pose_mode(replace(graph, translation=translation))
+    unknown = ~mode.problem.told.is_known
+    assert unknown.sum() == len(closure[::4])
+    off = np.linalg.norm(mode.solved.predictions.mean[unknown, mode.problem.turns :], axis=1)
+    assert off.max() < 10.0  # they lie within two metres of each other
+    leverage, redundancy = mode.solved.factor.leverage, mode.solved.factor.redundancy
+    np.testing.assert_allclose(
+        leverage + redundancy, np.broadcast_to(np.eye(leverage.shape[1]), leverage.shape), atol=1e-6
+    )
+    assert np.linalg.eigvalsh(redundancy).min() > 0 and np.linalg.eigvalsh(leverage).min() > -1e-9
