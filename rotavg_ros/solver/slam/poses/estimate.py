@@ -32,7 +32,7 @@ _OF_CLOSURES = 3
 # A variance that comes nearer by a constant factor from solve to solve is set to where that leads; by this at most.
 _SLOWEST_GAIN = 0.6
 # At rest: a step's root mean square in standard errors; chances of classes; logarithms of variances.
-_STEP_CONVERGED, _CHANCE_CONVERGED, _NOISE_CONVERGED = 0.02, 0.05, 0.05
+_STEP_CONVERGED, _CHANCE_CONVERGED, _NOISE_CONVERGED = 0.05, 0.1, 0.1
 # No two places are nearer than so many typical steps.
 _LEAST_EXTENT = 3.0
 
