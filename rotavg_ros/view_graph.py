@@ -19,6 +19,8 @@ from rotavg_ros.rotations import from_matrix, inverse
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 
+# A robot's loop closure is false if its rotation errs by more degrees than this, or its translation by more metres.
+FALSE_CLOSURE_DEG, FALSE_CLOSURE_M = 10.0, 2.0
 # A quaternion whose norm is farther than this from one is refused rather than normalised, and so is a matrix R of whose
 # R Rᵀ an entry is farther than this from the identity's.
 UNIT_NORM_TOLERANCE = 1e-3

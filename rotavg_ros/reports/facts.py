@@ -14,11 +14,13 @@ from rotavg_ros.online.measurements import OWN_EDGE_ID
 from rotavg_ros.replay.comparison import RobotComparison, compare
 from rotavg_ros.replay.record import RobotRecord, RunRecord
 from rotavg_ros.reports.panels import Clock
-from rotavg_ros.view_graph import EdgeKind
+from rotavg_ros.view_graph import FALSE_CLOSURE_DEG, FALSE_CLOSURE_M, EdgeKind
 
 FloatArray = NDArray[np.float64]
 
 _SURE = 0.4  # a score below 0.1 or above 0.9 is
+_EVEN = 0.5
+_DECIMALS = 3  # of scores, as tables show them
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,8 @@ class Closure:
         source, target: robot, keyframe id and stamp of its ends.
         score: probability that it is false.
         outlier: the verdict.
+        fails: what is held false of it, "rotation" or "place"; empty if it is believed.
+        off_deg, off_m: what the answer leaves of its rotation and translation; NaN where unknown.
     """
 
     edge_id: int | None
@@ -37,6 +41,9 @@ class Closure:
     target: tuple[str, int, int]
     score: float
     outlier: bool
+    fails: str
+    off_deg: float
+    off_m: float
 
 
 @dataclass(frozen=True)
@@ -94,10 +101,30 @@ class RunFacts:
     def num_flagged_odometry(self) -> int:
         return int(self.record.answer.outlier.sum()) - self.num_flagged
 
-    def most_suspicious(self, limit: int) -> list[Closure]:
-        """The loop closures with the highest scores, highest first; equal scores in order of arrival."""
-        score = self.record.answer.outlier_score[self.closures]
-        return self._described(self.closures[np.argsort(-score, kind="stable")[:limit]])
+    @property
+    def knows_places(self) -> bool:
+        """Whether closures were judged by their translations, too."""
+        return self.record.answer.position is not None
+
+    @cached_property
+    def off_m(self) -> FloatArray:
+        """``(M,)`` metres, what the answer leaves of edges' translations; NaN where unknown."""
+        off = self.record.answer.residual_m
+        return np.full(len(self.record.answer.source), np.nan) if off is None else off
+
+    def most_suspicious(self) -> list[Closure]:
+        """The loop closures with the highest scores first; equal ones by how far they are off, then by arrival."""
+        answer = self.record.answer
+        score = np.round(answer.outlier_score[self.closures], _DECIMALS)
+        off_deg, off_m = answer.residual_deg[self.closures], np.nan_to_num(self.off_m[self.closures])
+        off = np.maximum(off_deg / FALSE_CLOSURE_DEG, off_m / FALSE_CLOSURE_M)
+        return self._described(self.closures[np.lexsort((-off, -score))])
+
+    def believed_but_long(self) -> list[Closure]:
+        """Those that are believed though they are off by more than a false one's translation is, the farthest first."""
+        off = self.off_m[self.closures]
+        long = np.flatnonzero(~self.record.answer.outlier[self.closures] & (np.nan_to_num(off) > FALSE_CLOSURE_M))
+        return self._described(self.closures[long[np.argsort(-off[long], kind="stable")]])
 
     def closest_calls(self, limit: int) -> list[Closure]:
         """The loop closures of which the solver was least sure, the nearest to even first."""
@@ -114,9 +141,19 @@ class RunFacts:
                 target=self._end(answer.target[edge]),
                 score=float(answer.outlier_score[edge]),
                 outlier=bool(answer.outlier[edge]),
+                fails=self._fails(edge),
+                off_deg=float(answer.residual_deg[edge]),
+                off_m=float(self.off_m[edge]),
             )
             for edge in edges
         ]
+
+    def _fails(self, edge: np.intp) -> str:
+        answer = self.record.answer
+        if not answer.outlier[edge]:
+            return ""
+        is_turned = answer.rotation_score is None or answer.rotation_score[edge] > _EVEN
+        return "rotation" if is_turned else "place"
 
     def _end(self, node: np.int64) -> tuple[str, int, int]:
         answer = self.record.answer

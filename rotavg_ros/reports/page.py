@@ -20,8 +20,10 @@ from rotavg_ros.reports.tables import (
     topic_table,
 )
 from rotavg_ros.reports.tracks import tracks_of
+from rotavg_ros.view_graph import FALSE_CLOSURE_M
 
-MOST_CLOSURES = 40  # in the table; edges.csv has all
+MOST_CLOSURES = 40  # in the table that is open; edges.csv has all
+_NEARLY_ALL = 0.9
 
 
 @dataclass(frozen=True)
@@ -102,18 +104,21 @@ def _tiles(facts: RunFacts) -> list[Tile]:
     if len(facts.closures):
         tiles.append(Tile(f"{facts.num_flagged} of {len(facts.closures)}", "loop closures held false"))
     compared = [errors for _, errors in facts.compared]
-    if compared:
+    if not len(facts.closures):
+        pass  # nothing was corrected: equal errors before and after would look like a result
+    elif compared:
+        at = _where_known(facts)
         before, after = (
             np.degrees(_mean([getattr(errors, which).angle for errors in compared]))
             for which in ("odometry", "corrected")
         )
-        tiles.append(Tile(f"{before:.2f}° → {after:.2f}°", "mean orientation error, odometry → corrected"))
+        tiles.append(Tile(f"{before:.2f}° → {after:.2f}°", f"mean orientation error{at}, odometry → corrected"))
         before, after = (
             _mean([getattr(errors, which) for errors in compared])
             for which in ("odometry_distance", "corrected_distance")
         )
         if np.isfinite(before) and np.isfinite(after):
-            tiles.append(Tile(f"{before:.2f} m → {after:.2f} m", "mean position error, odometry → corrected"))
+            tiles.append(Tile(f"{before:.2f} m → {after:.2f} m", f"mean position error{at}, odometry → corrected"))
     else:
         turned = [values[np.isfinite(values)] for values in facts.correction]
         if any(map(len, turned)):
@@ -127,6 +132,13 @@ def _tiles(facts: RunFacts) -> list[Tile]:
         shown = f"{speed:.0f}" if speed >= 10 else f"{speed:.1f}"
         tiles.append(Tile(_duration(record.wall_seconds), f"of computing, {shown} × real time"))
     return tiles
+
+
+def _where_known(facts: RunFacts) -> str:
+    """At how many keyframes there is a reference, unless it is at nearly all."""
+    known = sum(int(np.isfinite(errors.corrected.angle).sum()) for _, errors in facts.compared)
+    total = sum(len(robot.stamp_ns) for robot, _ in facts.compared)
+    return "" if known > _NEARLY_ALL * total else f" at {known} of {total} keyframes"
 
 
 def _notes(facts: RunFacts) -> list[str]:
@@ -191,13 +203,28 @@ def _closures(facts: RunFacts) -> Section:
     if len(facts.closures) == 0:
         text = ["There are no loop closures in this run."]
         return Section("closures", "Loop closures", text)
-    shown = facts.most_suspicious(MOST_CLOSURES)
-    more = len(facts.closures) - len(shown)
+    ordered = facts.most_suspicious()
+    shown, further = ordered[:MOST_CLOSURES], ordered[MOST_CLOSURES:]
+    flagged = [closure for closure in further if closure.outlier]
+    more = len(further) - len(flagged)
     rest = f" {_count(more, 'further closure')} with lower scores: edges.csv has all." if more else ""
+    places = sum(closure.fails == "place" for closure in ordered)
+    of_places = f", {places} of these for joining wrong places though their rotation may be right" if places else ""
     text = [
-        f"{facts.num_flagged} of {len(facts.closures)} are held false. The table lists the most suspicious first.{rest}"
+        f"{facts.num_flagged} of {len(facts.closures)} are held false{of_places}. "
+        f"The table lists the most suspicious first.{rest}"
     ]
     tables = [closure_table(shown, facts)]
+    if flagged:
+        tables.append(closure_table(flagged, facts, f"The other {len(flagged)} that are held false"))
+    if long := facts.believed_but_long():
+        are = "is" if len(long) == 1 else "are"
+        text.append(
+            f"{_count(len(long), 'believed closure')} {are} more than {FALSE_CLOSURE_M:g} m off after correction, "
+            f"{long[0].off_m:.1f} m at most: nothing else tells enough of these places, or this front end states "
+            "directions rather than lengths."
+        )
+        tables.append(closure_table(long, facts, f"Believed, but more than {FALSE_CLOSURE_M:g} m off: {len(long)}"))
     close = facts.closest_calls(MOST_CLOSURES)
     if close:
         tables.append(closure_table(close, facts, f"The {len(close)} closest calls, scores between 0.1 and 0.9"))

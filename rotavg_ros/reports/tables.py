@@ -69,10 +69,13 @@ class Table:
 
 
 def closure_table(closures: Sequence[Closure], facts: RunFacts, folded: str = "") -> Table:
-    """Loop closures with both their ends: who, which keyframe, when."""
+    """Loop closures with what the answer leaves of them and with both their ends: who, which keyframe, when."""
+    in_metres = [Column("off by, m", "number")] if facts.knows_places else []
     columns = [
         Column("verdict"),
         Column("score", "number"),
+        Column("off by, °", "number"),
+        *in_metres,
         Column("id", "number"),
         Column("source"),
         Column("its stamp, s", "number"),
@@ -84,8 +87,10 @@ def closure_table(closures: Sequence[Closure], facts: RunFacts, folded: str = ""
     rows = [
         Row(
             (
-                "false" if closure.outlier else "believed",
+                f"false: {closure.fails}" if closure.outlier else "believed",
                 f"{closure.score:.3f}",
+                f"{closure.off_deg:.1f}",
+                *([_metres(closure.off_m)] if facts.knows_places else []),
                 "–" if closure.edge_id is None else str(closure.edge_id),
                 *_end(closure.source, facts),
                 *_end(closure.target, facts),
@@ -95,6 +100,10 @@ def closure_table(closures: Sequence[Closure], facts: RunFacts, folded: str = ""
         for closure in closures
     ]
     return Table(columns, rows, folded)
+
+
+def _metres(value: float) -> str:
+    return f"{value:.2f}" if np.isfinite(value) else "–"
 
 
 def _end(end: tuple[str, int, int], facts: RunFacts) -> tuple[str, str, str]:
@@ -120,6 +129,7 @@ def error_table(facts: RunFacts) -> Table:
         for what, values, factor, unit in (
             ("orientation, odometry alone", errors.odometry.angle, np.degrees(1.0), "°"),
             ("orientation, corrected", errors.corrected.angle, np.degrees(1.0), "°"),
+            ("… one standard deviation as stated", robot.uncertainty, np.degrees(1.0), "°"),
             ("position, odometry alone", errors.odometry_distance, 1.0, " m"),
             ("position, odometry's steps along corrected orientations", errors.dead_reckoned_distance, 1.0, " m"),
             ("position, corrected", errors.corrected_distance, 1.0, " m"),

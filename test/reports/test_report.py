@@ -15,10 +15,11 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 from PIL import Image
 
-from rotavg_ros.online import RejectReason
+from rotavg_ros.online import Answer, RejectReason
 from rotavg_ros.replay.record import RunRecord, TopicUse
 from rotavg_ros.reports import ReportError, report, write_report
 from rotavg_ros.reports.facts import RunFacts
+from rotavg_ros.reports.page import page_of
 from rotavg_ros.reports.report import PICTURES
 from rotavg_ros.reports.tables import WHY_REFUSED
 from rotavg_ros.reports.theme import DARK, LIGHT
@@ -222,3 +223,57 @@ def test_a_folder_that_cannot_be_written(record: RunRecord, tmp_path: Path) -> N
     (tmp_path / "file").touch()
     with pytest.raises(ReportError, match="cannot be written"):
         write_report(record, tmp_path / "file")
+
+
+def judged(record: RunRecord, outlier: np.ndarray, rotation_score: np.ndarray) -> RunFacts:
+    """The record with verdicts on its closures: outliers that fail by their rotations where those score high."""
+    answer = record.answer
+    closures = answer.kind == EdgeKind.LOOP_CLOSURE
+    score, flags, turned = answer.outlier_score.copy(), answer.outlier.copy(), np.zeros(len(answer.source))
+    flags[closures], turned[closures] = outlier, rotation_score
+    score[closures] = np.where(outlier, 0.9, 0.1)
+    found = replace(standing_still(answer), outlier_score=score, outlier=flags, rotation_score=turned)
+    return RunFacts(replace(record, answer=found))
+
+
+def standing_still(answer: Answer) -> Answer:
+    """With positions and translations, of a robot that goes nowhere."""
+    nowhere = np.zeros((len(answer.stamp_ns), 3))
+    return replace(answer, position=nowhere, translation=np.zeros((len(answer.source), 3)))
+
+
+def test_the_table_says_what_is_wrong_with_a_closure_and_by_how_much(record: RunRecord) -> None:
+    count = int((record.answer.kind == EdgeKind.LOOP_CLOSURE).sum())
+    outlier = np.arange(count) < 50
+    facts = judged(record, outlier, np.where(np.arange(count) % 2 == 0, 0.8, 0.0))
+    closures = facts.most_suspicious()
+    assert len(closures) == count and all(each.outlier for each in closures[:50])
+    assert {each.fails for each in closures[:50]} == {"rotation", "place"} and closures[-1].fails == ""
+    off = [max(each.off_deg / 10, np.nan_to_num(each.off_m) / 2) for each in closures]
+    assert off[:50] == sorted(off[:50], reverse=True)
+    section = next(each for each in page_of(facts).sections if each.anchor == "closures")
+    assert "50 of" in section.text[0] and "25 of these for joining wrong places" in section.text[0]
+    others = next(table for table in section.tables if table.folded.startswith("The other"))
+    assert others.folded == "The other 10 that are held false" and all(row.flagged for row in others.rows)
+    assert any(column.name == "off by, m" for column in section.tables[0].columns)
+
+
+def test_believed_closures_that_stay_long_are_named(record: RunRecord) -> None:
+    answer = standing_still(record.answer)
+    closures = np.flatnonzero(answer.kind == EdgeKind.LOOP_CLOSURE)
+    believed = closures[~answer.outlier[closures]][:3]
+    translation = answer.translation.copy()
+    translation[believed] += [7.0, 0.0, 0.0]
+    facts = RunFacts(replace(record, answer=replace(answer, translation=translation)))
+    assert {each.edge_id for each in facts.believed_but_long()} >= {int(answer.edge_id[edge]) for edge in believed}
+    text = " ".join(next(each for each in page_of(facts).sections if each.anchor == "closures").text)
+    assert "more than 2 m off after correction" in text
+    assert "more than 2 m off" not in " ".join(
+        next(each for each in page_of(RunFacts(record)).sections if each.anchor == "closures").text
+    )
+
+
+def test_nothing_to_correct_has_no_tiles_that_look_like_results(record: RunRecord) -> None:
+    labels = " ".join(tile.label for tile in page_of(RunFacts(without_closures(record))).tiles)
+    assert "error" not in labels and "turn of the odometry" not in labels
+    assert "mean orientation error" in " ".join(tile.label for tile in page_of(RunFacts(record)).tiles)

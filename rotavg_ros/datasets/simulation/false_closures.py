@@ -12,13 +12,11 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.simulation.slip_places import CROSSED, SlipRule, slip_places
 from rotavg_ros.errors import UserError
-from rotavg_ros.view_graph import EdgeKind
+from rotavg_ros.view_graph import FALSE_CLOSURE_DEG, EdgeKind
 
 FloatArray = NDArray[np.floating]
 BoolArray = NDArray[np.bool_]
 
-# A loop closure (or a slipping odometry edge) whose true noise exceeds this is an outlier.
-FALSE_CLOSURE_DEG = 10.0
 # Sizes of groups of false closures that agree with each other.
 GROUP_SIZE = (4, 12)
 SLIP_DEG = (20.0, 60.0)

@@ -6,10 +6,11 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.datasets.simulation.false_closures import FALSE_CLOSURE_DEG, GROUP_SIZE, random_rotations, random_turns
+from rotavg_ros.datasets.simulation.false_closures import GROUP_SIZE, random_rotations, random_turns
 from rotavg_ros.datasets.simulation.plane_paths import FloatArray
 from rotavg_ros.datasets.simulation.simulated_odometry import IndexArray, Measurements, noise_levels, rotation_vectors
 from rotavg_ros.datasets.simulation.slam_config import SlamSimulationConfig
+from rotavg_ros.view_graph import FALSE_CLOSURE_DEG
 
 _NEAR_MISS_DEG = (10.0, 30.0)
 # Keyframes over which a front end sees much the same.

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.datasets.files.graph_file import GraphFile
-from rotavg_ros.datasets.simulation.false_closures import FALSE_CLOSURE_DEG
 from rotavg_ros.datasets.simulation.plane_paths import FloatArray
 from rotavg_ros.datasets.simulation.simulated_closures import measure_closures
 from rotavg_ros.datasets.simulation.simulated_odometry import IndexArray, dead_reckoning, measure_odometry
@@ -24,7 +23,7 @@ from rotavg_ros.datasets.simulation.slam_config import (
     random_slam_config,
 )
 from rotavg_ros.datasets.simulation.trajectories import Way, drive
-from rotavg_ros.view_graph import EdgeKind, ViewGraph
+from rotavg_ros.view_graph import FALSE_CLOSURE_DEG, EdgeKind, ViewGraph
 
 __all__ = [
     "Precisions",

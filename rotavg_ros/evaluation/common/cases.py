@@ -11,10 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rotavg_ros.datasets.simulation.false_closures import FALSE_CLOSURE_DEG
 from rotavg_ros.datasets.simulation.synthetic import SFM_OUTLIER_ANGLE
 from rotavg_ros.metrics import true_edge_noise
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import FALSE_CLOSURE_DEG, ViewGraph
 
 
 @dataclass(frozen=True)

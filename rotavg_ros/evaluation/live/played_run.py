@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import rotations
-from rotavg_ros.datasets.simulation.false_closures import FALSE_CLOSURE_DEG
 from rotavg_ros.evaluation.live.node_answer import NodeAnswer
 from rotavg_ros.metrics import OutlierCounts, gauge_alignment, orientation_errors, true_edge_noise
-from rotavg_ros.view_graph import EdgeKind, ViewGraph
+from rotavg_ros.view_graph import FALSE_CLOSURE_DEG, EdgeKind, ViewGraph
 
 FloatArray = NDArray[np.floating]
 

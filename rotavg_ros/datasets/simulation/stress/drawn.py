@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.datasets.files.graph_file import GraphFile
-from rotavg_ros.datasets.simulation.false_closures import FALSE_CLOSURE_DEG
 from rotavg_ros.datasets.simulation.plane_paths import FloatArray
 from rotavg_ros.datasets.simulation.simulated_odometry import rotation_vectors
 from rotavg_ros.datasets.simulation.slam_config import SlamSimulationConfig
 from rotavg_ros.datasets.simulation.slam_simulation import simulate_slam_graph
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import FALSE_CLOSURE_DEG, ViewGraph
 
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]

@@ -9,9 +9,9 @@ from scipy.special import expit
 
 from rotavg_ros.solver.slam.noise.exceedance import exceedance
 from rotavg_ros.solver.slam.noise.model import NoiseModel
+from rotavg_ros.view_graph import FALSE_CLOSURE_DEG
 
-# A loop closure whose true noise exceeds this is an outlier.
-OUTLIER_ANGLE = np.radians(10.0)
+OUTLIER_ANGLE = np.radians(FALSE_CLOSURE_DEG)
 # Redundancy below this many edges' worth says little about a variance; the estimate so far is worth as much.
 _PRIOR_ODOMETRY_REDUNDANCY = 5.0
 _PRIOR_CLOSURE_SQUARE = np.radians(0.08) ** 2

@@ -12,10 +12,8 @@ from rotavg_ros.solver.slam.noise.judging import OUTLIER_ANGLE
 from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart, estimate_poses
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.posterior.mode import Mode
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import FALSE_CLOSURE_M, ViewGraph
 
-# A closure whose translation errs by more than this, metres, is false.
-FALSE_METRES = 2.0
 # Rival labellings are compared by their translations if rotations make them less likely by no more nats, and so many
 # at most; and averaged if both do so.
 _RIVAL, _MAX_RIVALS, _FAR = 20.0, 5, 5.0
@@ -181,6 +179,6 @@ def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
     rotation = 1 - mode.state.trusted
     rotation[closure] = good * exceeds + (1 - good) * exceedance(turn, predicted, OUTLIER_ANGLE, k)
     score = rotation.copy()
-    wrong = np.where(problem.told.is_known, places.false(FALSE_METRES), 1 - good)
+    wrong = np.where(problem.told.is_known, places.false(FALSE_CLOSURE_M), 1 - good)
     score[closure] = np.maximum(1 - (1 - exceeds) * (1 - wrong), rotation[closure])
     return score, rotation
