@@ -178,7 +178,8 @@ TOLD: dict[str, str] = {
     OURS: "rotations, translations, stated precisions of rotations (treated with suspicion); no deviation of a shift",
     POSTERIOR: "the same",
     ROTATIONS_ALONE: "the same, but no translations in the solve",
-    GNC_STATED: "deviations as edges state them; that odometry is right",
+    GNC_STATED: "deviations as edges state them: simulated graphs the true ones, others what their files state; that "
+    "odometry is right",
     GNC_TRUE: "the deviations that the noise was drawn with; that odometry is right",
     GNC_WRONG: "those of closures right, those of odometry divided by five; that odometry is right",
     "isam2-cauchy": "the deviations that the noise was drawn with; that odometry is right",
