@@ -12,12 +12,21 @@ from rotavg_ros.cli.progress import progress, working
 from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.common.cases import drawings
-from rotavg_ros.evaluation.common.contenders import contenders, warm_up
-from rotavg_ros.evaluation.common.named_peers import is_available
+from rotavg_ros.evaluation.common.contenders import Roster, contenders, warm_up
 from rotavg_ros.evaluation.common.scoring import Step, score_all
 from rotavg_ros.evaluation.live import incremental
 from rotavg_ros.evaluation.names import SLAM_GRAPHS, SLAM_SHARES
-from rotavg_ros.evaluation.slam import cases, report, sensitivity, stress, stress_report, uncertainty
+from rotavg_ros.evaluation.slam import (
+    cases,
+    pose_cases,
+    pose_contenders,
+    pose_report,
+    report,
+    sensitivity,
+    stress,
+    stress_report,
+    uncertainty,
+)
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS, ROSTER, ROWS
 from rotavg_ros.evaluation.slam.search_or_model import Diagnosis, diagnose
 from rotavg_ros.evaluation.slam.stress_calibration import Calibration
@@ -41,12 +50,30 @@ def run(arguments: argparse.Namespace) -> Path:
     return SUITES[arguments.slam_suite](arguments)
 
 
+def _run_poses(arguments: argparse.Namespace) -> Path:
+    _refuse_graphs(arguments)
+    _refuse_what_stress_alone_has(arguments)
+    roster = pose_contenders.ROSTER
+    names = _methods(arguments, roster, pose_contenders.ROWS)
+    chosen = contenders(names, roster, keep=arguments.keep)
+    kinds = pose_cases.kinds(lambda: data_folder(arguments, ("slam",)), arguments.kinds or ())
+    seeds = arguments.seeds or pose_cases.REPORTING_SEEDS
+    with working("warming up"):
+        warm_up(contenders(names, roster).values(), roster, pose_cases.tiny_case())
+
+    def watch(steps: Iterable[Step]) -> Iterable[Step]:
+        count = sum(len(seeds) if kind.is_random else 1 for kind in kinds)
+        return progress(steps, total=count * len(chosen), description="solving", unit="solve")
+
+    scores = score_all(drawings(kinds, seeds), chosen, watch)
+    return pose_report.report(arguments.output, scores, arguments.command_line)
+
+
 def _run_stress(arguments: argparse.Namespace) -> Path:
-    if arguments.graphs != SLAM_GRAPHS or arguments.shares != SLAM_SHARES:
-        raise SlamOptionsError("--graphs and --shares choose from the recorded suite; with --suite stress use --kinds")
+    _refuse_graphs(arguments)
     kinds = stress.kinds(arguments.kinds or (), translations=arguments.translations)
     seeds = arguments.seeds or stress.REPORTING_SEEDS
-    names = _methods(arguments, ROWS)
+    names = _methods(arguments, ROSTER, ROWS)
     chosen = contenders(names, ROSTER, keep=arguments.keep)
     with working("warming up"):
         warm_up(contenders(names, ROSTER).values(), ROSTER)
@@ -73,13 +100,10 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
 
 def _run_recorded(arguments: argparse.Namespace) -> Path:
     if arguments.kinds is not None:
-        raise SlamOptionsError("--kinds chooses from the stress suite; add --suite stress")
-    for name in ("search_or_model", "sensitivity", "translations"):
-        if getattr(arguments, name):
-            option = name.replace("_", "-")
-            raise SlamOptionsError(f"--{option} needs cases of which all is known; add --suite stress")
+        raise SlamOptionsError("--kinds chooses from the suites stress and poses; add --suite stress or --suite poses")
+    _refuse_what_stress_alone_has(arguments)
     seeds = arguments.seeds or _RECORDED_SEEDS
-    names = _methods(arguments, [name for name in ROWS if name not in _STRESS_ONLY])
+    names = _methods(arguments, ROSTER, [name for name in ROWS if name not in _STRESS_ONLY])
     chosen = contenders(names, ROSTER, keep=arguments.keep)
     # What the last table needs shows before the hours that the others take.
     more = [_uncertainty_file(name) for name in _UNCERTAINTY_GRAPHS] if arguments.uncertainty else []
@@ -108,13 +132,28 @@ def _uncertainty_file(name: str) -> str:
     return f"slam/{name}.g2o"
 
 
-def _methods(arguments: argparse.Namespace, default: Iterable[str]) -> list[str]:
+def _refuse_graphs(arguments: argparse.Namespace) -> None:
+    if arguments.graphs != SLAM_GRAPHS or arguments.shares != SLAM_SHARES:
+        suite = arguments.slam_suite
+        raise SlamOptionsError(
+            f"--graphs and --shares choose from the recorded suite; with --suite {suite} use --kinds"
+        )
+
+
+def _refuse_what_stress_alone_has(arguments: argparse.Namespace) -> None:
+    for name in ("search_or_model", "sensitivity", "translations"):
+        if getattr(arguments, name):
+            option = name.replace("_", "-")
+            raise SlamOptionsError(f"--{option} needs cases of which all is known; add --suite stress")
+
+
+def _methods(arguments: argparse.Namespace, roster: Roster, default: Iterable[str]) -> list[str]:
     """Those asked for, or all by default that can run here; always with ours and the oracle, which ratios need."""
-    names = arguments.methods or [name for name in default if is_available(name) and name not in _ABLATIONS]
+    names = arguments.methods or [name for name in default if roster.can_run(name) and name not in _ABLATIONS]
     if arguments.without:
         names = [*names, POSTERIOR, *(without(name) for name in arguments.without)]
     if not arguments.peers:
-        names = [name for name in names if name not in ROSTER.peers]
+        names = [name for name in names if not roster.is_peer(name)]
     return list(dict.fromkeys((OURS, *names, ORACLE)))
 
 
@@ -122,4 +161,8 @@ def _watch_ticks(description: str) -> Callable[[Iterable[int]], Iterable[int]]:
     return lambda ticks: progress(ticks, description=description, unit="tick")
 
 
-SUITES: dict[str, Callable[[argparse.Namespace], Path]] = {"recorded": _run_recorded, "stress": _run_stress}
+SUITES: dict[str, Callable[[argparse.Namespace], Path]] = {
+    "recorded": _run_recorded,
+    "stress": _run_stress,
+    "poses": _run_poses,
+}

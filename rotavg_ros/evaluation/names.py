@@ -19,7 +19,7 @@ ROBUSTNESS_SETTINGS = (
     "25000",
 )
 RGBD_SETS = ("scannet_fgr", "scannet_super4pcs", "redwood_fgr", "redwood_super4pcs")
-SLAM_SUITES = ("recorded", "stress")
+SLAM_SUITES = ("recorded", "stress", "poses")
 SLAM_GRAPHS = (
     "B25b_0.000",
     "B25b_0.250",

@@ -65,6 +65,23 @@ def test_stress(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert f"`rotavg evaluate slam --threads 1 {again}`" in (tmp_path / "stress.md").read_text(encoding="utf-8")
 
 
+def test_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Simulated kinds need no data; ours and the oracle are always there, others' packages not with --no-peers."""
+    command = ["evaluate", "slam", "--suite", "poses", "--output", str(tmp_path), "--threads", "1", "--no-peers"]
+    kinds = ["--kinds", "SPARSE building: 30 % parallel", "--seeds", "1000"]
+    assert main([*command, *kinds, "--methods", "gnc-true", "pcm", "neurora-posterior"]) == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'poses.md'}\n"
+    with (tmp_path / "poses-cases.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["method"] for row in rows] == ["neurora", "pcm", "neurora-posterior", "oracle"] * 2
+    assert {(row["graph"], row["seed"]) for row in rows} == {("sparse building", "1000")}
+    assert all(float(row["ate_m"]) > 0 for row in rows)
+    text = (tmp_path / "poses.md").read_text(encoding="utf-8")
+    assert "2 drawings (seeds 1000)" in text
+    for file in tmp_path.glob("*.csv"):
+        assert file.stem.startswith("poses-")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -76,9 +93,15 @@ def test_stress(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (["--graphs", "nowhere"], "invalid choice: 'nowhere'"),
         (["--data", ".", "--methods", "magic"], "unknown method 'magic'"),
         (["--suite", "worse"], "invalid choice: 'worse'"),
-        (["--data", ".", "--kinds", "grid"], "--kinds chooses from the stress suite; add --suite stress"),
+        (["--data", ".", "--kinds", "grid"], "--kinds chooses from the suites stress and poses; add --suite stress"),
         (["--suite", "stress", "--graphs", "CSAIL"], "with --suite stress use --kinds"),
         (["--suite", "stress", "--kinds", "nowhere"], "no kind's name contains 'nowhere'; names begin with building,"),
+        (["--suite", "poses", "--kinds", "nowhere"], "no kind's name contains 'nowhere'; names begin with B25b_0.000,"),
+        (["--suite", "poses", "--shares", "0.5"], "with --suite poses use --kinds"),
+        (["--suite", "poses", "--sensitivity"], "--sensitivity needs cases of which all is known; add --suite stress"),
+        (["--suite", "poses", "--methods", "gnc"], "unknown method 'gnc'; choose from neurora,"),
+        (["--suite", "poses", "--kinds", "CSAIL"], "name their folder with --data or $ROTAVG_DATA"),
+        (["--suite", "poses", "--kinds", "CSAIL", "--data", "."], ".: lacks slam;"),
     ],
 )
 def test_mistakes(

@@ -20,13 +20,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=SLAM_SUITES,
         default=SLAM_SUITES[0],
         help="recorded: real and classic graphs, some made worse; stress: about a hundred kinds of simulated graphs, "
-        "each hard in one known way, which need no data (default: recorded)",
+        "each hard in one known way, which need no data; poses: graphs of known poses, and closures that join wrong "
+        "places, judged by positions (default: recorded)",
     )
     parser.add_argument(
         "--kinds",
         nargs="+",
         metavar="TEXT",
-        help="stress: those kinds whose names contain one of the texts (default: all)",
+        help="stress, poses: those kinds whose names contain one of the texts (default: all)",
     )
     parser.add_argument(
         "--graphs",
@@ -41,7 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=whole_number,
         metavar="S",
-        help="of the drawings (default: recorded 0 1 2; stress 1000 to 1019, the solver is tuned on 0 to 19)",
+        help="of the drawings (default: recorded 0 1 2; stress 1000 to 1019, poses 1000 to 1002; the solver is "
+        "tuned on 0 to 19)",
     )
     parser.add_argument(
         "--shares",
@@ -62,7 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="NAME",
         help="methods of `rotavg solve`, gnc, isam2, isam2-cauchy, isam2-geman-mcclure, open3d, colmap, odometry, "
-        "least-squares (default: all; recorded without isam2-cauchy, isam2-geman-mcclure and open3d)",
+        "least-squares (default: all; recorded without isam2-cauchy, isam2-geman-mcclure and open3d); "
+        "poses: neurora-rotations, gnc-stated, gnc-true, gnc-wrong, isam2-cauchy, pcm, odometry",
     )
     parser.add_argument(
         "--without",

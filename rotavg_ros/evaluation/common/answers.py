@@ -19,6 +19,7 @@ class Answer:
         seconds, cpu_seconds: wall-clock and CPU time (of all threads) from the graph in memory to the answer.
         outlier_score: ``(M,)`` probability that the edge is an outlier; None: the solver does not judge edges.
         uncertainty: ``(N,)`` rad, stated standard deviation, NaN where unknown; None: it states none.
+        position: ``(N, 3)`` metres in the world frame; None: orientations alone.
     """
 
     body_from_world: Tensor
@@ -26,6 +27,7 @@ class Answer:
     cpu_seconds: float
     outlier_score: Tensor | None = None
     uncertainty: Tensor | None = None
+    position: Tensor | None = None
 
 
 @dataclass

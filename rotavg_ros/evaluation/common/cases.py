@@ -13,6 +13,7 @@ from torch import Tensor
 
 from rotavg_ros.datasets.simulation.synthetic import SFM_OUTLIER_ANGLE
 from rotavg_ros.metrics import true_edge_noise
+from rotavg_ros.rotations import rotate
 from rotavg_ros.view_graph import FALSE_CLOSURE_DEG, ViewGraph
 
 
@@ -41,6 +42,29 @@ SLAM = Family(
     (float(np.radians(8.0)), float(np.radians(12.0))),
     trusts_odometry=True,
 )
+
+
+# Beyond two metres a closure joins the wrong place; those within these borders do not count, since a recorded truth may
+# be off by as much.
+UNDECIDED_METRES = (1.5, 4.0)
+FALSE_CLOSURE_METRES = 2.0
+
+
+@dataclass(frozen=True)
+class PoseTruth:
+    """What is known of positions (N nodes, M edges).
+
+    Attributes:
+        position: ``(N, 3)`` metres in the truth's world frame; NaN rows where unknown.
+        sigma: ``(M, 2)`` rad and metres per component, of each edge's actual noise (of false closures: of good ones).
+        stated: ``(M, 2)`` likewise, what edges state.
+        floor: metres; in ratios of errors smaller ones count as this.
+    """
+
+    position: Tensor
+    sigma: Tensor
+    stated: Tensor
+    floor: float = 0.05
 
 
 class CaseKey(NamedTuple):
@@ -72,6 +96,7 @@ class Case:
         intact: ``(M,)`` bool, edges that whoever spoiled the graph left as they were; None: nobody did.
         floor: rad; in ratios of errors smaller ones count as this, since the truth is no better.
         true_precision: ``(M,)`` rad⁻², that of each edge's actual noise, where whoever drew the graph knows it.
+        poses: positions, by which closures are judged, too; None: rotations alone are known.
     """
 
     key: CaseKey
@@ -81,18 +106,31 @@ class Case:
     intact: Tensor | None = None
     floor: float = 0.0
     true_precision: Tensor | None = None
+    poses: PoseTruth | None = None
 
     @cached_property
     def noise(self) -> Tensor:
         """``(M,)`` rad, true noise of every edge; NaN where unknown."""
         return true_edge_noise(self.graph, self.truth)
 
+    @cached_property
+    def place_error(self) -> Tensor:
+        """``(M,)`` metres, by which every edge's translation errs; NaN where unknown."""
+        translation = self.graph.translation
+        if self.poses is None or translation is None:
+            return torch.full_like(self.noise, torch.nan)
+        shift = self.poses.position[self.graph.target] - self.poses.position[self.graph.source]
+        error: Tensor = (rotate(self.truth[self.graph.source], shift) - translation).norm(dim=1)
+        return error
+
     @property
     def is_inlier(self) -> Tensor:
         """``(M,)`` bool, the edges that an oracle knows to be good: intact ones, or those of little noise."""
         if self.intact is not None:
             return self.intact
-        return ~self.is_closure | (self.noise <= self.family.outlier_angle)
+        return ~self.is_closure | (
+            (self.noise <= self.family.outlier_angle) & ~self._is_elsewhere(FALSE_CLOSURE_METRES)
+        )
 
     @property
     def is_closure(self) -> Tensor:
@@ -102,12 +140,20 @@ class Case:
     @property
     def is_false(self) -> Tensor:
         """``(M,)`` bool: edges that are clearly outliers."""
-        return self.is_closure & (self.noise > self.family.undecided[1])
+        is_false = (self.noise > self.family.undecided[1]) | (self.place_error > UNDECIDED_METRES[1])
+        return self.is_closure & is_false
 
     @property
     def is_good(self) -> Tensor:
         """``(M,)`` bool: edges that are clearly none, and not because a random one happens to fit."""
-        return self.is_closure & self.is_inlier & (self.noise <= self.family.undecided[0])
+        is_good = (self.noise <= self.family.undecided[0]) & ~self._is_elsewhere(UNDECIDED_METRES[0])
+        return self.is_closure & self.is_inlier & is_good
+
+    def _is_elsewhere(self, metres: float) -> Tensor:
+        """``(M,)`` bool: translations that err by more, or of unknown error where positions are judged."""
+        if self.poses is None:
+            return torch.zeros_like(self.is_closure)
+        return ~(self.place_error <= metres)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,7 +15,7 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.common.answers import Answer, Clock
 from rotavg_ros.evaluation.common.cases import Case, Family, warm_up_case
 from rotavg_ros.evaluation.common.kept_answers import KeptAnswers
-from rotavg_ros.evaluation.common.named_peers import peer_solver
+from rotavg_ros.evaluation.common.named_peers import is_available, is_installed, missing, peer_solver
 from rotavg_ros.solver import METHODS, solve
 from rotavg_ros.solver.methods import is_method
 from rotavg_ros.view_graph import ViewGraph
@@ -29,6 +30,19 @@ class ContenderError(UserError):
 
 
 @dataclass(frozen=True)
+class OwnContender:
+    """One that is told more of a case than its graph; it judges edges itself.
+
+    Attributes:
+        solve: case → answer; None where it gives up.
+        package: on PyPI, that does the work; None: ours.
+    """
+
+    solve: Contender
+    package: str | None = None
+
+
+@dataclass(frozen=True)
 class Roster:
     """Who may take part in a suite besides the solver's methods.
 
@@ -36,13 +50,24 @@ class Roster:
         family: of the suite's cases.
         peers: of :data:`rotavg_ros.evaluation.common.named_peers.PEERS`.
         references: case → body_from_world ``(N, 4)``, by name.
-        max_edges: of the largest graph that a peer is given, by name.
+        max_edges: of the largest graph that one of them is given, by name.
+        own: contenders of this suite alone, by name.
     """
 
     family: Family
     peers: tuple[str, ...]
     references: Mapping[str, Reference]
     max_edges: Mapping[str, int] = field(default_factory=dict)
+    own: Mapping[str, OwnContender] = field(default_factory=dict)
+
+    def is_peer(self, name: str) -> bool:
+        """Whether somebody else's package does the work."""
+        return name in self.peers or (name in self.own and self.own[name].package is not None)
+
+    def can_run(self, name: str) -> bool:
+        """Whether what a contender needs is installed."""
+        own = self.own.get(name)
+        return is_available(name) if own is None else own.package is None or is_installed(own.package)
 
 
 def contenders(
@@ -64,9 +89,13 @@ def contenders(
     return {name: _contender(name, roster, weights, keep) for name in names}
 
 
-def warm_up(chosen: Collection[Contender], roster: Roster) -> None:
-    """Let every contender pay its one-time costs on a tiny graph."""
-    case = warm_up_case(roster.family)
+def warm_up(chosen: Collection[Contender], roster: Roster, case: Case | None = None) -> None:
+    """Let every contender pay its one-time costs on a tiny graph.
+
+    Args:
+        case: default: rotations alone, without noise.
+    """
+    case = warm_up_case(roster.family) if case is None else case
     for contender in chosen:
         contender(case)
 
@@ -78,13 +107,30 @@ def _contender(name: str, roster: Roster, weights: Path | None, keep: KeptAnswer
         reference = roster.references[name]
         run = partial(_run_reference, reference)
         return run if keep is None else keep.keeping(run, name, (__name__, reference.__module__))
+    if name in roster.own:
+        return _own(name, roster, keep)
     unknown = [part for part in name.split("+") if not is_method(part)]
     if unknown:
-        choices = ", ".join((*METHODS, *roster.peers, *roster.references))
+        choices = ", ".join((*METHODS, *roster.peers, *roster.references, *roster.own))
         raise ContenderError(f"unknown method {unknown[0]!r}; choose from {choices}, or combine: A+B")
     run = partial(_run_method, name, weights)
     # Networks of a folder are those of one run, and nobody asks for their answers again.
     return run if keep is None or weights is not None else keep.keeping(run, name, (__name__,))
+
+
+def _own(name: str, roster: Roster, keep: KeptAnswers | None) -> Contender:
+    own = roster.own[name]
+    if own.package is not None and not is_installed(own.package):
+        raise missing(name, own.package)
+    module = inspect.getmodule(own.solve.func if isinstance(own.solve, partial) else own.solve)
+    assert module is not None
+    run = own.solve if keep is None else keep.keeping(own.solve, name, (__name__, module.__name__), own.package)
+    limit = roster.max_edges.get(name)
+
+    def within_limit(case: Case) -> Answer | None:
+        return None if limit is not None and case.graph.num_edges > limit else run(case)
+
+    return within_limit
 
 
 def _run_method(name: str, weights: Path | None, case: Case) -> Answer:
@@ -92,7 +138,12 @@ def _run_method(name: str, weights: Path | None, case: Case) -> Answer:
     with clock.running():
         solution = solve(case.graph, method=name, profile=case.family.profile, weights=weights)
     return Answer(
-        solution.body_from_world, clock.seconds, clock.cpu_seconds, solution.outlier_score, solution.uncertainty
+        solution.body_from_world,
+        clock.seconds,
+        clock.cpu_seconds,
+        solution.outlier_score,
+        solution.uncertainty,
+        solution.position,
     )
 
 

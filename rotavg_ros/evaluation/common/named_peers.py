@@ -33,7 +33,17 @@ PEERS = {
 
 def is_available(name: str) -> bool:
     """Whether what a contender needs is installed; what is no peer needs nothing."""
-    return name not in PEERS or importlib.util.find_spec(PEERS[name].package) is not None
+    return name not in PEERS or is_installed(PEERS[name].package)
+
+
+def is_installed(package: str) -> bool:
+    """Whether it can be found."""
+    return importlib.util.find_spec(package) is not None
+
+
+def missing(name: str, package: str) -> MissingPeerError:
+    """What to say of a contender whose package is not installed."""
+    return MissingPeerError(f"method {name!r} needs {package}, which is not installed; run: pip install {package}")
 
 
 def peer_solver(name: str, keep: KeptAnswers | None = None) -> Callable[[ViewGraph], Answer | None]:
@@ -47,7 +57,7 @@ def peer_solver(name: str, keep: KeptAnswers | None = None) -> Callable[[ViewGra
     """
     package, solve = PEERS[name]
     if not is_available(name):
-        raise MissingPeerError(f"method {name!r} needs {package}, which is not installed; run: pip install {package}")
+        raise missing(name, package)
 
     def attempt(graph: ViewGraph) -> Answer | None:
         try:

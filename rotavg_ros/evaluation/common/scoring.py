@@ -14,7 +14,7 @@ from scipy.stats import gmean
 from rotavg_ros.evaluation.common.answers import Answer
 from rotavg_ros.evaluation.common.cases import Case, CaseKey
 from rotavg_ros.evaluation.common.contenders import Contender
-from rotavg_ros.metrics import CalibrationBins, OutlierCounts, orientation_errors, roc_area
+from rotavg_ros.metrics import CalibrationBins, OutlierCounts, orientation_errors, position_errors, roc_area
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,8 @@ class Score:
         roc_area: area under the receiver operating characteristic of the score on these edges; NaN without outliers
             or inliers.
         odometry_flagged: odometry edges that are called outliers though they are good.
+        ate_m: root mean square error of the positions after rigid alignment without scale; NaN where unknown.
+        floored_m: the same, no smaller than the floor.
     """
 
     case: CaseKey
@@ -39,6 +41,8 @@ class Score:
     roc_area: float
     odometry_flagged: int
     cpu_seconds: float
+    ate_m: float = float("nan")
+    floored_m: float = float("nan")
 
     def figure(self, path: str) -> float:
         """An attribute, or one of an attribute: ``mean_deg``, ``counts.recall``."""
@@ -63,7 +67,17 @@ def score(case: Case, name: str, answer: Answer) -> Score:
         roc_area(answer.outlier_score[decided].numpy(), is_outlier.numpy()),
         int((is_flagged & ~case.is_closure & case.is_inlier).sum()),
         answer.cpu_seconds,
+        *_position_errors(case, answer),
     )
+
+
+def _position_errors(case: Case, answer: Answer) -> tuple[float, float]:
+    """Root mean square in metres, as it is and no smaller than the floor."""
+    if case.poses is None or answer.position is None:
+        return float("nan"), float("nan")
+    errors = position_errors(answer.position.numpy(), case.poses.position.numpy())
+    ate = float(np.sqrt(np.nanmean(errors**2)))
+    return ate, max(ate, case.poses.floor)
 
 
 @dataclass

@@ -64,10 +64,20 @@ def _classic(name: str, folder: Path, _: np.random.Generator) -> GraphFile:
     return attach_truth(graph_file, truth) if truth.exists() else graph_file
 
 
-def _b25b(threshold: str, folder: Path, _: np.random.Generator) -> GraphFile:
+def b25b(threshold: str, folder: Path) -> GraphFile:
+    """A recorded run with stamps and ground truth.
+
+    Args:
+        threshold: of the closures that were accepted, as in the file's name.
+        folder: of the SLAM data.
+    """
     folder = folder / "b25b"
     stamped = attach_stamps(read_graph(folder / f"B25b_{threshold}.g2o"), folder / "B25b_timestamps.txt")
     return attach_truth(stamped, folder / "ground_truth.csv")
+
+
+def _recorded(threshold: str, folder: Path, _: np.random.Generator) -> GraphFile:
+    return b25b(threshold, folder)
 
 
 def _kitti(sequence: str, folder: Path, rng: np.random.Generator) -> GraphFile:
@@ -78,7 +88,7 @@ def _kitti(sequence: str, folder: Path, rng: np.random.Generator) -> GraphFile:
 _CLASSIC = ("intel", "CSAIL", "FR079", "manhattan", "parking-garage", "sphere2500")
 _SOURCES: dict[str, _Source] = {
     **{
-        f"B25b_{threshold}": _Source(partial(_b25b, threshold), is_spoiled=False)
+        f"B25b_{threshold}": _Source(partial(_recorded, threshold), is_spoiled=False)
         for threshold in ("0.000", "0.250", "0.500")
     },
     **{name: _Source(partial(_classic, name)) for name in _CLASSIC},

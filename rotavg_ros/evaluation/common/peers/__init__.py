@@ -3,11 +3,12 @@
 They come with ``pip install pycolmap gtsam open3d`` and are imported only when one of them runs. Each takes a
 view-graph and times its own work alone: the clock starts when the graph is in the peer's form and stops before its
 answer is translated back. Pose-graph methods get rotation factors only, with the precisions that the graph states,
-since rotations are all that the others get.
+since rotations are all that the others get; those on poses, in a module of their own, are told deviations.
 """
 
 from rotavg_ros.evaluation.common.peers.colmap_peer import colmap
 from rotavg_ros.evaluation.common.peers.gtsam_peers import gnc, isam2_cauchy, isam2_geman_mcclure, isam2_huber, shonan
+from rotavg_ros.evaluation.common.peers.gtsam_pose_peers import gnc_on_poses, isam2_on_poses
 from rotavg_ros.evaluation.common.peers.open3d_peer import line_process
 from rotavg_ros.evaluation.common.peers.running import MissingPeerError, PeerError
 
@@ -16,9 +17,11 @@ __all__ = [
     "PeerError",
     "colmap",
     "gnc",
+    "gnc_on_poses",
     "isam2_cauchy",
     "isam2_geman_mcclure",
     "isam2_huber",
+    "isam2_on_poses",
     "line_process",
     "shonan",
 ]

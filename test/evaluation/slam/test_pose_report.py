@@ -1,0 +1,66 @@
+"""What the report of the suite of poses counts, on figures that are known."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from rotavg_ros.evaluation.common.cases import CaseKey
+from rotavg_ros.evaluation.common.scoring import Score, Scores
+from rotavg_ros.evaluation.slam import pose_report
+from rotavg_ros.metrics import OutlierCounts
+
+
+def scored(contender: str, kind: str, metres: list[float], counts: OutlierCounts) -> list[Score]:
+    return [
+        Score(CaseKey("hall", kind, seed), contender, 1.0, 1.0, 1.0, counts, 1.0, 0, 0.5, each, max(each, 0.05))
+        for seed, each in enumerate(metres)
+    ]
+
+
+def made_up() -> Scores:
+    scores, right, clean = Scores(), OutlierCounts(9, 1, 0, 20), OutlierCounts(0, 2, 0, 8)
+    for kind, ours, gnc, counts in (
+        ("30 % random", [0.1, 0.4], [0.2, 0.2], right),
+        ("no false closures", [0.3, 0.3], [0.1, 0.1], clean),
+        ("as recorded", [1.2], [1.0], right),
+    ):
+        number = len(ours)
+        scores.rows += scored("neurora", kind, ours, counts)
+        scores.rows += scored("gnc-true", kind, gnc, counts)
+        scores.rows += scored("oracle", kind, [0.1] * number, counts)
+    return scores
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_report(tmp_path: Path) -> None:
+    path = pose_report.report(tmp_path, made_up(), "rotavg evaluate slam --suite poses")
+    text = path.read_text(encoding="utf-8")
+    assert "4 drawings (seeds 0, 1)" in text and "1 recorded graphs" in text
+    ours, gnc, oracle = read(tmp_path / "poses-totals.csv")
+    assert float(ours["ATE ratio"]) == pytest.approx((1 * 4 * 3 * 3) ** (1 / 4))
+    assert float(ours["share over 2×"]) == 0.75
+    assert float(gnc["ATE ratio"]) == pytest.approx((2 * 2 * 1 * 1) ** (1 / 4))
+    assert float(oracle["ATE ratio"]) == 1.0
+    assert float(ours["precision"]) == pytest.approx(18 / 24)
+    first = read(tmp_path / "poses-positions.csv")[0]
+    assert float(first["30 % random"]) == pytest.approx(2.0)
+    verdicts = read(tmp_path / "poses-verdicts.csv")[0]
+    assert (float(verdicts["30 % random: P"]), float(verdicts["no false closures: P"])) == (0.9, 0.8)
+    better = read(tmp_path / "poses-better.csv")
+    assert [(row["condition"], row["drawings"]) for row in better] == [("no false closures", "2"), ("as recorded", "1")]
+    assert float(better[0]["its ATE over ours"]) == pytest.approx(1 / 3)
+    assert [row["method"] for row in read(tmp_path / "poses-recorded.csv")][1].startswith("GNC")
+    assert len(read(tmp_path / "poses-cases.csv")) == 15
+    assert read(tmp_path / "poses-worst.csv")[0]["condition"] == "as recorded"
+
+
+def test_a_report_of_nothing(tmp_path: Path) -> None:
+    """Interrupted before the first case was done."""
+    assert pose_report.report(tmp_path, Scores(), "rotavg").exists()
