@@ -28,7 +28,7 @@ from rotavg_ros.solver.sfm.solve import solve_sfm
 from rotavg_ros.solver.slam import refinement
 from rotavg_ros.solver.slam.noise import judging
 from rotavg_ros.solver.slam.solve import solve_slam, update_slam
-from rotavg_ros.solver.slam.update.memory import SlamMemory
+from rotavg_ros.solver.slam.update.memory import SlamMemory, WholeSolveMemory
 from rotavg_ros.solver.slam.update.posterior_memory import PosteriorMemory
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel, HoldsViewGraph, ViewGraph, view_graph_of
@@ -139,9 +139,9 @@ class _Job:
     profile: str
 
 
-def _memory_of(names: list[str], memory: object | None) -> SlamMemory | PosteriorMemory | None:
+def _memory_of(names: list[str], memory: object | None) -> SlamMemory | WholeSolveMemory | PosteriorMemory | None:
     """What a method by these names can go on from, if it is that."""
-    if names == [DEFAULT_METHOD] and isinstance(memory, SlamMemory):
+    if names == [DEFAULT_METHOD] and isinstance(memory, (SlamMemory, WholeSolveMemory)):
         return memory
     return memory if names == [POSTERIOR] and isinstance(memory, PosteriorMemory) else None
 

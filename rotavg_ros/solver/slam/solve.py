@@ -30,7 +30,7 @@ from rotavg_ros.solver.slam.posterior.modes import publish
 from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.preparation import Prepared, prepare, prepared_with
 from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over
-from rotavg_ros.solver.slam.update.memory import SlamMemory
+from rotavg_ros.solver.slam.update.memory import SlamMemory, WholeSolveMemory
 from rotavg_ros.solver.slam.update.posterior_memory import PosteriorMemory, estimate_of
 from rotavg_ros.view_graph import ViewGraph
 
@@ -84,15 +84,21 @@ def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
         if not is_default or not has_places(graph):
             return rotations_alone
         with watch.stage("poses"):
-            before = run.memory
-            goes_on = isinstance(before, SlamMemory) and begins_with(graph, before.graph)
-            begin = before.poses if isinstance(before, SlamMemory) and goes_on else None
-            found = poses_after_passes(graph, prepared, cleaned.network_log_odds, estimate, begin)
+            before = _poses_before(graph, run)
+            found = poses_after_passes(graph, prepared, cleaned.network_log_odds, estimate, before)
             return _with_poses(graph, rotations_alone, found)
     with watch.stage("expand"):
         score = slam_stages.outlier_scores(prepared.closure_graph, 1 - cleaned.inlier_probability)
         orientations = prepared.closure_graph.orientations(correction)
     return Estimate(orientations, torch.from_numpy(score), torch.full((graph.num_nodes,), torch.nan))
+
+
+def _poses_before(graph: ViewGraph, run: Run) -> PoseMemory | None:
+    """Where those of the passes begin, if the graph has grown from one that was solved so."""
+    before = run.memory
+    if isinstance(before, (SlamMemory, WholeSolveMemory)) and begins_with(graph, before.graph):
+        return before.poses
+    return None
 
 
 def _solve_by_posterior(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
@@ -139,15 +145,17 @@ def _with_poses(graph: ViewGraph, estimate: Estimate, memory: PoseMemory) -> Est
         outlier_score=score,
         variance=torch.from_numpy(poses.variance),
         places=places,
-        memory=_remembering(estimate.memory, memory),
+        memory=_remembering(graph, estimate.memory, memory),
         # The posterior's is of answers that rotations alone do not tell apart.
         warnings=estimate.warnings if len(poses.rivals) > 1 else (),
     )
 
 
-def _remembering(memory: object | None, poses: PoseMemory) -> object | None:
-    """The memory of rotations with that of poses."""
-    return replace(memory, poses=poses) if isinstance(memory, (SlamMemory, PosteriorMemory)) else memory
+def _remembering(graph: ViewGraph, memory: object | None, poses: PoseMemory) -> object:
+    """The memory of rotations, if there is one, with that of poses."""
+    if isinstance(memory, (SlamMemory, PosteriorMemory)):
+        return replace(memory, poses=poses)
+    return WholeSolveMemory(graph, poses)
 
 
 def _slam_estimate(

@@ -76,6 +76,14 @@ class Updated(NamedTuple):
 
 
 @dataclass(frozen=True)
+class WholeSolveMemory:
+    """Where an update could not go on: the next solve is a whole one, and begins with these poses."""
+
+    graph: ViewGraph
+    poses: PoseMemory
+
+
+@dataclass(frozen=True)
 class SlamMemory:
     """Of a graph of N nodes and M edges.
 

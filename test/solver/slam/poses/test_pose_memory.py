@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from rotavg_ros import ViewGraph, rotations, solve
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
+from rotavg_ros.solver.slam.poses.estimate import PoseMode, estimate_poses
+from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.update.memory import WholeSolveMemory
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import EdgeLabel
 
@@ -123,7 +127,7 @@ def test_translations_that_come_later_are_used_at_once() -> None:
     assert go_on(up_to(graph, 305), alone).position is not None
 
 
-def test_a_large_graphs_update_keeps_what_places_said(monkeypatch) -> None:
+def test_a_large_graphs_update_keeps_what_places_said(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond some size an update has no joint solve; closures of wrong places stay flagged."""
     monkeypatch.setattr("rotavg_ros.solver.slam.solve._MAX_JOINT_UPDATE", 10)
     graph, wrong = displaced(run_of(5), 0.3, 5)
@@ -139,3 +143,22 @@ def test_a_large_graphs_update_keeps_what_places_said(monkeypatch) -> None:
     flags = found.outlier_score[closures] > 0.5
     assert torch.equal(flags, before.outlier_score[closures] > 0.5) and int(flags.sum()) > 10
     assert wrong.sum() > 10
+
+
+def test_a_biased_gyroscopes_poses_are_gone_on_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rotations are solved as a whole there; what closures join is not judged from nothing again."""
+    run = simulated(0, odometry_bias_deg=1.0, odometry_noise_deg=0.05)
+    graph = graph_of(run)
+    begun = []
+
+    def recording(problem: PoseProblem, **options: object) -> PoseMode:
+        begun.append(options.get("start"))
+        return estimate_poses(problem, **options)
+
+    monkeypatch.setattr("rotavg_ros.solver.slam.poses.solve.estimate_poses", recording)
+    before = solve(up_to(graph, 390))
+    assert isinstance(before.memory, WholeSolveMemory) and not begun
+    found = go_on(up_to(graph, 400), before)
+    assert len(begun) == 1 and begun[0] is not None and "refine" in found.stage_seconds
+    turned, moved = apart(found, solve(up_to(graph, 400)))
+    assert turned < 0.5 and moved < 0.3
