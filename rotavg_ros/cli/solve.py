@@ -9,7 +9,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.method = methods.without(*arguments.without)
     jobs = plan(arguments.graphs, arguments.output, poses=arguments.poses)
     _check_weights(arguments.weights)
-    solve_graph = partial(
+    solve_graph: Callable[[ViewGraph], Solution] = partial(
         solve,
         method=arguments.method,
         profile=arguments.profile,
@@ -62,6 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
         refinement_steps=arguments.refine,
         weights=arguments.weights,
     )
+    if arguments.translation_scale == "none":
+        solve_graph = _blind_to_translations(solve_graph)
     # One-time costs (loading weights, first kernels) are not the graphs', and wrong options show before any work.
     for has_odometry in (True, False):
         solve_graph(_warm_up_graph(has_odometry))
@@ -78,6 +80,10 @@ def run(arguments: argparse.Namespace) -> int:
     for error in errors:
         print_error(error)
     return EXIT_USER_ERROR if errors else 0
+
+
+def _blind_to_translations(solve_graph: Callable[[ViewGraph], Solution]) -> Callable[[ViewGraph], Solution]:
+    return lambda graph: solve_graph(replace(graph, translation=None))
 
 
 def _told(summary: dict[str, Any]) -> str:

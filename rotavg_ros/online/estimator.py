@@ -23,7 +23,7 @@ from rotavg_ros.online.state import content as state_content
 from rotavg_ros.online.state import file as state_file
 from rotavg_ros.online.state.discarded import Discarded
 from rotavg_ros.solver import Abandoned, abandonable
-from rotavg_ros.view_graph import EdgeLabel
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 if TYPE_CHECKING:
     from rotavg_ros.solver import Solution
@@ -296,7 +296,7 @@ class OnlineEstimator:
         try:
             with abandonable(running.is_abandoned):
                 solution = self._solver(
-                    snapshot.graph,
+                    _solved_graph(snapshot.graph, options),
                     method=options.method,
                     profile=options.profile,
                     device=options.device,
@@ -334,3 +334,8 @@ def _default_solver() -> Solver:
     from rotavg_ros.solver import solve  # loads the networks: not before somebody solves
 
     return solve
+
+
+def _solved_graph(graph: ViewGraph, options: EstimatorOptions) -> ViewGraph:
+    """Without translations that are no metres."""
+    return replace(graph, translation=None) if options.translation_scale == "none" else graph

@@ -10,7 +10,7 @@ from rotavg_ros.online.odometry.keyframe_choice import KeyframePolicy
 from rotavg_ros.online.odometry.samples import OdometryBounds
 from rotavg_ros.online.odometry.time_jumps import POLICIES
 from rotavg_ros.option import DEGREES, DEGREES_PER_SECOND, METRES, METRES_PER_SECOND, check_options, documented, option
-from rotavg_ros.solver import DEVICES, PROFILES
+from rotavg_ros.solver import DEVICES, PROFILES, TRANSLATION_SCALES
 
 NANOSECONDS = 1_000_000_000
 
@@ -122,6 +122,12 @@ class EstimatorOptions:
         -1, "refinement steps at most, 0 for none, -1 for the profile's own number", within=(-1, 1000), live=True
     )
     warm_start: bool = option(True, "start from the last answer while data flows", live=True)
+    translation_scale: str = option(
+        "metric",
+        "'metric': translations are in metres and tell wrong places; 'none': they tell positions alone",
+        choices=TRANSLATION_SCALES,
+        live=True,
+    )
     outlier_threshold: float = option(0.5, "an edge with a higher score is an outlier", within=(0.0, 1.0), live=True)
 
     def __post_init__(self) -> None:

@@ -10,15 +10,25 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rotavg_ros.solver.algebra.abandonment import Abandoned, abandonable
     from rotavg_ros.solver.batch import solve_batch
-    from rotavg_ros.solver.methods import DEVICES, METHODS, PROFILES
+    from rotavg_ros.solver.methods import DEVICES, METHODS, PROFILES, TRANSLATION_SCALES
     from rotavg_ros.solver.pipeline import solve
     from rotavg_ros.solver.solution import Solution
 
-__all__ = ["DEVICES", "METHODS", "PROFILES", "Abandoned", "Solution", "abandonable", "solve", "solve_batch"]
+__all__ = [
+    "DEVICES",
+    "METHODS",
+    "PROFILES",
+    "TRANSLATION_SCALES",
+    "Abandoned",
+    "Solution",
+    "abandonable",
+    "solve",
+    "solve_batch",
+]
 
 
 def __getattr__(name: str) -> Any:
-    if name in {"DEVICES", "METHODS", "PROFILES"}:
+    if name in {"DEVICES", "METHODS", "PROFILES", "TRANSLATION_SCALES"}:
         from rotavg_ros.solver import methods
 
         return getattr(methods, name)

@@ -48,6 +48,8 @@ BASELINES = ("chatterjee", "weiszfeld", "arrigoni", "wang")
 METHODS = (*NETWORK_METHODS, *BASELINES)
 PROFILES = ("auto", "slam", "sfm")
 DEVICES = ("auto", "cpu", "cuda")
+# What translations are: metres, so that closures are judged by them, or of no use for that.
+TRANSLATION_SCALES = ("metric", "none")
 
 
 def method_named(name: str) -> Method | None:

@@ -57,9 +57,23 @@ def test_least_squares_stays_where_it_is_put(tmp_path: Path, seed: int) -> None:
         assert rms(found, run.position) <= 1.02 * rms(vertices, run.position) + 0.01
 
 
+def test_translations_that_are_no_metres_judge_no_closure(tmp_path: Path) -> None:
+    config = SlamSimulationConfig(num_keyframes=200, laps=3.0, closures_per_keyframe=0.15)
+    run = simulate_slam_graph(config, np.random.default_rng(0))
+    write_graph(tmp_path / "run.g2o", run.to_graph_file())
+    columns = {}
+    for scale in ("metric", "none"):
+        out = tmp_path / scale
+        command = ["solve", str(tmp_path / "run.g2o"), "--output", str(out), "--poses", "--translation-scale", scale]
+        assert main(command) == 0
+        columns[scale] = set(_rows(out / "edges.csv")[0])
+        assert (out / "trajectory.kitti").stat().st_size > 0
+    assert columns["metric"] - columns["none"] == {"rotation_score", "residual_deg", "residual_m"}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("threshold", "metres", "degrees"), [("0.000", 1.3, 1.6), ("0.250", 1.3, 1.6), ("0.500", 1.1, 1.6)]
+    ("threshold", "metres", "degrees"), [("0.000", 1.2, 1.5), ("0.250", 1.2, 1.5), ("0.500", 1.1, 1.6)]
 )
 def test_a_real_robot(shared_data: Path, tmp_path: Path, threshold: str, metres: float, degrees: float) -> None:
     """B25b: orientations, positions, and closures of right rotation that join wrong places."""
@@ -80,7 +94,7 @@ def test_a_real_robot(shared_data: Path, tmp_path: Path, threshold: str, metres:
     wrong, right = _places(truth, known)
     flagged = np.array([row["outlier"] == "1" for row in _rows(tmp_path / "edges.csv")])
     if wrong.any():
-        assert flagged[wrong].mean() >= 0.9
+        assert flagged[wrong].mean() >= 0.93
         assert wrong[flagged & (wrong | right)].mean() >= 0.97
     else:
         assert not flagged[right].any()

@@ -12,7 +12,7 @@ import argparse
 from pathlib import Path
 
 from rotavg_ros.cli.arguments import whole_number
-from rotavg_ros.solver.methods import DEVICES, METHODS, POSTERIOR, PROFILES, SWITCHES
+from rotavg_ros.solver.methods import DEVICES, METHODS, POSTERIOR, PROFILES, SWITCHES, TRANSLATION_SCALES
 
 EDGE_FORMATS = ("csv", "npz")
 
@@ -33,6 +33,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--profile", default="auto", choices=PROFILES, help="auto (default): slam if any edge is odometry"
+    )
+    parser.add_argument(
+        "--translation-scale",
+        default=TRANSLATION_SCALES[0],
+        choices=TRANSLATION_SCALES,
+        help="metric (default): translations are in metres, and closures of wrong places are told by them; none: they "
+        "are not, and tell positions alone",
     )
     parser.add_argument("--device", default="auto", choices=DEVICES, help="default: auto")
     parser.add_argument(
