@@ -21,9 +21,9 @@ from rotavg_ros.solver.slam.passes.alternation import Verdicts
 from rotavg_ros.solver.slam.poses.memory import PoseMemory
 from rotavg_ros.solver.slam.poses.solve import (
     has_places,
+    likeliest_poses,
     mode_of_passes,
-    poses_after_passes,
-    poses_after_search,
+    poses_of,
     poses_of_update,
 )
 from rotavg_ros.solver.slam.posterior.modes import publish
@@ -84,8 +84,8 @@ def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
         if not is_default or not has_places(graph):
             return rotations_alone
         with watch.stage("poses"):
-            before = _poses_before(graph, run)
-            found = poses_after_passes(graph, prepared, cleaned.network_log_odds, estimate, before)
+            mode = mode_of_passes(prepared, cleaned.network_log_odds, estimate)
+            found = poses_of(graph, mode, _poses_before(graph, run))
             return _with_poses(graph, rotations_alone, found)
     with watch.stage("expand"):
         score = slam_stages.outlier_scores(prepared.closure_graph, 1 - cleaned.inlier_probability)
@@ -120,7 +120,7 @@ def _solve_by_posterior(graph: ViewGraph, stages: SlamStages, run: Run) -> Estim
     if "translations" in stages.without or not has_places(graph):
         return estimate
     with run.watch.stage("poses"):
-        return _with_poses(graph, estimate, poses_after_search(graph, found.modes))
+        return _with_poses(graph, estimate, likeliest_poses(graph, found.modes))
 
 
 def _with_poses(graph: ViewGraph, estimate: Estimate, memory: PoseMemory) -> Estimate:

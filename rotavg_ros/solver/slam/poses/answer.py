@@ -14,9 +14,9 @@ from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import FALSE_CLOSURE_M, ViewGraph
 
-# Rival labellings are compared by their translations if rotations make them less likely by no more nats, and so many
-# at most; and averaged if both do so.
-_RIVAL, _MAX_RIVALS, _FAR = 20.0, 5, 5.0
+# So many rival labellings are compared by their translations at most; those that are less likely by no more nats than
+# this are averaged.
+_MAX_RIVALS, _FAR = 5, 5.0
 
 
 @dataclass(frozen=True)
@@ -50,13 +50,11 @@ def rival_poses(graph: ViewGraph, translation: np.ndarray, modes: list[Mode]) ->
     Args:
         graph: whose odometry was drawn together, without its bias.
         translation: ``(M, 3)`` metres.
-        modes: the least F by rotations first.
+        modes: labellings of its rotations.
     """
     rivals: list[Mode] = []
     for mode in modes:
-        if mode.cost > modes[0].cost + _RIVAL or len(rivals) == _MAX_RIVALS:
-            break
-        if not any(mode.is_turned_like(other.state) for other in rivals):
+        if len(rivals) < _MAX_RIVALS and not any(mode.is_turned_like(other.state) for other in rivals):
             rivals.append(mode)
     problems = [PoseProblem(graph, translation, mode) for mode in rivals]
     if len(problems) == 1:

@@ -29,24 +29,15 @@ def has_places(graph: ViewGraph) -> bool:
     return moves and bool(known[odometry].all()) and bool(known[~odometry].any())
 
 
-def poses_after_passes(
-    graph: ViewGraph,
-    prepared: Prepared,
-    network_log_odds: np.ndarray,
-    verdicts: Verdicts,
-    memory: PoseMemory | None = None,
-) -> PoseMemory:
-    """With the labels and the noise that the passes ended with, which rivals are not looked for.
+def poses_of(graph: ViewGraph, mode: Mode, memory: PoseMemory | None = None) -> PoseMemory:
+    """With the labels of the rotations as they are.
 
     Args:
         graph: N nodes, M edges, with translations.
-        prepared: the same, drawn together into E edges.
-        network_log_odds: ``(E,)`` what CleanNet says of its closures.
-        verdicts: the passes' answer.
+        mode: the labels, and the same graph drawn together.
         memory: where to begin; default: from nothing.
     """
-    mode = mode_of_passes(prepared, network_log_odds, verdicts)
-    return _going_on(graph, mode, memory) or _from_nothing(graph, [mode])
+    return _going_on(graph, mode, memory) or likeliest_poses(graph, [mode])
 
 
 def mode_of_passes(prepared: Prepared, network_log_odds: np.ndarray, verdicts: Verdicts) -> Mode:
@@ -57,19 +48,15 @@ def mode_of_passes(prepared: Prepared, network_log_odds: np.ndarray, verdicts: V
     return Mode(problem, *polish(problem, state, hold_noise=True), "passes")
 
 
-def poses_after_search(graph: ViewGraph, modes: list[Mode]) -> PoseMemory:
-    """Of the labellings that the search has found, the likeliest by both."""
-    return _from_nothing(graph, modes)
+def likeliest_poses(graph: ViewGraph, modes: list[Mode]) -> PoseMemory:
+    """Of several labellings, the likeliest by rotations and translations; those that are nearly as likely averaged."""
+    rivals = rival_poses(graph, _translations(graph), modes)
+    return PoseMemory.of(rivals[0][0], answer(rivals))
 
 
 def poses_of_update(graph: ViewGraph, mode: Mode, memory: PoseMemory) -> PoseMemory | None:
     """Of a graph without its bias that has grown, with the labels of its rotations; None if all is due."""
     return _going_on(graph, mode, memory)
-
-
-def _from_nothing(graph: ViewGraph, modes: list[Mode]) -> PoseMemory:
-    rivals = rival_poses(graph, _translations(graph), modes)
-    return PoseMemory.of(rivals[0][0], answer(rivals))
 
 
 def _going_on(graph: ViewGraph, mode: Mode, memory: PoseMemory | None) -> PoseMemory | None:
