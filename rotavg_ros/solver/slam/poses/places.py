@@ -198,7 +198,7 @@ class Judge:
         )
 
     def nothing_known(self, is_good: np.ndarray, square: np.ndarray, scale: Scale) -> Places:
-        """Before any solve: no translation pulls, and rotations do as labelled.
+        """Before any solve: no translation pulls, rotations do as labelled, and as many places are wrong as may be.
 
         Args:
             is_good: ``(C,)`` labels.
@@ -207,7 +207,8 @@ class Judge:
         """
         count = len(is_good)
         chance = np.zeros((_GOOD + _ELSEWHERE + 1, count))
-        chance[-1] = ~is_good
+        wrong = self.priors.wrong_place / self.priors.counted
+        chance[0], chance[_GOOD], chance[-1] = is_good * (1 - wrong), is_good * wrong, ~is_good
         none = np.zeros((_GOOD + _ELSEWHERE, count))
         turn = np.where(is_good, 1.0, _NOTHING) / self.told.rotation_variance
         return Places(
