@@ -73,7 +73,7 @@ def test_translations_that_are_no_metres_judge_no_closure(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("threshold", "metres", "degrees"), [("0.000", 1.2, 1.5), ("0.250", 1.2, 1.5), ("0.500", 1.1, 1.6)]
+    ("threshold", "metres", "degrees"), [("0.000", 1.15, 1.45), ("0.250", 1.15, 1.4), ("0.500", 1.1, 1.6)]
 )
 def test_a_real_robot(shared_data: Path, tmp_path: Path, threshold: str, metres: float, degrees: float) -> None:
     """B25b: orientations, positions, and closures of right rotation that join wrong places."""
@@ -94,7 +94,7 @@ def test_a_real_robot(shared_data: Path, tmp_path: Path, threshold: str, metres:
     wrong, right = _places(truth, known)
     flagged = np.array([row["outlier"] == "1" for row in _rows(tmp_path / "edges.csv")])
     if wrong.any():
-        assert flagged[wrong].mean() >= 0.93
+        assert flagged[wrong].mean() >= 0.95
         assert wrong[flagged & (wrong | right)].mean() >= 0.97
     else:
         assert not flagged[right].any()

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from rotavg_ros import ViewGraph, solve
+from rotavg_ros.solver.slam.poses.places import Judge, Scale, _wrong_share
 
 from .test_poses import errors, graph_of, pose_mode, simulated
 
@@ -79,3 +80,14 @@ def test_what_is_told_of_a_closure_does_not_grow_as_it_pulls_less() -> None:
         leverage + redundancy, np.broadcast_to(np.eye(leverage.shape[1]), leverage.shape), atol=1e-6
     )
     assert np.linalg.eigvalsh(redundancy).min() > 0 and np.linalg.eigvalsh(leverage).min() > -1e-9
+
+
+def test_before_any_solve_as_many_places_may_be_wrong_as_is_believed_beforehand() -> None:
+    """What nobody has judged yet is no evidence that all places are right."""
+    problem = pose_mode(graph_of(simulated(1))).problem
+    count = len(problem.closures)
+    judge = Judge(problem.told, problem.turns, problem.priors)
+    scale = Scale(np.ones(count), np.ones(count), 100.0)
+    places = judge.nothing_known(np.ones(count, dtype=bool), np.zeros(count), scale)
+    wrong = problem.priors.wrong_place / problem.priors.counted
+    np.testing.assert_allclose(_wrong_share(places.chance, problem.told, problem.priors), wrong)
