@@ -17,6 +17,8 @@ from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
 from rotavg_ros.solver.algebra.laplacian import solve_in_parts
 
 _NUM_PROBES, _SEED = 48, 0
+# SuperLU merges no columns of unlike pattern: blocks are dense as they are, and merging fills in, on a sphere sixfold.
+_RELAX, _PANEL = 1, 4
 # What a row decides itself is no more than all but this: nothing else may tell of it.
 _LEAST = 1e-9
 # What is left of a turn and of a shift has less in common than this share, squared.
@@ -86,7 +88,7 @@ class BlockEquations:
         self._matrix.data = values
         options = {"SymmetricMode": True}
         order = "NATURAL" if self._is_ordered else "MMD_AT_PLUS_A"
-        factor = splu(self._matrix, permc_spec=order, diag_pivot_thresh=0.0, options=options)
+        factor = splu(self._matrix, order, 0.0, relax=_RELAX, panel_size=_PANEL, options=options)
         rank = self._rank
         if not self._is_ordered:
             self._rank, self._is_ordered = factor.perm_c.astype(np.int64)[self._rank], True
