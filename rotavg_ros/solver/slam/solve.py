@@ -26,11 +26,12 @@ from rotavg_ros.solver.slam.poses.solve import (
     poses_of,
     poses_of_update,
 )
+from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.modes import publish
 from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.preparation import Prepared, prepare, prepared_with
 from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over
-from rotavg_ros.solver.slam.update.memory import SlamMemory, WholeSolveMemory
+from rotavg_ros.solver.slam.update.memory import SlamMemory, Updated, WholeSolveMemory
 from rotavg_ros.solver.slam.update.posterior_memory import PosteriorMemory, estimate_of
 from rotavg_ros.view_graph import ViewGraph
 
@@ -176,24 +177,34 @@ def update_slam(graph: ViewGraph, memory: SlamMemory | PosteriorMemory, run: Run
     ``run`` has the warm start.
     """
     assert run.warm_start is not None
-    network, before = run.networks.load(SlamCleanNet), memory.poses
+    before = memory.poses
     start = run.warm_start.double() if before is None else before.start_alone(graph)
     if start is None or (before is None) is has_places(graph):
         return None
     if isinstance(memory, PosteriorMemory):
-        with run.watch.stage("update"):
-            found = memory.updated(graph, network, start)
-        if found is None or before is None:
-            return None if found is None else found.estimate
-        with run.watch.stage("poses"):
-            graph = graph if memory.bias is None else without_bias(graph, memory.bias)
-            poses = before.extended(graph) if found.mode is None else poses_of_update(graph, found.mode, before)
-            return None if poses is None else _with_poses(graph, found.estimate, poses)
+        return _updated_by_search(graph, memory, start, run)
+    return _updated_by_passes(graph, memory, start, run)
+
+
+def _updated_by_search(graph: ViewGraph, memory: PosteriorMemory, start: Tensor, run: Run) -> Estimate | None:
     with run.watch.stage("update"):
-        updated = memory.updated(graph, network, start)
+        found = memory.updated(graph, run.networks.load(SlamCleanNet), start)
+    before = memory.poses
+    if found is None or before is None:
+        return None if found is None else found.estimate
+    with run.watch.stage("poses"):
+        unbiased = graph if memory.bias is None else without_bias(graph, memory.bias)
+        poses = before.extended(unbiased) if found.mode is None else poses_of_update(unbiased, found.mode, before)
+        return None if poses is None else _with_poses(graph, found.estimate, poses)
+
+
+def _updated_by_passes(graph: ViewGraph, memory: SlamMemory, start: Tensor, run: Run) -> Estimate | None:
+    with run.watch.stage("update"):
+        updated = memory.updated(graph, run.networks.load(SlamCleanNet), start)
         if updated is None:
             return None
         estimate = _slam_estimate(*updated)
+    before = memory.poses
     if before is None:
         return estimate
     with run.watch.stage("poses"):
@@ -201,12 +212,16 @@ def update_slam(graph: ViewGraph, memory: SlamMemory | PosteriorMemory, run: Run
             return _with_poses(graph, estimate, extended)
         if updated.closure_graph.num_nodes > _MAX_JOINT_UPDATE:
             return _with_places_of_before(estimate, before)
-        goes_on = updated.memory
-        prepared = prepared_with(contract_along(graph, goes_on.paths), goes_on.paths.forest, goes_on.chain_noise)
-        told = carried_over(goes_on.network_log_odds, prepared.closure_graph, 0.0)
-        mode = mode_of_passes(prepared, told, updated.verdicts)
-        poses = poses_of_update(graph, mode, before)
+        poses = poses_of_update(graph, _mode_of(graph, updated), before)
         return None if poses is None else _with_poses(graph, estimate, poses)
+
+
+def _mode_of(graph: ViewGraph, updated: Updated) -> Mode:
+    """Labels and noise of an update by the passes, as the posterior sees them."""
+    memory = updated.memory
+    prepared = prepared_with(contract_along(graph, memory.paths), memory.paths.forest, memory.chain_noise)
+    told = carried_over(memory.network_log_odds, prepared.closure_graph, 0.0)
+    return mode_of_passes(prepared, told, updated.verdicts)
 
 
 def _with_places_of_before(estimate: Estimate, before: PoseMemory) -> Estimate:

@@ -78,8 +78,11 @@ def test_updates_say_what_a_whole_solve_says() -> None:
     assert updates > 5
     assert answer.position is not None and answer.rotation_score is not None
     assert flips < 10
-    turned, moved = apart(answer, whole)
-    assert turned < 0.5 and moved < 0.3
+    # Within what either knows: noise is estimated to a tenth, and ends where the other began.
+    turned = rotations.angle_between(answer.body_from_world, whole.body_from_world)
+    assert float(turned.median()) < 0.3 * float(whole.uncertainty.median())
+    assert float(turned.max()) < 1.5 * float(whole.uncertainty.median())
+    assert apart(answer, whole)[1] < 0.1
     assert ((answer.outlier_score > 0.5) != (whole.outlier_score > 0.5)).sum() <= 1
 
 
