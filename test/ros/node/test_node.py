@@ -261,12 +261,15 @@ def test_several_robots_keep_apart_until_they_meet(live_node) -> None:
     for robot, messages in heard.items():
         live_node.probe.create_subscription(QuaternionStamped, f"/{robot}/orientation", messages.append, 10)
     live_node.spin_until(lambda: all(live_node.probe.count_publishers(f"/{robot}/orientation") for robot in heard))
-    live_node.spin_for(0.5)
-    live_node.odometry.publish(odometry(20))
-    second.publish(odometry(20, Rotation.from_euler("z", 60.0, degrees=True)))
-    live_node.spin_until(lambda: all(heard.values()))
+    for index in range(20, 320):  # until the node has found who listens
+        live_node.odometry.publish(odometry(index))
+        second.publish(odometry(index, Rotation.from_euler("z", 3.0 * index, degrees=True)))
+        live_node.spin_for(0.2)
+        if all(told and told[-1].header.stamp == stamp(index) for told in heard.values()):
+            break
+    else:
+        pytest.fail("nobody heard of both robots")
     a, b = (Rotation.from_quat([q.x, q.y, q.z, q.w]) for q in (messages[-1].quaternion for messages in heard.values()))
-    expected = (
-        drifting(20).inv() * drifting(5) * (truth(5).inv() * truth(6)) * Rotation.from_euler("z", 42, degrees=True)
-    )
+    turned = Rotation.from_euler("z", 3.0 * (index - 6), degrees=True)
+    expected = drifting(index).inv() * drifting(5) * (truth(5).inv() * truth(6)) * turned
     assert np.degrees(((a.inv() * b).inv() * expected).magnitude()) < 0.01
