@@ -14,7 +14,7 @@ from torch import Tensor
 from rotavg_ros.datasets.simulation.synthetic import SFM_OUTLIER_ANGLE
 from rotavg_ros.metrics import true_edge_noise
 from rotavg_ros.rotations import rotate
-from rotavg_ros.view_graph import FALSE_CLOSURE_DEG, ViewGraph
+from rotavg_ros.view_graph import FALSE_CLOSURE_DEG, FALSE_CLOSURE_M, ViewGraph
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,8 @@ SLAM = Family(
 )
 
 
-# Beyond two metres a closure joins the wrong place; those within these borders do not count, since a recorded truth may
-# be off by as much.
+# Closures whose places err by something between do not count, since a recorded truth may be off by as much.
 UNDECIDED_METRES = (1.5, 4.0)
-FALSE_CLOSURE_METRES = 2.0
 
 
 @dataclass(frozen=True)
@@ -128,9 +126,7 @@ class Case:
         """``(M,)`` bool, the edges that an oracle knows to be good: intact ones, or those of little noise."""
         if self.intact is not None:
             return self.intact
-        return ~self.is_closure | (
-            (self.noise <= self.family.outlier_angle) & ~self._is_elsewhere(FALSE_CLOSURE_METRES)
-        )
+        return ~self.is_closure | ((self.noise <= self.family.outlier_angle) & ~self._is_elsewhere(FALSE_CLOSURE_M))
 
     @property
     def is_closure(self) -> Tensor:

@@ -33,6 +33,17 @@ def averages(title: str, scores: Scores, names: Iterable[str], figures: Sequence
     return Table(title, (Column("method"), *columns(figures)), tuple(average_rows(scores, names, figures)), notes)
 
 
+# Verdicts on a case, and what they cost.
+VERDICT_FIGURES = (
+    Figure("counts.true_positives", "false_flagged"),
+    Figure("counts.false_positives", "good_flagged"),
+    Figure("counts.false_negatives", "false_kept"),
+    Figure("counts.true_negatives", "good_kept"),
+    Figure("odometry_flagged", "odometry_flagged"),
+    Figure("cpu_seconds", "cpu_seconds"),
+)
+
+
 def per_case(title: str, scores: Scores, figures: Sequence[Figure], key: Mapping[str, str] | None = None) -> Table:
     """A row for every case and method.
 

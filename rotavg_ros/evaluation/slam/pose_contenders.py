@@ -14,13 +14,14 @@ from rotavg_ros.baselines.pose_least_squares import FloatArray, pose_least_squar
 from rotavg_ros.datasets.dead_reckoning import chain_poses
 from rotavg_ros.evaluation.common import peers
 from rotavg_ros.evaluation.common.answers import Answer, Clock
-from rotavg_ros.evaluation.common.cases import FALSE_CLOSURE_METRES, SLAM, Case
+from rotavg_ros.evaluation.common.cases import SLAM, Case
 from rotavg_ros.evaluation.common.contenders import OwnContender, Roster
 from rotavg_ros.evaluation.common.peers import MissingPeerError, PeerError
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS
 from rotavg_ros.solver import solve
 from rotavg_ros.solver.methods import POSTERIOR
 from rotavg_ros.solver.positions import Translations, fit_positions
+from rotavg_ros.view_graph import FALSE_CLOSURE_M
 
 ROTATIONS_ALONE = "neurora-rotations"
 # How much too small odometry's deviations are told to one of the peers.
@@ -113,7 +114,7 @@ def residual_verdicts(case: Case, body_from_world: Rotation, position: FloatArra
     measured = Rotation.from_quat(case.graph.target_from_source.numpy())
     turn = (measured * body_from_world[source] * body_from_world[target].inv()).magnitude()
     shift = body_from_world[source].apply(position[target] - position[source]) - _translation(case)
-    is_off = (turn > case.family.outlier_angle) | (np.linalg.norm(shift, axis=1) > FALSE_CLOSURE_METRES)
+    is_off = (turn > case.family.outlier_angle) | (np.linalg.norm(shift, axis=1) > FALSE_CLOSURE_M)
     return torch.from_numpy(is_off & case.is_closure.numpy()).double()
 
 

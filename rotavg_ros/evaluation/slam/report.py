@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from rotavg_ros.evaluation.common.score_tables import Figure, per_case
+from rotavg_ros.evaluation.common.score_tables import VERDICT_FIGURES, Figure, per_case
 from rotavg_ros.evaluation.common.scoring import Scores, geometric_mean
 from rotavg_ros.evaluation.common.tables import Cell, Column, Report, Table
 from rotavg_ros.evaluation.live import incremental_plot
@@ -23,12 +23,7 @@ _JUDGES = (OURS, "neurora-without-cleannet", GNC)
 _CASE_KEY = {"graph": "name", "condition": "kind", "seed": "seed"}
 _CASE_FIGURES = (
     Figure("mean_deg", "error_deg"),
-    Figure("counts.true_positives", "false_flagged"),
-    Figure("counts.false_positives", "good_flagged"),
-    Figure("counts.false_negatives", "false_kept"),
-    Figure("counts.true_negatives", "good_kept"),
-    Figure("odometry_flagged", "odometry_flagged"),
-    Figure("cpu_seconds", "cpu_seconds"),
+    *VERDICT_FIGURES,
 )
 
 

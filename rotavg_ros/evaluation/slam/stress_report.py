@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rotavg_ros.evaluation.common.score_tables import Figure, per_case
+from rotavg_ros.evaluation.common.score_tables import VERDICT_FIGURES, Figure, per_case
 from rotavg_ros.evaluation.common.scoring import Scores, geometric_mean
 from rotavg_ros.evaluation.common.tables import Cell, Column, Report, Table
 from rotavg_ros.evaluation.slam import search_or_model, sensitivity, stress_calibration
@@ -27,12 +27,7 @@ _CASE_KEY = {"kind": "kind", "seed": "seed"}
 _CASE_FIGURES = (
     Figure("mean_deg", "mean_deg"),
     Figure(_FIGURE, _FIGURE),
-    Figure("counts.true_positives", "false_flagged"),
-    Figure("counts.false_positives", "good_flagged"),
-    Figure("counts.false_negatives", "false_kept"),
-    Figure("counts.true_negatives", "good_kept"),
-    Figure("odometry_flagged", "odometry_flagged"),
-    Figure("cpu_seconds", "cpu_seconds"),
+    *VERDICT_FIGURES,
 )
 
 

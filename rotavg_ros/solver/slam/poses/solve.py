@@ -17,13 +17,15 @@ from rotavg_ros.solver.slam.preparation import Prepared
 from rotavg_ros.view_graph import ViewGraph
 
 _FALSE = 0.5
+# Metres that nothing is squared with: odometry of such a step tells no places.
+_ABSURD = 1e100
 
 
 def has_places(graph: ViewGraph) -> bool:
     """Whether translations of all odometry are known, of some closures, and lead anywhere."""
     if graph.translation is None:
         return False
-    known = graph.translation.isfinite().all(dim=1)
+    known = (graph.translation.abs() < _ABSURD).all(dim=1)
     odometry = graph.is_odometry
     moves = bool(graph.translation[odometry].any())
     return moves and bool(known[odometry].all()) and bool(known[~odometry].any())

@@ -42,6 +42,18 @@ def test_one_absurd_closure_is_flagged_and_no_other(metres: float) -> None:
     assert errors(run, answer)[1] < 0.3
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize(("metres", "tells"), [(1e12, True), (1e150, False), (1e300, False)])
+def test_absurd_odometry_breaks_nothing(metres: float, tells: bool) -> None:
+    graph = graph_of(simulated(4))
+    assert graph.translation is not None
+    translation = graph.translation.clone()
+    translation[int(torch.nonzero(graph.is_odometry)[7, 0]), 0] = metres
+    answer = solve(replace(graph, translation=translation))
+    assert torch.isfinite(answer.body_from_world).all()
+    assert (answer.position is not None) == tells
+
+
 def test_closures_that_tell_directions_rather_than_lengths() -> None:
     """Each is short by a factor of its own, as those of two views by one camera are: odometry tells lengths."""
     short, told = [], []
