@@ -172,7 +172,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "health": {"message_counting"},
         "output": {"topics"},
         "services": {"solving", "worker"},
-        "solving": {"diagnostics", "health", "output"},
+        "solving": {"diagnostics", "health", "intake", "output"},
         "intake": {"health", "message_counting", "output", "topics"},
         "estimator_node": {
             "diagnostics",

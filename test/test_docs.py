@@ -19,7 +19,7 @@ from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.simulation.robot_run import RobotRun
 from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.ros.node import diagnostics, parameter_server
-from rotavg_ros.ros.node.intake import wiring
+from rotavg_ros.ros.node.intake import forwarding, wiring
 from rotavg_ros.ros.node.output import frame_correction
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -44,6 +44,7 @@ NOT_RUN = {
     "pip install torch": "the network",
     "pip install safetensors": "ROS 2 from apt",
     "colcon build": "ROS 2 from apt; `make setup` builds the same folders",
+    "ros2 topic echo": "ros2cli is not on PyPI",
     "ros2 run rotavg_ros": "ros2cli is not on PyPI; test/ros starts the same node with the same parameters",
     "rotavg_node": "runs until it is stopped; test/ros starts it",
     "rotavg play run": "ends only when a subscriber has everything; test/ros/harness/test_play.py",
@@ -53,7 +54,7 @@ NOT_RUN = {
     "python examples/three_robots.py": "test/ros runs it",
 }
 # Where the lines of the diagnostics come from.
-WARNING = (diagnostics, wiring, frame_correction, parameter_server)
+WARNING = (diagnostics, forwarding, wiring, frame_correction, parameter_server)
 # What makes a command take seconds instead of minutes or hours.
 SMALLER = {"--laps 4": "--laps 1", "replay my_bag --output": "replay my_bag --duration 10 --no-report --output"}
 

@@ -4,7 +4,15 @@ Converters look at a message's fields only, so they take rclpy's messages as wel
 import neither.
 """
 
-from rotavg_ros.inputs.records import EdgeConverter, EdgeRecord, EdgeVerdict, OdometryConverter, OdometryRecord, Source
+from rotavg_ros.inputs.records import (
+    EdgeConverter,
+    EdgeRecord,
+    EdgeVerdict,
+    OdometryConverter,
+    OdometryRecord,
+    Source,
+    WholeGraphConverter,
+)
 from rotavg_ros.inputs.registry import BRINGS_KEYFRAMES, EDGE_CONVERTERS, FRAMELESS_ODOMETRY, ODOMETRY_CONVERTERS
 
 __all__ = [
@@ -18,4 +26,5 @@ __all__ = [
     "OdometryConverter",
     "OdometryRecord",
     "Source",
+    "WholeGraphConverter",
 ]

@@ -47,6 +47,7 @@ def _record(header: Any, pose: Any, body_from_sensor: Quaternion, child_frame_id
         (position.x, position.y, position.z),
         header.frame_id,
         child_frame_id,
+        body_from_sensor,
     )
 
 

@@ -30,6 +30,8 @@ _NO_EDGES = (2, 4, 5, 6)
 class PoseGraphConverter(ForeignGraph):
     """The sender's verdict on a closure counts, and counts no more as soon as the sender takes it back."""
 
+    edges_field = "edges"
+
     def __init__(self, source: Source) -> None:
         super().__init__(source)
         self._rejected: set[tuple[Key, Key]] = set()
@@ -62,6 +64,12 @@ class PoseGraphConverter(ForeignGraph):
             (self._rejected.add if is_rejected else self._rejected.discard)(ends)
             label = EdgeLabel.REJECTED if is_rejected else EdgeLabel.AUTOMATIC
             yield EdgeVerdict(ends[0][0], edge_id_of(ends[0][1], ends[1][1], kind), label)
+
+    def closure_name(self, edge: Any) -> tuple[str, int] | None:
+        if _KIND.get(edge.type) != EdgeKind.LOOP_CLOSURE:
+            return None
+        robot, source = self._key(edge.robot_from, edge.key_from)
+        return robot, edge_id_of(source, int(edge.key_to), EdgeKind.LOOP_CLOSURE)
 
     def _key(self, robot: int, key: int) -> Key:
         return (self._source.robot_of(int(robot)), int(key))

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from rotavg_ros.online import EdgeMeasurement, RejectReason
 from rotavg_ros.online.odometry.continuity import ANY_MOTION, ContinuityLimits
-from rotavg_ros.online.quaternion import IDENTITY, Quaternion, Vector
+from rotavg_ros.online.quaternion import IDENTITY, Quaternion, Vector, multiply
 from rotavg_ros.view_graph import EdgeLabel
 
 
@@ -50,12 +50,14 @@ class EdgeRecord:
         edge: the measurement, or why it cannot be read.
         sender, sequence: who counts, and the count; 0 for senders that do not.
         frame_id: the sensor frame that the sender says it measured in; empty where it says nothing.
+        element: of a message of many edges, the one that this is.
     """
 
     edge: EdgeMeasurement | RejectReason
     sender: str = ""
     sequence: int = 0
     frame_id: str = ""
+    element: Any = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +78,7 @@ class OdometryRecord:
         world_from_body: xyzw, not checked.
         position: metres, of the sensor; None where the message carries none.
         frame_id, child_frame_id: of the odometry and of what moves in it; empty where the message does not say.
+        body_from_sensor: xyzw, of what the message says the pose of.
     """
 
     stamp_ns: int
@@ -83,6 +86,12 @@ class OdometryRecord:
     position: Vector | None
     frame_id: str = ""
     child_frame_id: str = ""
+    body_from_sensor: Quaternion = IDENTITY
+
+    @property
+    def world_from_sensor(self) -> Quaternion:
+        """xyzw, as the message says."""
+        return multiply(self.world_from_body, self.body_from_sensor)
 
 
 class EdgeConverter(Protocol):
@@ -93,6 +102,19 @@ class EdgeConverter(Protocol):
 
     def forget(self) -> None:
         """Begin anew, as the graph does: everything that is sent again is new."""
+
+
+class WholeGraphConverter(EdgeConverter, Protocol):
+    """Of messages that hold a whole graph, which can be sent on without some of its edges.
+
+    Attributes:
+        edges_field: the message's field with the edges.
+    """
+
+    edges_field: str
+
+    def closure_name(self, edge: Any) -> tuple[str, int] | None:
+        """Source's robot and id of an element of that field, as in its record; None of what is no closure."""
 
 
 # Message, body_from_sensor → record. Raises RejectedInputError for what cannot be read at all.

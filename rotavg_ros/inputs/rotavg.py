@@ -41,7 +41,7 @@ class RelativeRotationArrayConverter(RelativeRotationConverter):
         frame_id = message.header.frame_id
         for edge in message.edges:
             for record in super().__call__(edge):
-                yield record if record.frame_id or not frame_id else replace(record, frame_id=frame_id)
+                yield replace(record, frame_id=record.frame_id or frame_id, element=edge)
 
 
 def edge_from_message(message: Any, source: Source) -> EdgeMeasurement:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from rotavg_ros.inputs.fields import precision_of_information, to_nanoseconds
+from rotavg_ros.inputs.fields import edge_id_of, precision_of_information, to_nanoseconds
 from rotavg_ros.inputs.foreign_graph import ForeignGraph, edges_in_order
 from rotavg_ros.inputs.records import EdgeRecord
 from rotavg_ros.online import RejectReason
@@ -25,6 +25,13 @@ _NO_EDGES = (7, 8, 9)
 
 class MapGraphConverter(ForeignGraph):
     """The message is about one robot."""
+
+    edges_field = "links"
+
+    def closure_name(self, edge: Any) -> tuple[str, int] | None:
+        if _KIND.get(edge.type) != EdgeKind.LOOP_CLOSURE:
+            return None
+        return self._source.robot, edge_id_of(int(edge.from_id), int(edge.to_id), EdgeKind.LOOP_CLOSURE)
 
     def __call__(self, message: Any) -> Iterator[EdgeRecord]:
         robot = self._source.robot

@@ -12,6 +12,7 @@ from torch import Tensor
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.answer.anchoring import anchor, corrections, first_correction
 from rotavg_ros.online.answer.last_answer import LastAnswer
+from rotavg_ros.online.answer.odometry_frame import OdometryFrame, first_frame, next_frame
 from rotavg_ros.online.answer.problem import Problem
 from rotavg_ros.online.graph.builder import GraphBuilder
 from rotavg_ros.online.graph.growth import Growth
@@ -103,7 +104,7 @@ class Content:
     """All of it is forgotten together, by a new one in its place. Not thread-safe.
 
     What the solver remembers of its last answer is not part of the state, so the first answer after a load is a cold
-    one.
+    one; nor is where it placed the robots' odometry, which is known again with that answer.
 
     Attributes:
         builder: the graph, and what is needed to grow it.
@@ -115,6 +116,7 @@ class Content:
         self.state = state
         self.builder = GraphBuilder(state.growth)
         self.first_version = state.version
+        self._frames: dict[str, OdometryFrame] = {}
         self._memory: object | None = None
         self._answered_revision = 0
         self._answer_was_cold = True
@@ -135,9 +137,29 @@ class Content:
         taken = self.builder.add_odometry(message)
         track = self.builder.tracks.get(robot)
         if track is not None and track.chain > len(track.anchors):
+            before = self._frames.pop(robot, None)
             anchor(track, self.correction(robot))
             self.state.world_from_odometry.pop(robot, None)
+            if before is not None and (frame := next_frame(before, track, self.correction(robot))) is not None:
+                self._frames[robot] = frame
+        elif track is not None and robot not in self._frames and self.answered is None:
+            frame = first_frame(track, self.correction(robot))
+            self._frames |= {} if frame is None else {robot: frame}
         return taken
+
+    def odometry_frame(self, robot: str) -> tuple[OdometryFrame, int] | None:
+        """Where the robot's present odometry frame lies in the world, and how many steps of odometry ago that was.
+
+        None while nobody can say.
+        """
+        frame = self._frames.get(robot)
+        if frame is None:
+            return None
+        return frame, self.builder.tracks[robot].num_keyframes - frame.keyframes_before + 1
+
+    def take_frames(self, frames: Mapping[str, OdometryFrame]) -> None:
+        """An answer has placed these robots' odometry frames."""
+        self._frames |= frames
 
     def correction(self, robot: str) -> Quaternion:
         """world_from_odometry; before the robot's first answer, what makes its first odometry fit the gauge."""

@@ -13,6 +13,7 @@ from rotavg_ros.online import free_memory
 from rotavg_ros.online.answer.anchoring import root_orientations
 from rotavg_ros.online.answer.answer import Answer
 from rotavg_ros.online.answer.gauge import fix_gauge
+from rotavg_ros.online.answer.odometry_frame import OdometryFrame, placed_frames
 from rotavg_ros.online.answer.trajectory import Trajectory, corrected_trajectories
 from rotavg_ros.online.content import AcceptedAnswer, Content, ContentState, Counts
 from rotavg_ros.online.graph.snapshot import GraphSnapshot
@@ -190,6 +191,25 @@ class OnlineEstimator:
         with self._lock:
             tracks = dict(self._content.builder.tracks)
         return corrected_trajectories(answer, tracks)
+
+    def place(self, answer: Answer) -> dict[str, Trajectory]:
+        """The same; from now on :meth:`odometry_frame` goes by them, unless the answer is of what was forgotten."""
+        trajectories = self.trajectories(answer)
+        with self._lock:
+            if answer.version > self._content.first_version:
+                self._content.take_frames(placed_frames(answer, trajectories, self._content.builder))
+        return trajectories
+
+    def odometry_frame(self, robot: str) -> tuple[OdometryFrame, int] | None:
+        """Where a robot's odometry frame lies in the world, by the last answer that was placed.
+
+        The number is of odometry's steps since the keyframe that it hangs on, the one under way counted whole.
+
+        Before the first answer it is where odometry says, and odometry that begins anew goes on where the robot was.
+        None before odometry with positions, and after a load until an answer has been placed.
+        """
+        with self._lock:
+            return self._content.odometry_frame(robot)
 
     def snapshot(self) -> GraphSnapshot:
         """The graph now. Until keyframes are marginalised a later one begins with the same keyframes and edges."""

@@ -53,9 +53,29 @@ class NodeParameters:
         "orientation of each edge topic's sensor frame in the body frame, xyzw one after the other; one for all, "
         "or one per edge topic",
     )
+    forward_topics: tuple[str, ...] = option(
+        ("",),
+        "'topic:output' for each of edge_topics whose believed closures are to be sent on, on a topic of the same type",
+    )
+    forward_delay_s: float = option(
+        0.0,
+        "so old a closure must be before it is sent on: others may contradict it meanwhile",
+        within=(0.0, 3600.0),
+        live=True,
+    )
     world_frame: str = option("map", "frame id of what is published")
-    publish_tf: bool = option(
-        False, "publish world → odometry frame on /tf, rotation only and no translation yet; needs tf2_msgs"
+    publish_tf: bool = option(False, "publish world → odometry frame on /tf; needs tf2_msgs")
+    transform_tolerance_s: float = option(
+        0.1, "so far ahead that transform is dated, so that it is there when it is asked for", within=(0.0, 60.0)
+    )
+    correction_rate_deg_s: float = option(
+        0.0,
+        "corrected_odometry and tf turn a robot no faster than this to where a new answer puts it; 0: at once",
+        within=(0.0, 1e6),
+        live=True,
+    )
+    correction_rate_m_s: float = option(
+        0.0, "they move it no faster than this; 0: at once", within=(0.0, 1e6), live=True
     )
     odometry_queue_depth: int = option(10_000, "messages that may wait per odometry topic", within=(1, 1_000_000))
     edge_queue_depth: int = option(10_000, "messages that may wait per edge topic", within=(1, 1_000_000))
@@ -78,6 +98,7 @@ class NodeParameters:
         self._check_topics()
         if self.autosave_period_s > 0 and not self.state_file:
             raise OptionError("autosave_period_s is set but state_file is empty; name a file")
+        self._check_forwards()
         self._check_frames()
 
     def _check_topics(self) -> None:
@@ -103,6 +124,21 @@ class NodeParameters:
             if entry.partition(":")[2] in BRINGS_KEYFRAMES and self.estimator.keyframe_source != "edges":
                 raise OptionError(f"edge topic {entry!r} brings keyframes of its own; set keyframe_source to edges")
 
+    def _check_forwards(self) -> None:
+        known = [entry.partition(":")[0] for entry in self.edge_topics]
+        outputs = self.forwarded()
+        entries = [entry for entry in self.forward_topics if entry]
+        for entry in entries:
+            topic, _, output = entry.partition(":")
+            if not (topic and output):
+                raise OptionError(f"forward_topics: {entry!r} names no two topics; write topic:output")
+            if topic not in known:
+                raise OptionError(f"forward_topics: {topic} is none of edge_topics ({', '.join(known)})")
+            if output in known:
+                raise OptionError(f"forward_topics: {output} is listened to; choose another output for {topic}")
+        if len(set(outputs.values())) < len(entries):
+            raise OptionError(f"forward_topics names something twice: {', '.join(entries)}")
+
     def _check_frames(self) -> None:
         if not self.world_frame or self.world_frame.startswith("/"):
             raise OptionError(
@@ -113,6 +149,11 @@ class NodeParameters:
                 raise OptionError(
                     f"publish_tf places the odometry's frame, and {entry} has none; use another odometry, or no tf"
                 )
+
+    def forwarded(self) -> dict[str, str]:
+        """Outputs of the edge topics that are sent on, by topic."""
+        pairs = (entry.partition(":") for entry in self.forward_topics if entry)
+        return {topic: output for topic, _, output in pairs}
 
     def odometry_sensors(self) -> list[Quaternion]:
         """body_from_sensor of every odometry topic."""

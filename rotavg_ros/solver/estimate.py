@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,6 +19,7 @@ class Estimate:
 
     ``memory`` is what makes the profile's next solve of the same graph, grown a little, cheaper; nobody else reads it.
     ``warnings`` say why it should not be trusted, a sentence each. ``places`` are there where translations are known.
+    ``step_variance`` is how far a step of odometry errs, rad² per component.
     """
 
     body_from_world: Tensor
@@ -26,6 +28,7 @@ class Estimate:
     memory: object | None = None
     warnings: tuple[str, ...] = ()
     places: Places | None = None
+    step_variance: float = math.nan
 
 
 @dataclass(frozen=True)

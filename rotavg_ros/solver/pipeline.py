@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -126,6 +127,7 @@ def solve(
         None if places is None else places.variance.sqrt(),
         None if places is None else places.rotation_score,
         None if places is None else places.precision,
+        math.sqrt(estimate.step_variance),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +36,7 @@ class Solution:
         edge_precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count in the answer, 0 where a
             translation is unknown; None likewise.
         warnings: why it should not be trusted, a sentence each: what was seen, what may be the cause, what to do.
+        step_deviation: radians, by which each component of a step of odometry errs; NaN where the method says nothing.
     """
 
     body_from_world: Tensor
@@ -51,6 +53,7 @@ class Solution:
     position_uncertainty: Tensor | None = None
     rotation_score: Tensor | None = None
     edge_precision: Tensor | None = None
+    step_deviation: float = math.nan
 
     @property
     def world_from_body(self) -> Tensor:

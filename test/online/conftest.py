@@ -28,6 +28,7 @@ class TreeSolution:
     position_uncertainty: None = None
     rotation_score: None = None
     edge_precision: None = None
+    step_deviation: float = 0.0
 
 
 @dataclass

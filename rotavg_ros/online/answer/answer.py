@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -55,6 +56,7 @@ class Answer:
         position_uncertainty: ``(N,)`` metres, one sigma of each component; None likewise.
         rotation_score: ``(M,)`` in [0, 1], that the edge's rotation alone is wrong; None likewise.
         edge_precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count; None likewise.
+        step_deviation: radians, by which each component of a step of odometry errs; NaN unknown.
     """
 
     version: int
@@ -87,6 +89,7 @@ class Answer:
     position_uncertainty: NDArray[np.float64] | None = None
     rotation_score: NDArray[np.float64] | None = None
     edge_precision: NDArray[np.float64] | None = None
+    step_deviation: float = math.nan
 
     @classmethod
     def of_solution(
@@ -138,6 +141,7 @@ class Answer:
             position_uncertainty=_numbers(solution.position_uncertainty),
             rotation_score=_numbers(solution.rotation_score),
             edge_precision=_numbers(solution.edge_precision),
+            step_deviation=solution.step_deviation,
         )
 
     @cached_property

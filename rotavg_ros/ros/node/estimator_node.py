@@ -56,8 +56,9 @@ class RotavgNode(parameter_server.ParameterNode):
         self._saver = Worker(executor, "rotavg_saver")
         self._outputs = Outputs(self, parameters, self._estimator)
         state_file = Path(parameters.state_file) if parameters.state_file else None
-        self._solving = Solving(self, self._estimator, self._health, self._outputs, state_file)
         listening = Subscriptions(self, parameters, self._estimator, self._health, self._outputs, self._on_time_jump)
+        self._forwarding = listening.forwarding
+        self._solving = Solving(self, self._estimator, self._health, self._outputs, self._forwarding, state_file)
         workers = Workers(solver=self._worker, saver=self._saver)
         Services(self, self._estimator, self._solving, workers, parameters.robots[0])
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -105,6 +106,8 @@ class RotavgNode(parameter_server.ParameterNode):
         if options != self._estimator.options:
             self._estimator.set_options(options)
         self._settings = parameters
+        self._outputs.set_parameters(parameters)
+        self._forwarding.set_parameters(parameters)
         if parameters.solve_period_s != old.solve_period_s:
             self.destroy_timer(self._solve_timer)
             self._solve_timer = self._create_timer(parameters.solve_period_s, self._on_solve_timer)
@@ -133,7 +136,9 @@ class RotavgNode(parameter_server.ParameterNode):
 
     def _on_diagnostics_timer(self) -> None:
         wiring = self._wiring.warnings(self._settings)
-        self._health.noticed([*self._mistaken_parameters, *wiring, *self._outputs.warnings()])
+        self._health.held_back = self._forwarding.waiting
+        lines = [*self._mistaken_parameters, *wiring, *self._outputs.warnings(), *self._forwarding.warnings()]
+        self._health.noticed(lines)
         status = self._reporter.report(self._health, self._estimator.counts(), self._settings, self._estimator.paused)
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()

@@ -24,6 +24,7 @@ class Health:
         last_odometry: when a message was last taken, per topic name.
         mistakes: in the wiring and the parameters, a line each.
         joins: how often components became one.
+        held_back: closures that wait to be sent on (``forward_topics``).
         unsolved_since: since when the graph has been ahead of the answer; None if it is not.
         solve_failures: how many ticks failed in all; ``failure`` is the last one's message, None after a good tick.
         save_failure: why the last save failed, None if it did not.
@@ -40,6 +41,7 @@ class Health:
     mistakes: list[str] = field(default_factory=list)
     answer: Answer | None = None
     joins: int = 0
+    held_back: int = 0
     answered: float | None = None
     unsolved_since: float | None = None
     solve_failures: int = 0

@@ -74,12 +74,12 @@ def _run(stop: _StopSignal) -> int:
     except ModuleNotFoundError as error:
         return _fail_without(error)
     executor = SingleThreadedExecutor()
+    stop.has_started()  # the node locks its state file, which must not be left behind
     try:
         node = RotavgNode(executor)
     except UserError as error:
         return _fail(str(error))
     executor.add_node(node)
-    stop.has_started()
     while not stop.requested:
         try:
             executor.spin_once(timeout_sec=_LONGEST_WAIT_S)

@@ -20,6 +20,7 @@ from rotavg_ros.online.state.file import StateFileError, StateFileInUseError, ch
 from rotavg_ros.online.state.lock import StateFileLock
 from rotavg_ros.ros.node.diagnostics import KEPT, NOT_KEPT
 from rotavg_ros.ros.node.health import Health
+from rotavg_ros.ros.node.intake.forwarding import Forwarding
 from rotavg_ros.ros.node.output.outputs import Outputs
 
 _LOG_PERIOD_S = 5.0
@@ -35,12 +36,19 @@ class Solving:
     """
 
     def __init__(
-        self, node: Node, estimator: OnlineEstimator, health: Health, outputs: Outputs, state_file: Path | None
+        self,
+        node: Node,
+        estimator: OnlineEstimator,
+        health: Health,
+        outputs: Outputs,
+        forwarding: Forwarding,
+        state_file: Path | None,
     ) -> None:
         self._node = node
         self._estimator = estimator
         self._health = health
         self._outputs = outputs
+        self._forwarding = forwarding
         self._state_file = state_file
         self._publishing = threading.Lock()  # an answer goes out before it is forgotten, or not at all
         self._lock: StateFileLock | None = None
@@ -64,6 +72,7 @@ class Solving:
         if answer is not None:
             self._publish(answer)
             self._outputs.draw(answer)
+        self._forwarding.decide(health.answer)
         return answer
 
     def solve_now(self) -> str:

@@ -115,7 +115,7 @@ def _solve_by_posterior(graph: ViewGraph, stages: SlamStages, run: Run) -> Estim
         found = search(graph, network, begin, stages.without)
         published = publish(found.drawn.problem, found.modes)
     with run.watch.stage("expand"):
-        estimate = estimate_of(published)
+        estimate = estimate_of(published, found.modes[0].state.noise)
         if not stages.without:
             estimate = replace(estimate, memory=PosteriorMemory.of(graph, found, estimate))
     if "translations" in stages.without or not has_places(graph):
@@ -147,9 +147,16 @@ def _with_poses(graph: ViewGraph, estimate: Estimate, memory: PoseMemory) -> Est
         variance=torch.from_numpy(poses.variance),
         places=places,
         memory=_remembering(graph, estimate.memory, memory),
+        step_variance=_step_variance(graph, poses.precision),
         # The posterior's is of answers that rotations alone do not tell apart.
         warnings=estimate.warnings if len(poses.rivals) > 1 else (),
     )
+
+
+def _step_variance(graph: ViewGraph, precision: np.ndarray) -> float:
+    """rad², of one step of sound odometry, from the precisions ``(M, 2)`` with which edges count."""
+    odometry = graph.is_odometry.numpy()
+    return float(np.median(1 / (precision[odometry, 0] * graph.steps.numpy()[odometry])))
 
 
 def _remembering(graph: ViewGraph, memory: object | None, poses: PoseMemory) -> object:
@@ -168,6 +175,7 @@ def _slam_estimate(
         torch.from_numpy(slam_stages.outlier_scores(graph, verdicts.outlier_probability)),
         torch.from_numpy(variance),
         memory,
+        step_variance=max(verdicts.noise.step_variance, verdicts.noise.likely_step_variance),
     )
 
 

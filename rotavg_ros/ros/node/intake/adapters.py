@@ -30,6 +30,11 @@ class EdgeTopic:
     convert: EdgeConverter
 
     @property
+    def element_type(self) -> type:
+        """Of the edges of a message that may have very many."""
+        return _message_type("edge", self.topic, DEFAULT_EDGE_TYPE)
+
+    @property
     def is_array(self) -> bool:
         """Whether messages may have very many edges: to be taken as bytes, for :class:`SerializedArray`."""
         return self.type_name == _EDGE_ARRAY_TYPE

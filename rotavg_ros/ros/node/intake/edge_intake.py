@@ -13,6 +13,7 @@ from rclpy.node import Node
 
 from rotavg_ros.inputs import EdgeConverter, EdgeRecord, EdgeVerdict
 from rotavg_ros.online import OnlineEstimator, RejectReason
+from rotavg_ros.ros.node.intake.forwarding import Forwarding
 from rotavg_ros.ros.node.intake.wiring import Input
 from rotavg_ros.ros.node.message_counting import TopicCounter
 
@@ -41,8 +42,15 @@ class EdgeIntake:
         callback_group: for the subscriptions to edges; it holds them back while too many messages are under way.
     """
 
-    def __init__(self, node: Node, estimator: OnlineEstimator, on_refusal: Callable[[RejectReason], None]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        estimator: OnlineEstimator,
+        forwarding: Forwarding,
+        on_refusal: Callable[[RejectReason], None],
+    ) -> None:
         self._estimator = estimator
+        self._forwarding = forwarding
         self._on_refusal = on_refusal
         self.callback_group = _WhileThereIsRoom(lambda: len(self._under_way) < _MOST_MESSAGES)
         self._generation = estimator.generation
@@ -88,6 +96,8 @@ class EdgeIntake:
             self._estimator.reject(record.edge)
         else:
             reason = self._estimator.add_edge(record.edge)
+        if topic.forward is not None:
+            self._forwarding.taken(topic.forward, record, reason)
         if reason is not None and reason is not RejectReason.DUPLICATE_EDGE:
             self._on_refusal(reason)
 

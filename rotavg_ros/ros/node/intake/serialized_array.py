@@ -66,6 +66,23 @@ class SerializedArray:
         self.edges = _elements(content, at, element_type, order)
 
 
+def as_message(element: Any, message_type: type) -> Any:
+    """An element as a message of its type, to be published."""
+    if isinstance(element, message_type):
+        return element
+    message = message_type()
+    for name, type_name in message_type.get_fields_and_field_types().items():  # type: ignore[attr-defined]
+        value = getattr(element, name)
+        setattr(message, name, as_message(value, _message_class(type_name)) if "/" in type_name else value)
+    return message
+
+
+def _message_class(type_name: str) -> type:
+    package, _, name = type_name.partition("/")
+    message_type: type = getattr(importlib.import_module(f"{package}.msg"), name)
+    return message_type
+
+
 def _elements(content: memoryview, at: int, element_type: str, order: str) -> Iterator[Any]:
     length, at = _reader("uint32", order)(content, at)
     read = _reader(element_type, order)
@@ -84,9 +101,10 @@ def _reader(type_name: str, order: str) -> _Read:
     if type_name.startswith("sequence<"):
         element_type, _, _ = type_name.removeprefix("sequence<").removesuffix(">").partition(",")
         return _sequence_reader(_reader("uint32", order), _reader(element_type, order))
-    package, _, name = type_name.partition("/")
-    fields = getattr(importlib.import_module(f"{package}.msg"), name).get_fields_and_field_types()
-    return _message_reader(name, {field: _reader(field_type, order) for field, field_type in fields.items()})
+    message_type = _message_class(type_name)
+    fields = message_type.get_fields_and_field_types()  # type: ignore[attr-defined]
+    readers = {field: _reader(field_type, order) for field, field_type in fields.items()}
+    return _message_reader(message_type.__name__, readers)
 
 
 def _primitive_reader(number: struct.Struct) -> _Read:

@@ -20,6 +20,7 @@ from rotavg_ros.ros.node.health import Health
 from rotavg_ros.ros.node.intake import adapters
 from rotavg_ros.ros.node.intake.adapters import EdgeTopic, OdometryTopic
 from rotavg_ros.ros.node.intake.edge_intake import EdgeIntake
+from rotavg_ros.ros.node.intake.forwarding import Forwarding
 from rotavg_ros.ros.node.intake.serialized_array import SerializedArray
 from rotavg_ros.ros.node.intake.wiring import Input
 from rotavg_ros.ros.node.message_counting import TopicCounter
@@ -35,6 +36,7 @@ class Subscriptions:
 
     Attributes:
         inputs: the topics that are listened to.
+        forwarding: where believed closures go.
 
     Raises:
         UserError: a topic's name, type or ``qos_overrides`` cannot be.
@@ -55,7 +57,8 @@ class Subscriptions:
         self._health = health
         self._outputs = outputs
         self.inputs: list[Input] = []
-        self._intake = EdgeIntake(node, estimator, partial(self._warn_of_refusal, "an edge"))
+        self.forwarding = Forwarding(node, parameters, estimator)
+        self._intake = EdgeIntake(node, estimator, self.forwarding, partial(self._warn_of_refusal, "an edge"))
         best_effort = QoSProfile(depth=parameters.odometry_queue_depth, reliability=ReliabilityPolicy.BEST_EFFORT)
         sources = zip(parameters.robots, parameters.odometry_topics, parameters.odometry_sensors(), strict=True)
         for robot, entry, body_from_sensor in sources:
@@ -69,6 +72,7 @@ class Subscriptions:
             edges = adapters.edge_topic(entry, source)
             self._intake.add_source(edges.convert)
             topic = Input(self._full_name(edges.topic), edges.type_name, "edge_topics", "", reliable)
+            topic.forward = self.forwarding.of(edges)
             counter = health.edges.setdefault(topic.name, TopicCounter())
             on_edges = partial(self._on_edges, topic, edges, counter)
             self._subscribe(topic, edges, on_edges, counter)
@@ -136,7 +140,7 @@ class Subscriptions:
             reason = self._estimator.add_odometry(topic.robot, record.stamp_ns, record.world_from_body, record.position)
         if reason is None:
             self._health.took_odometry(topic.name)
-            self._outputs.publish_orientation(topic.robot, topic.name, message.header)
+            self._outputs.publish_odometry(topic.robot, topic.name, message, record)
         else:
             self._warn_of_refusal(f"odometry of {topic.robot}", reason)
         if self._estimator.time_jumps != time_jumps:
@@ -149,7 +153,10 @@ class Subscriptions:
         self, topic: Input, edges: EdgeTopic, counter: TopicCounter, message: Any, _info: dict[str, Any] | None
     ) -> None:
         unpacked = SerializedArray(message, edges.message_type) if edges.is_array else message
-        self._intake.take(topic, counter, edges.convert(unpacked))
+        records = edges.convert(unpacked)
+        if topic.forward is not None:
+            records = topic.forward.begin(unpacked, records)
+        self._intake.take(topic, counter, records)
 
     def _warn_of_refusal(self, what: str, reason: RejectReason) -> None:
         self._node.get_logger().warning(

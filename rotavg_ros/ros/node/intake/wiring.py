@@ -15,6 +15,7 @@ from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
+from rotavg_ros.ros.node.intake.forwarding import Forward
 from rotavg_ros.settings.parameters import NodeParameters
 
 _CLOCK = "/clock"
@@ -33,6 +34,7 @@ class Input:
         robot: whose odometry it is; empty for edges.
         qos: what is asked for.
         frames: of the messages so far: of odometry header.frame_id and that of the body, of edges that of the sensor.
+        forward: where its believed closures go; None if nowhere.
         published: when somebody was last seen to publish it, by the monotonic clock; at first when it was subscribed.
     """
 
@@ -42,6 +44,7 @@ class Input:
     robot: str
     qos: QoSProfile
     frames: dict[tuple[str, ...], None] = field(default_factory=dict)
+    forward: Forward | None = None
     published: float = field(default_factory=time.monotonic)
 
     @property
@@ -108,12 +111,15 @@ class Wiring:
         return lines
 
     def _topics_of(self, type_name: str) -> list[str]:
-        """Topics of a type that are published and that this node does not know, a few of them."""
+        """Topics of a type that others publish and that this node does not know, a few of them."""
+        own = self._node.get_fully_qualified_name()
         known = {each.name for each in self._inputs}
         by_others = (
             topic
             for topic, types in self._node.get_topic_names_and_types()
-            if type_name in types and topic not in known and self._node.count_publishers(topic)
+            if type_name in types
+            and topic not in known
+            and any(_name(each) != own for each in self._node.get_publishers_info_by_topic(topic))
         )
         return sorted(by_others)[:_MOST_FRAMES]
 

@@ -43,27 +43,28 @@ def orientations_message(answer: Answer, frame_id: str) -> AbsoluteOrientations:
     )
 
 
-def flags_message(answer: Answer, frame_id: str) -> OutlierFlags:
-    """The answer's edges."""
+def flags_message(answer: Answer, frame_id: str, rows: NDArray[np.int64] | slice = slice(None)) -> OutlierFlags:
+    """The answer's edges, or those of some rows."""
+    source, target = answer.source[rows], answer.target[rows]
     return OutlierFlags(
         header=_header(answer, frame_id),
-        edge_ids=_array("Q", answer.edge_id, np.uint64),
+        edge_ids=_array("Q", answer.edge_id[rows], np.uint64),
         robots=list(answer.robots),
-        source_robots=_array("I", answer.keyframe_robot[answer.source], np.uint32),
-        source_ids=_array("Q", answer.keyframe_id[answer.source], np.uint64),
-        target_robots=_array("I", answer.keyframe_robot[answer.target], np.uint32),
-        target_ids=_array("Q", answer.keyframe_id[answer.target], np.uint64),
-        kinds=_array("B", answer.kind, np.uint8),
-        scores=_array("f", answer.outlier_score, np.float32),
-        outliers=answer.outlier.tolist(),
-        rotation_scores=_array("f", _or_nothing(answer.rotation_score), np.float32),
-        residuals_deg=_array("f", answer.residual_deg, np.float32),
-        residuals_m=_array("f", _or_nothing(answer.residual_m), np.float32),
+        source_robots=_array("I", answer.keyframe_robot[source], np.uint32),
+        source_ids=_array("Q", answer.keyframe_id[source], np.uint64),
+        target_robots=_array("I", answer.keyframe_robot[target], np.uint32),
+        target_ids=_array("Q", answer.keyframe_id[target], np.uint64),
+        kinds=_array("B", answer.kind[rows], np.uint8),
+        scores=_array("f", answer.outlier_score[rows], np.float32),
+        outliers=answer.outlier[rows].tolist(),
+        rotation_scores=_array("f", _known(answer.rotation_score, rows), np.float32),
+        residuals_deg=_array("f", answer.residual_deg[rows], np.float32),
+        residuals_m=_array("f", _known(answer.residual_m, rows), np.float32),
     )
 
 
-def _or_nothing(values: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    return np.empty(0) if values is None else values
+def _known(values: NDArray[np.float64] | None, rows: NDArray[np.int64] | slice) -> NDArray[np.float64]:
+    return np.empty(0) if values is None else values[rows]
 
 
 def _header(answer: Answer, frame_id: str) -> Header:

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import TransformStamped, Vector3
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.online.quaternion import Quaternion
-from rotavg_ros.ros.node.output.conversions import to_quaternion_message
+from rotavg_ros.inputs.fields import to_nanoseconds
+from rotavg_ros.online.answer.odometry_frame import OdometryFrame
+from rotavg_ros.ros.node.output.conversions import to_quaternion_message, to_time
 from rotavg_ros.ros.node.topics import publisher
-
-NO_TRANSLATION = (
-    "publish_tf: the transform from the world to the odometry frame has no translation yet; take positions from "
-    "corrected_path, not from tf"
-)
 
 
 class FrameCorrection:
@@ -25,31 +21,41 @@ class FrameCorrection:
         UserError: tf2_msgs is not installed, or a topic's ``qos_overrides`` cannot be.
     """
 
-    def __init__(self, node: Node, world_frame: str) -> None:
+    def __init__(self, node: Node, world_frame: str, tolerance_ns: int) -> None:
+        """Get ready to publish.
+
+        Args:
+            node: the node.
+            world_frame: name of the parent frame.
+            tolerance_ns: so far ahead transforms are dated, so that they are there when the next odometry is.
+        """
         try:
             from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
         except ImportError as error:
             raise UserError("publish_tf needs tf2_msgs: install that package or leave publish_tf off") from error
-        self._message_type, self._world_frame = TFMessage, world_frame
+        self._message_type, self._world_frame, self._tolerance_ns = TFMessage, world_frame, tolerance_ns
         self._publisher = publisher(node, TFMessage, "/tf", QoSProfile(depth=100))
         self._robot_of_frame: dict[str, str] = {}
         self._mistakes: dict[str, str] = {}
 
-    def publish(self, robot: str, topic: str, odometry: Header, world_from_odometry: Quaternion) -> None:
+    def publish(self, robot: str, topic: str, odometry: Header, frame: OdometryFrame) -> None:
         """Place the frame of a robot's odometry message, which came on ``topic`` and has this header."""
         mistake = self._mistake(robot, odometry.frame_id)
         if mistake is not None:
             self._mistakes[topic] = f"publish_tf says nothing about {topic}: {mistake}"
             return
         self._mistakes.pop(topic, None)
-        header = Header(stamp=odometry.stamp, frame_id=self._world_frame)
+        stamp = to_time(to_nanoseconds(odometry.stamp) + self._tolerance_ns)
+        header = Header(stamp=stamp, frame_id=self._world_frame)
         transform = TransformStamped(header=header, child_frame_id=odometry.frame_id)
-        transform.transform.rotation = to_quaternion_message(world_from_odometry)
+        x, y, z = frame.origin
+        transform.transform.translation = Vector3(x=x, y=y, z=z)
+        transform.transform.rotation = to_quaternion_message(frame.orientation)
         self._publisher.publish(self._message_type(transforms=[transform]))
 
     def warnings(self) -> list[str]:
         """What there is to say about it, a line each."""
-        return [NO_TRANSLATION, *list(self._mistakes.values())]
+        return list(self._mistakes.values())
 
     def _mistake(self, robot: str, frame: str) -> str | None:
         """Why a frame cannot be placed; None if it can."""

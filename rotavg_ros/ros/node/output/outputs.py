@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from functools import partial
+from typing import Any
 
 from geometry_msgs.msg import QuaternionStamped
 from nav_msgs.msg import Path
@@ -11,12 +12,13 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rotavg_msgs.msg import AbsoluteOrientations, OutlierFlags
-from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
+from rotavg_ros.inputs import OdometryRecord
 from rotavg_ros.online import Answer, OnlineEstimator
+from rotavg_ros.online.answer.trajectory import Trajectory
 from rotavg_ros.ros.node.output.conversions import flags_message, orientations_message, to_quaternion_message
-from rotavg_ros.ros.node.output.frame_correction import FrameCorrection
+from rotavg_ros.ros.node.output.robot_poses import RobotPoses
 from rotavg_ros.ros.node.output.visualization import markers_message, path_message
 from rotavg_ros.ros.node.topics import LATCHED, publisher
 from rotavg_ros.settings.parameters import NodeParameters
@@ -47,16 +49,22 @@ class Outputs:
             robot: publisher(node, QuaternionStamped, f"{prefix[robot]}orientation", QoSProfile(depth=10))
             for robot in self._robots
         }
-        self._tf = FrameCorrection(node, self._frame_id) if parameters.publish_tf else None
+        self._poses = RobotPoses(node, parameters, estimator, prefix)
+        self._placed: tuple[int, dict[str, Trajectory]] = (0, {})
 
     @property
     def exclusive_topics(self) -> list[str]:
         """Full names of topics that only one node should publish."""
-        return [self._orientations.topic_name, *(each.topic_name for each in self._orientation.values())]
+        oriented = (each.topic_name for each in self._orientation.values())
+        return [self._orientations.topic_name, *oriented, *self._poses.topics]
 
     def warnings(self) -> list[str]:
         """What is not as it should be, a line each."""
-        return [] if self._tf is None else self._tf.warnings()
+        return self._poses.warnings()
+
+    def set_parameters(self, parameters: NodeParameters) -> None:
+        """Take over what may change while the node runs."""
+        self._poses.set_parameters(parameters)
 
     def publish_answer(self, answer: Answer) -> None:
         """Latch the answer's keyframes and edges."""
@@ -64,17 +72,21 @@ class Outputs:
         self._flags.publish(flags_message(answer, self._frame_id))
 
     def draw(self, answer: Answer | None) -> None:
-        """Path and markers of the last answer, for those who look; again when somebody begins to.
+        """Path and markers of the last answer, for those who look, and poses; again when somebody begins to.
 
         Called once a second at least, so that what is left out because too much time went into drawing comes later.
         """
+        if answer is None:
+            return
+        if self._poses.are_wanted:
+            self._trajectories(answer)
         started = time.monotonic()
-        if answer is None or started < self._rests_until:
+        if started < self._rests_until:
             return
         missing = [p for p in (*self._paths.values(), self._markers) if self._lacks(p, answer)]
         if not missing:
             return
-        trajectories = self._estimator.trajectories(answer)
+        trajectories = self._trajectories(answer)
         for robot, path in self._paths.items():
             if path in missing and robot in trajectories:
                 path.publish(path_message(trajectories[robot], self._frame_id))
@@ -83,6 +95,12 @@ class Outputs:
         ended = time.monotonic()
         self._rests_until = ended + _REST * (ended - started)
 
+    def _trajectories(self, answer: Answer) -> dict[str, Trajectory]:
+        """Of the answer, by which poses go from now on."""
+        if self._placed[0] != answer.version:
+            self._placed = answer.version, self._estimator.place(answer)
+        return self._placed[1]
+
     def _lacks(self, picture: Publisher, answer: Answer) -> bool:
         """Whether somebody looks who has not been sent this answer yet; from now on they have."""
         watchers = picture.get_subscription_count()
@@ -90,21 +108,20 @@ class Outputs:
         self._drawn[picture] = answer.version, watchers
         return watchers > 0 and (version != answer.version or watchers > watchers_then)
 
-    def publish_orientation(self, robot: str, topic: str, odometry: Header) -> None:
-        """The robot's corrected orientation at the moment of its newest odometry message.
+    def publish_odometry(self, robot: str, topic: str, message: Any, record: OdometryRecord) -> None:
+        """The robot's corrected orientation and pose at the moment of its newest odometry message.
 
         Args:
             robot: whose.
             topic: that the message came on.
-            odometry: the message's header.
+            message: of odometry.
+            record: what it says.
         """
         orientation = self._estimator.current_orientation(robot)
         if orientation is None:
             return
         stamped = QuaternionStamped(quaternion=to_quaternion_message(orientation))
-        stamped.header.stamp = odometry.stamp
+        stamped.header.stamp = message.header.stamp
         stamped.header.frame_id = self._frame_id
         self._orientation[robot].publish(stamped)
-        correction = self._estimator.world_from_odometry(robot) if self._tf is not None else None
-        if self._tf is not None and correction is not None:
-            self._tf.publish(robot, topic, odometry, correction)
+        self._poses.publish(robot, topic, message, record)

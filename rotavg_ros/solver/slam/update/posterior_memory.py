@@ -112,7 +112,7 @@ class PosteriorMemory:
         is_old_closure = problem.graph.is_closure & ~is_new
         if (mode.state.trusted != start.trusted)[is_old_closure].sum() > _MAX_TURNED:
             return None
-        estimate = estimate_of(publish(problem, [mode]))
+        estimate = estimate_of(publish(problem, [mode]), mode.state.noise)
         memory = replace(
             self,
             graph=graph,
@@ -149,14 +149,21 @@ class PosteriorMemory:
             outlier_score=torch.cat((self.outlier_score, slipped)),
             variance=torch.cat((self.variance, self.variance[new.anchor] + passed)),
         )
-        return Estimate(memory.body_from_world, memory.outlier_score, memory.variance, memory)
+        return Estimate(
+            memory.body_from_world,
+            memory.outlier_score,
+            memory.variance,
+            memory,
+            step_variance=self.noise.step_variance,
+        )
 
 
-def estimate_of(published: Published) -> Estimate:
-    """The posterior's answer on the view-graph's nodes and edges."""
+def estimate_of(published: Published, noise: Noise) -> Estimate:
+    """The posterior's answer on the view-graph's nodes and edges; ``noise`` is of the likeliest labelling."""
     return Estimate(
         published.body_from_world,
         torch.from_numpy(outlier_scores(published.graph, published.outlier_probability)),
         torch.from_numpy(published.variance),
         warnings=published.warnings,
+        step_variance=noise.step_variance,
     )

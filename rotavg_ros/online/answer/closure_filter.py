@@ -1,0 +1,158 @@
+"""Which closures may go on to a back end: those that answers believe, each once, and what becomes of them later."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rotavg_ros.online.answer.answer import Answer
+from rotavg_ros.online.measurements import MAX_ID
+from rotavg_ros.view_graph import EdgeKind
+
+# A sender's name for an edge: the source's robot, and the edge's id.
+EdgeName = tuple[str, int]
+# Closures that wait for a verdict at most, and those whose later fate is followed; beyond, the oldest are forgotten.
+_MOST_WAITING, _MOST_FOLLOWED = 100_000, 1_000_000
+
+_Item = TypeVar("_Item")
+
+
+@dataclass(frozen=True)
+class Decision(Generic[_Item]):
+    """What an answer changes.
+
+    Attributes:
+        passed: what was handed in with closures that are believed now, in the order in which it came.
+        revoked: rows of the answer's edges that were let pass, and are false now.
+        reinstated: rows of those that were revoked, and are believed again.
+    """
+
+    passed: list[_Item] = field(default_factory=list)
+    revoked: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    reinstated: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+
+@dataclass
+class _Waiting(Generic[_Item]):
+    since: float
+    items: list[_Item]
+
+
+class ClosureFilter(Generic[_Item]):
+    """Closures by the names that their senders gave them. Not thread-safe.
+
+    A closure passes with the first answer that has it and believes it, once it is old enough; one that is held false
+    waits on. Where measurements share a name, one pass needs all of them to be believed. Items of type ``_Item`` stand
+    for what is to be sent on.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: dict[int, _Waiting[_Item]] = {}
+        self._believed: dict[int, bool] = {}  # of those that were let pass: whether they still are
+
+    def __len__(self) -> int:
+        """How many wait."""
+        return len(self._waiting)
+
+    def take(self, name: EdgeName, item: _Item, now: float) -> None:
+        """A closure has come, or another measurement by the same name.
+
+        Args:
+            name: the sender's.
+            item: to be handed out when it passes.
+            now: seconds.
+        """
+        key = _key(name)
+        if len(self._waiting) >= _MOST_WAITING:
+            del self._waiting[next(iter(self._waiting))]
+        self._waiting.setdefault(key, _Waiting(now, [])).items.append(item)
+
+    def knows(self, name: EdgeName) -> bool:
+        """Whether a closure of this name waits or has passed."""
+        key = _key(name)
+        return key in self._waiting or key in self._believed
+
+    def passes(self, name: EdgeName) -> bool:
+        """Whether a closure was let pass and is believed still."""
+        return self._believed.get(_key(name), False)
+
+    def decide(self, answer: Answer, now: float, delay_s: float) -> Decision[_Item]:
+        """What the last answer changes for closures that came ``delay_s`` ago or earlier."""
+        rows, keys = _closures(answer)
+        order = np.argsort(keys, kind="stable")
+        unique, first = np.unique(keys[order], return_index=True)
+        is_false = np.logical_or.reduceat(answer.outlier[rows][order], first) if len(first) else np.empty(0, dtype=bool)
+        revoked, reinstated = self._follow(unique, is_false, rows[order], first)
+        return Decision(self._let_pass(unique, is_false, now - delay_s), revoked, reinstated)
+
+    def _let_pass(self, unique: NDArray[np.uint64], is_false: NDArray[np.bool_], until: float) -> list[_Item]:
+        passed: list[_Item] = []
+        keys = [key for key, waiting in self._waiting.items() if waiting.since <= until]
+        found, place = _found(np.array(keys, dtype=np.uint64), unique)
+        for key, is_known, at in zip(keys, found.tolist(), place.tolist(), strict=True):
+            if is_known and not is_false[at]:
+                passed += self._waiting.pop(key).items
+                self._believed[key] = True
+        for key in list(self._believed)[: max(0, len(self._believed) - _MOST_FOLLOWED)]:
+            del self._believed[key]
+        return passed
+
+    def _follow(
+        self,
+        unique: NDArray[np.uint64],
+        is_false: NDArray[np.bool_],
+        rows: NDArray[np.int64],
+        first: NDArray[np.int64],
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows of edges that were let pass and whose verdict has changed: to false, and back."""
+        keys = np.fromiter(self._believed, dtype=np.uint64, count=len(self._believed))
+        believed = np.fromiter(self._believed.values(), dtype=bool, count=len(keys))
+        found, place = _found(keys, unique)
+        now_believed = believed.copy()
+        now_believed[found] = ~is_false[place[found]]
+        changed = now_believed != believed
+        for key, is_believed in zip(keys[changed].tolist(), now_believed[changed].tolist(), strict=True):
+            self._believed[key] = is_believed
+        ends = np.append(first[1:], len(rows))
+        revoked, reinstated = (
+            [rows[first[at] : ends[at]] for at in place[changed & (now_believed == back)].tolist()]
+            for back in (False, True)
+        )
+        return _joined(revoked), _joined(reinstated)
+
+
+def _closures(answer: Answer) -> tuple[NDArray[np.int64], NDArray[np.uint64]]:
+    """Rows of an answer's closures, and their names as numbers."""
+    rows = np.flatnonzero(answer.kind == EdgeKind.LOOP_CLOSURE)
+    robot_keys = np.array([_robot_key(robot) for robot in answer.robots], dtype=np.uint64)
+    if not len(rows):
+        return rows, np.empty(0, dtype=np.uint64)
+    return rows, answer.edge_id[rows] ^ robot_keys[answer.keyframe_robot[answer.source[rows]]]
+
+
+def _found(keys: NDArray[np.uint64], unique: NDArray[np.uint64]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Which keys there are in an ascending array, and where."""
+    if not len(unique):
+        return np.zeros(len(keys), dtype=bool), np.zeros(len(keys), dtype=np.int64)
+    place = np.minimum(np.searchsorted(unique, keys), len(unique) - 1)
+    return unique[place] == keys, place
+
+
+def _joined(rows: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    return np.sort(np.concatenate(rows)) if rows else np.empty(0, dtype=np.int64)
+
+
+def _key(name: EdgeName) -> int:
+    robot, edge_id = name
+    return (edge_id & MAX_ID) ^ _robot_key(robot)
+
+
+@cache
+def _robot_key(robot: str) -> int:
+    """64 bits that tell robots apart: two edges of different robots share a key in practice never."""
+    return int.from_bytes(hashlib.blake2b(robot.encode("utf-8", "surrogatepass"), digest_size=8).digest(), "little")

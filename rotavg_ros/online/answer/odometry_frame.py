@@ -1,0 +1,162 @@
+"""Where a robot's odometry frame lies in the world, and with it the robot now, between two answers as well."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from rotavg_ros.online import quaternion
+from rotavg_ros.online.answer.answer import Answer
+from rotavg_ros.online.answer.trajectory import Trajectory
+from rotavg_ros.online.graph.builder import GraphBuilder
+from rotavg_ros.online.measurements import RejectedInputError
+from rotavg_ros.online.odometry.track import OdometryTrack
+from rotavg_ros.online.quaternion import Quaternion, Vector
+from rotavg_ros.view_graph import EdgeKind
+
+# Rotations about z alone have x and y below this.
+_PLANAR = 1e-6
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How far a pose errs, as variances per component, that no answer has corrected yet.
+
+    Attributes:
+        orientation, position: of the keyframe that the pose hangs on, rad² and m², relative to its component's first.
+        step_orientation, step_position: of a step of odometry, rad² and m². NaN where the answer does not tell.
+    """
+
+    orientation: float
+    position: float
+    step_orientation: float
+    step_position: float
+
+    def after(self, steps: int, way: float) -> tuple[float, float]:
+        """rad² and m² so many steps of odometry, and so many metres, off the keyframe, which may be turned."""
+        orientation = self.orientation + steps * self.step_orientation
+        return orientation, self.position + steps * self.step_position + self.orientation * way**2
+
+
+UNKNOWN_DRIFT = Drift(math.nan, math.nan, math.nan, math.nan)
+
+
+@dataclass(frozen=True)
+class OdometryFrame:
+    """The pose of a robot's odometry frame in the world, from the robot's newest keyframe that an answer has placed.
+
+    Attributes:
+        chain: number of the odometry chain that it is about.
+        orientation: world_from_odometry, xyzw.
+        origin: of the odometry's frame, metres in the world.
+        keyframe_position: of that keyframe in the odometry's frame, metres.
+        keyframes_before: how many keyframes the robot's odometry had made up to that one.
+        drift: how far poses err.
+        is_planar: whether the robot has turned about the world's z axis only.
+    """
+
+    chain: int
+    orientation: Quaternion
+    origin: Vector
+    keyframe_position: Vector
+    keyframes_before: int = 0
+    drift: Drift = UNKNOWN_DRIFT
+    is_planar: bool = False
+
+    @classmethod
+    def through(
+        cls,
+        chain: int,
+        world_from_odometry: Quaternion,
+        position: Vector,
+        odometry_position: Vector,
+    ) -> OdometryFrame:
+        """The frame turned so in which a body at ``odometry_position`` is at ``position`` in the world, metres."""
+        turned = quaternion.rotate(world_from_odometry, odometry_position)
+        return cls(chain, world_from_odometry, quaternion.difference(position, turned), odometry_position)
+
+    def place(self, odometry_position: Vector) -> Vector:
+        """A point of the odometry's frame in the world, metres."""
+        x, y, z = quaternion.rotate(self.orientation, odometry_position)
+        return (x + self.origin[0], y + self.origin[1], z + self.origin[2])
+
+
+def first_frame(track: OdometryTrack, world_from_odometry: Quaternion) -> OdometryFrame | None:
+    """Before anything is known, the first odometry is where it says; None where it does not say."""
+    if track.latest is None or track.latest.position is None:
+        return None
+    at = track.latest.position
+    return OdometryFrame.through(track.chain, world_from_odometry, at, at)
+
+
+def next_frame(before: OdometryFrame, track: OdometryTrack, world_from_odometry: Quaternion) -> OdometryFrame | None:
+    """Of the chain that has just begun: it begins where the robot was last, the best guess."""
+    last, first = track.samples.seam(track.chain)
+    if last.position is None or first.position is None:
+        return None
+    return OdometryFrame.through(track.chain, world_from_odometry, before.place(last.position), first.position)
+
+
+def placed_frames(
+    answer: Answer, trajectories: Mapping[str, Trajectory], builder: GraphBuilder
+) -> dict[str, OdometryFrame]:
+    """Of every robot whose present odometry covers a keyframe of the answer and has positions there.
+
+    Args:
+        answer: the last.
+        trajectories: of its keyframes.
+        builder: its graph may have grown since.
+    """
+    is_planar = bool((np.abs(answer.target_from_source[:, :2]) < _PLANAR).all())
+    steps = _step_variances(answer)
+    found = {}
+    for robot, trajectory in trajectories.items():
+        track = builder.tracks.get(robot)
+        if track is None or track.latest is None:
+            continue
+        newest = len(trajectory.node) - 1
+        moment = int(trajectory.stamp_ns[newest]), int(trajectory.time_line[newest])
+        position = tuple(trajectory.position[newest].tolist())
+        odometry_position = track.samples.position_at(*moment)
+        if track.samples.chain_at(*moment) != track.chain or not all(map(math.isfinite, position + odometry_position)):
+            continue
+        try:
+            odometry = track.samples.world_from_body_at(*moment)
+        except RejectedInputError:
+            continue
+        x, y, z, w = trajectory.world_from_body[newest].tolist()
+        world_from_odometry = quaternion.normalize(quaternion.multiply((x, y, z, w), quaternion.inverse(odometry)))
+        frame = OdometryFrame.through(track.chain, world_from_odometry, position, odometry_position)
+        node = int(trajectory.node[newest])
+        deviation = float(answer.uncertainty[node])
+        place = math.nan if answer.position_uncertainty is None else float(answer.position_uncertainty[node])
+        found[robot] = OdometryFrame(
+            frame.chain,
+            frame.orientation,
+            frame.origin,
+            frame.keyframe_position,
+            track.num_keyframes - _keyframes_since(builder, robot, moment),
+            Drift(deviation**2, place**2, *steps),
+            is_planar,
+        )
+    return found
+
+
+def _keyframes_since(builder: GraphBuilder, robot: str, moment: tuple[int, int]) -> int:
+    stamps, lines = builder.graph.moments(robot)
+    stamp_ns, line = moment
+    return int(((lines > line) | ((lines == line) & (stamps > stamp_ns))).sum())
+
+
+def _step_variances(answer: Answer) -> tuple[float, float]:
+    """rad² and m² per component of a step of odometry."""
+    if answer.edge_precision is None:
+        return answer.step_deviation**2, math.nan
+    odometry = answer.kind == EdgeKind.ODOMETRY
+    told = odometry & (answer.edge_precision[:, 1] > 0)
+    if not told.any():
+        return answer.step_deviation**2, math.nan
+    return answer.step_deviation**2, float(np.median(1 / (answer.edge_precision[told, 1] * answer.steps[told])))

@@ -1,0 +1,216 @@
+"""Closures that are believed, sent on to a back end in the very messages in which they came."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import Any, TypeGuard
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rotavg_msgs.msg import OutlierFlags
+from std_msgs.msg import Header
+
+from rotavg_ros.inputs import EdgeConverter, EdgeRecord, EdgeVerdict, WholeGraphConverter
+from rotavg_ros.online import Answer, OnlineEstimator, RejectReason
+from rotavg_ros.online.answer.closure_filter import ClosureFilter
+from rotavg_ros.ros.node.intake.adapters import EdgeTopic
+from rotavg_ros.ros.node.intake.serialized_array import as_message
+from rotavg_ros.ros.node.output.conversions import flags_message
+from rotavg_ros.ros.node.topics import publisher
+from rotavg_ros.settings.parameters import NodeParameters
+from rotavg_ros.view_graph import EdgeKind
+
+
+class Forward:
+    """One edge topic's way on: how its messages are taken apart and put together again.
+
+    Attributes:
+        topic: where edges come from.
+        filter: what waits, and what has passed.
+        shares_names: whether different edges have come with the same id of the same robot.
+    """
+
+    def __init__(self, topic: str, output: Publisher) -> None:
+        self.topic, self._output = topic, output
+        self.filter: ClosureFilter[Any] = ClosureFilter()
+        self.shares_names = False
+
+    def begin(self, message: Any, records: Iterable[EdgeRecord | EdgeVerdict]) -> Iterator[EdgeRecord | EdgeVerdict]:
+        """The records of a message that has come, each with what is to be sent on of it."""
+        for record in records:
+            yield replace(record, element=message) if isinstance(record, EdgeRecord) else record
+
+    def send(self, items: list[Any]) -> None:
+        """Send on what may pass."""
+        for item in items:
+            self._output.publish(item)
+
+    def end(self) -> None:
+        """An answer has been looked at."""
+
+
+class ArrayForward(Forward):
+    """``rotavg_msgs/RelativeRotationArray``: what passes together is sent together."""
+
+    def __init__(self, edges: EdgeTopic, output: Publisher) -> None:
+        super().__init__(edges.topic, output)
+        self._message_type, self._element_type = edges.message_type, edges.element_type
+
+    def begin(self, message: Any, records: Iterable[EdgeRecord | EdgeVerdict]) -> Iterator[EdgeRecord | EdgeVerdict]:
+        for record in records:
+            if isinstance(record, EdgeRecord):
+                yield replace(record, element=(message.header, record.element))
+
+    def send(self, items: list[Any]) -> None:
+        if items:
+            header = as_message(items[-1][0], Header)
+            edges = [as_message(element, self._element_type) for _, element in items]
+            self._output.publish(self._message_type(header=header, edges=edges))
+
+
+class WholeGraphForward(Forward):
+    """A graph that comes whole goes out whole, but for closures that are not believed."""
+
+    def __init__(self, topic: str, output: Publisher, converter: WholeGraphConverter) -> None:
+        super().__init__(topic, output)
+        self._converter = converter
+        self._latest: Any = None
+        self._received = 0
+        self._sent: tuple[int, list[bool]] | None = None
+
+    def begin(self, message: Any, records: Iterable[EdgeRecord | EdgeVerdict]) -> Iterator[EdgeRecord | EdgeVerdict]:
+        yield from super().begin(None, records)
+        self._latest = message
+        self._received += 1
+
+    def send(self, items: list[Any]) -> None:
+        """What passes is a part of the graph."""
+
+    def end(self) -> None:
+        """Send the latest graph, unless it is as it was sent last."""
+        if self._latest is None:
+            return
+        edges = getattr(self._latest, self._converter.edges_field)
+        names = map(self._converter.closure_name, edges)
+        kept = [name is None or self.filter.passes(name) for name in names]
+        if self._sent == (self._received, kept):
+            return
+        self._sent = self._received, kept
+        graph = type(self._latest)()
+        for field in graph.get_fields_and_field_types():
+            setattr(graph, field, getattr(self._latest, field))
+        setattr(graph, self._converter.edges_field, [edge for edge, keep in zip(edges, kept, strict=True) if keep])
+        self._output.publish(graph)
+
+
+class Forwarding:
+    """All edge topics that are sent on, ``~/revoked`` and ``~/reinstated``.
+
+    Edges come on the executor's thread, answers on the solver's worker.
+
+    Raises:
+        UserError: a topic's name or its ``qos_overrides`` cannot be.
+    """
+
+    def __init__(self, node: Node, parameters: NodeParameters, estimator: OnlineEstimator) -> None:
+        self._node, self._estimator = node, estimator
+        self._frame_id = parameters.world_frame
+        self._output_of = parameters.forwarded()
+        self._delay_s = parameters.forward_delay_s
+        self._qos = QoSProfile(depth=parameters.edge_queue_depth, reliability=ReliabilityPolicy.RELIABLE)
+        self._forwards: list[Forward] = []
+        self._lock = threading.Lock()
+        self._generation = estimator.generation
+        self._decided = 0
+        self._verdicts: dict[str, Publisher] = {}
+        if self._output_of:
+            for name in ("revoked", "reinstated"):
+                self._verdicts[name] = publisher(node, OutlierFlags, f"~/{name}", self._qos)
+
+    def set_parameters(self, parameters: NodeParameters) -> None:
+        """Take over what may change while the node runs."""
+        self._delay_s = parameters.forward_delay_s
+
+    @property
+    def waiting(self) -> int:
+        """How many closures are held back."""
+        with self._lock:
+            return sum(len(each.filter) for each in self._forwards)
+
+    def warnings(self) -> list[str]:
+        """What is not as it should be, a line each."""
+        return [
+            f"{each.topic}: different closures have the same id of the same robot, and go on only together "
+            "(forward_topics): give each an id of its own"
+            for each in self._forwards
+            if each.shares_names and not isinstance(each, WholeGraphForward)
+        ]
+
+    def of(self, edges: EdgeTopic) -> Forward | None:
+        """Where the messages of an edge topic go; None if nowhere."""
+        topic = self._output_of.get(edges.topic)
+        if topic is None:
+            return None
+        output = publisher(self._node, edges.message_type, topic, self._qos)
+        forward: Forward
+        if edges.is_array:
+            forward = ArrayForward(edges, output)
+        elif _is_whole(edges.convert):
+            forward = WholeGraphForward(edges.topic, output, edges.convert)
+        else:
+            forward = Forward(edges.topic, output)
+        self._forwards.append(forward)
+        return forward
+
+    def taken(self, forward: Forward, record: EdgeRecord, refusal: RejectReason | None) -> None:
+        """An edge was handed to the estimator: send it on at once if it is odometry, or let it wait."""
+        if isinstance(record.edge, RejectReason) or refusal not in (None, RejectReason.DUPLICATE_EDGE):
+            return
+        with self._lock:
+            self._forget_with_the_estimator()
+            if record.edge.kind == EdgeKind.LOOP_CLOSURE:
+                name = record.edge.source.robot, record.edge.edge_id
+                is_known = forward.filter.knows(name)
+                forward.shares_names |= is_known and refusal is None
+                if not is_known or refusal is None:
+                    forward.filter.take(name, record.element, time.monotonic())
+                return
+        if refusal is None:
+            forward.send([record.element])
+
+    def decide(self, answer: Answer | None) -> None:
+        """Send on what the last answer believes; nothing if it has been looked at and nothing waits."""
+        with self._lock:
+            self._forget_with_the_estimator()
+            if answer is None or not self._forwards or answer.version <= self._estimator.first_version:
+                return
+            for forward in self._forwards:
+                self._decide(forward, answer, answer.version != self._decided)
+            self._decided = answer.version
+
+    def _decide(self, forward: Forward, answer: Answer, is_new: bool) -> None:
+        if is_new or len(forward.filter):
+            self._send(forward, answer)
+        forward.end()
+
+    def _send(self, forward: Forward, answer: Answer) -> None:
+        decision = forward.filter.decide(answer, time.monotonic(), self._delay_s)
+        for name, rows in (("revoked", decision.revoked), ("reinstated", decision.reinstated)):
+            if len(rows):
+                self._verdicts[name].publish(flags_message(answer, self._frame_id, rows))
+        forward.send(decision.passed)
+
+    def _forget_with_the_estimator(self) -> None:
+        if self._generation != self._estimator.generation:
+            self._generation = self._estimator.generation
+            self._decided = 0
+            for forward in self._forwards:
+                forward.filter, forward.shares_names = ClosureFilter(), False
+
+
+def _is_whole(convert: EdgeConverter) -> TypeGuard[WholeGraphConverter]:
+    return hasattr(convert, "edges_field")

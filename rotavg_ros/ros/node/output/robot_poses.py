@@ -1,0 +1,141 @@
+"""Where the robots are now, at odometry's rate: ``corrected_odometry``, and the odometry frames on ``/tf``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Point
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from rotavg_ros.inputs import OdometryRecord
+from rotavg_ros.online import OnlineEstimator, quaternion
+from rotavg_ros.online.answer.gradual import CorrectionRates, GradualFrame
+from rotavg_ros.online.answer.odometry_frame import OdometryFrame
+from rotavg_ros.online.options import NANOSECONDS
+from rotavg_ros.online.quaternion import Vector
+from rotavg_ros.ros.node.output.conversions import to_quaternion_message
+from rotavg_ros.ros.node.output.frame_correction import FrameCorrection
+from rotavg_ros.ros.node.topics import publisher
+from rotavg_ros.settings.parameters import NodeParameters
+
+# rad² or m² of what nobody can tell: a filter that fuses it takes next to nothing from it.
+UNKNOWN_VARIANCE = 1e6
+# The diagonal of a pose's 6 × 6 covariance: position, then orientation, about x, y, z of the world's frame.
+_DIAGONAL = slice(None, None, 7)
+
+
+class RobotPoses:
+    """One pose of each robot for every odometry message with a position, corrected as the last placed answer has it.
+
+    Raises:
+        UserError: a topic's ``qos_overrides`` cannot be, or ``publish_tf`` without tf2_msgs.
+    """
+
+    def __init__(
+        self, node: Node, parameters: NodeParameters, estimator: OnlineEstimator, prefix: Mapping[str, str]
+    ) -> None:
+        """Advertise the topics; ``prefix`` stands before a robot's own."""
+        self._estimator = estimator
+        self._frame_id = parameters.world_frame
+        self._publishers = {
+            robot: publisher(node, Odometry, f"{prefix[robot]}corrected_odometry", QoSProfile(depth=10))
+            for robot in parameters.robots
+        }
+        self._rates, self._gradual = _rates(parameters), dict[str, GradualFrame]()
+        self._generation = estimator.generation
+        tolerance_ns = round(parameters.transform_tolerance_s * NANOSECONDS)
+        self._tf = FrameCorrection(node, self._frame_id, tolerance_ns) if parameters.publish_tf else None
+
+    @property
+    def topics(self) -> list[str]:
+        """Full names of the topics with poses."""
+        return [each.topic_name for each in self._publishers.values()]
+
+    @property
+    def are_wanted(self) -> bool:
+        """Whether anybody takes them."""
+        return self._tf is not None or any(each.get_subscription_count() for each in self._publishers.values())
+
+    def set_parameters(self, parameters: NodeParameters) -> None:
+        """Take over what may change while the node runs."""
+        self._rates = _rates(parameters)
+        for gradual in self._gradual.values():
+            gradual.rates = self._rates
+
+    def warnings(self) -> list[str]:
+        """What is not as it should be, a line each."""
+        return [] if self._tf is None else self._tf.warnings()
+
+    def publish(self, robot: str, topic: str, message: Any, record: OdometryRecord) -> None:
+        """The robot's pose, and its odometry's, at the moment of its newest odometry message.
+
+        Args:
+            robot: whose.
+            topic: that the message came on.
+            message: of odometry.
+            record: what it says.
+        """
+        placed = self._estimator.odometry_frame(robot) if record.position is not None else None
+        is_asked_for = self._publishers[robot].get_subscription_count() > 0
+        if placed is None or record.position is None or not (is_asked_for or self._tf is not None):
+            return
+        exact, steps = placed
+        frame = self._gradual_frame(robot).follow(exact, record.stamp_ns, record.position)
+        if self._tf is not None:
+            self._tf.publish(robot, topic, message.header, frame)
+        if is_asked_for:
+            pose = _odometry_message(message, record, frame)
+            pose.header.frame_id = self._frame_id
+            pose.pose.covariance = covariance(exact, steps, record.position)
+            self._publishers[robot].publish(pose)
+
+    def _gradual_frame(self, robot: str) -> GradualFrame:
+        """A new one once everything was forgotten or replaced: then there is nothing to go on from."""
+        if self._generation != self._estimator.generation:
+            self._generation = self._estimator.generation
+            self._gradual.clear()
+        return self._gradual.setdefault(robot, GradualFrame(self._rates))
+
+
+def _rates(parameters: NodeParameters) -> CorrectionRates:
+    return CorrectionRates(math.radians(parameters.correction_rate_deg_s), parameters.correction_rate_m_s)
+
+
+def _odometry_message(message: Any, record: OdometryRecord, frame: OdometryFrame) -> Odometry:
+    """The message with its pose in the world; its velocity is in the frame that moves, and stays as it is."""
+    odometry = Odometry(child_frame_id=record.child_frame_id)
+    odometry.header.stamp = message.header.stamp
+    assert record.position is not None
+    x, y, z = frame.place(record.position)
+    odometry.pose.pose.position = Point(x=x, y=y, z=z)
+    orientation = quaternion.normalize(quaternion.multiply(frame.orientation, record.world_from_sensor))
+    odometry.pose.pose.orientation = to_quaternion_message(orientation)
+    if isinstance(message, Odometry):
+        odometry.twist = message.twist
+    return odometry
+
+
+def covariance(frame: OdometryFrame, steps: int, odometry_position: Vector) -> NDArray[np.float64]:
+    """``(36,)`` of a pose, row by row; position and orientation are stated without what they have in common.
+
+    Args:
+        frame: where the answer puts the odometry's frame.
+        steps: of odometry since the keyframe that it hangs on.
+        odometry_position: of the body in the odometry's frame, metres.
+
+    A robot that turns about z alone errs in no other rotation, nor in height.
+    """
+    orientation, position = frame.drift.after(steps, math.dist(odometry_position, frame.keyframe_position))
+    spread = np.array([position] * 3 + [orientation] * 3)
+    spread = np.where(np.isfinite(spread), spread, UNKNOWN_VARIANCE)
+    if frame.is_planar:
+        spread[2:5] = 0.0
+    flat = np.zeros(36)
+    flat[_DIAGONAL] = spread
+    return flat
