@@ -143,6 +143,7 @@ def belongings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_run_bag(folder / "my_bag", simulate_slam_graph(RobotRun(laps=2).config(), np.random.default_rng(0)))
     (recording,) = (folder / "my_bag").glob("*.mcap")
     (folder / "half.mcap").write_bytes(recording.read_bytes()[:60_000])
+    (folder / "empty.mcap").touch()
     (folder / "my-robot.yaml").write_text(TINY_TRAINING)
     return folder
 
