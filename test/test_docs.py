@@ -46,6 +46,9 @@ NOT_RUN = {
     "colcon build": "ROS 2 from apt; `make setup` builds the same folders",
     "ros2 topic echo": "ros2cli is not on PyPI",
     "ros2 run rotavg_ros": "ros2cli is not on PyPI; test/ros starts the same node with the same parameters",
+    "ros2 interface show": "ros2cli is not on PyPI",
+    "ros2 launch slam_toolbox": "another package",
+    "ros2 bag record": "ros2cli is not on PyPI",
     "rotavg_node": "runs until it is stopped; test/ros starts it",
     "rotavg play run": "ends only when a subscriber has everything; test/ros/harness/test_play.py",
     "rotavg play b25b": "the same",
@@ -141,6 +144,7 @@ def belongings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_run_bag(folder / "my_bag", simulate_slam_graph(RobotRun(laps=2).config(), np.random.default_rng(0)))
     (recording,) = (folder / "my_bag").glob("*.mcap")
     (folder / "half.mcap").write_bytes(recording.read_bytes()[:60_000])
+    (folder / "empty.mcap").touch()
     (folder / "my-robot.yaml").write_text(TINY_TRAINING)
     return folder
 

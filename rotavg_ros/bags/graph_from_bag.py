@@ -56,24 +56,26 @@ def read_graph_bag(path: str | Path) -> GraphFile:
 
     Where the edges name their ends by id, they are the graph, in the order of the edges' own numbers. Where they name
     them by stamp, every odometry message is a keyframe, consecutive ones are joined by odometry edges, and an end
-    belongs to the nearest odometry message within 0.05 s; edges without such a message are skipped and counted.
+    belongs to the nearest odometry message within 0.05 s; edges without such a message are skipped and counted. Of a
+    damaged bag the graph is that of what can be read.
 
     Raises:
         BagReadError: an unreadable bag, one without edges, or one that needs odometry and has none.
     """
-    with BagReader(path) as bag:
+    with BagReader(path, salvage=True) as bag:
         bag.require(EDGE_TOPIC, RELATIVE_ROTATION)
         content = _read(bag)
         if not content.by_id:
             bag.require(ODOM_TOPIC, ODOMETRY)
             if not any(map(_is_sound, content.odometry)):
                 raise BagReadError(f"{path}: {ODOM_TOPIC} has no messages with a pose, so there are no keyframes")
+        damage = bag.damage
     _check(path, content)
     try:
         graph_file = _from_ids(content) if content.by_id else _from_stamps(content)
     except ViewGraphError as error:
         raise BagReadError(f"{path}: {EDGE_TOPIC}: {error}") from None
-    return _with_truth(graph_file, content)
+    return _with_truth(replace(graph_file, damage=damage), content)
 
 
 def _read(bag: BagReader) -> _Content:

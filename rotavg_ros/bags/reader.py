@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.interfaces import Connection, QosDurability
 from rosbags.rosbag1 import ReaderError as Rosbag1Error
 from rosbags.rosbag2 import ReaderError as Rosbag2Error
 
+from rotavg_ros.bags.lost import Lost
 from rotavg_ros.bags.message_types import typestore
+from rotavg_ros.bags.salvage import salvaging_reader
 from rotavg_ros.errors import UserError
 
-_Record = TypeVar("_Record")
 # Files that are bags by themselves.
 RECORDING_SUFFIXES = (".mcap", ".db3", ".bag")
 
@@ -42,34 +44,23 @@ class BagMessage:
     data: bytes
 
 
-class Sound(Generic[_Record]):
-    """Records of a bag up to where it is damaged.
-
-    Attributes:
-        damage: the message about it, once that place has been reached; None: the bag is whole so far.
-    """
-
-    def __init__(self, records: Iterator[_Record]) -> None:
-        self._records = records
-        self.damage: str | None = None
-
-    def __iter__(self) -> Iterator[_Record]:
-        try:
-            yield from self._records
-        except BagReadError as error:
-            self.damage = str(error)
-
-
 class BagReader:
     """A rosbag2 folder (MCAP or sqlite3, compressed or not), a single recording or a ROS 1 bag, opened by ``with``.
 
+    Args:
+        path: of the bag.
+        salvage: read of a damaged bag what can be read, and tell of the rest in :attr:`damage`.
+
     Raises:
-        BagReadError: no such bag, a truncated or foreign file, an unknown compression.
+        BagReadError: no such bag, a truncated or foreign file, an unknown compression; with ``salvage`` only if nothing
+            can be read.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        self._path = _bag_of(Path(path))
+    def __init__(self, path: str | Path, *, salvage: bool = False) -> None:
+        self._salvages = salvage
+        self._path = _bag_of(Path(path), salvage)
         self._reader: AnyReader | None = None
+        self._lost: Lost | None = None
 
     def __enter__(self) -> BagReader:
         try:
@@ -77,7 +68,11 @@ class BagReader:
             self._reader.open()
         except Exception as error:
             self._reader = None
-            raise self._unreadable(error) from None
+            problem = self._unreadable(error)
+            if not self._salvages or "not supported" in str(error):  # an unknown compression is no damage
+                raise problem from None
+            self._salvage(problem)
+            self._losing().cause = _one_line(error)
         return self
 
     def __exit__(
@@ -91,6 +86,11 @@ class BagReader:
     def path(self) -> Path:
         """The bag's file or folder."""
         return self._path
+
+    @property
+    def damage(self) -> str | None:
+        """What cannot be read, as far as it is known by now, in a line; None: nothing."""
+        return None if self._lost is None else f"{self._path}: the bag is damaged: {self._lost.told(self._open())}"
 
     @property
     def topics(self) -> dict[str, str]:
@@ -162,8 +162,8 @@ class BagReader:
 
         Types of packages that are not installed are decoded by the definitions in the bag.
         """
-        reader = self._open()
         for connection, time_ns, data in self._records(topics, start_ns, stop_ns):
+            reader = self._open()  # another one, once the bag has turned out to be damaged
             if connection.msgtype not in reader.typestore.fielddefs:
                 raise BagReadError(
                     f"{self._path}: {connection.topic} has type {connection.msgtype}, which neither the bag nor rotavg "
@@ -172,6 +172,9 @@ class BagReader:
             try:
                 message = reader.deserialize(data, connection.msgtype)
             except Exception as error:  # whatever garbled bytes make the decoder stumble over
+                if self._salvages:
+                    self._losing().undecodable.add((connection.topic, time_ns))
+                    continue
                 raise BagReadError(
                     f"{self._path}: a message on {connection.topic} cannot be decoded ({_one_line(error)}); "
                     "the bag is damaged"
@@ -181,6 +184,26 @@ class BagReader:
     def _records(
         self, topics: Collection[str] | None, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Records in their order; where a recording turns out to be damaged, those that can be read behind it, too."""
+        passed = _Passed()
+        while True:
+            try:
+                for record in self._sound_records(topics, start_ns, stop_ns):
+                    if passed.is_new(*record):
+                        yield record
+                return
+            except BagReadError as problem:
+                if not self._salvages:
+                    raise
+                if self._lost is not None and self._lost.is_final:
+                    return
+                self._salvage_thoroughly(problem)
+                passed.begin_again()
+
+    def _sound_records(
+        self, topics: Collection[str] | None, start_ns: int | None, stop_ns: int | None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Records up to the first that cannot be read."""
         connections = [c for c in self._all() if topics is None or c.topic in topics]
         if not connections:
             return
@@ -202,6 +225,35 @@ class BagReader:
                 "`ros2 bag convert` may save them"
             )
 
+    def _salvage(self, problem: BagReadError, *, thorough: bool = False) -> None:
+        """Go on with a reader of what is left.
+
+        Raises:
+            BagReadError: the problem, since nothing is left.
+        """
+        try:
+            reader, losses = salvaging_reader(_recordings(self._path), typestore(), thorough=thorough)
+        except Exception:
+            raise problem from None
+        if self._reader is not None:
+            self._reader.close()
+        self._reader = reader
+        self._losing().recordings = losses
+
+    def _salvage_thoroughly(self, problem: BagReadError) -> None:
+        """The same in the middle of a bag: if nothing is left, what was read so far is all."""
+        lost, expected = self._losing(), self.num_messages()
+        lost.is_final, lost.expected = True, expected
+        try:
+            self._salvage(problem, thorough=True)
+        except BagReadError:
+            lost.problem = str(problem)
+
+    def _losing(self) -> Lost:
+        if self._lost is None:
+            self._lost = Lost()
+        return self._lost
+
     def _open(self) -> AnyReader:
         assert self._reader is not None, "use the reader in a with statement"
         return self._reader
@@ -217,17 +269,51 @@ class BagReader:
         return BagReadError(f"{self._path}: not a readable bag, or a truncated one ({what})")
 
 
-def _bag_of(path: Path) -> Path:
+class _Passed:
+    """Which records have been handed out, of an iteration in the order of time that begins again."""
+
+    def __init__(self) -> None:
+        self._newest_ns = -1
+        self._at_newest: Counter[tuple[str, bytes]] = Counter()
+        self._horizon_ns, self._again = -1, Counter[tuple[str, bytes]]()
+
+    def begin_again(self) -> None:
+        """What was new until now comes once more."""
+        self._horizon_ns, self._again = self._newest_ns, Counter(self._at_newest)
+
+    def is_new(self, connection: Connection, time_ns: int, data: bytes) -> bool:
+        """Whether a record has not been handed out; it has now."""
+        key = connection.topic, bytes(data)
+        if time_ns < self._horizon_ns:
+            return False
+        if time_ns == self._horizon_ns and self._again[key] > 0:
+            self._again[key] -= 1
+            return False
+        if time_ns > self._newest_ns:
+            self._newest_ns, self._at_newest = time_ns, Counter()
+        if time_ns == self._newest_ns:
+            self._at_newest[key] += 1
+        return True
+
+
+def _bag_of(path: Path, salvage: bool) -> Path:
     """The bag that a path means: itself, or the rosbag2 folder around a recording."""
     if not path.exists():
         raise BagReadError(f"{path}: no such bag; check the path")
     if path.is_dir():
-        if not (path / "metadata.yaml").exists():
+        if not (path / "metadata.yaml").exists() and not (salvage and _recordings(path)):
             raise BagReadError(f"{path}: is no rosbag2 folder (it has no metadata.yaml); give a bag")
         return path
     if path.suffix not in RECORDING_SUFFIXES:
         raise BagReadError(f"{path}: give a rosbag2 folder, or a file with suffix {', '.join(RECORDING_SUFFIXES)}")
     return path.parent if (path.parent / "metadata.yaml").exists() else path
+
+
+def _recordings(bag: Path) -> list[Path]:
+    """MCAP files of a bag, in the order in which rosbag2 numbers them."""
+    if not bag.is_dir():
+        return [bag] if bag.suffix == ".mcap" else []
+    return sorted(bag.glob("*.mcap"), key=lambda path: (len(path.name), path.name))
 
 
 def _one_line(error: Exception) -> str:

@@ -8,6 +8,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 from rotavg_ros.bags import graph_bag
+from rotavg_ros.cli.main import print_warning
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.files import formats
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
@@ -57,6 +58,8 @@ def run(arguments: argparse.Namespace) -> int:
     left_out = f"; no room for: {', '.join(lost)}" if lost else ""
     skipped = "".join(f"; skipped {count} × {kind}" for kind, count in graph_file.skipped.items())
     print(f"{arguments.input} → {arguments.output}: {counts}{skipped}{left_out}")
+    if graph_file.damage is not None:
+        print_warning(f"{graph_file.damage}; {arguments.output} has the graph of that")
     return 0
 
 

@@ -31,10 +31,12 @@ def run(arguments: argparse.Namespace) -> int:
     values = read_parameter_file(arguments.params) if arguments.params else {}
     values |= read_settings(arguments.p)
     wishes = Wishes(arguments.odometry, arguments.edges, arguments.reference, arguments.robots)
-    with BagReader(arguments.bag) as bag:
+    with BagReader(arguments.bag, salvage=True) as bag:
         plan = make_plan(bag, values, wishes)
         print(_described(plan))
         if arguments.list:
+            if bag.damage is not None:
+                print_warning(bag.damage)
             return 0
         if arguments.output is None:
             raise ReplayUsageError("give a folder for the answer (--output DIR), or --list to see the topics")
@@ -49,10 +51,9 @@ def run(arguments: argparse.Namespace) -> int:
     print(_told(summary, arguments.output))
     for warning in summary["warnings"]:
         print_warning(f"{arguments.bag}: {warning}")
-    if summary["damage"] is None:
-        return 0
-    print_warning(f"{summary['damage']}; what could be read is in {arguments.output}")
-    return 2
+    if summary["damage"] is not None:
+        print_warning(f"{summary['damage']}; what could be made of it is in {arguments.output}")
+    return 0
 
 
 def _check_inputs(bag: Path, plan: Plan, output: Path) -> None:

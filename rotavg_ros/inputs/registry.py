@@ -14,10 +14,13 @@ from rotavg_ros.inputs.pose_graph_tools import PoseGraphConverter
 from rotavg_ros.inputs.records import EdgeConverter, OdometryConverter, Source
 from rotavg_ros.inputs.rotavg import RelativeRotationArrayConverter, RelativeRotationConverter
 from rotavg_ros.inputs.rtabmap import MapGraphConverter
+from rotavg_ros.inputs.slam_toolbox import GraphConverter, NewNodeConverter
 
 _FOREIGN: dict[str, Callable[[Source], EdgeConverter]] = {
     "rtabmap_msgs/msg/MapGraph": MapGraphConverter,
     "pose_graph_tools_msgs/msg/PoseGraph": PoseGraphConverter,
+    "slam_toolbox/msg/PoseGraph": GraphConverter,
+    "slam_toolbox/msg/NewNodeEvent": NewNodeConverter,
     "cslam_common_interfaces/msg/KeyframeOdom": KeyframeOdomConverter,
     "cslam_common_interfaces/msg/IntraRobotLoopClosure": IntraRobotLoopClosureConverter,
     "cslam_common_interfaces/msg/InterRobotLoopClosure": InterRobotLoopClosureConverter,

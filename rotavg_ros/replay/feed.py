@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rotavg_ros.bags.reader import BagReader, Sound
+from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.inputs import (
     EDGE_CONVERTERS,
     ODOMETRY_CONVERTERS,
@@ -139,7 +139,7 @@ def _time_lines(records: list[OdometryRecord], options: EstimatorOptions) -> NDA
 
 
 def _records(bag: BagReader, source: Input, start_ns: int, stop_ns: int) -> Iterator[OdometryRecord]:
-    for _, _, message in Sound(bag.decoded([source.topic], start_ns, stop_ns)):
+    for _, _, message in bag.decoded([source.topic], start_ns, stop_ns):
         try:
             yield ODOMETRY_CONVERTERS[source.type_name](message, IDENTITY)
         except RejectedInputError:

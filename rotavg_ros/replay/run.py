@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rotavg_ros.bags.reader import BagReader, BagReadError, Sound
+from rotavg_ros.bags.reader import BagReader, BagReadError
 from rotavg_ros.errors import UserError
 from rotavg_ros.inputs import OdometryRecord
 from rotavg_ros.online import Answer, OnlineEstimator
@@ -52,7 +52,7 @@ class Outcome:
         start_ns, end_ns: bag time of the replayed part.
         failures: ticks whose solve failed; the last one did not.
         interrupted: before the end.
-        damage: why the bag could not be read to its end; None: it could.
+        damage: what of the bag could not be read; None: nothing.
         wall_seconds: that it took.
     """
 
@@ -91,7 +91,7 @@ def replay(
     """Replay.
 
     Args:
-        bag: open.
+        bag: open; of a damaged one what can be read is replayed, if it salvages.
         plan: what its topics are used as.
         window: which part.
         recording: file for what the node would have published.
@@ -111,7 +111,7 @@ def replay(
         feed = Feed(estimator, plan, loop.on_odometry)
         end_ns, interrupted = start_ns, False
         is_whole = start_ns == bag.start_ns and stop_ns == bag.end_ns
-        records = Sound(bag.decoded(feed.topics, *((None, None) if is_whole else (start_ns, stop_ns))))
+        records = bag.decoded(feed.topics, *((None, None) if is_whole else (start_ns, stop_ns)))
         for topic, time_ns, message in records:
             if window.rate > 0:
                 _wait_until(started + (time_ns - start_ns) / _NANOSECONDS / window.rate, onlooker.stop)
@@ -121,7 +121,7 @@ def replay(
             feed(topic, message)
             onlooker.progress((time_ns - end_ns) / _NANOSECONDS)
             end_ns = time_ns
-        damage = records.damage
+        damage = bag.damage
         answer = loop.finish()
     if answer is None and interrupted:
         raise ReplayError(f"{bag.path}: interrupted before the first keyframe; there is nothing to write")

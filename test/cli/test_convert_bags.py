@@ -55,3 +55,24 @@ def test_a_bag_without_edges(tmp_path: Path, capsys: pytest.CaptureFixture[str],
     path = shared_data / "bags" / "nav2_turtlebot.mcap"
     assert main(["convert", str(path), str(tmp_path / "x.g2o")]) == 2
     assert "no topic /relative_rotations" in capsys.readouterr().err
+
+
+def test_what_can_be_read_of_a_damaged_bag_is_converted(
+    tmp_path: Path, graph_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["convert", str(graph_path), str(tmp_path / "bag")]) == 0
+    whole = (tmp_path / "bag" / "bag.mcap").read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole[: len(whole) // 2])
+    capsys.readouterr()
+    assert main(["convert", str(cut), str(tmp_path / "half.g2o")]) == 0
+    warning = capsys.readouterr().err
+    assert warning.startswith(f"rotavg: warning: {cut}: the bag is damaged: cut.mcap is cut off, after ")
+    assert warning.count("\n") == 1
+    before, after = read_graph(graph_path), read_graph(tmp_path / "half.g2o")
+    number = after.graph.num_edges
+    assert before.graph.num_edges / 4 < number < before.graph.num_edges
+    assert torch.equal(after.graph.source, before.graph.source[:number])
+    cut.write_bytes(whole[:200])
+    assert main(["convert", str(cut), str(tmp_path / "none.g2o")]) == 2
+    assert capsys.readouterr().err.startswith(f"rotavg: error: {cut}: not a readable bag")

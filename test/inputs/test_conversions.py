@@ -97,6 +97,25 @@ def pose_graph(closure: int) -> Fields:
     return Fields(nodes=nodes, edges=edges)
 
 
+def numbered_edge(source: int, target: int) -> Fields:
+    """Of slam_toolbox as it is since Pose2D is deprecated."""
+    relative_pose = pose(between(source, target), way(source, target))
+    covariance = np.diag([9.0, 9.0, 0.04]).ravel()
+    return Fields(source_id=source, target_id=target, relative_pose=relative_pose, covariance=covariance)
+
+
+def numbered_graph() -> Fields:
+    """Stamped when it is published, long after its last node."""
+    nodes = [Fields(node_id=corner) for corner in range(SIDES)]
+    edges = [numbered_edge(3, 0), *(numbered_edge(corner, corner + 1) for corner in range(3))]
+    return Fields(header=Fields(stamp=stamp(50), frame_id="map"), nodes=nodes, edges=edges)
+
+
+def new_node(corner: int) -> Fields:
+    """The first node's event has an edge that nobody has filled in."""
+    return Fields(new_node_id=corner, stamp=stamp(corner), edge=numbered_edge(max(corner - 1, 0), corner))
+
+
 def keyframe_odometry(corner: int) -> Fields:
     here = pose(quaternion(world_from_sensor(corner)), vector(position(corner)))
     odometry = Fields(header=Fields(stamp=stamp(corner)), pose=Fields(pose=here))
@@ -123,6 +142,8 @@ def edges(records) -> list[EdgeMeasurement]:
 SQUARE = {
     "rtabmap_msgs/msg/MapGraph": ([map_graph()], 25.0),
     "pose_graph_tools_msgs/msg/PoseGraph": ([pose_graph(1)], 25.0),
+    "slam_toolbox/msg/PoseGraph": ([numbered_graph()], 25.0),
+    "slam_toolbox/msg/NewNodeEvent": ([new_node(corner) for corner in range(SIDES)], 25.0),
     "cslam_common_interfaces/msg/KeyframeOdom": ([keyframe_odometry(corner) for corner in range(SIDES)], 0.0),
     "cslam_common_interfaces/msg/IntraRobotLoopClosure": ([intra_closure()], 0.0),
     "cslam_common_interfaces/msg/InterRobotLoopClosure": ([inter_closure()], 0.0),
@@ -135,7 +156,7 @@ def test_edges_lead_around_a_square(type_name: str) -> None:
     messages, precision = SQUARE[type_name]
     convert = converter(type_name)
     found = edges(record for message in messages for record in convert(message))
-    assert len(found) == (1 if "Closure" in type_name else 3 if "Keyframe" in type_name else 4)
+    assert len(found) == (1 if "Closure" in type_name else 3 if type_name.endswith(("Odom", "Event")) else 4)
     for edge in found:
         source, target = edge.source.keyframe_id, edge.target.keyframe_id
         expected = world_from_body(target).inv() * world_from_body(source)
@@ -181,14 +202,60 @@ def test_odometry_that_contradicts_itself_is_refused() -> None:
 
 
 def test_stamps_of_keyframes() -> None:
-    """RTAB-Map's message is of its newest node's time; Kimera's nodes have stamps; Swarm-SLAM's closures none."""
+    """RTAB-Map's message is of its newest node's time, slam_toolbox's is not; Swarm-SLAM's closures have none."""
     times = {corner: to_nanoseconds(stamp(corner)) for corner in range(SIDES)}
     for type_name, (messages, _) in SQUARE.items():
         convert = converter(type_name)
         for edge in edges(record for message in messages for record in convert(message)):
             for end in (edge.source, edge.target):
-                known = type_name.endswith(("PoseGraph", "Odom")) or ("MapGraph" in type_name and end.keyframe_id == 3)
+                known = type_name.endswith(("tools_msgs/msg/PoseGraph", "Odom", "Event"))
+                known |= "MapGraph" in type_name and end.keyframe_id == 3
                 assert end.stamp_ns == (times[end.keyframe_id] if known else None)
+
+
+def planar_edge(source: int, target: int) -> Fields:
+    """Of slam_toolbox as it was: around a square of one metre, with quarter turns to the left."""
+    relative_pose = Fields(x=1.0, y=0.0, theta=np.pi / 2)
+    return Fields(source_id=source, target_id=target, relative_pose=relative_pose, covariance=np.zeros(9))
+
+
+def test_poses_in_the_plane_lead_around_a_square() -> None:
+    graph = Fields(edges=[planar_edge(3, 0), *(planar_edge(corner, corner + 1) for corner in range(3))])
+    found = edges(EDGE_CONVERTERS["slam_toolbox/msg/PoseGraph"](Source("b"))(graph))
+    heading = [Rotation.from_euler("z", 90 * corner, degrees=True) for corner in range(SIDES)]
+    assert [(edge.source.keyframe_id, edge.target.keyframe_id, edge.kind) for edge in found] == [
+        (0, 1, 0),
+        (1, 2, 0),
+        (2, 3, 0),
+        (3, 0, 1),
+    ]
+    for edge in found:
+        expected = heading[edge.target.keyframe_id].inv() * heading[edge.source.keyframe_id]
+        assert (Rotation.from_quat(edge.target_from_source).inv() * expected).magnitude() < 1e-12
+        assert edge.translation == (1.0, 0.0, 0.0) and edge.precision == 0.0
+
+
+@pytest.mark.parametrize(
+    ("variance", "precision"), [(0.04, 25.0), (0.0, 0.0), (-1.0, 0.0), (float("nan"), 0.0), (float("inf"), 0.0)]
+)
+def test_the_precision_of_a_yaw(variance: float, precision: float) -> None:
+    edge = planar_edge(0, 1)
+    edge.covariance[8] = variance
+    (found,) = edges(EDGE_CONVERTERS["slam_toolbox/msg/PoseGraph"](Source("b"))(Fields(edges=[edge])))
+    assert found.precision == pytest.approx(precision)
+
+
+@pytest.mark.parametrize("graph_first", [True, False])
+def test_a_graph_and_its_events_count_once_and_the_events_stamps_are_kept(graph_first: bool) -> None:
+    estimator = OnlineEstimator(EstimatorOptions(keyframe_source="edges"), lambda *_, **__: None)
+    graph = edges(converter("slam_toolbox/msg/PoseGraph")(numbered_graph()))
+    convert = converter("slam_toolbox/msg/NewNodeEvent")
+    events = [edge for corner in range(SIDES) for edge in edges(convert(new_node(corner)))]
+    refused = [estimator.add_edge(edge) for edge in (graph + events if graph_first else events + graph)]
+    assert refused.count(RejectReason.DUPLICATE_EDGE) == 3 and refused.count(None) == 4
+    snapshot = estimator.snapshot()
+    assert len(snapshot.graph.source) == 4
+    assert snapshot.stamp_ns.tolist() == [to_nanoseconds(stamp(corner)) for corner in range(SIDES)]
 
 
 def test_a_senders_verdict_on_a_closure() -> None:
@@ -318,6 +385,13 @@ POSE_GRAPH_EDGES = st.builds(
     pose=POSES,
     covariance=MATRICES,
 )
+NUMBERED_EDGES = st.builds(
+    Fields,
+    source_id=INT32,
+    target_id=INT32,
+    relative_pose=st.one_of(POSES, st.builds(Fields, x=NUMBERS, y=NUMBERS, theta=NUMBERS)),
+    covariance=NUMBERS.map(lambda variance: np.full(9, variance)),
+)
 ODOMETRIES = st.builds(Fields, header=HEADERS, pose=st.builds(Fields, pose=POSES))
 REFERENCES = st.builds(Fields, by=st.integers(0, 3), robot=st.sampled_from(["", "b"]), id=UINT64, stamp=STAMPS)
 RELATIVE_ROTATIONS = st.builds(
@@ -346,6 +420,8 @@ MESSAGES = {
         nodes=st.lists(st.builds(Fields, header=HEADERS, robot_id=INT32, key=UINT64), max_size=5),
         edges=st.lists(POSE_GRAPH_EDGES, max_size=8),
     ),
+    "slam_toolbox/msg/PoseGraph": st.builds(Fields, header=HEADERS, edges=st.lists(NUMBERED_EDGES, max_size=8)),
+    "slam_toolbox/msg/NewNodeEvent": st.builds(Fields, new_node_id=INT32, stamp=STAMPS, edge=NUMBERED_EDGES),
     "cslam_common_interfaces/msg/KeyframeOdom": st.builds(Fields, id=UINT32, odom=ODOMETRIES),
     "cslam_common_interfaces/msg/IntraRobotLoopClosure": st.builds(
         Fields, keyframe0_id=UINT32, keyframe1_id=UINT32, success=st.booleans(), transform=TRANSFORMS

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from rosbags.rosbag1 import Writer as Rosbag1Writer
@@ -64,11 +64,14 @@ def ros1_typestore() -> Typestore:
     return store
 
 
-def foreign_typestore(package: str) -> Typestore:
-    """ROS 2's messages and those of a package that is not installed."""
+def foreign_typestore(package: str, replacements: Mapping[str, str] | None = None) -> Typestore:
+    """ROS 2's messages and those of a package that is not installed, another version of it after replacements."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for path in sorted((INTERFACES / package / "msg").glob("*.msg")):
-        store.register(get_types_from_msg(path.read_text(encoding="utf-8"), f"{package}/msg/{path.stem}"))
+        text = path.read_text(encoding="utf-8")
+        for old, new in (replacements or {}).items():
+            text = text.replace(old, new)
+        store.register(get_types_from_msg(text, f"{package}/msg/{path.stem}"))
     return store
 
 

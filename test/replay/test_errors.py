@@ -93,7 +93,6 @@ def unknown_compression(folder: Path, small: Path) -> Path:
 @pytest.mark.parametrize(
     ("broken", "says"),
     [
-        (truncated, "not a readable bag, or a truncated one"),
         (zero_length, "not a readable bag, or a truncated one"),
         (without_messages, "has no messages"),
         (without_odometry, "its topics: /wind (geometry_msgs/msg/Vector3Stamped)"),
@@ -112,16 +111,21 @@ def test_a_bag_that_cannot_be_replayed(
     assert not (tmp_path / "out").exists()
 
 
-def test_what_comes_before_the_damage_is_written(
-    tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("broken", "says"), [(truncated, "cut.mcap is cut off, after 2."), (corrupted, "bad.mcap: 1 chunk is corrupt")]
+)
+def test_what_can_be_read_of_a_damaged_bag_is_replayed(
+    tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str], broken: Callable[[Path, Path], Path], says: str
 ) -> None:
-    bag = corrupted(tmp_path, small)
-    assert main(["replay", str(bag), "--output", str(tmp_path / "out"), "--no-report"]) == 2
+    bag = broken(tmp_path, small)
+    assert main(["replay", str(bag), "--output", str(tmp_path / "out"), "--no-report"]) == 0
     error = capsys.readouterr().err
-    assert error.startswith(f"rotavg: warning: {bag}: ") and error.count("\n") == 1
+    assert error.startswith(f"rotavg: warning: {bag}: the bag is damaged: {says}") and error.count("\n") == 1
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["damage"] in error and summary["interrupted"] and summary["keyframes"] > 0
     assert (tmp_path / "out" / "trajectory.tum").exists()
+    assert main(["replay", str(bag), "--list"]) == 0
+    assert capsys.readouterr().err.startswith(f"rotavg: warning: {bag}: the bag is damaged: ") or broken is corrupted
 
 
 def test_nothing_it_was_given_is_overwritten(tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -52,6 +52,56 @@ def test_a_package_that_is_not_installed_is_decoded_by_the_bags_definitions(tmp_
     np.testing.assert_allclose(corners[:, 1:4], [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], atol=1e-5)
 
 
+@pytest.mark.parametrize("version", [{}, {"geometry_msgs/Pose relative_pose": "geometry_msgs/Pose2D relative_pose"}])
+def test_slam_toolbox_in_both_versions_of_its_edges(tmp_path: Path, version: dict[str, str]) -> None:
+    """Nodes one after the other, and the whole graph when its loop closes: what comes twice counts once."""
+    store = foreign_typestore("slam_toolbox", version)
+    graph, events = numbered_square_in_the_words_of(store)
+    with Writer(tmp_path / "slam", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        kinds = {kind: f"slam_toolbox/msg/{kind}" for kind in ("NewNodeEvent", "PoseGraph")}
+        connections = {
+            kind: writer.add_connection(f"/slam_toolbox/{kind}", name, typestore=store) for kind, name in kinds.items()
+        }
+        for second, event in enumerate(events):
+            writer.write(
+                connections["NewNodeEvent"], (100 + second) * 10**9, store.serialize_cdr(event, kinds["NewNodeEvent"])
+            )
+        writer.write(connections["PoseGraph"], 110 * 10**9, store.serialize_cdr(graph, kinds["PoseGraph"]))
+    assert main(["replay", str(tmp_path / "slam"), "--output", str(tmp_path / "out"), "--no-report"]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["keyframes"], summary["edges"], summary["loop_closures"]) == (4, 4, 1)
+    assert (summary["outliers"], summary["rejected"]) == (0, {"duplicate_edge": 3})
+    corners = np.loadtxt(tmp_path / "out" / "trajectory.tum")
+    np.testing.assert_allclose(corners[:, 0], [100, 101, 102, 103])
+    np.testing.assert_allclose(corners[:, 1:4], [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], atol=1e-5)
+    heading = Rotation.from_quat(corners[:, 4:]).as_euler("ZYX", degrees=True)[:, 0] % 360
+    np.testing.assert_allclose(heading, [0, 90, 180, 270], atol=1e-3)
+
+
+def numbered_square_in_the_words_of(store):
+    """A ``slam_toolbox/PoseGraph`` and the ``NewNodeEvent`` of each of its nodes."""
+    types = store.types
+    time, point = types["builtin_interfaces/msg/Time"], types["geometry_msgs/msg/Point"]
+    x, y, z, w = Rotation.from_euler("z", 90, degrees=True).as_quat()
+    spatial = types["geometry_msgs/msg/Pose"](point(1.0, 0.0, 0.0), types["geometry_msgs/msg/Quaternion"](x, y, z, w))
+    step = spatial
+    if "Pose2D" in str(store.fielddefs["slam_toolbox/msg/GraphEdge"]):
+        step = types["geometry_msgs/msg/Pose2D"](x=1.0, y=0.0, theta=np.pi / 2)
+
+    def edge(source: int, target: int):
+        return types["slam_toolbox/msg/GraphEdge"](source, target, step, np.eye(3).ravel() * 1e-4)
+
+    events = [
+        types["slam_toolbox/msg/NewNodeEvent"](
+            corner, time(sec=100 + corner, nanosec=0), spatial, edge(max(corner - 1, 0), corner)
+        )
+        for corner in range(4)
+    ]
+    nodes = [types["slam_toolbox/msg/GraphNode"](corner, spatial) for corner in range(4)]
+    header = types["std_msgs/msg/Header"](time(sec=110, nanosec=0), "map")
+    return types["slam_toolbox/msg/PoseGraph"](header, nodes, [edge(3, 0), *(edge(k, k + 1) for k in range(3))]), events
+
+
 def square_in_the_words_of(store):
     """A ``pose_graph_tools_msgs/PoseGraph``."""
     types = store.types

@@ -55,6 +55,7 @@ class GraphFile:
         stamps_ns: ``(N,)`` int64 nanoseconds.
         position_gt: ``(N, 3)`` ground truth in the world frame, metres; NaN rows where unknown.
         skipped: number of lines that were left out on reading, by kind.
+        damage: what of a damaged recording could not be read; None: it was whole.
     """
 
     graph: ViewGraph
@@ -66,6 +67,7 @@ class GraphFile:
     position_gt: np.ndarray | None = None
     skipped: dict[str, int] = field(default_factory=dict)
     edge_information: np.ndarray | None = None
+    damage: str | None = None
 
     def __post_init__(self) -> None:
         """The graph has the translations, too: a solver sees nothing else."""

@@ -35,6 +35,7 @@ class EdgePlacement:
             undecided = self._undecided_end(edge)
             is_known = undecided is None and self._fingerprint(edge) in growth.fingerprints
             if is_known or edge in growth.pending:
+                self._complete_stamps(edge)
                 raise RejectedInputError(RejectReason.DUPLICATE_EDGE)
             if not growth.has_room_for_edge():
                 raise RejectedInputError(RejectReason.GRAPH_FULL)
@@ -105,6 +106,16 @@ class EdgePlacement:
             for end in (edge.source, edge.target)
         )
         return edge.fingerprint((source, target))
+
+    def _complete_stamps(self, edge: EdgeMeasurement) -> None:
+        """A repeated edge may say when a keyframe was taken where the first did not."""
+        graph = self._growth.graph
+        for end in (edge.source, edge.target):
+            if end.keyframe_id is None or end.stamp_ns is None:
+                continue
+            if graph.node(end.robot, end.keyframe_id) is not None:
+                time_line = self._growth.time_line_of(end.robot, end.stamp_ns)
+                graph.add_keyframe(end.robot, end.keyframe_id, end.stamp_ns, time_line)
 
     def _create_keyframes(self, edge: EdgeMeasurement) -> None:
         """Make the keyframes that the edge names, where edges may do so."""

@@ -77,6 +77,7 @@ class GrowingViewGraph:
             stamps[node] = stamp_ns
             self._keyframe["time_line"].view[node] = time_line
             index.add_moment(time_line, stamp_ns, node)
+            self.revision += 1
         return node
 
     def add_edge(self, edge: GraphEdge) -> None:

@@ -1,4 +1,4 @@
-"""A program that speaks others' messages: a square, seen by RTAB-Map, Kimera and two robots of Swarm-SLAM.
+"""A program that speaks others' messages: a square, seen by RTAB-Map, Kimera, slam_toolbox and two of Swarm-SLAM.
 
 A process of its own, because only it and the node it talks to see those messages. With the argument `rejected`
 Kimera's back end has rejected its closure.
@@ -17,6 +17,8 @@ from pose_graph_tools_msgs.msg import PoseGraph, PoseGraphEdge, PoseGraphNode
 from rclpy.qos import QoSProfile
 from rtabmap_msgs.msg import Link, MapGraph
 from scipy.spatial.transform import Rotation
+from slam_toolbox.msg import GraphEdge, GraphNode, NewNodeEvent
+from slam_toolbox.msg import PoseGraph as NumberedGraph
 
 SIDES = 4
 BODY_FROM_SENSOR = Rotation.from_euler("zyx", [-90, 0, -90], degrees=True)  # a camera that looks ahead
@@ -76,6 +78,26 @@ def pose_graph(closure: int) -> PoseGraph:
     return PoseGraph(nodes=nodes, edges=[edge(3, 0, closure), *steps])
 
 
+def numbered_edge(source: int, target: int) -> GraphEdge:
+    pose = Pose(orientation=between(world_from_body(source), world_from_body(target)))
+    covariance = np.diag([1e-2, 1e-2, 1e-4]).ravel().tolist()
+    return GraphEdge(source_id=source, target_id=target, relative_pose=pose, covariance=covariance)
+
+
+def numbered_graph() -> NumberedGraph:
+    """Published long after its last node."""
+    graph = NumberedGraph(nodes=[GraphNode(node_id=corner) for corner in range(SIDES)])
+    graph.header.stamp, graph.header.frame_id = stamp(50), "map"
+    graph.edges = [numbered_edge(3, 0), *(numbered_edge(corner, corner + 1) for corner in range(SIDES - 1))]
+    return graph
+
+
+def new_node(corner: int) -> NewNodeEvent:
+    """The first node has no edge, so its event's is as it was made."""
+    edge = numbered_edge(corner - 1, corner) if corner else GraphEdge()
+    return NewNodeEvent(new_node_id=corner, stamp=stamp(corner), edge=edge)
+
+
 def keyframe(corner: int, turned_deg: float) -> KeyframeOdom:
     message = KeyframeOdom(id=corner)
     message.odom.header.stamp = stamp(corner)
@@ -104,6 +126,8 @@ def main() -> None:
     topics = {
         "map_graph": (MapGraph, [map_graph()]),
         "pose_graph": (PoseGraph, [pose_graph(3 if rejected else 1)]),
+        "slam/pose_graph": (NumberedGraph, [numbered_graph()]),
+        "slam/new_node_event": (NewNodeEvent, [new_node(corner) for corner in range(SIDES)]),
         # Each robot's odometry begins with an orientation of its own.
         "r2/keyframe_odom": (KeyframeOdom, [keyframe(corner, 0) for corner in range(SIDES)]),
         "r3/keyframe_odom": (KeyframeOdom, [keyframe(corner, 71) for corner in range(SIDES)]),
