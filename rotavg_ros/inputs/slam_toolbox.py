@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from rotavg_ros.inputs.fields import to_nanoseconds
+from rotavg_ros.inputs.fields import edge_id_of, to_nanoseconds
 from rotavg_ros.inputs.foreign_graph import ForeignGraph
 from rotavg_ros.inputs.records import EdgeRecord
 from rotavg_ros.online.measurements import RejectedInputError
@@ -53,6 +53,13 @@ class _NumberedGraph(ForeignGraph):
 
 class GraphConverter(_NumberedGraph):
     """``PoseGraph``: odometry first, for it makes the keyframes that closures refer to."""
+
+    edges_field = "edges"
+
+    def closure_name(self, edge: Any) -> tuple[str, int] | None:
+        if _is_consecutive(edge):
+            return None
+        return self._source.robot, edge_id_of(int(edge.source_id), int(edge.target_id), EdgeKind.LOOP_CLOSURE)
 
     def __call__(self, message: Any) -> Iterator[EdgeRecord]:
         for edge in sorted(message.edges, key=lambda edge: not _is_consecutive(edge)):

@@ -171,6 +171,14 @@ def test_edges_lead_around_a_square(type_name: str) -> None:
     assert len({edge.edge_id for edge in found}) == len(found)
 
 
+@pytest.mark.parametrize("type_name", [name for name in SQUARE if name.endswith("Graph")])
+def test_the_closures_of_a_whole_graph_have_the_names_of_their_records(type_name: str) -> None:
+    convert, ((message,), _) = converter(type_name), SQUARE[type_name]
+    closures = [(edge.source.robot, edge.edge_id) for edge in edges(convert(message)) if edge.kind]
+    names = [convert.closure_name(edge) for edge in getattr(message, convert.edges_field)]
+    assert len(closures) == 1 and [name for name in names if name is not None] == closures
+
+
 def test_graphs_that_are_sent_again_say_nothing_new() -> None:
     convert = converter("rtabmap_msgs/msg/MapGraph")
     assert len(list(convert(map_graph()))) == 4
