@@ -85,6 +85,11 @@ class NodeParameters:
     solve_period_s: float = option(
         0.5, "how often to look for something new to solve", within=(0.01, 3600.0), live=True
     )
+    solver_process: bool = option(
+        True,
+        "solve in a process of its own, which costs memory and keeps odometry from waiting while a solve runs; false: "
+        "on a thread of the node",
+    )
     solver_threads: int = option(0, "threads of a solve; 0: all cores but one", within=(0, 1024))
 
     state_file: str = option("", "file for ~/save and ~/load, read at start if it exists; empty: none")

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rotavg_ros.solver.algebra.abandonment import Abandoned, abandonable
+    from rotavg_ros.solver.algebra.abandonment import Abandoned, abandonable, stop_if_abandoned
     from rotavg_ros.solver.batch import solve_batch
     from rotavg_ros.solver.methods import DEVICES, METHODS, PROFILES, TRANSLATION_SCALES
     from rotavg_ros.solver.pipeline import solve
@@ -24,6 +24,7 @@ __all__ = [
     "abandonable",
     "solve",
     "solve_batch",
+    "stop_if_abandoned",
 ]
 
 
@@ -32,7 +33,7 @@ def __getattr__(name: str) -> Any:
         from rotavg_ros.solver import methods
 
         return getattr(methods, name)
-    if name in {"Abandoned", "abandonable"}:
+    if name in {"Abandoned", "abandonable", "stop_if_abandoned"}:
         from rotavg_ros.solver.algebra import abandonment
 
         return getattr(abandonment, name)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import torch
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
@@ -23,8 +22,8 @@ from rotavg_ros.ros.node.intake.subscriptions import Subscriptions
 from rotavg_ros.ros.node.intake.wiring import Wiring
 from rotavg_ros.ros.node.output.outputs import Outputs
 from rotavg_ros.ros.node.services import Services
+from rotavg_ros.ros.node.solver import Solver
 from rotavg_ros.ros.node.solving import Solving
-from rotavg_ros.ros.node.warm_up import warm_up
 from rotavg_ros.ros.node.worker import Worker, Workers
 from rotavg_ros.settings.parameters import NODE_NAME, NodeParameters
 from rotavg_ros.version import __version__
@@ -47,9 +46,9 @@ class RotavgNode(parameter_server.ParameterNode):
         except Exception as error:  # rclpy has a type of its own for each of its own parameters
             raise UserError(" ".join(str(error).split())) from error
         self._settings = parameters = parameter_server.declare(self)
-        torch.set_num_threads(parameters.solver_threads or max(1, torch.get_num_threads() - 1))
-        device = warm_up(parameters.estimator)
-        self._estimator = OnlineEstimator(parameters.estimator, on_discard=self._on_discard)
+        self._solver = Solver(parameters)
+        device = self._solver.warm_up(parameters.estimator)
+        self._estimator = OnlineEstimator(parameters.estimator, self._solver.solve, self._on_discard)
         self._health = Health()
         self._reporter = Reporter(f"{self.get_fully_qualified_name().lstrip('/')}: estimator")
         self._worker = Worker(executor, "rotavg_worker")
@@ -89,7 +88,9 @@ class RotavgNode(parameter_server.ParameterNode):
         is_saved = self._saver.stop(timeout_s, finish=True)
         if is_saved:
             self._solving.let_go()
-        return self._worker.stop(_SHORT_SOLVE_S) and is_saved
+        is_done = self._worker.stop(_SHORT_SOLVE_S)
+        self._solver.close()
+        return is_done and is_saved
 
     def _create_timer(self, period_s: float, callback: Callable[[], object]) -> Timer:
         return self.create_timer(period_s, callback, clock=self._steady)
@@ -102,7 +103,7 @@ class RotavgNode(parameter_server.ParameterNode):
         """
         old, options = self._settings, parameters.estimator
         if (options.method, options.profile) != (self._estimator.options.method, self._estimator.options.profile):
-            warm_up(options)
+            self._solver.warm_up(options)
         if options != self._estimator.options:
             self._estimator.set_options(options)
         self._settings = parameters

@@ -62,7 +62,8 @@ class NotingNode:
         self.order.write_text("work")
 
     def start(self, *parameters: str) -> None:
-        self.live.start(*parameters, command=[sys.executable, "-c", NOTING, self._notes, self.order])
+        command = [sys.executable, "-c", NOTING, self._notes, self.order]
+        self.live.start(*parameters, "solver_process:=false", command=command)  # it notes what this process solves
 
     def notes(self) -> list[str]:
         return self._notes.read_text().split()

@@ -1,0 +1,128 @@
+"""The side that asks: :func:`rotavg_ros.solve` in another process."""
+
+from __future__ import annotations
+
+import pickle
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any
+
+from torch import Tensor
+
+from rotavg_ros.errors import UserError
+from rotavg_ros.online.solver_process.wire import ABANDON, Request, from_arrays, to_arrays
+from rotavg_ros.solver import Abandoned, Solution, stop_if_abandoned
+from rotavg_ros.view_graph import ViewGraph
+
+# So often a solve that is waited for is asked whether anybody still wants it.
+_PATIENCE_S = 0.02
+_EXIT_TIMEOUT_S = 5.0
+
+
+@dataclass(frozen=True)
+class _Remembered:
+    """Stands for what the other process remembers of its last solve."""
+
+    number: int
+
+
+class SolverProcess:
+    """Callable as :func:`rotavg_ros.solve`; one solve at a time.
+
+    Python runs one thread at a time, so that a solve of small steps in the same process delays each odometry message by
+    milliseconds, and by a hundred on a busy machine. Here only arrays come and go. What a solve remembers for the next
+    one stays in the other process. If that process dies, the solve fails, and the next one starts another.
+    """
+
+    def __init__(self, threads: int) -> None:
+        """Start the process, which takes a second or two to be ready; the first solve waits for it.
+
+        Args:
+            threads: of torch.
+        """
+        self._threads = threads
+        self._lock = threading.Lock()
+        self._solves = 0
+        self._start()
+
+    def _start(self) -> None:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            command = [sys.executable, "-m", "rotavg_ros.online.solver_process.server"]
+            self._process = subprocess.Popen(
+                [*command, str(theirs.fileno()), str(self._threads)],
+                stdin=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,  # Ctrl-C is for the node, which ends this process itself
+            )
+        self._connection = Connection(ours.detach())
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def __call__(
+        self,
+        graph: ViewGraph,
+        *,
+        warm_start: Tensor | None = None,
+        memory: object | None = None,
+        **options: Any,
+    ) -> Solution:
+        """See :func:`rotavg_ros.solve`.
+
+        Raises:
+            UserError: as there, or the process has died.
+            Abandoned: nobody waits for the solution any more.
+        """
+        with self._lock:
+            if self._process.poll() is not None:
+                self._close()
+                self._start()
+            self._solves += 1
+            remembered = memory.number if isinstance(memory, _Remembered) else None
+            request = Request(self._solves, to_arrays(graph), None, remembered, options)
+            if warm_start is not None:
+                request.warm_start = warm_start.numpy()
+            try:
+                return self._answer(request)
+            except (EOFError, OSError) as error:
+                with suppress(subprocess.TimeoutExpired):
+                    self._process.wait(_EXIT_TIMEOUT_S)
+                how = self._process.returncode
+                raise UserError(
+                    f"the solver's process has died (exit code {how}; -9 is what a lack of memory looks like); it is "
+                    "started again"
+                ) from error
+
+    def _answer(self, request: Request) -> Solution:
+        self._connection.send_bytes(pickle.dumps(request, protocol=5))
+        while not self._connection.poll(_PATIENCE_S):
+            try:
+                stop_if_abandoned()
+            except Abandoned:
+                self._connection.send_bytes(ABANDON)
+                self._connection.recv_bytes()  # it may have been ready just now; nobody wants it
+                raise
+        outcome = pickle.loads(self._connection.recv_bytes())  # noqa: S301 - of our own process
+        if isinstance(outcome, BaseException):
+            raise outcome
+        solution: dict[str, Any] = from_arrays(outcome)
+        if solution.pop("remembers"):
+            solution["memory"] = _Remembered(request.number)
+        return Solution(**solution)
+
+    def close(self) -> None:
+        """End the process, in the middle of a solve as well."""
+        self._close()
+        self._process.kill()
+        self._process.wait()
+
+    def _close(self) -> None:
+        with suppress(OSError):
+            self._connection.close()

@@ -1,0 +1,80 @@
+"""The side that solves: ``python -m rotavg_ros.online.solver_process.server SOCKET THREADS``."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import queue
+import sys
+import threading
+from multiprocessing.connection import Connection
+
+import torch
+
+from rotavg_ros.errors import UserError
+from rotavg_ros.online import free_memory
+from rotavg_ros.online.solver_process.wire import ABANDON, Request, from_arrays, to_arrays
+from rotavg_ros.solver import Abandoned, abandonable, solve
+from rotavg_ros.view_graph import ViewGraph
+
+# Whole solves of so many edges take memory that is worth the milliseconds of giving it back.
+_MANY_EDGES = 1000
+
+
+class _Server:
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._is_abandoned = False
+        self._memory: tuple[int, object | None] = (0, None)
+
+    def run(self) -> None:
+        """Solve until the other side has gone."""
+        threading.Thread(target=self._listen, name="listener", daemon=True).start()
+        while True:
+            request: Request = pickle.loads(self._requests.get())  # noqa: S301 - of the process that started this one
+            try:
+                answer: object = self._solve(request)
+            except (UserError, Abandoned) as error:
+                answer = error
+            except Exception as error:
+                answer = RuntimeError(f"{type(error).__name__}: {error}")
+            self._connection.send_bytes(pickle.dumps(answer, protocol=5))
+
+    def _listen(self) -> None:
+        try:
+            while True:
+                message = self._connection.recv_bytes()
+                if message == ABANDON:
+                    self._is_abandoned = True
+                else:
+                    self._is_abandoned = False
+                    self._requests.put(message)
+        except (EOFError, OSError):
+            os._exit(0)  # in the middle of a solve, perhaps, that nobody waits for
+
+    def _solve(self, request: Request) -> dict[str, object]:
+        number, memory = self._memory
+        with abandonable(lambda: self._is_abandoned):
+            solution = solve(
+                ViewGraph(**from_arrays(request.graph)),
+                warm_start=None if request.warm_start is None else torch.from_numpy(request.warm_start),
+                memory=memory if number == request.remembered else None,
+                **request.options,
+            )
+        self._memory = request.number, solution.memory
+        if len(solution.outlier_score) >= _MANY_EDGES and set(solution.stage_seconds) != {"update"}:
+            free_memory.give_back()
+        values = to_arrays(solution)
+        return values | {"memory": None, "remembers": values["memory"] is not None}
+
+
+def main() -> None:
+    """Serve the process that has started this one."""
+    descriptor, threads = (int(word) for word in sys.argv[1:])
+    torch.set_num_threads(threads)
+    _Server(Connection(descriptor)).run()
+
+
+if __name__ == "__main__":
+    main()

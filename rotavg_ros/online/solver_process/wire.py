@@ -1,0 +1,43 @@
+"""What goes between the two processes: plain arrays, pickled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+# In the place of a request: the running solve is not wanted any more.
+ABANDON = b""
+
+
+@dataclass
+class Request:
+    """A solve that is asked for.
+
+    Attributes:
+        number: counts them.
+        graph: a :class:`ViewGraph`'s fields.
+        warm_start: ``(N, 4)``.
+        remembered: number of the solve whose memory may be gone on from.
+        options: of :func:`rotavg_ros.solve`.
+    """
+
+    number: int
+    graph: dict[str, Any]
+    warm_start: np.ndarray | None
+    remembered: int | None
+    options: dict[str, Any]
+
+
+def to_arrays(content: Any) -> dict[str, Any]:
+    """A dataclass's fields, with arrays for tensors."""
+    values = {each.name: getattr(content, each.name) for each in fields(content)}
+    return {name: value.cpu().numpy() if isinstance(value, Tensor) else value for name, value in values.items()}
+
+
+def from_arrays(values: dict[str, Any]) -> dict[str, Any]:
+    """The same with tensors for arrays."""
+    return {name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value for name, value in values.items()}

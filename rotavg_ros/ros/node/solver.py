@@ -1,0 +1,54 @@
+"""The solver that a node asks: in a process of its own, or in the node's."""
+
+from __future__ import annotations
+
+import torch
+
+from rotavg_ros.online import EstimatorOptions
+from rotavg_ros.online.estimator import Solver as Solve
+from rotavg_ros.online.solver_process.client import SolverProcess
+from rotavg_ros.settings.parameters import NodeParameters
+from rotavg_ros.view_graph import EdgeKind, ViewGraph
+
+
+class Solver:
+    """What a node's estimator solves with.
+
+    Attributes:
+        solve: as :func:`rotavg_ros.solve`.
+    """
+
+    def __init__(self, parameters: NodeParameters) -> None:
+        threads = parameters.solver_threads or max(1, torch.get_num_threads() - 1)
+        self._process = SolverProcess(threads) if parameters.solver_process else None
+        self.solve: Solve
+        if self._process is not None:
+            self.solve = self._process
+            torch.set_num_threads(1)  # what is left to do here is small
+        else:
+            from rotavg_ros.solver import solve  # loads the networks
+
+            self.solve = solve
+            torch.set_num_threads(threads)
+
+    def warm_up(self, options: EstimatorOptions) -> str:
+        """Solve a triangle, which costs nothing: it loads the networks; returns the device.
+
+        Raises:
+            UserError: options that the solver does not know.
+        """
+        triangle = ViewGraph.create(
+            [0, 1, 0], [1, 2, 2], [[0.0, 0.0, 0.0, 1.0]] * 3, kind=[EdgeKind.ODOMETRY] * 2 + [EdgeKind.LOOP_CLOSURE]
+        )
+        return self.solve(
+            triangle,
+            method=options.method,
+            profile=options.profile,
+            device=options.device,
+            refinement_steps=options.max_refinement_steps,
+        ).device
+
+    def close(self) -> None:
+        """End the process, if there is one."""
+        if self._process is not None:
+            self._process.close()

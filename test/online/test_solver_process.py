@@ -1,0 +1,121 @@
+"""Solves in a process of their own: the same answers, memories, errors and ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros import solve
+from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.errors import UserError
+from rotavg_ros.online import EstimatorOptions, OnlineEstimator
+from rotavg_ros.online.solver_process.client import SolverProcess
+from rotavg_ros.solver import Abandoned, abandonable
+from rotavg_ros.view_graph import ViewGraph
+
+OPTIONS = {"method": "neurora", "profile": "auto", "device": "cpu", "refinement_steps": None}
+
+
+@pytest.fixture(scope="module")
+def process() -> Iterator[SolverProcess]:
+    solver = SolverProcess(threads=1)
+    yield solver
+    solver.close()
+    assert not os.path.exists(f"/proc/{solver.pid}")
+
+
+def graph(num_keyframes: int = 300) -> ViewGraph:
+    simulated = simulate_slam_graph(
+        SlamSimulationConfig(num_keyframes=num_keyframes, false_share=0.3), np.random.default_rng(0)
+    )
+    return simulated.graph
+
+
+def grown(whole: ViewGraph, num_nodes: int) -> ViewGraph:
+    """The graph as it was with fewer nodes."""
+    kept = whole.select_edges((whole.source < num_nodes) & (whole.target < num_nodes))
+    return replace(kept, num_nodes=num_nodes)
+
+
+def test_solutions_are_those_of_this_process(process):
+    whole = graph()
+    here, there = solve(whole, **OPTIONS), process(whole, **OPTIONS)
+    for name in ("body_from_world", "outlier_score", "component", "uncertainty"):
+        ours, theirs = getattr(here, name), getattr(there, name)
+        assert ours.dtype == theirs.dtype
+        np.testing.assert_allclose(theirs.numpy(), ours.numpy(), atol=1e-9)
+    assert (there.method, there.profile, there.device, there.warnings) == (
+        here.method,
+        here.profile,
+        here.device,
+        here.warnings,
+    )
+
+
+def test_it_remembers_its_last_solution_and_no_other(process):
+    whole = graph()
+    first = process(grown(whole, 298), **OPTIONS)
+    start = torch.cat((first.body_from_world, first.body_from_world[-1:]))
+    second = process(grown(whole, 299), warm_start=start, memory=first.memory, **OPTIONS)
+    assert "update" in second.stage_seconds
+    again = process(grown(whole, 299), warm_start=start, memory=first.memory, **OPTIONS)
+    assert "update" not in again.stage_seconds
+
+
+def test_mistakes_are_told_as_in_this_process(process):
+    with pytest.raises(UserError, match="unknown method 'nonsense'; choose from"):
+        process(graph(), **(OPTIONS | {"method": "nonsense"}))
+    process(graph(30), **OPTIONS)
+
+
+def test_a_solve_that_nobody_wants_ends_soon_and_the_next_one_is_right(process):
+    whole = graph(3000)
+    unwanted = threading.Event()
+    threading.Timer(0.2, unwanted.set).start()
+
+    def solve_on() -> None:
+        while True:  # however fast it is, one of them is under way when the time has come
+            process(whole, **OPTIONS)
+
+    with pytest.raises(Abandoned), abandonable(unwanted.is_set):
+        solve_on()
+    small = graph(30)
+    there = process(small, **OPTIONS)
+    np.testing.assert_allclose(there.body_from_world.numpy(), solve(small, **OPTIONS).body_from_world.numpy())
+
+
+def test_a_process_that_dies_is_an_error_and_the_next_solve_starts_another():
+    solver = SolverProcess(threads=1)
+    try:
+        small = graph(30)
+        solver(small, **OPTIONS)
+        before = solver.pid
+        os.kill(before, signal.SIGKILL)
+        while Path(f"/proc/{before}/stat").read_text().split()[2] != "Z":
+            time.sleep(0.01)
+        assert solver(small, **OPTIONS).method == "neurora"
+        assert solver.pid != before
+        large = graph(20_000)
+        threading.Timer(0.3, os.kill, (solver.pid, signal.SIGKILL)).start()
+        with pytest.raises(UserError, match=r"the solver's process has died \(exit code -9"):
+            solver(large, **OPTIONS)
+    finally:
+        solver.close()
+
+
+def test_an_estimator_solves_with_it(process):
+    estimator = OnlineEstimator(EstimatorOptions(), process)
+    for index in range(50):
+        angle = 0.1 * index
+        estimator.add_odometry("r", 10**9 * (index + 1), (0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2)))
+    answer = estimator.tick()
+    assert answer is not None and len(answer.keyframe_id) == 50
