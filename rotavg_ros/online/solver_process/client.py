@@ -81,8 +81,8 @@ class SolverProcess:
             Abandoned: nobody waits for the solution any more.
         """
         with self._lock:
-            if self._process.poll() is not None:
-                self._close()
+            if self._connection.poll(0):  # nothing was asked: this is its end
+                self.close()
                 self._start()
             self._solves += 1
             remembered = memory.number if isinstance(memory, _Remembered) else None
