@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -57,7 +58,12 @@ class RotavgNode(parameter_server.ParameterNode):
         self._outputs = Outputs(self, parameters, self._estimator)
         state_file = Path(parameters.state_file) if parameters.state_file else None
         self._solving = Solving(self, self._estimator, self._health, self._outputs, state_file)
-        listening = Subscriptions(self, parameters, self._estimator, self._health, self._outputs, self._on_time_jump)
+        given = frozenset(parameter_server.given(self))
+        # An orientation that was given settles how sensors sit.
+        from_tf = parameters.edge_frames_from_tf and "edge_sensor_orientations" not in given
+        listened = replace(parameters, edge_frames_from_tf=from_tf)
+        listening = Subscriptions(self, listened, self._estimator, self._health, self._outputs, self._on_time_jump)
+        self._listening = listening
         workers = Workers(solver=self._worker, saver=self._saver)
         Services(self, self._estimator, self._solving, workers, parameters.robots[0])
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -75,7 +81,6 @@ class RotavgNode(parameter_server.ParameterNode):
         self.get_logger().info(f"rotavg {__version__} on {device}, listening to {topics}")
         if parameters.estimator.device == "cuda" and device == "cpu":
             self.get_logger().warning("there is no CUDA device; the networks run on the CPU")
-        given = frozenset(parameter_server.given(self))
         self._wiring = Wiring(self, listening.inputs, self._outputs.exclusive_topics, given)
         self._mistaken_parameters, other_parameters = parameter_server.unknown(self)
         for line in [*self._mistaken_parameters, *other_parameters, *self._outputs.warnings()]:
@@ -132,6 +137,7 @@ class RotavgNode(parameter_server.ParameterNode):
         self._saver.submit(lambda: self._solving.back_up_quietly(discarded))
 
     def _on_diagnostics_timer(self) -> None:
+        self._health.waiting_for_frames = self._listening.waiting_for_frames
         wiring = self._wiring.warnings(self._settings)
         self._health.noticed([*self._mistaken_parameters, *wiring, *self._outputs.warnings()])
         status = self._reporter.report(self._health, self._estimator.counts(), self._settings, self._estimator.paused)

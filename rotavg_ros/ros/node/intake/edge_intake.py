@@ -12,7 +12,8 @@ from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 from rclpy.node import Node
 
 from rotavg_ros.inputs import EdgeConverter, EdgeRecord, EdgeVerdict
-from rotavg_ros.online import OnlineEstimator, RejectReason
+from rotavg_ros.online import EdgeMeasurement, OnlineEstimator, RejectReason
+from rotavg_ros.ros.node.intake.edge_frames import EdgeFrames
 from rotavg_ros.ros.node.intake.wiring import Input
 from rotavg_ros.ros.node.message_counting import TopicCounter
 
@@ -39,10 +40,26 @@ class EdgeIntake:
 
     Attributes:
         callback_group: for the subscriptions to edges; it holds them back while too many messages are under way.
+        frames: takes the edges of sensors into the body's frame.
     """
 
-    def __init__(self, node: Node, estimator: OnlineEstimator, on_refusal: Callable[[RejectReason], None]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        estimator: OnlineEstimator,
+        on_refusal: Callable[[RejectReason], None],
+        frame_wait_s: float | None = None,
+    ) -> None:
+        """Take in edges.
+
+        Args:
+            node: the node.
+            estimator: gets them.
+            on_refusal: told of every edge that is refused.
+            frame_wait_s: see :class:`EdgeFrames`.
+        """
         self._estimator = estimator
+        self.frames = EdgeFrames(node, frame_wait_s, self._add)
         self._on_refusal = on_refusal
         self.callback_group = _WhileThereIsRoom(lambda: len(self._under_way) < _MOST_MESSAGES)
         self._generation = estimator.generation
@@ -84,10 +101,16 @@ class EdgeIntake:
         topic.note_frames(record.frame_id)
         counter.by_sequence.observe(record.sender, record.sequence)
         if isinstance(record.edge, RejectReason):
-            reason: RejectReason | None = record.edge
             self._estimator.reject(record.edge)
+            self._on_refusal(record.edge)
         else:
-            reason = self._estimator.add_edge(record.edge)
+            self.frames.take(record.edge, record.frame_id, topic)
+
+    def _add(self, edge: EdgeMeasurement) -> None:
+        if self._generation != self._estimator.generation:  # it has waited, and what it was about is forgotten
+            self._forget_with_the_estimator()
+            return
+        reason = self._estimator.add_edge(edge)
         if reason is not None and reason is not RejectReason.DUPLICATE_EDGE:
             self._on_refusal(reason)
 
@@ -96,5 +119,6 @@ class EdgeIntake:
         if self._generation != self._estimator.generation:
             self._generation = self._estimator.generation
             self._under_way.clear()
+            self.frames.forget()
             for convert in self._converters:
                 convert.forget()
