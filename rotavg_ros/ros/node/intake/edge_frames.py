@@ -99,6 +99,8 @@ class EdgeFrames:
     def _look(self) -> None:
         now = time.monotonic()
         for _ in range(min(len(self._waiting), _LOOK_AT)):
+            if not self._waiting:  # all was forgotten meanwhile
+                break
             waiting = self._waiting.popleft()
             if self._hand_on(waiting):
                 continue
