@@ -22,6 +22,7 @@ from rotavg_ros.online import EstimatorOptions, OnlineEstimator, RejectReason
 from rotavg_ros.online.measurements import OdometryMessage, RejectedInputError
 from rotavg_ros.online.odometry.time_jumps import KEEPS_TIME_LINE, BackwardJumps
 from rotavg_ros.online.quaternion import IDENTITY, Quaternion
+from rotavg_ros.replay.frames import BagFrames
 from rotavg_ros.replay.plan import Input, Plan
 from rotavg_ros.replay.record import Reference
 from rotavg_ros.settings.parameters import NodeParameters
@@ -36,11 +37,12 @@ class Feed:
     Args:
         estimator: gets everything.
         plan: which topic is what.
+        frames: how the sensors sit that edges are measured between.
         on_odometry: is told of every odometry message that was taken.
     """
 
-    def __init__(self, estimator: OnlineEstimator, plan: Plan, on_odometry: OnOdometry) -> None:
-        self._estimator = estimator
+    def __init__(self, estimator: OnlineEstimator, plan: Plan, frames: BagFrames, on_odometry: OnOdometry) -> None:
+        self._estimator, self._frames = estimator, frames
         self._on_odometry = on_odometry
         self._generation = estimator.generation
         self._edge_converters: list[EdgeConverter] = []
@@ -52,7 +54,7 @@ class Feed:
         for source, about in zip(plan.edges, parameters.edge_sources(), strict=True):
             convert = EDGE_CONVERTERS[source.type_name](about)
             self._edge_converters.append(convert)
-            edges = partial(self._take_edges, convert)
+            edges = partial(self._take_edges, convert, source.topic)
             self._handlers.setdefault(source.topic, []).append(edges)
 
     @property
@@ -74,7 +76,7 @@ class Feed:
         if self._estimator.add_odometry(robot, record.stamp_ns, record.world_from_body, record.position) is None:
             self._on_odometry(robot, record)
 
-    def _take_edges(self, convert: EdgeConverter, message: Any) -> None:
+    def _take_edges(self, convert: EdgeConverter, topic: str, message: Any) -> None:
         if self._generation != self._estimator.generation:  # time went back: what is sent again is new
             self._generation = self._estimator.generation
             for converter in self._edge_converters:
@@ -85,7 +87,7 @@ class Feed:
             elif isinstance(record.edge, RejectReason):
                 self._estimator.reject(record.edge)
             else:
-                self._estimator.add_edge(record.edge)
+                self._estimator.add_edge(self._frames.edge_of_body(record.edge, record.frame_id, topic))
 
 
 def read_references(

@@ -13,7 +13,7 @@ from rotavg_ros.datasets.files.pose_files import read_pose_file
 from rotavg_ros.errors import UserError
 from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
 from rotavg_ros.replay.record import TopicUse
-from rotavg_ros.replay.topics import Candidate, Candidates, find_candidates
+from rotavg_ros.replay.topics import Candidate, Candidates, find_candidates, static_transforms
 from rotavg_ros.settings.parameters import NodeParameters
 
 # Parameters that name topics, and those with so many numbers or names for each of them.
@@ -60,6 +60,7 @@ class Plan:
         edges: in the order of ``parameters.edge_topics``.
         references: topic or file by robot.
         topics: every topic of the bag and its use.
+        edge_frames_from_tf: edges of sensors are taken into the body's frame by the bag's static transforms.
     """
 
     parameters: NodeParameters
@@ -67,6 +68,7 @@ class Plan:
     edges: tuple[Input, ...]
     references: dict[str, Input | Path]
     topics: tuple[TopicUse, ...]
+    edge_frames_from_tf: bool = True
 
     @property
     def has_input(self) -> bool:
@@ -104,7 +106,8 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
         settings.setdefault("unknown_keyframes", "create")
     parameters = NodeParameters().changed(settings)
     references = _references(bag, found, wishes.references, parameters.robots, odometry)
-    plan = Plan(parameters, odometry, edges, references, topics=())
+    from_tf = parameters.edge_frames_from_tf and "edge_sensor_orientations" not in values
+    plan = Plan(parameters, odometry, edges, references, topics=(), edge_frames_from_tf=from_tf)
     return replace(plan, topics=_uses(bag, found, plan))
 
 
@@ -217,6 +220,8 @@ def _uses(bag: BagReader, found: Candidates, plan: Plan) -> tuple[TopicUse, ...]
     for robot, reference in plan.references.items():
         if isinstance(reference, Input):
             roles.setdefault(reference.topic, []).append(f"reference for {robot}")
+    for topic in static_transforms(bag) if plan.edge_frames_from_tf and plan.edges else ():
+        roles.setdefault(topic, []).append("frames of sensors")
     could_be = {candidate.topic: "could be a reference: --reference" for candidate in found.references}
     could_be |= {candidate.topic: "could be odometry: --odometry" for candidate in found.odometry}
     could_be |= {candidate.topic: "could be loop closures: --edges" for candidate in found.edges}

@@ -17,6 +17,7 @@ from rotavg_ros.inputs import OdometryRecord
 from rotavg_ros.online import Answer, OnlineEstimator
 from rotavg_ros.online.measurements import OWN_EDGE_ID
 from rotavg_ros.replay.feed import Feed
+from rotavg_ros.replay.frames import BagFrames
 from rotavg_ros.replay.plan import Plan
 from rotavg_ros.replay.record import TickRecord
 from rotavg_ros.replay.recording import Recording
@@ -53,6 +54,7 @@ class Outcome:
         failures: ticks whose solve failed; the last one did not.
         interrupted: before the end.
         damage: what of the bag could not be read; None: nothing.
+        warnings: about how the bag was read, a line each.
         wall_seconds: that it took.
     """
 
@@ -65,6 +67,7 @@ class Outcome:
     failures: int
     interrupted: bool
     damage: str | None
+    warnings: tuple[str, ...]
     wall_seconds: float
 
 
@@ -108,7 +111,8 @@ def replay(
     estimator = OnlineEstimator(plan.parameters.estimator)
     with Recording(recording, plan.parameters, estimator, answer_period_ns) as recorder:
         loop = _Loop(estimator, plan.parameters.solve_period_s, recorder)
-        feed = Feed(estimator, plan, loop.on_odometry)
+        frames = BagFrames(bag, plan)
+        feed = Feed(estimator, plan, frames, loop.on_odometry)
         end_ns, interrupted = start_ns, False
         is_whole = start_ns == bag.start_ns and stop_ns == bag.end_ns
         records = bag.decoded(feed.topics, *((None, None) if is_whole else (start_ns, stop_ns)))
@@ -139,6 +143,7 @@ def replay(
         loop.failures,
         interrupted,
         damage,
+        tuple(frames.warnings),
         time.perf_counter() - started,
     )
 

@@ -37,7 +37,7 @@ def summarize(record: RunRecord, bag: Path, outcome: Outcome) -> dict[str, Any]:
         "loop_closures": int(closures.sum()),
         "outliers": int(answer.outlier.sum()),
         "components": answer.num_components,
-        "warnings": list(answer.warnings),
+        "warnings": [*outcome.warnings, *answer.warnings],
         "robots": {robot.robot: _robot(robot, answer.component[robot.nodes]) for robot in record.robots},
         "rejected": {reason: count for reason, count in record.rejected.items() if count},
         "topics": {use.topic: use.used_as for use in record.topics if use.used_as},

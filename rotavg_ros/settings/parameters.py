@@ -63,6 +63,16 @@ class NodeParameters:
         within=(0.0, 3600.0),
         live=True,
     )
+    edge_frames_from_tf: bool = option(
+        True,
+        "take edges whose header names a sensor's frame into the body's, by /tf_static; not where "
+        "edge_sensor_orientations is given, or tf2_msgs not installed",
+    )
+    edge_frame_wait_s: float = option(
+        3.0,
+        "how long an edge waits for the transform between its frame and the body's; it is then taken as it is",
+        within=(0.0, 1e6),
+    )
     world_frame: str = option("map", "frame id of what is published")
     publish_tf: bool = option(False, "publish world → odometry frame on /tf; needs tf2_msgs")
     transform_tolerance_s: float = option(

@@ -151,6 +151,7 @@ def _values(health: Health, counts: Counts, paused: bool, now: float) -> dict[st
         "dropped closures": str(counts.dropped_closures),
         "pending": str(counts.pending),
         "held back": str(health.held_back),
+        "waiting for frames": str(health.waiting_for_frames),
         "answer version": str(0 if answer is None else answer.version),
         "answer age s": "nan" if health.answered is None else f"{now - health.answered:.1f}",
         "answer cold": "nan" if answer is None else str(answer.was_cold).lower(),

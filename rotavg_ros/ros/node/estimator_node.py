@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -55,8 +56,12 @@ class RotavgNode(parameter_server.ParameterNode):
         self._saver = Worker(executor, "rotavg_saver")
         self._outputs = Outputs(self, parameters, self._estimator)
         state_file = Path(parameters.state_file) if parameters.state_file else None
-        listening = Subscriptions(self, parameters, self._estimator, self._health, self._outputs, self._on_time_jump)
-        self._forwarding = listening.forwarding
+        given = frozenset(parameter_server.given(self))
+        # An orientation that was given settles how sensors sit.
+        from_tf = parameters.edge_frames_from_tf and "edge_sensor_orientations" not in given
+        listened = replace(parameters, edge_frames_from_tf=from_tf)
+        listening = Subscriptions(self, listened, self._estimator, self._health, self._outputs, self._on_time_jump)
+        self._listening, self._forwarding = listening, listening.forwarding
         self._solving = Solving(self, self._estimator, self._health, self._outputs, self._forwarding, state_file)
         workers = Workers(solver=self._worker, saver=self._saver)
         Services(self, self._estimator, self._solving, workers, parameters.robots[0])
@@ -75,7 +80,6 @@ class RotavgNode(parameter_server.ParameterNode):
         self.get_logger().info(f"rotavg {__version__} on {device}, listening to {topics}")
         if parameters.estimator.device == "cuda" and device == "cpu":
             self.get_logger().warning("there is no CUDA device; the networks run on the CPU")
-        given = frozenset(parameter_server.given(self))
         self._wiring = Wiring(self, listening.inputs, self._outputs.exclusive_topics, given)
         self._mistaken_parameters, other_parameters = parameter_server.unknown(self)
         for line in [*self._mistaken_parameters, *other_parameters, *self._outputs.warnings()]:
@@ -136,6 +140,7 @@ class RotavgNode(parameter_server.ParameterNode):
         self._saver.submit(lambda: self._solving.back_up_quietly(discarded))
 
     def _on_diagnostics_timer(self) -> None:
+        self._health.waiting_for_frames = self._listening.waiting_for_frames
         wiring = self._wiring.warnings(self._settings)
         self._health.held_back = self._forwarding.waiting
         lines = [*self._mistaken_parameters, *wiring, *self._outputs.warnings(), *self._forwarding.warnings()]

@@ -28,6 +28,7 @@ class Health:
         unsolved_since: since when the graph has been ahead of the answer; None if it is not.
         solve_failures: how many ticks failed in all; ``failure`` is the last one's message, None after a good tick.
         save_failure: why the last save failed, None if it did not.
+        waiting_for_frames: edges that wait for the transform between their frame and the body's.
         notices: what has happened to the graph, and when.
     """
 
@@ -47,6 +48,7 @@ class Health:
     solve_failures: int = 0
     failure: str | None = None
     save_failure: str | None = None
+    waiting_for_frames: int = 0
     notices: dict[str, float] = field(default_factory=dict)
 
     @property

@@ -13,6 +13,7 @@ from rclpy.node import Node
 
 from rotavg_ros.inputs import EdgeConverter, EdgeRecord, EdgeVerdict
 from rotavg_ros.online import OnlineEstimator, RejectReason
+from rotavg_ros.ros.node.intake.edge_frames import EdgeFrames
 from rotavg_ros.ros.node.intake.forwarding import Forwarding
 from rotavg_ros.ros.node.intake.wiring import Input
 from rotavg_ros.ros.node.message_counting import TopicCounter
@@ -40,6 +41,7 @@ class EdgeIntake:
 
     Attributes:
         callback_group: for the subscriptions to edges; it holds them back while too many messages are under way.
+        frames: takes the edges of sensors into the body's frame.
     """
 
     def __init__(
@@ -48,9 +50,19 @@ class EdgeIntake:
         estimator: OnlineEstimator,
         forwarding: Forwarding,
         on_refusal: Callable[[RejectReason], None],
+        frame_wait_s: float | None = None,
     ) -> None:
-        self._estimator = estimator
-        self._forwarding = forwarding
+        """Take in edges.
+
+        Args:
+            node: the node.
+            estimator: gets them.
+            forwarding: told of what became of those that are to be sent on.
+            on_refusal: told of every edge that is refused.
+            frame_wait_s: see :class:`EdgeFrames`.
+        """
+        self._estimator, self._forwarding = estimator, forwarding
+        self.frames = EdgeFrames(node, frame_wait_s, self._add)
         self._on_refusal = on_refusal
         self.callback_group = _WhileThereIsRoom(lambda: len(self._under_way) < _MOST_MESSAGES)
         self._generation = estimator.generation
@@ -92,10 +104,17 @@ class EdgeIntake:
         topic.note_frames(record.frame_id)
         counter.by_sequence.observe(record.sender, record.sequence)
         if isinstance(record.edge, RejectReason):
-            reason: RejectReason | None = record.edge
             self._estimator.reject(record.edge)
+            self._on_refusal(record.edge)
         else:
-            reason = self._estimator.add_edge(record.edge)
+            self.frames.take(record, topic)
+
+    def _add(self, record: EdgeRecord, topic: Input) -> None:
+        if self._generation != self._estimator.generation:  # it has waited, and what it was about is forgotten
+            self._forget_with_the_estimator()
+            return
+        assert not isinstance(record.edge, RejectReason)
+        reason = self._estimator.add_edge(record.edge)
         if topic.forward is not None:
             self._forwarding.taken(topic.forward, record, reason)
         if reason is not None and reason is not RejectReason.DUPLICATE_EDGE:
@@ -106,5 +125,6 @@ class EdgeIntake:
         if self._generation != self._estimator.generation:
             self._generation = self._estimator.generation
             self._under_way.clear()
+            self.frames.forget()
             for convert in self._converters:
                 convert.forget()

@@ -58,7 +58,13 @@ class Subscriptions:
         self._outputs = outputs
         self.inputs: list[Input] = []
         self.forwarding = Forwarding(node, parameters, estimator)
-        self._intake = EdgeIntake(node, estimator, self.forwarding, partial(self._warn_of_refusal, "an edge"))
+        self._intake = EdgeIntake(
+            node,
+            estimator,
+            self.forwarding,
+            partial(self._warn_of_refusal, "an edge"),
+            parameters.edge_frame_wait_s if parameters.edge_frames_from_tf else None,
+        )
         best_effort = QoSProfile(depth=parameters.odometry_queue_depth, reliability=ReliabilityPolicy.BEST_EFFORT)
         sources = zip(parameters.robots, parameters.odometry_topics, parameters.odometry_sensors(), strict=True)
         for robot, entry, body_from_sensor in sources:
@@ -76,6 +82,11 @@ class Subscriptions:
             counter = health.edges.setdefault(topic.name, TopicCounter())
             on_edges = partial(self._on_edges, topic, edges, counter)
             self._subscribe(topic, edges, on_edges, counter)
+
+    @property
+    def waiting_for_frames(self) -> int:
+        """How many edges wait for the transform between their frame and the body's."""
+        return self._intake.frames.waiting
 
     def _full_name(self, topic: str) -> str:
         """With the namespace and remappings.
@@ -137,6 +148,7 @@ class Subscriptions:
             self._estimator.reject(rejection.reason)
         else:
             topic.note_frames(record.frame_id, record.child_frame_id)
+            self._intake.frames.note_body(topic.robot, record.child_frame_id, body_from_sensor)
             reason = self._estimator.add_odometry(topic.robot, record.stamp_ns, record.world_from_body, record.position)
         if reason is None:
             self._health.took_odometry(topic.name)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import Enum, auto
 
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
@@ -21,6 +22,15 @@ from rotavg_ros.settings.parameters import NodeParameters
 _CLOCK = "/clock"
 # Frames come from messages and may be anything; so many different ones of a topic tell enough.
 _MOST_FRAMES = 3
+_MOST_PLACEMENTS = 1000
+
+
+class Placement(Enum):
+    """What is known of how a sensor sits on a robot's body."""
+
+    AWAITED = auto()
+    KNOWN = auto()
+    UNKNOWN = auto()  # nobody has said it in time
 
 
 @dataclass
@@ -35,6 +45,7 @@ class Input:
         qos: what is asked for.
         frames: of the messages so far: of odometry header.frame_id and that of the body, of edges that of the sensor.
         forward: where its believed closures go; None if nowhere.
+        placement: of edges: how their sensors sit, by robot and frame.
         published: when somebody was last seen to publish it, by the monotonic clock; at first when it was subscribed.
     """
 
@@ -45,6 +56,7 @@ class Input:
     qos: QoSProfile
     frames: dict[tuple[str, ...], None] = field(default_factory=dict)
     forward: Forward | None = None
+    placement: dict[tuple[str, str], Placement] = field(default_factory=dict)
     published: float = field(default_factory=time.monotonic)
 
     @property
@@ -59,6 +71,18 @@ class Input:
         """Remember in which frames a message is."""
         if frames not in self.frames and len(self.frames) < _MOST_FRAMES:
             self.frames[frames] = None
+
+    def note_placement(self, robot: str, frame: str, placement: Placement) -> None:
+        """Remember what is known of how a robot's sensor sits."""
+        if (robot, frame) in self.placement or len(self.placement) < _MOST_PLACEMENTS:
+            self.placement[robot, frame] = placement
+
+    @property
+    def sensors(self) -> list[str]:
+        """Frames of edges that are taken as they are, though they may be of sensors."""
+        told = {frame for _, frame in self.placement}
+        unknown = {frame for (_, frame), placement in self.placement.items() if placement is Placement.UNKNOWN}
+        return [frame for (frame,) in self.frames if frame and (frame in unknown or frame not in told)]
 
 
 class Wiring:
@@ -134,10 +158,11 @@ class Wiring:
         if "edge_sensor_orientations" in self._given or not bodies:
             return lines
         for each in self._inputs:
-            sensors = [] if each.is_odometry else [sensor for (sensor,) in each.frames if sensor not in (*bodies, "")]
+            sensors = [] if each.is_odometry else [sensor for sensor in each.sensors if sensor not in bodies]
             if sensors:
                 lines.append(
-                    f"{each.name} is in frame {', '.join(sensors)}, but odometry tells of {', '.join(bodies)}: set "
+                    f"{each.name} is in frame {', '.join(sensors)}, but odometry tells of {', '.join(bodies)}: publish "
+                    "the transform between them on /tf_static (it is read where tf2_msgs is installed), or set "
                     "edge_sensor_orientations to the orientation of the one in the other (0, 0, 0, 1 if they are equal)"
                 )
         return lines

@@ -1,0 +1,59 @@
+"""A bag's edges between sensors, taken into the bodies' frames by the static transforms recorded with them."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+from rotavg_ros.bags.reader import BagReader
+from rotavg_ros.inputs import ODOMETRY_CONVERTERS
+from rotavg_ros.inputs.sensor_frames import SensorFrames
+from rotavg_ros.online import EdgeMeasurement
+from rotavg_ros.online.measurements import RejectedInputError
+from rotavg_ros.replay.plan import Plan
+from rotavg_ros.replay.topics import static_transforms
+
+
+class BagFrames:
+    """How the sensors of a bag sit, of the whole bag from the beginning on.
+
+    Where the node waits a while for a transform, nothing has to wait here.
+    """
+
+    def __init__(self, bag: BagReader, plan: Plan) -> None:
+        """Look into the bag for static transforms, and for the frames that odometry moves in."""
+        self._is_on = plan.edge_frames_from_tf
+        self._sensors, self._bodies = SensorFrames(), set[str]()
+        self._unknown: dict[str, dict[str, None]] = {}
+        for _, _, message in bag.decoded(static_transforms(bag) if self._is_on else []):
+            self._sensors.take(message)
+        parameters = plan.parameters
+        for robot, source, sensor in zip(parameters.robots, plan.odometry, parameters.odometry_sensors(), strict=False):
+            for _, _, message in islice(bag.decoded([source.topic]), 1):
+                try:
+                    frame = ODOMETRY_CONVERTERS[source.type_name](message, sensor).child_frame_id
+                except RejectedInputError:
+                    continue
+                self._sensors.note_body(robot, frame, sensor)
+                self._bodies |= {frame} if frame else set()
+
+    def edge_of_body(self, edge: EdgeMeasurement, frame: str, topic: str) -> EdgeMeasurement:
+        """The edge between bodies; as it is, where nothing says how the sensor sits."""
+        if not self._is_on or not frame:
+            return edge
+        body_from_sensor = self._sensors.body_from(edge.source.robot, frame)
+        if body_from_sensor is not None:
+            return body_from_sensor.edge_of_body(edge)
+        self._unknown.setdefault(topic, {})[frame] = None
+        return edge
+
+    @property
+    def warnings(self) -> list[str]:
+        """One line for each topic with edges that were taken as they are, though odometry tells of another frame."""
+        lines, bodies = [], ", ".join(sorted(self._bodies))
+        for topic, frames in self._unknown.items() if self._bodies else ():
+            named = ", ".join(list(frames)[:3])
+            lines.append(
+                f"{topic} is in frame {named}, but odometry tells of {bodies}, and the bag has no static transform "
+                "between them: its edges are taken as they are; set edge_sensor_orientations"
+            )
+        return lines

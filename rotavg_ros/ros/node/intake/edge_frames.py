@@ -1,0 +1,155 @@
+"""Edges that name a sensor's frame, taken into the body's by ``/tf_static``; those that come before it wait a while."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from rotavg_ros.inputs import EdgeRecord
+from rotavg_ros.inputs.sensor_frames import SensorFrames
+from rotavg_ros.online import EdgeMeasurement
+from rotavg_ros.online.quaternion import Quaternion
+from rotavg_ros.ros.node.intake.wiring import Input, Placement
+from rotavg_ros.ros.node.topics import overrides, user_error_about
+
+_TOPIC = "/tf_static"
+# Every broadcaster of static transforms latches one message.
+_DEPTH = 1000
+_MOST_WAITING = 10_000
+# How often it is looked whether the first edges have waited long enough, and at how many of them.
+_LOOK_PERIOD_S, _LOOK_AT = 0.1, 1000
+
+
+class _Waiting(NamedTuple):
+    record: EdgeRecord
+    topic: Input
+    until: float  # on the monotonic clock
+
+    @property
+    def edge(self) -> EdgeMeasurement:
+        assert isinstance(self.record.edge, EdgeMeasurement)
+        return self.record.edge
+
+
+class EdgeFrames:
+    """Hands every edge on, as one between bodies where it is known how the sensor sits. Runs on the executor's thread.
+
+    Where nothing says that in time, edges are taken as they are, and the later ones of that frame do not wait any more.
+    A transform that comes still later counts from then on.
+    """
+
+    def __init__(self, node: Node, wait_s: float | None, add: Callable[[EdgeRecord, Input], None]) -> None:
+        """Listen to static transforms, where tf2_msgs is installed.
+
+        Args:
+            node: the node.
+            wait_s: how long an edge waits for one; None: all edges are taken as they are.
+            add: takes an edge and the topic that it came on.
+
+        Raises:
+            UserError: the topic's ``qos_overrides`` cannot be.
+        """
+        self._node, self._wait_s, self._add = node, wait_s or 0.0, add
+        self._sensors = SensorFrames()
+        self._waiting: deque[_Waiting] = deque()
+        self._timer = node.create_timer(_LOOK_PERIOD_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._timer.cancel()
+        message_type = None if wait_s is None else _tf_message()
+        self._is_on, self._listens = wait_s is not None, message_type is not None
+        if message_type is not None:
+            qos = QoSProfile(
+                depth=_DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+            )
+            with user_error_about(_TOPIC):
+                node.create_subscription(
+                    message_type, _TOPIC, self._sensors.take, qos, qos_overriding_options=overrides()
+                )
+
+    @property
+    def waiting(self) -> int:
+        """How many edges wait."""
+        return len(self._waiting)
+
+    def note_body(self, robot: str, frame: str, body_from_frame: Quaternion) -> None:
+        """Remember in which frame a robot's odometry moves, see :meth:`SensorFrames.note_body`."""
+        self._sensors.note_body(robot, frame, body_from_frame)
+
+    def take(self, record: EdgeRecord, topic: Input) -> None:
+        """Hand an edge on, now or in a while."""
+        if not self._is_on or not record.frame_id:
+            self._add(record, topic)
+            return
+        waiting = _Waiting(record, topic, time.monotonic() + self._wait_s)
+        if self._hand_on(waiting):
+            return
+        robot = waiting.edge.source.robot
+        if not self._listens or topic.placement.get((robot, record.frame_id)) is Placement.UNKNOWN:
+            self._add(record, topic)
+            return
+        topic.note_placement(robot, record.frame_id, Placement.AWAITED)
+        self._waiting.append(waiting)
+        if len(self._waiting) > _MOST_WAITING:
+            self._give_up(self._waiting.popleft())
+        self._timer.reset()
+
+    def forget(self) -> None:
+        """Drop the edges that wait."""
+        self._waiting.clear()
+
+    def _look(self) -> None:
+        now = time.monotonic()
+        for _ in range(min(len(self._waiting), _LOOK_AT)):
+            if not self._waiting:  # all was forgotten meanwhile
+                break
+            waiting = self._waiting.popleft()
+            if self._hand_on(waiting):
+                continue
+            if waiting.until <= now:
+                self._give_up(waiting)
+            else:
+                self._waiting.append(waiting)
+        if not self._waiting:
+            self._timer.cancel()
+
+    def _hand_on(self, waiting: _Waiting) -> bool:
+        """Hand an edge on if it is known how its sensor sits."""
+        edge, frame, topic = waiting.edge, waiting.record.frame_id, waiting.topic
+        body_from_sensor = self._sensors.body_from(edge.source.robot, frame)
+        if body_from_sensor is None:
+            return False
+        if topic.placement.get((edge.source.robot, frame)) is Placement.UNKNOWN:
+            self._node.get_logger().warning(
+                f"{topic.name}: the transform of {frame} is known now; edges before it were taken as they were: call "
+                "~/reset to begin anew without them"
+            )
+        topic.note_placement(edge.source.robot, frame, Placement.KNOWN)
+        self._add(replace(waiting.record, edge=body_from_sensor.edge_of_body(edge)), topic)
+        return True
+
+    def _give_up(self, waiting: _Waiting) -> None:
+        """Hand an edge on as it is."""
+        edge, frame, topic = waiting.edge, waiting.record.frame_id, waiting.topic
+        if topic.placement.get((edge.source.robot, frame)) is not Placement.UNKNOWN:
+            self._node.get_logger().warning(
+                f"{topic.name}: nothing has said how frame {frame} sits on the body of {edge.source.robot}, so its "
+                f"edges are taken as they are: publish the transform on {_TOPIC}, or set edge_sensor_orientations"
+            )
+        topic.note_placement(edge.source.robot, frame, Placement.UNKNOWN)
+        self._add(waiting.record, topic)
+
+
+def _tf_message() -> type | None:
+    """``tf2_msgs/TFMessage``, where that package is installed."""
+    try:
+        from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
+    except ImportError:
+        return None
+    message_type: type = TFMessage
+    return message_type
