@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.algebra.small_matrices import inverse
 from rotavg_ros.solver.slam.poses.block_system import BlockFactor
 from rotavg_ros.solver.slam.poses.evidence import translation_cost
 from rotavg_ros.solver.slam.poses.noise import likeliest_noise
@@ -198,12 +199,11 @@ def _scale(problem: PoseProblem, state: PoseState) -> Scale:
 
 
 def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.ndarray) -> Predictions:
-    """What all else says of some rows, by what is left of them and their leverages."""
-    leverage, root = factor.leverage[rows], root[rows]
-    inverse = np.linalg.inv(root)
-    rest = np.linalg.inv(factor.redundancy[rows])
-    mean = np.matmul(inverse, np.matmul(rest, left[rows]))[:, :, 0]
-    covariance = np.matmul(inverse, np.matmul(np.matmul(rest, leverage), inverse.transpose(0, 2, 1)))
+    """What all else says of some rows, whose ``root`` is diagonal, by what is left of them and their leverages."""
+    sigma = 1 / np.diagonal(root[rows], axis1=1, axis2=2)
+    rest = inverse(factor.redundancy[rows])
+    mean = sigma * np.matmul(rest, left[rows])[:, :, 0]
+    covariance = sigma[:, :, None] * np.matmul(rest, factor.leverage[rows]) * sigma[:, None, :]
     return Predictions(mean, (covariance + covariance.transpose(0, 2, 1)) / 2)
 
 
