@@ -7,6 +7,7 @@ and W; samples of N(0, H⁻¹) tell what everything else predicts of a row.
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 
 import numpy as np
@@ -60,8 +61,10 @@ class BlockEquations:
         """
         d, num_blocks = self.size, self.num_blocks
         columns = (block[:, :, None] * d + np.arange(d)).reshape(len(block), 1, 3 * d)
-        self._columns = np.broadcast_to(columns, (len(block), d, 3 * d)).ravel().astype(np.int32)
-        self._first = np.arange(0, len(self._columns) + 1, 3 * d, dtype=np.int32)
+        entries = np.broadcast_to(columns, (len(block), d, 3 * d)).ravel().astype(np.int32)
+        begins = np.arange(0, len(entries) + 1, 3 * d, dtype=np.int32)
+        shape = len(block) * d, (num_blocks + 1) * d
+        self._rows: csr_array = csr_array((np.ones(len(entries)), entries, begins), shape=shape)
         row, column = np.broadcast_arrays(block[:, :, None], block[:, None, :])
         is_used = ((row < num_blocks) & (column < num_blocks)).ravel()
         key = (column * num_blocks + row).ravel()[is_used]
@@ -88,8 +91,10 @@ class BlockEquations:
 
     def rows(self, jacobian: np.ndarray) -> csr_array:
         """W^½ J, ``((E + R) d, (blocks + 1) d)``, columns in the order of elimination and those of no block."""
-        shape = len(self._first) - 1, (self.num_blocks + 1) * self.size
-        return csr_array((jacobian.ravel(), self._columns, self._first), shape=shape)
+        # SciPy's constructors check each time what stays as it is.
+        rows = copy(self._rows)
+        rows.data = jacobian.ravel()
+        return rows
 
     def factorise(self, jacobian: np.ndarray, root_weight: np.ndarray) -> BlockFactor:
         """Of whitened rows.

@@ -30,8 +30,8 @@ _MAX_TURN = 0.3
 _SLOWEST, _HELD = 16.0, 3
 # Variances before this one are not those of closures' shifts.
 _OF_CLOSURES = 3
-# A variance whose change is a constant multiple of the one before is set to where that leads; of these at most. One that
-# swings has a negative one.
+# A variance whose change is a constant multiple of the one before is set to where that leads; of these at most. The
+# multiple of one that swings is negative.
 _LEAST_RATIO, _LARGEST_RATIO = -2.0, 0.6
 # Weights go this share of the way to what they should be, in the logarithm, those that swing less, down to the other.
 _SHARE, _LEAST_SHARE = 0.5, 0.1
@@ -213,7 +213,7 @@ def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.
 
 @dataclass(frozen=True)
 class Pace:
-    """How far closures' weights go towards what they should be: of those that answer each other, not far enough to swing.
+    """How far weights of closures go towards what they should be; those that swing go less far.
 
     Attributes:
         share: ``(2, C)`` of the way, in the logarithm, of weights of shifts and of turns.
@@ -226,8 +226,8 @@ class Pace:
     def towards(self, places: Places, before: Places, at_once: np.ndarray) -> tuple[Places, Pace]:
         """Places with weights between theirs and those before, and the next pace.
 
-        A weight whose change turns round was last at a zero between: by the secant through both (regula falsi), 1 / (1 − r)
-        of the share before leads there, r < 0 the ratio of the changes.
+        Where a change turns round, the weight has passed the one that stays as it is. By the secant through both
+        changes (regula falsi) 1 / (1 − r) of the last share leads there, r < 0 their ratio.
 
         Args:
             places, before: of C closures.
