@@ -7,14 +7,16 @@ and W; samples of N(0, H⁻¹) tell what everything else predicts of a row.
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
 from rotavg_ros.solver.algebra.laplacian import solve_in_parts
+from rotavg_ros.solver.algebra.small_matrices import inverse_root
 
 _NUM_PROBES, _SEED = 48, 0
 # SuperLU merges no columns of unlike pattern: blocks are dense as they are, and merging fills in, on a sphere sixfold.
@@ -41,36 +43,58 @@ class BlockEquations:
         self, size: tuple[int, int], num_nodes: int, ends: np.ndarray, run: np.ndarray, roots: np.ndarray
     ) -> None:
         num_runs = int(run.max(initial=-1)) + 1
-        self.turns, self.size = size[0], sum(size)
+        self.turns, self.size, self.num_edges = size[0], sum(size), len(ends)
         self.num_blocks, self.roots = num_nodes + num_runs, roots
         nowhere = self.num_blocks
         source, target = ends.T
-        self.block = np.stack((target, source, np.where(run >= 0, num_nodes + run, nowhere)), axis=1)
-        self.block = np.concatenate(
-            (self.block, np.stack((num_nodes + np.arange(num_runs), *[np.full(num_runs, nowhere)] * 2), axis=1))
-        )
-        # Sums over rows go block by block: in this order, from these places on.
-        self._by_block = np.argsort(self.block.ravel(), kind="stable")
-        self._used_blocks, self._first = np.unique(self.block.ravel()[self._by_block], return_index=True)
-        self._rank = np.arange(self.num_blocks * self.size)
-        self._is_ordered = False
-        self._lay_out()
-        self.probes = np.random.default_rng(_SEED).standard_normal((len(self.block), self.size, _NUM_PROBES))
+        block = np.stack((target, source, np.where(run >= 0, num_nodes + run, nowhere)), axis=1)
+        of_runs = np.stack((num_nodes + np.arange(num_runs), *[np.full(num_runs, nowhere)] * 2), axis=1)
+        block = np.concatenate((block, of_runs))
+        self.rank = _elimination_order(block, self.num_blocks)
+        self._lay_out(np.append(self.rank, nowhere)[block])
+        self.probes = np.random.default_rng(_SEED).standard_normal((len(block), self.size, _NUM_PROBES))
 
-    def _lay_out(self) -> None:
-        d, count = self.size, self.num_blocks * self.size
-        rank = np.concatenate((self._rank, np.full(d, -1)))
-        column = rank[(self.block[:, :, None] * d + np.arange(d)).reshape(len(self.block), 3 * d)]
-        row, col = np.repeat(column, 3 * d, axis=1).ravel(), np.tile(column, 3 * d).ravel()
-        self._is_used = (row >= 0) & (col >= 0)
-        keys = np.concatenate((col[self._is_used] * count + row[self._is_used], np.arange(count) * (count + 1)))
-        occupied, slot = np.unique(keys, return_inverse=True)
-        self._slot, self._diagonal = slot[: len(keys) - count], slot[len(keys) - count :]
-        first = np.searchsorted(occupied, np.arange(count + 1) * count)
-        self._num_entries = len(occupied)
-        self._matrix: csc_array = csc_array(
-            (np.ones(len(occupied)), (occupied % count).astype(np.int32), first.astype(np.int32)), shape=(count, count)
+    def _lay_out(self, block: np.ndarray) -> None:
+        """Where in compressed rows J's numbers stand and in compressed columns H's, blocks in the order of elimination.
+
+        What a row has of no block stands beyond all columns of J.
+        """
+        d, num_blocks = self.size, self.num_blocks
+        columns = (block[:, :, None] * d + np.arange(d)).reshape(len(block), 1, 3 * d)
+        entries = np.broadcast_to(columns, (len(block), d, 3 * d)).ravel().astype(np.int32)
+        begins = np.arange(0, len(entries) + 1, 3 * d, dtype=np.int32)
+        shape = len(block) * d, (num_blocks + 1) * d
+        self._rows: csr_array = csr_array((np.ones(len(entries)), entries, begins), shape=shape)
+        row, column = np.broadcast_arrays(block[:, :, None], block[:, None, :])
+        is_used = ((row < num_blocks) & (column < num_blocks)).ravel()
+        key = (column * num_blocks + row).ravel()[is_used]
+        occupied, slot = np.unique(np.concatenate((key, np.arange(num_blocks) * (num_blocks + 1))), return_inverse=True)
+        count = np.bincount(occupied // num_blocks, minlength=num_blocks)
+        before = np.append(0, np.cumsum(count))
+        within = np.arange(len(occupied)) - before[occupied // num_blocks]
+        # Of a block the first number, and from one of its columns to the next as many as the blocks there have.
+        start, stride = d * (d * before[occupied // num_blocks] + within), d * count[occupied // num_blocks]
+        inside = np.arange(d)
+        place = start[:, None, None] + stride[:, None, None] * inside + inside[:, None]
+        self._used = np.flatnonzero(
+            np.broadcast_to(is_used.reshape(-1, 3, 1, 3, 1), (len(block), 3, d, 3, d)).reshape(-1)
         )
+        slots = np.zeros((len(is_used), d, d), dtype=np.int64)
+        slots[is_used] = place[slot[: len(key)]]
+        slots = slots.reshape(-1, 3, 3, d, d).transpose(0, 1, 3, 2, 4).ravel()
+        self._slot = slots[self._used]
+        self._diagonal = place[slot[len(key) :]][:, inside, inside]
+        rows = np.empty(d * d * len(occupied), dtype=np.int32)
+        rows[place] = ((occupied % num_blocks) * d)[:, None, None] + inside[:, None]
+        first = np.append(0, np.cumsum(np.repeat(d * count, d))).astype(np.int32)
+        self._matrix: csc_array = csc_array((np.ones(len(rows)), rows, first), shape=(num_blocks * d, num_blocks * d))
+
+    def rows(self, jacobian: np.ndarray) -> csr_array:
+        """W^½ J, ``((E + R) d, (blocks + 1) d)``, columns in the order of elimination and those of no block."""
+        # SciPy's constructors check each time what stays as it is.
+        rows = copy(self._rows)
+        rows.data = jacobian.ravel()
+        return rows
 
     def factorise(self, jacobian: np.ndarray, root_weight: np.ndarray) -> BlockFactor:
         """Of whitened rows.
@@ -80,30 +104,38 @@ class BlockEquations:
             root_weight: what ties roots down, ``(d,)``.
         """
         stop_if_abandoned()
-        blocks = np.matmul(jacobian.transpose(0, 2, 1), jacobian).ravel()[self._is_used]
-        values = np.bincount(self._slot, blocks, self._num_entries)
+        blocks = np.matmul(jacobian.transpose(0, 2, 1), jacobian).ravel().take(self._used)
+        values = np.bincount(self._slot, blocks, self._matrix.nnz)
         values[self._diagonal] += np.finfo(np.float64).tiny
-        d = self.size
-        values[self._diagonal[self._rank[self.roots[:, None] * d + np.arange(d)]]] += root_weight
+        values[self._diagonal[self.rank[self.roots]]] += root_weight
         self._matrix.data = values
         options = {"SymmetricMode": True}
-        order = "NATURAL" if self._is_ordered else "MMD_AT_PLUS_A"
-        factor = splu(self._matrix, order, 0.0, relax=_RELAX, panel_size=_PANEL, options=options)
-        rank = self._rank
-        if not self._is_ordered:
-            self._rank, self._is_ordered = factor.perm_c.astype(np.int64)[self._rank], True
-            self._lay_out()
-        return BlockFactor(self, jacobian, factor, rank, len(self.roots) * float(np.log(root_weight).sum()))
+        factor = splu(self._matrix, "NATURAL", 0.0, relax=_RELAX, panel_size=_PANEL, options=options)
+        return BlockFactor(self, self.rows(jacobian), factor, len(self.roots) * float(np.log(root_weight).sum()))
+
+
+def _elimination_order(block: np.ndarray, num_blocks: int) -> np.ndarray:
+    """``(blocks,)`` where each stands in the order of minimum degree of the blocks' graph."""
+    row, column = (ends.ravel() for ends in np.broadcast_arrays(block[:, :, None], block[:, None, :]))
+    is_used = (row < num_blocks) & (column < num_blocks) & (row != column)
+    row, column = row[is_used], column[is_used]
+    # Any positive definite matrix of the pattern will do.
+    degree = np.bincount(row, minlength=num_blocks)
+    diagonal = np.arange(num_blocks)
+    values = np.concatenate((np.full(len(row), -1.0), degree + 1.0))
+    shape = num_blocks, num_blocks
+    graph: csc_array = csc_array(
+        (values, (np.concatenate((row, diagonal)), np.concatenate((column, diagonal)))), shape=shape
+    )
+    order = splu(graph, "MMD_AT_PLUS_A", 0.0, relax=_RELAX, panel_size=_PANEL, options={"SymmetricMode": True})
+    return np.asarray(order.perm_c.astype(np.int64))
 
 
 class BlockFactor:
-    """H for one choice of J and W."""
+    """H for one choice of J and W, here in the order of elimination."""
 
-    def __init__(
-        self, system: BlockEquations, jacobian: np.ndarray, factor: SuperLU, rank: np.ndarray, grounding: float
-    ) -> None:
-        self._system, self._jacobian, self._factor, self._rank = system, jacobian, factor, rank
-        self._place, self._grounding = np.argsort(rank), grounding
+    def __init__(self, system: BlockEquations, rows: csr_array, factor: SuperLU, grounding: float) -> None:
+        self._system, self._rows, self._factor, self._grounding = system, rows, factor, grounding
 
     @property
     def log_det(self) -> float:
@@ -112,29 +144,42 @@ class BlockFactor:
 
     def fit(self, whitened: np.ndarray) -> np.ndarray:
         """Unknowns ``(blocks, d, n)`` that explain whitened rows ``(E + R, d, n)`` best."""
+        return self._by_block(self._fit(whitened))
+
+    def _fit(self, whitened: np.ndarray) -> np.ndarray:
+        """The same in the order of elimination, ``(blocks d, n)``."""
         stop_if_abandoned()
-        system, d = self._system, self._system.size
-        parts = np.matmul(self._jacobian.transpose(0, 2, 1), whitened).reshape(-1, d, whitened.shape[2])
-        right = np.zeros((system.num_blocks + 1, d, whitened.shape[2]))
-        right[system._used_blocks] = np.add.reduceat(parts[system._by_block], system._first, axis=0)
-        columns = right[:-1].reshape(-1, whitened.shape[2])
-        solved = solve_in_parts(self._factor, columns.take(self._place, axis=0)).take(self._rank, axis=0)
-        return np.asarray(solved.reshape(system.num_blocks, d, -1))
+        right = self._rows.T @ whitened.reshape(-1, whitened.shape[2])
+        return solve_in_parts(self._factor, right[: -self._system.size])
+
+    def _by_block(self, ordered: np.ndarray) -> np.ndarray:
+        """``(blocks, d, n)``, in which block v stood at its rank."""
+        system = self._system
+        return ordered.reshape(system.num_blocks, system.size, -1).take(system.rank, axis=0)
 
     def predicted(self, unknowns: np.ndarray) -> np.ndarray:
         """Whitened rows ``(E + R, d, n)`` of unknowns ``(blocks, d, n)``."""
-        padded = np.concatenate((unknowns, np.zeros((1, *unknowns.shape[1:]))))
-        d = self._system.size
-        return np.asarray(np.matmul(self._jacobian, padded[self._system.block].reshape(-1, 3 * d, unknowns.shape[2])))
+        ordered = np.empty_like(unknowns)
+        ordered[self._system.rank] = unknowns
+        return self._predicted(ordered.reshape(-1, unknowns.shape[2]))
+
+    def _predicted(self, ordered: np.ndarray) -> np.ndarray:
+        d, count = self._system.size, ordered.shape[1]
+        padded = np.concatenate((ordered, np.zeros((d, count))))
+        return np.asarray((self._rows @ padded).reshape(-1, d, count))
 
     @cached_property
+    def _samples(self) -> np.ndarray:
+        return self._fit(self._system.probes)
+
+    @property
     def samples(self) -> np.ndarray:
         """Unknowns ``(blocks, d, 48)`` drawn from N(0, H⁻¹)."""
-        return self.fit(self._system.probes)
+        return self._by_block(self._samples)
 
     @cached_property
     def leverage(self) -> np.ndarray:
-        """``(E + R, d, d)`` Λ, what of a whitened row its own measurement decides.
+        """``(E, d, d)`` Λ, what of a whitened row its own measurement decides.
 
         Of a row's own probe z ~ N(0, I) the fit takes up y, and y ~ N(0, Λ), z − y ~ N(0, I − Λ) are independent. Of
         turns and of shifts by themselves their moments A and B make L⁻¹ A L⁻ᵀ with L Lᵀ = A + B (a matrix-variate
@@ -144,20 +189,20 @@ class BlockFactor:
 
     @cached_property
     def redundancy(self) -> np.ndarray:
-        """``(E + R, d, d)`` I − Λ, positive definite."""
+        """``(E, d, d)`` I − Λ, positive definite."""
         return self._shares[1]
 
     @cached_property
     def _shares(self) -> tuple[np.ndarray, np.ndarray]:
-        k, d = self._system.turns, self._system.size
-        taken = self.predicted(self.samples)
-        left = self._system.probes - taken
+        k, d, num_edges = self._system.turns, self._system.size, self._system.num_edges
+        taken = self._predicted(self._samples)[:num_edges]
+        left = self._system.probes[:num_edges] - taken
         moments = [np.matmul(part, part.transpose(0, 2, 1)) / _NUM_PROBES for part in (taken, left)]
         both = moments[0] + moments[1]
         # A turn's moments with a shift's are noise where one of the two hardly counts, and it is as slight as that in y
         # or in z − y by itself, but not in their sum: nothing of the one's leverage may get into the other's.
-        both[:, :k, k:] = both[:, k:, :k] = 0
-        root = np.linalg.inv(np.linalg.cholesky(both))
+        root = np.zeros_like(both)
+        root[:, :k, :k], root[:, k:, k:] = inverse_root(both[:, :k, :k]), inverse_root(both[:, k:, k:])
         of_taken, of_left = (np.matmul(root, np.matmul(part, root.transpose(0, 2, 1))) for part in moments)
         of_left += _LEAST * np.eye(d)
         across = _slighter(of_taken[:, :k, k:], -of_left[:, :k, k:])
@@ -178,4 +223,4 @@ def _slighter(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _least_value(matrix: np.ndarray) -> np.ndarray:
     """``(n,)`` no more than the least eigenvalues of ``(n, k, k)``."""
-    return np.asarray(1 / np.trace(np.linalg.inv(matrix), axis1=1, axis2=2))
+    return np.asarray(1 / (inverse_root(matrix) ** 2).sum(axis=(1, 2)))

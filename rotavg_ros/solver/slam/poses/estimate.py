@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.algebra.small_matrices import inverse
 from rotavg_ros.solver.slam.poses.block_system import BlockFactor
 from rotavg_ros.solver.slam.poses.evidence import translation_cost
 from rotavg_ros.solver.slam.poses.noise import likeliest_noise
@@ -26,11 +27,14 @@ _MAX_UPDATE_SOLVES = 6
 # A step turns nothing by more than this, rad.
 _MAX_TURN = 0.3
 # Variances change by no more than this factor from solve to solve; most of them stay while places are sorted out.
-_SLOWEST, _HELD = 4.0, 3
+_SLOWEST, _HELD = 16.0, 3
 # Variances before this one are not those of closures' shifts.
 _OF_CLOSURES = 3
-# A variance that comes nearer by a constant factor from solve to solve is set to where that leads; by this at most.
-_SLOWEST_GAIN = 0.6
+# A variance whose change is a constant multiple of the one before is set to where that leads; of these at most. The
+# multiple of one that swings is negative.
+_LEAST_RATIO, _LARGEST_RATIO = -2.0, 0.6
+# Weights go this share of the way to what they should be, in the logarithm, those that swing less, down to the other.
+_SHARE, _LEAST_SHARE = 0.5, 0.1
 # At rest: a step's root mean square in standard errors; chances of classes; logarithms of variances.
 _STEP_CONVERGED, _CHANCE_CONVERGED, _NOISE_CONVERGED = 0.05, 0.1, 0.1
 # No two places are nearer than so many typical steps.
@@ -104,11 +108,12 @@ def estimate_poses(problem: PoseProblem, *, hold: bool = False, start: PoseStart
     if start is not None:
         places, is_new = start.over(places), start.column < 0
     change, sorted_by = np.zeros(len(state.noise.logarithms)), np.zeros_like(places.chance)
+    pace = Pace(np.full((2, len(is_good)), _SHARE), np.zeros((2, len(is_good))))
     number, held, most = 0, *((_HELD, _MAX_SOLVES) if start is None else (0, start.solves))
     while True:
         solved = _solve(problem, state, places, judge)
         chance, sorted_by = _settling(solved.places.chance, places.chance, sorted_by)
-        after = _halfway(replace(solved.places, chance=chance), places, is_new & (number == 0))
+        after, pace = pace.towards(replace(solved.places, chance=chance), places, is_new & (number == 0))
         noise = likeliest_noise(problem, solved).logarithms
         changed = np.abs(after.chance - places.chance).max(initial=0.0)
         is_at_rest = solved.moved < _STEP_CONVERGED and changed < _CHANCE_CONVERGED
@@ -117,8 +122,8 @@ def estimate_poses(problem: PoseProblem, *, hold: bool = False, start: PoseStart
             number > held and is_at_rest and np.abs(noise - state.noise.logarithms).max() < _NOISE_CONVERGED
         ):
             break
-        places = after
         state, change = _with_noise(solved.state, noise, change, is_held=number <= held)
+        places = _following(after, problem, solved.state.noise, state.noise)
     if not hold:
         return PoseMode(problem, solved, math.nan)
     used = problem.rotation_variance(solved.state.noise)[problem.mode.problem.closure]
@@ -198,28 +203,51 @@ def _scale(problem: PoseProblem, state: PoseState) -> Scale:
 
 
 def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.ndarray) -> Predictions:
-    """What all else says of some rows, by what is left of them and their leverages."""
-    leverage, root = factor.leverage[rows], root[rows]
-    inverse = np.linalg.inv(root)
-    rest = np.linalg.inv(factor.redundancy[rows])
-    mean = np.matmul(inverse, np.matmul(rest, left[rows]))[:, :, 0]
-    covariance = np.matmul(inverse, np.matmul(np.matmul(rest, leverage), inverse.transpose(0, 2, 1)))
+    """What all else says of some rows, whose ``root`` is diagonal, by what is left of them and their leverages."""
+    sigma = 1 / np.diagonal(root[rows], axis1=1, axis2=2)
+    rest = inverse(factor.redundancy[rows])
+    mean = sigma * np.matmul(rest, left[rows])[:, :, 0]
+    covariance = sigma[:, :, None] * np.matmul(rest, factor.leverage[rows]) * sigma[:, None, :]
     return Predictions(mean, (covariance + covariance.transpose(0, 2, 1)) / 2)
 
 
-def _halfway(places: Places, before: Places, at_once: np.ndarray) -> Places:
-    """With weights between theirs and those before, in the logarithm: closures that answer each other would swing.
+@dataclass(frozen=True)
+class Pace:
+    """How far weights of closures go towards what they should be; those that swing go less far.
 
-    Args:
-        places, before: of C closures.
-        at_once: ``(C,)`` bool, which take theirs.
+    Attributes:
+        share: ``(2, C)`` of the way, in the logarithm, of weights of shifts and of turns.
+        change: ``(2, C)`` by what they were to change.
     """
-    between = np.sqrt(places.weight * before.weight), np.sqrt(places.rotation_weight * before.rotation_weight)
-    weight, rotation_weight = (
-        np.where(at_once, theirs, halfway)
-        for theirs, halfway in zip((places.weight, places.rotation_weight), between, strict=True)
-    )
-    return replace(places, weight=weight, rotation_weight=rotation_weight)
+
+    share: np.ndarray
+    change: np.ndarray
+
+    def towards(self, places: Places, before: Places, at_once: np.ndarray) -> tuple[Places, Pace]:
+        """Places with weights between theirs and those before, and the next pace.
+
+        Where a change turns round, the weight has passed the one that stays as it is. By the secant through both
+        changes (regula falsi) 1 / (1 − r) of the last share leads there, r < 0 their ratio.
+
+        Args:
+            places, before: of C closures.
+            at_once: ``(C,)`` bool, which take theirs.
+        """
+        used = np.stack((before.weight, before.rotation_weight))
+        change = np.log(np.stack((places.weight, places.rotation_weight)) / used)
+        turns_round = change * self.change < 0
+        ratio = change / np.where(turns_round, self.change, 1.0)
+        share = np.where(turns_round, np.maximum(self.share / (1 - ratio), _LEAST_SHARE), _SHARE)
+        share = np.where(at_once, 1.0, share)
+        weight, rotation_weight = used * np.exp(share * change)
+        return replace(places, weight=weight, rotation_weight=rotation_weight), Pace(share, change)
+
+
+def _following(places: Places, problem: PoseProblem, before: PoseNoise, after: PoseNoise) -> Places:
+    """With weights that are what they were in those of good closures, of which the variances are others."""
+    shift = problem.closure_variance(before) / problem.closure_variance(after)
+    turn = before.closure_turn / after.closure_turn
+    return replace(places, weight=places.weight * shift, rotation_weight=places.rotation_weight * turn)
 
 
 def _settling(chance: np.ndarray, before: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -245,7 +273,7 @@ def _with_noise(
     change = noise - before
     change[:_OF_CLOSURES] *= not is_held
     ratio = change * last / np.maximum(last * last, np.finfo(np.float64).tiny)
-    is_steady = ratio > 0
-    reached = np.where(is_steady, change / (1 - np.minimum(ratio, _SLOWEST_GAIN)), change)
+    goes_on = last != 0
+    reached = np.where(goes_on, change / (1 - np.clip(ratio, _LEAST_RATIO, _LARGEST_RATIO)), change)
     reached = before + np.clip(reached, -np.log(_SLOWEST), np.log(_SLOWEST))
-    return replace(state, noise=PoseNoise.of(reached)), np.where(is_steady, 0.0, change)
+    return replace(state, noise=PoseNoise.of(reached)), np.where(goes_on, 0.0, change)

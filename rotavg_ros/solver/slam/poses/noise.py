@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.slam.poses.rows import PoseNoise, PoseProblem
 from rotavg_ros.solver.slam.poses.solved import Solved
 from rotavg_ros.solver.slam.posterior.em import likeliest_variance
@@ -17,8 +18,7 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     noise, places = solved.state.noise, solved.places
     k, segments = problem.turns, np.flatnonzero(~problem.slipped)
     redundancy = solved.factor.redundancy[segments]
-    inverse = np.linalg.inv(solved.covariance[segments])
-    half = np.linalg.cholesky(inverse)
+    half = inverse_root(solved.covariance[segments][:, ::-1, ::-1])[:, ::-1, ::-1].transpose(0, 2, 1)
     pulled = np.matmul(half, solved.left[segments, k:])
     left_over = np.matmul(half, np.matmul(redundancy[:, k:, k:], half.transpose(0, 2, 1)))
 

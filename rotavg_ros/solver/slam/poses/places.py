@@ -7,10 +7,11 @@ N(μ, P) in k turns and m shifts together, gives each class its chance, and the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.special import logsumexp
 
+from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.slam.noise.exceedance import exceedance
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 
@@ -121,7 +122,7 @@ class Scale:
     floor_share: np.ndarray
     extent: float
 
-    @property
+    @cached_property
     def closure(self) -> float:
         """A typical good one."""
         return float(np.median(self.good)) if len(self.good) else self.extent
@@ -170,7 +171,7 @@ class Judge:
         log_class[:, ~known] = _LOG_NOTHING
         log_class[0, ~known] = 0.0
         log_all = self._as_labelled(np.concatenate((log_turn + log_class, log_false[None])))
-        log_density = logsumexp(log_all, axis=0)
+        log_density = _log_sum(log_all)
         chance = np.exp(log_all - log_density)
 
         each = chance[:-1, :, None]
@@ -230,7 +231,8 @@ class Judge:
 
     def _wrong(self, scale: Scale) -> np.ndarray:
         """m², from the least that a wrong place is off by to the map's extent."""
-        return np.geomspace(min(self.priors.least_wrong**2 * scale.closure, scale.extent), scale.extent, _WRONG)
+        least = min(self.priors.least_wrong**2 * scale.closure, scale.extent)
+        return np.asarray(scale.extent * (least / scale.extent) ** np.linspace(1.0, 0.0, _WRONG))
 
     def _log_classes(self, before: np.ndarray) -> np.ndarray:
         """``(J, C)`` nats, of each class if the rotation is no false one."""
@@ -259,7 +261,7 @@ class Judge:
         along = np.matmul(axes.transpose(0, 2, 1), predictions.mean[:, k:, None])[:, :, 0]
         total = np.maximum(spread, 0.0) + self._wrong(scale)[:, None, None]
         log_each = -(along**2 / total + np.log(2 * np.pi * total)).sum(axis=2) / 2
-        log_alone = logsumexp(log_each, axis=0) - np.log(_WRONG)
+        log_alone = _log_sum(log_each) - np.log(_WRONG)
         log_wrong = np.logaddexp(log_alone + log_itself, log_repeated + log_repeat)
         right = np.maximum(spread, 0.0) + (scale.good * self.told.own_share)[:, None]
         log_right = -(along**2 / right + np.log(2 * np.pi * right)).sum(axis=1) / 2
@@ -275,6 +277,12 @@ class Judge:
         log_all[:-1, is_false] = _LOG_NOTHING
         log_all[_GOOD:, accepted & self.told.is_known] = _LOG_NOTHING
         return log_all
+
+
+def _log_sum(logarithms: np.ndarray) -> np.ndarray:
+    """``(n,)`` log of sums over the first axis, of numbers that are finite."""
+    largest = logarithms.max(axis=0)
+    return np.asarray(largest + np.log(np.exp(logarithms - largest).sum(axis=0)))
 
 
 def _least_weight(square: np.ndarray, scale: Scale) -> np.ndarray:
@@ -301,11 +309,13 @@ def _given_turn(predictions: Predictions, variance: np.ndarray, turns: int) -> _
     """With the variance ``(C,)`` of the turn's own noise, rad²."""
     k, mean, covariance = turns, predictions.mean, predictions.covariance
     turn = covariance[:, :k, :k] + variance[:, None, None] * np.eye(k)
-    gain = np.linalg.solve(turn, covariance[:, :k, k:]).transpose(0, 2, 1)
-    log_turn = -(mean[:, :k] * np.linalg.solve(turn, mean[:, :k, None])[:, :, 0]).sum(axis=1) / 2
-    log_turn -= np.linalg.slogdet(turn)[1] / 2 + k / 2 * np.log(2 * np.pi)
-    given = mean[:, k:] - np.matmul(gain, mean[:, :k, None])[:, :, 0]
-    spread, axes = np.linalg.eigh(covariance[:, k:, k:] - np.matmul(gain, covariance[:, :k, k:]))
+    root = inverse_root(turn)
+    whitened, across = np.matmul(root, mean[:, :k, None]), np.matmul(root, covariance[:, :k, k:])
+    explained = across.transpose(0, 2, 1)
+    log_turn = np.log(np.diagonal(root, axis1=1, axis2=2) / np.sqrt(2 * np.pi)).sum(axis=1)
+    log_turn -= (whitened[:, :, 0] ** 2).sum(axis=1) / 2
+    given = mean[:, k:] - np.matmul(explained, whitened)[:, :, 0]
+    spread, axes = np.linalg.eigh(covariance[:, k:, k:] - np.matmul(explained, across))
     return _GivenTurn(log_turn, np.matmul(axes.transpose(0, 2, 1), given[:, :, None])[:, :, 0], np.maximum(spread, 0.0))
 
 

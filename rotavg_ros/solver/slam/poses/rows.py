@@ -10,6 +10,7 @@ import torch
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.odometry_lengths import lengths_passed, typical_length
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
@@ -301,10 +302,15 @@ class PoseProblem:
         rows[num_edges:, :, :d] = unit
         return rows
 
+    @cached_property
+    def _crossing(self) -> np.ndarray:
+        """``(3, m k)`` what makes of v the numbers of v × in the bases: (v × a) · b = v · (a × b)."""
+        turns, shifts = self.bases
+        return np.asarray(np.cross(turns.T[None], shifts.T[:, None]).reshape(-1, 3).T)
+
     def _crossed(self, vector: np.ndarray) -> np.ndarray:
         """``(E, m, k)`` of v × in the bases."""
-        turns, shifts = self.bases
-        return np.stack([np.cross(vector, axis) @ shifts for axis in turns.T], axis=2)
+        return np.asarray((vector @ self._crossing).reshape(len(vector), self.shifts, self.turns))
 
     def shift_covariance(self, state: PoseState, way: Displacements) -> np.ndarray:
         """``(E, m, m)`` m², of the noise of odometry's shifts; of closures, what they do not share as good ones."""
@@ -324,7 +330,7 @@ class PoseProblem:
     def bent(self, way: Displacements) -> np.ndarray:
         """``(S, m, m)`` m² per rad² a step, of segments' shifts by what bends them."""
         shifts = self.bases[1]
-        return np.asarray(np.einsum("ia,eij,jb->eab", shifts, way.bridge[: self.drawn.num_segments], shifts))
+        return np.asarray(shifts.T @ way.bridge[: self.drawn.num_segments] @ shifts)
 
     def whitening(
         self,
@@ -346,7 +352,8 @@ class PoseProblem:
         root = np.zeros((num_edges + self.num_runs, k + m, k + m))
         edges, common = root[:num_edges], root[num_edges:]
         edges[:, :k, :k] = np.sqrt(rotation_weight)[:, None, None] * np.eye(k)
-        edges[:, k:, k:] = np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)
+        # Upper triangular: Cholesky's from the last component on.
+        edges[:, k:, k:] = inverse_root(covariance[:, ::-1, ::-1])[:, ::-1, ::-1]
         edges[self.mode.problem.closure, k:, k:] = np.sqrt(closure_weight)[:, None, None] * np.eye(m)
         if self.num_runs:
             common[:, :k, :k] = np.eye(k) / np.sqrt(self.common_turn(state.noise))

@@ -1,0 +1,35 @@
+"""Cholesky and inverses of many small matrices against NumPy's own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rotavg_ros.solver.algebra.small_matrices import inverse, inverse_root
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 6])
+def test_as_numpy_has_it(size: int) -> None:
+    """Of matrices whose numbers differ by twelve orders of magnitude, too."""
+    rng = np.random.default_rng(size)
+    part = rng.standard_normal((40, size, size + 2)) * 10.0 ** rng.uniform(-6, 6, (40, size, 1))
+    matrices = part @ part.transpose(0, 2, 1)
+    before = matrices.copy()
+    root = inverse_root(matrices)
+    np.testing.assert_array_equal(matrices, before)
+    np.testing.assert_array_equal(root, np.tril(root))
+    scale = np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
+    expected = np.linalg.inv(np.linalg.cholesky(matrices))
+    np.testing.assert_allclose(root * scale[:, None, :], expected * scale[:, None, :], rtol=1e-9, atol=1e-9)
+    unit = np.broadcast_to(np.eye(size), matrices.shape)
+    relative = inverse(matrices) @ matrices * (scale[:, :, None] / scale[:, None, :])
+    np.testing.assert_allclose(relative, unit, atol=1e-8)
+
+
+def test_none_at_all() -> None:
+    assert inverse_root(np.zeros((0, 3, 3))).shape == (0, 3, 3)
+
+
+def test_one_that_is_not_positive_definite() -> None:
+    with pytest.raises(np.linalg.LinAlgError, match="positive definite"):
+        inverse_root(np.stack((np.eye(2), np.ones((2, 2)))))
