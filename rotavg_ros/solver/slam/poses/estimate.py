@@ -18,7 +18,7 @@ from rotavg_ros.solver.slam.poses.block_system import BlockFactor
 from rotavg_ros.solver.slam.poses.evidence import translation_cost
 from rotavg_ros.solver.slam.poses.noise import likeliest_noise
 from rotavg_ros.solver.slam.poses.places import Judge, Places, Predictions, Scale
-from rotavg_ros.solver.slam.poses.rows import PoseNoise, PoseProblem, PoseState
+from rotavg_ros.solver.slam.poses.rows import ANYHOW, PoseNoise, PoseProblem, PoseState
 from rotavg_ros.solver.slam.poses.solved import Solved
 
 _MAX_SOLVES = 24
@@ -160,7 +160,8 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     left = whitened - explained
     # xᵀ H x of a step x, whose mean is one for each unknown where x is drawn from N(0, H⁻¹).
     moved_by = math.sqrt(float((explained**2).sum()) / max(step.size, 1))
-    predictions, scale = _left_out(factor, root, left, closure), _scale(problem, state)
+    scale = _scale(problem, state)
+    predictions = _left_out(factor, root, left, closure).within(k, ANYHOW, scale.extent)
     judge = replace(judge, told=replace(judge.told, rotation_variance=rotation_variance[closure]))
     judged = judge(predictions, places.chance, scale)
     return Solved(

@@ -37,6 +37,24 @@ class Predictions:
     mean: np.ndarray
     covariance: np.ndarray
 
+    def within(self, turns: int, turn: float, shift: float) -> Predictions:
+        """With what holds of any closure: that nothing is turned, or farther off, than can be.
+
+        Where a closure alone joins two robots, nothing else predicts it, and the density of a good one would vanish.
+
+        Args:
+            turns: k.
+            turn, shift: variances per component a priori, rad² and m², about what the closure says.
+        """
+        variance = np.full(self.mean.shape[1], shift)
+        variance[:turns] = turn
+        # V (P + V)⁻¹, by which both are taken nearer.
+        share = variance[:, None] * np.linalg.inv(self.covariance + np.diag(variance))
+        covariance = share @ self.covariance
+        return Predictions(
+            np.matmul(share, self.mean[:, :, None])[:, :, 0], (covariance + covariance.transpose(0, 2, 1)) / 2
+        )
+
 
 @dataclass(frozen=True)
 class Told:

@@ -18,7 +18,7 @@ from rotavg_ros.solver.slam.poses.block_system import BlockEquations
 from rotavg_ros.solver.slam.poses.displacements import Displacements, DrawnSteps
 from rotavg_ros.solver.slam.poses.places import Told
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
-from rotavg_ros.solver.slam.posterior.densities import log_good
+from rotavg_ros.solver.slam.posterior.densities import log_false, log_good
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.rows import tails, variances
 from rotavg_ros.solver.slam.posterior.state import RUN_STEPS
@@ -27,6 +27,8 @@ from rotavg_ros.view_graph import ViewGraph
 
 # Shifts off the plane of motion by less than this share of the longest are none.
 _PLANAR = 1e-6
+# rad² per component of a turn about which nothing is known.
+ANYHOW = np.pi**2 / 3
 # A segment in which nothing moves errs by this share of a typical step at least.
 _LEAST_LENGTH = 1e-3
 # The share of an error that is not shared; the system stays solvable.
@@ -241,6 +243,10 @@ class PoseProblem:
         label = np.where(np.isinf(odds), np.sign(odds), 0.0)
         with np.errstate(invalid="ignore"):
             false_odds = np.where(label == 0, good - left_out.log_odds[closure], 0.0)
+        # A place that looks alike is seen at nearly the angle at which the true one would be, which may not be known.
+        priors = problem.priors
+        broad = predicted / (1 + predicted / ANYHOW)
+        false_odds += log_false(square, k, priors, predicted=broad) - log_false(square, k, priors)
         is_known = np.isfinite(self.translation).all(axis=1)[self.closures]
         shared = np.where(self.run[closure] >= 0, self.priors.common, 0.0)
         own = self.rotation_variance(self.turn_noise)[closure]

@@ -88,9 +88,13 @@ class Sites:
 
 
 def log_false(
-    square: np.ndarray, components: int, priors: SlamPriors, near_miss_share: np.ndarray | float | None = None
+    square: np.ndarray,
+    components: int,
+    priors: SlamPriors,
+    near_miss_share: np.ndarray | float | None = None,
+    predicted: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """Of closures that are false by themselves: log [(1 − m) u(r) + ½ m N(r; near miss) + ½ m h(r)].
+    """Of closures that are false by themselves: log [(1 − m) u(r) + ½ m N(r; near miss + p) + ½ m h(r)].
 
     u is uniform over rotations. A place is mistaken for one that looks alike and is seen at nearly the same angle, or
     from the other end, as a corridor is: h is as wide about half a turn, about any axis.
@@ -100,11 +104,12 @@ def log_false(
         components: k.
         priors: the near misses' width, and m where it is not given.
         near_miss_share: m, broadcast against ``square``.
+        predicted: rad², p, where what r is counted from is not known any better.
     """
     share = priors.near_miss_share if near_miss_share is None else near_miss_share
     variance = np.radians(priors.near_miss_deg) ** 2
     uniform = log_uniform_density(np.sqrt(square), components) + np.log1p(-share)
-    near = log_normal(square, variance, components)
+    near = log_normal(square, variance + predicted, components)
     angle = np.minimum(np.sqrt(square), np.pi)
     half_turn = log_normal((np.pi - angle) ** 2, variance, 1)
     if components == 3:  # from the angle's density, all axes alike
