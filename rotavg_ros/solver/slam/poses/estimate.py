@@ -161,7 +161,9 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     # xᵀ H x of a step x, whose mean is one for each unknown where x is drawn from N(0, H⁻¹).
     moved_by = math.sqrt(float((explained**2).sum()) / max(step.size, 1))
     scale = _scale(problem, state)
-    predictions = _left_out(factor, root, left, closure).within(k, ANYHOW, scale.extent)
+    # Wherever a closure's source is, and however it is turned.
+    anywhere = scale.extent + (problem.lengths[problem.closures] ** 2).sum(axis=1)
+    predictions = _left_out(factor, root, left, closure).within(k, ANYHOW, anywhere)
     judge = replace(judge, told=replace(judge.told, rotation_variance=rotation_variance[closure]))
     judged = judge(predictions, places.chance, scale)
     return Solved(

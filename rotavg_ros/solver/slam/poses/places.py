@@ -37,23 +37,23 @@ class Predictions:
     mean: np.ndarray
     covariance: np.ndarray
 
-    def within(self, turns: int, turn: float, shift: float) -> Predictions:
+    def within(self, turns: int, turn: float, shift: np.ndarray) -> Predictions:
         """With what holds of any closure: that nothing is turned, or farther off, than can be.
 
         Where a closure alone joins two robots, nothing else predicts it, and the density of a good one would vanish.
 
         Args:
             turns: k.
-            turn, shift: variances per component a priori, rad² and m², about what the closure says.
+            turn: variance per component a priori, rad², about what the closure says.
+            shift: ``(C,)`` m², likewise.
         """
-        variance = np.full(self.mean.shape[1], shift)
-        variance[:turns] = turn
-        # V (P + V)⁻¹, by which both are taken nearer.
-        share = variance[:, None] * np.linalg.inv(self.covariance + np.diag(variance))
-        covariance = share @ self.covariance
-        return Predictions(
-            np.matmul(share, self.mean[:, :, None])[:, :, 0], (covariance + covariance.transpose(0, 2, 1)) / 2
-        )
+        spread = np.diagonal(self.covariance, axis1=1, axis2=2)
+        # V / (p + V), of turns and of shifts by themselves: nothing absurd of the one gets into the other.
+        share = np.empty_like(self.mean)
+        share[:, :turns] = (turn / (spread[:, :turns].mean(axis=1) + turn))[:, None]
+        share[:, turns:] = (shift / (spread[:, turns:].mean(axis=1) + shift))[:, None]
+        root = np.sqrt(share)
+        return Predictions(share * self.mean, root[:, :, None] * self.covariance * root[:, None, :])
 
 
 @dataclass(frozen=True)
