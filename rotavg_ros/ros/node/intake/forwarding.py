@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any, TypeGuard
@@ -23,6 +24,9 @@ from rotavg_ros.ros.node.output.conversions import flags_message
 from rotavg_ros.ros.node.topics import publisher
 from rotavg_ros.settings.parameters import NodeParameters
 from rotavg_ros.view_graph import EdgeKind
+
+# Graphs that wait to be sent, or of which something waits.
+_MOST_GRAPHS = 1000
 
 
 class Forward:
@@ -52,6 +56,10 @@ class Forward:
     def end(self) -> None:
         """An answer has been looked at."""
 
+    def forget(self) -> None:
+        """Begin anew, as the graph does."""
+        self.filter, self.shares_names = ClosureFilter(), False
+
 
 class ArrayForward(Forward):
     """``rotavg_msgs/RelativeRotationArray``: what passes together is sent together."""
@@ -72,39 +80,63 @@ class ArrayForward(Forward):
             self._output.publish(self._message_type(header=header, edges=edges))
 
 
+class _Graph:
+    """A message with a graph, or a part of one: which of its edges are closures, and which were sent on last."""
+
+    def __init__(self, message: Any, converter: WholeGraphConverter) -> None:
+        self.message, self.field = message, converter.edges_field
+        self.names = [converter.closure_name(edge) for edge in getattr(message, self.field)]
+        self.closures = {name for name in self.names if name is not None}
+        self.sent: list[bool] | None = None
+
+    def with_edges(self, kept: list[bool]) -> Any:
+        """The same message with some of its edges."""
+        graph = type(self.message)()
+        for field in graph.get_fields_and_field_types():
+            setattr(graph, field, getattr(self.message, field))
+        edges = getattr(self.message, self.field)
+        setattr(graph, self.field, [edge for edge, keep in zip(edges, kept, strict=True) if keep])
+        return graph
+
+
 class WholeGraphForward(Forward):
-    """A graph that comes whole goes out whole, but for closures that are not believed."""
+    """A graph goes out as it came, but for closures that are not believed; again when that changes.
+
+    A newer graph stands for those whose closures it has. Where senders send parts, a part stays until all of it was
+    sent.
+    """
 
     def __init__(self, topic: str, output: Publisher, converter: WholeGraphConverter) -> None:
         super().__init__(topic, output)
         self._converter = converter
-        self._latest: Any = None
-        self._received = 0
-        self._sent: tuple[int, list[bool]] | None = None
+        self._incoming: deque[_Graph] = deque(maxlen=_MOST_GRAPHS)
+        self._graphs: list[_Graph] = []
 
     def begin(self, message: Any, records: Iterable[EdgeRecord | EdgeVerdict]) -> Iterator[EdgeRecord | EdgeVerdict]:
         yield from super().begin(None, records)
-        self._latest = message
-        self._received += 1
+        self._incoming.append(_Graph(message, self._converter))
 
     def send(self, items: list[Any]) -> None:
-        """What passes is a part of the graph."""
+        """What passes is a part of a graph."""
 
     def end(self) -> None:
-        """Send the latest graph, unless it is as it was sent last."""
-        if self._latest is None:
-            return
-        edges = getattr(self._latest, self._converter.edges_field)
-        names = map(self._converter.closure_name, edges)
-        kept = [name is None or self.filter.passes(name) for name in names]
-        if self._sent == (self._received, kept):
-            return
-        self._sent = self._received, kept
-        graph = type(self._latest)()
-        for field in graph.get_fields_and_field_types():
-            setattr(graph, field, getattr(self._latest, field))
-        setattr(graph, self._converter.edges_field, [edge for edge, keep in zip(edges, kept, strict=True) if keep])
-        self._output.publish(graph)
+        """Send on what is not as it was sent last."""
+        while self._incoming:
+            self._graphs.append(self._incoming.popleft())
+        for graph in self._graphs:
+            kept = [name is None or self.filter.passes(name) for name in graph.names]
+            if graph.sent != kept:
+                graph.sent = kept
+                self._output.publish(graph.with_edges(kept))
+        if self._graphs:
+            *older, newest = self._graphs
+            waiting = [each for each in older if not all(each.sent or ()) and not each.closures <= newest.closures]
+            self._graphs = [*waiting[-_MOST_GRAPHS:], newest]
+
+    def forget(self) -> None:
+        super().forget()
+        self._incoming.clear()
+        self._graphs.clear()
 
 
 class Forwarding:
@@ -209,7 +241,7 @@ class Forwarding:
             self._generation = self._estimator.generation
             self._decided = 0
             for forward in self._forwards:
-                forward.filter, forward.shares_names = ClosureFilter(), False
+                forward.forget()
 
 
 def _is_whole(convert: EdgeConverter) -> TypeGuard[WholeGraphConverter]:

@@ -1,0 +1,92 @@
+"""Graphs on their way to a back end, without DDS: a newer graph stands for the older, parts wait until all was sent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace as Fields
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
+from rotavg_ros.ros.node.intake.forwarding import WholeGraphForward
+
+
+@dataclass
+class Graph:
+    """With edges by number; odd ones are closures."""
+
+    edges: list[int] = field(default_factory=list)
+    frame: str = ""
+
+    def get_fields_and_field_types(self) -> dict[str, str]:
+        return {"edges": "sequence<int>", "frame": "string"}
+
+
+class Converter:
+    edges_field = "edges"
+
+    def closure_name(self, edge: int) -> tuple[str, int] | None:
+        return ("r", edge) if edge % 2 else None
+
+
+class Run:
+    """A forward whose believed closures are set by hand."""
+
+    def __init__(self) -> None:
+        self.sent: list[Graph] = []
+        self.believed: set[int] = set()
+        self.forward = WholeGraphForward("graph", Fields(publish=self.sent.append), Converter())
+        self.forward.filter = Fields(passes=lambda name: name[1] in self.believed)
+
+    def comes(self, *edges: int) -> None:
+        assert list(self.forward.begin(Graph(list(edges), "map"), [])) == []
+
+    def goes(self) -> list[list[int]]:
+        """What goes out now."""
+        self.sent.clear()
+        self.forward.end()
+        assert all(graph.frame == "map" for graph in self.sent)
+        return [graph.edges for graph in self.sent]
+
+
+def test_a_whole_graph_goes_out_when_it_comes_and_when_a_verdict_changes() -> None:
+    run = Run()
+    assert run.goes() == []
+    run.comes(0, 1, 2, 3)
+    assert run.goes() == [[0, 2]]
+    assert run.goes() == []
+    run.believed = {3}
+    assert run.goes() == [[0, 2, 3]]
+    run.comes(0, 1, 2, 3, 4)
+    assert run.goes() == [[0, 2, 3, 4]]
+    run.believed = {1, 3}
+    assert run.goes() == [[0, 1, 2, 3, 4]]  # the newer graph stands for the older
+    run.believed = {1}
+    assert run.goes() == [[0, 1, 2, 4]]
+
+
+def test_parts_of_a_graph_all_go_out_and_what_is_believed_later_as_well() -> None:
+    run = Run()
+    run.comes(0, 1)
+    run.comes(2)
+    run.comes(4, 3, 5)
+    run.believed = {3}
+    assert run.goes() == [[0], [2], [4, 3]]
+    run.comes(6)
+    assert run.goes() == [[6]]
+    run.believed = {1, 3, 5}
+    assert run.goes() == [[0, 1], [4, 3, 5]]
+    assert run.goes() == []
+    run.comes(8)
+    assert run.goes() == [[8]]
+
+
+def test_after_a_reset_nothing_of_before_goes_out() -> None:
+    run = Run()
+    run.comes(0, 1)
+    run.goes()
+    run.comes(2, 3)
+    run.forward.forget()
+    assert run.goes() == []
+    run.comes(0, 1)
+    assert run.goes() == [[0]]
