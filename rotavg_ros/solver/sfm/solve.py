@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
 from rotavg_ros.solver.estimate import Estimate, Run
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.fine_net import FineNet
@@ -31,13 +33,16 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     networks, watch = run.networks, run.watch
     if graph.num_edges > _TUNING_PAYS and graph.device.type == "cpu":
         tune()
+    form = CanonicalForm.of(graph, component)
+    graph, component = form.graph, form.component
     with watch.stage("clean"):
         cleaned = clean(networks.load(CleanNet), graph) if stages.clean else trust_all(graph)
         cleaned = apply_labels(cleaned, graph.label)
     with watch.stage("bootstrap"):
         orientations, roots, cleaned = bootstrap(cleaned, component)
         if run.warm_start is not None:
-            orientations = run.warm_start.double().to(graph.device)
+            start = form.canonical_orientations(run.warm_start.double().to(graph.device))
+            orientations = rotations.multiply(start, rotations.inverse(start[roots])[component])
     for _ in range(stages.fine_tunings):
         with watch.stage("fine-tune"):
             orientations = fine_tune(networks.load(FineNet), cleaned, orientations, component)
@@ -56,4 +61,4 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     # Where there is but a tree, CleanNet's own score; else a residual is the noise but for the orientations' error.
     probability = cleaned.outlier_probability.double()
     score = residual_score(graph, orientations, NUMBERS.outlier_angle, component) if fits else probability
-    return Estimate(orientations, score, torch.full((graph.num_nodes,), torch.nan))
+    return Estimate(form.orientations(orientations), score[form.edge], torch.full((graph.num_nodes,), torch.nan))
