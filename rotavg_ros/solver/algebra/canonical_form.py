@@ -25,10 +25,12 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.medians import median_by_group
 from rotavg_ros.solver.algebra.sorted_edges import sorted_by_node
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import EdgeKind, ViewGraph
 
 # So often walks grow by an edge: enough to tell apart what only distant edges tell apart, little beside a solve.
 _WALK_LENGTH = 4
+# So many edges of a component tell its axes; those of the synthetic recipes to about half a degree.
+_MOST_EDGES = 1 << 15
 # Quaternions are the same if no entry differs by more: far below any measurement, far above rounding.
 _SAME = 1e-9
 
@@ -55,27 +57,16 @@ class CanonicalForm:
     def of(cls, graph: ViewGraph, component: Tensor | None = None) -> CanonicalForm:
         """Of a graph; ``component`` ``(N,)`` as it numbers its own, default: computed."""
         component = graph.components() if component is None else component
+        form, has_parallels = _form(graph, component)
+        if not has_parallels:
+            return form
         kept, copy_of = _without_copies(graph)
-        once = replace(graph if kept is None else graph.select_edges(kept), translation=None)
-        node = _nodes_in_order(once, component)
-        rank = torch.empty_like(node)
-        rank[node] = torch.arange(len(node), device=node.device)
-        source, target = rank[once.source], rank[once.target]
-        low, high = torch.minimum(source, target), torch.maximum(source, target)
-        order = _by_both_ends(low, high, graph.num_nodes)
-        if bool(_is_parallel(low, high, order).any()):  # rotations between the same nodes by their angles
-            by_angle = once.target_from_source[:, 3].argsort(stable=True)
-            order = by_angle[_by_both_ends(low[by_angle], high[by_angle], graph.num_nodes)]
-        once, low, high = once.select_edges(order), low[order], high[order]
-        axes = _axes(once, component)
-        vector = _turned(axes, once.target_from_source[:, :3], component[once.source])
-        vector = torch.where((source <= target)[order, None], vector, -vector)
-        quaternion = torch.cat((vector, once.target_from_source[:, 3:]), dim=1)
-        canonical = replace(once, source=low, target=high, target_from_source=quaternion)
-        place = torch.empty_like(order)
-        place[order] = torch.arange(len(order), device=order.device)
-        edge = place if copy_of is None else place[copy_of]
-        return cls(canonical, component[node], node, edge, rotations.from_matrix(axes))
+        # Several rotations between the same nodes are sorted by their angles, and so stay.
+        by_angle = graph.target_from_source[kept, 3].argsort(stable=True)
+        form, _ = _form(graph.select_edges(kept[by_angle]), component)
+        place = torch.empty_like(form.edge)
+        place[by_angle] = form.edge
+        return replace(form, edge=place[copy_of])
 
     def orientations(self, body_from_world: Tensor) -> Tensor:
         """Those of the canonical graph → those of the given one, ``(N, 4)``."""
@@ -90,44 +81,46 @@ class CanonicalForm:
         return rotations.canonical(rotations.multiply(axes, body_from_world[self.node]))
 
 
-def _without_copies(graph: ViewGraph) -> tuple[Tensor | None, Tensor | None]:
-    """Indices ``(K,)`` of the edges without copies, and ``(M,)`` which of these stands for each; None: all differ."""
-    low, high = torch.minimum(graph.source, graph.target), torch.maximum(graph.source, graph.target)
-    order = _by_both_ends(low, high, graph.num_nodes)
-    again = _is_parallel(low, high, order)
-    if not bool(again.any()):
-        return None, None
-    # Only pairs of nodes with several edges are looked at closely.
-    no = again.new_zeros(1)
-    close = order[torch.cat((again, no)) | torch.cat((no, again))]
-    stated = graph.target_from_source[close]
-    forward = torch.where((graph.source < graph.target)[close, None], stated, rotations.inverse(stated))
-    number = (forward / _SAME).round().long()
+def _form(graph: ViewGraph, component: Tensor) -> tuple[CanonicalForm, bool]:
+    """The form of a graph without copies, and whether it has several edges between any two nodes."""
+    node = _nodes_in_order(graph, component)
+    rank = torch.empty_like(node)
+    rank[node] = torch.arange(len(node), device=node.device)
+    source, target = (rank.index_select(0, end) for end in (graph.source, graph.target))
+    low, high = torch.minimum(source, target), torch.maximum(source, target)
+    _, by_high = sorted_by_node(high.int(), graph.num_nodes)
+    _, by_low = sorted_by_node(low.int().index_select(0, by_high), graph.num_nodes)
+    order = by_high.index_select(0, by_low).long()
+    is_forward = (source < target).index_select(0, order)
+    low, high, label = (column.index_select(0, order) for column in (low, high, graph.label))
+    component, measured = component[node], graph.target_from_source.index_select(0, order)
+    measured[:, :3] *= torch.where(is_forward, 1.0, -1.0)[:, None]
+    axes = _axes(low, high, measured, component)
+    measured[:, :3] = _in_axes(axes, measured[:, :3], component, low)
+    ones = torch.ones_like(graph.precision)
+    kind = torch.full_like(low, EdgeKind.LOOP_CLOSURE)
+    canonical = ViewGraph(graph.num_nodes, low, high, measured, kind, ones * torch.nan, label, ones)
+    edge = torch.empty_like(order)
+    edge[order] = torch.arange(len(order), device=order.device)
+    has_parallels = bool(((low[1:] == low[:-1]) & (high[1:] == high[:-1])).any())
+    return CanonicalForm(canonical, component, node, edge, rotations.from_matrix(axes)), has_parallels
+
+
+def _without_copies(graph: ViewGraph) -> tuple[Tensor, Tensor]:
+    """Indices ``(K,)`` of the edges without copies, and which of these stands for each edge ``(M,)``."""
+    is_forward = (graph.source < graph.target)[:, None]
+    number = (graph.target_from_source / _SAME).round().long()
+    number[:, :3] *= torch.where(is_forward, 1, -1)
     # Half turns have two quaternions.
     leading = number[:, :3].sign() * torch.tensor([4, 2, 1], device=number.device)
     number = torch.where(((number[:, 3] == 0) & (leading.sum(dim=1) < 0))[:, None], -number, number)
-    content = torch.cat(((low * graph.num_nodes + high)[close, None], number, graph.label[close, None]), dim=1)
+    low, high = torch.minimum(graph.source, graph.target), torch.maximum(graph.source, graph.target)
+    content = torch.cat((torch.stack((low, high, graph.label), dim=1), number), dim=1)
     _, group = torch.unique(content, dim=0, return_inverse=True)
-    first = torch.full((int(group.max()) + 1,), graph.num_edges, device=group.device)
-    first = first.scatter_reduce(0, group, close, "amin")
-    stands_for = torch.arange(graph.num_edges, device=close.device)
-    stands_for[close] = first[group]
-    is_kept = stands_for == torch.arange(graph.num_edges, device=close.device)
-    place = is_kept.cumsum(0) - 1
-    return is_kept.nonzero().squeeze(1), place[stands_for]
-
-
-def _is_parallel(low: Tensor, high: Tensor, order: Tensor) -> Tensor:
-    """``(M - 1,)`` whether an edge has the ends of the one before it, in an order by both ends."""
-    low, high = low[order], high[order]
-    return (low[1:] == low[:-1]) & (high[1:] == high[:-1])
-
-
-def _by_both_ends(low: Tensor, high: Tensor, num_nodes: int) -> Tensor:
-    """The order of edges by ``low`` and then by ``high``, ``(M,)``."""
-    _, by_high = sorted_by_node(high.int(), num_nodes)
-    _, by_low = sorted_by_node(low.int()[by_high.long()], num_nodes)
-    return by_high.long()[by_low.long()]
+    every = torch.arange(graph.num_edges, device=group.device)
+    first = torch.full_like(every, graph.num_edges).scatter_reduce(0, group, every, "amin")[group]
+    is_kept = first == every
+    return is_kept.nonzero().squeeze(1), (is_kept.cumsum(0) - 1)[first]
 
 
 def _nodes_in_order(graph: ViewGraph, component: Tensor) -> Tensor:
@@ -135,74 +128,71 @@ def _nodes_in_order(graph: ViewGraph, component: Tensor) -> Tensor:
     weight = 0.5 + graph.target_from_source[:, 3]
     walks = torch.ones(graph.num_nodes, dtype=weight.dtype, device=weight.device)
     for _ in range(_WALK_LENGTH):
-        walks = _collected(graph, weight * walks[graph.source], weight * walks[graph.target])
+        walks = _collected(graph, *(weight * walks.index_select(0, end) for end in (graph.source, graph.target)))
     by_walks = walks.argsort(stable=True)
     return by_walks[component[by_walks].argsort(stable=True)]
 
 
 def _collected(graph: ViewGraph, at_target: Tensor, at_source: Tensor) -> Tensor:
     """Sums ``(N,)`` of what edges ``(M,)`` bring to their ends."""
-    ends = ((graph.target, at_target), (graph.source, at_source))
-    into, out_of = (torch.bincount(end, weight, minlength=graph.num_nodes) for end, weight in ends)
-    return into + out_of
+    collected = at_target.new_zeros(graph.num_nodes)
+    return collected.index_add_(0, graph.target, at_target).index_add_(0, graph.source, at_source)
 
 
-def _axes(graph: ViewGraph, component: Tensor) -> Tensor:
-    """Canonical axes ``(C, 3, 3)``, in rows, of the cameras of each component."""
+def _axes(source: Tensor, target: Tensor, target_from_source: Tensor, component: Tensor) -> Tensor:
+    """Canonical axes ``(C, 3, 3)``, in rows, of the cameras of each component; of edges ``(M,)`` in canonical order."""
     count = int(component.max()) + 1 if len(component) else 0
-    rows, of_edge = graph.target_from_source.t().contiguous(), component[graph.source]
-    _, axes = torch.linalg.eigh(_moments(rows[:3], of_edge, count))
-    main = axes[:, :, 2]
-    off_main = torch.eye(3, dtype=main.dtype, device=main.device) - main[:, :, None] * main[:, None]
-    # The main axis has no swing; it is kept apart from the others by a moment below zero.
-    swings = _moments(_swings(main, rows, of_edge), of_edge.repeat(2), count)
-    _, axes = torch.linalg.eigh(
-        off_main @ swings @ off_main
-        - swings.diagonal(dim1=1, dim2=2).sum(dim=1)[:, None, None] * main[:, :, None] * main[:, None]
-    )
-    arriving = torch.stack([_collected(graph, row, -row) for row in rows[:3]])
+    of_edge = component[source]
+    some = evenly_spread(of_edge, count, _MOST_EDGES)
+    source, target, of_edge = (column.index_select(0, some) for column in (source, target, of_edge))
+    rows = target_from_source.index_select(0, some).t().contiguous()
+    main = torch.linalg.eigh(_moments(rows[:3], of_edge, count)).eigenvectors
+    # The main axis last: then what turns about it have left lies in the plane of the first two coordinates.
+    first, second, along = _in_axes(main.mT, rows[:3].t(), component, source).t()
+    length = torch.hypot(along, rows[3]).clamp(min=_SAME)
+    along, cosine = along / length, rows[3] / length
+    before = torch.stack((cosine * first - along * second, cosine * second + along * first))
+    after = torch.stack((cosine * first + along * second, cosine * second - along * first))
+    moment = _moments(before, of_edge, count) + _moments(after, of_edge, count)
+    in_plane = torch.linalg.eigh(moment).eigenvectors[:, :, 1]
+    axes = torch.stack(((main[:, :, :2] @ in_plane[:, :, None]).squeeze(2), main[:, :, 2]), dim=1)
+    arriving = rows.new_zeros(3, len(component)).index_add_(1, target, rows[:3]).index_add_(1, source, -rows[:3])
     skew = _sums((arriving * arriving).sum(dim=0) * arriving, component, count)
-    x, y = (_towards(axis, skew) for axis in (axes[:, :, 2], main))
-    return torch.stack((x, y, torch.linalg.cross(x, y)), dim=1)
+    axes = torch.where(axes @ skew[:, :, None] < 0, -axes, axes)
+    return torch.cat((axes, torch.linalg.cross(axes[:, :1], axes[:, 1:])), dim=1)
+
+
+def evenly_spread(group: Tensor, num_groups: int, largest: int) -> Tensor:
+    """Indices of members, evenly spread, at most about ``largest`` of each group ``(M,)``."""
+    if num_groups == 1:
+        return torch.arange(0, len(group), 1 + (len(group) - 1) // largest, device=group.device)
+    order = group.sort(stable=True).indices
+    count = torch.bincount(group, minlength=num_groups)
+    ordered = group[order]
+    rank = torch.arange(len(group), device=group.device) - (count.cumsum(0) - count)[ordered]
+    stride = (count + largest - 1).div(largest, rounding_mode="floor")[ordered]
+    return order[rank % stride == 0]
 
 
 def _moments(rows: Tensor, group: Tensor, count: int) -> Tensor:
-    """Robust second moments ``(G, 3, 3)`` of the columns of ``(3, M)`` by group ``(M,)``, up to their scale."""
+    """Robust second moments ``(C, k, k)`` of the columns of ``(k, M)`` by group ``(M,)``, up to their scale."""
     square = (rows * rows).sum(dim=0)
-    typical = square.median()[None] if count == 1 else median_by_group(square, group, count)[group]
-    weighted = rows / (square + typical.clamp(min=_SAME**2))
-    return _sums((weighted[:, None] * rows[None]).flatten(0, 1), group, count).reshape(count, 3, 3)
-
-
-def _swings(axis: Tensor, rows: Tensor, group: Tensor) -> Tensor:
-    """What is left of rotations ``(4, M)`` without their turn about the axes ``(C, 3)`` of their groups, ``(3, 2M)``.
-
-    R̃ = T S = S' T with a turn T about the axis: x, y, z of S, and then of S'.
-    """
-    along = axis.t()[:, group] if len(axis) > 1 else axis.t()
-    vector = rows[:3]
-    sine, cosine = (along * vector).sum(dim=0), rows[3]
-    off_axis = vector - along * sine
-    across = torch.linalg.cross(along.expand_as(vector), vector, dim=0)
-    length = (sine * sine + cosine * cosine).sqrt().clamp(min=_SAME)
-    before, after = cosine * off_axis - sine * across, cosine * off_axis + sine * across
-    return torch.cat((before / length, after / length), dim=1)
+    typical = median_by_group(square, group, count)
+    weighted = rows / (square + (typical if count == 1 else typical[group]).clamp(min=_SAME**2))
+    if count == 1:
+        return (weighted @ rows.t())[None]
+    return _sums((weighted[:, None] * rows[None]).flatten(0, 1), group, count).reshape(count, len(rows), len(rows))
 
 
 def _sums(rows: Tensor, group: Tensor, count: int) -> Tensor:
-    """Sums ``(G, k)`` of the columns of ``(k, M)`` by group ``(M,)``."""
+    """Sums ``(C, k)`` of the columns of ``(k, M)`` by group ``(M,)``."""
     if count == 1:
         return rows.sum(dim=1)[None]
     return rows.new_zeros(len(rows), count).index_add_(1, group, rows).t()
 
 
-def _towards(axis: Tensor, direction: Tensor) -> Tensor:
-    """The axes ``(C, 3)``, each turned round if it points away from its direction ``(C, 3)``."""
-    return torch.where((axis * direction).sum(dim=1, keepdim=True) < 0, -axis, axis)
-
-
-def _turned(axes: Tensor, vectors: Tensor, group: Tensor) -> Tensor:
-    """Vectors ``(M, 3)`` as the axes ``(C, 3, 3)`` of their groups have them."""
+def _in_axes(axes: Tensor, vectors: Tensor, component: Tensor, source: Tensor) -> Tensor:
+    """Vectors ``(M, 3)`` of edges, given their sources, as the axes ``(C, 3, 3)`` of their components have them."""
     if len(axes) == 1:
         return vectors @ axes[0].t()
-    return (axes[group] @ vectors[:, :, None]).squeeze(2)
+    return (axes[component[source]] @ vectors[:, :, None]).squeeze(2)

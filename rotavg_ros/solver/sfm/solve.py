@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -11,12 +13,13 @@ from rotavg_ros.solver.estimate import Estimate, Run
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.fine_net import FineNet
 from rotavg_ros.solver.neurora.numbers import NUMBERS
-from rotavg_ros.solver.neurora.scores import residual_score
+from rotavg_ros.solver.neurora.scores import residual_and_uncertainty, residual_probability
 from rotavg_ros.solver.neurora.stages import apply_labels, clean, fine_tune, trust_all
 from rotavg_ros.solver.neurora.tiled.tuning import tune
-from rotavg_ros.solver.neurora.tree import bootstrap
+from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap
 from rotavg_ros.solver.sfm.options import SfmStages
 from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
+from rotavg_ros.solver.sfm.series import EdgesInSeries
 from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
@@ -33,16 +36,19 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     networks, watch = run.networks, run.watch
     if graph.num_edges > _TUNING_PAYS and graph.device.type == "cpu":
         tune()
-    form = CanonicalForm.of(graph, component)
+    with watch.stage("order"):
+        form = CanonicalForm.of(graph, component)
     graph, component = form.graph, form.component
     with watch.stage("clean"):
         cleaned = clean(networks.load(CleanNet), graph) if stages.clean else trust_all(graph)
         cleaned = apply_labels(cleaned, graph.label)
     with watch.stage("bootstrap"):
-        orientations, roots, cleaned = bootstrap(cleaned, component)
+        begun = bootstrap(cleaned, component)
+        cleaned, orientations = begun.cleaned, begun.body_from_world
+        structure = _structure(begun, component)
         if run.warm_start is not None:
             start = form.canonical_orientations(run.warm_start.double().to(graph.device))
-            orientations = rotations.multiply(start, rotations.inverse(start[roots])[component])
+            orientations = rotations.multiply(start, rotations.inverse(start[begun.roots])[component])
     for _ in range(stages.fine_tunings):
         with watch.stage("fine-tune"):
             orientations = fine_tune(networks.load(FineNet), cleaned, orientations, component)
@@ -53,12 +59,29 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
         with watch.stage("refine"):
             allowed = (graph.label != EdgeLabel.REJECTED).double()
             coarse = 1 - cleaned.outlier_probability if stages.weighted else torch.ones_like(allowed)
-            structure = Structure(component, roots, cleaned.edges)
             weights = EdgeWeights(allowed, allowed * coarse)
             priors = PRIORS if stages.shaped else ROUND
             orientations = refine(graph, orientations, steps, structure=structure, weights=weights, priors=priors)
-    fits = steps > 0 or stages.fine_tunings > 0
     # Where there is but a tree, CleanNet's own score; else a residual is the noise but for the orientations' error.
-    probability = cleaned.outlier_probability.double()
-    score = residual_score(graph, orientations, NUMBERS.outlier_angle, component) if fits else probability
+    fits = steps > 0 or stages.fine_tunings > 0
+    score = _residual_scores(graph, orientations, structure) if fits else cleaned.outlier_probability.double()
     return Estimate(form.orientations(orientations), score[form.edge], torch.full((graph.num_nodes,), torch.nan))
+
+
+def _structure(begun: Bootstrapped, component: Tensor) -> Structure:
+    """The graph's connections; of edges in series CleanNet says which is to blame, as far as it can know."""
+    graph, probability = begun.cleaned.measured, begun.cleaned.outlier_probability.double()
+    series = EdgesInSeries.of(graph, begun.parent, begun.parent_edge)
+    structure = Structure(component, begun.roots, begun.cleaned.edges, series)
+    redundancy = structure.redundancy(graph)
+    trust = (redundancy / (redundancy + PRIORS.half_trusted))[component][graph.source]
+    log_odds = probability.logit().clamp(-NUMBERS.max_logit, NUMBERS.max_logit)
+    return replace(structure, series=series.blamed(trust * log_odds))
+
+
+def _residual_scores(graph: ViewGraph, body_from_world: Tensor, structure: Structure) -> Tensor:
+    """Probability that an edge is an outlier by what orientations ``(N, 4)`` leave, ``(M,)`` float64."""
+    angle, uncertainty = residual_and_uncertainty(graph, body_from_world, structure.component)
+    score = residual_probability(angle, uncertainty, NUMBERS.outlier_angle)
+    score[structure.series.edge] = structure.series.score(angle, uncertainty, NUMBERS.outlier_angle)
+    return score
