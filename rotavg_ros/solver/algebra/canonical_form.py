@@ -68,6 +68,18 @@ class CanonicalForm:
         place[by_angle] = form.edge
         return replace(form, edge=place[copy_of])
 
+    def first_nodes(self) -> Tensor:
+        """``(C,)`` the node of the canonical graph that is the first of each component of the given one."""
+        nodes = torch.full((len(self.canonical_from_body),), len(self.node), device=self.node.device)
+        first = nodes.scatter_reduce(0, self.component, self.node, "amin")
+        place = torch.empty_like(self.node)
+        place[self.node] = torch.arange(len(self.node), device=self.node.device)
+        return place[first]
+
+    def of_nodes(self, value: Tensor) -> Tensor:
+        """Values ``(N,)`` of the canonical graph's nodes → of the given one's."""
+        return torch.empty_like(value).scatter_(0, self.node, value)
+
     def orientations(self, body_from_world: Tensor) -> Tensor:
         """Those of the canonical graph → those of the given one, ``(N, 4)``."""
         axes = rotations.inverse(self.canonical_from_body)[self.component]

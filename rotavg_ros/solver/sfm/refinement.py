@@ -102,12 +102,13 @@ def _shaped(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: in
     noise = problem.round
     variance = problem.variance_of_means()
     dispersion = torch.ones_like(problem.roots, dtype=orientations.dtype)
-    dtype, share = torch.float32, None
+    dtype, step = torch.float32, None
     is_open = torch.ones_like(problem.roots, dtype=torch.bool)
     is_held = torch.zeros_like(is_open)
     for _ in range(max_steps):
-        if bool(is_held.all()):
-            measure = Measure(problem.shapes.carried(noise, orientations), variance, l_half_weight, dtype, share)
+        if step is not None and bool(is_held.all()):
+            carried = problem.shapes.carried(noise, orientations)
+            measure = Measure(carried, variance, l_half_weight, dtype, step.weights.source_share)
         else:
             sample = problem.sample(orientations)
             is_noisy = problem.is_well_knit and bool((problem.typical(sample) > priors.coarse_noise).all())
@@ -117,7 +118,6 @@ def _shaped(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: in
             pooled = problem.pooled(orientations, measure, prior)
             dispersion = torch.where(is_held, dispersion, problem.dispersion(sample, measure, pooled))
         step = problem.step(orientations, measure, problem.pooled(orientations, measure, prior), is_open)
-        share = step.source_share
         variance = (dispersion[problem.component] / step.weight).clamp(min=priors.least_square / 2)
         length = (step.decrement / (dispersion * problem.num_nodes)).sqrt()
         stretch = torch.where(length < priors.stretched, priors.relaxation, 1.0)

@@ -43,7 +43,11 @@ class EdgesInSeries(NamedTuple):
 
     @classmethod
     def of(cls, graph: ViewGraph, parent: Tensor, parent_edge: Tensor) -> EdgesInSeries:
-        """Of a graph with a spanning forest: ``(N,)`` each node's parent, itself for roots, and the edge to it, or -1."""
+        """Of a graph with a spanning forest.
+
+        Args:
+            parent, parent_edge: ``(N,)`` each node's parent and the edge to it; of a root itself, and -1.
+        """
         is_child = parent_edge >= 0
         in_forest = torch.zeros(graph.num_edges, dtype=torch.bool, device=graph.device)
         in_forest[parent_edge[is_child]] = True
@@ -58,11 +62,12 @@ class EdgesInSeries(NamedTuple):
         seen[forest_flow & (_TABLE - 1)] = True
         likely = seen.index_select(0, flow & (_TABLE - 1))
         edge = torch.cat((parent_edge[is_child], others[likely]))
-        _, group, size = torch.cat((forest_flow, flow[likely])).unique(return_inverse=True, return_counts=True)
+        flows = torch.cat((forest_flow, flow[likely]))
+        _, group, size = torch.unique(flows, return_inverse=True, return_counts=True)
         # Bridges have no flow; nothing at all checks them.
         checked = torch.cat((forest_flow != 0, likely.new_ones(int(likely.sum()))))
         chosen = (checked & (size[group] > 1)).nonzero().squeeze(1)
-        _, group, size = group[chosen].unique(return_inverse=True, return_counts=True)
+        _, group, size = torch.unique(group[chosen], return_inverse=True, return_counts=True)
         return cls(edge[chosen], group, len(size), 1 / size.double()[group])
 
     def blamed(self, log_odds: Tensor) -> EdgesInSeries:

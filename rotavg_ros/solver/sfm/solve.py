@@ -9,6 +9,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
+from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.estimate import Estimate, Run
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.fine_net import FineNet
@@ -21,6 +22,7 @@ from rotavg_ros.solver.sfm.options import SfmStages
 from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
 from rotavg_ros.solver.sfm.series import EdgesInSeries
 from rotavg_ros.solver.sfm.step import Structure
+from rotavg_ros.solver.sfm.uncertainty import References, variances
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # A graph of more edges is worth measuring what tiles this machine likes.
@@ -48,7 +50,9 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
         structure = _structure(begun, component)
         if run.warm_start is not None:
             start = form.canonical_orientations(run.warm_start.double().to(graph.device))
-            orientations = rotations.multiply(start, rotations.inverse(start[begun.roots])[component])
+            orientations = rotations.canonical(
+                rotations.multiply(start, rotations.inverse(start[begun.roots])[component])
+            )
     for _ in range(stages.fine_tunings):
         with watch.stage("fine-tune"):
             orientations = fine_tune(networks.load(FineNet), cleaned, orientations, component)
@@ -65,7 +69,12 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     # Where there is but a tree, CleanNet's own score; else a residual is the noise but for the orientations' error.
     fits = steps > 0 or stages.fine_tunings > 0
     score = _residual_scores(graph, orientations, structure) if fits else cleaned.outlier_probability.double()
-    return Estimate(form.orientations(orientations), score[form.edge], torch.full((graph.num_nodes,), torch.nan))
+    variance = torch.full((graph.num_nodes,), torch.nan)
+    if steps > 0 and 2 * graph.num_edges < PRIORS.well_knit_degree * graph.num_nodes:
+        with watch.stage("uncertainty"):
+            angle = EdgeResiduals(graph, orientations).angles()
+            variance = form.of_nodes(variances(graph, angle, score, References(component, form.first_nodes())))
+    return Estimate(form.orientations(orientations), score[form.edge], variance)
 
 
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:

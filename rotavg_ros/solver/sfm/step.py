@@ -73,7 +73,7 @@ class Measure(NamedTuple):
     source_share: Tensor | None = None
 
     def rows(self, dtype: torch.dtype) -> Tensor:
-        """What each node says of its edges: variance and, unless noise is round, six entries of the shape, ``(k, N)``."""
+        """What nodes say of their edges, ``(k, N)``: variance and, unless noise is round, six entries of the shape."""
         variance = self.variance[None]
         if self.shape.covariance is None:
             return variance.to(dtype)
@@ -116,13 +116,13 @@ class Step(NamedTuple):
         turn: ``(3, N)`` radians, world's frame.
         weight: ``(N,)`` of all edges of each node.
         decrement: ``(C,)`` xᵀ L x.
-        source_share: ``(M,)`` as in :class:`Measure`.
+        weights: the edges' robust weights.
     """
 
     turn: Tensor
     weight: Tensor
     decrement: Tensor
-    source_share: Tensor
+    weights: SplitWeights
 
 
 class Problem:
@@ -219,7 +219,7 @@ class Problem:
             turn, _ = system.solve(force, approximate, *tolerances)
         decrement = (force * turn).sum(dim=0).double()
         turn = (turn - turn[:, self.roots[self.component]]).double()
-        return Step(turn, system.weight_sum.double(), self.sum(decrement), weights.source_share)
+        return Step(turn, system.weight_sum.double(), self.sum(decrement), weights)
 
     def _weights_and_forces(self, orientations: Tensor, measure: Measure, prior: Tensor) -> tuple[SplitWeights, Tensor]:
         """The edges' robust weights, and the weighted residuals that pull at each node, summed ``(3, N)``."""
@@ -235,9 +235,9 @@ class Problem:
         def walk(part: int) -> None:
             for edges in parts[part]:
                 source, target = graph.source[edges], graph.target[edges]
-                ends = (rows.index_select(1, end) for end in (source, target))
+                at_source, at_target = rows.index_select(1, source), rows.index_select(1, target)
                 held = None if measure.source_share is None else measure.source_share[edges].to(dtype)
-                expected = Expected.of(residuals.vectors(edges), *ends, held)
+                expected = Expected.of(residuals.vectors(edges), at_source, at_target, held)
                 robust = measure.weigh(expected.square + expected.variance).mul_(prior[edges])
                 weights.total[edges], weights.source_share[edges] = robust, expected.source_share
                 pull = expected.pull.mul_(robust)
