@@ -11,7 +11,6 @@ from torch import Tensor
 from rotavg_ros import baselines, rotations
 from rotavg_ros.errors import UserError
 from rotavg_ros.solver import devices, warnings
-from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
 from rotavg_ros.solver.algebra.threads import workers
 from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
 from rotavg_ros.solver.methods import (
@@ -32,7 +31,7 @@ from rotavg_ros.solver.slam.solve import solve_slam, update_slam
 from rotavg_ros.solver.slam.update.memory import SlamMemory, WholeSolveMemory
 from rotavg_ros.solver.slam.update.posterior_memory import PosteriorMemory
 from rotavg_ros.solver.solution import Solution
-from rotavg_ros.view_graph import EdgeLabel, HoldsViewGraph, ViewGraph, view_graph_of
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel, HoldsViewGraph, ViewGraph, view_graph_of
 
 # The noise that makes an edge an outlier, in radians.
 _OUTLIER_ANGLE = {"sfm": NUMBERS.outlier_angle, "slam": judging.OUTLIER_ANGLE}
@@ -196,15 +195,12 @@ def _solve_once(job: _Job, name: str, run: Run) -> Estimate:
 
 def _solve_baseline(job: _Job, name: str, run: Run) -> Estimate:
     """One of the methods to compare with. It gives no scores, so the residuals it leaves must do."""
-    graph, start, form = job.graph, run.warm_start, None
+    graph = job.graph
     if job.profile == "sfm":  # where an order of the nodes means nothing
-        form = CanonicalForm.of(graph, job.component)
-        graph, start = form.graph, None if start is None else form.canonical_orientations(start)
+        graph = replace(graph, kind=torch.full_like(graph.kind, EdgeKind.LOOP_CLOSURE))
     with run.watch.stage(name):
-        orientations = baselines.BASELINES[name](graph, start)
+        orientations = baselines.BASELINES[name](graph, run.warm_start)
     score = baselines.residual_score(graph, orientations, _OUTLIER_ANGLE[job.profile])
-    if form is not None:
-        orientations, score = form.orientations(orientations), score[form.edge]
     return Estimate(orientations, score, torch.full((graph.num_nodes,), torch.nan))
 
 
