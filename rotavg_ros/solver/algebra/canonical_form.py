@@ -105,15 +105,18 @@ def _form(graph: ViewGraph, component: Tensor) -> tuple[CanonicalForm, bool]:
     order = by_high.index_select(0, by_low).long()
     is_forward = (source < target).index_select(0, order)
     low, high, label = (column.index_select(0, order) for column in (low, high, graph.label))
-    component, measured = component[node], graph.target_from_source.index_select(0, order)
-    measured[:, :3] *= torch.where(is_forward, 1.0, -1.0)[:, None]
-    axes = _axes(low, high, measured, component)
-    measured[:, :3] = _in_axes(axes, measured[:, :3], component, low)
+    component = component[node]
+    # Components in rows: picking numbers one by one takes a quarter of the time of picking rows of four.
+    rows = torch.stack([row.index_select(0, order) for row in graph.target_from_source.t().contiguous()])
+    rows[:3] *= torch.where(is_forward, 1.0, -1.0)
+    axes = _axes(low, high, rows, component)
+    turned = torch.cat((_in_axes(axes, rows[:3], component, low), rows[3:]))
     ones = torch.ones_like(graph.precision)
     kind = torch.full_like(low, EdgeKind.LOOP_CLOSURE)
-    canonical = ViewGraph(graph.num_nodes, low, high, measured, kind, ones * torch.nan, label, ones)
-    edge = torch.empty_like(order)
-    edge[order] = torch.arange(len(order), device=order.device)
+    canonical = ViewGraph(
+        graph.num_nodes, low, high, turned.t().contiguous(), kind, torch.full_like(ones, torch.nan), label, ones
+    )
+    edge = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
     has_parallels = bool(((low[1:] == low[:-1]) & (high[1:] == high[:-1])).any())
     return CanonicalForm(canonical, component, node, edge, rotations.from_matrix(axes)), has_parallels
 
@@ -151,16 +154,22 @@ def _collected(graph: ViewGraph, at_target: Tensor, at_source: Tensor) -> Tensor
     return collected.index_add_(0, graph.target, at_target).index_add_(0, graph.source, at_source)
 
 
-def _axes(source: Tensor, target: Tensor, target_from_source: Tensor, component: Tensor) -> Tensor:
-    """Canonical axes ``(C, 3, 3)``, in rows, of the cameras of each component; of edges ``(M,)`` in canonical order."""
+def _axes(source: Tensor, target: Tensor, rows: Tensor, component: Tensor) -> Tensor:
+    """Canonical axes ``(C, 3, 3)`` of the cameras of each component, an axis a row.
+
+    Args:
+        source, target: ``(M,)`` of edges in canonical order.
+        rows: ``(4, M)`` their measurements.
+        component: ``(N,)`` of every node.
+    """
     count = int(component.max()) + 1 if len(component) else 0
-    of_edge = component[source]
+    of_edge = component.index_select(0, source)
     some = evenly_spread(of_edge, count, _MOST_EDGES)
     source, target, of_edge = (column.index_select(0, some) for column in (source, target, of_edge))
-    rows = target_from_source.index_select(0, some).t().contiguous()
+    rows = torch.stack([row.index_select(0, some) for row in rows])
     main = torch.linalg.eigh(_moments(rows[:3], of_edge, count)).eigenvectors
     # The main axis last: then what turns about it have left lies in the plane of the first two coordinates.
-    first, second, along = _in_axes(main.mT, rows[:3].t(), component, source).t()
+    first, second, along = _in_axes(main.mT, rows[:3], component, source)
     length = torch.hypot(along, rows[3]).clamp(min=_SAME)
     along, cosine = along / length, rows[3] / length
     before = torch.stack((cosine * first - along * second, cosine * second + along * first))
@@ -204,7 +213,7 @@ def _sums(rows: Tensor, group: Tensor, count: int) -> Tensor:
 
 
 def _in_axes(axes: Tensor, vectors: Tensor, component: Tensor, source: Tensor) -> Tensor:
-    """Vectors ``(M, 3)`` of edges, given their sources, as the axes ``(C, 3, 3)`` of their components have them."""
+    """Vectors ``(3, M)`` of edges, given their sources, as the axes ``(C, 3, 3)`` of their components have them."""
     if len(axes) == 1:
-        return vectors @ axes[0].t()
-    return (axes[component[source]] @ vectors[:, :, None]).squeeze(2)
+        return axes[0] @ vectors
+    return (axes.permute(1, 2, 0)[:, :, component[source]] * vectors).sum(dim=1)

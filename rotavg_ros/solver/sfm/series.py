@@ -71,9 +71,8 @@ class EdgesInSeries(NamedTuple):
         return cls(edge[chosen], group, len(size), 1 / size.double()[group])
 
     def blamed(self, log_odds: Tensor) -> EdgesInSeries:
-        """With the blame that log-odds ``(M,)`` of every edge to be wrong give it."""
-        chosen = log_odds[self.edge].double()
-        odds = torch.exp(chosen - chosen.amax()) if len(chosen) else chosen
+        """With the blame that log-odds ``(K,)`` to be wrong give."""
+        odds = torch.exp(log_odds - log_odds.amax()) if len(log_odds) else log_odds
         return self._replace(blame=odds / self.sums(odds)[self.group])
 
     def score(self, angle: Tensor, uncertainty: Tensor, outlier_angle: float) -> Tensor:

@@ -74,18 +74,19 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
         with watch.stage("uncertainty"):
             angle = EdgeResiduals(graph, orientations).angles()
             variance = form.of_nodes(variances(graph, angle, score, References(component, form.first_nodes())))
-    return Estimate(form.orientations(orientations), score[form.edge], variance)
+    return Estimate(form.orientations(orientations), score.index_select(0, form.edge), variance)
 
 
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:
     """The graph's connections; of edges in series CleanNet says which is to blame, as far as it can know."""
-    graph, probability = begun.cleaned.measured, begun.cleaned.outlier_probability.double()
+    graph = begun.cleaned.measured
     series = EdgesInSeries.of(graph, begun.parent, begun.parent_edge)
     structure = Structure(component, begun.roots, begun.cleaned.edges, series)
     redundancy = structure.redundancy(graph)
-    trust = (redundancy / (redundancy + PRIORS.half_trusted))[component][graph.source]
-    log_odds = probability.logit().clamp(-NUMBERS.max_logit, NUMBERS.max_logit)
-    return replace(structure, series=series.blamed(trust * log_odds))
+    trust = (redundancy / (redundancy + PRIORS.half_trusted))[component[graph.source[series.edge]]]
+    log_odds = begun.cleaned.outlier_probability[series.edge].double().logit()
+    log_odds = trust * log_odds.clamp(-NUMBERS.max_logit, NUMBERS.max_logit)
+    return replace(structure, series=series.blamed(log_odds))
 
 
 def _residual_scores(graph: ViewGraph, body_from_world: Tensor, structure: Structure) -> Tensor:

@@ -50,7 +50,7 @@ class Structure:
 
     def redundancy(self, graph: ViewGraph) -> Tensor:
         """How many edges each component has beyond a spanning tree, ``(C,)``."""
-        members = (self.component[graph.source], self.component)
+        members = (self.component.index_select(0, graph.source), self.component)
         edges, nodes = (torch.bincount(member, minlength=len(self.roots)) for member in members)
         return edges - nodes + 1
 
@@ -138,7 +138,7 @@ class Problem:
         self.is_well_knit = 2 * graph.num_edges >= priors.well_knit_degree * graph.num_nodes
         self.num_nodes = torch.bincount(self.component, minlength=len(self.roots))
         self.shapes = ShapeEstimator(self.component, structure.redundancy(graph), priors.shape)
-        self._chosen = evenly_spread(self.component[graph.source], len(self.roots), priors.max_sample)
+        self._chosen = evenly_spread(self.component.index_select(0, graph.source), len(self.roots), priors.max_sample)
         self._some = graph.select_edges(self._chosen)
         self._component_of_some = self.component[self._some.source]
         self._count_of_some = torch.bincount(self._component_of_some, minlength=len(self.roots)).clamp(min=1)
