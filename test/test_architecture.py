@@ -77,7 +77,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "refinement": {"priors", "step"},
         "step": {"block_laplacian", "noise_shape", "priors", "series"},
         "series": set(),
-        "uncertainty": set(),
+        "uncertainty": {"priors"},
         "solve": {"options", "refinement", "series", "step", "uncertainty"},
     },
     "solver/slam": {

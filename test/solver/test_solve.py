@@ -170,7 +170,8 @@ def test_stages_follow_the_method() -> None:
     assert "refine" not in solve(graph, refinement_steps=0).stage_seconds
     paper = solve(graph, profile="sfm", method="neurora-paper").stage_seconds
     assert list(paper) == ["order", "clean", "bootstrap", "fine-tune"]
-    assert list(solve(graph, profile="sfm").stage_seconds) == ["clean", "bootstrap", "fine-tune", "refine"]
+    whole = solve(graph, profile="sfm").stage_seconds
+    assert list(whole) == ["order", "clean", "bootstrap", "fine-tune", "refine", "uncertainty"]
 
 
 @pytest.mark.parametrize("profile", ["slam", "sfm"])

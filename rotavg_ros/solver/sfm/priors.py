@@ -63,7 +63,7 @@ class RefinementPriors:
         well_knit_degree: edges per node from which on conjugate gradients are tried without a factorisation. Half: up
             to 1.5 % on small graphs.
         max_sample: edges of a component that tell its noise; half and twice: up to 1.4 %.
-        half_trusted: edges beyond a spanning tree with which CleanNet's log-odds count by half where they tell edges in
+        half_trusted: edges beyond a cycle with which CleanNet's log-odds count by half where they tell edges in
             series apart: it knows graphs in which many edges check each other. Orientations of the synthetic recipes,
             which have thousands, do not depend on it.
         shape: how the noise's shape is estimated.

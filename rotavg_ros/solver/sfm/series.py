@@ -79,10 +79,9 @@ class EdgesInSeries(NamedTuple):
         """Probability ``(K,)`` that noise exceeds ``outlier_angle``, rad: of one of the class, times the blame.
 
         Args:
-            angle, uncertainty: ``(M,)`` rad, of all edges, as residuals have them.
+            angle, uncertainty: ``(K,)`` rad, as residuals have them.
         """
-        together = self.sums(angle[self.edge].double())
-        spread = self.sums(uncertainty[self.edge].double().square()).sqrt()
+        together, spread = self.sums(angle.double()), self.sums(uncertainty.double().square()).sqrt()
         return self.blame * residual_probability(together, spread, outlier_angle)[self.group]
 
     def sums(self, value: Tensor) -> Tensor:

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
-from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.estimate import Estimate, Run
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.fine_net import FineNet
@@ -66,14 +65,16 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             weights = EdgeWeights(allowed, allowed * coarse)
             priors = PRIORS if stages.shaped else ROUND
             orientations = refine(graph, orientations, steps, structure=structure, weights=weights, priors=priors)
-    # Where there is but a tree, CleanNet's own score; else a residual is the noise but for the orientations' error.
-    fits = steps > 0 or stages.fine_tunings > 0
-    score = _residual_scores(graph, orientations, structure) if fits else cleaned.outlier_probability.double()
-    variance = torch.full((graph.num_nodes,), torch.nan)
-    if steps > 0 and 2 * graph.num_edges < PRIORS.well_knit_degree * graph.num_nodes:
-        with watch.stage("uncertainty"):
-            angle = EdgeResiduals(graph, orientations).angles()
-            variance = form.of_nodes(variances(graph, angle, score, References(component, form.first_nodes())))
+    score, variance = cleaned.outlier_probability.double(), torch.full((graph.num_nodes,), torch.nan)
+    if steps > 0 or stages.fine_tunings > 0:
+        # Before, there is but a tree; now a residual is the noise but for the orientations' error.
+        angle, spread = residual_and_uncertainty(graph, orientations, component)
+        score = residual_probability(angle, spread, NUMBERS.outlier_angle)
+        series = structure.series
+        score[series.edge] = series.score(angle[series.edge], spread[series.edge], NUMBERS.outlier_angle)
+        if steps > 0:
+            with watch.stage("uncertainty"):
+                variance = form.of_nodes(variances(graph, angle, score, References(component, form.first_nodes())))
     return Estimate(form.orientations(orientations), score.index_select(0, form.edge), variance)
 
 
@@ -83,15 +84,9 @@ def _structure(begun: Bootstrapped, component: Tensor) -> Structure:
     series = EdgesInSeries.of(graph, begun.parent, begun.parent_edge)
     structure = Structure(component, begun.roots, begun.cleaned.edges, series)
     redundancy = structure.redundancy(graph)
-    trust = (redundancy / (redundancy + PRIORS.half_trusted))[component[graph.source[series.edge]]]
+    # Of a lone cycle it has seen nothing that could tell.
+    others = (redundancy - 1).clamp(min=0)
+    trust = (others / (others + PRIORS.half_trusted))[component[graph.source[series.edge]]]
     log_odds = begun.cleaned.outlier_probability[series.edge].double().logit()
     log_odds = trust * log_odds.clamp(-NUMBERS.max_logit, NUMBERS.max_logit)
     return replace(structure, series=series.blamed(log_odds))
-
-
-def _residual_scores(graph: ViewGraph, body_from_world: Tensor, structure: Structure) -> Tensor:
-    """Probability that an edge is an outlier by what orientations ``(N, 4)`` leave, ``(M,)`` float64."""
-    angle, uncertainty = residual_and_uncertainty(graph, body_from_world, structure.component)
-    score = residual_probability(angle, uncertainty, NUMBERS.outlier_angle)
-    score[structure.series.edge] = structure.series.score(angle, uncertainty, NUMBERS.outlier_angle)
-    return score

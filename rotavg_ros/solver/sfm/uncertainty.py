@@ -15,8 +15,10 @@ from torch import Tensor
 
 from rotavg_ros.solver.algebra.laplacian import LaplacianSystem
 from rotavg_ros.solver.algebra.probes import probe_signs
+from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.view_graph import ViewGraph
 
+_WELL_KNIT_DEGREE = RefinementPriors().well_knit_degree
 # Sampled standard deviations err by 9 %.
 _SAMPLES = 64
 # Of edges that are surely wrong: they hold the graph together.
@@ -39,23 +41,35 @@ class References(NamedTuple):
 def variances(graph: ViewGraph, angle: Tensor, score: Tensor, to: References) -> Tensor:
     """Variance ``(N,)`` rad² of each component of a node's error relative to its component's reference.
 
+    NaN in components that are well knit.
+
     Args:
         angle: ``(M,)`` rad, residuals.
         score: ``(M,)`` probability that an edge is an outlier.
     """
-    weight = (1 - score).clamp(min=_LEAST_WEIGHT)
-    of_edge, count = to.component[graph.source], len(to.node)
+    count = len(to.node)
+    size = torch.bincount(to.component, minlength=count)
+    edges = torch.bincount(to.component[graph.source], minlength=count)
+    is_loose = 2 * edges < _WELL_KNIT_DEGREE * size
+    loose = is_loose[to.component]
+    variance = torch.where(loose, 0.0, torch.nan).double()
+    kept = loose[graph.source].nonzero().squeeze(1)
+    if len(kept) == 0:
+        return variance
+    weight = (1 - score[kept]).clamp(min=_LEAST_WEIGHT)
+    source, target = graph.source[kept], graph.target[kept]
 
     def sums(value: Tensor) -> Tensor:
-        return value.new_zeros(count).index_add_(0, of_edge, value)
+        return value.new_zeros(count).index_add_(0, to.component[source], value)
 
     # Edges beyond a spanning tree, at least one: a tree alone says nothing of its noise.
-    believed = sums((score < _FLAGGED).to(weight))
-    checks = (believed - torch.bincount(to.component, minlength=count) + 1).clamp(min=1)
-    noise = sums(weight * angle.to(weight).square()) / (3 * checks)
-    ends = (end.cpu().numpy() for end in (graph.source, graph.target))
-    source, target = ends
-    system = LaplacianSystem(graph.num_nodes, source, target, weight.cpu().numpy(), to.node.cpu().numpy())
-    samples = torch.from_numpy(system.samples(probe_signs(source, target, _SAMPLES))).to(weight)
+    checks = (sums((score[kept] < _FLAGGED).to(weight)) - size + 1).clamp(min=1)
+    noise = sums(weight * angle[kept].to(weight).square()) / (3 * checks)
+    # What is not asked for is held fixed as the references are.
+    fixed = ~loose
+    fixed[to.node] = True
+    ends = source.cpu().numpy(), target.cpu().numpy()
+    system = LaplacianSystem(graph.num_nodes, *ends, weight.cpu().numpy(), fixed.nonzero().squeeze(1).cpu().numpy())
+    samples = torch.from_numpy(system.samples(probe_signs(*ends, _SAMPLES))).to(weight)
     difference = samples - samples[to.node][to.component]
-    return noise[to.component] * difference.square().mean(dim=1)
+    return variance + noise[to.component] * difference.square().mean(dim=1)
