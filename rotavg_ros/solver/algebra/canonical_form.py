@@ -111,11 +111,13 @@ def _form(graph: ViewGraph, component: Tensor) -> tuple[CanonicalForm, bool]:
     rows[:3] *= torch.where(is_forward, 1.0, -1.0)
     axes = _axes(low, high, rows, component)
     turned = torch.cat((_in_axes(axes, rows[:3], component, low), rows[3:]))
-    ones = torch.ones_like(graph.precision)
-    kind = torch.full_like(low, EdgeKind.LOOP_CLOSURE)
-    canonical = ViewGraph(
-        graph.num_nodes, low, high, turned.t().contiguous(), kind, torch.full_like(ones, torch.nan), label, ones
+    # One number each, seen M times: at millions of edges columns that nobody reads take room.
+    unread = (
+        torch.full_like(column[:1], value).expand(len(column))
+        for column, value in ((graph.kind, EdgeKind.LOOP_CLOSURE), (graph.precision, torch.nan), (graph.steps, 1.0))
     )
+    kind, precision, steps = unread
+    canonical = ViewGraph(graph.num_nodes, low, high, turned.t().contiguous(), kind, precision, label, steps)
     edge = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
     has_parallels = bool(((low[1:] == low[:-1]) & (high[1:] == high[:-1])).any())
     return CanonicalForm(canonical, component, node, edge, rotations.from_matrix(axes)), has_parallels

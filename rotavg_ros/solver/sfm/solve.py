@@ -74,7 +74,8 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
         score[series.edge] = series.score(angle[series.edge], spread[series.edge], NUMBERS.outlier_angle)
         if steps > 0:
             with watch.stage("uncertainty"):
-                variance = form.of_nodes(variances(graph, angle, score, References(component, form.first_nodes())))
+                stated = variances(graph, angle, score, References(component, form.first_nodes()))
+            variance = variance if stated is None else form.of_nodes(stated)
     return Estimate(form.orientations(orientations), score.index_select(0, form.edge), variance)
 
 

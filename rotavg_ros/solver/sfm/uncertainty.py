@@ -38,10 +38,10 @@ class References(NamedTuple):
     node: Tensor
 
 
-def variances(graph: ViewGraph, angle: Tensor, score: Tensor, to: References) -> Tensor:
+def variances(graph: ViewGraph, angle: Tensor, score: Tensor, to: References) -> Tensor | None:
     """Variance ``(N,)`` rad² of each component of a node's error relative to its component's reference.
 
-    NaN in components that are well knit.
+    NaN in components that are well knit, and in trees, where nothing checks anything; None if all are well knit.
 
     Args:
         angle: ``(M,)`` rad, residuals.
@@ -51,20 +51,20 @@ def variances(graph: ViewGraph, angle: Tensor, score: Tensor, to: References) ->
     size = torch.bincount(to.component, minlength=count)
     edges = torch.bincount(to.component[graph.source], minlength=count)
     is_loose = 2 * edges < _WELL_KNIT_DEGREE * size
+    if not bool(is_loose.any()):
+        return None
     loose = is_loose[to.component]
-    variance = torch.where(loose, 0.0, torch.nan).double()
     kept = loose[graph.source].nonzero().squeeze(1)
-    if len(kept) == 0:
-        return variance
     weight = (1 - score[kept]).clamp(min=_LEAST_WEIGHT)
     source, target = graph.source[kept], graph.target[kept]
 
     def sums(value: Tensor) -> Tensor:
         return value.new_zeros(count).index_add_(0, to.component[source], value)
 
-    # Edges beyond a spanning tree, at least one: a tree alone says nothing of its noise.
+    # Edges beyond a spanning tree that are believed, at least one.
     checks = (sums((score[kept] < _FLAGGED).to(weight)) - size + 1).clamp(min=1)
     noise = sums(weight * angle[kept].to(weight).square()) / (3 * checks)
+    noise = torch.where(edges >= size, noise, torch.nan)
     # What is not asked for is held fixed as the references are.
     fixed = ~loose
     fixed[to.node] = True
@@ -72,4 +72,4 @@ def variances(graph: ViewGraph, angle: Tensor, score: Tensor, to: References) ->
     system = LaplacianSystem(graph.num_nodes, *ends, weight.cpu().numpy(), fixed.nonzero().squeeze(1).cpu().numpy())
     samples = torch.from_numpy(system.samples(probe_signs(*ends, _SAMPLES))).to(weight)
     difference = samples - samples[to.node][to.component]
-    return variance + noise[to.component] * difference.square().mean(dim=1)
+    return torch.where(loose, noise[to.component] * difference.square().mean(dim=1), torch.nan)

@@ -154,6 +154,10 @@ def test_well_knit_components_state_none() -> None:
     assert bool(uncertainty[20:].isfinite().all())
 
 
+def test_a_tree_states_none() -> None:
+    assert bool(_solved(measured(random_truth(9, 8), np.arange(8), np.arange(8) + 1)).uncertainty.isnan().all())
+
+
 def test_where_a_graph_checks_itself_cleannet_tells_which_of_two_edges_is_wrong() -> None:
     """A camera on two edges, one of them wrong by a wide angle, beside a hundred that see each other."""
     rng = np.random.default_rng(7)
