@@ -142,13 +142,9 @@ def test_loosely_knit_graphs_state_their_uncertainty() -> None:
 def test_well_knit_components_state_none() -> None:
     """Beside a street that does."""
     source, target = np.triu_indices(20, k=1)
-    street = 20 + np.arange(29)
-    graph = measured(
-        random_truth(50, 6),
-        np.concatenate((source, street)),
-        np.concatenate((target, street + 1)),
-        small_noise(219, 1.0, 6),
-    )
+    street = np.repeat(20 + np.arange(28), 2)
+    ends = np.concatenate((source, street)), np.concatenate((target, street + np.tile([1, 2], 28)))
+    graph = measured(random_truth(50, 6), *ends, small_noise(len(ends[0]), 1.0, 6))
     uncertainty = _solved(graph).uncertainty
     assert bool(uncertainty[:20].isnan().all())
     assert bool(uncertainty[20:].isfinite().all())
