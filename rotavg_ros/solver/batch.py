@@ -27,8 +27,6 @@ def solve_batch(
 ) -> list[Solution]:
     """What :func:`~rotavg_ros.solver.solve` says of every graph, to 10⁻⁵ rad; the arguments are the same.
 
-    Uncertainties of photo graphs are sampled anew; they differ by some per cent.
-
     SfM graphs are solved together as one graph of that many components, and ``stage_seconds`` are those of all.
     SLAM graphs, and methods that are not ours, go one by one.
 

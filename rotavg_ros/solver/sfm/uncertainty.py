@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -41,7 +42,7 @@ class References(NamedTuple):
 def variances(graph: ViewGraph, angle: Tensor, score: Tensor, to: References) -> Tensor | None:
     """Variance ``(N,)`` rad² of each component of a node's error relative to its component's reference.
 
-    NaN in components that are well knit, and in trees, where nothing checks anything; None if all are well knit.
+    NaN in components that are well knit, and in trees, where nothing checks anything; None if there are no others.
 
     Args:
         angle: ``(M,)`` rad, residuals.
@@ -50,7 +51,7 @@ def variances(graph: ViewGraph, angle: Tensor, score: Tensor, to: References) ->
     count = len(to.node)
     size = torch.bincount(to.component, minlength=count)
     edges = torch.bincount(to.component[graph.source], minlength=count)
-    is_loose = 2 * edges < _WELL_KNIT_DEGREE * size
+    is_loose = (2 * edges < _WELL_KNIT_DEGREE * size) & (edges >= size)
     if not bool(is_loose.any()):
         return None
     loose = is_loose[to.component]
@@ -64,12 +65,29 @@ def variances(graph: ViewGraph, angle: Tensor, score: Tensor, to: References) ->
     # Edges beyond a spanning tree that are believed, at least one.
     checks = (sums((score[kept] < _FLAGGED).to(weight)) - size + 1).clamp(min=1)
     noise = sums(weight * angle[kept].to(weight).square()) / (3 * checks)
-    noise = torch.where(edges >= size, noise, torch.nan)
     # What is not asked for is held fixed as the references are.
     fixed = ~loose
     fixed[to.node] = True
     ends = source.cpu().numpy(), target.cpu().numpy()
     system = LaplacianSystem(graph.num_nodes, *ends, weight.cpu().numpy(), fixed.nonzero().squeeze(1).cpu().numpy())
-    samples = torch.from_numpy(system.samples(probe_signs(*ends, _SAMPLES))).to(weight)
+    signs = _signs(*ends, to.component[source].cpu().numpy(), _first_nodes(to.component, count))
+    samples = torch.from_numpy(system.samples(signs)).to(weight)
     difference = samples - samples[to.node][to.component]
     return torch.where(loose, noise[to.component] * difference.square().mean(dim=1), torch.nan)
+
+
+def _first_nodes(component: Tensor, count: int) -> np.ndarray:
+    """``(C,)`` of every component."""
+    nodes = torch.arange(len(component), device=component.device)
+    first = nodes.new_full((count,), len(component)).scatter_reduce(0, component, nodes, "amin")
+    return np.asarray(first.cpu().numpy())
+
+
+def _signs(source: np.ndarray, target: np.ndarray, component: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Random signs ``(M, samples)`` of edges, for each component as if it were alone."""
+    signs = np.empty((len(source), _SAMPLES), dtype=np.int8)
+    order = np.argsort(component, kind="stable")
+    for members in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):
+        start = first[component[members[0]]]
+        signs[members] = probe_signs(source[members] - start, target[members] - start, _SAMPLES)
+    return signs
