@@ -75,8 +75,10 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "block_laplacian": {"noise_shape"},
         "noise_shape": {"priors"},
         "refinement": {"priors", "step"},
-        "step": {"block_laplacian", "noise_shape", "priors"},
-        "solve": {"options", "refinement", "step"},
+        "step": {"block_laplacian", "noise_shape", "priors", "series"},
+        "series": set(),
+        "uncertainty": {"priors"},
+        "solve": {"options", "refinement", "series", "step", "uncertainty"},
     },
     "solver/slam": {
         "": set(),

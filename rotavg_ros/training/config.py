@@ -23,8 +23,8 @@ class TrainingConfig:
     Attributes:
         family: "sfm" or "slam", the networks' profile.
         recipe: SfM: "released", "released-spatial" (axes anywhere), "paper", "wide" (small and large noise, mostly on
-            topologies of dense clusters with a sparse fringe), "mixture" (the first three), "broad" or
-            "mostly-released" (all four); SLAM: "wide".
+            topologies of dense clusters with a sparse fringe), "released-round" (noise axes alone anywhere), "mixture"
+            (the first three), "broad" or "mostly-released" (the first four), "any-axes" (all five); SLAM: "wide".
         nodes: cameras or keyframes of the training graphs, drawn uniformly (SLAM: in the logarithm).
         graphs: number of training graphs; each epoch sees all of them once.
         validation_nodes, validation_graphs: the same for the graphs that decide which weights are kept.
@@ -60,7 +60,10 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         recipes = {
-            "sfm": ("released", "released-spatial", "paper", "wide", "mixture", "broad", "mostly-released"),
+            "sfm": (
+                *("released", "released-spatial", "released-round", "paper", "wide"),
+                *("mixture", "broad", "mostly-released", "any-axes"),
+            ),
             "slam": ("wide",),
         }
         if self.family not in recipes:

@@ -38,9 +38,10 @@ class StartedGraph:
 
     @classmethod
     def of(cls, clean_net: CleanNet, graph: SyntheticGraph) -> StartedGraph:
-        start, _, cleaned = bootstrap(clean(clean_net, graph.graph))
+        begun = bootstrap(clean(clean_net, graph.graph))
+        start = begun.body_from_world
         truth = rotations.multiply(graph.body_from_world, gauge_alignment(start, graph.body_from_world))
-        return cls(cleaned, start, truth)
+        return cls(begun.cleaned, start, truth)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe, SyntheticGraph
 from rotavg_ros.datasets.simulation.topology import ClusteredTopology
+from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
 from rotavg_ros.solver.neurora.message_passing import DirectedEdges
 
 
@@ -45,6 +46,7 @@ _MIXTURES = {
     "mixture": {"released": 0.5, "released-spatial": 0.25, "paper": 0.25},
     "broad": {"released": 0.45, "released-spatial": 0.15, "paper": 0.15, "wide": 0.25},
     "mostly-released": {"released": 0.6, "released-spatial": 0.1, "paper": 0.15, "wide": 0.15},
+    "any-axes": {"released": 0.4, "released-round": 0.1, "released-spatial": 0.15, "paper": 0.15, "wide": 0.2},
 }
 _WIDE_NOISE_DEG = (0.2, 30.0)
 _WIDE_OUTLIER_SHARE = (0.0, 0.3)
@@ -61,7 +63,17 @@ def sample_graph(recipe: str, nodes: tuple[int, int], rng: np.random.Generator) 
         # On small graphs the share of pairs grows so that a camera keeps its number of neighbours.
         denser = min(1.0, 0.3 * 500 / nodes[1])
         return PaperRecipe(cameras=nodes, pair_share=(denser / 3, denser)).sample(rng)
-    return ReleasedRecipe(cameras=nodes, planar=recipe == "released").sample(rng)
+    return ReleasedRecipe(
+        cameras=nodes, planar=recipe != "released-spatial", round_noise=recipe == "released-round"
+    ).sample(rng)
+
+
+def in_canonical_form(sample: SyntheticGraph) -> SyntheticGraph:
+    """The same as solves show it to the networks."""
+    form = CanonicalForm.of(sample.graph)
+    noise_angle = sample.noise_angle.new_empty(form.graph.num_edges)
+    noise_angle[form.edge] = sample.noise_angle
+    return SyntheticGraph(form.graph, form.canonical_orientations(sample.body_from_world), noise_angle)
 
 
 def _wide_graph(nodes: tuple[int, int], rng: np.random.Generator) -> SyntheticGraph:

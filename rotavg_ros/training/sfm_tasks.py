@@ -18,7 +18,7 @@ from rotavg_ros.solver.neurora.stages import fine_tune
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.fine_data import FineBatch, StartedGraph
 from rotavg_ros.training.losses import clean_net_loss, fine_net_loss
-from rotavg_ros.training.sfm_data import SfmBatch, join, sample_graph
+from rotavg_ros.training.sfm_data import SfmBatch, in_canonical_form, join, sample_graph
 
 
 class GivenGraphs(NamedTuple):
@@ -37,11 +37,12 @@ def _draw(config: TrainingConfig) -> GivenGraphs:
 
 
 class _SfmTask:
-    """Training and validation graphs: drawn once from the configuration's seed, or given."""
+    """Training and validation graphs, in canonical form: drawn once from the configuration's seed, or given."""
 
     def __init__(self, config: TrainingConfig, given: GivenGraphs | None) -> None:
         self.config = config
-        self.graphs, self.validation = given if given is not None else _draw(config)
+        drawn = given if given is not None else _draw(config)
+        self.graphs, self.validation = ([in_canonical_form(graph) for graph in graphs] for graphs in drawn)
 
     def num_batches(self) -> int:
         return -(-len(self.graphs) // self.config.batch_graphs)

@@ -56,8 +56,9 @@ def test_exact_sfm_graphs_are_solved_exactly(seed: int) -> None:
     target = np.concatenate((np.arange(1, 40), (source[39:] + rng.integers(1, 40, 200)) % 40))
     truth = random_truth(40, seed)
     assert _max_error_deg(measured(truth, source, target), truth, method="spt") < 1e-4
-    # CleanNet expects noise, and sees some; but the measurements as they are fit themselves better.
-    assert _max_error_deg(measured(truth, source, target), truth, method="neurora-paper") < 0.01
+    # CleanNet expects noise, and sees some; but the measurements as they are fit themselves better. FineNet corrects in
+    # units of at least NUMBERS.min_residual, 0.011°.
+    assert _max_error_deg(measured(truth, source, target), truth, method="neurora-paper") < 0.02
     assert _max_error_deg(measured(truth, source, target), truth, refinement_steps=20) < 0.01
 
 
@@ -168,8 +169,9 @@ def test_stages_follow_the_method() -> None:
     assert list(solve(graph).stage_seconds) == ["contract", "clean", "bootstrap", "refine", "expand"]
     assert "refine" not in solve(graph, refinement_steps=0).stage_seconds
     paper = solve(graph, profile="sfm", method="neurora-paper").stage_seconds
-    assert list(paper) == ["clean", "bootstrap", "fine-tune"]
-    assert list(solve(graph, profile="sfm").stage_seconds) == ["clean", "bootstrap", "fine-tune", "refine"]
+    assert list(paper) == ["order", "clean", "bootstrap", "fine-tune"]
+    whole = solve(graph, profile="sfm").stage_seconds
+    assert list(whole) == ["order", "clean", "bootstrap", "fine-tune", "refine", "uncertainty"]
 
 
 @pytest.mark.parametrize("profile", ["slam", "sfm"])

@@ -56,6 +56,7 @@ class ReleasedRecipe:
         noise_deg: standard deviation of the noise's angle, per graph, before division by √3.
         outlier_share: share of the edges disturbed further, by a wide normal rotation.
         planar: turn and noise axes lie in a vertical plane; otherwise anywhere.
+        round_noise: noise axes are anywhere even then.
     """
 
     cameras: tuple[int, int] = (400, 1000)
@@ -66,6 +67,7 @@ class ReleasedRecipe:
     noise_deg: tuple[float, float] = (15.0, 30.0)
     outlier_share: tuple[float, float] = (0.1, 0.2)
     planar: bool = True
+    round_noise: bool = False
 
     def sample(self, rng: np.random.Generator) -> SyntheticGraph:
         """Draw one graph."""
@@ -97,7 +99,8 @@ class ReleasedRecipe:
     def noise(self, m: int, rng: np.random.Generator) -> Rotation:
         """Noise of the ``m`` edges of one graph, outliers included."""
         sigma = np.radians(rng.uniform(*self.noise_deg)) / np.sqrt(3)
-        noise = Rotation.from_rotvec(_axes(m, self.planar, rng) * sigma * rng.standard_normal((m, 1)))
+        in_plane = self.planar and not self.round_noise
+        noise = Rotation.from_rotvec(_axes(m, in_plane, rng) * sigma * rng.standard_normal((m, 1)))
         noise = noise * Rotation.from_rotvec(_axes(m, False, rng) * sigma / 10 * rng.standard_normal((m, 1)))
         disturbed = rng.choice(m, int(rng.uniform(*self.outlier_share) * m), replace=False)
         wide = np.zeros((m, 3))

@@ -39,7 +39,7 @@ class SortedEdges:
     @classmethod
     def of(cls, graph: ViewGraph) -> SortedEdges:
         num_edges = graph.num_edges
-        first, order = _by_arrival(torch.cat((graph.target, graph.source)).int(), graph.num_nodes)
+        first, order = sorted_by_node(torch.cat((graph.target, graph.source)).int(), graph.num_nodes)
         source = torch.cat((graph.source, graph.target)).int().index_select(0, order)
         is_reversed = order >= num_edges
         return cls(first, source, order - num_edges * is_reversed.int(), is_reversed)
@@ -82,7 +82,7 @@ class SortedEdges:
         return [Tile(slice(low, high), slice(start, end)) for low, high, start, end in bounds]
 
 
-def _by_arrival(arrival: Tensor, num_nodes: int) -> tuple[Tensor, Tensor]:
+def sorted_by_node(arrival: Tensor, num_nodes: int) -> tuple[Tensor, Tensor]:
     """Where the edges that arrive at each node begin in their order by node, ``(N + 1,)``, and that order; int32."""
     if arrival.device.type == "cpu" and 0 < len(arrival) < 2**31:
         # Transposing a matrix with one entry in every row is a counting sort: a quarter of the time of torch's.

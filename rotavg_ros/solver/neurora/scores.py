@@ -19,7 +19,11 @@ def residual_score(
     The residual is the noise but for the error of the orientations at the edge's ends: one half at the outlier angle,
     and the closer to certainty on either side, the better the ends are known.
     """
-    angle, uncertainty = residual_and_uncertainty(graph, body_from_world, component)
+    return residual_probability(*residual_and_uncertainty(graph, body_from_world, component), outlier_angle)
+
+
+def residual_probability(angle: Tensor, uncertainty: Tensor, outlier_angle: float) -> Tensor:
+    """The same of residuals and uncertainties ``(M,)``, as :func:`residual_and_uncertainty` gives them."""
     return torch.sigmoid((angle - outlier_angle) / (NUMBERS.score_scale * uncertainty)).double()
 
 

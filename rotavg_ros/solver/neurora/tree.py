@@ -26,11 +26,14 @@ class Bootstrapped(NamedTuple):
     Attributes:
         body_from_world: ``(N, 4)`` float64.
         roots: ``(C,)`` the trees' roots, in the order of the components.
+        parent, parent_edge: ``(N,)`` the trees: a root is its own parent, by the edge -1.
         cleaned: without CleanNet's corrections where the measurements as they are were better.
     """
 
     body_from_world: Tensor
     roots: Tensor
+    parent: Tensor
+    parent_edge: Tensor
     cleaned: Cleaned
 
 
@@ -58,13 +61,13 @@ def bootstrap(cleaned: Cleaned, component: Tensor | None = None) -> Bootstrapped
     rectified_misfit, raw_misfit = _misfits(cleaned, (rectified, raw), component)
     raw_is_better = raw_misfit <= rectified_misfit
     if not bool(raw_is_better.any()):
-        return Bootstrapped(rectified, roots, cleaned)
+        return Bootstrapped(rectified, roots, parent, parent_edge, cleaned)
     chosen = raw_is_better[component][:, None]
     relative = torch.where(
         chosen[cleaned.graph.source], cleaned.measured.target_from_source, cleaned.graph.target_from_source
     )
     cleaned = replace(cleaned, graph=replace(cleaned.graph, target_from_source=relative))
-    return Bootstrapped(torch.where(chosen, raw, rectified), roots, cleaned)
+    return Bootstrapped(torch.where(chosen, raw, rectified), roots, parent, parent_edge, cleaned)
 
 
 def _misfits(cleaned: Cleaned, candidates: Sequence[Tensor], component: Tensor) -> list[Tensor]:

@@ -1,10 +1,10 @@
 """Laplacian systems whose weights are 3 × 3 matrices, by conjugate gradients.
 
-The weight of an edge u→v is ``w (S_u + T_v)``: w is a scalar for each edge; S_u and T_v are 3 × 3 matrices for each
-node. So no matrix of an edge is ever formed, and a product with the whole takes two products with sparse matrices of
-scalars, W over the edges as they run and Wᵀ:
+The weight of an edge between u and v is ``a_u S_u + a_v S_v``: S is a 3 × 3 matrix for each node, a_u and a_v are two
+scalars for each edge. So no matrix of an edge is ever formed, and a product with the whole takes two products with
+sparse matrices of scalars. A has in row v and column u what belongs to v's own matrix, a_v; Aᵀ what belongs to u's:
 
-    (L x)_v = D_v x_v − (W S x)_v − T_v (W x)_v − (Wᵀ T x)_v − S_v (Wᵀ x)_v
+    (L x)_v = D_v x_v − S_v (A x)_v − (Aᵀ S x)_v
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,8 +30,15 @@ _WORTH_WORKERS = 50_000
 Preconditioner = Callable[[Tensor], Tensor]
 
 
+class SplitWeights(NamedTuple):
+    """Of M edges: positive weights ``(M,)``, and the share of each ``(M,)`` that belongs to its source's matrix."""
+
+    total: Tensor
+    source_share: Tensor
+
+
 class Arrivals:
-    """The sparsity patterns of W and Wᵀ: which nodes' edges arrive at a node, as given and reversed.
+    """The sparsity pattern of A: which nodes' edges arrive at a node, either way.
 
     Args:
         edges: of the graph, sorted.
@@ -38,20 +46,25 @@ class Arrivals:
 
     def __init__(self, edges: SortedEdges) -> None:
         self.num_nodes = edges.num_nodes
-        self._patterns = []
-        for chosen in (~edges.is_reversed, edges.is_reversed):
-            rows = chosen.nonzero().squeeze(1)
-            first = torch.searchsorted(rows, edges.first.long(), out_int32=True)
-            self._patterns.append((first, edges.source.index_select(0, rows), edges.edge.index_select(0, rows)))
+        self._edges = edges
+        # Where what belongs to either end's matrix stands: first of all edges' targets, then of their sources.
+        num_edges = len(edges.edge) // 2
+        self._arrives = edges.edge + num_edges * edges.is_reversed.int()
+        self._leaves = edges.edge + num_edges * (~edges.is_reversed).int()
 
-    def matrices(self, weight: Tensor) -> list[Tensor]:
-        """W and Wᵀ ``(N, N)`` of the edges' ``weight`` ``(M,)``."""
-        size = (self.num_nodes, self.num_nodes)
+    def matrices(self, weights: SplitWeights) -> list[Tensor]:
+        """A and Aᵀ ``(N, N)``."""
+        edges, size = self._edges, (self.num_nodes, self.num_nodes)
+        at_source = weights.total * weights.source_share
+        # An edge arrives at its target, reversed at its source.
+        by_end = torch.cat((weights.total - at_source, at_source))
+        own = by_end.index_select(0, self._arrives)
+        others = by_end.index_select(0, self._leaves)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
             return [
-                torch.sparse_csr_tensor(first, source, weight.index_select(0, edge), size, check_invariants=False)
-                for first, source, edge in self._patterns
+                torch.sparse_csr_tensor(edges.first, edges.source, values, size, check_invariants=False)
+                for values in (own, others)
             ]
 
 
@@ -60,38 +73,36 @@ class BlockLaplacian:
 
     Args:
         arrivals: the graph's.
-        weight: ``(M,)`` positive.
-        shape: what the ends say, S and T.
+        weights: of the edges.
+        shape: S.
         component: ``(N,)``; each of the C components is solved by itself.
 
     Attributes:
         weight_sum: ``(N,)`` the weights of each node's edges, added up.
     """
 
-    def __init__(self, arrivals: Arrivals, weight: Tensor, shape: NoiseShape, component: Tensor) -> None:
-        self._matrices = arrivals.matrices(weight)
-        self._threads = threads_on(weight.device) if len(weight) > _WORTH_WORKERS else 1
+    def __init__(self, arrivals: Arrivals, weights: SplitWeights, shape: NoiseShape, component: Tensor) -> None:
+        self._own, self._others = arrivals.matrices(weights)
+        self._threads = threads_on(component.device) if len(weights.total) > _WORTH_WORKERS else 1
         self._components = _Components(component, int(component.max()) + 1)
-        # (3, 3, N): what is said of an edge at the end that it comes from, and at the one where it arrives.
-        at_source, at_target = (end.to(weight).contiguous() for end in (shape.at_source, shape.at_target))
-        self._far, self._near = (at_source, at_target), (at_target, at_source)
-        one = weight.new_ones(1, arrivals.num_nodes)
-        self._diagonal = torch.zeros_like(at_source)
-        self.weight_sum = weight.new_zeros(arrivals.num_nodes)
-        for matrix, near, far in zip(self._matrices, self._near, self._far, strict=True):
-            arriving = _arriving(matrix, torch.cat((far.flatten(0, 1), one)))
-            self._diagonal += arriving[:9].view_as(far) + arriving[9] * near
-            self.weight_sum += arriving[9]
+        self._information = shape.information.to(weights.total).contiguous()
+        one = weights.total.new_ones(1, arrivals.num_nodes)
+        arriving = _arriving(self._others, torch.cat((self._information.flatten(0, 1), one)))
+        own = _arriving(self._own, one)[0]
+        self._diagonal = arriving[:9].view_as(self._information) + own * self._information
+        self.weight_sum = own + arriving[9]
 
     def product(self, x: Tensor) -> Tensor:
         """``L x`` ``(3, N)``."""
         parts = [x] * 2
 
-        def one_way(number: int) -> None:
-            arriving = _arriving(self._matrices[number], torch.cat((_apply(self._far[number], x), x)))
-            parts[number] = _apply(self._near[number], arriving[3:]).add_(arriving[:3])
+        def one_part(number: int) -> None:
+            if number == 0:
+                parts[0] = _apply(self._information, _arriving(self._own, x))
+            else:
+                parts[1] = _arriving(self._others, _apply(self._information, x))
 
-        for_each(one_way, (0, 1), self._threads)
+        for_each(one_part, (0, 1), self._threads)
         return _apply(self._diagonal, x).sub_(parts[0]).sub_(parts[1])
 
     def diagonal_solve(self) -> Preconditioner:
@@ -145,8 +156,8 @@ class _Components:
 
 def factorised(graph: ViewGraph, weight: Tensor, shape: NoiseShape, roots: Tensor) -> Preconditioner:
     """A preconditioner for graphs that are not well knit: the same Laplacian with round weights, factorised."""
-    at_source, at_target = (end.diagonal().sum(dim=1) for end in (shape.at_source, shape.at_target))
-    trace = at_source[graph.source] + at_target[graph.target]
+    # Cameras of a component share their noise's shape, which turning does not make larger.
+    trace = shape.information.diagonal().sum(dim=1)[graph.source]
     ends = graph.source.cpu().numpy(), graph.target.cpu().numpy()
     system = LaplacianSystem(graph.num_nodes, *ends, (weight * trace / 3).cpu().numpy(), roots.cpu().numpy())
     return lambda x: torch.from_numpy(system.solve(x.t().cpu().double().numpy())).t().to(x)

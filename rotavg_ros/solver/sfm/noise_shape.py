@@ -2,8 +2,9 @@
 
 Two views fix the turn about the optical axis far better than pan and tilt, which trade against the translation
 (Daniilidis & Spetsakis 1997; of the Lund data's Sphinx, the errors about x, y and z are as 2.4 : 1.5 : 1). The shape is
-estimated from residuals; nothing is known of it beforehand. An edge's direction is its maker's choice, and noise may
-belong to either end's frame, so each end has a shape of its own; that of the wrong end comes out rounder.
+estimated from residuals; nothing is known of it beforehand. All cameras have the same, but an edge's noise belongs to
+the frame of one of its two ends, and which of them is not known, since the direction in which an edge is stated is its
+maker's choice. So each end has a probability.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.threads import for_each, threads_on
 from rotavg_ros.solver.sfm.priors import NoiseShapePriors
 
 
@@ -34,22 +34,21 @@ class ResidualSample(NamedTuple):
 
 @dataclass(frozen=True)
 class NoiseShape:
-    """Information matrices in the world's frame (N nodes): edge u→v has ``at_source[..., u] + at_target[..., v]``.
+    """Information matrices in the world's frame (N nodes).
 
     Attributes:
-        at_source, at_target: ``(3, 3, N)`` rad⁻², symmetric; a matrix's entries lie N apart, for sums over the nodes.
-        scatter: covariances in the cameras' frames at either end, ``(C, 3, 3)`` rad²; None: nothing was estimated.
+        information: ``(3, 3, N)`` rad⁻², symmetric, of an edge whose noise is in that node's frame; a matrix's entries
+            lie N apart, for sums over the nodes.
+        covariance: in the cameras' frames, ``(C, 3, 3)`` rad²; None: nothing was estimated.
     """
 
-    at_source: Tensor
-    at_target: Tensor
-    scatter: tuple[Tensor, Tensor] | None = None
+    information: Tensor
+    covariance: Tensor | None = None
 
     @classmethod
     def round(cls, num_nodes: int, device: torch.device) -> NoiseShape:
         """Every edge has the unit matrix."""
-        half = torch.eye(3, dtype=torch.float64, device=device)[:, :, None].expand(3, 3, num_nodes) / 2
-        return cls(half, half)
+        return cls(torch.eye(3, dtype=torch.float64, device=device)[:, :, None].expand(3, 3, num_nodes))
 
 
 class ShapeEstimator:
@@ -74,34 +73,33 @@ class ShapeEstimator:
             is_held: ``(C,)`` components that keep in their cameras' frames what was estimated a step ago.
         """
         matrix = _matrices(body_from_world)
-        ends, starts = (sample.source, sample.target), before.scatter or (None, None)
-        scatters = [matrix] * 2
-
-        def estimate(number: int) -> None:
-            end, start = ends[number], starts[number]
-            at_end = matrix.flatten(0, 1).index_select(1, end).view(3, 3, -1)
-            in_camera = (at_end * sample.vector).sum(dim=1)
-            found = scatter(in_camera, self._component[end], len(self._redundancy), start, self._priors)
-            scatters[number] = found if start is None else torch.where(is_held[:, None, None], start, found)
-
-        for_each(estimate, (0, 1), threads_on(matrix.device))
-        return self._placed((scatters[0], scatters[1]), matrix)
+        at_ends = (matrix.flatten(0, 1).index_select(1, end).view(3, 3, -1) for end in (sample.source, sample.target))
+        in_cameras = [(at_end * sample.vector).sum(dim=1) for at_end in at_ends]
+        group, start = self._component[sample.source], before.covariance
+        found = scatter((in_cameras[0], in_cameras[1]), group, len(self._redundancy), start, self._priors)
+        found = found if start is None else torch.where(is_held[:, None, None], start, found)
+        return self._placed(found, matrix)
 
     def carried(self, shape: NoiseShape, body_from_world: Tensor) -> NoiseShape:
         """The same in the cameras' frames, where the cameras have turned to ``(N, 4)``."""
-        return shape if shape.scatter is None else self._placed(shape.scatter, _matrices(body_from_world))
+        return shape if shape.covariance is None else self._placed(shape.covariance, _matrices(body_from_world))
 
-    def _placed(self, scatters: tuple[Tensor, Tensor], matrix: Tensor) -> NoiseShape:
-        """Covariances in the cameras' frames → information in the world's, given body_from_world ``(3, 3, N)``."""
-        at_ends = []
-        for covariance in scatters:
-            supported = _as_far_as_supported(covariance, self._redundancy, self._priors)
-            information = torch.linalg.inv_ex(supported).inverse.permute(1, 2, 0) / 2
-            if len(supported) > 1:
-                information = information[:, :, self._component]
-            turned = (information[:, :, None] * matrix).sum(dim=1)
-            at_ends.append((matrix[:, :, None] * turned[:, None]).sum(dim=0))
-        return NoiseShape(at_ends[0], at_ends[1], scatters)
+    def _placed(self, covariance: Tensor, matrix: Tensor) -> NoiseShape:
+        """Covariance in the cameras' frames → information in the world's, given body_from_world ``(3, 3, N)``."""
+        supported = _as_far_as_supported(covariance, self._redundancy, self._priors)
+        information = torch.linalg.inv_ex(supported).inverse.permute(1, 2, 0)
+        if len(supported) > 1:
+            information = information[:, :, self._component]
+        turned = (information[:, :, None] * matrix).sum(dim=1)
+        return NoiseShape((matrix[:, :, None] * turned[:, None]).sum(dim=0), covariance)
+
+
+def share_of_first(first_square: Tensor, second_square: Tensor) -> Tensor:
+    """Probability that noise belongs to the first of two frames, by its squared lengths in units of the noise there.
+
+    Densities are normal, which tells the two frames apart more sharply than the heavy tails of :func:`scatter` do.
+    """
+    return torch.sigmoid((second_square - first_square) / 2)
 
 
 def _matrices(body_from_world: Tensor) -> Tensor:
@@ -113,44 +111,46 @@ _PRIORS = NoiseShapePriors()
 
 
 def scatter(
-    vectors: Tensor,
+    vectors: tuple[Tensor, Tensor],
     group: Tensor,
     num_groups: int,
     start: Tensor | None = None,
     priors: NoiseShapePriors = _PRIORS,
 ) -> Tensor:
-    """Robust covariance ``(G, 3, 3)`` about zero of the vectors ``(3, K)`` of each group ``(K,)``, up to its scale.
+    """Robust covariance ``(G, 3, 3)`` about zero of the vectors of each group ``(K,)``, up to its scale.
 
     The maximum likelihood estimate for Student's t with one degree of freedom (Kent & Tyler 1991), sought from
-    ``start``, an estimate from much the same vectors.
+    ``start``, an estimate from much the same vectors. Every vector is given as two frames have it, each ``(3, K)``; it
+    counts in both, by the probability that noise belongs to that frame.
     """
     count = torch.bincount(group, minlength=num_groups).clamp(min=1)[:, None, None]
-    unit = torch.eye(3, dtype=vectors.dtype, device=vectors.device)
+    both, groups = torch.cat(vectors, dim=1), group.repeat(2)
+    unit = torch.eye(3, dtype=both.dtype, device=both.device)
 
     def second_moment(weight: Tensor) -> Tensor:
         if num_groups == 1:  # a matrix product adds up many times as fast
-            total = ((weight * vectors) @ vectors.t()).flatten()[:, None]
+            total = ((weight * both) @ both.t()).flatten()[:, None]
         else:
-            products = ((weight * vectors)[:, None] * vectors[None]).flatten(0, 1)
-            total = products.new_zeros(9, num_groups).index_add_(1, group, products)
+            products = ((weight * both)[:, None] * both[None]).flatten(0, 1)
+            total = products.new_zeros(9, num_groups).index_add_(1, groups, products)
         moment: Tensor = priors.least_deviation**2 * unit + total.t().reshape(-1, 3, 3) / count
         return moment
 
     def squared_lengths(covariance: Tensor) -> Tensor:
         inverse = torch.linalg.inv_ex(covariance).inverse
-        turned = (
-            inverse[0] @ vectors if num_groups == 1 else (inverse.permute(1, 2, 0)[:, :, group] * vectors).sum(dim=1)
-        )
-        squares: Tensor = (vectors * turned).sum(dim=0)
+        turned = inverse[0] @ both if num_groups == 1 else (inverse.permute(1, 2, 0)[:, :, groups] * both).sum(dim=1)
+        squares: Tensor = (both * turned).sum(dim=0)
         return squares
 
     if start is None:
-        mean_square = second_moment(torch.ones_like(vectors[0])).diagonal(dim1=1, dim2=2).mean(dim=1)
+        mean_square = second_moment(torch.full_like(both[0], 0.5)).diagonal(dim1=1, dim2=2).mean(dim=1)
         covariance, iterations = mean_square[:, None, None] * unit, priors.iterations
     else:
         covariance, iterations = start, priors.further_iterations
     for _ in range(iterations):
-        covariance = second_moment(4 / (1 + squared_lengths(covariance)))
+        squares = squared_lengths(covariance)
+        first = share_of_first(*squares.chunk(2))
+        covariance = second_moment(torch.cat((first, 1 - first)) * 4 / (1 + squares))
     return covariance
 
 

@@ -63,6 +63,9 @@ class RefinementPriors:
         well_knit_degree: edges per node from which on conjugate gradients are tried without a factorisation. Half: up
             to 1.5 % on small graphs.
         max_sample: edges of a component that tell its noise; half and twice: up to 1.4 %.
+        half_trusted: edges beyond a cycle with which CleanNet's log-odds count by half where they tell edges in
+            series apart: it knows graphs in which many edges check each other. Orientations of the synthetic recipes,
+            which have thousands, do not depend on it.
         shape: how the noise's shape is estimated.
     """
 
@@ -84,4 +87,5 @@ class RefinementPriors:
     least_residual: float = float(np.radians(0.001))
     well_knit_degree: float = 12.0
     max_sample: int = 8_000
+    half_trusted: float = 20.0
     shape: NoiseShapePriors = NoiseShapePriors()

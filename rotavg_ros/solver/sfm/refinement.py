@@ -88,7 +88,7 @@ def _coarse(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: in
     is_open = torch.ones_like(problem.roots, dtype=torch.bool)
     for number in range(max_steps):
         typical = problem.typical(problem.sample(orientations))
-        step = problem.step(orientations, measure, prior, is_open)
+        step = problem.step(orientations, measure, problem.pooled(orientations, measure, prior), is_open)
         orientations = _turned(orientations, step.turn)
         is_open = is_open & (problem.mean(step.turn.norm(dim=0)) >= priors.coarse_settled * typical)
         if not bool(is_open.any()):
@@ -102,20 +102,22 @@ def _shaped(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: in
     noise = problem.round
     variance = problem.variance_of_means()
     dispersion = torch.ones_like(problem.roots, dtype=orientations.dtype)
-    dtype = torch.float32
+    dtype, step = torch.float32, None
     is_open = torch.ones_like(problem.roots, dtype=torch.bool)
     is_held = torch.zeros_like(is_open)
     for _ in range(max_steps):
-        if bool(is_held.all()):
-            measure = Measure(problem.shapes.carried(noise, orientations), variance, l_half_weight, dtype)
+        if step is not None and bool(is_held.all()):
+            carried = problem.shapes.carried(noise, orientations)
+            measure = Measure(carried, variance, l_half_weight, dtype, step.weights.source_share)
         else:
             sample = problem.sample(orientations)
             is_noisy = problem.is_well_knit and bool((problem.typical(sample) > priors.coarse_noise).all())
             dtype = torch.float32 if is_noisy else torch.float64
             noise = problem.shapes.estimate(sample, orientations, noise, is_held)
             measure = Measure(noise, variance, l_half_weight, dtype)
-            dispersion = torch.where(is_held, dispersion, problem.dispersion(sample, measure, prior))
-        step = problem.step(orientations, measure, prior, is_open)
+            pooled = problem.pooled(orientations, measure, prior)
+            dispersion = torch.where(is_held, dispersion, problem.dispersion(sample, measure, pooled))
+        step = problem.step(orientations, measure, problem.pooled(orientations, measure, prior), is_open)
         variance = (dispersion[problem.component] / step.weight).clamp(min=priors.least_square / 2)
         length = (step.decrement / (dispersion * problem.num_nodes)).sqrt()
         stretch = torch.where(length < priors.stretched, priors.relaxation, 1.0)

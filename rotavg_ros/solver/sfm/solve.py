@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
+from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
 from rotavg_ros.solver.estimate import Estimate, Run
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.fine_net import FineNet
 from rotavg_ros.solver.neurora.numbers import NUMBERS
-from rotavg_ros.solver.neurora.scores import residual_score
+from rotavg_ros.solver.neurora.scores import residual_and_uncertainty, residual_probability
 from rotavg_ros.solver.neurora.stages import apply_labels, clean, fine_tune, trust_all
 from rotavg_ros.solver.neurora.tiled.tuning import tune
-from rotavg_ros.solver.neurora.tree import bootstrap
+from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap
 from rotavg_ros.solver.sfm.options import SfmStages
 from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
+from rotavg_ros.solver.sfm.series import EdgesInSeries
 from rotavg_ros.solver.sfm.step import Structure
+from rotavg_ros.solver.sfm.uncertainty import References, variances
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # A graph of more edges is worth measuring what tiles this machine likes.
@@ -31,13 +37,21 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     networks, watch = run.networks, run.watch
     if graph.num_edges > _TUNING_PAYS and graph.device.type == "cpu":
         tune()
+    with watch.stage("order"):
+        form = CanonicalForm.of(graph, component)
+    graph, component = form.graph, form.component
     with watch.stage("clean"):
         cleaned = clean(networks.load(CleanNet), graph) if stages.clean else trust_all(graph)
         cleaned = apply_labels(cleaned, graph.label)
     with watch.stage("bootstrap"):
-        orientations, roots, cleaned = bootstrap(cleaned, component)
+        begun = bootstrap(cleaned, component)
+        cleaned, orientations = begun.cleaned, begun.body_from_world
+        structure = _structure(begun, component)
         if run.warm_start is not None:
-            orientations = run.warm_start.double().to(graph.device)
+            start = form.canonical_orientations(run.warm_start.double().to(graph.device))
+            orientations = rotations.canonical(
+                rotations.multiply(start, rotations.inverse(start[begun.roots])[component])
+            )
     for _ in range(stages.fine_tunings):
         with watch.stage("fine-tune"):
             orientations = fine_tune(networks.load(FineNet), cleaned, orientations, component)
@@ -48,12 +62,32 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
         with watch.stage("refine"):
             allowed = (graph.label != EdgeLabel.REJECTED).double()
             coarse = 1 - cleaned.outlier_probability if stages.weighted else torch.ones_like(allowed)
-            structure = Structure(component, roots, cleaned.edges)
             weights = EdgeWeights(allowed, allowed * coarse)
             priors = PRIORS if stages.shaped else ROUND
             orientations = refine(graph, orientations, steps, structure=structure, weights=weights, priors=priors)
-    fits = steps > 0 or stages.fine_tunings > 0
-    # Where there is but a tree, CleanNet's own score; else a residual is the noise but for the orientations' error.
-    probability = cleaned.outlier_probability.double()
-    score = residual_score(graph, orientations, NUMBERS.outlier_angle, component) if fits else probability
-    return Estimate(orientations, score, torch.full((graph.num_nodes,), torch.nan))
+    score, variance = cleaned.outlier_probability.double(), torch.full((graph.num_nodes,), torch.nan)
+    if steps > 0 or stages.fine_tunings > 0:
+        # Before, there is but a tree; now a residual is the noise but for the orientations' error.
+        angle, spread = residual_and_uncertainty(graph, orientations, component)
+        score = residual_probability(angle, spread, NUMBERS.outlier_angle)
+        series = structure.series
+        score[series.edge] = series.score(angle[series.edge], spread[series.edge], NUMBERS.outlier_angle)
+        if steps > 0:
+            with watch.stage("uncertainty"):
+                stated = variances(graph, angle, score, References(component, form.first_nodes()))
+            variance = variance if stated is None else form.of_nodes(stated)
+    return Estimate(form.orientations(orientations), score.index_select(0, form.edge), variance)
+
+
+def _structure(begun: Bootstrapped, component: Tensor) -> Structure:
+    """The graph's connections; of edges in series CleanNet says which is to blame, as far as it can know."""
+    graph = begun.cleaned.measured
+    series = EdgesInSeries.of(graph, begun.parent, begun.parent_edge)
+    structure = Structure(component, begun.roots, begun.cleaned.edges, series)
+    redundancy = structure.redundancy(graph)
+    # Of a lone cycle it has seen nothing that could tell.
+    others = (redundancy - 1).clamp(min=0)
+    trust = (others / (others + PRIORS.half_trusted))[component[graph.source[series.edge]]]
+    log_odds = begun.cleaned.outlier_probability[series.edge].double().logit()
+    log_odds = trust * log_odds.clamp(-NUMBERS.max_logit, NUMBERS.max_logit)
+    return replace(structure, series=series.blamed(log_odds))

@@ -9,12 +9,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from rotavg_ros.solver.algebra.canonical_form import evenly_spread
+from rotavg_ros.solver.algebra.relaxed_forest import relaxed_forest
 from rotavg_ros.solver.algebra.residuals import SLICE_EDGES, EdgeResiduals, measured_rows
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.algebra.threads import for_each, slices, stretches
-from rotavg_ros.solver.sfm.block_laplacian import Arrivals, BlockLaplacian, factorised
-from rotavg_ros.solver.sfm.noise_shape import NoiseShape, ResidualSample, ShapeEstimator
+from rotavg_ros.solver.sfm.block_laplacian import Arrivals, BlockLaplacian, SplitWeights, factorised
+from rotavg_ros.solver.sfm.noise_shape import NoiseShape, ResidualSample, ShapeEstimator, share_of_first
 from rotavg_ros.solver.sfm.priors import RefinementPriors
+from rotavg_ros.solver.sfm.series import EdgesInSeries
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -26,19 +29,30 @@ class Structure:
         component: ``(N,)`` connected components.
         roots: ``(C,)`` a node of each, in the components' order; they are held fixed.
         edges: the graph's edges sorted.
+        series: those of its edges that only check each other.
     """
 
     component: Tensor
     roots: Tensor
     edges: SortedEdges
+    series: EdgesInSeries
 
     @classmethod
     def of(cls, graph: ViewGraph) -> Structure:
         """Computed; a component's root is its first node."""
-        component = graph.components()
+        component, edges = graph.components(), SortedEdges.of(graph)
         nodes = torch.arange(graph.num_nodes, device=graph.device)
         roots = nodes.new_full((int(component.max()) + 1,), graph.num_nodes)
-        return cls(component, roots.scatter_reduce(0, component, nodes, "amin"), SortedEdges.of(graph))
+        roots = roots.scatter_reduce(0, component, nodes, "amin")
+        forest = relaxed_forest(edges, torch.ones_like(graph.precision), roots)
+        series = EdgesInSeries.of(graph, forest.parent, forest.parent_edge)
+        return cls(component, roots, edges, series)
+
+    def redundancy(self, graph: ViewGraph) -> Tensor:
+        """How many edges each component has beyond a spanning tree, ``(C,)``."""
+        members = (self.component.index_select(0, graph.source), self.component)
+        edges, nodes = (torch.bincount(member, minlength=len(self.roots)) for member in members)
+        return edges - nodes + 1
 
 
 class Measure(NamedTuple):
@@ -49,17 +63,50 @@ class Measure(NamedTuple):
         variance: ``(N,)`` of the nodes, in units of the shape; numerical floors apart.
         weigh: expected squared residuals → robust weights.
         dtype: how exactly residuals and systems are computed.
+        source_share: ``(M,)`` probability of each edge that its noise is in its source's frame; None: as residuals say.
     """
 
     shape: NoiseShape
     variance: Tensor
     weigh: Callable[[Tensor], Tensor]
     dtype: torch.dtype
+    source_share: Tensor | None = None
 
-    def at_ends(self, dtype: torch.dtype) -> list[Tensor]:
-        """What is said of an edge at its source and at its target: six entries of the shape, variance; ``(7, N)``."""
-        ends = (self.shape.at_source, self.shape.at_target)
-        return [torch.cat((_distinct_entries(end), self.variance[None])).to(dtype) for end in ends]
+    def rows(self, dtype: torch.dtype) -> Tensor:
+        """What nodes say of their edges, ``(k, N)``: variance and, unless noise is round, six entries of the shape."""
+        variance = self.variance[None]
+        if self.shape.covariance is None:
+            return variance.to(dtype)
+        return torch.cat((variance, _distinct_entries(self.shape.information))).to(dtype)
+
+
+class Expected(NamedTuple):
+    """Residuals ``(3, k)`` as a :class:`Measure` has them.
+
+    Attributes:
+        pull: ``(3, k)`` Ω r.
+        square: ``(k,)`` rᵀ Ω r.
+        variance: ``(k,)`` of both ends.
+        source_share: ``(k,)`` probability that the noise is in the source's frame; Ω is the mean of both ends'.
+    """
+
+    pull: Tensor
+    square: Tensor
+    variance: Tensor
+    source_share: Tensor
+
+    @classmethod
+    def of(cls, vector: Tensor, at_source: Tensor, at_target: Tensor, source_share: Tensor | None = None) -> Expected:
+        """Of residuals, given :meth:`Measure.rows` of both ends; the share, where it is held."""
+        variance = at_source[0] + at_target[0]
+        if len(at_source) == 1:  # noise is round: Ω = 1
+            square = _dot(vector, vector)
+            return cls(vector, square, variance, torch.full_like(square, 0.5))
+        pulls = [_times(end[1:], vector) for end in (at_source, at_target)]
+        squares = [_dot(vector, pull) for pull in pulls]
+        share = share_of_first(*squares) if source_share is None else source_share
+        square = torch.lerp(squares[1], squares[0], share)
+        return cls(torch.lerp(pulls[1], pulls[0], share), square, variance, share)
 
 
 class Step(NamedTuple):
@@ -69,11 +116,13 @@ class Step(NamedTuple):
         turn: ``(3, N)`` radians, world's frame.
         weight: ``(N,)`` of all edges of each node.
         decrement: ``(C,)`` xᵀ L x.
+        weights: the edges' robust weights.
     """
 
     turn: Tensor
     weight: Tensor
     decrement: Tensor
+    weights: SplitWeights
 
 
 class Problem:
@@ -82,15 +131,14 @@ class Problem:
     def __init__(self, graph: ViewGraph, structure: Structure, priors: RefinementPriors) -> None:
         self.graph, self.priors = graph, priors
         self.roots, self.component = structure.roots, structure.component
-        self.degree = structure.edges.degree
+        self.degree, self.series = structure.edges.degree, structure.series
+        self._in_series = graph.select_edges(self.series.edge)
         self.arrivals = Arrivals(structure.edges)
         self.round = NoiseShape.round(graph.num_nodes, graph.device)
         self.is_well_knit = 2 * graph.num_edges >= priors.well_knit_degree * graph.num_nodes
         self.num_nodes = torch.bincount(self.component, minlength=len(self.roots))
-        of_edge = self.component[graph.source]
-        redundancy = torch.bincount(of_edge, minlength=len(self.roots)) - self.num_nodes + 1
-        self.shapes = ShapeEstimator(self.component, redundancy, priors.shape)
-        self._chosen = _evenly_spread(of_edge, len(self.roots), priors.max_sample)
+        self.shapes = ShapeEstimator(self.component, structure.redundancy(graph), priors.shape)
+        self._chosen = evenly_spread(self.component.index_select(0, graph.source), len(self.roots), priors.max_sample)
         self._some = graph.select_edges(self._chosen)
         self._component_of_some = self.component[self._some.source]
         self._count_of_some = torch.bincount(self._component_of_some, minlength=len(self.roots)).clamp(min=1)
@@ -127,13 +175,30 @@ class Problem:
         logarithm = _dot(sample.vector, sample.vector).clamp(min=least**2).log() / 2
         return torch.exp(self._sum_of_some(logarithm) / self._count_of_some)
 
+    def pooled(self, orientations: Tensor, measure: Measure, prior: Tensor) -> Tensor:
+        """Prior weights ``(M,)`` that let edges in series weigh as one expects them to err.
+
+        Their squared residuals say what they err by together. Each is expected to err by its share of the blame.
+        """
+        graph, series = self._in_series, self.series
+        if graph.num_edges == 0:
+            return prior
+        rows = measure.rows(torch.float64)
+        vector = EdgeResiduals(graph, orientations).vectors(slice(0, graph.num_edges))
+        own = Expected.of(vector, *(rows.index_select(1, end) for end in (graph.source, graph.target)))
+        together = series.sums(own.square)[series.group]
+        weights = (measure.weigh(square + own.variance) for square in (series.blame * together, own.square))
+        pooled = prior.clone()
+        pooled[series.edge] *= (next(weights) / next(weights)).to(prior)
+        return pooled
+
     def dispersion(self, sample: ResidualSample, measure: Measure, prior: Tensor) -> Tensor:
         """φ of each component, ``(C,)``, as some residuals have it."""
-        at_source, at_target = measure.at_ends(torch.float64)
-        both = at_source.index_select(1, sample.source) + at_target.index_select(1, sample.target)
-        square = _dot(sample.vector, _times(both[:6], sample.vector))
-        weight = measure.weigh(square + both[6]) * prior[self._chosen]
-        return self._sum_of_some(weight * weight * square) / self._sum_of_some(weight)
+        rows = measure.rows(torch.float64)
+        ends = (rows.index_select(1, end) for end in (sample.source, sample.target))
+        expected = Expected.of(sample.vector, *ends)
+        weight = measure.weigh(expected.square + expected.variance) * prior[self._chosen]
+        return self._sum_of_some(weight * weight * expected.square) / self._sum_of_some(weight)
 
     def _sum_of_some(self, value: Tensor) -> Tensor:
         """Sums ``(C,)`` of some edges' values ``(K,)``."""
@@ -141,48 +206,46 @@ class Problem:
 
     def step(self, orientations: Tensor, measure: Measure, prior: Tensor, is_open: Tensor) -> Step:
         """The least-squares step of the components ``(C,)`` that are open; the others' is zero."""
-        weight, force = self._weights_and_forces(orientations, measure, prior)
+        weights, force = self._weights_and_forces(orientations, measure, prior)
         force *= is_open[self.component]
-        system = BlockLaplacian(self.arrivals, weight, measure.shape, self.component)
+        system = BlockLaplacian(self.arrivals, weights, measure.shape, self.component)
         tolerances = self.priors.least_angle, self.priors.step_tolerance
         turn, is_solved = force, False
         if self.is_well_knit:
             turn, is_solved = system.solve(force, system.diagonal_solve(), *tolerances)
             self.is_well_knit = is_solved
         if not is_solved:
-            approximate = factorised(self.graph, weight, measure.shape, self.roots)
+            approximate = factorised(self.graph, weights.total, measure.shape, self.roots)
             turn, _ = system.solve(force, approximate, *tolerances)
         decrement = (force * turn).sum(dim=0).double()
         turn = (turn - turn[:, self.roots[self.component]]).double()
-        return Step(turn, system.weight_sum.double(), self.sum(decrement))
+        return Step(turn, system.weight_sum.double(), self.sum(decrement), weights)
 
-    def _weights_and_forces(self, orientations: Tensor, measure: Measure, prior: Tensor) -> tuple[Tensor, Tensor]:
-        """Every edge's robust weight ``(M,)``, and the weighted residuals that pull at each node, summed ``(3, N)``."""
+    def _weights_and_forces(self, orientations: Tensor, measure: Measure, prior: Tensor) -> tuple[SplitWeights, Tensor]:
+        """The edges' robust weights, and the weighted residuals that pull at each node, summed ``(3, N)``."""
         graph, dtype = self.graph, measure.dtype
         measured = self._measured if dtype == self._measured.dtype else None
         residuals = EdgeResiduals(graph, orientations.to(dtype), measured)
-        at_source, at_target = measure.at_ends(dtype)
-        prior = prior.to(dtype)
-        weight = torch.empty_like(prior)
+        rows, prior = measure.rows(dtype), prior.to(dtype)
+        weights = SplitWeights(torch.empty_like(prior), torch.empty_like(prior))
         parts = stretches(slices(graph.num_edges, SLICE_EDGES, graph.device))
         # Components in rows: adding columns up by node is a dozen times as fast as adding up rows.
-        forces = [at_source.new_zeros(3, graph.num_nodes) for _ in parts]
+        forces = [rows.new_zeros(3, graph.num_nodes) for _ in parts]
 
         def walk(part: int) -> None:
             for edges in parts[part]:
                 source, target = graph.source[edges], graph.target[edges]
-                vector = residuals.vectors(edges)
-                both = at_source.index_select(1, source).add_(at_target.index_select(1, target))
-                pull = _times(both[:6], vector)
-                square = _dot(vector, pull).add_(both[6])
-                robust = measure.weigh(square).mul_(prior[edges])
-                weight[edges] = robust
-                pull *= robust
+                at_source, at_target = rows.index_select(1, source), rows.index_select(1, target)
+                held = None if measure.source_share is None else measure.source_share[edges].to(dtype)
+                expected = Expected.of(residuals.vectors(edges), at_source, at_target, held)
+                robust = measure.weigh(expected.square + expected.variance).mul_(prior[edges])
+                weights.total[edges], weights.source_share[edges] = robust, expected.source_share
+                pull = expected.pull.mul_(robust)
                 forces[part].index_add_(1, target, pull)
                 forces[part].index_add_(1, source, pull.neg_())  # with alpha = -1 it takes six times as long
 
         for_each(walk, range(len(parts)))
-        return weight, torch.stack(forces).sum(dim=0)
+        return weights, torch.stack(forces).sum(dim=0)
 
 
 def l1_weight(squared_residual: Tensor) -> Tensor:
@@ -217,15 +280,3 @@ def _times(entries: Tensor, vector: Tensor) -> Tensor:
 def _dot(a: Tensor, b: Tensor) -> Tensor:
     """Inner products ``(k,)`` of columns ``(3, k)``, a third faster than a sum over rows."""
     return torch.mul(a[0], b[0]).addcmul_(a[1], b[1]).addcmul_(a[2], b[2])
-
-
-def _evenly_spread(group: Tensor, num_groups: int, largest: int) -> Tensor:
-    """Indices of members, evenly spread, at most about ``largest`` of each group ``(M,)``."""
-    if num_groups == 1:
-        return torch.arange(0, len(group), 1 + (len(group) - 1) // largest, device=group.device)
-    order = group.sort(stable=True).indices
-    count = torch.bincount(group, minlength=num_groups)
-    ordered = group[order]
-    rank = torch.arange(len(group), device=group.device) - (count.cumsum(0) - count)[ordered]
-    stride = (count + largest - 1).div(largest, rounding_mode="floor")[ordered]
-    return order[rank % stride == 0]

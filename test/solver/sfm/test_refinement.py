@@ -14,7 +14,7 @@ from rotavg_ros.datasets.simulation.synthetic import PaperRecipe
 from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.sfm import refinement
-from rotavg_ros.solver.sfm.block_laplacian import Arrivals, BlockLaplacian, factorised
+from rotavg_ros.solver.sfm.block_laplacian import Arrivals, BlockLaplacian, SplitWeights, factorised
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape, scatter
 from rotavg_ros.view_graph import EdgeLabel
 from test.solver.graphs import as_quaternions, measured, random_truth
@@ -55,16 +55,18 @@ def test_block_systems_are_numpys_least_squares(is_factorised: bool) -> None:
     graph = replace(graph, num_nodes=41)  # the last node has no edge
     rng = np.random.default_rng(2)
     weight = torch.from_numpy(rng.uniform(0.1, 10, graph.num_edges))
-    factors = rng.standard_normal((2, 41, 3, 3))
-    at_ends = [torch.from_numpy(f @ f.transpose(0, 2, 1) + 0.1 * np.eye(3)).permute(1, 2, 0) for f in factors]
-    shape = NoiseShape(*at_ends)
+    weights = SplitWeights(weight, torch.from_numpy(rng.uniform(0, 1, graph.num_edges)))
+    factors = rng.standard_normal((41, 3, 3))
+    information = factors @ factors.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    shape = NoiseShape(torch.from_numpy(information).permute(1, 2, 0))
     dense = np.zeros((41, 3, 41, 3))
     for edge in range(graph.num_edges):
         u, v = int(graph.source[edge]), int(graph.target[edge])
-        block = float(weight[edge]) * (shape.at_source[..., u] + shape.at_target[..., v]).numpy()
+        share = float(weights.source_share[edge])
+        block = float(weight[edge]) * (share * information[u] + (1 - share) * information[v])
         for row, column, sign in ((u, u, 1), (v, v, 1), (u, v, -1), (v, u, -1)):
             dense[row, :, column] += sign * block
-    system = BlockLaplacian(Arrivals(SortedEdges.of(graph)), weight, shape, graph.components())
+    system = BlockLaplacian(Arrivals(SortedEdges.of(graph)), weights, shape, graph.components())
     x = torch.from_numpy(rng.standard_normal((3, 41)))
     force = np.einsum("uivj,jv->iu", dense, x.numpy())
     np.testing.assert_allclose(system.product(x), force, atol=1e-9)
@@ -84,7 +86,10 @@ def test_scatter_finds_each_groups_shape_among_outliers() -> None:
     vectors = np.einsum("kij,kj->ki", np.linalg.cholesky(covariance)[group], rng.standard_normal((len(group), 3)))
     wrong = rng.random(len(group)) < 0.1
     vectors[wrong] = Rotation.random(int(wrong.sum()), rng).as_rotvec()
-    found = scatter(torch.from_numpy(vectors.T.copy()), group, 3).numpy()
+    elsewhere = np.einsum("kij,kj->ki", Rotation.random(len(vectors), rng).as_matrix(), vectors)
+    is_first = rng.random(len(vectors)) < 0.5
+    frames = [np.where(here[:, None], vectors, elsewhere) for here in (is_first, ~is_first)]
+    found = scatter((torch.from_numpy(frames[0].T.copy()), torch.from_numpy(frames[1].T.copy())), group, 3).numpy()
     for number in range(2):
         expected = covariance[number] / np.trace(covariance[number])
         np.testing.assert_allclose(found[number] / np.trace(found[number]), expected, atol=0.05)

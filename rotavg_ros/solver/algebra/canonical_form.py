@@ -1,0 +1,221 @@
+"""One form for all descriptions of the same view-graph.
+
+Names of the nodes, order and direction of the edges, copies of an edge and the choice of the cameras' axes say nothing
+about the orientations. Here they are chosen anew, by what was measured alone:
+
+- Of edges that state the same rotation between the same nodes, one is kept.
+- Nodes are sorted by a weighted number of walks, k_v = Σ_u (½ + w_uv) k_u, a few times over, begun with k = 1. w_uv is
+  the cosine of half an edge's angle, which none of those choices changes.
+- Edges run from the earlier node to the later one and are sorted by both.
+- Cameras' axes: those of the second moment Σ s sᵀ of all edges, where s is x, y, z of an edge's quaternion. Turning the
+  cameras' axes by A, R̃_uv → A R̃_uv A⁻¹, turns every s by A, and the moment's axes with them. y has the largest moment,
+  z the least. An axis points to where Σ_v |b_v|² b_v does, b_v = Σ_u s_uv over the edges that arrive at v; this is odd
+  in s, but the same whichever way an edge was stated.
+
+Where the data are the same for several nodes or axes, any of them is taken, since then it makes no difference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.medians import median_by_group
+from rotavg_ros.solver.algebra.sorted_edges import sorted_by_node
+from rotavg_ros.view_graph import EdgeKind, ViewGraph
+
+# So often walks grow by an edge: enough to tell apart what only distant edges tell apart, little beside a solve.
+_WALK_LENGTH = 4
+# So many edges of a component tell its axes; those of the synthetic recipes to about half a degree.
+_MOST_EDGES = 1 << 15
+# Quaternions are the same if no entry differs by more: far below any measurement, far above rounding.
+_SAME = 1e-9
+
+
+@dataclass(frozen=True)
+class CanonicalForm:
+    """A view-graph of N nodes, M edges and C components in canonical form, and how to get back.
+
+    Attributes:
+        graph: in canonical form, with K ≤ M edges, without translations.
+        component: ``(N,)`` of its nodes.
+        node: ``(N,)`` which of the given graph's nodes each is.
+        edge: ``(M,)`` which of its edges stands for each of the given graph's.
+        canonical_from_body: ``(C, 4)`` the canonical axes of each component's cameras.
+    """
+
+    graph: ViewGraph
+    component: Tensor
+    node: Tensor
+    edge: Tensor
+    canonical_from_body: Tensor
+
+    @classmethod
+    def of(cls, graph: ViewGraph, component: Tensor | None = None) -> CanonicalForm:
+        """Of a graph; ``component`` ``(N,)`` as it numbers its own, default: computed."""
+        component = graph.components() if component is None else component
+        form, has_parallels = _form(graph, component)
+        if not has_parallels:
+            return form
+        kept, copy_of = _without_copies(graph)
+        # Several rotations between the same nodes are sorted by their angles, and so stay.
+        by_angle = graph.target_from_source[kept, 3].argsort(stable=True)
+        form, _ = _form(graph.select_edges(kept[by_angle]), component)
+        place = torch.empty_like(form.edge)
+        place[by_angle] = form.edge
+        return replace(form, edge=place[copy_of])
+
+    def first_nodes(self) -> Tensor:
+        """``(C,)`` the node of the canonical graph that is the first of each component of the given one."""
+        nodes = torch.full((len(self.canonical_from_body),), len(self.node), device=self.node.device)
+        first = nodes.scatter_reduce(0, self.component, self.node, "amin")
+        place = torch.empty_like(self.node)
+        place[self.node] = torch.arange(len(self.node), device=self.node.device)
+        return place[first]
+
+    def of_nodes(self, value: Tensor) -> Tensor:
+        """Values ``(N,)`` of the canonical graph's nodes → of the given one's."""
+        return torch.empty_like(value).scatter_(0, self.node, value)
+
+    def orientations(self, body_from_world: Tensor) -> Tensor:
+        """Those of the canonical graph → those of the given one, ``(N, 4)``."""
+        axes = rotations.inverse(self.canonical_from_body)[self.component]
+        given = torch.empty_like(body_from_world)
+        given[self.node] = rotations.multiply(axes.to(body_from_world), body_from_world)
+        return given
+
+    def canonical_orientations(self, body_from_world: Tensor) -> Tensor:
+        """The other way round, ``(N, 4)``."""
+        axes = self.canonical_from_body[self.component].to(body_from_world)
+        return rotations.canonical(rotations.multiply(axes, body_from_world[self.node]))
+
+
+def _form(graph: ViewGraph, component: Tensor) -> tuple[CanonicalForm, bool]:
+    """The form of a graph without copies, and whether it has several edges between any two nodes."""
+    node = _nodes_in_order(graph, component)
+    rank = torch.empty_like(node)
+    rank[node] = torch.arange(len(node), device=node.device)
+    source, target = (rank.index_select(0, end) for end in (graph.source, graph.target))
+    low, high = torch.minimum(source, target), torch.maximum(source, target)
+    _, by_high = sorted_by_node(high.int(), graph.num_nodes)
+    _, by_low = sorted_by_node(low.int().index_select(0, by_high), graph.num_nodes)
+    order = by_high.index_select(0, by_low).long()
+    is_forward = (source < target).index_select(0, order)
+    low, high, label = (column.index_select(0, order) for column in (low, high, graph.label))
+    component = component[node]
+    # Components in rows: picking numbers one by one takes a quarter of the time of picking rows of four.
+    rows = torch.stack([row.index_select(0, order) for row in graph.target_from_source.t().contiguous()])
+    rows[:3] *= torch.where(is_forward, 1.0, -1.0)
+    axes = _axes(low, high, rows, component)
+    turned = torch.cat((_in_axes(axes, rows[:3], component, low), rows[3:]))
+    # One number each, seen M times: at millions of edges columns that nobody reads take room.
+    unread = (
+        torch.full_like(column[:1], value).expand(len(column))
+        for column, value in ((graph.kind, EdgeKind.LOOP_CLOSURE), (graph.precision, torch.nan), (graph.steps, 1.0))
+    )
+    kind, precision, steps = unread
+    canonical = ViewGraph(graph.num_nodes, low, high, turned.t().contiguous(), kind, precision, label, steps)
+    edge = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
+    has_parallels = bool(((low[1:] == low[:-1]) & (high[1:] == high[:-1])).any())
+    return CanonicalForm(canonical, component, node, edge, rotations.from_matrix(axes)), has_parallels
+
+
+def _without_copies(graph: ViewGraph) -> tuple[Tensor, Tensor]:
+    """Indices ``(K,)`` of the edges without copies, and which of these stands for each edge ``(M,)``."""
+    is_forward = (graph.source < graph.target)[:, None]
+    number = (graph.target_from_source / _SAME).round().long()
+    number[:, :3] *= torch.where(is_forward, 1, -1)
+    # Half turns have two quaternions.
+    leading = number[:, :3].sign() * torch.tensor([4, 2, 1], device=number.device)
+    number = torch.where(((number[:, 3] == 0) & (leading.sum(dim=1) < 0))[:, None], -number, number)
+    low, high = torch.minimum(graph.source, graph.target), torch.maximum(graph.source, graph.target)
+    content = torch.cat((torch.stack((low, high, graph.label), dim=1), number), dim=1)
+    _, group = torch.unique(content, dim=0, return_inverse=True)
+    every = torch.arange(graph.num_edges, device=group.device)
+    first = torch.full_like(every, graph.num_edges).scatter_reduce(0, group, every, "amin")[group]
+    is_kept = first == every
+    return is_kept.nonzero().squeeze(1), (is_kept.cumsum(0) - 1)[first]
+
+
+def _nodes_in_order(graph: ViewGraph, component: Tensor) -> Tensor:
+    """The nodes ``(N,)`` in canonical order, component by component."""
+    weight = 0.5 + graph.target_from_source[:, 3]
+    walks = torch.ones(graph.num_nodes, dtype=weight.dtype, device=weight.device)
+    for _ in range(_WALK_LENGTH):
+        walks = _collected(graph, *(weight * walks.index_select(0, end) for end in (graph.source, graph.target)))
+    by_walks = walks.argsort(stable=True)
+    return by_walks[component[by_walks].argsort(stable=True)]
+
+
+def _collected(graph: ViewGraph, at_target: Tensor, at_source: Tensor) -> Tensor:
+    """Sums ``(N,)`` of what edges ``(M,)`` bring to their ends."""
+    collected = at_target.new_zeros(graph.num_nodes)
+    return collected.index_add_(0, graph.target, at_target).index_add_(0, graph.source, at_source)
+
+
+def _axes(source: Tensor, target: Tensor, rows: Tensor, component: Tensor) -> Tensor:
+    """Canonical axes ``(C, 3, 3)`` of the cameras of each component, an axis a row.
+
+    Args:
+        source, target: ``(M,)`` of edges in canonical order.
+        rows: ``(4, M)`` their measurements.
+        component: ``(N,)`` of every node.
+    """
+    count = int(component.max()) + 1 if len(component) else 0
+    of_edge = component.index_select(0, source)
+    some = evenly_spread(of_edge, count, _MOST_EDGES)
+    source, target, of_edge = (column.index_select(0, some) for column in (source, target, of_edge))
+    rows = torch.stack([row.index_select(0, some) for row in rows])
+    main = torch.linalg.eigh(_moments(rows[:3], of_edge, count)).eigenvectors
+    # The main axis last: then what turns about it have left lies in the plane of the first two coordinates.
+    first, second, along = _in_axes(main.mT, rows[:3], component, source)
+    length = torch.hypot(along, rows[3]).clamp(min=_SAME)
+    along, cosine = along / length, rows[3] / length
+    before = torch.stack((cosine * first - along * second, cosine * second + along * first))
+    after = torch.stack((cosine * first + along * second, cosine * second - along * first))
+    moment = _moments(before, of_edge, count) + _moments(after, of_edge, count)
+    in_plane = torch.linalg.eigh(moment).eigenvectors[:, :, 1]
+    axes = torch.stack(((main[:, :, :2] @ in_plane[:, :, None]).squeeze(2), main[:, :, 2]), dim=1)
+    arriving = rows.new_zeros(3, len(component)).index_add_(1, target, rows[:3]).index_add_(1, source, -rows[:3])
+    skew = _sums((arriving * arriving).sum(dim=0) * arriving, component, count)
+    axes = torch.where(axes @ skew[:, :, None] < 0, -axes, axes)
+    return torch.cat((axes, torch.linalg.cross(axes[:, :1], axes[:, 1:])), dim=1)
+
+
+def evenly_spread(group: Tensor, num_groups: int, largest: int) -> Tensor:
+    """Indices of members, evenly spread, at most about ``largest`` of each group ``(M,)``."""
+    if num_groups == 1:
+        return torch.arange(0, len(group), 1 + (len(group) - 1) // largest, device=group.device)
+    order = group.sort(stable=True).indices
+    count = torch.bincount(group, minlength=num_groups)
+    ordered = group[order]
+    rank = torch.arange(len(group), device=group.device) - (count.cumsum(0) - count)[ordered]
+    stride = (count + largest - 1).div(largest, rounding_mode="floor")[ordered]
+    return order[rank % stride == 0]
+
+
+def _moments(rows: Tensor, group: Tensor, count: int) -> Tensor:
+    """Robust second moments ``(C, k, k)`` of the columns of ``(k, M)`` by group ``(M,)``, up to their scale."""
+    square = (rows * rows).sum(dim=0)
+    typical = median_by_group(square, group, count)
+    weighted = rows / (square + (typical if count == 1 else typical[group]).clamp(min=_SAME**2))
+    if count == 1:
+        return (weighted @ rows.t())[None]
+    return _sums((weighted[:, None] * rows[None]).flatten(0, 1), group, count).reshape(count, len(rows), len(rows))
+
+
+def _sums(rows: Tensor, group: Tensor, count: int) -> Tensor:
+    """Sums ``(C, k)`` of the columns of ``(k, M)`` by group ``(M,)``."""
+    if count == 1:
+        return rows.sum(dim=1)[None]
+    return rows.new_zeros(len(rows), count).index_add_(1, group, rows).t()
+
+
+def _in_axes(axes: Tensor, vectors: Tensor, component: Tensor, source: Tensor) -> Tensor:
+    """Vectors ``(3, M)`` of edges, given their sources, as the axes ``(C, 3, 3)`` of their components have them."""
+    if len(axes) == 1:
+        return axes[0] @ vectors
+    return (axes.permute(1, 2, 0)[:, :, component[source]] * vectors).sum(dim=1)
