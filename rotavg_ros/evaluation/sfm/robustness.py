@@ -102,18 +102,17 @@ def report(folder: Path, scores: dict[str, Scores], names: tuple[str, ...], comm
         about = SETTINGS[setting]
         for row in average_rows(of_setting, names, _FIGURES):
             graphs = len(of_setting.of(str(row[0])))
-            rows.append((about.title, _TRAINING_TITLES[about.training], *row, graphs, None))
+            rows.append((about.title, _TRAINING_TITLES[about.training], *row, graphs))
     headings = (
         Column("tested on"),
         Column("trained on"),
         Column("method"),
         *columns(_FIGURES),
         Column("graphs", "d"),
-        Column("paper: mean °", ".2f"),
     )
     note = (
-        "The settings are ours, after the paper's idea; its own ten settings and their figures are not known to us, so "
-        "its column is empty."
+        "The settings are ours, after the paper's idea; its own ten and their figures are on "
+        "[a page of theirs](published.md)."
     )
     introduction = (
         f"`{command}`: the recipe of the paper's text with other noise, outliers and sizes than the networks have "
