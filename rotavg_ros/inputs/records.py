@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -57,7 +57,7 @@ class EdgeRecord:
     sender: str = ""
     sequence: int = 0
     frame_id: str = ""
-    element: Any = None
+    element: Any = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -117,3 +117,9 @@ def test_an_estimator_solves_with_it(process):
         estimator.add_odometry("r", 10**9 * (index + 1), (0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2)))
     answer = estimator.tick()
     assert answer is not None and len(answer.keyframe_id) == 50
+
+
+def test_ctrl_c_is_not_for_it(process):
+    for _ in range(3):
+        os.kill(process.pid, signal.SIGINT)
+        assert process(graph(30), **OPTIONS).method == "neurora"

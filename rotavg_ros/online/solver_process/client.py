@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import pickle
 import socket
 import subprocess
@@ -49,17 +50,16 @@ class SolverProcess:
         self._lock = threading.Lock()
         self._solves = 0
         self._start()
+        atexit.register(self.close)
 
     def _start(self) -> None:
         ours, theirs = socket.socketpair()
         with theirs:
-            command = [sys.executable, "-m", "rotavg_ros.online.solver_process.server"]
-            self._process = subprocess.Popen(
-                [*command, str(theirs.fileno()), str(self._threads)],
-                stdin=subprocess.DEVNULL,
-                pass_fds=[theirs.fileno()],
-                start_new_session=True,  # Ctrl-C is for the node, which ends this process itself
-            )
+            given = str(theirs.fileno()), str(self._threads)
+            server = [sys.executable, "-m", "rotavg_ros.online.solver_process.server", *given]
+            # Ctrl-C is for the node, which ends this process itself.
+            command = ["/bin/sh", "-c", 'trap "" INT; exec "$@"', "sh", *server]
+            self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()])
         self._connection = Connection(ours.detach())
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import pytest
 
@@ -50,7 +51,7 @@ def executor() -> Iterator[SingleThreadedExecutor]:
 
 def test_a_long_message_lets_others_have_their_turn(executor: SingleThreadedExecutor) -> None:
     online = OnlineEstimator(EstimatorOptions(keyframe_source="edges"), lambda *_, **__: None)
-    intake = EdgeIntake(executor.get_nodes()[0], online, lambda reason: None)
+    intake = EdgeIntake(executor.get_nodes()[0], online, SimpleNamespace(), lambda reason: None)
     convert, counter = Chain(), TopicCounter()
     intake.add_source(convert)
     topic = Input("/edges", "any", "edge_topics", "", QoSProfile(depth=1))
