@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -133,14 +133,11 @@ def placed_frames(
         node = int(trajectory.node[newest])
         deviation = float(answer.uncertainty[node])
         place = math.nan if answer.position_uncertainty is None else float(answer.position_uncertainty[node])
-        found[robot] = OdometryFrame(
-            frame.chain,
-            frame.orientation,
-            frame.origin,
-            frame.keyframe_position,
-            track.num_keyframes - _keyframes_since(builder, robot, moment),
-            Drift(deviation**2, place**2, *steps),
-            is_planar,
+        found[robot] = replace(
+            frame,
+            keyframes_before=track.num_keyframes - _keyframes_since(builder, robot, moment),
+            drift=Drift(deviation**2, place**2, *steps),
+            is_planar=is_planar,
         )
     return found
 
