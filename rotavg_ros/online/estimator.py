@@ -29,9 +29,6 @@ from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 if TYPE_CHECKING:
     from rotavg_ros.solver import Solution
 
-# Whole solves of so many edges take memory that is worth the milliseconds of giving it back.
-_MANY_EDGES = 1000
-
 # The signature of :func:`rotavg_ros.solve`.
 Solver = Callable[..., "Solution"]
 
@@ -301,8 +298,7 @@ class OnlineEstimator:
             answer = self._tick(force_cold)
             if answer is None:
                 return None
-            if len(answer.source) >= _MANY_EDGES and set(answer.stage_seconds) != {"update"}:
-                free_memory.give_back()
+            free_memory.give_back_after(len(answer.source), answer.stage_seconds)
             return replace(answer, seconds=time.perf_counter() - started)
 
     def _tick(self, force_cold: bool) -> Answer | None:

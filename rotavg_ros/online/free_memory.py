@@ -3,8 +3,18 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
+
+# Whole solves of so many edges take memory that is worth the milliseconds of giving it back.
+_MANY_EDGES = 1000
+_STAGES_OF_UPDATES = {"update", "poses"}
+
+
+def give_back_after(num_edges: int, stages: Iterable[str]) -> None:
+    """Return it after a whole solve of a large graph, given the stages that ran."""
+    if num_edges >= _MANY_EDGES and not set(stages) <= _STAGES_OF_UPDATES:
+        give_back()
 
 
 def give_back() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rotavg_ros.online import estimator, free_memory
+from rotavg_ros.online import free_memory
 from rotavg_ros.online.estimator import OnlineEstimator
 from rotavg_ros.online.measurements import EdgeMeasurement, KeyframeReference
 
@@ -35,7 +35,7 @@ def test_free_memory_below_what_is_kept_goes_back() -> None:
 @pytest.mark.parametrize(("many", "times"), [(3, 1), (4, 0)])
 def test_ticks_of_large_graphs_give_memory_back(monkeypatch: pytest.MonkeyPatch, many: int, times: int) -> None:
     calls: list[None] = []
-    monkeypatch.setattr(estimator, "_MANY_EDGES", many)
+    monkeypatch.setattr(free_memory, "_MANY_EDGES", many)
     monkeypatch.setattr(free_memory, "give_back", lambda: calls.append(None))
     online = OnlineEstimator()
     for index in range(3):

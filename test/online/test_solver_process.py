@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -98,8 +100,8 @@ def test_a_process_that_dies_is_an_error_and_the_next_solve_starts_another():
         solver(small, **OPTIONS)
         before = solver.pid
         os.kill(before, signal.SIGKILL)
-        while not solver._connection.poll(0.1):  # until this side can know
-            pass
+        while solver.is_alive:  # until this side can know
+            time.sleep(0.01)
         assert solver(small, **OPTIONS).method == "neurora"
         assert solver.pid != before
         large = graph(20_000)
@@ -123,3 +125,14 @@ def test_ctrl_c_is_not_for_it(process):
     for _ in range(3):
         os.kill(process.pid, signal.SIGINT)
         assert process(graph(30), **OPTIONS).method == "neurora"
+
+
+def test_modules_of_the_folder_where_it_is_started_are_none_of_its(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for name in ("queue", "torch", "pickle"):
+        (tmp_path / f"{name}.py").write_text("raise RuntimeError('a user's own module')")
+    monkeypatch.chdir(tmp_path)
+    solver = SolverProcess(threads=1)
+    try:
+        assert solver(graph(30), **OPTIONS).method == "neurora"
+    finally:
+        solver.close()

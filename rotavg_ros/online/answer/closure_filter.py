@@ -47,11 +47,17 @@ class ClosureFilter(Generic[_Item]):
     """Closures by the names that their senders gave them. Not thread-safe.
 
     A closure passes with the first answer that has it and believes it, once it is old enough; one that is held false
-    waits on. Where measurements share a name, one pass needs all of them to be believed. Items of type ``_Item`` stand
-    for what is to be sent on.
+    waits on. Items of type ``_Item`` stand for what is to be sent on.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, newest_counts: bool = False) -> None:
+        """Begin with nothing.
+
+        Args:
+            newest_counts: of measurements that share a name the newest decides, since the sender means it to stand for
+                those before; else all of them have to be believed.
+        """
+        self._newest_counts = newest_counts
         self._waiting: dict[int, _Waiting[_Item]] = {}
         self._believed: dict[int, bool] = {}  # of those that were let pass: whether they still are
 
@@ -86,7 +92,13 @@ class ClosureFilter(Generic[_Item]):
         rows, keys = _closures(answer)
         order = np.argsort(keys, kind="stable")
         unique, first = np.unique(keys[order], return_index=True)
-        is_false = np.logical_or.reduceat(answer.outlier[rows][order], first) if len(first) else np.empty(0, dtype=bool)
+        outlier = answer.outlier[rows][order]
+        if not len(first):
+            is_false = np.empty(0, dtype=bool)
+        elif self._newest_counts:
+            is_false = outlier[np.append(first[1:], len(rows)) - 1]
+        else:
+            is_false = np.logical_or.reduceat(outlier, first)
         revoked, reinstated = self._follow(unique, is_false, rows[order], first)
         return Decision(self._let_pass(unique, is_false, now - delay_s), revoked, reinstated)
 

@@ -23,6 +23,13 @@ from rotavg_ros.view_graph import ViewGraph
 # So often a solve that is waited for is asked whether anybody still wants it.
 _PATIENCE_S = 0.02
 _EXIT_TIMEOUT_S = 5.0
+# With -c and -m Python looks for modules in the folder where it is started, first of all: a user's queue.py, say.
+_SERVER = """\
+import sys
+sys.path[:] = [folder for folder in sys.path if folder]
+from rotavg_ros.online.solver_process.server import main
+main()
+"""
 
 
 @dataclass(frozen=True)
@@ -56,11 +63,16 @@ class SolverProcess:
         ours, theirs = socket.socketpair()
         with theirs:
             given = str(theirs.fileno()), str(self._threads)
-            server = [sys.executable, "-m", "rotavg_ros.online.solver_process.server", *given]
+            server = [sys.executable, "-c", _SERVER, *given]
             # Ctrl-C is for the node, which ends this process itself.
             command = ["/bin/sh", "-c", 'trap "" INT; exec "$@"', "sh", *server]
             self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()])
         self._connection = Connection(ours.detach())
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the process has not ended, as far as this side knows; to be asked between solves."""
+        return not self._connection.poll(0)  # nothing was asked: what comes is its end
 
     @property
     def pid(self) -> int:
@@ -81,7 +93,7 @@ class SolverProcess:
             Abandoned: nobody waits for the solution any more.
         """
         with self._lock:
-            if self._connection.poll(0):  # nothing was asked: this is its end
+            if not self.is_alive:
                 self.close()
                 self._start()
             self._solves += 1
@@ -119,10 +131,7 @@ class SolverProcess:
 
     def close(self) -> None:
         """End the process, in the middle of a solve as well."""
-        self._close()
-        self._process.kill()
-        self._process.wait()
-
-    def _close(self) -> None:
         with suppress(OSError):
             self._connection.close()
+        self._process.kill()
+        self._process.wait()

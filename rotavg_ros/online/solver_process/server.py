@@ -1,4 +1,4 @@
-"""The side that solves: ``python -m rotavg_ros.online.solver_process.server SOCKET THREADS``."""
+"""The side that solves; :mod:`~rotavg_ros.online.solver_process.client` starts it."""
 
 from __future__ import annotations
 
@@ -16,9 +16,6 @@ from rotavg_ros.online import free_memory
 from rotavg_ros.online.solver_process.wire import ABANDON, Request, from_arrays, to_arrays
 from rotavg_ros.solver import Abandoned, abandonable, solve
 from rotavg_ros.view_graph import ViewGraph
-
-# Whole solves of so many edges take memory that is worth the milliseconds of giving it back.
-_MANY_EDGES = 1000
 
 
 class _Server:
@@ -63,8 +60,7 @@ class _Server:
                 **request.options,
             )
         self._memory = request.number, solution.memory
-        if len(solution.outlier_score) >= _MANY_EDGES and set(solution.stage_seconds) != {"update"}:
-            free_memory.give_back()
+        free_memory.give_back_after(len(solution.outlier_score), solution.stage_seconds)
         values = to_arrays(solution)
         return values | {"memory": None, "remembers": values["memory"] is not None}
 
@@ -74,7 +70,3 @@ def main() -> None:
     descriptor, threads = (int(word) for word in sys.argv[1:])
     torch.set_num_threads(threads)
     _Server(Connection(descriptor)).run()
-
-
-if __name__ == "__main__":
-    main()

@@ -80,6 +80,20 @@ def test_measurements_of_one_name_go_together():
     assert closures.decide(answer([("a", 1, False), ("a", 1, False)]), 0.0, 0.0).passed == ["good", "false"]
 
 
+def test_of_graphs_the_newest_measurement_of_a_closure_counts():
+    closures: ClosureFilter[None] = ClosureFilter(newest_counts=True)
+    assert closures.decide(answer([]), 0.0, 0.0).passed == []
+    closures.take(("a", 1), None, now=0.0)
+    closures.decide(answer([("a", 1, True)]), 0.0, 0.0)
+    assert not closures.passes(("a", 1))
+    closures.take(("a", 1), None, now=1.0)  # refined
+    refined = answer([("a", 1, True), ("b", 1, True), ("a", 1, False)])
+    closures.decide(refined, 1.0, 0.0)
+    assert closures.passes(("a", 1)) and not closures.passes(("b", 1))
+    closures.decide(answer([("a", 1, False), ("a", 1, True)]), 2.0, 0.0)
+    assert not closures.passes(("a", 1))
+
+
 @given(data=st.data())
 @settings(max_examples=60, deadline=None)
 def test_at_any_time_passed_but_for_revoked_is_what_was_believed_last(data):

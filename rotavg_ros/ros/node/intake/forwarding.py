@@ -40,8 +40,11 @@ class Forward:
 
     def __init__(self, topic: str, output: Publisher) -> None:
         self.topic, self._output = topic, output
-        self.filter: ClosureFilter[Any] = ClosureFilter()
+        self.filter: ClosureFilter[Any] = self._new_filter()
         self.shares_names = False
+
+    def _new_filter(self) -> ClosureFilter[Any]:
+        return ClosureFilter()
 
     def begin(self, message: Any, records: Iterable[EdgeRecord | EdgeVerdict]) -> Iterator[EdgeRecord | EdgeVerdict]:
         """The records of a message that has come, each with what is to be sent on of it."""
@@ -58,7 +61,7 @@ class Forward:
 
     def forget(self) -> None:
         """Begin anew, as the graph does."""
-        self.filter, self.shares_names = ClosureFilter(), False
+        self.filter, self.shares_names = self._new_filter(), False
 
 
 class ArrayForward(Forward):
@@ -111,6 +114,9 @@ class WholeGraphForward(Forward):
         self._converter = converter
         self._incoming: deque[_Graph] = deque(maxlen=_MOST_GRAPHS)
         self._graphs: list[_Graph] = []
+
+    def _new_filter(self) -> ClosureFilter[Any]:
+        return ClosureFilter(newest_counts=True)  # a sender that refines a closure sends it in the place of the old one
 
     def begin(self, message: Any, records: Iterable[EdgeRecord | EdgeVerdict]) -> Iterator[EdgeRecord | EdgeVerdict]:
         yield from super().begin(None, records)

@@ -24,7 +24,7 @@ from rotavg_ros.ros.node.output.frame_correction import FrameCorrection
 from rotavg_ros.ros.node.topics import publisher
 from rotavg_ros.settings.parameters import NodeParameters
 
-# rad² or m² of what nobody can tell: a filter that fuses it takes next to nothing from it.
+# Of what nobody can tell, in rad² or m², or these over s²: a filter that fuses it takes next to nothing from it.
 UNKNOWN_VARIANCE = 1e6
 # The diagonal of a pose's 6 × 6 covariance: position, then orientation, about x, y, z of the world's frame.
 _DIAGONAL = slice(None, None, 7)
@@ -108,7 +108,7 @@ def _rates(parameters: NodeParameters) -> CorrectionRates:
 
 
 def _odometry_message(message: Any, record: OdometryRecord, frame: OdometryFrame) -> Odometry:
-    """The message with its pose in the world; its velocity is in the frame that moves, and stays as it is."""
+    """The message with its pose in the world; its velocity is in the frame that moves, and stays as it is if known."""
     odometry = Odometry(child_frame_id=record.child_frame_id)
     odometry.header.stamp = message.header.stamp
     assert record.position is not None
@@ -118,6 +118,10 @@ def _odometry_message(message: Any, record: OdometryRecord, frame: OdometryFrame
     odometry.pose.pose.orientation = to_quaternion_message(orientation)
     if isinstance(message, Odometry):
         odometry.twist = message.twist
+    else:
+        unknown = np.zeros(36)
+        unknown[_DIAGONAL] = UNKNOWN_VARIANCE
+        odometry.twist.covariance = unknown
     return odometry
 
 
