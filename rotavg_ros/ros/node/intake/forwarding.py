@@ -15,13 +15,14 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rotavg_msgs.msg import OutlierFlags
 from std_msgs.msg import Header
 
+from rotavg_ros.errors import UserError
 from rotavg_ros.inputs import EdgeConverter, EdgeRecord, EdgeVerdict, WholeGraphConverter
 from rotavg_ros.online import Answer, OnlineEstimator, RejectReason
 from rotavg_ros.online.answer.closure_filter import ClosureFilter
 from rotavg_ros.ros.node.intake.adapters import EdgeTopic
 from rotavg_ros.ros.node.intake.serialized_array import as_message
 from rotavg_ros.ros.node.output.conversions import flags_message
-from rotavg_ros.ros.node.topics import publisher
+from rotavg_ros.ros.node.topics import publisher, user_error_about
 from rotavg_ros.settings.parameters import NodeParameters
 from rotavg_ros.view_graph import EdgeKind
 
@@ -151,13 +152,15 @@ class Forwarding:
     Edges come on the executor's thread, answers on the solver's worker.
 
     Raises:
-        UserError: a topic's name or its ``qos_overrides`` cannot be.
+        UserError: a topic's name or its ``qos_overrides`` cannot be, or an output is listened to.
     """
 
     def __init__(self, node: Node, parameters: NodeParameters, estimator: OnlineEstimator) -> None:
         self._node, self._estimator = node, estimator
         self._frame_id = parameters.world_frame
         self._output_of = parameters.forwarded()
+        entries = (*parameters.odometry_topics, *parameters.edge_topics)
+        self._check_outputs(entry.partition(":")[0] for entry in entries if self._output_of)
         self._delay_s = parameters.forward_delay_s
         self._qos = QoSProfile(depth=parameters.edge_queue_depth, reliability=ReliabilityPolicy.RELIABLE)
         self._forwards: list[Forward] = []
@@ -203,6 +206,22 @@ class Forwarding:
             forward = Forward(edges.topic, output)
         self._forwards.append(forward)
         return forward
+
+    def _check_outputs(self, listened: Iterable[str]) -> None:
+        """Compare the outputs' full names, with the namespace and remappings, with those of what is listened to."""
+        taken = {self._full_name(topic) for topic in listened}
+        for topic, output in self._output_of.items():
+            name = self._full_name(output)
+            if name in taken:
+                raise UserError(
+                    f"forward_topics: the output of {topic} is {name}, which is listened to, or another output, "
+                    "already; choose another"
+                )
+            taken.add(name)
+
+    def _full_name(self, topic: str) -> str:
+        with user_error_about(topic):
+            return str(self._node.resolve_topic_name(topic))
 
     def taken(self, forward: Forward, record: EdgeRecord, refusal: RejectReason | None) -> None:
         """An edge was handed to the estimator: send it on at once if it is odometry, or let it wait."""

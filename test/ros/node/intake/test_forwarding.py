@@ -174,6 +174,8 @@ def test_a_whole_graph_goes_out_without_its_false_edges(foreign_packages, live_n
         ("nothing", "'nothing' names no two topics; write topic:output"),
         ("other:trusted", "other is none of edge_topics"),
         ("relative_rotations:relative_rotation_arrays", "relative_rotation_arrays is listened to; choose another"),
+        ("relative_rotations:/relative_rotations", "is /relative_rotations, which is listened to"),
+        ("relative_rotations:odom", "is /odom, which is listened to"),
     ],
 )
 def test_what_cannot_be_sent_on(entry, said) -> None:
