@@ -150,6 +150,7 @@ def _values(health: Health, counts: Counts, paused: bool, now: float) -> dict[st
         "marginalized keyframes": str(counts.marginalized),
         "dropped closures": str(counts.dropped_closures),
         "pending": str(counts.pending),
+        "queued closures": str(counts.queued),
         "held back": str(health.held_back),
         "waiting for frames": str(health.waiting_for_frames),
         "answer version": str(0 if answer is None else answer.version),

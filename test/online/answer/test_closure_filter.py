@@ -23,6 +23,7 @@ def answer(verdicts: list[tuple[str, int, bool]], odometry: int = 3) -> SimpleNa
         edge_id=np.array([edge_id for _, edge_id, _ in named], dtype=np.uint64),
         kind=np.array([EdgeKind.ODOMETRY] * odometry + [EdgeKind.LOOP_CLOSURE] * len(verdicts)),
         outlier=np.array([is_false for _, _, is_false in named]),
+        waits=np.zeros(len(named), dtype=bool),
     )
 
 
