@@ -33,7 +33,8 @@ class EntryLimits:
             graph that is loaded, bring closures with their keyframes, a flood brings them without.
         contradicting: of those that enter, the share of those that the last answer contradicts, at most.
         flagged: while data flows, none but those at the newest keyframes of these enter once so many of the closures in
-            the solve are flagged, by the number of those believed.
+            the solve are flagged, by the number of those believed. Each of them makes every tick dearer.
+        newest: so many keyframes of the last answer count as the newest, besides those that it does not know.
     """
 
     at_least: int = 100
@@ -41,6 +42,7 @@ class EntryLimits:
     per_keyframe: int = 4
     contradicting: float = 0.25
     flagged: float = 0.1
+    newest: int = 10
 
 
 @dataclass
@@ -112,15 +114,16 @@ class ClosureQueue:
         closures = graph.select_edges(torch.from_numpy(candidates))
         log_odds = known.carried_on(graph.select_edges(torch.from_numpy(~waits))).log_odds(closures)
         later_end = torch.maximum(closures.source, closures.target).numpy()
+        at_newest = later_end >= num_known - limits.newest
         explained = np.flatnonzero(log_odds >= 0)
         explained = explained[np.argsort(-later_end[explained], kind="stable")][:most]
         may_enter, spare = log_odds < 0, most - len(explained)
         if not self.idle_ticks:
             spare = min(spare, int(limits.contradicting * most))
             if solved.sum() > max(limits.at_least, limits.flagged * (~solved).sum()):
-                may_enter &= later_end >= num_known
+                may_enter &= at_newest
         others = np.flatnonzero(may_enter)
-        others = others[np.lexsort((-log_odds[others], later_end[others] < num_known))][:spare]
+        others = others[np.lexsort((-log_odds[others], ~at_newest[others]))][:spare]
         return candidates[np.concatenate((explained, others))]
 
 
