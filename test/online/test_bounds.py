@@ -70,7 +70,7 @@ def test_a_view_graph_without_odometry_stops_growing() -> None:
 
 
 def test_closures_are_bounded_with_the_keyframes() -> None:
-    """A robot that goes to and fro between the same keyframes closes loops for hours; each one that is dropped counts."""
+    """A robot that goes to and fro between the same keyframes closes loops for hours; what is dropped is counted."""
     options = EstimatorOptions(keyframe_angle=0, keyframe_distance=0, max_keyframes=100)
     online = OnlineEstimator(options, lambda *_, **__: None)
     for index in range(100):
