@@ -25,8 +25,8 @@ class WorkRates:
     """
 
     with_closures: int = 7
-    at_first: int = 2_000_000
-    per_second: int = 6_000
+    at_first: int = 1_500_000
+    per_second: int = 5_000
 
 
 class Pace:

@@ -42,6 +42,16 @@ def test_what_is_believed_passes_once_and_in_order():
     assert len(closures) == 0
 
 
+def test_a_closure_that_is_not_solved_yet_does_not_pass_however_well_it_fits():
+    closures: ClosureFilter[str] = ClosureFilter()
+    closures.take(("a", 1), "it", now=0.0)
+    queued = answer([("a", 1, False)])
+    queued.waits[-1] = True
+    assert closures.decide(queued, now=1.0, delay_s=0.0).passed == []
+    queued.waits[-1] = False
+    assert closures.decide(queued, now=2.0, delay_s=0.0).passed == ["it"]
+
+
 def test_a_closure_waits_until_it_is_old_enough():
     closures: ClosureFilter[str] = ClosureFilter()
     closures.take(("a", 1), "first", now=0.0)
