@@ -33,7 +33,7 @@ class LastAnswer:
 
         Args:
             body_from_world, component, outlier: see above.
-            queued: ``(m',)`` closures that wait.
+            queued: ``(M,)`` closures of the graph that wait; the other edges have entered.
         """
         self.body_from_world = body_from_world
         self.component = component

@@ -30,7 +30,7 @@ def upgraded(arrays: Arrays, header: dict[str, Any]) -> tuple[Arrays, dict[str, 
     if header["format_version"] < _FIRST_WITH_TIME_LINES:
         arrays, header = _with_time_lines(arrays), _with_surroundings(header, arrays)
     if header["format_version"] < _FIRST_WITH_QUEUE:
-        arrays = arrays | {"queued": np.zeros(0, dtype=bool)}
+        arrays = arrays | {"queued": np.zeros(0, dtype=np.int64)}
     return arrays, header
 
 

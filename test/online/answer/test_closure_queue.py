@@ -105,6 +105,20 @@ def test_a_graph_that_is_loaded_at_once_enters_at_once() -> None:
     assert not run.tick().waits.any()
 
 
+def test_what_was_solved_before_a_restart_does_not_wait_after_it(tmp_path: Path) -> None:
+    run = Run()
+    run.drive(300)
+    run.close(1200)
+    run.tick()
+    run.online.save(tmp_path / "state")
+    run.online = OnlineEstimator(OPTIONS, run.solver)
+    run.online.load(tmp_path / "state")
+    run.drive(1)
+    run.close(3)
+    assert not run.tick().waits.any()
+    assert same(run.solver.graphs[-1], run.online.snapshot().graph)
+
+
 def test_without_odometry_a_graph_grows_by_closures() -> None:
     online = OnlineEstimator(EstimatorOptions(unknown_keyframes="create"), TreeSolver())
     online.add_edge(edge(0, 0, 1, STEP_DEG, EdgeKind.LOOP_CLOSURE))
