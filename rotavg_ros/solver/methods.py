@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from rotavg_ros.solver.sfm.options import SfmStages
 from rotavg_ros.solver.slam.options import SWITCHES as SWITCHES
@@ -21,17 +21,29 @@ def _without_refinement(clean: bool, fine_tunings: int) -> Method:
     return Method(SfmStages(clean, fine_tunings, refine=False), SlamStages(clean, refine=False))
 
 
+def _as_written(clean: bool, fine_tunings: int) -> Method:
+    """The paper's text is about photos; robots' graphs get what this package has of the same stages."""
+    ours = _without_refinement(clean, fine_tunings)
+    return replace(ours, sfm=replace(ours.sfm, as_written=True))
+
+
 DEFAULT_METHOD = "neurora"
 POSTERIOR = "neurora-posterior"
 # "neurora-posterior~slips,cleannet" is the posterior without these.
 _WITHOUT, _AND = "~", ","
 NETWORK_METHODS = {
     DEFAULT_METHOD: Method(),
-    "neurora-paper": _without_refinement(clean=True, fine_tunings=1),
+    "neurora-v1": _without_refinement(clean=True, fine_tunings=1),
     "neurora-v2": _without_refinement(clean=True, fine_tunings=2),
     "cleannet-spt": _without_refinement(clean=True, fine_tunings=0),
     "spt-finenet": _without_refinement(clean=False, fine_tunings=1),
     "spt": _without_refinement(clean=False, fine_tunings=0),
+    # The paper as its text has it, with networks of its own.
+    "neurora-paper": _as_written(clean=True, fine_tunings=1),
+    "neurora-v2-paper": _as_written(clean=True, fine_tunings=2),
+    "cleannet-spt-paper": _as_written(clean=True, fine_tunings=0),
+    "spt-finenet-paper": _as_written(clean=False, fine_tunings=1),
+    "spt-paper": _as_written(clean=False, fine_tunings=0),
     # Ablations: what each network and the noise's shape earn.
     "neurora-unweighted": Method(sfm=SfmStages(weighted=False)),
     "neurora-without-finenet": Method(sfm=SfmStages(fine_tunings=0)),

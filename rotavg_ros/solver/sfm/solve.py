@@ -13,10 +13,11 @@ from rotavg_ros.solver.estimate import Estimate, Run
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.fine_net import FineNet
 from rotavg_ros.solver.neurora.numbers import NUMBERS
+from rotavg_ros.solver.neurora.paper import PaperCleanNet, PaperFineNet, paper_fine_tune
 from rotavg_ros.solver.neurora.scores import residual_and_uncertainty, residual_probability
 from rotavg_ros.solver.neurora.stages import apply_labels, clean, fine_tune, trust_all
 from rotavg_ros.solver.neurora.tiled.tuning import tune
-from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap
+from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap, breadth_first
 from rotavg_ros.solver.sfm.options import SfmStages
 from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
 from rotavg_ros.solver.sfm.series import EdgesInSeries
@@ -38,13 +39,14 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     if graph.num_edges > _TUNING_PAYS and graph.device.type == "cpu":
         tune()
     with watch.stage("order"):
-        form = CanonicalForm.of(graph, component)
+        form = CanonicalForm.of(graph, component, own_axes=not stages.as_written)
     graph, component = form.graph, form.component
     with watch.stage("clean"):
-        cleaned = clean(networks.load(CleanNet), graph) if stages.clean else trust_all(graph)
+        kind = PaperCleanNet if stages.as_written else CleanNet
+        cleaned = clean(networks.load(kind), graph) if stages.clean else trust_all(graph)
         cleaned = apply_labels(cleaned, graph.label)
     with watch.stage("bootstrap"):
-        begun = bootstrap(cleaned, component)
+        begun = (breadth_first if stages.as_written else bootstrap)(cleaned, component)
         cleaned, orientations = begun.cleaned, begun.body_from_world
         structure = _structure(begun, component)
         if run.warm_start is not None:
@@ -54,7 +56,10 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             )
     for _ in range(stages.fine_tunings):
         with watch.stage("fine-tune"):
-            orientations = fine_tune(networks.load(FineNet), cleaned, orientations, component)
+            if stages.as_written:
+                orientations = paper_fine_tune(networks.load(PaperFineNet), cleaned, orientations)
+            else:
+                orientations = fine_tune(networks.load(FineNet), cleaned, orientations, component)
     steps = run.refinement_steps
     if steps is None:
         steps = PRIORS.max_steps if stages.refine else 0
@@ -66,8 +71,10 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             priors = PRIORS if stages.shaped else ROUND
             orientations = refine(graph, orientations, steps, structure=structure, weights=weights, priors=priors)
     score, variance = cleaned.outlier_probability.double(), torch.full((graph.num_nodes,), torch.nan)
-    if steps > 0 or stages.fine_tunings > 0:
-        # Before, there is but a tree; now a residual is the noise but for the orientations' error.
+    by_residuals = stages.fine_tunings > 0 and not (stages.as_written and stages.clean)
+    if steps > 0 or by_residuals:
+        # Before, there is but a tree; now a residual is the noise but for the orientations' error. The paper's CleanNet
+        # has the last word in any case.
         angle, spread = residual_and_uncertainty(graph, orientations, component)
         score = residual_probability(angle, spread, NUMBERS.outlier_angle)
         series = structure.series
