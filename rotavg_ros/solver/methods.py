@@ -56,7 +56,7 @@ NETWORK_METHODS = {
     "neurora-without-slip-search": Method(slam=SlamStages(slip_search=False)),
 }
 # Others' methods, to compare with.
-BASELINES = ("chatterjee", "weiszfeld", "arrigoni", "wang")
+BASELINES = ("chatterjee", "geman-mcclure", "weiszfeld", "arrigoni", "wang")
 METHODS = (*NETWORK_METHODS, *BASELINES)
 PROFILES = ("auto", "slam", "sfm")
 DEVICES = ("auto", "cpu", "cuda")

@@ -61,9 +61,9 @@ def test_robustness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         setting = robustness.SETTINGS[name]
         monkeypatch.setitem(robustness.SETTINGS, name, robustness.Setting(setting.title, setting.training, tiny))
     command = ["evaluate", "robustness", "--graphs", "1", "--minutes", "0.001", "--settings", "easy", "easy-easy"]
-    assert main([*command, "--methods", "neurora-paper", "--output", str(tmp_path), "--threads", "1"]) == 0
+    assert main([*command, "--methods", "neurora-v1", "--output", str(tmp_path), "--threads", "1"]) == 0
     assert (
-        "`rotavg evaluate robustness --threads 1 --graphs 1 --methods neurora-paper --settings easy easy-easy"
+        "`rotavg evaluate robustness --threads 1 --graphs 1 --methods neurora-v1 --settings easy easy-easy"
         in (tmp_path / "robustness.md").read_text()
     )
     with (tmp_path / "robustness.csv").open() as file:
@@ -167,6 +167,6 @@ def test_rgbd(tmp_path: Path) -> None:
     with (tmp_path / "rgbd-redwood_fgr.csv").open() as file:
         rows = {row["method"]: row for row in csv.DictReader(file)}
     assert {row["scenes"] for row in rows.values()} == {"4"}
-    assert rows["neurora-paper"]["mean °"] != rows["package: neurora-paper"]["mean °"]
+    assert rows["neurora-v1"]["mean °"] != rows["package: neurora-v1"]["mean °"]
     of_package = Counter(path.name.rpartition("-")[0] for path in keep.iterdir())
-    assert of_package == dict.fromkeys(("chatterjee", "weiszfeld", "cleannet-spt", "neurora-paper", "neurora"), 4)
+    assert of_package == dict.fromkeys(("chatterjee", "weiszfeld", "cleannet-spt", "neurora-v1", "neurora"), 4)

@@ -28,9 +28,12 @@ METHODS = (
     "arrigoni",
     "wang",
     "cleannet-spt",
+    "cleannet-spt-paper",
     "neurora-paper",
+    "neurora-v1",
     "neurora-v2",
     "neurora",
+    "geman-mcclure",
     "colmap",
     "shonan",
 )

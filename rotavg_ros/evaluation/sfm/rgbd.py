@@ -20,7 +20,7 @@ from rotavg_ros.training.sfm_tasks import GivenGraphs
 
 # Methods without networks, and those that are trained in every fold.
 UNTRAINED = ("chatterjee", "weiszfeld")
-TRAINED = ("cleannet-spt", "neurora-paper", "neurora")
+TRAINED = ("cleannet-spt", "neurora-v1", "neurora")
 # Before the name of a method with the package's own networks.
 PACKAGE_PREFIX = "package: "
 # Of a fold's training scenes, every so many-th decides which weights are kept.
