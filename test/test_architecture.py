@@ -66,6 +66,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "clean_net": {"message_passing", "network_store"},
         "fine_net": {"message_passing", "network_store", "numbers"},
         "stages": {"clean_net", "cleaned", "fine_net", "tiled"},
+        "paper": {"clean_net", "cleaned", "message_passing", "network_store", "tiled"},
         "tiled": {"clean_net", "cleaned", "fine_net", "message_passing", "numbers"},
     },
     "solver/sfm": {

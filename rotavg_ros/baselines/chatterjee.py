@@ -69,7 +69,11 @@ def minimize_l1(graph: ViewGraph, body_from_world: Tensor, roots: np.ndarray) ->
 
 
 def reweighted(
-    graph: ViewGraph, body_from_world: Tensor, roots: np.ndarray, weigh: Callable[[np.ndarray], np.ndarray], stage: Stage
+    graph: ViewGraph,
+    body_from_world: Tensor,
+    roots: np.ndarray,
+    weigh: Callable[[np.ndarray], np.ndarray],
+    stage: Stage,
 ) -> Tensor:
     """Iteratively reweighted least squares on the edges' residual vectors, ``(N, 4)`` float64.
 

@@ -80,7 +80,8 @@ def paper_fine_net_loss(body_from_world: Tensor, truth: Tensor, edges: DirectedE
     half = len(edges.source) // 2
     source, target = edges.source[:half], edges.target[:half]
     relative, true_relative = (
-        rotations.multiply(of_nodes[target], rotations.inverse(of_nodes[source])) for of_nodes in (body_from_world, truth)
+        rotations.multiply(of_nodes[target], rotations.inverse(of_nodes[source]))
+        for of_nodes in (body_from_world, truth)
     )
     edge = degree_normalised(quaternion_distance(relative, true_relative), edges)
     node = quaternion_distance(body_from_world, truth).mean()

@@ -1,4 +1,4 @@
-"""Training of the networks as the paper's text has them: graphs as they are drawn, its tree, its losses (NeuRoRA §4)."""
+"""Training of the networks as the paper's text has them: graphs as drawn, its tree, its losses (NeuRoRA §4)."""
 
 from __future__ import annotations
 

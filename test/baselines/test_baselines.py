@@ -77,7 +77,8 @@ def test_exact_without_noise(method: Baseline, source: object, target: object, n
 
 
 @pytest.mark.parametrize(
-    ("name", "tolerance"), [("chatterjee", 1e-6), ("geman-mcclure", 1e-6), ("weiszfeld", 1e-3), ("arrigoni", 1e-3), ("wang", 1e-2)]
+    ("name", "tolerance"),
+    [("chatterjee", 1e-6), ("geman-mcclure", 1e-6), ("weiszfeld", 1e-3), ("arrigoni", 1e-3), ("wang", 1e-2)],
 )
 def test_a_wrong_start_is_forgotten(name: str, tolerance: float) -> None:
     graph, truth = dense_graph(20, seed=1)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe, SyntheticGraph
 from rotavg_ros.evaluation.common import plots
 from rotavg_ros.evaluation.common.cases import Case, CaseKey, Kind
 from rotavg_ros.evaluation.common.score_tables import Figure, average_rows, columns, per_case
@@ -60,6 +60,7 @@ ROWS: dict[str, str] = {
     "neurora-round": "· without the noise's shape",
     "oracle": "oracle: ℓ½ on the true inliers, from the truth",
     "oracle-shaped": "oracle that is told the noise's shape by the residuals",
+    "oracle-covariances": "oracle that is told the covariance of every edge's noise",
 }
 # Run on every graph; the other rows take minutes a graph or say little more, so that few graphs do for them.
 CORE = (
@@ -112,7 +113,12 @@ def kinds(recipes: Sequence[str], seed: int) -> list[Kind]:
 def _draw(recipe: str, seed: int, number: int) -> Case:
     rng = np.random.default_rng((seed, _STREAM, zlib.crc32(recipe.encode()), number))
     sample = RECIPES[recipe].sample(rng)
-    return Case(CaseKey(f"{recipe} {number}", recipe, seed), sample.graph, sample.body_from_world)
+    return case_of(CaseKey(f"{recipe} {number}", recipe, seed), sample)
+
+
+def case_of(key: CaseKey, sample: SyntheticGraph) -> Case:
+    """A drawn graph, with all that its generator knows."""
+    return Case(key, sample.graph, sample.body_from_world, noise_covariance=sample.noise)
 
 
 @dataclass(frozen=True)

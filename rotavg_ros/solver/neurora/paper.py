@@ -36,11 +36,11 @@ class PaperCleanNet(CleanNet):
 
 
 class PaperFineNet(StoredNetwork):
-    """The paper's §4.3: h_v⁰ = R_v, x_uv = e_uv, and one linear head on the last node state h_v:
+    """The paper's §4.3: h_v⁰ = R_v, x_uv = e_uv, and one linear head on the last node state h_v.
 
-        R_v ← R_v · normalise(1 + H h_v + b),        e_uv = R_v⁻¹ R̂_uv R_u.
+        R_v ← R_v · normalise(1 + H h_v + b),        e_uv = R_v⁻¹ R̂_uv R_u
 
-    Both are quaternions, and R̂_uv is what CleanNet has left of the measurement.
+    All are quaternions, and R̂_uv is what CleanNet has left of the measurement.
     """
 
     NAME = "paper-fine-net"
