@@ -78,8 +78,9 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "refinement": {"priors", "step"},
         "step": {"block_laplacian", "noise_shape", "priors", "series"},
         "series": set(),
+        "stated_precision": {"priors"},
         "uncertainty": {"priors"},
-        "solve": {"options", "refinement", "series", "step", "uncertainty"},
+        "solve": {"options", "refinement", "series", "stated_precision", "step", "uncertainty"},
     },
     "solver/slam": {
         "": set(),

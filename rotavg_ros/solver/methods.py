@@ -50,6 +50,7 @@ NETWORK_METHODS = {
     "neurora-without-cleannet": Method(SfmStages(clean=False), SlamStages(clean=False)),
     "neurora-without-both": Method(SfmStages(clean=False, fine_tunings=0), SlamStages(clean=False)),
     "neurora-round": Method(sfm=SfmStages(shaped=False)),
+    "neurora-equal-precisions": Method(sfm=SfmStages(stated=False)),
     "neurora-odometry-start": Method(slam=SlamStages(tree_start=False)),
     "neurora-stated-precisions": Method(slam=SlamStages(scale_estimation=False)),
     POSTERIOR: Method(slam=SlamStages(posterior=True)),

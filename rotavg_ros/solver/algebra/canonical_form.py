@@ -40,7 +40,7 @@ class CanonicalForm:
     """A view-graph of N nodes, M edges and C components in canonical form, and how to get back.
 
     Attributes:
-        graph: in canonical form, with K ≤ M edges, without translations.
+        graph: in canonical form, with K ≤ M edges, without translations; of copies the highest precision is kept.
         component: ``(N,)`` of its nodes.
         node: ``(N,)`` which of the given graph's nodes each is.
         edge: ``(M,)`` which of its edges stands for each of the given graph's.
@@ -66,6 +66,7 @@ class CanonicalForm:
         if not has_parallels:
             return form
         kept, copy_of = _without_copies(graph)
+        graph = _stating_the_highest(graph, kept, copy_of)
         # Several rotations between the same nodes are sorted by their angles, and so stay.
         by_angle = graph.target_from_source[kept, 3].argsort(stable=True)
         form, _ = _form(graph.select_edges(kept[by_angle]), component, own_axes)
@@ -121,11 +122,12 @@ def _form(graph: ViewGraph, component: Tensor, own_axes: bool) -> tuple[Canonica
         count = int(component.max()) + 1 if len(component) else 0
         axes = torch.eye(3, dtype=rows.dtype, device=rows.device).expand(count, 3, 3)
     # One number each, seen M times: at millions of edges columns that nobody reads take room.
-    unread = (
+    kind, precision, steps = (
         torch.full_like(column[:1], value).expand(len(column))
         for column, value in ((graph.kind, EdgeKind.LOOP_CLOSURE), (graph.precision, torch.nan), (graph.steps, 1.0))
     )
-    kind, precision, steps = unread
+    if bool(graph.precision.isfinite().any()):
+        precision = graph.precision.index_select(0, order)
     canonical = ViewGraph(graph.num_nodes, low, high, rows.t().contiguous(), kind, precision, label, steps)
     edge = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
     has_parallels = bool(((low[1:] == low[:-1]) & (high[1:] == high[:-1])).any())
@@ -147,6 +149,17 @@ def _without_copies(graph: ViewGraph) -> tuple[Tensor, Tensor]:
     first = torch.full_like(every, graph.num_edges).scatter_reduce(0, group, every, "amin")[group]
     is_kept = first == every
     return is_kept.nonzero().squeeze(1), (is_kept.cumsum(0) - 1)[first]
+
+
+def _stating_the_highest(graph: ViewGraph, kept: Tensor, copy_of: Tensor) -> ViewGraph:
+    """The graph whose ``kept`` edges state the highest precision that any of their copies does."""
+    if not bool(graph.precision.isfinite().any()):
+        return graph
+    stated = graph.precision.nan_to_num(nan=0.0)
+    highest = stated.new_zeros(len(kept)).scatter_reduce(0, copy_of, stated, "amax")
+    precision = graph.precision.clone()
+    precision[kept] = torch.where(highest > 0, highest, torch.nan)
+    return replace(graph, precision=precision)
 
 
 def _nodes_in_order(graph: ViewGraph, component: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ class SfmStages:
         refine: refinement ends the solve.
         weighted: refinement begins by weighing the edges by CleanNet's scores.
         shaped: the refinement estimates the noise's shape; otherwise noise is taken to be round.
+        stated: precisions that edges state are believed as far as residuals bear them out; otherwise not at all.
         as_written: networks, tree and cameras' axes as the paper's text has them, not as this package does.
     """
 
@@ -23,4 +24,5 @@ class SfmStages:
     refine: bool = True
     weighted: bool = True
     shaped: bool = True
+    stated: bool = True
     as_written: bool = False

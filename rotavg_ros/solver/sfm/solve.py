@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
+from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.estimate import Estimate, Run
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.fine_net import FineNet
@@ -21,6 +23,7 @@ from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap, breadth_firs
 from rotavg_ros.solver.sfm.options import SfmStages
 from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
 from rotavg_ros.solver.sfm.series import EdgesInSeries
+from rotavg_ros.solver.sfm.stated_precision import relative_variance
 from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.solver.sfm.uncertainty import References, variances
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
@@ -68,8 +71,14 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             allowed = (graph.label != EdgeLabel.REJECTED).double()
             coarse = 1 - cleaned.outlier_probability if stages.weighted else torch.ones_like(allowed)
             weights = EdgeWeights(allowed, allowed * coarse)
-            priors = PRIORS if stages.shaped else ROUND
-            orientations = refine(graph, orientations, steps, structure=structure, weights=weights, priors=priors)
+            refinement = partial(
+                refine, graph, max_steps=steps, structure=structure, priors=PRIORS if stages.shaped else ROUND
+            )
+            orientations = refinement(orientations, weights=weights)
+            ratio = _relative_variance(graph, orientations, structure) if stages.stated else None
+            if ratio is not None:
+                weights = EdgeWeights(weights.shaped * ratio**-0.25, weights.coarse * ratio**-0.5)
+                orientations = refinement(orientations, weights=weights)
     score, variance = cleaned.outlier_probability.double(), torch.full((graph.num_nodes,), torch.nan)
     by_residuals = stages.fine_tunings > 0 and not (stages.as_written and stages.clean)
     if steps > 0 or by_residuals:
@@ -84,6 +93,14 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
                 stated = variances(graph, angle, score, References(component, form.first_nodes()))
             variance = variance if stated is None else form.of_nodes(stated)
     return Estimate(form.orientations(orientations), score.index_select(0, form.edge), variance)
+
+
+def _relative_variance(graph: ViewGraph, orientations: Tensor, structure: Structure) -> Tensor | None:
+    """Of every edge's noise as far as precisions are stated and residuals bear them out, ``(M,)``; None: no such."""
+    if not bool(graph.precision.isfinite().any()):
+        return None
+    angle = EdgeResiduals(graph, orientations.float()).angles()
+    return relative_variance(graph.precision, angle, float(structure.redundancy(graph).sum()))
 
 
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:

@@ -222,7 +222,10 @@ def test_each_component_has_axes_of_its_own() -> None:
 
 def test_all_methods_that_photos_have_are_tried() -> None:
     """Whoever adds one with networks of its own adds it above, or here, if it is an ablation or of robots' graphs."""
-    ablations = {f"neurora-{name}" for name in ("unweighted", "without-finenet", "without-cleannet", "without-both")}
+    ablations = {
+        f"neurora-{name}"
+        for name in ("unweighted", "equal-precisions", "without-finenet", "without-cleannet", "without-both")
+    }
     of_robots = {
         f"neurora-{name}" for name in ("odometry-start", "stated-precisions", "posterior", "without-slip-search")
     }
