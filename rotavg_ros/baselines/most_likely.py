@@ -1,7 +1,7 @@
 """Least squares with a covariance for every edge: the likeliest orientations where noise is normal and small or large.
 
 An edge's noise is ν = log(R_u R_v⁻¹ R̃_uv), a rotation vector in the frame of its source u. The cost is Σ ½ νᵀ C⁻¹ ν.
-With R_v ← R_v exp(x_v), ν changes by J⁻¹(ν) R_u (x_u − x_v), where J is the left Jacobian of the exponential map (Barfoot
+With R_v ← R_v exp(x_v), ν changes by J⁻¹(ν) R_u (x_u − x_v), J the left Jacobian of the exponential map (Barfoot
 2017, §7.1). Gauss–Newton steps solve the block Laplacian of A = J⁻¹(ν) R_u exactly enough by conjugate gradients.
 
 It doubts no covariance, so it is for oracles, which are told them, those of outliers included.

@@ -122,7 +122,7 @@ def solve(
         profile,
         where,
         estimate.memory,
-        (*estimate.warnings, *warnings.mostly_flagged(graph, score)),
+        (*estimate.warnings, *warnings.stating_nothing(graph), *warnings.mostly_flagged(graph, score)),
         None if places is None else _root_at_origin(places.position, estimate.body_from_world, job.component),
         None if places is None else places.variance.sqrt(),
         None if places is None else places.rotation_score,

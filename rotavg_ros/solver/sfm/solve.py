@@ -23,7 +23,7 @@ from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap, breadth_firs
 from rotavg_ros.solver.sfm.options import SfmStages
 from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
 from rotavg_ros.solver.sfm.series import EdgesInSeries
-from rotavg_ros.solver.sfm.stated_precision import relative_variance
+from rotavg_ros.solver.sfm.stated_precision import Residuals, relative_variance
 from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.solver.sfm.uncertainty import References, variances
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
@@ -100,7 +100,8 @@ def _relative_variance(graph: ViewGraph, orientations: Tensor, structure: Struct
     if not bool(graph.precision.isfinite().any()):
         return None
     angle = EdgeResiduals(graph, orientations.float()).angles()
-    return relative_variance(graph.precision, angle, float(structure.redundancy(graph).sum()))
+    residuals = Residuals(angle, structure.component[graph.source], structure.redundancy(graph))
+    return relative_variance(graph.precision, residuals)
 
 
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:

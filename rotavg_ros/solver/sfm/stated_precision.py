@@ -16,9 +16,13 @@ In the refinement an edge's residual then counts in units of √ρ_e. For the co
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
+from rotavg_ros.solver.algebra.canonical_form import evenly_spread
+from rotavg_ros.solver.algebra.medians import median_by_group
 from rotavg_ros.solver.sfm.priors import PrecisionPriors
 
 PRECISION_PRIORS = PrecisionPriors()
@@ -26,46 +30,73 @@ PRECISION_PRIORS = PrecisionPriors()
 _SCALE_STEPS = 30
 
 
+class Residuals(NamedTuple):
+    """Of M edges in C components.
+
+    Attributes:
+        angle: ``(M,)`` rad.
+        component: ``(M,)`` of every edge.
+        redundancy: ``(C,)`` edges of each component beyond a spanning tree: so many residuals are worth something.
+    """
+
+    angle: Tensor
+    component: Tensor
+    redundancy: Tensor
+
+
 def relative_variance(
-    precision: Tensor, angle: Tensor, redundancy: float, priors: PrecisionPriors = PRECISION_PRIORS
+    precision: Tensor, residuals: Residuals, priors: PrecisionPriors = PRECISION_PRIORS
 ) -> Tensor | None:
-    """Variance of every edge's noise in units of a typical edge's, ``(M,)``; None where all are alike.
+    """Variance of every edge's noise in units of a typical edge's of its component, ``(M,)``; None where all are alike.
 
     Args:
         precision: ``(M,)`` rad⁻², of any scale; NaN where unknown, which counts as typical.
-        angle: ``(M,)`` rad, of the residuals.
-        redundancy: number of edges beyond a spanning forest: so many residuals are worth something.
     """
     is_known = precision.isfinite() & (precision > 0)
-    if not bool(is_known.any()) or redundancy <= 0:
+    if not bool(is_known.any()):
         return None
-    log_precision = torch.where(is_known, precision, 1.0).log()
-    log_ratio = torch.where(is_known, log_precision[is_known].median() - log_precision, 0.0)
+    group, count = residuals.component, len(residuals.redundancy)
+    log_precision = torch.where(is_known, precision, 1.0).double().log()
+    typical = median_by_group(log_precision[is_known], group[is_known], count)
+    log_ratio = torch.where(is_known, typical[group] - log_precision, 0.0)
     log_ratio = log_ratio.clamp(-priors.max_log_ratio, priors.max_log_ratio)
-    if float(log_ratio.std()) < priors.least_spread:
-        return None
-    exponent = _exponent(log_ratio[is_known].double(), angle[is_known].double(), redundancy / len(angle), priors)
-    return None if exponent < priors.least_exponent else (exponent * log_ratio).exp()
+    exponent = _exponents(log_ratio, is_known, residuals, priors)
+    exponent = torch.where(exponent < priors.least_exponent, 0.0, exponent)
+    return (exponent[group] * log_ratio).exp() if bool((exponent > 0).any()) else None
 
 
-def _exponent(log_ratio: Tensor, angle: Tensor, worth: float, priors: PrecisionPriors) -> float:
-    """Mean of α over its posterior.
+def _exponents(log_ratio: Tensor, is_known: Tensor, residuals: Residuals, priors: PrecisionPriors) -> Tensor:
+    """Mean of α over its posterior, ``(C,)``; 0 where stated precisions hardly differ.
 
     Args:
-        log_ratio: ``(K,)`` of typical to stated precision.
-        angle: ``(K,)`` rad.
-        worth: how many independent residuals each is.
+        log_ratio: ``(M,)`` of typical to stated precision.
+        is_known: ``(M,)`` bool.
     """
-    chosen = slice(None, None, 1 + len(angle) // priors.max_sample)
-    log_ratio, square = log_ratio[chosen], (angle * angle)[chosen].clamp(min=priors.least_angle**2)
+    count = len(residuals.redundancy)
+    edges = torch.bincount(residuals.component, minlength=count)
+    known = is_known.nonzero().squeeze(1)
+    chosen = known[evenly_spread(residuals.component[known], count, priors.max_sample)]
+    log_ratio, group = log_ratio[chosen], residuals.component[chosen]
+    number = torch.bincount(group, minlength=count).clamp(min=1)
+    square = residuals.angle[chosen].double().clamp(min=priors.least_angle) ** 2
     exponent = torch.linspace(0.0, 1.0, priors.num_exponents, dtype=square.dtype, device=square.device)
-    scaled = square * (-exponent[:, None] * log_ratio).exp()  # r²/ρ, a row each
-    scale = scaled.median(dim=1, keepdim=True).values
+    scaled = square * (-exponent[:, None] * log_ratio).exp()  # r²/ρ, a row for each α
+
+    def sums(rows: Tensor) -> Tensor:
+        return rows.new_zeros(len(rows), count).index_add_(1, group, rows)
+
+    scale = median_by_group(square, group, count).expand(len(exponent), count).nan_to_num(nan=1.0)
     for _ in range(_SCALE_STEPS):
         # Kent & Tyler (1991): the derivative of the likelihood by s² vanishes at this fixed point.
-        scale = (4 / 3) * (scaled / (1 + scaled / scale)).mean(dim=1, keepdim=True)
-    log_likelihood = (-1.5 * (scale.log() + exponent[:, None] * log_ratio) - 2 * (scaled / scale).log1p()).sum(dim=1)
+        scale = (4 / 3) * sums(scaled / (1 + scaled / scale[:, group])) / number
+        scale = scale.clamp(min=priors.least_angle**2)
+    log_likelihood = sums(
+        -1.5 * (scale[:, group].log() + exponent[:, None] * log_ratio) - 2 * (scaled / scale[:, group]).log1p()
+    )
+    worth = residuals.redundancy.clamp(min=0) / edges.clamp(min=1)
     prior = torch.full_like(exponent, (1 - priors.worthless) / (len(exponent) - 1))
     prior[0] = priors.worthless
-    posterior = torch.softmax(worth * log_likelihood + prior.log(), dim=0)
-    return float(posterior @ exponent)
+    posterior = torch.softmax(worth * log_likelihood + prior.log()[:, None], dim=0)
+    mean = sums(log_ratio[None]) / number
+    spread = (sums(log_ratio[None] ** 2) / number - mean**2).clamp(min=0).sqrt()[0]
+    return torch.where(spread < priors.least_spread, 0.0, exponent @ posterior)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros import ViewGraph, solve
 from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
-from rotavg_ros.solver.sfm.stated_precision import relative_variance
+from rotavg_ros.solver.sfm.stated_precision import Residuals, relative_variance
 
 
 def _uneven(seed: int, num_nodes: int = 60) -> tuple[ViewGraph, torch.Tensor, np.ndarray]:
@@ -31,6 +31,11 @@ def _uneven(seed: int, num_nodes: int = 60) -> tuple[ViewGraph, torch.Tensor, np
     relative[wrong] = Rotation.random(int(wrong.sum()), random_state=seed + 1).as_quat()
     graph = ViewGraph.create(source, target, relative, num_nodes=num_nodes)
     return graph, torch.from_numpy(truth.as_quat()), sigma**-2.0
+
+
+def _alone(angle: torch.Tensor, redundancy: int) -> Residuals:
+    """Of one component."""
+    return Residuals(angle, torch.zeros(len(angle), dtype=torch.int64), torch.tensor([redundancy]))
 
 
 def _error(graph: ViewGraph, truth: torch.Tensor) -> float:
@@ -67,7 +72,7 @@ def test_the_exponent_is_found(seed: int, exponent: float) -> None:
     precision = np.exp(rng.normal(3, 1.5, 3000))
     vectors = 0.05 * precision[:, None] ** (-exponent / 2) * rng.standard_normal((3000, 3))
     angle = np.where(rng.random(3000) < 0.2, rng.uniform(0, np.pi, 3000), np.linalg.norm(vectors, axis=1))
-    found = relative_variance(torch.from_numpy(precision), torch.from_numpy(angle), 2900.0)
+    found = relative_variance(torch.from_numpy(precision), _alone(torch.from_numpy(angle), 2900))
     if exponent == 0:
         assert found is None
         return
@@ -76,12 +81,26 @@ def test_the_exponent_is_found(seed: int, exponent: float) -> None:
     assert slope == pytest.approx(exponent, abs=0.15)
 
 
+def test_each_component_is_believed_by_itself() -> None:
+    """Three at once, of which the second has no edges, as each alone."""
+    rng = np.random.default_rng(0)
+    precision = torch.from_numpy(np.exp(rng.normal(0, 1.0, 900)))
+    angle = torch.from_numpy(np.abs(rng.normal(0, 0.1, 900)))
+    angle[:500] /= precision[:500].sqrt()
+    component = torch.tensor([0] * 500 + [2] * 400)
+    together = relative_variance(precision, Residuals(angle, component, torch.tensor([450, 0, 350])))
+    alone = relative_variance(precision[:500], _alone(angle[:500], 450))
+    assert together is not None and alone is not None
+    torch.testing.assert_close(together[:500], alone)
+    torch.testing.assert_close(together[500:], torch.ones(400, dtype=torch.float64))
+
+
 def test_nothing_is_believed_where_nothing_checks_or_differs() -> None:
     angle = torch.rand(50, dtype=torch.float64)
     spread = torch.logspace(0, 3, 50, dtype=torch.float64)
-    assert relative_variance(spread, angle, 0.0) is None
-    assert relative_variance(torch.full((50,), 7.0, dtype=torch.float64), angle, 40.0) is None
-    assert relative_variance(torch.full((50,), torch.nan, dtype=torch.float64), angle, 40.0) is None
+    assert relative_variance(spread, _alone(angle, 0)) is None
+    assert relative_variance(torch.full((50,), 7.0, dtype=torch.float64), _alone(angle, 40)) is None
+    assert relative_variance(torch.full((50,), torch.nan, dtype=torch.float64), _alone(angle, 40)) is None
 
 
 def test_copies_state_the_highest_precision_of_any() -> None:
