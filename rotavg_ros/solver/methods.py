@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from rotavg_ros.solver.sfm.options import SfmStages
+from rotavg_ros.solver.sfm.options import PAPER_PARTS, SfmStages
 from rotavg_ros.solver.slam.options import SWITCHES as SWITCHES
 from rotavg_ros.solver.slam.options import SlamStages
 
@@ -21,15 +21,16 @@ def _without_refinement(clean: bool, fine_tunings: int) -> Method:
     return Method(SfmStages(clean, fine_tunings, refine=False), SlamStages(clean, refine=False))
 
 
-def _as_written(clean: bool, fine_tunings: int) -> Method:
+def _as_written(clean: bool, fine_tunings: int, but_for: frozenset[str] = frozenset()) -> Method:
     """The paper's text is about photos; robots' graphs get what this package has of the same stages."""
     ours = _without_refinement(clean, fine_tunings)
-    return replace(ours, sfm=replace(ours.sfm, as_written=True))
+    return replace(ours, sfm=replace(ours.sfm, as_written=PAPER_PARTS - but_for))
 
 
 DEFAULT_METHOD = "neurora"
 POSTERIOR = "neurora-posterior"
-# "neurora-posterior~slips,cleannet" is the posterior without these.
+PAPER = "neurora-paper"
+# "neurora-posterior~slips,cleannet" is the posterior without these, "neurora-paper~tree" the paper's with our tree.
 _WITHOUT, _AND = "~", ","
 NETWORK_METHODS = {
     DEFAULT_METHOD: Method(),
@@ -39,7 +40,7 @@ NETWORK_METHODS = {
     "spt-finenet": _without_refinement(clean=False, fine_tunings=1),
     "spt": _without_refinement(clean=False, fine_tunings=0),
     # The paper as its text has it, with networks of its own.
-    "neurora-paper": _as_written(clean=True, fine_tunings=1),
+    PAPER: _as_written(clean=True, fine_tunings=1),
     "neurora-v2-paper": _as_written(clean=True, fine_tunings=2),
     "cleannet-spt-paper": _as_written(clean=True, fine_tunings=0),
     "spt-finenet-paper": _as_written(clean=False, fine_tunings=1),
@@ -70,12 +71,15 @@ def method_named(name: str) -> Method | None:
 
     Args:
         name: of :data:`NETWORK_METHODS`; "neurora-posterior~A,B" is the posterior without A and B, which are of
-            :data:`rotavg_ros.solver.slam.options.SWITCHES`.
+            :data:`rotavg_ros.solver.slam.options.SWITCHES`; "neurora-paper~A,B" is the paper's with A and B, which
+            are of :data:`rotavg_ros.solver.sfm.options.PAPER_PARTS`, as this package has them.
     """
     whole, *switched_off = name.split(_WITHOUT)
     if not switched_off:
         return NETWORK_METHODS.get(name)
     without = frozenset(switched_off[0].split(_AND))
+    if whole == PAPER and len(switched_off) == 1 and without <= PAPER_PARTS:
+        return _as_written(clean=True, fine_tunings=1, but_for=without)
     if whole != POSTERIOR or len(switched_off) > 1 or not without <= SWITCHES.keys():
         return None
     return Method(slam=SlamStages(posterior=True, without=without))

@@ -13,6 +13,7 @@ from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
+from rotavg_ros.evaluation.common.named_peers import is_available
 from rotavg_ros.evaluation.sfm import robustness, synthetic
 
 
@@ -169,4 +170,6 @@ def test_rgbd(tmp_path: Path) -> None:
     assert {row["scenes"] for row in rows.values()} == {"4"}
     assert rows["neurora-v1"]["mean °"] != rows["package: neurora-v1"]["mean °"]
     of_package = Counter(path.name.rpartition("-")[0] for path in keep.iterdir())
-    assert of_package == dict.fromkeys(("chatterjee", "weiszfeld", "cleannet-spt", "neurora-v1", "neurora"), 4)
+    ours = ("chatterjee", "weiszfeld", "geman-mcclure", "neurora-equal-precisions", "oracle")
+    peers = [name for name in ("colmap", "shonan") if is_available(name)]
+    assert of_package == dict.fromkeys((*ours, *peers, "cleannet-spt", "neurora-v1", "neurora"), 4)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+# What the paper's text has otherwise than this package: cameras' axes as they are given, its networks and its tree.
+PAPER_PARTS = frozenset({"axes", "cleannet", "tree", "finenet"})
+
 
 @dataclass(frozen=True)
 class SfmStages:
@@ -16,7 +19,7 @@ class SfmStages:
         weighted: refinement begins by weighing the edges by CleanNet's scores.
         shaped: the refinement estimates the noise's shape; otherwise noise is taken to be round.
         stated: precisions that edges state are believed as far as residuals bear them out; otherwise not at all.
-        as_written: networks, tree and cameras' axes as the paper's text has them, not as this package does.
+        as_written: of :data:`PAPER_PARTS`, those that run as the paper's text has them, not as this package does.
     """
 
     clean: bool = True
@@ -25,4 +28,4 @@ class SfmStages:
     weighted: bool = True
     shaped: bool = True
     stated: bool = True
-    as_written: bool = False
+    as_written: frozenset[str] = frozenset()

@@ -42,14 +42,14 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     if graph.num_edges > _TUNING_PAYS and graph.device.type == "cpu":
         tune()
     with watch.stage("order"):
-        form = CanonicalForm.of(graph, component, own_axes=not stages.as_written)
+        form = CanonicalForm.of(graph, component, own_axes="axes" not in stages.as_written)
     graph, component = form.graph, form.component
     with watch.stage("clean"):
-        kind = PaperCleanNet if stages.as_written else CleanNet
+        kind = PaperCleanNet if "cleannet" in stages.as_written else CleanNet
         cleaned = clean(networks.load(kind), graph) if stages.clean else trust_all(graph)
         cleaned = apply_labels(cleaned, graph.label)
     with watch.stage("bootstrap"):
-        begun = (breadth_first if stages.as_written else bootstrap)(cleaned, component)
+        begun = (breadth_first if "tree" in stages.as_written else bootstrap)(cleaned, component)
         cleaned, orientations = begun.cleaned, begun.body_from_world
         structure = _structure(begun, component)
         if run.warm_start is not None:
@@ -59,7 +59,7 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             )
     for _ in range(stages.fine_tunings):
         with watch.stage("fine-tune"):
-            if stages.as_written:
+            if "finenet" in stages.as_written:
                 orientations = paper_fine_tune(networks.load(PaperFineNet), cleaned, orientations)
             else:
                 orientations = fine_tune(networks.load(FineNet), cleaned, orientations, component)
@@ -80,7 +80,7 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
                 weights = EdgeWeights(weights.shaped * ratio**-0.25, weights.coarse * ratio**-0.5)
                 orientations = refinement(orientations, weights=weights)
     score, variance = cleaned.outlier_probability.double(), torch.full((graph.num_nodes,), torch.nan)
-    by_residuals = stages.fine_tunings > 0 and not (stages.as_written and stages.clean)
+    by_residuals = stages.fine_tunings > 0 and not ("cleannet" in stages.as_written and stages.clean)
     if steps > 0 or by_residuals:
         # Before, there is but a tree; now a residual is the noise but for the orientations' error. The paper's CleanNet
         # has the last word in any case.

@@ -13,9 +13,11 @@ from torch import Tensor
 
 from rotavg_ros import Solution, ViewGraph, rotations, solve
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe, SyntheticGraph
+from rotavg_ros.errors import UserError
 from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.solver import METHODS
 from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
+from rotavg_ros.solver.sfm.options import PAPER_PARTS
 from rotavg_ros.view_graph import EdgeLabel
 
 NETWORK_METHODS = ("neurora", "neurora-v1", "neurora-v2", "cleannet-spt", "spt-finenet", "spt", "neurora-round")
@@ -122,7 +124,7 @@ def _furthest_deg(found: Tensor, expected: Tensor) -> float:
     return float(torch.rad2deg(orientation_errors(found, expected)).max())
 
 
-@pytest.mark.parametrize("method", [*NETWORK_METHODS, *BASELINES])
+@pytest.mark.parametrize("method", [*NETWORK_METHODS, "neurora-paper~axes", *BASELINES])
 @pytest.mark.parametrize("kind", ["released", "paper"])
 def test_the_cameras_axes_do_not_matter(kind: str, method: str) -> None:
     sample = SAMPLES[kind]
@@ -230,3 +232,15 @@ def test_all_methods_that_photos_have_are_tried() -> None:
         f"neurora-{name}" for name in ("odometry-start", "stated-precisions", "posterior", "without-slip-search")
     }
     assert set(METHODS) == {*NETWORK_METHODS, *AS_WRITTEN, *BASELINES, *ablations, *of_robots}
+
+
+def test_the_papers_parts_are_switched_one_by_one() -> None:
+    """With all of them as this package has them it is this package's; each alone changes something."""
+    graph = SAMPLES["released"].graph
+    ours, papers = (_solved(graph, name).body_from_world for name in ("neurora-v1", "neurora-paper"))
+    all_parts = ",".join(sorted(PAPER_PARTS))
+    torch.testing.assert_close(_solved(graph, f"neurora-paper~{all_parts}").body_from_world, ours)
+    for part in PAPER_PARTS:
+        assert _furthest_deg(_solved(graph, f"neurora-paper~{part}").body_from_world, papers) > 0.01
+    with pytest.raises(UserError, match="unknown method 'neurora-paper~losses'"):
+        _solved(graph, "neurora-paper~losses")
