@@ -14,6 +14,7 @@ from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.evaluation.common.named_peers import is_available
+from rotavg_ros.evaluation.common.training_plot import read_log
 from rotavg_ros.evaluation.sfm import robustness, synthetic
 
 
@@ -141,6 +142,19 @@ def test_plot_statistics(knows_truth: bool, tmp_path: Path, capsys: pytest.Captu
     assert main(["plot", "statistics", str(tmp_path / "graph.npz"), "--output", str(tmp_path / "x.what")]) == 2
     assert "x.what: cannot be written" in capsys.readouterr().err
     assert main(["plot", "statistics", str(tmp_path / "none.npz")]) == 2
+
+
+def test_plot_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, picture = tmp_path / "net.log.jsonl", tmp_path / "picture.png"
+    log.write_text("".join(f'{{"epoch": {epoch}, "validation_objective": {2 / (epoch + 1)}}}\n' for epoch in range(5)))
+    assert main(["plot", "training", str(log), str(log), "--output", str(picture)]) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    epochs, objective = read_log(log)
+    np.testing.assert_allclose(epochs * objective, 2)
+    log.write_text('{"epoch": 1}\n')
+    assert main(["plot", "training", str(log), "--output", str(picture)]) == 2
+    assert "net.log.jsonl: not a log of training" in capsys.readouterr().err
+    assert main(["plot", "training", str(tmp_path / "none"), "--output", str(picture)]) == 2
 
 
 def test_rgbd(tmp_path: Path) -> None:
