@@ -21,12 +21,12 @@ from rotavg_ros.evaluation.sfm import robustness, synthetic
 def test_synthetic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setitem(synthetic.RECIPES, "paper", PaperRecipe(cameras=(30, 40)))
     monkeypatch.setitem(synthetic.RECIPES, "released-spatial", ReleasedRecipe(cameras=(30, 40), planar=False))
-    methods = ["neurora", "cleannet-spt+chatterjee", "spt", "oracle"]
+    methods = ["neurora", "cleannet-spt-paper+chatterjee", "spt", "oracle"]
     command = ["evaluate", "synthetic", "--graphs", "2", "--output", str(tmp_path / "results"), "--threads", "1"]
     assert main([*command, "--recipes", "paper", "released-spatial", "--methods", *methods]) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'results' / 'synthetic.md'}\n"
     report = (tmp_path / "results" / "synthetic.md").read_text()
-    assert "| **full pipeline** (NeuRoRA + refinement) |" in report
+    assert "| **full pipeline** (our networks + refinement) |" in report
     assert "CleanNet-SPT + chatterjee" in report
     for file in tmp_path.glob("results/*.png"):
         assert f"({file.name})" in report

@@ -80,7 +80,7 @@ def test_training_goes_on_from_given_weights(config: Path, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["clean-net", "nothing"], "nothing: no such file; the package's own are sfm-clean-net"),
+        (["clean-net", "nothing"], "nothing: no such file; the package's own are paper-clean-net"),
         (["fine-net", "slam-clean-net"], "no FineNet"),
         (["clean-net", "slam-clean-net", "--device", "cuda"], "on the CPU"),
         (["clean-net", "sfm-clean-net", "--clean-net", "x"], "--clean-net is for fine-net"),
