@@ -67,6 +67,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "clean_net": {"message_passing", "network_store"},
         "fine_net": {"message_passing", "network_store", "numbers"},
         "stages": {"clean_net", "cleaned", "fine_net", "tiled"},
+        "paper": {"clean_net", "cleaned", "message_passing", "network_store", "tiled"},
         "tiled": {"clean_net", "cleaned", "fine_net", "message_passing", "numbers"},
     },
     "solver/sfm": {
@@ -78,8 +79,9 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "refinement": {"priors", "step"},
         "step": {"block_laplacian", "noise_shape", "priors", "series"},
         "series": set(),
+        "stated_precision": {"priors"},
         "uncertainty": {"priors"},
-        "solve": {"options", "refinement", "series", "step", "uncertainty"},
+        "solve": {"options", "refinement", "series", "stated_precision", "step", "uncertainty"},
     },
     "solver/slam": {
         "": set(),

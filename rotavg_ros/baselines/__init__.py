@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rotavg_ros.baselines.arrigoni import arrigoni
 from rotavg_ros.baselines.chatterjee import chatterjee
+from rotavg_ros.baselines.geman_mcclure import geman_mcclure
 from rotavg_ros.baselines.wang import wang
 from rotavg_ros.baselines.weiszfeld import weiszfeld
 from rotavg_ros.solver.neurora.scores import residual_score
@@ -22,9 +23,10 @@ Baseline = Callable[[ViewGraph, Tensor | None], Tensor]
 
 BASELINES: dict[str, Baseline] = {
     "chatterjee": chatterjee,
+    "geman-mcclure": geman_mcclure,
     "weiszfeld": weiszfeld,
     "arrigoni": arrigoni,
     "wang": wang,
 }
 
-__all__ = ["BASELINES", "Baseline", "arrigoni", "chatterjee", "residual_score", "wang", "weiszfeld"]
+__all__ = ["BASELINES", "Baseline", "arrigoni", "chatterjee", "geman_mcclure", "residual_score", "wang", "weiszfeld"]

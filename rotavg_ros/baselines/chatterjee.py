@@ -16,6 +16,9 @@ Warm start: in place of the spanning tree's orientations; both stages run.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -30,11 +33,22 @@ from rotavg_ros.view_graph import ViewGraph
 # and in standard deviations on SLAM graphs.
 _SMOOTHING = np.radians(1.0)
 _SLAM_SMOOTHING = 0.003
-_MAX_L1_STEPS = 30
-_MAX_HALF_NORM_STEPS = 100
-# The mean correction that ends a stage, in radians; the first is the paper's.
-_L1_CONVERGED_STEP = 1e-3
-_HALF_NORM_CONVERGED_STEP = 1e-4
+
+
+class Stage(NamedTuple):
+    """When a stage ends.
+
+    Attributes:
+        max_steps: after so many steps.
+        converged_step: rad; or when the mean correction is less.
+    """
+
+    max_steps: int
+    converged_step: float
+
+
+# The step that ends the first is the paper's.
+_L1_STAGE, _HALF_NORM_STAGE = Stage(30, 1e-3), Stage(100, 1e-4)
 
 
 def chatterjee(graph: ViewGraph, start: Tensor | None = None) -> Tensor:
@@ -45,37 +59,56 @@ def chatterjee(graph: ViewGraph, start: Tensor | None = None) -> Tensor:
     """
     graph = usable_edges(graph)
     orientations, roots = start_orientations(graph, start)
-    orientations = minimize_power(graph, orientations, roots, 1.0, _MAX_L1_STEPS, _L1_CONVERGED_STEP)
-    return minimize_power(graph, orientations, roots, 0.5, _MAX_HALF_NORM_STEPS, _HALF_NORM_CONVERGED_STEP)
+    orientations = minimize_l1(graph, orientations, roots)
+    return reweighted(graph, orientations, roots, _power_weight(graph, 0.5), _HALF_NORM_STAGE)
 
 
-def minimize_power(
-    graph: ViewGraph, body_from_world: Tensor, roots: np.ndarray, power: float, max_steps: int, converged_step: float
+def minimize_l1(graph: ViewGraph, body_from_world: Tensor, roots: np.ndarray) -> Tensor:
+    """The first stage, Σ‖r‖ over the edges' residual vectors, from ``body_from_world`` ``(N, 4)``."""
+    return reweighted(graph, body_from_world, roots, _power_weight(graph, 1.0), _L1_STAGE)
+
+
+def reweighted(
+    graph: ViewGraph,
+    body_from_world: Tensor,
+    roots: np.ndarray,
+    weigh: Callable[[np.ndarray], np.ndarray],
+    stage: Stage,
 ) -> Tensor:
-    """Minimise Σ‖r‖^power over the edges' residual vectors by iteratively reweighted least squares.
+    """Iteratively reweighted least squares on the edges' residual vectors, ``(N, 4)`` float64.
 
     Args:
         body_from_world: ``(N, 4)`` start.
         roots: a node of each connected component, held fixed.
-        converged_step: mean correction in radians that ends it.
+        weigh: squared residuals ``(M,)`` in rad² → weights ``(M,)``.
     """
     source, target = graph.source.numpy(), graph.target.numpy()
-    precision, smoothing = _units(graph)
-    for _ in range(max_steps):
+    for _ in range(stage.max_steps):
         residual = edge_residual(body_from_world, graph.target_from_source, graph.source, graph.target)
         vector = rotations.log(residual).numpy()
-        weight = precision * (precision * (vector**2).sum(axis=1) + smoothing**2) ** (power / 2 - 1)
+        weight = weigh((vector**2).sum(axis=1))
         step = LaplacianSystem(graph.num_nodes, source, target, weight, roots).fit(vector)
         body_from_world = rotations.multiply(body_from_world, rotations.exp(torch.from_numpy(step)))
-        if float(np.linalg.norm(step, axis=1).mean()) < converged_step:
+        if float(np.linalg.norm(step, axis=1).mean()) < stage.converged_step:
             break
     return rotations.normalize(body_from_world)
 
 
-def _units(graph: ViewGraph) -> tuple[np.ndarray, float]:
-    """One over the squared unit in which each residual counts, ``(M,)``, and the smoothing in these units."""
+def _power_weight(graph: ViewGraph, power: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Weights of the cost Σ‖r‖^power."""
+    precision, smoothing = units(graph, _SMOOTHING, _SLAM_SMOOTHING)
+    return lambda square: precision * (precision * square + smoothing**2) ** (power / 2 - 1)
+
+
+def units(graph: ViewGraph, angle: float, deviations: float) -> tuple[np.ndarray, float]:
+    """One over the squared unit in which each residual counts, ``(M,)``, and a number in these units.
+
+    Args:
+        angle: the number where residuals count in radians.
+        deviations: the number where they count in stated standard deviations, as on SLAM graphs.
+    """
     stated = graph.precision.isfinite()
     if not bool(graph.is_odometry.any() & stated.any()):
-        return np.ones(graph.num_edges), _SMOOTHING
+        return np.ones(graph.num_edges), angle
     precision = torch.where(stated, graph.precision, graph.precision[stated].median())
-    return precision.numpy(), _SLAM_SMOOTHING
+    return precision.numpy(), deviations

@@ -125,7 +125,8 @@ def _run_rgbd(arguments: argparse.Namespace) -> Path:
                 trained = contenders(rgbd.TRAINED, ROSTER, Path(folder))
                 own = contenders(rgbd.TRAINED, ROSTER, keep=arguments.keep)
                 own = {rgbd.PACKAGE_PREFIX + method: contender for method, contender in own.items()}
-                untrained = contenders(rgbd.UNTRAINED, ROSTER, keep=arguments.keep)
+                fit = [method for method in rgbd.UNTRAINED if is_available(method)]
+                untrained = contenders(fit, ROSTER, keep=arguments.keep)
                 scores.extend(score_all(fold.test, {**untrained, **own, **trained}))
         tables[f"rgbd-{name}"] = rgbd.table(name, scores, arguments.minutes)
     introduction = (

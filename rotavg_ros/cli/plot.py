@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from rotavg_ros.datasets.files.formats import read_graph, stem_of
 from rotavg_ros.datasets.files.ground_truth import attach_truth
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.common.noise_plot import draw, edge_noise
+from rotavg_ros.evaluation.common.training_plot import draw_training
 
 
 class PlotError(UserError):
@@ -21,6 +24,17 @@ class PlotError(UserError):
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw."""
+    return _run_training(arguments) if arguments.kind == "training" else _run_statistics(arguments)
+
+
+def _run_training(arguments: argparse.Namespace) -> int:
+    with _writing(arguments.output):
+        draw_training(arguments.output, arguments.logs)
+    print(arguments.output)
+    return 0
+
+
+def _run_statistics(arguments: argparse.Namespace) -> int:
     with working(f"reading {arguments.graph}"):
         graph_file = read_graph(arguments.graph)
         if arguments.truth is not None:
@@ -37,10 +51,19 @@ def run(arguments: argparse.Namespace) -> int:
         output = output.with_name(f"{output.name}.png")
     with working("solving and drawing"):
         noise = edge_noise(graph, torch.from_numpy(truth) if truth is not None and knows_truth else None)
-        try:
+        with _writing(output):
             draw(output, noise, arguments.graph.name, outlier_angle_deg)
-        except (OSError, ValueError) as error:  # matplotlib: an unknown suffix is a ValueError
-            reason = error.strerror if isinstance(error, OSError) else str(error)
-            raise PlotError(f"{output}: cannot be written ({reason})") from None
     print(output)
     return 0
+
+
+@contextmanager
+def _writing(output: Path) -> Iterator[None]:
+    """Inside, ``output`` is written by matplotlib, whose word for an unknown suffix is a ValueError."""
+    try:
+        yield
+    except UserError:
+        raise
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise PlotError(f"{output}: cannot be written ({reason})") from None

@@ -6,14 +6,16 @@ import argparse
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
 from rotavg_ros.cli.progress import working
 from rotavg_ros.errors import UserError
 from rotavg_ros.results import make_folder
-from rotavg_ros.solver.networks import NETWORKS, WEIGHTS_FOLDER, CleanNet, read_network
+from rotavg_ros.solver.networks import NETWORKS, WEIGHTS_FOLDER, CleanNet, PaperCleanNet, read_network
 from rotavg_ros.training.config import TrainingConfig, TrainingConfigError
+from rotavg_ros.training.paper_tasks import PaperCleanTask, PaperFineTask
 from rotavg_ros.training.sfm_tasks import SfmCleanTask, SfmFineTask
 from rotavg_ros.training.slam_tasks import SlamCleanTask
 from rotavg_ros.training.trainer import Trainer, TrainingTask, fingerprint
@@ -107,9 +109,15 @@ def make_trainer(network: str, config: TrainingConfig, given: Inputs, output: Pa
             task = SlamCleanTask(config)
     elif network == "clean-net":
         with working("drawing view-graphs"):
-            task = SfmCleanTask(config, _torch_device(device))
+            make = PaperCleanTask if config.family == "paper" else SfmCleanTask
+            task = make(config, _torch_device(device))
+    elif config.family == "paper":
+        papers = _clean_net(PaperCleanNet, output, given.clean_net)
+        inputs["clean_net_fingerprint"] = fingerprint(papers)
+        with working("drawing view-graphs"):
+            task = PaperFineTask(config, _torch_device(device), papers)
     else:
-        before = _clean_net(output, given.clean_net)
+        before = _clean_net(CleanNet, output, given.clean_net)
         inputs["clean_net_fingerprint"] = fingerprint(before)
         with working("drawing view-graphs"):
             task = SfmFineTask(config, _torch_device(device), before)
@@ -123,10 +131,13 @@ def make_trainer(network: str, config: TrainingConfig, given: Inputs, output: Pa
     return Trainer(task, config, output, name, inputs, command)
 
 
-def _clean_net(output: Path, given: Path | None) -> CleanNet:
-    trained = output / "sfm-clean-net.safetensors"
+_Before = TypeVar("_Before", bound=CleanNet)
+
+
+def _clean_net(kind: type[_Before], output: Path, given: Path | None) -> _Before:
+    trained = output / f"{kind.NAME}.safetensors"
     path = given or (trained if trained.exists() else WEIGHTS_FOLDER / trained.name)
-    return read_network(CleanNet, path)
+    return read_network(kind, path)
 
 
 def _torch_device(name: str) -> torch.device:

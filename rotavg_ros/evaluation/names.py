@@ -38,4 +38,4 @@ SLAM_GRAPHS = (
 # Shares of random false closures.
 SLAM_SHARES = (0.0, 0.1, 0.3, 0.5, 0.8)
 BENCHMARK_FAMILIES = ("recipe", "sfm-sparse", "slam", "sfm-dense")
-BENCHMARK_CONTENDERS = ("neurora", "neurora-paper", "neurora-cuda", "colmap", "shonan", "gnc")
+BENCHMARK_CONTENDERS = ("neurora", "neurora-v1", "neurora-cuda", "colmap", "shonan", "gnc")

@@ -88,7 +88,10 @@ def _split(joint: Solution, graphs: Sequence[ViewGraph]) -> list[Solution]:
                 joint.method,
                 joint.profile,
                 joint.device,
-                warnings=warnings.mostly_flagged(graph.to("cpu"), joint.outlier_score[edges]),
+                warnings=(
+                    *warnings.stating_nothing(graph.to("cpu")),
+                    *warnings.mostly_flagged(graph.to("cpu"), joint.outlier_score[edges]),
+                ),
             )
         )
     return parts

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from rotavg_ros.solver.sfm.options import SfmStages
+from rotavg_ros.solver.sfm.options import PAPER_PARTS, SfmStages
 from rotavg_ros.solver.slam.options import SWITCHES as SWITCHES
 from rotavg_ros.solver.slam.options import SlamStages
 
@@ -21,30 +21,44 @@ def _without_refinement(clean: bool, fine_tunings: int) -> Method:
     return Method(SfmStages(clean, fine_tunings, refine=False), SlamStages(clean, refine=False))
 
 
+def _as_written(clean: bool, fine_tunings: int, but_for: frozenset[str] = frozenset()) -> Method:
+    """The paper's text is about photos; robots' graphs get what this package has of the same stages."""
+    ours = _without_refinement(clean, fine_tunings)
+    return replace(ours, sfm=replace(ours.sfm, as_written=PAPER_PARTS - but_for))
+
+
 DEFAULT_METHOD = "neurora"
 POSTERIOR = "neurora-posterior"
-# "neurora-posterior~slips,cleannet" is the posterior without these.
+PAPER = "neurora-paper"
+# "neurora-posterior~slips,cleannet" is the posterior without these, "neurora-paper~tree" the paper's with our tree.
 _WITHOUT, _AND = "~", ","
 NETWORK_METHODS = {
     DEFAULT_METHOD: Method(),
-    "neurora-paper": _without_refinement(clean=True, fine_tunings=1),
+    "neurora-v1": _without_refinement(clean=True, fine_tunings=1),
     "neurora-v2": _without_refinement(clean=True, fine_tunings=2),
     "cleannet-spt": _without_refinement(clean=True, fine_tunings=0),
     "spt-finenet": _without_refinement(clean=False, fine_tunings=1),
     "spt": _without_refinement(clean=False, fine_tunings=0),
+    # The paper as its text has it, with networks of its own.
+    PAPER: _as_written(clean=True, fine_tunings=1),
+    "neurora-v2-paper": _as_written(clean=True, fine_tunings=2),
+    "cleannet-spt-paper": _as_written(clean=True, fine_tunings=0),
+    "spt-finenet-paper": _as_written(clean=False, fine_tunings=1),
+    "spt-paper": _as_written(clean=False, fine_tunings=0),
     # Ablations: what each network and the noise's shape earn.
     "neurora-unweighted": Method(sfm=SfmStages(weighted=False)),
     "neurora-without-finenet": Method(sfm=SfmStages(fine_tunings=0)),
     "neurora-without-cleannet": Method(SfmStages(clean=False), SlamStages(clean=False)),
     "neurora-without-both": Method(SfmStages(clean=False, fine_tunings=0), SlamStages(clean=False)),
     "neurora-round": Method(sfm=SfmStages(shaped=False)),
+    "neurora-equal-precisions": Method(sfm=SfmStages(stated=False)),
     "neurora-odometry-start": Method(slam=SlamStages(tree_start=False)),
     "neurora-stated-precisions": Method(slam=SlamStages(scale_estimation=False)),
     POSTERIOR: Method(slam=SlamStages(posterior=True)),
     "neurora-without-slip-search": Method(slam=SlamStages(slip_search=False)),
 }
 # Others' methods, to compare with.
-BASELINES = ("chatterjee", "weiszfeld", "arrigoni", "wang")
+BASELINES = ("chatterjee", "geman-mcclure", "weiszfeld", "arrigoni", "wang")
 METHODS = (*NETWORK_METHODS, *BASELINES)
 PROFILES = ("auto", "slam", "sfm")
 DEVICES = ("auto", "cpu", "cuda")
@@ -57,12 +71,15 @@ def method_named(name: str) -> Method | None:
 
     Args:
         name: of :data:`NETWORK_METHODS`; "neurora-posterior~A,B" is the posterior without A and B, which are of
-            :data:`rotavg_ros.solver.slam.options.SWITCHES`.
+            :data:`rotavg_ros.solver.slam.options.SWITCHES`; "neurora-paper~A,B" is the paper's with A and B, which
+            are of :data:`rotavg_ros.solver.sfm.options.PAPER_PARTS`, as this package has them.
     """
     whole, *switched_off = name.split(_WITHOUT)
     if not switched_off:
         return NETWORK_METHODS.get(name)
     without = frozenset(switched_off[0].split(_AND))
+    if whole == PAPER and len(switched_off) == 1 and without <= PAPER_PARTS:
+        return _as_written(clean=True, fine_tunings=1, but_for=without)
     if whole != POSTERIOR or len(switched_off) > 1 or not without <= SWITCHES.keys():
         return None
     return Method(slam=SlamStages(posterior=True, without=without))

@@ -57,7 +57,8 @@ def solve(
         graph: N nodes, M edges; or what has it as its ``graph``, as the result of ``read_graph`` does.
         method: one of :data:`METHODS`, or several joined by "+", of which each starts from the answer of the one
             before. "neurora-posterior~A,B" is the posterior without A and B
-            (:data:`rotavg_ros.solver.slam.options.SWITCHES`).
+            (:data:`rotavg_ros.solver.slam.options.SWITCHES`); "neurora-paper~A,B" is the paper's with A and B as this
+            package has them (:data:`rotavg_ros.solver.sfm.options.PAPER_PARTS`).
         profile: "slam" for odometry chains with loop closures, "sfm" for unordered view-graphs, "auto": "slam" if any
             edge is odometry.
         device: where the SfM profile runs, whole: "cpu", "cuda", or "auto" (a GPU if torch finds one). Where there is
@@ -122,7 +123,7 @@ def solve(
         profile,
         where,
         estimate.memory,
-        (*estimate.warnings, *warnings.mostly_flagged(graph, score)),
+        (*estimate.warnings, *warnings.stating_nothing(graph), *warnings.mostly_flagged(graph, score)),
         None if places is None else _root_at_origin(places.position, estimate.body_from_world, job.component),
         None if places is None else places.variance.sqrt(),
         None if places is None else places.rotation_score,

@@ -52,6 +52,9 @@ _NEARLY = 0.9
 # order is mistaken: w = cos(θ/2) in x's place makes a turn by θ one by 180° - θ or more. Fewer edges than closures that
 # are compared tell nothing: one random rotation in seventeen looks like that.
 _SMALL_STEP, _LARGE_STEP = math.radians(60.0), math.radians(120.0)
+# Half an angle in rad: below the first an edge states no rotation, to rounding; where the others turn by more than the
+# second in the median, none of them measures that. So large a share of the edges is worth a word.
+_NO_ROTATION, _SOME_ROTATION, _SHARE_OF_NOTHING = 1e-9, 0.01, 0.05
 # So few believed closures may be false together; they turn the answer far from odometry's if by more than this, rad.
 _FEW_BELIEVED, _FAR = 10, math.radians(30.0)
 
@@ -72,6 +75,28 @@ def mostly_flagged(graph: ViewGraph, outlier_score: Tensor) -> tuple[str, ...]:
         f"{flagged} of {closures} {what} are flagged as false; the front end may match wrong places, or all of them "
         "may have a wrong direction, sensor mounting or clock: check that each edge's rotation is the target's in the "
         "source's frame, and compare some with the odometry by hand",
+    )
+
+
+def stating_nothing(graph: ViewGraph) -> tuple[str, ...]:
+    """Many edges of a graph without odometry state exactly no rotation: what some front ends write that found nothing.
+
+    Rigs of parallel cameras state it, too, but each between a few cameras of its own.
+
+    Args:
+        graph: on the CPU, N nodes, M edges.
+    """
+    sine = graph.target_from_source[:, :3].norm(dim=1)
+    is_identity = sine < _NO_ROTATION
+    count = int(is_identity.sum())
+    if bool(graph.is_odometry.any()) or count < _SHARE_OF_NOTHING * graph.num_edges or bool(is_identity.all()):
+        return ()
+    touched = torch.unique(torch.cat((graph.source[is_identity], graph.target[is_identity])))
+    if count <= len(touched) or float(sine[~is_identity].median()) < _SOME_ROTATION:
+        return ()
+    return (
+        f"{count} of {graph.num_edges} edges state exactly no rotation; if the front end writes that where it found "
+        "nothing, they agree with each other and make all orientations alike: leave such edges out",
     )
 
 

@@ -21,7 +21,7 @@ class TrainingConfig:
     """Everything that decides the outcome of a training run, the machine aside.
 
     Attributes:
-        family: "sfm" or "slam", the networks' profile.
+        family: "sfm" or "slam", the networks' profile, or "paper": SfM as the paper's text has it.
         recipe: SfM: "released", "released-spatial" (axes anywhere), "paper", "wide" (small and large noise, mostly on
             topologies of dense clusters with a sparse fringe), "released-round" (noise axes alone anywhere), "mixture"
             (the first three), "broad" or "mostly-released" (the first four), "any-axes" (all five); SLAM: "wide".
@@ -59,13 +59,11 @@ class TrainingConfig:
     goes_on_from: str = ""
 
     def __post_init__(self) -> None:
-        recipes = {
-            "sfm": (
-                *("released", "released-spatial", "released-round", "paper", "wide"),
-                *("mixture", "broad", "mostly-released", "any-axes"),
-            ),
-            "slam": ("wide",),
-        }
+        of_photos = (
+            *("released", "released-spatial", "released-round", "paper", "wide"),
+            *("mixture", "broad", "mostly-released", "any-axes"),
+        )
+        recipes = {"sfm": of_photos, "slam": ("wide",), "paper": of_photos}
         if self.family not in recipes:
             raise TrainingConfigError(f"family is {self.family!r}; choose from {', '.join(recipes)}")
         if self.recipe not in recipes[self.family]:

@@ -10,6 +10,7 @@ from rotavg_ros.solver.neurora.message_passing import DirectedEdges
 
 OUTLIER_LOSS_WEIGHT = 10.0
 NODE_LOSS_WEIGHT = 1.0
+PAPER_NODE_LOSS_WEIGHT = 0.1
 _SMALL = 1e-8
 _WEISZFELD_STEPS, _WEISZFELD_SMOOTHING = 4, 0.01
 
@@ -68,6 +69,23 @@ def fine_net_loss(
     edge = degree_normalised(apart / unit[edges.target[:half]], edges)
     node = (size / unit).mean()
     return {"loss": edge + NODE_LOSS_WEIGHT * node, "edge": edge, "node": node}
+
+
+def paper_fine_net_loss(body_from_world: Tensor, truth: Tensor, edges: DirectedEdges) -> dict[str, Tensor]:
+    """The paper's equation 10 as its text has it: edge term + 0.1 · node term, both of quaternion distances.
+
+    Args:
+        body_from_world, truth: ``(N, 4)``, in the same gauge: that of the tree's root.
+    """
+    half = len(edges.source) // 2
+    source, target = edges.source[:half], edges.target[:half]
+    relative, true_relative = (
+        rotations.multiply(of_nodes[target], rotations.inverse(of_nodes[source]))
+        for of_nodes in (body_from_world, truth)
+    )
+    edge = degree_normalised(quaternion_distance(relative, true_relative), edges)
+    node = quaternion_distance(body_from_world, truth).mean()
+    return {"loss": edge + PAPER_NODE_LOSS_WEIGHT * node, "edge": edge, "node": node}
 
 
 def _robust_means(vectors: Tensor, group: Tensor) -> Tensor:

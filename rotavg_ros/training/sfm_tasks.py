@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -28,7 +28,8 @@ class GivenGraphs(NamedTuple):
     validation: Sequence[SyntheticGraph]
 
 
-def _draw(config: TrainingConfig) -> GivenGraphs:
+def drawn_graphs(config: TrainingConfig) -> GivenGraphs:
+    """The graphs that a configuration's seed gives."""
     rng = np.random.default_rng((config.seed, 1))
     training = [sample_graph(config.recipe, config.nodes, rng) for _ in range(config.graphs)]
     rng = np.random.default_rng((config.seed, 2))
@@ -37,12 +38,20 @@ def _draw(config: TrainingConfig) -> GivenGraphs:
 
 
 class _SfmTask:
-    """Training and validation graphs, in canonical form: drawn once from the configuration's seed, or given."""
+    """Training and validation graphs: drawn once from the configuration's seed, or given.
+
+    Attributes:
+        CANONICAL: networks see them in canonical form.
+    """
+
+    CANONICAL: ClassVar[bool] = True
 
     def __init__(self, config: TrainingConfig, given: GivenGraphs | None) -> None:
         self.config = config
-        drawn = given if given is not None else _draw(config)
-        self.graphs, self.validation = ([in_canonical_form(graph) for graph in graphs] for graphs in drawn)
+        drawn = given if given is not None else drawn_graphs(config)
+        if self.CANONICAL:
+            drawn = GivenGraphs(*([in_canonical_form(graph) for graph in graphs] for graphs in drawn))
+        self.graphs, self.validation = drawn
 
     def num_batches(self) -> int:
         return -(-len(self.graphs) // self.config.batch_graphs)
@@ -57,11 +66,13 @@ class _SfmTask:
 class SfmCleanTask(_SfmTask):
     """CleanNet: rectify and score (loss: rotation + 10 · outlier)."""
 
+    KIND: ClassVar[type[CleanNet]] = CleanNet
+
     def __init__(self, config: TrainingConfig, device: torch.device, given: GivenGraphs | None = None) -> None:
         super().__init__(config, given)
         self.device = device
         torch.manual_seed(config.seed)
-        self.network = CleanNet().to(device)
+        self.network = self.KIND().to(device)
 
     def batches(self, rng: np.random.Generator) -> Iterator[dict[str, Tensor]]:
         for joined in self._joined_batches(rng):

@@ -9,6 +9,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from rotavg_ros import rotations
@@ -75,7 +77,8 @@ def test_exact_without_noise(method: Baseline, source: object, target: object, n
 
 
 @pytest.mark.parametrize(
-    ("name", "tolerance"), [("chatterjee", 1e-6), ("weiszfeld", 1e-3), ("arrigoni", 1e-3), ("wang", 1e-2)]
+    ("name", "tolerance"),
+    [("chatterjee", 1e-6), ("geman-mcclure", 1e-6), ("weiszfeld", 1e-3), ("arrigoni", 1e-3), ("wang", 1e-2)],
 )
 def test_a_wrong_start_is_forgotten(name: str, tolerance: float) -> None:
     graph, truth = dense_graph(20, seed=1)
@@ -195,3 +198,27 @@ def test_odometry_is_the_start_of_a_pose_graph() -> None:
     precision = [4e4] * 59 + [400.0] * 2
     graph = ViewGraph.create(graph.source, graph.target, measured, kind=kind, precision=precision)
     assert np.degrees(worst_error(BASELINES["chatterjee"](graph, None), truth, graph)) < 2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_geman_mcclure_is_at_a_minimum_of_its_cost(seed: int) -> None:
+    """As SciPy's minimiser sees it, which knows the cost alone, written down once more in SciPy's rotations."""
+    graph, truth = dense_graph(8, seed=20 + seed, noise=np.radians(2), outlier_share=0.2, pair_share=1.0)
+    source, target = graph.source.numpy(), graph.target.numpy()
+    measured = Rotation.from_quat(graph.target_from_source.numpy())
+    scale = np.radians(5)
+
+    def cost(turns: np.ndarray, begun: Rotation) -> float:
+        body_from_world = begun * Rotation.from_rotvec(np.concatenate((np.zeros(3), turns)).reshape(-1, 3))
+        residual = body_from_world[target].inv() * measured * body_from_world[source]
+        square = residual.magnitude() ** 2
+        return float((scale**2 * square / (2 * (scale**2 + square))).sum())
+
+    answer = Rotation.from_quat(BASELINES["geman-mcclure"](graph, None).numpy())
+    nothing = np.zeros(21)
+    at_answer = cost(nothing, answer)
+    lowest = minimize(cost, nothing, args=(answer,), method="BFGS", options={"gtol": 1e-9})
+    assert at_answer - lowest.fun < 1e-9
+    from_truth = minimize(cost, nothing, args=(Rotation.from_quat(truth.numpy()),), method="BFGS")
+    assert from_truth.fun == pytest.approx(at_answer, rel=1e-5)
+    assert at_answer < 0.999 * cost(nothing, Rotation.from_quat(BASELINES["chatterjee"](graph, None).numpy()))

@@ -13,18 +13,20 @@ from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
+from rotavg_ros.evaluation.common.named_peers import is_available
+from rotavg_ros.evaluation.common.training_plot import read_log
 from rotavg_ros.evaluation.sfm import robustness, synthetic
 
 
 def test_synthetic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setitem(synthetic.RECIPES, "paper", PaperRecipe(cameras=(30, 40)))
     monkeypatch.setitem(synthetic.RECIPES, "released-spatial", ReleasedRecipe(cameras=(30, 40), planar=False))
-    methods = ["neurora", "cleannet-spt+chatterjee", "spt", "oracle"]
+    methods = ["neurora", "cleannet-spt-paper+chatterjee", "spt", "oracle"]
     command = ["evaluate", "synthetic", "--graphs", "2", "--output", str(tmp_path / "results"), "--threads", "1"]
     assert main([*command, "--recipes", "paper", "released-spatial", "--methods", *methods]) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'results' / 'synthetic.md'}\n"
     report = (tmp_path / "results" / "synthetic.md").read_text()
-    assert "| **full pipeline** (NeuRoRA + refinement) |" in report
+    assert "| **full pipeline** (our networks + refinement) |" in report
     assert "CleanNet-SPT + chatterjee" in report
     for file in tmp_path.glob("results/*.png"):
         assert f"({file.name})" in report
@@ -61,9 +63,9 @@ def test_robustness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         setting = robustness.SETTINGS[name]
         monkeypatch.setitem(robustness.SETTINGS, name, robustness.Setting(setting.title, setting.training, tiny))
     command = ["evaluate", "robustness", "--graphs", "1", "--minutes", "0.001", "--settings", "easy", "easy-easy"]
-    assert main([*command, "--methods", "neurora-paper", "--output", str(tmp_path), "--threads", "1"]) == 0
+    assert main([*command, "--methods", "neurora-v1", "--output", str(tmp_path), "--threads", "1"]) == 0
     assert (
-        "`rotavg evaluate robustness --threads 1 --graphs 1 --methods neurora-paper --settings easy easy-easy"
+        "`rotavg evaluate robustness --threads 1 --graphs 1 --methods neurora-v1 --settings easy easy-easy"
         in (tmp_path / "robustness.md").read_text()
     )
     with (tmp_path / "robustness.csv").open() as file:
@@ -142,6 +144,19 @@ def test_plot_statistics(knows_truth: bool, tmp_path: Path, capsys: pytest.Captu
     assert main(["plot", "statistics", str(tmp_path / "none.npz")]) == 2
 
 
+def test_plot_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, picture = tmp_path / "net.log.jsonl", tmp_path / "picture.png"
+    log.write_text("".join(f'{{"epoch": {epoch}, "validation_objective": {2 / (epoch + 1)}}}\n' for epoch in range(5)))
+    assert main(["plot", "training", str(log), str(log), "--output", str(picture)]) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    epochs, objective = read_log(log)
+    np.testing.assert_allclose(epochs * objective, 2)
+    log.write_text('{"epoch": 1}\n')
+    assert main(["plot", "training", str(log), "--output", str(picture)]) == 2
+    assert "net.log.jsonl: not a log of training" in capsys.readouterr().err
+    assert main(["plot", "training", str(tmp_path / "none"), "--output", str(picture)]) == 2
+
+
 def test_rgbd(tmp_path: Path) -> None:
     """Two folds of two scenes each; what is trained differs from the package's networks, which run beside it."""
     folder = tmp_path / "rgbd" / "redwood_fgr"
@@ -167,6 +182,8 @@ def test_rgbd(tmp_path: Path) -> None:
     with (tmp_path / "rgbd-redwood_fgr.csv").open() as file:
         rows = {row["method"]: row for row in csv.DictReader(file)}
     assert {row["scenes"] for row in rows.values()} == {"4"}
-    assert rows["neurora-paper"]["mean °"] != rows["package: neurora-paper"]["mean °"]
+    assert rows["neurora-v1"]["mean °"] != rows["package: neurora-v1"]["mean °"]
     of_package = Counter(path.name.rpartition("-")[0] for path in keep.iterdir())
-    assert of_package == dict.fromkeys(("chatterjee", "weiszfeld", "cleannet-spt", "neurora-paper", "neurora"), 4)
+    ours = ("chatterjee", "weiszfeld", "geman-mcclure", "neurora-equal-precisions", "oracle")
+    peers = [name for name in ("colmap", "shonan") if is_available(name)]
+    assert of_package == dict.fromkeys((*ours, *peers, "cleannet-spt", "neurora-v1", "neurora"), 4)

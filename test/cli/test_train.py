@@ -3,12 +3,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
 
+from rotavg_ros import solve
 from rotavg_ros.cli.main import main
-from rotavg_ros.solver.networks import NETWORKS
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe
+from rotavg_ros.solver.networks import NETWORKS, PaperCleanNet, read_network
 from rotavg_ros.solver.neurora.network_store import WEIGHTS_FOLDER, load_network
 from rotavg_ros.training.trainer import fingerprint
 
@@ -77,7 +80,7 @@ def test_training_goes_on_from_given_weights(config: Path, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["clean-net", "nothing"], "nothing: no such file; the package's own are sfm-clean-net"),
+        (["clean-net", "nothing"], "nothing: no such file; the package's own are paper-clean-net"),
         (["fine-net", "slam-clean-net"], "no FineNet"),
         (["clean-net", "slam-clean-net", "--device", "cuda"], "on the CPU"),
         (["clean-net", "sfm-clean-net", "--clean-net", "x"], "--clean-net is for fine-net"),
@@ -146,3 +149,22 @@ def test_no_gpu(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert main(["train", "clean-net", str(config), "--output", str(tmp_path / "out"), "--device", "cuda"]) == 2
     assert "no usable GPU" in capsys.readouterr().err
+
+
+def test_the_papers_networks(config: Path, tmp_path: Path) -> None:
+    """Both, into a folder that then serves as weights of the paper's methods alone."""
+    of_paper = config.with_name("paper.yaml")
+    of_paper.write_text(config.read_text().replace("family: sfm", "family: paper"))
+    for network in ("clean-net", "fine-net"):
+        assert main(["train", network, str(of_paper), "--output", str(tmp_path / "weights"), *CPU]) == 0
+    card = json.loads((tmp_path / "weights" / "paper-fine-net.json").read_text())
+    assert card["clean_net_fingerprint"] == fingerprint(
+        read_network(PaperCleanNet, tmp_path / "weights" / "paper-clean-net.safetensors")
+    )
+    sample = PaperRecipe(cameras=(15, 15), pair_share=(0.6, 0.6)).sample(np.random.default_rng(0))
+    for method, is_used in (("neurora-paper", True), ("neurora-v1", False)):
+        trained, packaged = (
+            solve(sample.graph, profile="sfm", method=method, weights=weights).body_from_world
+            for weights in (tmp_path / "weights", None)
+        )
+        assert torch.allclose(trained, packaged) != is_used

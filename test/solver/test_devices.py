@@ -118,7 +118,7 @@ def test_an_accelerators_tree_is_as_short_as_the_cpus(num_nodes: int, num_edges:
     np.testing.assert_allclose(lengths[1], lengths[0], atol=1e-12)
 
 
-@pytest.mark.parametrize("method", ["neurora", "neurora-paper", "chatterjee"])
+@pytest.mark.parametrize("method", ["neurora", "neurora-v1", "chatterjee"])
 def test_a_batch_is_its_graphs(method: str) -> None:
     lone = ViewGraph.create([0, 2], [1, 3], [[0, 0, 0.1, 0.995], [0, 0, 0, 1]], num_nodes=6)
     source, target, kind = slam_edges(40, 6, 0)

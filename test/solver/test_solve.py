@@ -58,7 +58,7 @@ def test_exact_sfm_graphs_are_solved_exactly(seed: int) -> None:
     assert _max_error_deg(measured(truth, source, target), truth, method="spt") < 1e-4
     # CleanNet expects noise, and sees some; but the measurements as they are fit themselves better. FineNet corrects in
     # units of at least NUMBERS.min_residual, 0.011°.
-    assert _max_error_deg(measured(truth, source, target), truth, method="neurora-paper") < 0.02
+    assert _max_error_deg(measured(truth, source, target), truth, method="neurora-v1") < 0.02
     assert _max_error_deg(measured(truth, source, target), truth, refinement_steps=20) < 0.01
 
 
@@ -168,7 +168,7 @@ def test_stages_follow_the_method() -> None:
     graph, _, _ = _slam_graph(8)
     assert list(solve(graph).stage_seconds) == ["contract", "clean", "bootstrap", "refine", "expand"]
     assert "refine" not in solve(graph, refinement_steps=0).stage_seconds
-    paper = solve(graph, profile="sfm", method="neurora-paper").stage_seconds
+    paper = solve(graph, profile="sfm", method="neurora-v1").stage_seconds
     assert list(paper) == ["order", "clean", "bootstrap", "fine-tune"]
     whole = solve(graph, profile="sfm").stage_seconds
     assert list(whole) == ["order", "clean", "bootstrap", "fine-tune", "refine", "uncertainty"]
@@ -196,7 +196,7 @@ def test_a_warm_start_ends_where_the_cold_one_does() -> None:
 def test_the_networks_beat_the_tree(recipe: ReleasedRecipe | PaperRecipe) -> None:
     """Mean and median error, and accuracy of the flags, of every stage on graphs that no network has seen."""
     rows = {}
-    for method in ("spt", "cleannet-spt", "neurora-paper", "neurora"):
+    for method in ("spt", "cleannet-spt", "neurora-v1", "neurora"):
         of_method = []
         for seed in range(3):
             sample = recipe.sample(np.random.default_rng((99, seed)))
@@ -207,9 +207,9 @@ def test_the_networks_beat_the_tree(recipe: ReleasedRecipe | PaperRecipe) -> Non
         rows[method] = np.mean(of_method, axis=0)
     mean, median, accuracy = ({method: row[column] for method, row in rows.items()} for column in range(3))
     assert mean["cleannet-spt"] < 0.7 * mean["spt"]
-    assert mean["neurora-paper"] < 0.85 * mean["cleannet-spt"]
-    assert median["neurora"] < median["neurora-paper"] < 0.6 * median["cleannet-spt"]
-    assert accuracy["neurora"] > accuracy["cleannet-spt"] < accuracy["neurora-paper"]
+    assert mean["neurora-v1"] < 0.85 * mean["cleannet-spt"]
+    assert median["neurora"] < median["neurora-v1"] < 0.6 * median["cleannet-spt"]
+    assert accuracy["neurora"] > accuracy["cleannet-spt"] < accuracy["neurora-v1"]
 
 
 @pytest.mark.parametrize(

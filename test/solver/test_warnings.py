@@ -257,3 +257,21 @@ def test_graphs_that_are_solved_together_are_warned_of_one_by_one() -> None:
     together = solve_batch([clean, wild, closures])
     assert together[0].warnings == ()
     assert together[1].warnings[0].endswith("by hand") and "of 66 edges are flagged" in together[1].warnings[0]
+
+
+def test_edges_that_state_exactly_nothing() -> None:
+    """As a registration does that found nothing, between any two scans; not as a rig of parallel cameras does."""
+    source, target = torch.triu_indices(12, 12, offset=1)
+    generator = torch.Generator().manual_seed(0)
+    relative = rotations.random(len(source), generator=generator)
+    found_nothing = torch.rand(len(source), generator=generator) < 0.4
+    nothing = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    graph = ViewGraph.create(source, target, torch.where(found_nothing[:, None], nothing, relative))
+    (text,) = warnings.stating_nothing(graph)
+    assert text.startswith(f"{int(found_nothing.sum())} of 66 edges state exactly no rotation")
+    assert text in solve(graph).warnings
+    is_rig = (source // 3) == (target // 3)
+    rigs = ViewGraph.create(source, target, torch.where(is_rig[:, None], nothing, relative))
+    assert warnings.stating_nothing(rigs) == ()
+    assert warnings.stating_nothing(ViewGraph.create(source, target, relative)) == ()
+    assert warnings.stating_nothing(ViewGraph.create(source, target, nothing.expand(66, 4))) == ()

@@ -16,8 +16,10 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.solver.networks import NETWORKS
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.network_store import read_network
+from rotavg_ros.solver.neurora.paper import PaperCleanNet
 from rotavg_ros.training import checkpoint
 from rotavg_ros.training.config import TrainingConfig
+from rotavg_ros.training.paper_tasks import PaperCleanTask, PaperFineTask
 from rotavg_ros.training.sfm_tasks import SfmCleanTask, SfmFineTask
 from rotavg_ros.training.slam_tasks import SlamCleanTask
 from rotavg_ros.training.trainer import Trainer, TrainingTask, fingerprint
@@ -37,6 +39,7 @@ SLAM = TrainingConfig(
     epochs=EPOCHS,
     batch_graphs=2,
 )
+PAPER = replace(SFM, family="paper", recipe="paper", edge_dropout=0.25)
 CPU = torch.device("cpu")
 
 
@@ -54,7 +57,11 @@ def make_task(name: str) -> tuple[TrainingTask, TrainingConfig]:
         return SlamCleanTask(SLAM), SLAM
     if name == "sfm-clean-net":
         return SfmCleanTask(SFM, CPU), SFM
+    if name == "paper-clean-net":
+        return PaperCleanTask(PAPER, CPU), PAPER
     torch.manual_seed(0)
+    if name == "paper-fine-net":
+        return PaperFineTask(PAPER, CPU, PaperCleanNet()), PAPER
     return SfmFineTask(FINE, CPU, CleanNet()), FINE
 
 
@@ -74,7 +81,9 @@ def log(folder: Path, name: str) -> list[dict[str, float]]:
     return [json.loads(line) for line in (folder / f"{name}.log.jsonl").read_text().splitlines()]
 
 
-@pytest.mark.parametrize("name", ["sfm-clean-net", "sfm-fine-net", "slam-clean-net"])
+@pytest.mark.parametrize(
+    "name", ["sfm-clean-net", "sfm-fine-net", "slam-clean-net", "paper-clean-net", "paper-fine-net"]
+)
 def test_resumed_run_equals_unbroken_run_bit_for_bit(name: str, tmp_path: Path) -> None:
     make_trainer(name, tmp_path / "unbroken").run()
     make_trainer(name, tmp_path / "resumed").run(max_epochs=1)

@@ -12,7 +12,7 @@ from rotavg_ros.cli.data_folder import add_data_argument
 from rotavg_ros.cli.options import evaluate_slam
 from rotavg_ros.evaluation.names import RGBD_SETS, ROBUSTNESS_SETTINGS, SYNTHETIC_RECIPES
 
-ROBUSTNESS_METHODS = ("chatterjee", "neurora-paper", "neurora")
+ROBUSTNESS_METHODS = ("chatterjee", "neurora-v1", "neurora")
 
 
 class _Suite(NamedTuple):

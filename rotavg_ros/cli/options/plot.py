@@ -1,7 +1,8 @@
-"""Draw pictures (PNG) of a view-graph.
+"""Draw pictures (PNG) of a view-graph, or of training.
 
 statistics: histograms of the angles and axes of the edges' noise against the truth; where the truth is unknown, of
 their residuals against the solution.
+training: what validation said after every epoch, a panel for each log.
 """
 
 from __future__ import annotations
@@ -25,4 +26,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=positive_number,
         metavar="DEG",
         help="noise of an outlier (default: 20, or 10 if the graph has odometry)",
+    )
+    about = "validation after every epoch of training"
+    training = kinds.add_parser("training", help=about, description=about)
+    training.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="NAME.log.jsonl of `rotavg train`")
+    training.add_argument(
+        "--output", type=Path, metavar="PNG", default=Path("training.png"), help="default: training.png"
     )

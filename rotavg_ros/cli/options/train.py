@@ -2,7 +2,8 @@
 
 CONFIG is a YAML file, or the name of one that comes with the package: sfm-clean-net, sfm-fine-net, slam-clean-net, and
 the later stages that the package's own networks went through: sfm-clean-net-broad and sfm-fine-net-settled, then
-sfm-clean-net-canonical and sfm-fine-net-canonical.
+sfm-clean-net-canonical and sfm-fine-net-canonical. The method neurora-paper has paper-clean-net, then
+paper-clean-net-settled, and paper-fine-net.
 DIR gets, for the network NAME, the best weights (NAME.safetensors), their model card (NAME.json), a log with a line per
 epoch (NAME.log.jsonl) and a checkpoint. Run the same command again after an interruption: training goes on as if it had
 never stopped. A FineNet learns on what a CleanNet leaves, so train CleanNet first, into the same DIR.

@@ -21,7 +21,7 @@ _ORTHOGONALITY_TOLERANCE = 1e-3
 
 
 def read(path: Path) -> GraphFile:
-    """Read a Lund file; a Hessian becomes the rotation part of the edge's information.
+    """Read a Lund file; a Hessian becomes the rotation part of the edge's information, and its precision.
 
     Raises:
         GraphFileError: naming the array that is at fault.
@@ -39,12 +39,14 @@ def read(path: Path) -> GraphFile:
     source, target = np.nonzero(np.triu((relative != 0).any(axis=(2, 3)), k=1))
     if len(source) == 0:
         raise GraphFileError.at(path, None, "no edges in the upper triangle of Rrel; there is nothing to solve")
+    hessian = _blocks(arrays["H"])[source, target] if "H" in arrays else None
     graph_file = GraphFile.from_ids(
         source,
         target,
         _quaternions(path, "Rrel", relative[source, target]),
+        precision=None if hessian is None else _precision(hessian),
         lone_ids=np.arange(num_nodes),
-        edge_information=_information(_blocks(arrays["H"])[source, target]) if "H" in arrays else None,
+        edge_information=None if hessian is None else _information(hessian),
     )
     return replace(graph_file, body_from_world_gt=_quaternions(path, "Rgt", truth.reshape(-1, 3, 3)))
 
@@ -88,3 +90,10 @@ def _information(hessian: np.ndarray) -> np.ndarray:
     """``(M, 21)``: zeros for the translation, and the upper triangle of the Hessian for the rotation."""
     row, column = np.triu_indices(3)
     return np.concatenate((np.zeros((len(hessian), 15)), hessian[:, row, column]), axis=1)
+
+
+def _precision(hessian: np.ndarray) -> np.ndarray:
+    """``(M,)`` one over the mean variance that the Hessians imply; NaN where one is not positive definite."""
+    values = np.linalg.eigvalsh((hessian + hessian.transpose(0, 2, 1)) / 2)
+    is_definite = values[:, 0] > 0
+    return np.where(is_definite, 3 / (1 / np.where(values > 0, values, 1.0)).sum(axis=1), np.nan)

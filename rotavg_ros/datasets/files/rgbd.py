@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError
@@ -16,7 +17,9 @@ class RgbdScene:
     """A scene of N scans and M registrations.
 
     Attributes:
-        graph_file: the view-graph with ground truth.
+        graph_file: the view-graph with ground truth. Edges that state no precision have that of a registration whose
+            points lie 1 m from its centre, rms⁻² rad⁻²: the scale means nothing, the differences may. Failed ones
+            count as the worst of the others.
         registration_rms: ``(M,)`` metres, the root mean square distance of matched points; inf where it failed.
     """
 
@@ -45,4 +48,13 @@ def read_scene(path: str | Path) -> RgbdScene:
         proper = archive["source"] != archive["target"]  # self-edges are no part of the graph
     if rms.shape != proper.shape:
         raise GraphFileError.at(path, None, f"registration_rms has shape {rms.shape}, source has {proper.shape}")
-    return RgbdScene(graph_file, np.where(rms < _FAILED_RMS, rms, np.inf)[proper])
+    rms = np.where(rms < _FAILED_RMS, rms, np.inf)[proper]
+    return RgbdScene(_with_precisions(graph_file, rms), rms)
+
+
+def _with_precisions(graph_file: GraphFile, rms: np.ndarray) -> GraphFile:
+    graph, is_known = graph_file.graph, np.isfinite(rms) & (rms > 0)
+    if bool(graph.precision.isfinite().any()) or not is_known.any():
+        return graph_file
+    of_edge = np.where(is_known, rms, rms[is_known].max())
+    return replace(graph_file, graph=replace(graph, precision=torch.from_numpy(of_edge**-2)))

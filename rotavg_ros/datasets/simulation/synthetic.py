@@ -7,6 +7,7 @@ disturb a share of the measurements. A measurement's noise is right-multiplied: 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,8 +20,26 @@ from rotavg_ros.view_graph import ViewGraph
 
 # The paper calls an edge an outlier beyond this noise.
 SFM_OUTLIER_ANGLE = np.radians(20.0)
+# rad², variance per component of the rotation vector of a rotation that may be any: (π²/3 + 2) / 3.
+_ANY_ROTATION = (np.pi**2 / 3 + 2) / 3
 # Beyond this many cameras a list of all pairs takes gigabytes.
 _MAX_NODES_TO_LIST_PAIRS = 4000
+
+
+class NoiseCovariance(NamedTuple):
+    """Covariances of the noise of M edges, of which there are K different ones.
+
+    Attributes:
+        of_kind: ``(K, 3, 3)`` rad², in the frames of the edges' sources.
+        kind: ``(M,)`` which of them is each edge's.
+    """
+
+    of_kind: Tensor
+    kind: Tensor
+
+    def of_edges(self) -> Tensor:
+        """``(M, 3, 3)`` rad²."""
+        return self.of_kind[self.kind.long()]
 
 
 @dataclass(frozen=True)
@@ -31,16 +50,30 @@ class SyntheticGraph:
         graph: the measurements.
         body_from_world: ``(N, 4)`` float64, true orientations.
         noise_angle: ``(M,)`` rad, angle between measured and true relative rotation.
+        noise: what whoever drew the graph knows of its edges' noise; None: unknown.
     """
 
     graph: ViewGraph
     body_from_world: Tensor
     noise_angle: Tensor
+    noise: NoiseCovariance | None = None
 
     @property
     def is_outlier(self) -> Tensor:
         """``(M,)`` bool, the paper's label: noise beyond 20°."""
         return torch.gt(self.noise_angle, SFM_OUTLIER_ANGLE)
+
+
+class EdgeNoise(NamedTuple):
+    """Noise of the M edges of one graph.
+
+    Attributes:
+        rotation: of every edge, outliers included, in its source's frame.
+        covariance: to first order; of undisturbed edges, then of disturbed ones.
+    """
+
+    rotation: Rotation
+    covariance: NoiseCovariance
 
 
 @dataclass(frozen=True)
@@ -96,7 +129,7 @@ class ReleasedRecipe:
         tilt = _axes(n, False, rng) * np.radians(rng.uniform(0, self.tilt_deg, (n, 1)))
         return Rotation.from_rotvec(turn) * Rotation.from_rotvec(tilt)
 
-    def noise(self, m: int, rng: np.random.Generator) -> Rotation:
+    def noise(self, m: int, rng: np.random.Generator) -> EdgeNoise:
         """Noise of the ``m`` edges of one graph, outliers included."""
         sigma = np.radians(rng.uniform(*self.noise_deg)) / np.sqrt(3)
         in_plane = self.planar and not self.round_noise
@@ -110,7 +143,9 @@ class ReleasedRecipe:
             * rng.standard_normal((len(disturbed), 1))
             * rng.standard_normal((len(disturbed), 3))
         )
-        return noise * Rotation.from_rotvec(wide)
+        usual = sigma**2 * (_axis_moment(in_plane) + _axis_moment(False) / 100)
+        disturbance = np.radians(90) ** 2 / 3 * np.eye(3)
+        return EdgeNoise(noise * Rotation.from_rotvec(wide), _covariance(usual, usual + disturbance, disturbed, m))
 
 
 @dataclass(frozen=True)
@@ -146,21 +181,23 @@ class PaperRecipe:
         yaw[:, 1] = rng.uniform(-np.pi, np.pi, n)
         return Rotation.from_rotvec(yaw)
 
-    def noise(self, m: int, rng: np.random.Generator) -> Rotation:
+    def noise(self, m: int, rng: np.random.Generator) -> EdgeNoise:
         """Noise of the ``m`` edges of one graph, outliers included."""
         sigma = np.radians(rng.uniform(*self.noise_deg))
         rotvec = _axes(m, True, rng) * sigma * rng.standard_normal((m, 1))
         noise = Rotation.from_rotvec(rotvec).as_quat()
         replaced = rng.choice(m, int(rng.uniform(*self.outlier_share) * m), replace=False)
         noise[replaced] = _random_quaternions(len(replaced), rng)
-        return Rotation.from_quat(noise)
+        covariance = _covariance(sigma**2 * _axis_moment(True), _ANY_ROTATION * np.eye(3), replaced, m)
+        return EdgeNoise(Rotation.from_quat(noise), covariance)
 
 
-def measured(orientation: Rotation, source: np.ndarray, target: np.ndarray, noise: Rotation) -> SyntheticGraph:
+def measured(orientation: Rotation, source: np.ndarray, target: np.ndarray, noise: EdgeNoise) -> SyntheticGraph:
     """The graph that measures ``orientation`` (body_from_world) with right-multiplied ``noise``."""
-    relative = orientation[target] * orientation[source].inv() * noise
+    relative = orientation[target] * orientation[source].inv() * noise.rotation
     graph = ViewGraph.create(source, target, relative.as_quat(), num_nodes=len(orientation))
-    return SyntheticGraph(graph, torch.from_numpy(orientation.as_quat()), torch.from_numpy(noise.magnitude()))
+    truth, angle = orientation.as_quat(), noise.rotation.magnitude()
+    return SyntheticGraph(graph, torch.from_numpy(truth), torch.from_numpy(angle), noise.covariance)
 
 
 def _random_pairs(n: int, share: tuple[float, float], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -187,6 +224,18 @@ def _axes(count: int, in_vertical_plane: bool, rng: np.random.Generator) -> np.n
         return np.stack((y, np.sqrt(1 - y * y), np.zeros(count)), axis=1)
     axes = rng.standard_normal((count, 3))
     return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))
+
+
+def _covariance(usual: np.ndarray, disturbed: np.ndarray, which: np.ndarray, m: int) -> NoiseCovariance:
+    """Of ``m`` edges, of which ``which`` are disturbed."""
+    kind = torch.zeros(m, dtype=torch.uint8)
+    kind[torch.from_numpy(which)] = 1
+    return NoiseCovariance(torch.from_numpy(np.stack((usual, disturbed))), kind)
+
+
+def _axis_moment(in_vertical_plane: bool) -> np.ndarray:
+    """``(3, 3)`` second moment of :func:`_axes`."""
+    return np.diag((1 / 3, 2 / 3, 0.0)) if in_vertical_plane else np.eye(3) / 3
 
 
 def _random_quaternions(count: int, rng: np.random.Generator) -> np.ndarray:

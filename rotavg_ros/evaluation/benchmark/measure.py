@@ -28,7 +28,7 @@ from rotavg_ros.view_graph import ViewGraph
 # Contenders by name, and what reports call them.
 LABELS = {
     "neurora": "rotavg",
-    "neurora-paper": "rotavg without refinement",
+    "neurora-v1": "rotavg without refinement",
     "neurora-cuda": "rotavg on a GPU",
     "colmap": "COLMAP",
     "shonan": "GTSAM Shonan",
@@ -36,7 +36,7 @@ LABELS = {
 }
 # Solves are repeated until they have taken this long.
 ENOUGH_S = 15.0
-OURS = frozenset({"neurora", "neurora-paper", "neurora-cuda"})
+OURS = frozenset({"neurora", "neurora-v1", "neurora-cuda"})
 
 
 @dataclass(frozen=True)

@@ -115,13 +115,13 @@ def _dense(nodes: int, share: float) -> Plan:
     return Plan("sfm-dense", nodes, round(share * nodes * (nodes - 1) / 2))
 
 
-_SFM = ("neurora", "neurora-paper", "neurora-cuda", "colmap", "shonan")
+_SFM = ("neurora", "neurora-v1", "neurora-cuda", "colmap", "shonan")
 FAMILIES = {
     "recipe": Series(
         "The paper's recipe: 250–1000 cameras",
         tuple(Plan("recipe", 625, 39_000, seed) for seed in range(3)),
         _draw_recipe,
-        ("neurora", "neurora-paper", "neurora-cuda", "colmap"),
+        ("neurora", "neurora-v1", "neurora-cuda", "colmap"),
     ),
     "sfm-sparse": Series(
         "SfM, sparse: 20 neighbours a camera",

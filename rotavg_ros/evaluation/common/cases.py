@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rotavg_ros.datasets.simulation.synthetic import SFM_OUTLIER_ANGLE
+from rotavg_ros.datasets.simulation.synthetic import SFM_OUTLIER_ANGLE, NoiseCovariance
 from rotavg_ros.metrics import true_edge_noise
 from rotavg_ros.rotations import rotate
 from rotavg_ros.view_graph import FALSE_CLOSURE_DEG, FALSE_CLOSURE_M, ViewGraph
@@ -95,6 +95,7 @@ class Case:
         floor: rad; in ratios of errors smaller ones count as this, since the truth is no better.
         true_precision: ``(M,)`` rad⁻², that of each edge's actual noise, where whoever drew the graph knows it.
         poses: positions, by which closures are judged, too; None: rotations alone are known.
+        noise_covariance: what whoever drew the graph knows of the edges' noise; None: unknown.
     """
 
     key: CaseKey
@@ -105,6 +106,7 @@ class Case:
     floor: float = 0.0
     true_precision: Tensor | None = None
     poses: PoseTruth | None = None
+    noise_covariance: NoiseCovariance | None = None
 
     @cached_property
     def noise(self) -> Tensor:

@@ -7,8 +7,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from rotavg_ros.baselines import residual_score
+from rotavg_ros.baselines.most_likely import most_likely
+from rotavg_ros.evaluation.common.answers import Answer, Clock
 from rotavg_ros.evaluation.common.cases import SFM, Case
-from rotavg_ros.evaluation.common.contenders import Roster
+from rotavg_ros.evaluation.common.contenders import OwnContender, Roster
 from rotavg_ros.solver import solve
 from rotavg_ros.view_graph import EdgeLabel
 
@@ -32,10 +35,22 @@ def _told(case: Case, method: str) -> Tensor:
     return solve(graph, method=method, profile="sfm", device="cpu", warm_start=case.truth).body_from_world
 
 
+def told_covariances(case: Case) -> Answer | None:
+    """Least squares from the truth, weighed by the covariances of the edges' noise; None: unknown."""
+    if case.noise_covariance is None:
+        return None
+    clock = Clock()
+    with clock.running():
+        orientations = most_likely(case.graph, case.noise_covariance.of_edges(), case.truth)
+    score = residual_score(case.graph, orientations, case.family.outlier_angle)
+    return Answer(orientations, clock.seconds, clock.cpu_seconds, score)
+
+
 ROSTER = Roster(
     SFM,
     peers=("colmap", "shonan"),
     references={"oracle": oracle, "oracle-shaped": shaped_oracle},
     # Shonan's matrices beyond this many edges take minutes.
     max_edges={"shonan": 150_000},
+    own={"oracle-covariances": OwnContender(told_covariances)},
 )

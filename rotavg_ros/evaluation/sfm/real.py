@@ -19,6 +19,7 @@ from rotavg_ros.evaluation.common.contenders import Contender
 from rotavg_ros.evaluation.common.score_tables import Figure, averages
 from rotavg_ros.evaluation.common.scoring import Scores
 from rotavg_ros.evaluation.common.tables import Cell, Column, Table
+from rotavg_ros.evaluation.sfm import synthetic
 from rotavg_ros.metrics import true_edge_noise
 from rotavg_ros.metrics.orientations import orientation_errors
 
@@ -28,9 +29,12 @@ METHODS = (
     "arrigoni",
     "wang",
     "cleannet-spt",
+    "cleannet-spt-paper",
     "neurora-paper",
+    "neurora-v1",
     "neurora-v2",
     "neurora",
+    "geman-mcclure",
     "colmap",
     "shonan",
 )
@@ -65,7 +69,7 @@ def topology_kinds(data: Path, noise: str) -> list[Kind]:
 
 def _on_topology(path: Path, noise: str, number: int, seed: int) -> Case:
     sample = read_topology(path).sample(NOISE[noise], np.random.default_rng((seed, _STREAM, number)))
-    return Case(CaseKey(path.stem, noise, seed), sample.graph, sample.body_from_world)
+    return synthetic.case_of(CaseKey(path.stem, noise, seed), sample)
 
 
 def madrid_case(data: Path) -> Case:

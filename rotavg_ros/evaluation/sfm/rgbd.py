@@ -19,8 +19,8 @@ from rotavg_ros.evaluation.common.tables import Column, Table
 from rotavg_ros.training.sfm_tasks import GivenGraphs
 
 # Methods without networks, and those that are trained in every fold.
-UNTRAINED = ("chatterjee", "weiszfeld")
-TRAINED = ("cleannet-spt", "neurora-paper", "neurora")
+UNTRAINED = ("chatterjee", "weiszfeld", "geman-mcclure", "colmap", "shonan", "neurora-equal-precisions", "oracle")
+TRAINED = ("cleannet-spt", "neurora-v1", "neurora")
 # Before the name of a method with the package's own networks.
 PACKAGE_PREFIX = "package: "
 # Of a fold's training scenes, every so many-th decides which weights are kept.
@@ -66,12 +66,17 @@ def folds(folder: Path, count: int, max_scenes: int | None) -> Iterator[Fold]:
 def table(title: str, scores: Scores, minutes: float) -> Table:
     """Errors over all scenes, each solved in the fold that had not seen it."""
     names = (*UNTRAINED, *(PACKAGE_PREFIX + name for name in TRAINED), *TRAINED)
-    rows = tuple((*row, len(scores.of(str(row[0])))) for row in average_rows(scores, names, _FIGURES))
+    names = tuple(name for name in names if scores.of(name))
+    rows = tuple(
+        (*row, scores.calibration[str(row[0])].error, len(scores.of(str(row[0]))))
+        for row in average_rows(scores, names, _FIGURES)
+    )
     note = (
         f"The networks of each fold went on from the package's for {minutes:g} minutes on one CPU core, on the other "
         "scenes; package: as they come, trained on synthetic graphs alone."
     )
-    return Table(title, (Column("method"), *columns(_FIGURES), Column("scenes", "d")), rows, (note,))
+    headings = (Column("method"), *columns(_FIGURES), Column("calibration error", ".3f"), Column("scenes", "d"))
+    return Table(title, headings, rows, (note,))
 
 
 def _read(path: Path) -> Case:

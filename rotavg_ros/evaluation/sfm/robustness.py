@@ -13,6 +13,7 @@ from rotavg_ros.evaluation.common.cases import Case, CaseKey, Kind
 from rotavg_ros.evaluation.common.score_tables import Figure, average_rows, columns
 from rotavg_ros.evaluation.common.scoring import Scores
 from rotavg_ros.evaluation.common.tables import Cell, Column, Report, Table
+from rotavg_ros.evaluation.sfm import synthetic
 from rotavg_ros.training.sfm_tasks import GivenGraphs
 
 PACKAGE = "package"
@@ -84,7 +85,7 @@ def kind(setting: str, seed: int) -> Kind:
 
 def _draw(setting: str, seed: int, number: int) -> Case:
     sample = SETTINGS[setting].test.sample(np.random.default_rng((seed, _STREAM, number)))
-    return Case(CaseKey(f"{setting} {number}", setting, seed), sample.graph, sample.body_from_world)
+    return synthetic.case_of(CaseKey(f"{setting} {number}", setting, seed), sample)
 
 
 def training_graphs(training: str, seed: int, count: int = _TRAINING_GRAPHS) -> GivenGraphs:

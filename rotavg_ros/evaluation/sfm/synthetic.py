@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe, SyntheticGraph
 from rotavg_ros.evaluation.common import plots
 from rotavg_ros.evaluation.common.cases import Case, CaseKey, Kind
 from rotavg_ros.evaluation.common.score_tables import Figure, average_rows, columns, per_case
@@ -37,37 +37,54 @@ ROWS: dict[str, str] = {
     "weiszfeld": "Weiszfeld ℓ1 (Hartley et al.)",
     "arrigoni": "R-GoDec (Arrigoni et al.)",
     "wang": "LUD (Wang & Singer)",
-    "cleannet-spt": "CleanNet-SPT",
-    **{f"cleannet-spt+{base}": f"CleanNet-SPT + {base}" for base in _BASES},
-    "spt-finenet": "SPT-FineNet",
-    **{f"spt-finenet+{base}": f"SPT-FineNet + {base}" for base in _BASES},
-    "neurora-paper": "NeuRoRA",
-    "neurora-v2": "NeuRoRA-v2",
-    **{f"neurora-paper+{base}": f"NeuRoRA + {base}" for base in _BASES},
-    "spt": "spanning tree alone",
+    "geman-mcclure": "Geman–McClure (ℓ1 → IRLS)",
     "colmap": "COLMAP's rotation averaging",
     "shonan": "Shonan (GTSAM)",
-    "neurora": "**full pipeline** (NeuRoRA + refinement)",
+    "spt-paper": "the paper's tree alone",
+    "cleannet-spt-paper": "CleanNet-SPT",
+    **{f"cleannet-spt-paper+{base}": f"CleanNet-SPT + {base}" for base in _BASES},
+    "spt-finenet-paper": "SPT-FineNet",
+    **{f"spt-finenet-paper+{base}": f"SPT-FineNet + {base}" for base in _BASES},
+    "neurora-paper": "NeuRoRA",
+    "neurora-v2-paper": "NeuRoRA-v2",
+    **{f"neurora-paper+{base}": f"NeuRoRA + {base}" for base in _BASES},
+    "neurora-paper~cleannet": "· with our CleanNet",
+    "neurora-paper~tree": "· with our tree",
+    "neurora-paper~finenet": "· with our FineNet",
+    "neurora-paper~cleannet,tree": "· with our CleanNet and tree",
+    "neurora-paper~axes": "· with the cameras' axes of the data",
+    "spt": "our tree alone",
+    "cleannet-spt": "our CleanNet + tree",
+    "spt-finenet": "our tree + FineNet",
+    "neurora-v1": "our networks, FineNet once",
+    "neurora-v2": "our networks, FineNet twice",
+    "neurora": "**full pipeline** (our networks + refinement)",
     "neurora-unweighted": "· without CleanNet's weights",
     "neurora-without-finenet": "· without FineNet",
     "neurora-without-both": "· without both networks",
     "neurora-round": "· without the noise's shape",
     "oracle": "oracle: ℓ½ on the true inliers, from the truth",
     "oracle-shaped": "oracle that is told the noise's shape by the residuals",
+    "oracle-covariances": "oracle that is told the covariance of every edge's noise",
 }
 # Run on every graph; the other rows take minutes a graph or say little more, so that few graphs do for them.
 CORE = (
     "chatterjee",
-    "cleannet-spt",
-    "neurora-paper",
-    "neurora-v2",
+    "geman-mcclure",
     "colmap",
+    "cleannet-spt-paper",
+    "neurora-paper",
+    "neurora-v2-paper",
+    "cleannet-spt",
+    "neurora-v1",
+    "neurora-v2",
     "neurora",
 )
 # Whose outlier verdicts are compared: scores of ours, residuals of the others.
 _CLASSIFIERS = {
-    "cleannet-spt": "CleanNet's score",
-    "neurora-paper": "NeuRoRA's score",
+    "neurora-paper": "the paper's CleanNet's score",
+    "cleannet-spt": "our CleanNet's score",
+    "neurora-v1": "our networks' score",
     "neurora": "full pipeline's score",
     "chatterjee": "Chatterjee & Govindu's residuals",
     "colmap": "COLMAP's residuals",
@@ -101,7 +118,12 @@ def kinds(recipes: Sequence[str], seed: int) -> list[Kind]:
 def _draw(recipe: str, seed: int, number: int) -> Case:
     rng = np.random.default_rng((seed, _STREAM, zlib.crc32(recipe.encode()), number))
     sample = RECIPES[recipe].sample(rng)
-    return Case(CaseKey(f"{recipe} {number}", recipe, seed), sample.graph, sample.body_from_world)
+    return case_of(CaseKey(f"{recipe} {number}", recipe, seed), sample)
+
+
+def case_of(key: CaseKey, sample: SyntheticGraph) -> Case:
+    """A drawn graph, with all that its generator knows."""
+    return Case(key, sample.graph, sample.body_from_world, noise_covariance=sample.noise)
 
 
 @dataclass(frozen=True)

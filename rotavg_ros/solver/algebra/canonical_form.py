@@ -40,7 +40,7 @@ class CanonicalForm:
     """A view-graph of N nodes, M edges and C components in canonical form, and how to get back.
 
     Attributes:
-        graph: in canonical form, with K ≤ M edges, without translations.
+        graph: in canonical form, with K ≤ M edges, without translations; of copies the highest precision is kept.
         component: ``(N,)`` of its nodes.
         node: ``(N,)`` which of the given graph's nodes each is.
         edge: ``(M,)`` which of its edges stands for each of the given graph's.
@@ -54,16 +54,22 @@ class CanonicalForm:
     canonical_from_body: Tensor
 
     @classmethod
-    def of(cls, graph: ViewGraph, component: Tensor | None = None) -> CanonicalForm:
-        """Of a graph; ``component`` ``(N,)`` as it numbers its own, default: computed."""
+    def of(cls, graph: ViewGraph, component: Tensor | None = None, own_axes: bool = True) -> CanonicalForm:
+        """Of a graph.
+
+        Args:
+            component: ``(N,)`` as it numbers its own, default: computed.
+            own_axes: the cameras' axes are those of the measurements; otherwise they stay as they are given.
+        """
         component = graph.components() if component is None else component
-        form, has_parallels = _form(graph, component)
+        form, has_parallels = _form(graph, component, own_axes)
         if not has_parallels:
             return form
         kept, copy_of = _without_copies(graph)
+        graph = _stating_the_highest(graph, kept, copy_of)
         # Several rotations between the same nodes are sorted by their angles, and so stay.
         by_angle = graph.target_from_source[kept, 3].argsort(stable=True)
-        form, _ = _form(graph.select_edges(kept[by_angle]), component)
+        form, _ = _form(graph.select_edges(kept[by_angle]), component, own_axes)
         place = torch.empty_like(form.edge)
         place[by_angle] = form.edge
         return replace(form, edge=place[copy_of])
@@ -93,7 +99,7 @@ class CanonicalForm:
         return rotations.canonical(rotations.multiply(axes, body_from_world[self.node]))
 
 
-def _form(graph: ViewGraph, component: Tensor) -> tuple[CanonicalForm, bool]:
+def _form(graph: ViewGraph, component: Tensor, own_axes: bool) -> tuple[CanonicalForm, bool]:
     """The form of a graph without copies, and whether it has several edges between any two nodes."""
     node = _nodes_in_order(graph, component)
     rank = torch.empty_like(node)
@@ -109,15 +115,20 @@ def _form(graph: ViewGraph, component: Tensor) -> tuple[CanonicalForm, bool]:
     # Components in rows: picking numbers one by one takes a quarter of the time of picking rows of four.
     rows = torch.stack([row.index_select(0, order) for row in graph.target_from_source.t().contiguous()])
     rows[:3] *= torch.where(is_forward, 1.0, -1.0)
-    axes = _axes(low, high, rows, component)
-    turned = torch.cat((_in_axes(axes, rows[:3], component, low), rows[3:]))
+    if own_axes:
+        axes = _axes(low, high, rows, component)
+        rows = torch.cat((_in_axes(axes, rows[:3], component, low), rows[3:]))
+    else:
+        count = int(component.max()) + 1 if len(component) else 0
+        axes = torch.eye(3, dtype=rows.dtype, device=rows.device).expand(count, 3, 3)
     # One number each, seen M times: at millions of edges columns that nobody reads take room.
-    unread = (
+    kind, precision, steps = (
         torch.full_like(column[:1], value).expand(len(column))
         for column, value in ((graph.kind, EdgeKind.LOOP_CLOSURE), (graph.precision, torch.nan), (graph.steps, 1.0))
     )
-    kind, precision, steps = unread
-    canonical = ViewGraph(graph.num_nodes, low, high, turned.t().contiguous(), kind, precision, label, steps)
+    if bool(graph.precision.isfinite().any()):
+        precision = graph.precision.index_select(0, order)
+    canonical = ViewGraph(graph.num_nodes, low, high, rows.t().contiguous(), kind, precision, label, steps)
     edge = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
     has_parallels = bool(((low[1:] == low[:-1]) & (high[1:] == high[:-1])).any())
     return CanonicalForm(canonical, component, node, edge, rotations.from_matrix(axes)), has_parallels
@@ -138,6 +149,17 @@ def _without_copies(graph: ViewGraph) -> tuple[Tensor, Tensor]:
     first = torch.full_like(every, graph.num_edges).scatter_reduce(0, group, every, "amin")[group]
     is_kept = first == every
     return is_kept.nonzero().squeeze(1), (is_kept.cumsum(0) - 1)[first]
+
+
+def _stating_the_highest(graph: ViewGraph, kept: Tensor, copy_of: Tensor) -> ViewGraph:
+    """The graph whose ``kept`` edges state the highest precision that any of their copies does."""
+    if not bool(graph.precision.isfinite().any()):
+        return graph
+    stated = graph.precision.nan_to_num(nan=0.0)
+    highest = stated.new_zeros(len(kept)).scatter_reduce(0, copy_of, stated, "amax")
+    precision = graph.precision.clone()
+    precision[kept] = torch.where(highest > 0, highest, torch.nan)
+    return replace(graph, precision=precision)
 
 
 def _nodes_in_order(graph: ViewGraph, component: Tensor) -> Tensor:

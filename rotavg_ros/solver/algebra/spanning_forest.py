@@ -46,7 +46,7 @@ class SpanningForest:
 def shortest_path_forest(
     graph: ViewGraph,
     cost: Tensor | None = None,
-    root: str = "hub",
+    root: str | Tensor = "hub",
     *,
     edges: SortedEdges | None = None,
     component: Tensor | None = None,
@@ -58,14 +58,17 @@ def shortest_path_forest(
     Args:
         graph: on the CPU.
         cost: ``(M,)`` positive; default: 1 each.
-        root: "hub", the node of highest degree, or "first", the first node of the component.
+        root: "hub", the node of highest degree, or "first", the first node of the component; or ``(C,)`` the roots.
         edges: the graph's edges sorted; default: computed.
         component: ``(N,)`` its connected components; default: computed.
     """
     edges = SortedEdges.of(graph) if edges is None else edges
     labels = (graph.components() if component is None else component).numpy()
-    priority = -edges.degree.numpy() if root == "hub" else np.zeros(graph.num_nodes)
-    roots = _first_per_component(labels, priority)
+    if isinstance(root, Tensor):
+        roots = root.numpy()
+    else:
+        priority = -edges.degree.numpy() if root == "hub" else np.zeros(graph.num_nodes)
+        roots = _first_per_component(labels, priority)
     costs = np.ones(len(edges.source)) if cost is None else cost.detach().index_select(0, edges.edge).double().numpy()
     # Rows of the matrix are symmetric, parallel edges included, which Dijkstra's algorithm does not mind.
     adjacency = csr_array((costs, edges.source.numpy(), edges.first.numpy()), shape=(graph.num_nodes, graph.num_nodes))

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.neurora.message_passing import HIDDEN_WIDTH, DirectedEdges, MessagePassingNetwork
+from rotavg_ros.solver.neurora.message_passing import HIDDEN_WIDTH, DirectedEdges, MessagePassingNetwork, Wiring
 from rotavg_ros.solver.neurora.network_store import StoredNetwork
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 
@@ -37,7 +37,7 @@ class FineNet(StoredNetwork):
     def __init__(self) -> None:
         super().__init__()
         self.network = MessagePassingNetwork(
-            NODE_FEATURES, ODD_FEATURES + EVEN_FEATURES, odd_width=ODD_FEATURES, accumulates=True
+            NODE_FEATURES, ODD_FEATURES + EVEN_FEATURES, odd_width=ODD_FEATURES, wiring=Wiring(accumulates=True)
         )
         self.correction_head = nn.Linear(HIDDEN_WIDTH, 3)
         # It begins as no correction at all.

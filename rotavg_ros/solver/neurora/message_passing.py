@@ -29,6 +29,23 @@ NUM_LAYERS = 4
 
 
 @dataclass(frozen=True)
+class Wiring:
+    """How layers are joined.
+
+    Attributes:
+        remembers: edges keep their activation from layer to layer, as in the authors' released code; otherwise
+            a layer sees an edge's features alone, as in the paper's text.
+        accumulates: from the second layer on, updates are added to the node states.
+    """
+
+    remembers: bool = True
+    accumulates: bool = False
+
+
+_DEFAULT_WIRING = Wiring()
+
+
+@dataclass(frozen=True)
 class DirectedEdges:
     """Both directions of M edges: rows 0 … M-1 are the edges as given, rows M … 2M-1 the same edges reversed.
 
@@ -108,7 +125,7 @@ class MessagePassingNetwork(nn.Module):
         node_width: width of the initial node states, 0 for none.
         edge_width: width of the edge features ``x``, which every layer sees.
         odd_width: so many of them, the first, change their sign where an edge is reversed; of a rotation, x, y and z.
-        accumulates: from the second layer on, updates are added to the node states.
+        wiring: default: edges remember.
     """
 
     def __init__(
@@ -118,16 +135,16 @@ class MessagePassingNetwork(nn.Module):
         hidden_width: int = HIDDEN_WIDTH,
         num_layers: int = NUM_LAYERS,
         odd_width: int = 3,
-        accumulates: bool = False,
+        wiring: Wiring = _DEFAULT_WIRING,
     ) -> None:
         super().__init__()
-        self.odd_width = odd_width
+        self.odd_width, self.wiring = odd_width, wiring
         self.layers = nn.ModuleList(
             MessagePassingLayer(
                 node_width if first else hidden_width,
-                edge_width + (0 if first else hidden_width),
+                edge_width + (0 if first or not wiring.remembers else hidden_width),
                 hidden_width,
-                accumulates and not first,
+                wiring.accumulates and not first,
             )
             for first in [True] + [False] * (num_layers - 1)
         )
@@ -136,6 +153,7 @@ class MessagePassingNetwork(nn.Module):
         """Returns the last node states ``(N, hidden)`` and the last layer's messages ``(2M, hidden)``."""
         nodes, activation = self.layers[0](nodes, features, edges)
         for layer in self.layers[1:]:
-            nodes, activation = layer(nodes, torch.cat((features, activation), dim=1), edges)
+            inputs = torch.cat((features, activation), dim=1) if self.wiring.remembers else features
+            nodes, activation = layer(nodes, inputs, edges)
         last = cast(MessagePassingLayer, self.layers[-1])
         return nodes, last.message_output(activation)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros.solver.algebra.medians import median_by_group
-from rotavg_ros.solver.algebra.relaxed_forest import hubs, relaxed_forest
+from rotavg_ros.solver.algebra.relaxed_forest import RelaxedForest, hubs, relaxed_forest
 from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.algebra.spanning_forest import compose, shortest_path_forest
 from rotavg_ros.solver.neurora.cleaned import Cleaned
@@ -50,13 +50,7 @@ def bootstrap(cleaned: Cleaned, component: Tensor | None = None) -> Bootstrapped
     degree = cleaned.edges.degree
     fewest = torch.minimum(degree[cleaned.graph.source], degree[cleaned.graph.target])
     cost = NUMBERS.edge_cost + NUMBERS.outlier_cost * cleaned.outlier_probability + NUMBERS.fringe_cost / fewest
-    if cleaned.graph.device.type == "cpu":
-        forest = shortest_path_forest(cleaned.graph, cost, edges=cleaned.edges, component=component)
-        parent, parent_edge = torch.from_numpy(forest.parent), torch.from_numpy(forest.parent_edge)
-        roots = torch.from_numpy(forest.roots)
-    else:
-        tree = relaxed_forest(cleaned.edges, cost, hubs(cleaned.edges, component))
-        parent, parent_edge, roots = tree.parent, tree.parent_edge, tree.roots
+    parent, parent_edge, roots = _cheapest_forest(cleaned, cost, hubs(cleaned.edges, component), component)
     rectified, raw = (compose(parent, parent_edge, graph) for graph in (cleaned.graph, cleaned.measured))
     rectified_misfit, raw_misfit = _misfits(cleaned, (rectified, raw), component)
     raw_is_better = raw_misfit <= rectified_misfit
@@ -68,6 +62,32 @@ def bootstrap(cleaned: Cleaned, component: Tensor | None = None) -> Bootstrapped
     )
     cleaned = replace(cleaned, graph=replace(cleaned.graph, target_from_source=relative))
     return Bootstrapped(torch.where(chosen, raw, rectified), roots, parent, parent_edge, cleaned)
+
+
+def breadth_first(cleaned: Cleaned, component: Tensor | None = None) -> Bootstrapped:
+    """The paper's tree as its text has it: fewest inlier edges from the node that has most of them.
+
+    An edge is an inlier if its outlier probability is below ε. Parts of a component that no inlier edge joins are
+    joined by as few outliers as can be, of which the paper says nothing.
+
+    Args:
+        component: ``(N,)`` the graph's connected components; default: computed.
+    """
+    component = cleaned.graph.components() if component is None else component
+    is_inlier = cleaned.is_inlier
+    # No path is longer than this, so that one outlier costs more than any number of inliers.
+    cost = torch.where(is_inlier, 1.0, float(cleaned.graph.num_nodes))
+    roots = hubs(cleaned.edges.select(is_inlier), component)
+    parent, parent_edge, roots = _cheapest_forest(cleaned, cost, roots, component)
+    return Bootstrapped(compose(parent, parent_edge, cleaned.graph), roots, parent, parent_edge, cleaned)
+
+
+def _cheapest_forest(cleaned: Cleaned, cost: Tensor, roots: Tensor, component: Tensor) -> RelaxedForest:
+    """Shortest paths from the ``roots`` ``(C,)``: Dijkstra's algorithm on a CPU, rounds over all edges elsewhere."""
+    if cleaned.graph.device.type != "cpu":
+        return relaxed_forest(cleaned.edges, cost, roots)
+    forest = shortest_path_forest(cleaned.graph, cost, roots, edges=cleaned.edges, component=component)
+    return RelaxedForest(torch.from_numpy(forest.parent), torch.from_numpy(forest.parent_edge), roots)
 
 
 def _misfits(cleaned: Cleaned, candidates: Sequence[Tensor], component: Tensor) -> list[Tensor]:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+# What the paper's text has otherwise than this package: cameras' axes as they are given, its networks and its tree.
+PAPER_PARTS = frozenset({"axes", "cleannet", "tree", "finenet"})
+
 
 @dataclass(frozen=True)
 class SfmStages:
@@ -15,6 +18,8 @@ class SfmStages:
         refine: refinement ends the solve.
         weighted: refinement begins by weighing the edges by CleanNet's scores.
         shaped: the refinement estimates the noise's shape; otherwise noise is taken to be round.
+        stated: precisions that edges state are believed as far as residuals bear them out; otherwise not at all.
+        as_written: of :data:`PAPER_PARTS`, those that run as the paper's text has them, not as this package does.
     """
 
     clean: bool = True
@@ -22,3 +27,5 @@ class SfmStages:
     refine: bool = True
     weighted: bool = True
     shaped: bool = True
+    stated: bool = True
+    as_written: frozenset[str] = frozenset()

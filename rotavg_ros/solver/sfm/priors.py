@@ -33,6 +33,32 @@ class NoiseShapePriors:
 
 
 @dataclass(frozen=True)
+class PrecisionPriors:
+    """How far stated precisions are believed (``stated_precision.py``).
+
+    Chosen before any graph with precisions was solved, after those of robots' graphs; none was tuned.
+
+    Attributes:
+        worthless: probability beforehand that stated precisions say nothing.
+        num_exponents: α is one of so many numbers from 0 to 1.
+        least_exponent: a mean below this is hardly more than what was known beforehand, and counts as 0.
+        least_spread: of the logarithms of stated variances; where they spread by less, weights could gain 4 % of
+            variance at most.
+        max_log_ratio: logarithm of the factor by which an edge is believed to be better or worse than typical ones.
+        max_sample: edges that tell α.
+        least_angle: rad; residuals count as at least this, numerical.
+    """
+
+    worthless: float = 0.95
+    num_exponents: int = 9
+    least_exponent: float = 0.1
+    least_spread: float = 0.2
+    max_log_ratio: float = float(np.log(100.0))
+    max_sample: int = 8_000
+    least_angle: float = float(np.radians(1e-4))
+
+
+@dataclass(frozen=True)
 class RefinementPriors:
     """How the refinement weighs edges and when it ends (``refinement.py``).
 

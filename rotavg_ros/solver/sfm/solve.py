@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
+from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.estimate import Estimate, Run
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.fine_net import FineNet
 from rotavg_ros.solver.neurora.numbers import NUMBERS
+from rotavg_ros.solver.neurora.paper import PaperCleanNet, PaperFineNet, paper_fine_tune
 from rotavg_ros.solver.neurora.scores import residual_and_uncertainty, residual_probability
 from rotavg_ros.solver.neurora.stages import apply_labels, clean, fine_tune, trust_all
 from rotavg_ros.solver.neurora.tiled.tuning import tune
-from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap
+from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap, breadth_first
 from rotavg_ros.solver.sfm.options import SfmStages
 from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
 from rotavg_ros.solver.sfm.series import EdgesInSeries
+from rotavg_ros.solver.sfm.stated_precision import Residuals, relative_variance
 from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.solver.sfm.uncertainty import References, variances
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
@@ -38,13 +42,14 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     if graph.num_edges > _TUNING_PAYS and graph.device.type == "cpu":
         tune()
     with watch.stage("order"):
-        form = CanonicalForm.of(graph, component)
+        form = CanonicalForm.of(graph, component, own_axes="axes" not in stages.as_written)
     graph, component = form.graph, form.component
     with watch.stage("clean"):
-        cleaned = clean(networks.load(CleanNet), graph) if stages.clean else trust_all(graph)
+        kind = PaperCleanNet if "cleannet" in stages.as_written else CleanNet
+        cleaned = clean(networks.load(kind), graph) if stages.clean else trust_all(graph)
         cleaned = apply_labels(cleaned, graph.label)
     with watch.stage("bootstrap"):
-        begun = bootstrap(cleaned, component)
+        begun = (breadth_first if "tree" in stages.as_written else bootstrap)(cleaned, component)
         cleaned, orientations = begun.cleaned, begun.body_from_world
         structure = _structure(begun, component)
         if run.warm_start is not None:
@@ -54,7 +59,10 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             )
     for _ in range(stages.fine_tunings):
         with watch.stage("fine-tune"):
-            orientations = fine_tune(networks.load(FineNet), cleaned, orientations, component)
+            if "finenet" in stages.as_written:
+                orientations = paper_fine_tune(networks.load(PaperFineNet), cleaned, orientations)
+            else:
+                orientations = fine_tune(networks.load(FineNet), cleaned, orientations, component)
     steps = run.refinement_steps
     if steps is None:
         steps = PRIORS.max_steps if stages.refine else 0
@@ -63,11 +71,19 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             allowed = (graph.label != EdgeLabel.REJECTED).double()
             coarse = 1 - cleaned.outlier_probability if stages.weighted else torch.ones_like(allowed)
             weights = EdgeWeights(allowed, allowed * coarse)
-            priors = PRIORS if stages.shaped else ROUND
-            orientations = refine(graph, orientations, steps, structure=structure, weights=weights, priors=priors)
+            refinement = partial(
+                refine, graph, max_steps=steps, structure=structure, priors=PRIORS if stages.shaped else ROUND
+            )
+            orientations = refinement(orientations, weights=weights)
+            ratio = _relative_variance(graph, orientations, structure) if stages.stated else None
+            if ratio is not None:
+                weights = EdgeWeights(weights.shaped * ratio**-0.25, weights.coarse * ratio**-0.5)
+                orientations = refinement(orientations, weights=weights)
     score, variance = cleaned.outlier_probability.double(), torch.full((graph.num_nodes,), torch.nan)
-    if steps > 0 or stages.fine_tunings > 0:
-        # Before, there is but a tree; now a residual is the noise but for the orientations' error.
+    by_residuals = stages.fine_tunings > 0 and not ("cleannet" in stages.as_written and stages.clean)
+    if steps > 0 or by_residuals:
+        # Before, there is but a tree; now a residual is the noise but for the orientations' error. The paper's CleanNet
+        # has the last word in any case.
         angle, spread = residual_and_uncertainty(graph, orientations, component)
         score = residual_probability(angle, spread, NUMBERS.outlier_angle)
         series = structure.series
@@ -77,6 +93,15 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
                 stated = variances(graph, angle, score, References(component, form.first_nodes()))
             variance = variance if stated is None else form.of_nodes(stated)
     return Estimate(form.orientations(orientations), score.index_select(0, form.edge), variance)
+
+
+def _relative_variance(graph: ViewGraph, orientations: Tensor, structure: Structure) -> Tensor | None:
+    """Of every edge's noise as far as precisions are stated and residuals bear them out, ``(M,)``; None: no such."""
+    if not bool(graph.precision.isfinite().any()):
+        return None
+    angle = EdgeResiduals(graph, orientations.float()).angles()
+    residuals = Residuals(angle, structure.component[graph.source], structure.redundancy(graph))
+    return relative_variance(graph.precision, residuals)
 
 
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:

@@ -51,8 +51,8 @@ def test_networks_trained_on_given_graphs_can_be_used(tmp_path: Path, monkeypatc
         read_network(NETWORKS[name], tmp_path / f"{name}.safetensors")
 
     case = next(drawings(synthetic.kinds(["released"], 0), [0]))
-    ours = contenders(("neurora-paper",), ROSTER, tmp_path)["neurora-paper"](case)
-    packages = contenders(("neurora-paper",), ROSTER)["neurora-paper"](case)
+    ours = contenders(("neurora-v1",), ROSTER, tmp_path)["neurora-v1"](case)
+    packages = contenders(("neurora-v1",), ROSTER)["neurora-v1"](case)
     assert ours is not None and ours.outlier_score is not None
     assert packages is not None and packages.outlier_score is not None
     assert not torch.allclose(ours.outlier_score, packages.outlier_score)

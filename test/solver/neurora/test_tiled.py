@@ -22,7 +22,7 @@ from rotavg_ros.solver.algebra.threads import workers
 from rotavg_ros.solver.networks import NETWORKS
 from rotavg_ros.solver.neurora.cleaned import Cleaned
 from rotavg_ros.solver.neurora.fine_net import edge_features
-from rotavg_ros.solver.neurora.message_passing import DirectedEdges, MessagePassingNetwork
+from rotavg_ros.solver.neurora.message_passing import DirectedEdges, MessagePassingNetwork, Wiring
 from rotavg_ros.solver.neurora.network_store import load_network
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.neurora.tiled import passes as inference
@@ -118,13 +118,13 @@ def _apart(found: Tensor, expected: Tensor) -> float:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("accumulates", [False, True])
-def test_any_widths_and_any_subset_of_the_edges(accumulates: bool) -> None:
+@pytest.mark.parametrize("wiring", [Wiring(), Wiring(accumulates=True), Wiring(remembers=False)])
+def test_any_widths_and_any_subset_of_the_edges(wiring: Wiring) -> None:
     graph = _random_graph(20, 80, 0)
     kept = torch.from_numpy(np.random.default_rng(1).random(80) < 0.6)
     torch.manual_seed(0)
     network = MessagePassingNetwork(
-        node_width=3, edge_width=7, hidden_width=16, num_layers=3, odd_width=5, accumulates=accumulates
+        node_width=3, edge_width=7, hidden_width=16, num_layers=3, odd_width=5, wiring=wiring
     )
     states, features = torch.randn(20, 3), torch.randn(80, 7)
     few = graph.select_edges(kept)

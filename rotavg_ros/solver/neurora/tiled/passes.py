@@ -95,6 +95,8 @@ class _Walk:
         state: Tensor,
     ) -> None:
         self.layers, self.features, self.edges, self.state = layers, features, edges, state
+        # Whether layers see what the one before has left of an edge.
+        self.remembers = layers[-1].edge_projection.in_features > features.shape[1]
         # Of the features of edges as given, and of edges reversed.
         self.signs = features.new_ones(2, features.shape[1])
         self.signs[1, :odd_width] = -1
@@ -134,7 +136,7 @@ class _Walk:
                 state = self.state[tile.edges]
                 if is_first:
                     self._write_features(tile, state)
-                inputs = state[:, self.hidden :] if is_first else state
+                inputs = state if self.remembers and not is_first else state[:, self.hidden :]
                 if projected is None:
                     activation = torch.addmm(projection.bias, inputs, weight)
                 else:
@@ -143,7 +145,7 @@ class _Walk:
                 if visit is not None:
                     visit(tile, activation)
                     continue
-                if not is_last:
+                if self.remembers and not is_last:
                     state[:, : self.hidden] = activation
                 if len(state):
                     mean[tile.nodes] = self._mean_by_node(tile, activation)

@@ -1,0 +1,60 @@
+"""A picture of training runs: what validation said after every epoch."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from rotavg_ros.errors import UserError
+from rotavg_ros.evaluation.common.plots import MUTED, PALETTE, style
+
+
+class TrainingLogError(UserError):
+    """A log that cannot be drawn; the message names the file."""
+
+
+def read_log(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Epochs ``(E,)`` from 1 and the validation's objective ``(E,)`` of a ``NAME.log.jsonl`` that training writes.
+
+    Raises:
+        TrainingLogError: unreadable, or not such a log.
+    """
+    try:
+        rows = [json.loads(line) for line in path.read_text().splitlines()]
+        epochs = np.array([row["epoch"] + 1 for row in rows], dtype=float)
+        objective = np.array([row["validation_objective"] for row in rows], dtype=float)
+    except OSError as error:
+        raise TrainingLogError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, KeyError, TypeError):
+        raise TrainingLogError(f"{path}: not a log of training (NAME.log.jsonl of `rotavg train`)") from None
+    if len(epochs) == 0:
+        raise TrainingLogError(f"{path}: has no epoch yet")
+    return epochs, objective
+
+
+def draw_training(path: Path, logs: Sequence[Path]) -> None:
+    """A panel for each log, with its best epoch, the one that is kept."""
+    read = [(log, *read_log(log)) for log in logs]
+    figure = Figure(figsize=(4.6 * len(read), 3.6), dpi=150, facecolor="white", layout="constrained")
+    panels = figure.subplots(1, len(read), squeeze=False)[0]
+    for axes, colour, (log, epochs, objective) in zip(panels, PALETTE * len(read), read, strict=False):
+        best = int(objective.argmin())
+        axes.plot(epochs, objective, color=colour, linewidth=1.2)
+        axes.plot(epochs[best], objective[best], "o", color=colour, markersize=5)
+        axes.annotate(
+            f"epoch {epochs[best]:g}: {objective[best]:.3g}",
+            (epochs[best], objective[best]),
+            textcoords="offset points",
+            xytext=(-4, 12),
+            ha="right",
+            fontsize=8,
+            color=MUTED,
+        )
+        style(axes, log.name.removesuffix(".log.jsonl"))
+        axes.set_xlabel("epoch", fontsize=9, color=MUTED)
+        axes.set_ylabel("validation", fontsize=9, color=MUTED)
+    figure.savefig(path)

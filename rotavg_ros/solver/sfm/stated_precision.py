@@ -1,0 +1,102 @@
+"""How far the precisions that edges state are believed: exactly as far as their residuals bear them out.
+
+The scale of what a file states is often unknown, and its differences from edge to edge may mean nothing. So an edge's
+noise is assumed to have the variance of a typical edge's times
+
+    ρ_e = (typical precision / stated precision) ^ α,        0 ≤ α ≤ 1.
+
+α is the mean over its posterior. Beforehand it is 0 with a high probability, so that nothing is believed unless the
+residuals speak for it. Their density is Student's t with one degree of freedom in three dimensions and the scale
+s √ρ_e, which outliers do not swamp; s is the likeliest for each α. The residuals are those of an answer that took all
+edges to be alike.
+
+In the refinement an edge's residual then counts in units of √ρ_e. For the costs |r| and |r|^½ that is a weight of
+ρ^(−1/2) and ρ^(−1/4).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rotavg_ros.solver.algebra.canonical_form import evenly_spread
+from rotavg_ros.solver.algebra.medians import median_by_group
+from rotavg_ros.solver.sfm.priors import PrecisionPriors
+
+PRECISION_PRIORS = PrecisionPriors()
+# Fixed-point steps to the likeliest scale; what is left after so many is below 1 %.
+_SCALE_STEPS = 30
+
+
+class Residuals(NamedTuple):
+    """Of M edges in C components.
+
+    Attributes:
+        angle: ``(M,)`` rad.
+        component: ``(M,)`` of every edge.
+        redundancy: ``(C,)`` edges of each component beyond a spanning tree: so many residuals are worth something.
+    """
+
+    angle: Tensor
+    component: Tensor
+    redundancy: Tensor
+
+
+def relative_variance(
+    precision: Tensor, residuals: Residuals, priors: PrecisionPriors = PRECISION_PRIORS
+) -> Tensor | None:
+    """Variance of every edge's noise in units of a typical edge's of its component, ``(M,)``; None where all are alike.
+
+    Args:
+        precision: ``(M,)`` rad⁻², of any scale; NaN where unknown, which counts as typical.
+    """
+    is_known = precision.isfinite() & (precision > 0)
+    if not bool(is_known.any()):
+        return None
+    group, count = residuals.component, len(residuals.redundancy)
+    log_precision = torch.where(is_known, precision, 1.0).double().log()
+    typical = median_by_group(log_precision[is_known], group[is_known], count)
+    log_ratio = torch.where(is_known, typical[group] - log_precision, 0.0)
+    log_ratio = log_ratio.clamp(-priors.max_log_ratio, priors.max_log_ratio)
+    exponent = _exponents(log_ratio, is_known, residuals, priors)
+    exponent = torch.where(exponent < priors.least_exponent, 0.0, exponent)
+    return (exponent[group] * log_ratio).exp() if bool((exponent > 0).any()) else None
+
+
+def _exponents(log_ratio: Tensor, is_known: Tensor, residuals: Residuals, priors: PrecisionPriors) -> Tensor:
+    """Mean of α over its posterior, ``(C,)``; 0 where stated precisions hardly differ.
+
+    Args:
+        log_ratio: ``(M,)`` of typical to stated precision.
+        is_known: ``(M,)`` bool.
+    """
+    count = len(residuals.redundancy)
+    edges = torch.bincount(residuals.component, minlength=count)
+    known = is_known.nonzero().squeeze(1)
+    chosen = known[evenly_spread(residuals.component[known], count, priors.max_sample)]
+    log_ratio, group = log_ratio[chosen], residuals.component[chosen]
+    number = torch.bincount(group, minlength=count).clamp(min=1)
+    square = residuals.angle[chosen].double().clamp(min=priors.least_angle) ** 2
+    exponent = torch.linspace(0.0, 1.0, priors.num_exponents, dtype=square.dtype, device=square.device)
+    scaled = square * (-exponent[:, None] * log_ratio).exp()  # r²/ρ, a row for each α
+
+    def sums(rows: Tensor) -> Tensor:
+        return rows.new_zeros(len(rows), count).index_add_(1, group, rows)
+
+    scale = median_by_group(square, group, count).expand(len(exponent), count).nan_to_num(nan=1.0)
+    for _ in range(_SCALE_STEPS):
+        # Kent & Tyler (1991): the derivative of the likelihood by s² vanishes at this fixed point.
+        scale = (4 / 3) * sums(scaled / (1 + scaled / scale[:, group])) / number
+        scale = scale.clamp(min=priors.least_angle**2)
+    log_likelihood = sums(
+        -1.5 * (scale[:, group].log() + exponent[:, None] * log_ratio) - 2 * (scaled / scale[:, group]).log1p()
+    )
+    worth = residuals.redundancy.clamp(min=0) / edges.clamp(min=1)
+    prior = torch.full_like(exponent, (1 - priors.worthless) / (len(exponent) - 1))
+    prior[0] = priors.worthless
+    posterior = torch.softmax(worth * log_likelihood + prior.log()[:, None], dim=0)
+    mean = sums(log_ratio[None]) / number
+    spread = (sums(log_ratio[None] ** 2) / number - mean**2).clamp(min=0).sqrt()[0]
+    return torch.where(spread < priors.least_spread, 0.0, exponent @ posterior)
