@@ -11,8 +11,9 @@ from rotavg_ros.solver.neurora.network_store import (
     load_network,
     read_network,
 )
+from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.network import SlamCleanNet
 
 __all__ = ["NETWORKS", "WEIGHTS_FOLDER", "CleanNet", "FineNet", "forget_networks", "load_network", "read_network"]
 
-NETWORKS: dict[str, type[StoredNetwork]] = {kind.NAME: kind for kind in (CleanNet, FineNet, SlamCleanNet)}
+NETWORKS: dict[str, type[StoredNetwork]] = {kind.NAME: kind for kind in (CleanNet, FineNet, SlamCleanNet, SlamFineNet)}

@@ -13,6 +13,8 @@ from rotavg_ros.solver.estimate import Estimate, Places, Run
 from rotavg_ros.solver.slam import refinement as slam_refinement
 from rotavg_ros.solver.slam import stages as slam_stages
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract_along
+from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
+from rotavg_ros.solver.slam.fine_net.tuning import all_fine_tuned
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
@@ -113,15 +115,18 @@ def _solve_by_posterior(graph: ViewGraph, stages: SlamStages, run: Run) -> Estim
     network = None if "cleannet" in stages.without else run.networks.load(SlamCleanNet)
     with run.watch.stage("refine"):
         found = search(graph, network, begin, stages.without)
-        published = publish(found.drawn.problem, found.modes)
+        modes = found.modes
+        if "fine-net" not in stages.without:
+            modes = all_fine_tuned(modes, run.networks.load(SlamFineNet))
+        published = publish(found.drawn.problem, modes)
     with run.watch.stage("expand"):
-        estimate = estimate_of(published, found.modes[0].state.noise)
+        estimate = estimate_of(published, modes[0].state.noise)
         if not stages.without:
             estimate = replace(estimate, memory=PosteriorMemory.of(graph, found, estimate))
     if "translations" in stages.without or not has_places(graph):
         return estimate
     with run.watch.stage("poses"):
-        return _with_poses(graph, estimate, likeliest_poses(graph, found.modes))
+        return _with_poses(graph, estimate, likeliest_poses(graph, modes))
 
 
 def _with_poses(graph: ViewGraph, estimate: Estimate, memory: PoseMemory) -> Estimate:
@@ -196,7 +201,8 @@ def update_slam(graph: ViewGraph, memory: SlamMemory | PosteriorMemory, run: Run
 
 def _updated_by_search(graph: ViewGraph, memory: PosteriorMemory, start: Tensor, run: Run) -> Estimate | None:
     with run.watch.stage("update"):
-        found = memory.updated(graph, run.networks.load(SlamCleanNet), start)
+        networks = run.networks.load(SlamCleanNet), run.networks.load(SlamFineNet)
+        found = memory.updated(graph, networks, start)
     before = memory.poses
     if found is None or before is None:
         return None if found is None else found.estimate

@@ -5,7 +5,9 @@ It has the conditions of the stress suite, but of drawn strength, together, and 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,8 +18,24 @@ from rotavg_ros.datasets.simulation.slam_config import SlamSimulationConfig
 from rotavg_ros.datasets.simulation.stress.drawn import DrawnGraph, per_axis, simulated
 from rotavg_ros.datasets.simulation.trajectories import PLANAR_WORLDS
 from rotavg_ros.datasets.worlds import World
+from rotavg_ros.errors import UserError
 
 _LEAST = 1e-12
+# Ends of what may be asked for; of all that is not named, 0 and 1.
+_BOUNDS: dict[str, tuple[float, float]] = {
+    "odometry_deg": (1e-3, 20.0),
+    "closure_deg": (1e-2, 30.0),
+    "closures_per_keyframe": (1e-3, 3.0),
+    "false_share": (0.0, 0.9),
+    "uneven_factor": (1.0, 100.0),
+    "uneven_steps": (2.0, 1000.0),
+    "level_spread": (0.0, 3.0),
+    "quality_factor": (1.0, 100.0),
+}
+
+
+class RobotFamilyError(UserError):
+    """A family of runs that cannot be drawn from; the message names the key and its range."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +69,9 @@ class RobotFamily:
 
     worlds: tuple[str, ...] = tuple(world.value for world in World)
     planar_share: float = 0.5
-    odometry_deg: tuple[float, float] = (0.03, 2.0)
-    closure_deg: tuple[float, float] = (0.2, 5.0)
-    closures_per_keyframe: tuple[float, float] = (0.03, 1.0)
+    odometry_deg: tuple[float, float] = (0.05, 1.5)
+    closure_deg: tuple[float, float] = (0.2, 4.0)
+    closures_per_keyframe: tuple[float, float] = (0.06, 1.0)
     false_share: tuple[float, float] = (0.0, 0.4)
     grouped_share: float = 0.2
     uneven: float = 0.4
@@ -73,13 +91,44 @@ class RobotFamily:
     stated: float = 0.2
 
     def __post_init__(self) -> None:
+        known = {world.value for world in World}
+        if not self.worlds or not known.issuperset(self.worlds):
+            raise RobotFamilyError(f"worlds is {list(self.worlds)}; choose some of {', '.join(sorted(known))}")
         for field in fields(self):
-            value = getattr(self, field.name)
             if field.name == "worlds":
                 continue
+            value = getattr(self, field.name)
             low, high = value if isinstance(value, tuple) else (value, value)
-            if not 0 <= low <= high:
-                raise ValueError(f"{field.name} is {value}; it must not be negative, and ranges ascend")
+            least, most = _BOUNDS.get(field.name, (0.0, 1.0))
+            if not least <= low <= high <= most:
+                what = "an ascending pair" if isinstance(value, tuple) else "a number"
+                raise RobotFamilyError(f"{field.name} is {value}; use {what} between {least:g} and {most:g}")
+
+    @classmethod
+    def of(cls, content: Any) -> RobotFamily:
+        """From plain values, as a YAML file has them; what is not named is as usual.
+
+        Raises:
+            RobotFamilyError: an unknown key, or a value of the wrong type or beyond its range.
+        """
+        if not isinstance(content, Mapping):
+            raise RobotFamilyError(f"expected `key: value` lines, found {type(content).__name__}")
+        usual, values = cls(), {}
+        for key, value in content.items():
+            if not hasattr(usual, str(key)) or key not in {field.name for field in fields(cls)}:
+                raise RobotFamilyError(f"unknown key {key!r}; known are {', '.join(f.name for f in fields(cls))}")
+            default = getattr(usual, key)
+            try:
+                if key == "worlds":
+                    values[key] = tuple(str(world) for world in value)
+                elif isinstance(default, tuple):
+                    low, high = value
+                    values[key] = float(low), float(high)
+                else:
+                    values[key] = float(value)
+            except (TypeError, ValueError):
+                raise RobotFamilyError(f"{key} is {value!r}, expected like {default!r}") from None
+        return cls(**values)
 
     def drawn(self, keyframes: int, rng: np.random.Generator) -> DrawnGraph:
         """One run of so many keyframes."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rotavg_ros.solver.slam.posterior.problem import Problem
-from rotavg_ros.solver.slam.posterior.rows import residuals, sites, tails, variances, weights_if_good
+from rotavg_ros.solver.slam.posterior.rows import residuals, sites, variances, weights_if_good
 from rotavg_ros.solver.slam.posterior.state import Noise, State
 
 
@@ -21,12 +21,11 @@ class Evidence:
         is_good: ``(E,)`` bool, labels.
         own: ``(E,)`` rad², v, the variance of each edge's own noise as estimated.
         residual_square: ``(E,)`` rad², ‖r‖².
-        weight: ``(E,)`` rad⁻², what each edge weighs as a good one.
+        weight: ``(E,)`` rad⁻², what each edge weighs as a good one; with tails another one than 1 / v.
         rest: ``(E,)`` 1 − w R, what the edge itself leaves of what all others say.
         square: ``(E,)`` rad², ‖μ‖², the discrepancy with what all others say.
         predicted: ``(E,)`` rad², p, the variance of that.
-        tails: ``(E,)`` chance to be in the tails of its kind.
-        log_relative: ``(E,)`` what FineNet said before, 0 in the first pass.
+        log_relative: ``(E,)`` of v over what noise makes of it: what was found in an earlier pass, else 0.
         position: ``(E, 2)`` where the older and the newer end lie along the odometry, in steps; chains are far apart.
         run: ``(C,)`` number of each closure's run.
         steps: ``(E,)`` steps of odometry: of segments their own, of closures those between their ends.
@@ -47,7 +46,6 @@ class Evidence:
     rest: np.ndarray
     square: np.ndarray
     predicted: np.ndarray
-    tails: np.ndarray
     log_relative: np.ndarray
     position: np.ndarray
     run: np.ndarray
@@ -79,7 +77,6 @@ class Evidence:
             rest=state.others.rest,
             square=site.square,
             predicted=site.predicted,
-            tails=tails(problem, state.noise),
             log_relative=np.log(relative),
             position=np.sort(graph.position[np.stack((graph.source, graph.target), axis=1)], axis=1),
             run=problem.run if len(closure) else np.zeros(0, dtype=np.int64),

@@ -8,6 +8,7 @@ estimated where they tell all. Nothing here depends on frame, gauge, the noise's
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,6 +76,19 @@ def fine_features(evidence: Evidence) -> FineFeatures:
         torch.from_numpy(np.stack((evidence.source, evidence.target)).astype(np.int64)),
         num_nodes,
         torch.zeros(len(told), dtype=torch.int64),
+    )
+
+
+def joined(several: Sequence[FineFeatures]) -> FineFeatures:
+    """Several graphs as one that falls apart into them."""
+    first = np.concatenate(([0], np.cumsum([features.num_nodes for features in several])))
+    return FineFeatures(
+        torch.cat([features.edges for features in several]),
+        torch.cat([features.is_odometry for features in several]),
+        torch.cat([features.is_good for features in several]),
+        torch.cat([features.ends + int(start) for features, start in zip(several, first, strict=False)], dim=1),
+        int(first[-1]),
+        torch.cat([torch.full((len(features.edges),), number) for number, features in enumerate(several)]),
     )
 
 
