@@ -42,6 +42,8 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "algebra": set(),
         "estimate": {"neurora"},
         "closures": {"slam"},
+        "fine_tuning": {"diagnosis", "neurora", "slam"},
+        "robot_runs": {"neurora", "slam"},
         "diagnosis": {"neurora", "slam"},
         "odometry_lengths": set(),
         "positions": {"algebra", "odometry_lengths"},

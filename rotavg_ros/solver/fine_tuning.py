@@ -9,15 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rotavg_ros.solver.diagnosis import from_truth
 from rotavg_ros.solver.neurora.network_store import Networks
-from rotavg_ros.solver.slam import stages
 from rotavg_ros.solver.slam.fine_net.features import joined
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.fine_net.sample import FineSample, Losses, Truth
 from rotavg_ros.solver.slam.fine_net.tuning import Tuned, applied
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.network import SlamCleanNet
-from rotavg_ros.solver.slam.posterior.solve import search
+from rotavg_ros.solver.slam.posterior.solve import Drawn
 from rotavg_ros.view_graph import ViewGraph
 
 __all__ = ["FineSample", "Losses", "SlamFineNet", "SolvedRun", "losses_of", "losses_under", "solved_run"]
@@ -53,7 +53,7 @@ class SolvedRun:
 
 @torch.no_grad()
 def solved_run(graph: ViewGraph, body_from_world: Tensor, is_false: Tensor, variance: Tensor) -> SolvedRun | None:
-    """Solve a graph that states nothing twice, without FineNet.
+    """The posterior of a graph that states nothing twice, from its true labels on, without FineNet.
 
     Args:
         graph: N nodes, M edges.
@@ -62,11 +62,13 @@ def solved_run(graph: ViewGraph, body_from_world: Tensor, is_false: Tensor, vari
         variance: ``(M,)`` rad² per component, of each edge's actual noise.
 
     Returns:
-        None where there are too few closures, or the answer is wrong by so much that no weights will mend it.
+        None where there are too few closures, or labels change so that the answer is wrong by so much that no weights
+        will mend it.
     """
     if int((~graph.is_odometry).sum()) < _LEAST_CLOSURES:
         return None
-    mode = search(graph, Networks("cpu").load(SlamCleanNet), stages.bootstrap).modes[0]
+    drawn = Drawn.of(graph, Networks("cpu").load(SlamCleanNet))
+    mode = from_truth(drawn, body_from_world, is_false).modes[0]
     closure_graph = mode.problem.graph
     tuned = Tuned(mode.problem, mode.state, mode.evaluation.factorised)
     correction = np.ascontiguousarray(closure_graph.corrections(body_from_world).numpy().T)
