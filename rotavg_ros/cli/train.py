@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.threads is not None:
         torch.set_num_threads(arguments.threads)
     if (arguments.network == "slam") != (arguments.runs is not None):
-        raise TrainCommandError("`rotavg train slam --from GRAPH…` fine-tunes on your runs; other networks take no --from")
+        raise TrainCommandError("slam fine-tunes on your runs and needs --from GRAPH…; other networks take none")
     if arguments.network == "slam":
         return train_on_robot.run(arguments)
     name = arguments.config or arguments.network

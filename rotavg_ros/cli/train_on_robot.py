@@ -33,10 +33,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Look, simulate, train, compare; keep what is better."""
     truths = arguments.truth or [None] * len(arguments.runs)
     if len(truths) != len(arguments.runs):
-        raise OwnRobotError(f"--truth names {len(truths)} files, --from {len(arguments.runs)}; give one for each, in order")
+        raise OwnRobotError(f"--truth names {len(truths)} files, --from {len(arguments.runs)}; give one for each")
     for name in ("config", "clean_net", "start"):
         if getattr(arguments, name) is not None:
-            raise OwnRobotError(f"`rotavg train slam` takes no {name.replace('_', '-')}: it begins with the package's network")
+            raise OwnRobotError(f"slam takes no {name.replace('_', '-')}: it begins with the package's network")
     runs = [_read(path, truth) for path, truth in zip(arguments.runs, truths, strict=True)]
     noises = [each.noise() for each in runs]
     for path, noise in zip(arguments.runs, noises, strict=True):

@@ -1,4 +1,4 @@
-"""What training sees of a robot's graph: a solved labelling whose truth is known, as FineNet of the SLAM profile gets it."""
+"""What training of robots' FineNet sees of a graph: a solved labelling whose truth is known."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _of_edges(graph: ClosureGraph, variance: np.ndarray) -> np.ndarray:
     """``(E,)`` from ``(M,)``: a segment's is the sum over its edges."""
     is_passed = graph.segment_of_edge >= 0
     of_segments = np.bincount(graph.segment_of_edge[is_passed], variance[is_passed], minlength=graph.num_segments)
-    return np.maximum(np.concatenate((of_segments, variance[graph.view_graph_edge])), _LEAST_VARIANCE)
+    return np.asarray(np.maximum(np.concatenate((of_segments, variance[graph.view_graph_edge])), _LEAST_VARIANCE))
 
 
 def losses_of(network: SlamFineNet, samples: Sequence[FineSample], rng: np.random.Generator) -> Losses:

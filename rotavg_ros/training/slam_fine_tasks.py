@@ -66,9 +66,7 @@ class SlamFineTask:
         return {"objective": figures["log_error"] + figures["log_expected"] + NATS_WEIGHT * figures["nats"], **figures}
 
 
-def draw_runs(
-    family: RobotFamily, count: int, nodes: tuple[int, int], rng: np.random.Generator
-) -> list[SolvedRun]:
+def draw_runs(family: RobotFamily, count: int, nodes: tuple[int, int], rng: np.random.Generator) -> list[SolvedRun]:
     """So many runs that were solved well enough to learn from."""
     runs: list[SolvedRun] = []
     while len(runs) < count:

@@ -98,9 +98,7 @@ class SlamCleanTask:
         }
 
 
-def _draw(
-    count: int, nodes: tuple[int, int], rng: np.random.Generator, family: RobotFamily | None
-) -> list[SlamSample]:
+def _draw(count: int, nodes: tuple[int, int], rng: np.random.Generator, family: RobotFamily | None) -> list[SlamSample]:
     samples: list[SlamSample] = []
     while len(samples) < count:
         sample = sample_run(nodes, rng, family)

@@ -1,15 +1,15 @@
 """Train a network of NeuRoRA on simulated view-graphs.
 
 CONFIG is a YAML file, or the name of one that comes with the package: sfm-clean-net, sfm-fine-net, slam-clean-net,
-slam-fine-net, and the later stages that the package's own networks went through: sfm-clean-net-broad and sfm-fine-net-settled, then
-sfm-clean-net-canonical and sfm-fine-net-canonical. slam-fine-net is that of robots' graphs.
+slam-fine-net, and the later stages that the package's own networks went through: sfm-clean-net-broad and
+sfm-fine-net-settled, then sfm-clean-net-canonical and sfm-fine-net-canonical. Those of slam are of robots' graphs.
 DIR gets, for the network NAME, the best weights (NAME.safetensors), their model card (NAME.json), a log with a line per
 epoch (NAME.log.jsonl) and a checkpoint. Run the same command again after an interruption: training goes on as if it had
 never stopped. An SfM FineNet learns on what a CleanNet leaves, so train CleanNet first, into the same DIR.
 
-`rotavg train slam --from GRAPH…` looks at how your robot errs in its own runs, simulates runs that err alike, and goes on
-training FineNet of robots' graphs on these. DIR gets the outcome only if it explains stretches of your runs that were
-held back better than before, by more than two standard errors.
+`rotavg train slam --from GRAPH…` looks at how your robot errs in its own runs, simulates runs that err alike, and goes
+on training FineNet of robots' graphs on these. DIR gets the outcome only if it explains stretches of your runs that
+were held back better than before, by more than two standard errors.
 """
 
 from __future__ import annotations

@@ -12,9 +12,9 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.estimate import Estimate, Places, Run
 from rotavg_ros.solver.slam import refinement as slam_refinement
 from rotavg_ros.solver.slam import stages as slam_stages
-from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract_along
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.fine_net.tuning import all_fine_tuned
+from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract_along
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias

@@ -113,7 +113,7 @@ class RobotFamily:
         """
         if not isinstance(content, Mapping):
             raise RobotFamilyError(f"expected `key: value` lines, found {type(content).__name__}")
-        usual, values = cls(), {}
+        usual, values = cls(), dict[str, Any]()
         for key, value in content.items():
             if not hasattr(usual, str(key)) or key not in {field.name for field in fields(cls)}:
                 raise RobotFamilyError(f"unknown key {key!r}; known are {', '.join(f.name for f in fields(cls))}")
@@ -135,12 +135,14 @@ class RobotFamily:
         closure_deg = _log_uniform(self.closure_deg, rng)
         config = self._config(keyframes, rng)
         if rng.random() < self.common:
-            config = replace(config, closure_noise_deg=closure_deg, closure_common_share=rng.uniform(*self.common_share))
+            config = replace(
+                config, closure_noise_deg=closure_deg, closure_common_share=rng.uniform(*self.common_share)
+            )
         exact = simulated(config, rng)
         exact, speed = self._with_speed(exact, rng)
         odometry, closure = ~exact.is_closure, exact.is_closure
         usual = per_axis(_log_uniform(self.odometry_deg, rng), exact.planar)
-        sigma = usual * speed * self._levels(int(odometry.sum()), rng)
+        sigma: FloatArray = usual * speed * self._levels(int(odometry.sum()), rng)
         if rng.random() < self.turns:
             turn = np.asarray(exact.true_target_from_source[np.flatnonzero(odometry)].magnitude())
             share = _log_uniform(self.per_turn, rng) / np.sqrt(1 if exact.planar else 3)

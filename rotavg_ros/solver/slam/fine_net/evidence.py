@@ -93,4 +93,4 @@ def _of_segments(shared_out: np.ndarray, problem: Problem) -> np.ndarray:
     """``(E,)`` steps as shared out among segments over how many they are; 1 of all other edges."""
     graph = problem.graph
     is_known = graph.is_odometry & (graph.own_steps > 0)
-    return np.divide(shared_out, graph.own_steps, out=np.ones(len(shared_out)), where=is_known)
+    return np.asarray(np.divide(shared_out, graph.own_steps, out=np.ones(len(shared_out)), where=is_known))

@@ -57,9 +57,7 @@ class SlamFineNet(StoredNetwork):
             around = heard[features.ends[0]] + heard[features.ends[1]]
             state = state + update(torch.cat((state, around), dim=1))
         both = torch.cat((state, x), dim=1)
-        told = torch.where(
-            features.is_odometry, self.segment_head(both).squeeze(1), self.closure_head(both).squeeze(1)
-        )
+        told = torch.where(features.is_odometry, self.segment_head(both).squeeze(1), self.closure_head(both).squeeze(1))
         return centred(_LARGEST * torch.tanh(told / _LARGEST), features)
 
     @staticmethod

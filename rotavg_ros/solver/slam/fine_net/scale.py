@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 _ROUNDS = 4
@@ -57,4 +56,3 @@ class Told:
         kind = self.is_odometry.long()
         none = variance.new_zeros(2)
         return none.index_add(0, kind, squares), self.components * none.index_add(0, kind, part)
-

@@ -89,8 +89,8 @@ class Problem:
         if "slips" in without:
             told[graph.is_odometry] = np.inf
         follows = _predecessors(graph, pairs, priors)
-        along = {"turned": turned, "travelled": travelled}
-        return cls(graph, components, told, chain, follows, priors, without=frozenset(without), bias=bias, **along)
+        problem = cls(graph, components, told, chain, follows, priors, without=frozenset(without), bias=bias)
+        return replace(problem, turned=turned, travelled=travelled)
 
     def with_relative(self, relative: np.ndarray) -> Problem:
         """The same, but for ``relative`` ``(E,)`` times the variances; what is known of the pattern is shared."""
