@@ -52,7 +52,7 @@ class RobotRun:
 
     def noise(self) -> RobotNoise:
         """How it errs."""
-        return robot_noise(self.mode, self.truth)
+        return robot_noise(self.mode, Networks("cpu").load(SlamFineNet), self.truth)
 
     def explained(self, networks: Sequence[SlamFineNet | None]) -> np.ndarray:
         """``(B, n)`` nats a closure that each network gives stretches of closures that are held back."""

@@ -12,6 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from rotavg_ros.datasets.simulation.stress.family import RobotFamily
 from rotavg_ros.errors import UserError
 from rotavg_ros.solver.networks import NETWORKS
 from rotavg_ros.solver.neurora.clean_net import CleanNet
@@ -19,6 +20,7 @@ from rotavg_ros.solver.neurora.network_store import read_network
 from rotavg_ros.training import checkpoint
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.sfm_tasks import SfmCleanTask, SfmFineTask
+from rotavg_ros.training.slam_fine_tasks import SlamFineTask
 from rotavg_ros.training.slam_tasks import SlamCleanTask
 from rotavg_ros.training.trainer import Trainer, TrainingTask, fingerprint
 
@@ -37,6 +39,9 @@ SLAM = TrainingConfig(
     epochs=EPOCHS,
     batch_graphs=2,
 )
+ROBOTS = replace(
+    SLAM, recipe="robots", passes=2, robots=RobotFamily(worlds=("building", "grid"), false_share=(0.0, 0.2))
+)
 CPU = torch.device("cpu")
 
 
@@ -52,6 +57,8 @@ def _one_thread() -> Iterator[None]:
 def make_task(name: str) -> tuple[TrainingTask, TrainingConfig]:
     if name == "slam-clean-net":
         return SlamCleanTask(SLAM), SLAM
+    if name == "slam-fine-net":
+        return SlamFineTask(ROBOTS), ROBOTS
     if name == "sfm-clean-net":
         return SfmCleanTask(SFM, CPU), SFM
     torch.manual_seed(0)
@@ -74,7 +81,7 @@ def log(folder: Path, name: str) -> list[dict[str, float]]:
     return [json.loads(line) for line in (folder / f"{name}.log.jsonl").read_text().splitlines()]
 
 
-@pytest.mark.parametrize("name", ["sfm-clean-net", "sfm-fine-net", "slam-clean-net"])
+@pytest.mark.parametrize("name", ["sfm-clean-net", "sfm-fine-net", "slam-clean-net", "slam-fine-net"])
 def test_resumed_run_equals_unbroken_run_bit_for_bit(name: str, tmp_path: Path) -> None:
     make_trainer(name, tmp_path / "unbroken").run()
     make_trainer(name, tmp_path / "resumed").run(max_epochs=1)

@@ -20,8 +20,8 @@ from rotavg_ros.solver.slam.posterior.rows import residuals
 
 # An edge whose own noise makes up less of what is seen of it says little.
 _TOLD = 0.5
-# Stretches of odometry that together tell of so many steps.
-_STRETCH = 4.0
+# Fewer say nothing of how edges of a kind differ.
+_LEAST_EDGES = 6
 # Closures are held back in so many stretches at most, of so many closures at least.
 _STRETCHES, _IN_STRETCH = 16, 6
 # Solves after closures are held back.
@@ -64,11 +64,12 @@ class RobotNoise:
     states_precision: bool
 
 
-def robot_noise(mode: Mode, truth: np.ndarray | None = None) -> RobotNoise:
+def robot_noise(mode: Mode, network: SlamFineNet, truth: np.ndarray | None = None) -> RobotNoise:
     """Of a run, by its likeliest labelling.
 
     Args:
         mode: without FineNet.
+        network: FineNet.
         truth: ``(4, K)`` true corrections, by which errors are known; default: by what all others say of each edge.
     """
     problem, state = mode.problem, mode.state
@@ -90,7 +91,7 @@ def robot_noise(mode: Mode, truth: np.ndarray | None = None) -> RobotNoise:
         closures_per_keyframe=len(is_false) / len(problem.graph.above),
         false_share=float(is_false.sum()) / closures,
         grouped_share=_grouped(mode),
-        step_spread=_spread_along(evidence),
+        step_spread=_spread_along(mode, network),
         closure_spread=_spread(evidence, ~odometry),
         per_turn=_per_turn(mode, evidence) if noise.turn_share > 0 else 0.0,
         common_share=noise.common_share if noise.run_steps > 0 else 0.0,
@@ -151,7 +152,7 @@ def _level(evidence: Evidence, kind: np.ndarray) -> float:
     """By what the usual variance differs from the estimated one: the median of z² over that of its distribution."""
     square, told = _standardised(evidence, kind)
     clear = square[told > _TOLD]
-    if len(clear) < _IN_STRETCH:
+    if len(clear) < _LEAST_EDGES:
         return 1.0
     k = evidence.components
     # Of χ² over its degrees of freedom (Wilson and Hilferty 1931).
@@ -162,26 +163,21 @@ def _spread(evidence: Evidence, kind: np.ndarray) -> float:
     """Standard deviation of the logarithm of σ, from that of z² beyond what χ² has."""
     square, told = _standardised(evidence, kind)
     clear = square[told > _TOLD]
-    if len(clear) < _IN_STRETCH:
+    if len(clear) < _LEAST_EDGES:
         return 0.0
     beyond = np.log(np.maximum(clear, 1e-4)).var() - float(polygamma(1, evidence.components / 2))
     return float(np.sqrt(max(beyond, 0.0))) / 2
 
 
-def _spread_along(evidence: Evidence) -> float:
-    """The same of odometry, from stretch to stretch, each long enough to tell of its level."""
-    odometry = evidence.is_odometry
-    square, told = _standardised(evidence, odometry)
-    order = np.argsort(evidence.position[odometry & evidence.is_good].mean(axis=1), kind="stable")
-    square, told = square[order], told[order]
-    stretch = (np.cumsum(told) // _STRETCH).astype(np.int64)
-    tells = np.bincount(stretch, told)
-    whole = tells > _STRETCH / 2
-    if whole.sum() < _IN_STRETCH:
-        return 0.0
-    level = np.log(np.maximum(np.bincount(stretch, told * square)[whole] / tells[whole], 1e-4))
-    chance = float((2 / (evidence.components * tells[whole])).mean())
-    return float(np.sqrt(max(level.var() - chance, 0.0))) / 2
+def _spread_along(mode: Mode, network: SlamFineNet) -> float:
+    """The same of odometry, from segment to segment as FineNet has it; each counts as often as it has steps."""
+    tuned = applied(network, applied(network, Tuned(mode.problem, mode.state, mode.evaluation.factorised)))
+    relative, graph = tuned.problem.relative, mode.problem.graph
+    assert relative is not None
+    used = graph.is_odometry & mode.state.is_good
+    level, steps = np.log(relative[used]) / 2, graph.own_steps[used]
+    middle = np.average(level, weights=steps)
+    return float(np.sqrt(np.average((level - middle) ** 2, weights=steps)))
 
 
 def _per_turn(mode: Mode, evidence: Evidence) -> float:
@@ -189,7 +185,7 @@ def _per_turn(mode: Mode, evidence: Evidence) -> float:
     problem = mode.problem
     segments = np.flatnonzero(evidence.is_odometry & evidence.is_good & (evidence.own > evidence.predicted))
     segments = segments[segments < problem.graph.num_segments]
-    if problem.turned is None or len(segments) < _IN_STRETCH:
+    if problem.turned is None or len(segments) < _LEAST_EDGES:
         return 0.0
     graph = problem.graph
     turned = problem.turned[graph.nodes]
