@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from rotavg_ros.datasets.simulation.stress.family import RobotFamily
 from rotavg_ros.datasets.simulation.trajectories import PLANAR_WORLDS
@@ -122,7 +123,8 @@ def fine_tune(
     clocked = time.monotonic()
     for terms in task.batches(np.random.default_rng(0)):
         terms["loss"].backward()  # type: ignore[no-untyped-call]
-    task.validate()
+    with torch.no_grad():
+        task.validate()
     an_epoch = time.monotonic() - clocked
     left = 60 * minutes - (time.monotonic() - begun)
     config = replace(config, epochs=int(np.clip(left / an_epoch, 2, _MOST_EPOCHS)))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -105,13 +106,22 @@ class _Pool:
         """Of sums ``(n, 2)``: the logarithm of variance over estimate, and how much tells of it."""
         return [np.log((sums[:, 0] + 1) / (sums[:, 1] + 1)), np.log1p(sums[:, 1]) / 2]
 
-    def along(self, at: np.ndarray, position: np.ndarray, of: np.ndarray, reach: float) -> np.ndarray:
-        """``(n, 2)`` sums over those of ``of`` whose ``position`` is at most ``reach`` from each of ``at`` ``(n,)``."""
+    def sorted(self, position: np.ndarray, of: np.ndarray) -> _Sorted:
+        """Those of ``of`` ``(m,)`` by their ``position`` ``(m,)``."""
         order = np.argsort(position, kind="stable")
-        cumulated = np.concatenate((np.zeros((1, 2)), np.cumsum(self.sums[of][order], axis=0)))
-        sorted_position = position[order]
-        low = np.searchsorted(sorted_position, at - reach, side="left")
-        return np.asarray(cumulated[np.searchsorted(sorted_position, at + reach, side="right")] - cumulated[low])
+        return _Sorted(position[order], np.concatenate((np.zeros((1, 2)), np.cumsum(self.sums[of[order]], axis=0))))
+
+
+class _Sorted(NamedTuple):
+    """Edges by where they are, and sums up to each."""
+
+    position: np.ndarray
+    cumulated: np.ndarray
+
+    def within(self, reach: float, at: np.ndarray) -> np.ndarray:
+        """``(n, 2)`` sums over those that are at most ``reach`` from each of ``at`` ``(n,)``."""
+        low = self.position.searchsorted(at - reach, side="left")
+        return np.asarray(self.cumulated[self.position.searchsorted(at + reach, side="right")] - self.cumulated[low])
 
 
 def _stretches(evidence: Evidence, pool: _Pool) -> list[np.ndarray]:
@@ -119,24 +129,23 @@ def _stretches(evidence: Evidence, pool: _Pool) -> list[np.ndarray]:
     odometry, closure = np.flatnonzero(evidence.is_odometry), np.flatnonzero(~evidence.is_odometry)
     middle = evidence.position.mean(axis=1)
     ends = evidence.position[closure]
-    by_end = np.concatenate((ends[:, 0], ends[:, 1]))
-    twice = np.concatenate((closure, closure))
+    along = pool.sorted(middle[odometry], odometry)
+    by_end = pool.sorted(np.concatenate((ends[:, 0], ends[:, 1])), np.concatenate((closure, closure)))
     columns = np.zeros((2 * (len(_STRETCHES) + 1), len(middle)))
 
     def fill(number: int, edges: np.ndarray, sums: np.ndarray) -> None:
         columns[2 * number : 2 * number + 2, edges] = _Pool.says(sums)
 
     for number, reach in enumerate(_STRETCHES):
-        fill(number, odometry, pool.along(middle[odometry], middle[odometry], odometry, reach))
-    fill(len(_STRETCHES), odometry, pool.along(middle[odometry], by_end, twice, _NEAR_ENDS[1]))
+        fill(number, odometry, along.within(reach, middle[odometry]))
+    fill(len(_STRETCHES), odometry, by_end.within(_NEAR_ENDS[1], middle[odometry]))
     if len(closure):
         of_run = np.stack([np.bincount(evidence.run, part) for part in pool.sums[closure].T], axis=1)
         fill(0, closure, of_run[evidence.run])
         for number, reach in enumerate(_NEAR_ENDS, start=1):
-            near = [pool.along(end, by_end, twice, reach) for end in ends.T]
-            fill(number, closure, near[0] + near[1])
+            fill(number, closure, by_end.within(reach, ends[:, 0]) + by_end.within(reach, ends[:, 1]))
         for number, end in enumerate(ends.T, start=1 + len(_NEAR_ENDS)):
-            fill(number, closure, pool.along(end, middle[odometry], odometry, _STRETCHES[1]))
+            fill(number, closure, along.within(_STRETCHES[1], end))
         # Which end is the older one is no matter of the edge: their mean and their distance.
         older, newer = columns[6:8, closure].copy(), columns[8:10, closure].copy()
         columns[6:8, closure], columns[8:10, closure] = (older + newer) / 2, np.abs(older - newer)

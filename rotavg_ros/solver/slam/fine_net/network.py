@@ -49,27 +49,19 @@ class SlamFineNet(StoredNetwork):
         state = x.new_zeros(len(x), _WIDTH)
         state = state.index_copy(0, odometry, self.segment_encoder(x[odometry]))
         state = state.index_copy(0, closure, self.closure_encoder(x[closure]))
-        parts = [
-            (part, features.ends[:, part].reshape(-1), _inverse_degree(features, part)) for part in (odometry, closure)
-        ]
+        # At every node two places: for its segments, and for its closures.
+        place = (2 * features.ends + ~features.is_odometry).reshape(-1)
+        degree = torch.bincount(place, minlength=2 * features.num_nodes)
+        inverse_degree = (1 / degree.clamp(min=1).to(x))[:, None]
         for update in self.updates:
-            heard = torch.cat([self._at_nodes(state, *part, features.num_nodes) for part in parts], dim=1)
-            around = heard[features.ends[0]] + heard[features.ends[1]]
+            told = torch.relu(state).repeat(2, 1)
+            heard = x.new_zeros(len(degree), _WIDTH).index_add(0, place, told) * inverse_degree
+            at_nodes = heard.reshape(features.num_nodes, 2 * _WIDTH)
+            around = at_nodes[features.ends[0]] + at_nodes[features.ends[1]]
             state = state + update(torch.cat((state, around), dim=1))
         both = torch.cat((state, x), dim=1)
-        told = torch.where(features.is_odometry, self.segment_head(both).squeeze(1), self.closure_head(both).squeeze(1))
-        return centred(_LARGEST * torch.tanh(told / _LARGEST), features)
-
-    @staticmethod
-    def _at_nodes(state: Tensor, part: Tensor, ends: Tensor, inverse_degree: Tensor, num_nodes: int) -> Tensor:
-        """Means ``(K, width)`` over the edges of a kind at each node."""
-        values = torch.relu(state[part]).repeat(2, 1)
-        return state.new_zeros(num_nodes, state.shape[1]).index_add(0, ends, values) * inverse_degree
-
-
-def _inverse_degree(features: FineFeatures, part: Tensor) -> Tensor:
-    degree = torch.bincount(features.ends[:, part].reshape(-1), minlength=features.num_nodes)
-    return (1 / degree.clamp(min=1).to(features.edges))[:, None]
+        said = torch.where(features.is_odometry, self.segment_head(both).squeeze(1), self.closure_head(both).squeeze(1))
+        return centred(_LARGEST * torch.tanh(said / _LARGEST), features)
 
 
 def centred(value: Tensor, features: FineFeatures) -> Tensor:

@@ -69,7 +69,7 @@ def fine_tuned(mode: Mode, network: SlamFineNet, passes: int = PASSES) -> Mode:
     return replace(mode, problem=tuned.problem, state=tuned.state, evaluation=evaluation)
 
 
-@torch.no_grad()
+@torch.inference_mode()
 def applied(network: SlamFineNet, before: Tuned) -> Tuned:
     """After FineNet once more: its variances take the place of the noise's tails."""
     evidence = Evidence.of(before.problem, before.state)

@@ -58,7 +58,7 @@ def test_uneven_odometry_shows() -> None:
 
 def test_errors_in_turns_show_by_the_truth() -> None:
     turning = replace(USUAL, turns=1, per_turn=(0.08, 0.08), odometry_deg=(0.1, 0.1))
-    drawn, run = run_of(turning, 3, True)
+    _drawn, run = run_of(turning, 3, True)
     noise = run.noise()
     assert noise.per_turn == pytest.approx(0.08, rel=0.4)
     assert run_of(USUAL, 1, True)[1].noise().per_turn < 0.03
