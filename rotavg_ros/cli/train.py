@@ -95,7 +95,7 @@ def make_trainer(network: str, config: TrainingConfig, given: Inputs, output: Pa
     """
     if network.startswith("slam-") and config.family != "slam":
         raise TrainCommandError(f"{given.config}: is of the family {config.family}, {network} of the family slam")
-    network = network.removeprefix("slam-")
+    asked, network = network, network.removeprefix("slam-")
     if network == "clean-net" and given.clean_net is not None:
         raise TrainCommandError("--clean-net is for fine-net; to go on with a CleanNet, give the same --output")
     if config.goes_on_from and given.start is None:
@@ -126,7 +126,7 @@ def make_trainer(network: str, config: TrainingConfig, given: Inputs, output: Pa
         inputs["clean_net_fingerprint"] = fingerprint(before)
         with working("drawing view-graphs"):
             task = SfmFineTask(config, _torch_device(device), before)
-    command = f"rotavg train {network} {Path(given.config).stem if Path(given.config).exists() else given.config}"
+    command = f"rotavg train {asked} {Path(given.config).stem if Path(given.config).exists() else given.config}"
     if given.clean_net is not None:
         command += " --clean-net WEIGHTS"
     if weights is not None:

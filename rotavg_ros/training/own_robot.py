@@ -79,6 +79,7 @@ def family_of(noises: Sequence[RobotNoise]) -> RobotFamily:
         closures_per_keyframe=around([noise.closures_per_keyframe for noise in noises], 1e-3, 3.0),
         false_share=(max(min(false) - _SHARE, 0.0), min(max(false) + _SHARE, 0.9)),
         grouped_share=float(np.mean([noise.grouped_share for noise in noises])),
+        even=0.0,
         uneven=seen([spread > _EVEN for spread in steps]),
         level=seen([spread > _EVEN for spread in steps]),
         level_spread=around([max(*steps, *closures, _EVEN)], 0.0, 3.0),

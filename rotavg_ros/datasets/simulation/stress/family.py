@@ -21,6 +21,8 @@ from rotavg_ros.datasets.worlds import World
 from rotavg_ros.errors import UserError
 
 _LEAST = 1e-12
+# Probabilities of all that is uneven.
+_CAUSES = ("uneven", "level", "single", "turns", "speed", "qualities", "heavy", "common")
 # Ends of what may be asked for; of all that is not named, 0 and 1.
 _BOUNDS: dict[str, tuple[float, float]] = {
     "odometry_deg": (1e-3, 20.0),
@@ -50,6 +52,7 @@ class RobotFamily:
         closures_per_keyframe: uniform in the logarithm.
         false_share: of the closures.
         grouped_share: probability that those of a run are false in groups that agree.
+        even: probability that nothing of what follows is so, false closures and stated precisions apart; otherwise, …
         uneven: probability that stretches of odometry err by more, …
         uneven_factor: … so many times, …
         uneven_steps: … for so many steps, with three to nine times as many between, …
@@ -74,6 +77,7 @@ class RobotFamily:
     closures_per_keyframe: tuple[float, float] = (0.06, 1.0)
     false_share: tuple[float, float] = (0.0, 0.4)
     grouped_share: float = 0.2
+    even: float = 0.4
     uneven: float = 0.4
     uneven_factor: tuple[float, float] = (2.0, 20.0)
     uneven_steps: tuple[float, float] = (8.0, 100.0)
@@ -132,6 +136,8 @@ class RobotFamily:
 
     def drawn(self, keyframes: int, rng: np.random.Generator) -> DrawnGraph:
         """One run of so many keyframes."""
+        if rng.random() < self.even:
+            return replace(self, even=0.0, **dict.fromkeys(_CAUSES, 0.0)).drawn(keyframes, rng)
         closure_deg = _log_uniform(self.closure_deg, rng)
         config = self._config(keyframes, rng)
         if rng.random() < self.common:

@@ -25,6 +25,7 @@ class Evidence:
         rest: ``(E,)`` 1 − w R, what the edge itself leaves of what all others say.
         square: ``(E,)`` rad², ‖μ‖², the discrepancy with what all others say.
         predicted: ``(E,)`` rad², p, the variance of that.
+        log_density: ``(E,)`` nats, of μ if the edge is good, tails included.
         log_relative: ``(E,)`` of v over what noise makes of it: what was found in an earlier pass, else 0.
         position: ``(E, 2)`` where the older and the newer end lie along the odometry, in steps; chains are far apart.
         run: ``(C,)`` number of each closure's run.
@@ -46,6 +47,7 @@ class Evidence:
     rest: np.ndarray
     square: np.ndarray
     predicted: np.ndarray
+    log_density: np.ndarray
     log_relative: np.ndarray
     position: np.ndarray
     run: np.ndarray
@@ -77,6 +79,7 @@ class Evidence:
             rest=state.others.rest,
             square=site.square,
             predicted=site.predicted,
+            log_density=site.log_density,
             log_relative=np.log(relative),
             position=np.sort(graph.position[np.stack((graph.source, graph.target), axis=1)], axis=1),
             run=problem.run if len(closure) else np.zeros(0, dtype=np.int64),

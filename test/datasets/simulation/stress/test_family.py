@@ -10,7 +10,7 @@ import pytest
 from rotavg_ros.datasets.simulation.stress.family import RobotFamily, RobotFamilyError
 from rotavg_ros.datasets.worlds import World
 
-EVEN = RobotFamily(uneven=0, level=0, single=0, turns=0, speed=0, qualities=0, heavy=0, common=0, stated=0)
+EVEN = RobotFamily(uneven=0, level=0, single=0, turns=0, speed=0, qualities=0, heavy=0, common=0, stated=0, even=0)
 
 
 @pytest.mark.parametrize("seed", range(6))

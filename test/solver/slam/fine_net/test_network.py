@@ -21,7 +21,7 @@ from rotavg_ros.solver.slam.stages import bootstrap
 
 _PER_EDGE = (
     *("source", "target", "is_odometry", "is_good", "own", "residual_square", "weight", "rest", "square"),
-    *("predicted", "log_relative", "position", "steps", "turn", "length", "stated"),
+    *("predicted", "log_density", "log_relative", "position", "steps", "turn", "length", "stated"),
 )
 
 

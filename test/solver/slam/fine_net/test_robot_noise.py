@@ -16,7 +16,7 @@ from rotavg_ros.solver.robot_runs import RobotRun
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 
 EVEN = RobotFamily(
-    ("building",), uneven=0, level=0, single=0, turns=0, speed=0, qualities=0, heavy=0, common=0, stated=0
+    ("building",), uneven=0, level=0, single=0, turns=0, speed=0, qualities=0, heavy=0, common=0, stated=0, even=0
 )
 USUAL = replace(
     EVEN,
