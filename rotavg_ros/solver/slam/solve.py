@@ -110,6 +110,8 @@ def _solve_by_posterior(graph: ViewGraph, stages: SlamStages, run: Run) -> Estim
     def begin(prepared: Prepared, cleaned: slam_stages.CleanedClosures) -> Tensor:
         if run.warm_start is not None:
             return prepared.closure_graph.corrections(run.warm_start.double())
+        if "tree" in stages.without:
+            return rotations.identity(prepared.closure_graph.num_nodes)
         return slam_stages.bootstrap(prepared, cleaned)
 
     network = None if "cleannet" in stages.without else run.networks.load(SlamCleanNet)

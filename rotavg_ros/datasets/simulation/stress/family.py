@@ -77,7 +77,7 @@ class RobotFamily:
     closures_per_keyframe: tuple[float, float] = (0.06, 1.0)
     false_share: tuple[float, float] = (0.0, 0.4)
     grouped_share: float = 0.2
-    even: float = 0.4
+    even: float = 0.0
     uneven: float = 0.4
     uneven_factor: tuple[float, float] = (2.0, 20.0)
     uneven_steps: tuple[float, float] = (8.0, 100.0)
