@@ -17,8 +17,8 @@ from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.files.ground_truth import attach_truth
 from rotavg_ros.errors import UserError
 from rotavg_ros.results import make_folder
-from rotavg_ros.solver.fine_tuning import SlamFineNet
-from rotavg_ros.solver.robot_runs import RobotNoise, RobotRun
+from rotavg_ros.solver.learning.fine_tuning import SlamFineNet
+from rotavg_ros.solver.learning.robot_runs import RobotNoise, RobotRun
 from rotavg_ros.training.own_robot import Verdict, compare, family_of, fine_tune
 
 _LEAST_CLOSURES = 12

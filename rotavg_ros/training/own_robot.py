@@ -13,9 +13,9 @@ import torch
 from rotavg_ros.datasets.simulation.stress.family import RobotFamily
 from rotavg_ros.datasets.simulation.trajectories import PLANAR_WORLDS
 from rotavg_ros.datasets.worlds import World
-from rotavg_ros.solver.fine_tuning import SlamFineNet, SolvedRun
+from rotavg_ros.solver.learning.fine_tuning import SlamFineNet, SolvedRun
+from rotavg_ros.solver.learning.robot_runs import RobotNoise, RobotRun
 from rotavg_ros.solver.networks import load_network, read_network
-from rotavg_ros.solver.robot_runs import RobotNoise, RobotRun
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.slam_fine_tasks import SlamFineTask, draw_runs
 from rotavg_ros.training.trainer import Trainer

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros.datasets.simulation.stress.family import RobotFamily
-from rotavg_ros.solver.fine_tuning import Losses, SlamFineNet, SolvedRun, losses_of, losses_under, solved_run
+from rotavg_ros.solver.learning.fine_tuning import Losses, SlamFineNet, SolvedRun, losses_of, losses_under, solved_run
 from rotavg_ros.training.config import TrainingConfig
 
 # A nat per edge by which its variance differs from the true one counts as so much of the logarithm of the mean error:

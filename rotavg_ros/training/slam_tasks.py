@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from rotavg_ros.datasets.simulation.slam_simulation import random_slam_config, simulate_slam_graph
 from rotavg_ros.datasets.simulation.stress.family import RobotFamily
 from rotavg_ros.metrics.calibration import expected_calibration_error
-from rotavg_ros.solver.closures import ClosureFeatures, SlamCleanNet, closure_inputs
+from rotavg_ros.solver.learning.closures import ClosureFeatures, SlamCleanNet, closure_inputs
 from rotavg_ros.solver.neurora.message_passing import DirectedEdges
 from rotavg_ros.training.config import TrainingConfig
 

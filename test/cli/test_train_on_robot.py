@@ -16,7 +16,7 @@ from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.simulation.stress.drawn import DrawnGraph
 from rotavg_ros.datasets.simulation.stress.family import RobotFamily
-from rotavg_ros.solver.robot_runs import RobotNoise
+from rotavg_ros.solver.learning.robot_runs import RobotNoise
 from rotavg_ros.training import own_robot
 from rotavg_ros.training.own_robot import Verdict, family_of
 

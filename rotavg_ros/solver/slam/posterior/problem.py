@@ -67,8 +67,6 @@ class Problem:
         priors: SlamPriors | None = None,
         without: Collection[str] = (),
         bias: Bias | None = None,
-        turned: np.ndarray | None = None,
-        travelled: np.ndarray | None = None,
     ) -> Problem:
         """Find the chains of closures that follow each other closely.
 
@@ -89,8 +87,11 @@ class Problem:
         if "slips" in without:
             told[graph.is_odometry] = np.inf
         follows = _predecessors(graph, pairs, priors)
-        problem = cls(graph, components, told, chain, follows, priors, without=frozenset(without), bias=bias)
-        return replace(problem, turned=turned, travelled=travelled)
+        return cls(graph, components, told, chain, follows, priors, without=frozenset(without), bias=bias)
+
+    def along(self, turned: np.ndarray | None, travelled: np.ndarray | None) -> Problem:
+        """The same where it is known how far odometry turned ``(N,)`` rad² and went ``(N,)`` metres from roots on."""
+        return replace(self, turned=turned, travelled=travelled)
 
     def with_relative(self, relative: np.ndarray) -> Problem:
         """The same, but for ``relative`` ``(E,)`` times the variances; what is known of the pattern is shared."""

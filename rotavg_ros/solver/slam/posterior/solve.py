@@ -55,8 +55,8 @@ class Drawn:
         prepared = prepare_as_it_is(corrected)
         cleaned = clean(network, prepared, graph.label)
         of_bias = None if bias is None else Bias.of(corrected, prepared, bias)
-        along = {"turned": _turned(corrected, prepared), "travelled": _travelled(graph, prepared)}
-        problem = Problem.of(prepared, cleaned.network_log_odds, priors=priors, without=without, bias=of_bias, **along)
+        problem = Problem.of(prepared, cleaned.network_log_odds, priors=priors, without=without, bias=of_bias)
+        problem = problem.along(_turned(corrected, prepared), _travelled(graph, prepared))
         return cls(prepared, cleaned, problem)
 
     def orientations(self, state: State) -> Tensor:

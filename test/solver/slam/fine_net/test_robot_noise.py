@@ -11,8 +11,8 @@ import torch
 
 from rotavg_ros.datasets.simulation.stress.drawn import DrawnGraph
 from rotavg_ros.datasets.simulation.stress.family import RobotFamily
+from rotavg_ros.solver.learning.robot_runs import RobotRun
 from rotavg_ros.solver.neurora.network_store import Networks
-from rotavg_ros.solver.robot_runs import RobotRun
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 
 EVEN = RobotFamily(
