@@ -6,7 +6,7 @@ It has the conditions of the stress suite, but of drawn strength, together, and 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,8 @@ from rotavg_ros.datasets.worlds import World
 from rotavg_ros.errors import UserError
 
 _LEAST = 1e-12
-# Probabilities of all that is uneven.
-_CAUSES = ("uneven", "level", "single", "turns", "speed", "qualities", "heavy", "common")
+# Probabilities of all that is uneven, and that nothing is.
+_CAUSES = ("even", "uneven", "level", "single", "turns", "speed", "qualities", "heavy", "common")
 # Ends of what may be asked for; of all that is not named, 0 and 1.
 _BOUNDS: dict[str, tuple[float, float]] = {
     "odometry_deg": (1e-3, 20.0),
@@ -137,7 +137,7 @@ class RobotFamily:
     def drawn(self, keyframes: int, rng: np.random.Generator) -> DrawnGraph:
         """One run of so many keyframes."""
         if rng.random() < self.even:
-            return replace(self, even=0.0, **dict.fromkeys(_CAUSES, 0.0)).drawn(keyframes, rng)
+            return RobotFamily.of({**asdict(self), **dict.fromkeys(_CAUSES, 0.0)}).drawn(keyframes, rng)
         closure_deg = _log_uniform(self.closure_deg, rng)
         config = self._config(keyframes, rng)
         if rng.random() < self.common:
