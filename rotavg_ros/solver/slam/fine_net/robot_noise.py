@@ -27,7 +27,7 @@ _STRETCHES, _IN_STRETCH = 16, 6
 # Solves after closures are held back.
 _SOLVES = 4
 # False closures repeat each other's turn if they agree within this, rad.
-_SAME_TURN = np.radians(10.0)
+_SAME_TURN = np.radians(5.0)
 _LEAST_SHARE = 0.02
 
 
@@ -199,7 +199,7 @@ def _per_turn(mode: Mode, evidence: Evidence) -> float:
 
 
 def _grouped(mode: Mode) -> float:
-    """Share of the false closures whose wrong turn another one of them has."""
+    """Share of the false closures whose wrong turn another one of them has, less what random turns have by chance."""
     problem = mode.problem
     false = np.flatnonzero(mode.is_false)
     if len(false) < 2:
@@ -208,4 +208,8 @@ def _grouped(mode: Mode) -> float:
     turn = quaternion_rows.exp(np.ascontiguousarray(residual.T))
     cosine = np.abs(turn.T @ turn)
     np.fill_diagonal(cosine, 0.0)
-    return float((cosine.max(axis=1) > np.cos(_SAME_TURN / 2)).mean())
+    agree = float((cosine.max(axis=1) > np.cos(_SAME_TURN / 2)).mean())
+    # Of all rotations, those nearer than that to a given one.
+    near = _SAME_TURN / np.pi if problem.components == 1 else (_SAME_TURN - np.sin(_SAME_TURN)) / np.pi
+    chance = 1 - (1 - near) ** (len(false) - 1)
+    return max(0.0, (agree - chance) / (1 - chance))
