@@ -14,7 +14,6 @@ from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.fine_net.scale import Told
 from rotavg_ros.solver.slam.posterior.em import step
 from rotavg_ros.solver.slam.posterior.mode import Mode
-from rotavg_ros.solver.slam.posterior.modes import FAR
 from rotavg_ros.solver.slam.posterior.objective import Evaluation
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import residuals
@@ -48,8 +47,9 @@ class Tuned:
 
 
 def all_fine_tuned(modes: list[Mode], network: SlamFineNet) -> list[Mode]:
-    """The modes (the best first), those that are likely enough to be published fine-tuned."""
-    return [fine_tuned(mode, network) if mode.cost <= modes[0].cost + FAR else mode for mode in modes]
+    """The modes (the best first), rivals of the best fine-tuned; what is published is made of these."""
+    farthest = modes[0].cost + modes[0].problem.limits.rival
+    return [fine_tuned(mode, network) if mode.cost <= farthest else mode for mode in modes]
 
 
 def fine_tuned(mode: Mode, network: SlamFineNet, passes: int = PASSES) -> Mode:

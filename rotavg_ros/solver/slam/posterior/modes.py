@@ -16,7 +16,7 @@ from rotavg_ros.solver.slam.posterior.mode import OTHER_NOISE, Mode
 from rotavg_ros.solver.slam.posterior.problem import Problem
 
 # No labelling counts that is less likely by so many nats, and no other noise of the same labels.
-FAR, _FAR_NOISE = 5.0, 2.0
+_FAR, _FAR_NOISE = 5.0, 2.0
 # Rivals as likely as this that turn a node by more than this, rad, are worth a warning.
 _LIKELY, _FAR_TURN = 0.05, np.radians(5.0)
 # What is less likely good than this does not pull at all.
@@ -102,7 +102,7 @@ def distinct(problem: Problem, modes: list[Mode]) -> tuple[list[Mode], np.ndarra
     """
     labellings: list[list[Mode]] = []
     for mode in modes:
-        if mode.cost > modes[0].cost + FAR:
+        if mode.cost > modes[0].cost + _FAR:
             break
         alike = next((others for others in labellings if mode.is_like(others[0].state)), None)
         if alike is None:

@@ -67,6 +67,7 @@ class Problem:
         priors: SlamPriors | None = None,
         without: Collection[str] = (),
         bias: Bias | None = None,
+        turned: np.ndarray | None = None,
     ) -> Problem:
         """Find the chains of closures that follow each other closely.
 
@@ -87,11 +88,9 @@ class Problem:
         if "slips" in without:
             told[graph.is_odometry] = np.inf
         follows = _predecessors(graph, pairs, priors)
-        return cls(graph, components, told, chain, follows, priors, without=frozenset(without), bias=bias)
-
-    def along(self, turned: np.ndarray | None, travelled: np.ndarray | None) -> Problem:
-        """The same where it is known how far odometry turned ``(N,)`` rad² and went ``(N,)`` metres from roots on."""
-        return replace(self, turned=turned, travelled=travelled)
+        return cls(
+            graph, components, told, chain, follows, priors, without=frozenset(without), bias=bias, turned=turned
+        )
 
     def with_relative(self, relative: np.ndarray) -> Problem:
         """The same, but for ``relative`` ``(E,)`` times the variances; what is known of the pattern is shared."""

@@ -55,8 +55,11 @@ class Drawn:
         prepared = prepare_as_it_is(corrected)
         cleaned = clean(network, prepared, graph.label)
         of_bias = None if bias is None else Bias.of(corrected, prepared, bias)
-        problem = Problem.of(prepared, cleaned.network_log_odds, priors=priors, without=without, bias=of_bias)
-        problem = problem.along(_turned(corrected, prepared), _travelled(graph, prepared))
+        turned = _turned(corrected, prepared)
+        problem = Problem.of(
+            prepared, cleaned.network_log_odds, priors=priors, without=without, bias=of_bias, turned=turned
+        )
+        problem = replace(problem, travelled=_travelled(graph, prepared))
         return cls(prepared, cleaned, problem)
 
     def orientations(self, state: State) -> Tensor:
