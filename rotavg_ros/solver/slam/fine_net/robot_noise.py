@@ -212,4 +212,4 @@ def _grouped(mode: Mode) -> float:
     # Of all rotations, those nearer than that to a given one.
     near = _SAME_TURN / np.pi if problem.components == 1 else (_SAME_TURN - np.sin(_SAME_TURN)) / np.pi
     chance = 1 - (1 - near) ** (len(false) - 1)
-    return max(0.0, (agree - chance) / (1 - chance))
+    return float(max(0.0, (agree - chance) / (1 - chance)))
