@@ -14,6 +14,7 @@ import numpy as np
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.slam.noise.exceedance import exceedance
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
+from rotavg_ros.solver.slam.posterior.densities import log_half_turn
 
 # Classes of good closures, and of those of wrong places of their own; one more repeats another's.
 _GOOD, _WRONG = 2, 6
@@ -79,14 +80,6 @@ class Told:
     own_share: np.ndarray
     follows: np.ndarray
     sign: np.ndarray
-
-    @property
-    def has_neighbour(self) -> np.ndarray:
-        """``(C,)`` bool, whether the place of the closure before or after it is told as well."""
-        later = np.flatnonzero((self.follows >= 0) & self.is_known & self.is_known[self.follows])
-        found = np.zeros(len(self.follows), dtype=bool)
-        found[later] = found[self.follows[later]] = True
-        return found
 
 
 @dataclass(frozen=True)
@@ -182,9 +175,13 @@ class Judge:
         total = spread + variance[:, :, None]
         log_shift = -(along**2 / total + np.log(2 * np.pi * total)).sum(axis=2) / 2
         shift = told.sign[:, None] * predictions.mean[:, k:]
-        log_shift[-1] = _log_repeated(shift, before, told, scale.closure, in_order)
-        log_false = told.false_odds + np.where(known, self._log_unrelated(predictions, scale, log_shift[-1]), 0.0)
-        log_class = log_shift + self._log_classes(before)
+        repeats = _repeats(shift, before, told, scale.closure, in_order)
+        log_shift[-1] = 0.0
+        share = _wrong_share(before, told, self.priors)
+        log_false = told.false_odds + np.where(known, self._log_unrelated(predictions, scale, repeats), 0.0)
+        log_behind = _log_from_behind(predictions, seen_alike, k) + self._log_behind(predictions, scale, repeats)
+        log_false = np.where(known, np.logaddexp(log_false, log_behind + np.log(share)), log_false)
+        log_class = log_shift + self._log_classes(share, repeats)
         # Without a translation nothing tells of a place: a closure whose rotation is right is good.
         log_class[:, ~known] = _LOG_NOTHING
         log_class[0, ~known] = 0.0
@@ -252,12 +249,17 @@ class Judge:
         least = min(self.priors.least_wrong**2 * scale.closure, scale.extent)
         return np.asarray(scale.extent * (least / scale.extent) ** np.linspace(1.0, 0.0, _WRONG))
 
-    def _log_classes(self, before: np.ndarray) -> np.ndarray:
-        """``(J, C)`` nats, of each class if the rotation is no false one."""
-        priors, share = self.priors, _wrong_share(before, self.told, self.priors)
+    def _log_classes(self, share: np.ndarray, repeats: _Repeats) -> np.ndarray:
+        """``(J, C)`` nats, of each class if the rotation is no false one.
+
+        Args:
+            share: ``(C,)`` of wrong places.
+            repeats: of those before and after.
+        """
+        priors = self.priors
         right, wrong = np.log1p(-share), np.log(share)
-        log_alone, log_repeat = self._log_repeats()
-        by_itself = wrong + log_alone - np.log(_WRONG)
+        log_alone, log_repeat = self._log_repeats(repeats.alike, repeats)
+        by_itself = wrong + log_alone + np.log1p(-priors.from_behind) - np.log(_WRONG)
         return np.stack(
             (
                 right + np.log1p(-priors.tails),
@@ -267,24 +269,34 @@ class Judge:
             )
         )
 
-    def _log_repeats(self) -> tuple[np.ndarray, np.ndarray]:
-        """``(C,)`` nats each, that a wrong place is no neighbour's, and that it is."""
-        may_repeat, share = self.told.has_neighbour, self.priors.repeats
-        return np.where(may_repeat, np.log1p(-share), 0.0), np.where(may_repeat, np.log(share), _LOG_NOTHING)
+    def _log_repeats(self, density: np.ndarray, repeats: _Repeats) -> tuple[np.ndarray, np.ndarray]:
+        """``(C,)`` nats each: that a wrong place is no neighbour's; and that it is, with the density of its shift."""
+        share = self.priors.repeats
+        with np.errstate(divide="ignore"):
+            return np.log1p(-share * repeats.chance), np.maximum(np.log(share * density), _LOG_NOTHING)
 
-    def _log_unrelated(self, predictions: Predictions, scale: Scale, log_repeated: np.ndarray) -> np.ndarray:
+    def _log_anywhere(self, predictions: Predictions, scale: Scale) -> np.ndarray:
+        """``(C,)`` nats, of shifts that lead anywhere on the map."""
+        along, spread = _along_axes(predictions, self.turns)
+        total = spread + scale.extent
+        return np.asarray(-(along**2 / total + np.log(2 * np.pi * total)).sum(axis=1) / 2)
+
+    def _log_behind(self, predictions: Predictions, scale: Scale, repeats: _Repeats) -> np.ndarray:
+        """``(C,)`` nats, of shifts of closures that join wrong places, seen from the other side."""
+        log_alone, log_repeat = self._log_repeats(repeats.turned, repeats)
+        log_alone = log_alone + np.log(self.priors.from_behind) + self._log_anywhere(predictions, scale)
+        return np.asarray(np.logaddexp(log_alone, log_repeat))
+
+    def _log_unrelated(self, predictions: Predictions, scale: Scale, repeats: _Repeats) -> np.ndarray:
         """``(C,)`` nats, of shifts of closures whose rotation is false: wrong places, or the right one turned."""
-        k, (log_itself, log_repeat) = self.turns, self._log_repeats()
-        spread, axes = np.linalg.eigh(predictions.covariance[:, k:, k:])
-        along = np.matmul(axes.transpose(0, 2, 1), predictions.mean[:, k:, None])[:, :, 0]
-        total = np.maximum(spread, 0.0) + self._wrong(scale)[:, None, None]
-        log_each = -(along**2 / total + np.log(2 * np.pi * total)).sum(axis=2) / 2
-        log_alone = _log_sum(log_each) - np.log(_WRONG)
-        log_wrong = np.logaddexp(log_alone + log_itself, log_repeated + log_repeat)
-        right = np.maximum(spread, 0.0) + (scale.good * self.told.own_share)[:, None]
+        along, spread = _along_axes(predictions, self.turns)
+        right = spread + (scale.good * self.told.own_share)[:, None]
         log_right = -(along**2 / right + np.log(2 * np.pi * right)).sum(axis=1) / 2
         share = self.priors.turned_in_place
-        return np.asarray(np.logaddexp(log_wrong + np.log1p(-share), log_right + np.log(share)))
+        log_alone, log_repeat = self._log_repeats(repeats.turned, repeats)
+        log_wrong = self._log_anywhere(predictions, scale)
+        log_alone = log_alone + np.logaddexp(log_wrong + np.log1p(-share), log_right + np.log(share))
+        return np.asarray(np.logaddexp(log_alone, log_repeat))
 
     def _as_labelled(self, log_all: np.ndarray) -> np.ndarray:
         """Without the classes that somebody's label, or that of rotations, rules out."""
@@ -337,6 +349,20 @@ def _given_turn(predictions: Predictions, variance: np.ndarray, turns: int) -> _
     return _GivenTurn(log_turn, np.matmul(axes.transpose(0, 2, 1), given[:, :, None])[:, :, 0], np.maximum(spread, 0.0))
 
 
+def _along_axes(predictions: Predictions, turns: int) -> tuple[np.ndarray, np.ndarray]:
+    """``(C, m)`` metres and m² of shifts along the axes of their covariances, whatever the turns."""
+    spread, axes = np.linalg.eigh(predictions.covariance[:, turns:, turns:])
+    along = np.matmul(axes.transpose(0, 2, 1), predictions.mean[:, turns:, None])[:, :, 0]
+    return along, np.maximum(spread, 0.0)
+
+
+def _log_from_behind(predictions: Predictions, variance: np.ndarray, turns: int) -> np.ndarray:
+    """``(C,)`` nats, of turns that are half a turn off but for noise of ``variance`` ``(C,)`` rad²."""
+    spread = np.trace(predictions.covariance[:, :turns, :turns], axis1=1, axis2=2) / turns
+    angle = np.minimum(np.sqrt((predictions.mean[:, :turns] ** 2).sum(axis=1)), np.pi)
+    return log_half_turn(angle, variance + spread, turns)
+
+
 def _wrong_share(before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndarray:
     """``(C,)`` how likely each is to join wrong places, by all others and by its run most (Beta, Bernoulli)."""
     wrong = before[_GOOD:-1].sum(axis=0) * told.is_known
@@ -346,10 +372,25 @@ def _wrong_share(before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndar
     return np.asarray(np.clip((overall + in_run) / (1 + of_run), _SHARE, 1 - _SHARE))
 
 
-def _log_repeated(
+@dataclass(frozen=True)
+class _Repeats:
+    """Of C closures, by the ones before and after.
+
+    Attributes:
+        chance: ``(C,)`` that such a one joins wrong places.
+        alike, turned: ``(C,)`` densities of each one's shift if it is such a one's, where that is seen nearly at the
+            right angle, and where not; times the chances of these.
+    """
+
+    chance: np.ndarray
+    alike: np.ndarray
+    turned: np.ndarray
+
+
+def _repeats(
     mean: np.ndarray, before: np.ndarray, told: Told, closure_variance: float, in_order: bool
-) -> np.ndarray:
-    """``(C,)`` nats, density of each closure's shift if it joins the same wrong place as the one before or after.
+) -> _Repeats:
+    """By the closures that follow each other, if both join the same wrong place.
 
     Args:
         mean: ``(C, m)`` metres, what each is off by, from its older to its newer end.
@@ -360,21 +401,23 @@ def _log_repeated(
     """
     later = np.flatnonzero((told.follows >= 0) & told.is_known & told.is_known[told.follows])
     earlier = told.follows[later]
-    wrong = before[_GOOD:].sum(axis=0)
     square = ((mean[later] - mean[earlier]) ** 2).sum(axis=1)
     variance = 2 * closure_variance * _KERNELS[:, None]
     density = np.exp(-square / (2 * variance)) / (2 * np.pi * variance) ** (mean.shape[1] / 2)
     density = density.mean(axis=0)
     count = len(mean)
-    total = np.bincount(later, density * wrong[earlier], count)
-    neighbours = np.bincount(later, minlength=count)
-    if not in_order:
-        total = total + np.bincount(earlier, density * wrong[later], count)
-        neighbours = neighbours + np.bincount(earlier, minlength=count)
-    return np.asarray(np.log(np.maximum(total / np.maximum(neighbours, 1), _LEAST_DENSITY)))
+    ends = [(later, earlier)] if in_order else [(later, earlier), (earlier, later)]
+    neighbours = np.maximum(sum(np.bincount(end, minlength=count) for end, _ in ends), 1)
+
+    def mean_over(weight: np.ndarray, each: np.ndarray) -> np.ndarray:
+        return np.asarray(sum(np.bincount(end, each * weight[other], count) for end, other in ends) / neighbours)
+
+    alike, turned = before[_GOOD:-1].sum(axis=0), before[-1]
+    ones = np.ones(len(later))
+    return _Repeats(mean_over(alike + turned, ones), mean_over(alike, density), mean_over(turned, density))
 
 
-# Squared widths of what repeats differ by, in those of two good closures; the least density that counts.
-_KERNELS, _LEAST_DENSITY = np.array([1.0, 16.0]), 1e-300
+# Squared widths of what repeats differ by, in those of two good closures.
+_KERNELS = np.array([1.0, 16.0, 256.0])
 # No share is less than this, or nearer to one.
 _SHARE = 0.01

@@ -23,6 +23,7 @@ class PlacePriors:
         tails: share of good closures whose translation errs by far more than others', …
         tail_ratio: … by so many times the variance.
         turned_deg: standard deviation of how much another place that looks alike is seen turned.
+        from_behind: share of places that look alike that do so from the other side, half a turn off.
         turned_in_place: share of false rotations at the right place: symmetric rooms, registrations that flip.
         wrong_place: closures of a plausible rotation that join wrong places: a priori that many in as many as are
             counted beforehand, …
@@ -43,8 +44,9 @@ class PlacePriors:
     tails: float = 0.1
     tail_ratio: float = 16.0
     turned_deg: float = 10.0
+    from_behind: float = 0.5
     turned_in_place: float = 0.5
     wrong_place: float = 0.5
     counted: float = 3.0
-    repeats: float = 0.5
+    repeats: float = 0.9
     least_wrong: float = 4.0

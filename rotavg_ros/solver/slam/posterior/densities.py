@@ -110,11 +110,17 @@ def log_false(
     variance = np.radians(priors.near_miss_deg) ** 2
     uniform = log_uniform_density(np.sqrt(square), components) + np.log1p(-share)
     near = log_normal(square, variance + predicted, components)
-    angle = np.minimum(np.sqrt(square), np.pi)
-    half_turn = log_normal((np.pi - angle) ** 2, variance, 1)
-    if components == 3:  # from the angle's density, all axes alike
-        half_turn = half_turn + np.log(2.0) - np.log(4 * np.pi * np.maximum(angle, _LEAST_ANGLE) ** 2)
+    half_turn = log_half_turn(np.sqrt(square), variance, components)
     return np.asarray(np.logaddexp(uniform, np.logaddexp(near, half_turn) + np.log(share / 2)))
+
+
+def log_half_turn(angle: np.ndarray, variance: np.ndarray | float, components: int) -> np.ndarray:
+    """Of turns by ``angle``, rad, that are normal about half a turn about any axis, with ``variance`` rad²."""
+    angle = np.minimum(angle, np.pi)
+    density = log_normal((np.pi - angle) ** 2, variance, 1)
+    if components == 3:  # from the angle's density, all axes alike
+        density = density + np.log(2.0) - np.log(4 * np.pi * np.maximum(angle, _LEAST_ANGLE) ** 2)
+    return np.asarray(density)
 
 
 def log_slipped(

@@ -42,17 +42,17 @@ class SlamPriors:
 
     step_deg: float = 0.3
     closure_deg: float = 2.0
-    noise_spread: float = 1.2
+    noise_spread: float = 0.7
     tails: float = 0.5
     tail_ratio: float = 16.0
     outlier_share: float = 0.25
     outlier_count: float = 4.0
-    near_miss_share: float = 0.2
+    near_miss_share: float = 0.5
     near_miss_deg: float = 20.0
     elsewhere_count: float = 10.0
     slip_count: float = 1.0
-    slip_steps: float = 2000.0
-    slip_deg: float = 60.0
+    slip_steps: float = 20000.0
+    slip_deg: float = 45.0
     bias_deg: float = 1.0
     run_gap_steps: float = 30.0
     common_errors: float = 0.5
