@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 from safetensors.torch import load_file
 
 from rotavg_ros.datasets.simulation.stress.family import RobotFamily
@@ -229,3 +230,27 @@ def test_training_reduces_the_loss(tmp_path: Path) -> None:
     Trainer(SfmCleanTask(config, CPU), config, tmp_path, "sfm-clean-net").run()
     losses = [row["loss"] for row in log(tmp_path, "sfm-clean-net")]
     assert losses[-1] < 0.7 * losses[0]
+
+
+def test_a_stated_family_is_what_both_networks_of_robots_see() -> None:
+    """All closures of one false share, in flat worlds alone."""
+    family = RobotFamily(
+        worlds=("building",), planar_share=1.0, false_share=(0.3, 0.3), closures_per_keyframe=(0.5, 0.5)
+    )
+    config = replace(SLAM, recipe="robots", robots=family)
+    false = torch.cat([sample.is_false for sample in SlamCleanTask(config).samples])
+    assert float(false.double().mean()) == pytest.approx(0.3, abs=0.05)
+    runs = SlamFineTask(replace(config, graphs=2, validation_graphs=1)).runs
+    assert all(run.first.told.components == 1 for run in runs)
+
+
+def test_a_family_survives_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "robots.yaml"
+    path.write_text(yaml.safe_dump(ROBOTS.to_dict()))
+    assert TrainingConfig.load(path) == ROBOTS
+    path.write_text("family: slam\nrecipe: robots\nrobots:\n  worlds: [moon]\n")
+    with pytest.raises(UserError, match=r"robots.yaml: robots: worlds is \['moon'\]; choose some of building"):
+        TrainingConfig.load(path)
+    path.write_text("family: slam\nrecipe: wide\nrobots:\n  planar_share: 1\n")
+    with pytest.raises(UserError, match="robots is for `recipe: robots`"):
+        TrainingConfig.load(path)

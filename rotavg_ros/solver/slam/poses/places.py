@@ -387,9 +387,7 @@ class _Repeats:
     turned: np.ndarray
 
 
-def _repeats(
-    mean: np.ndarray, before: np.ndarray, told: Told, closure_variance: float, in_order: bool
-) -> _Repeats:
+def _repeats(mean: np.ndarray, before: np.ndarray, told: Told, closure_variance: float, in_order: bool) -> _Repeats:
     """By the closures that follow each other, if both join the same wrong place.
 
     Args:
