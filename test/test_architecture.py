@@ -18,6 +18,7 @@ INWARD: dict[str, set[str]] = {
     "option": {"errors"},
     "view_graph": {"errors", "rotations"},
     "hamilton": set(),
+    "startup": set(),
     "rotations": {"hamilton"},
     "baselines": {"errors", "rotations", "solver", "view_graph"},
     "solver": {"baselines", "errors", "hamilton", "rotations", "view_graph"},
@@ -228,7 +229,7 @@ FACES = {
 }
 INSIDERS = {"baselines": {"algebra", "neurora"}, "training": {"algebra", "neurora"}}
 # What a robot runs needs no more.
-NODE_MAY_USE = {"errors", "inputs", "online", "option", "settings", "solver", "version", "view_graph"}
+NODE_MAY_USE = {"errors", "inputs", "online", "option", "settings", "solver", "startup", "version", "view_graph"}
 # Others' packages that only one wing may know.
 BORDERS = {"rclpy": "ros", "rosbags": "bags", "mcap": "bags"}
 # Who imports by name what no arrow is about: subcommands, message packages, peers that may not be installed.

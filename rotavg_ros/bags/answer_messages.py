@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 
+from rotavg_ros.bags.bulk import Rows, StampedPoses
 from rotavg_ros.bags.message_types import typestore
 from rotavg_ros.online import Answer
 from rotavg_ros.online.answer.drawing import EDGE_WIDTH_M, KEYFRAME_COLOR, KEYFRAME_SIZE_M, PALETTE, Drawing
@@ -24,6 +25,7 @@ MARKERS = "visualization_msgs/msg/MarkerArray"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 _NANOSECONDS = 1_000_000_000
+_END_OF_TIME_S = 2**31  # seconds of a stamp are 32 bits with a sign
 
 
 def orientations_message(answer: Answer, frame_id: str) -> Any:
@@ -71,30 +73,19 @@ def orientation_message(stamp_ns: int, world_from_body: Quaternion, frame_id: st
 
 
 def path_message(trajectory: Trajectory, frame_id: str) -> Any:
-    """A ``nav_msgs/msg/Path``; the origin where positions are not known."""
-    pose_stamped, pose = _type("geometry_msgs/msg/PoseStamped"), _type("geometry_msgs/msg/Pose")
-    point = _type("geometry_msgs/msg/Point")
-    poses = [
-        pose_stamped(
-            header=_header(stamp_ns, frame_id),
-            pose=pose(position=point(*position), orientation=_quaternion(orientation)),
-        )
-        for stamp_ns, position, orientation in zip(
-            trajectory.stamp_ns.tolist(),
-            np.nan_to_num(trajectory.position).tolist(),
-            trajectory.world_from_body.tolist(),
-            strict=True,
-        )
-    ]
+    """A ``nav_msgs/msg/Path`` with its poses in bulk; the origin where positions are not known."""
+    stamp = np.stack(np.divmod(trajectory.stamp_ns, _NANOSECONDS), axis=1)
+    stamp[(stamp[:, 0] < 0) | (stamp[:, 0] >= _END_OF_TIME_S)] = 0
+    pose = np.concatenate((np.nan_to_num(trajectory.position), trajectory.world_from_body), axis=1)
+    poses = StampedPoses(stamp, frame_id, pose)
     newest = int(trajectory.stamp_ns[-1]) if len(trajectory.stamp_ns) else 0
     return _make(PATH, header=_header(newest, frame_id), poses=poses)
 
 
 def markers_message(drawing: Drawing, frame_id: str) -> Any:
-    """A ``visualization_msgs/msg/MarkerArray``: a sphere list of keyframes and a line list of edges."""
+    """A ``visualization_msgs/msg/MarkerArray``: a sphere list of keyframes and a line list of edges, points in bulk."""
     marker, color = _type("visualization_msgs/msg/Marker"), _type("std_msgs/msg/ColorRGBA")
     size = {"x": KEYFRAME_SIZE_M, "y": KEYFRAME_SIZE_M, "z": KEYFRAME_SIZE_M}
-    palette = [color(*rgba) for rgba in PALETTE]
     upright = _make("geometry_msgs/msg/Pose", orientation=_quaternion((0.0, 0.0, 0.0, 1.0)))
     spheres = _make(
         "visualization_msgs/msg/Marker",
@@ -104,7 +95,7 @@ def markers_message(drawing: Drawing, frame_id: str) -> Any:
         pose=upright,
         scale=_make("geometry_msgs/msg/Vector3", **size),
         color=color(*KEYFRAME_COLOR),
-        points=_points(drawing.keyframes),
+        points=Rows(drawing.keyframes),
     )
     lines = _make(
         "visualization_msgs/msg/Marker",
@@ -113,8 +104,8 @@ def markers_message(drawing: Drawing, frame_id: str) -> Any:
         type=marker.LINE_LIST,
         pose=upright,
         scale=_make("geometry_msgs/msg/Vector3", x=EDGE_WIDTH_M),
-        points=_points(drawing.edge_ends),
-        colors=[palette[shade] for shade in drawing.edge_shades.tolist() for _ in range(2)],
+        points=Rows(drawing.edge_ends),
+        colors=Rows(np.repeat(np.array(PALETTE, dtype=np.float32)[drawing.edge_shades], 2, axis=0)),
     )
     return _make(MARKERS, markers=[spheres, lines])
 
@@ -135,17 +126,12 @@ def diagnostics_message(stamp_ns: int, level: int, name: str, message: str, valu
 
 def _header(stamp_ns: int, frame_id: str) -> Any:
     seconds, nanosec = divmod(stamp_ns, _NANOSECONDS)
-    time = (seconds, nanosec) if 0 <= seconds < 2**31 else (0, 0)
+    time = (seconds, nanosec) if 0 <= seconds < _END_OF_TIME_S else (0, 0)
     return _type("std_msgs/msg/Header")(stamp=_type("builtin_interfaces/msg/Time")(*time), frame_id=frame_id)
 
 
 def _quaternion(xyzw: Iterable[float]) -> Any:
     return _type("geometry_msgs/msg/Quaternion")(*xyzw)
-
-
-def _points(xyz: NDArray[np.float64]) -> list[Any]:
-    point = _type("geometry_msgs/msg/Point")
-    return [point(*row) for row in xyz.tolist()]
 
 
 @cache

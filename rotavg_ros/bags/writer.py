@@ -12,6 +12,7 @@ from typing import Any
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
+from rotavg_ros.bags import bulk
 from rotavg_ros.bags.message_types import typestore
 from rotavg_ros.errors import UserError
 
@@ -77,6 +78,10 @@ class BagWriter:
         """Append a message to a declared topic; messages should come in the order of their stamps."""
         connection = self._connections[topic]
         self.write_raw(topic, stamp_ns, typestore().serialize_cdr(message, connection.msgtype))
+
+    def write_bulk(self, topic: str, stamp_ns: int, message: Any) -> None:
+        """As :meth:`write`, for a message with sequences in bulk (:mod:`rotavg_ros.bags.bulk`)."""
+        self.write_raw(topic, stamp_ns, bulk.serialize(message, self._connections[topic].msgtype))
 
     def write_raw(self, topic: str, stamp_ns: int, cdr: bytes | memoryview) -> None:
         """Append a message that is serialised already."""

@@ -53,7 +53,8 @@ def _run_synthetic(arguments: argparse.Namespace) -> Path:
         if more:
             scores_of_few[kind.name] = _score([kind], range(few), more, f"{kind.name}, more methods")
     results = synthetic.Results(tuple(core), scores, tuple(more), scores_of_few)
-    return synthetic.report(arguments.output, results, arguments.command_line)
+    with working("writing the report"):
+        return synthetic.report(arguments.output, results, arguments.command_line)
 
 
 def _run_robustness(arguments: argparse.Namespace) -> Path:
@@ -63,7 +64,8 @@ def _run_robustness(arguments: argparse.Namespace) -> Path:
     with tempfile.TemporaryDirectory() as folder:
         trained = {robustness.SETTINGS[setting].training for setting in arguments.settings} - {robustness.PACKAGE}
         for training in sorted(trained):
-            graphs = robustness.training_graphs(training, arguments.seed)
+            with working(f"drawing the graphs to train on ({training})"):
+                graphs = robustness.training_graphs(training, arguments.seed)
             train_networks(Path(folder) / training, graphs, 60 * arguments.minutes)
         for setting in arguments.settings:
             training = robustness.SETTINGS[setting].training
@@ -72,13 +74,15 @@ def _run_robustness(arguments: argparse.Namespace) -> Path:
             chosen = _contenders(fit, (), weights, arguments.keep)
             count = robustness.num_graphs(setting, arguments.graphs)
             scores[setting] = _score([robustness.kind(setting, arguments.seed)], range(count), chosen, setting)
-    return robustness.report(arguments.output, scores, names, arguments.command_line)
+    with working("writing the report"):
+        return robustness.report(arguments.output, scores, names, arguments.command_line)
 
 
 def _run_real(arguments: argparse.Namespace) -> Path:
     data = data_folder(arguments, (real.LUND, real.MADRID, real.TOPOLOGIES))
     chosen = _contenders(arguments.methods, real.METHODS, keep=arguments.keep)
-    lund, madrid = real.lund_case(data), real.madrid_case(data)
+    with working("reading"):
+        lund, madrid = real.lund_case(data), real.madrid_case(data)
     on_lund = score_all([lund], chosen, _watch(len(chosen), lund.key.name))
     fast = {name: contender for name, contender in chosen.items() if name not in real.SLOW_ON_TOPOLOGIES}
     on_topologies = {}
@@ -100,14 +104,18 @@ def _run_real(arguments: argparse.Namespace) -> Path:
     tables["real-madrid-residuals"] = real.residual_table(madrid.key.name, found)
     tables["real-madrid-agreement"] = real.agreement_table(f"{madrid.key.name}: who agrees with whom", found)
     introduction = f"`{arguments.command_line}`"
-    return Report("real", "Real view-graphs", introduction, tables, extra_csv=graphs).write(arguments.output)
+    with working("writing the report"):
+        return Report("real", "Real view-graphs", introduction, tables, extra_csv=graphs).write(arguments.output)
 
 
 def _run_rgbd(arguments: argparse.Namespace) -> Path:
     data = data_folder(arguments, [f"rgbd/{name}" for name in arguments.sets])
     if arguments.folds < 2:
         raise EvaluateError("--folds must be 2 or more: what is tested must not be trained on")
-    split = {name: list(rgbd.folds(data / "rgbd" / name, arguments.folds, arguments.scenes)) for name in arguments.sets}
+    with working("reading"):
+        split = {
+            name: list(rgbd.folds(data / "rgbd" / name, arguments.folds, arguments.scenes)) for name in arguments.sets
+        }
     tables = {}
     for name, folds in split.items():
         scores = Scores()
@@ -124,7 +132,8 @@ def _run_rgbd(arguments: argparse.Namespace) -> Path:
         f"`{arguments.command_line}`: scans registered pairwise, most of the registrations wrong; degrees per scene, "
         "averaged."
     )
-    return Report("rgbd", "RGB-D scans", introduction, tables).write(arguments.output)
+    with working("writing the report"):
+        return Report("rgbd", "RGB-D scans", introduction, tables).write(arguments.output)
 
 
 def _contenders(

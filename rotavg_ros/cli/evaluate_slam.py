@@ -11,7 +11,7 @@ from rotavg_ros.cli.data_folder import data_folder
 from rotavg_ros.cli.progress import progress, working
 from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.errors import UserError
-from rotavg_ros.evaluation.common.cases import drawings
+from rotavg_ros.evaluation.common.cases import drawings, num_drawings
 from rotavg_ros.evaluation.common.contenders import Roster, contenders, warm_up
 from rotavg_ros.evaluation.common.scoring import Step, score_all
 from rotavg_ros.evaluation.live import incremental
@@ -61,12 +61,9 @@ def _run_poses(arguments: argparse.Namespace) -> Path:
     with working("warming up"):
         warm_up(contenders(names, roster).values(), roster, pose_cases.tiny_case())
 
-    def watch(steps: Iterable[Step]) -> Iterable[Step]:
-        count = sum(len(seeds) if kind.is_random else 1 for kind in kinds)
-        return progress(steps, total=count * len(chosen), description="solving", unit="solve")
-
-    scores = score_all(drawings(kinds, seeds), chosen, watch)
-    return pose_report.report(arguments.output, scores, arguments.command_line)
+    scores = score_all(drawings(kinds, seeds), chosen, _watch(num_drawings(kinds, seeds) * len(chosen)))
+    with working("writing the report"):
+        return pose_report.report(arguments.output, scores, arguments.command_line)
 
 
 def _run_stress(arguments: argparse.Namespace) -> Path:
@@ -80,10 +77,7 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
     calibrations = {name: Calibration() for name in (OURS, POSTERIOR) if name in chosen}
     chosen |= {name: calibration.watching(chosen[name]) for name, calibration in calibrations.items()}
 
-    def watch(steps: Iterable[Step]) -> Iterable[Step]:
-        return progress(steps, total=len(kinds) * len(seeds) * len(chosen), description="solving", unit="solve")
-
-    scores = score_all(drawings(kinds, seeds), chosen, watch)
+    scores = score_all(drawings(kinds, seeds), chosen, _watch(len(kinds) * len(seeds) * len(chosen)))
     diagnoses: list[Diagnosis] = []
     if arguments.search_or_model and not scores.interrupted:
         with suppress(KeyboardInterrupt):  # what is done is written
@@ -95,7 +89,8 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
             cases_again = progress(drawings(kinds, seeds), total=len(kinds) * len(seeds), description="other priors")
             priors.extend([*sensitivity.answers(case)] for case in cases_again)
     findings = stress_report.Findings(calibrations, diagnoses, priors)
-    return stress_report.report(arguments.output, scores, findings, arguments.command_line)
+    with working("writing the report"):
+        return stress_report.report(arguments.output, scores, findings, arguments.command_line)
 
 
 def _run_recorded(arguments: argparse.Namespace) -> Path:
@@ -111,11 +106,8 @@ def _run_recorded(arguments: argparse.Namespace) -> Path:
     with working("warming up"):
         warm_up(contenders(names, ROSTER).values(), ROSTER)
 
-    def watch(steps: Iterable[Step]) -> Iterable[Step]:
-        return progress(steps, description="solving", unit="solve")
-
     kinds = cases.kinds(data, arguments.graphs, arguments.shares, arguments.hard)
-    scores = score_all(drawings(kinds, seeds), chosen, watch)
+    scores = score_all(drawings(kinds, seeds), chosen, _watch(num_drawings(kinds, seeds) * len(chosen)))
     runs: list[incremental.IncrementalRun] = []
     checks: list[uncertainty.UncertaintyCheck] = []
     if not scores.interrupted:
@@ -125,7 +117,8 @@ def _run_recorded(arguments: argparse.Namespace) -> Path:
         for name in progress(_UNCERTAINTY_GRAPHS if more else (), description="uncertainty", total=len(more)):
             graph_file = read_graph(data / _uncertainty_file(name))
             checks += uncertainty.check(name, graph_file, _UNCERTAINTY_DRAWS, seeds[0])
-    return report.report(arguments.output, scores, runs, checks, arguments.command_line)
+    with working("writing the report"):
+        return report.report(arguments.output, scores, runs, checks, arguments.command_line)
 
 
 def _uncertainty_file(name: str) -> str:
@@ -155,6 +148,10 @@ def _methods(arguments: argparse.Namespace, roster: Roster, default: Iterable[st
     if not arguments.peers:
         names = [name for name in names if not roster.is_peer(name)]
     return list(dict.fromkeys((OURS, *names, ORACLE)))
+
+
+def _watch(solves: int) -> Callable[[Iterable[Step]], Iterable[Step]]:
+    return lambda steps: progress(steps, total=solves, description="solving", unit="solve")
 
 
 def _watch_ticks(description: str) -> Callable[[Iterable[int]], Iterable[int]]:

@@ -8,11 +8,13 @@ import io
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import NamedTuple, NoReturn
 
 from rotavg_ros.cli.command_line import command_line
 from rotavg_ros.cli.progress import working
 from rotavg_ros.errors import UserError
+from rotavg_ros.startup import leave_to_the_system, loading
 from rotavg_ros.version import __version__
 
 
@@ -67,13 +69,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit code: 0, or 2 for a mistake in what the user gave (one line on stderr), or 130 after Ctrl-C.
     """
+    is_own_process = arguments is None
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a terminal without UTF-8, a file name without encoding
     try:
         parsed = parse(arguments)
         module = next(command.module for command in COMMANDS if command.name == parsed.command)
-        with working("loading"):
+        with working("loading"), loading() if is_own_process else nullcontext():
             run = importlib.import_module(module).run
         exit_code: int = run(parsed)
         return exit_code
@@ -87,6 +90,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Whoever read our output (`| head`) has seen enough. Python would complain again when it closes stdout.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    finally:
+        if is_own_process:
+            leave_to_the_system()
 
 
 def print_error(error: UserError) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -17,7 +17,13 @@ _PERIOD_SECONDS = 0.5
 
 
 def progress(items: Iterable[Item], *, description: str, total: int | None = None, unit: str = "it") -> Iterator[Item]:
-    """Pass items through; show a bar whose seconds go on while an item takes long."""
+    """Pass items through; show a bar whose seconds go on while an item takes long.
+
+    Args:
+        total: how many there are; None: as many as ``items`` says, if it does.
+    """
+    if total is None and isinstance(items, Sized):
+        total = len(items)
     if not sys.stderr.isatty():
         yield from items
         return

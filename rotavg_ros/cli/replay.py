@@ -46,6 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
                 + ", ".join(f"{use.topic} ({use.type_name})" for use in plan.topics)
             )
         _check_inputs(bag.path, plan, arguments.output)
+        print(f"  {plan.pace().told()}", flush=True)
         window = Window(arguments.start, arguments.duration, arguments.rate)
         summary = _replay(bag, plan, window, arguments)
     print(_told(summary, arguments.output))

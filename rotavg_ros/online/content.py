@@ -14,6 +14,7 @@ from rotavg_ros.online.answer.anchoring import anchor, corrections, first_correc
 from rotavg_ros.online.answer.last_answer import LastAnswer
 from rotavg_ros.online.answer.odometry_frame import OdometryFrame, first_frame, next_frame
 from rotavg_ros.online.answer.problem import Problem
+from rotavg_ros.online.answer.screening import Known
 from rotavg_ros.online.graph.builder import GraphBuilder
 from rotavg_ros.online.graph.growth import Growth
 from rotavg_ros.online.measurements import KeyframeReference, OdometryMessage, RejectReason
@@ -27,6 +28,7 @@ class Counts:
 
     Attributes:
         keyframes, edges, pending: sizes now.
+        queued: closures in the graph that wait to be solved, see :mod:`~rotavg_ros.online.answer.closure_queue`.
         rejected: inputs refused, by :class:`RejectReason` value.
         time_jumps: how often the data's time went back.
         time_is_back: whether odometry is refused since such a jump, and somebody has to decide.
@@ -53,6 +55,7 @@ class Counts:
     pending_by_robot: Mapping[str, int] = field(default_factory=dict)
     longest_pending: KeyframeReference | None = None
     longest_pending_s: float = 0.0
+    queued: int = 0
 
 
 @dataclass
@@ -90,6 +93,7 @@ class AcceptedAnswer:
         revision: of the graph that they are about.
         was_cold: solved from scratch.
         memory: what the solver remembers of it.
+        known: what it tells of closures that are no part of it.
     """
 
     body_from_world: Tensor
@@ -98,6 +102,7 @@ class AcceptedAnswer:
     revision: int
     was_cold: bool
     memory: object | None
+    known: Known
 
 
 class Content:
@@ -181,8 +186,9 @@ class Content:
 
     @property
     def is_behind(self) -> bool:
-        """Whether the graph has changed since the last answer; an empty one has no answer to wait for."""
-        return not self.is_empty and self.builder.graph.revision != self._answered_revision
+        """Whether the last answer is not of the whole graph; an empty one has no answer to wait for."""
+        has_changed = self.builder.graph.revision != self._answered_revision
+        return not self.is_empty and (has_changed or len(self.state.last.queue) > 0)
 
     def solve_anew(self) -> None:
         """Let the next tick solve though the graph is the same."""
@@ -197,17 +203,22 @@ class Content:
             self.builder.settle()
         if self.is_empty or (not self.is_behind and self._answer_was_cold):
             return None
-        snapshot = self.builder.graph.snapshot()
+        snapshot, last = self.builder.graph.snapshot(), state.last
         state.ticked_revision = snapshot.revision
-        state.last.begin_problem()
-        cold = force_cold or idle or not self.builder.options.warm_start
-        last = state.last
-        return Problem(snapshot, cold, last.body_from_world, last.component, last.outlier, self._memory)
+        last.begin_problem()
+        is_last = force_cold or (idle and not len(last.queue))
+        if is_last:
+            last.queue.let_in_all(snapshot.graph)
+        else:
+            last.queue.let_in(snapshot.graph, last.known, last.outlier, idle=idle)
+        cold = is_last or not self.builder.options.warm_start
+        order = last.queue.order
+        return Problem(snapshot, cold, last.body_from_world, last.component, last.outlier, self._memory, order)
 
     def accept(self, answer: AcceptedAnswer) -> None:
         """Make the answer to the last problem the last answer."""
         state = self.state
-        state.last.replace(answer.body_from_world, answer.component, answer.outlier)
+        state.last.replace(answer.body_from_world, answer.component, answer.outlier, answer.known)
         # After a compaction the memory fits no graph, and the solver sees that.
         self._answered_revision, self._answer_was_cold, self._memory = answer.revision, answer.was_cold, answer.memory
         state.version += 1
@@ -222,6 +233,7 @@ class Content:
             keyframes=growth.graph.num_keyframes,
             edges=growth.graph.num_edges,
             pending=len(growth.pending),
+            queued=len(self.state.last.queue),
             rejected=dict(growth.rejected),
             time_jumps=time_jumps,
             time_is_back=growth.backward_jumps.is_back and growth.options.on_time_jump == "error",

@@ -236,7 +236,7 @@ class OnlineEstimator:
 
     @property
     def is_behind(self) -> bool:
-        """Whether the graph has changed since the last answer."""
+        """Whether the graph has changed since the last answer, or closures of it wait to be solved."""
         with self._lock:
             return self._content.is_behind
 
@@ -312,7 +312,7 @@ class OnlineEstimator:
         try:
             with abandonable(running.is_abandoned):
                 solution = self._solver(
-                    _solved_graph(snapshot.graph, options),
+                    _solved_graph(problem.graph, options),
                     method=options.method,
                     profile=options.profile,
                     device=options.device,
@@ -323,23 +323,26 @@ class OnlineEstimator:
         except Abandoned:
             raise TickAbandonedError(f"abandoned: {running.abandoned_by}") from None
         component = solution.component.cpu()
+        known = problem.known(solution, options.outlier_threshold)
         with self._lock:
             roots = root_orientations(content.builder, snapshot, component, problem.answered)
         body_from_world = fix_gauge(solution.body_from_world.cpu(), component, roots)
         was_cold = warm_start is None
         answer = Answer.of_solution(
             snapshot,
-            solution,
+            problem.of_all_edges(solution, known),
             body_from_world,
             problem.thresholds(options.outlier_threshold, was_cold),
             content.version + 1,
             was_cold,
         )
+        answer = replace(answer, waits=problem.waits)
         with self._lock:
             if content is not self._content:  # the solve had ended before it could be told
                 raise TickAbandonedError(f"abandoned: {running.abandoned_by}")
+            revision, memory = snapshot.revision, solution.memory
             content.accept(
-                AcceptedAnswer(body_from_world, component, answer.outlier, snapshot.revision, was_cold, solution.memory)
+                AcceptedAnswer(body_from_world, component, answer.outlier, revision, was_cold, memory, known)
             )
             if options is not self.options:
                 content.solve_anew()

@@ -13,6 +13,9 @@ from rotavg_ros.option import DEGREES, DEGREES_PER_SECOND, METRES, METRES_PER_SE
 from rotavg_ros.solver import DEVICES, PROFILES, TRANSLATION_SCALES
 
 NANOSECONDS = 1_000_000_000
+# Edges that a graph may have for each keyframe that it may have, odometry's one included. So closures are bounded with
+# the keyframes, where a robot closes loops between the same few again and again.
+EDGES_PER_KEYFRAME = 6
 
 
 @documented
@@ -102,7 +105,8 @@ class EstimatorOptions:
     )
     max_edges: int = option(
         2_000_000,
-        "at so many edges the loop closures that can best be spared are dropped",
+        f"at so many edges, or {EDGES_PER_KEYFRAME} times max_keyframes, the loop closures that can best be spared "
+        "are dropped",
         within=(1, 1_000_000_000),
         live=True,
     )
@@ -137,6 +141,11 @@ class EstimatorOptions:
     def max_refinement_steps(self) -> int | None:
         """As :func:`rotavg_ros.solve` wants it; None: the profile's own number."""
         return None if self.refinement_steps < 0 else self.refinement_steps
+
+    @property
+    def most_edges(self) -> int:
+        """Edges that the graph may have."""
+        return min(self.max_edges, EDGES_PER_KEYFRAME * self.max_keyframes)
 
     @property
     def needs_odometry(self) -> bool:

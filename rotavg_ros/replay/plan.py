@@ -12,6 +12,7 @@ from rotavg_ros.bags.reader import RECORDING_SUFFIXES, BagReader
 from rotavg_ros.datasets.files.pose_files import read_pose_file
 from rotavg_ros.errors import UserError
 from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
+from rotavg_ros.replay.pace import Pace, WorkRates
 from rotavg_ros.replay.record import TopicUse
 from rotavg_ros.replay.topics import Candidate, Candidates, find_candidates, static_transforms
 from rotavg_ros.settings.parameters import NodeParameters
@@ -61,6 +62,7 @@ class Plan:
         references: topic or file by robot.
         topics: every topic of the bag and its use.
         edge_frames_from_tf: edges of sensors are taken into the body's frame by the bag's static transforms.
+        tick_work: what ticks may cost; None where the user has said how often there is one.
     """
 
     parameters: NodeParameters
@@ -69,10 +71,15 @@ class Plan:
     references: dict[str, Input | Path]
     topics: tuple[TopicUse, ...]
     edge_frames_from_tf: bool = True
+    tick_work: WorkRates | None = None
 
     @property
     def has_input(self) -> bool:
         return bool(self.odometry or self.edges)
+
+    def pace(self) -> Pace:
+        """When there are ticks, from the first message on."""
+        return Pace(self.parameters.solve_period_s, self.tick_work)
 
 
 def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan:
@@ -107,7 +114,8 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
     parameters = NodeParameters().changed(settings)
     references = _references(bag, found, wishes.references, parameters.robots, odometry)
     from_tf = parameters.edge_frames_from_tf and "edge_sensor_orientations" not in values
-    plan = Plan(parameters, odometry, edges, references, topics=(), edge_frames_from_tf=from_tf)
+    tick_work = None if "solve_period_s" in values else WorkRates()
+    plan = Plan(parameters, odometry, edges, references, (), edge_frames_from_tf=from_tf, tick_work=tick_work)
     return replace(plan, topics=_uses(bag, found, plan))
 
 

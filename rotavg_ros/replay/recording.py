@@ -91,9 +91,9 @@ class Recording:
         for robot, trajectory in trajectories.items():
             if robot in self._prefix:
                 path = messages.path_message(trajectory, self._frame_id)
-                self._bag.write(f"{self._prefix[robot]}corrected_path", time_ns, path)
+                self._bag.write_bulk(f"{self._prefix[robot]}corrected_path", time_ns, path)
         drawing = draw(answer, trajectories.values())
-        self._bag.write(f"/{NODE_NAME}/markers", time_ns, messages.markers_message(drawing, self._frame_id))
+        self._bag.write_bulk(f"/{NODE_NAME}/markers", time_ns, messages.markers_message(drawing, self._frame_id))
 
     def diagnostics(self, time_ns: int) -> None:
         """How the estimator is doing, once a second, without what only a live node has (latencies, lost messages)."""

@@ -18,9 +18,11 @@ from rotavg_ros.online import Answer, OnlineEstimator
 from rotavg_ros.online.measurements import OWN_EDGE_ID
 from rotavg_ros.replay.feed import Feed
 from rotavg_ros.replay.frames import BagFrames
+from rotavg_ros.replay.pace import Pace
 from rotavg_ros.replay.plan import Plan
 from rotavg_ros.replay.record import TickRecord
 from rotavg_ros.replay.recording import Recording
+from rotavg_ros.view_graph import EdgeKind
 
 _NANOSECONDS = 1_000_000_000
 _NAP_S = 0.1
@@ -110,7 +112,7 @@ def replay(
     torch.set_num_threads(plan.parameters.solver_threads or max(1, torch.get_num_threads() - 1))  # as in the node
     estimator = OnlineEstimator(plan.parameters.estimator)
     with Recording(recording, plan.parameters, estimator, answer_period_ns) as recorder:
-        loop = _Loop(estimator, plan.parameters.solve_period_s, recorder)
+        loop = _Loop(estimator, plan.pace(), recorder)
         frames = BagFrames(bag, plan)
         feed = Feed(estimator, plan, frames, loop.on_odometry)
         end_ns, interrupted = start_ns, False
@@ -151,9 +153,9 @@ def replay(
 class _Loop:
     """The clock, and what happens when it strikes."""
 
-    def __init__(self, estimator: OnlineEstimator, period_s: float, recorder: Recording) -> None:
-        self._estimator, self._recorder = estimator, recorder
-        self._period_ns = round(period_s * _NANOSECONDS)
+    def __init__(self, estimator: OnlineEstimator, pace: Pace, recorder: Recording) -> None:
+        self._estimator, self._recorder, self._pace = estimator, recorder, pace
+        self._period_ns = pace.period_ns
         self._now_ns = self._next_tick_ns = 0
         self._last: Answer | None = None
         self.ticks: list[TickRecord] = []
@@ -167,11 +169,14 @@ class _Loop:
         while self._next_tick_ns <= time_ns:
             self._now_ns = self._next_tick_ns
             self._next_tick_ns += self._period_ns
+            if not self._pace.strikes():
+                continue
             answered = self._tick()
             if not answered and not self._estimator.is_behind:
                 # Nothing will change before the message: skip the strikes until then.
                 skipped = max(0, time_ns - self._next_tick_ns) // self._period_ns
                 self._next_tick_ns += skipped * self._period_ns
+                self._pace.strikes(skipped)
         self._now_ns = time_ns
         self._recorder.diagnostics(time_ns)
 
@@ -214,6 +219,7 @@ class _Loop:
             outliers=int(answer.outlier.sum()),
             flips=0 if self._last is None else _flips(self._last, answer),
         )
+        self._pace.spend(tick.keyframes + tick.edges, int((answer.kind == EdgeKind.LOOP_CLOSURE).sum()))
         self.ticks.append(tick)
         self._last = answer
         return True

@@ -67,3 +67,22 @@ def test_a_view_graph_without_odometry_stops_growing() -> None:
             EdgeMeasurement(index, KeyframeReference("r", index), KeyframeReference("r", index + 1), IDENTITY)
         )
     assert online.counts().keyframes == 10 and online.counts().pending == 11 and online.counts().is_full
+
+
+def test_closures_are_bounded_with_the_keyframes() -> None:
+    """A robot that goes to and fro between the same keyframes closes loops for hours; what is dropped is counted."""
+    options = EstimatorOptions(keyframe_angle=0, keyframe_distance=0, max_keyframes=100)
+    online = OnlineEstimator(options, lambda *_, **__: None)
+    for index in range(100):
+        online.add_odometry("r", index * SECOND, (0.0, 0.0, np.sin(0.01 * index), np.cos(0.01 * index)), (0, 0, 0))
+    rng = np.random.default_rng(0)
+    taken = 0
+    for number in range(3000):
+        source, target = rng.choice(100, 2, replace=False).tolist()
+        ends = KeyframeReference("r", source), KeyframeReference("r", target)
+        taken += online.add_edge(EdgeMeasurement(number, *ends, IDENTITY)) is None
+        assert online.counts().edges <= options.most_edges == 600
+    counts = online.counts()
+    assert counts.keyframes <= 100 and counts.dropped_closures > 1000
+    closures = counts.edges - (counts.keyframes - 1)
+    assert taken == closures + counts.dropped_closures

@@ -57,6 +57,7 @@ def answer_of(run: SimulatedRun) -> Answer:
         steps=run.graph.steps.numpy(),
         outlier_score=score,
         outlier=score > 0.5,
+        waits=np.zeros(len(score), dtype=bool),
         was_cold=True,
         seconds=0.02,
         stage_seconds={"clean": 0.004, "bootstrap": 0.002, "refine": 0.014},

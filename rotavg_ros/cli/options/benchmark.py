@@ -4,7 +4,8 @@ Every contender runs in a process of its own, after a tiny graph that pays what 
 against the truth. Contenders that would take too long of the given minutes are left out, and the report says so. One
 size by itself: --families sfm-dense --min-pairs 7000000 --max-pairs 9000000 --contenders neurora.
 With --soak, a live node holds a graph of 10 000 keyframes while odometry arrives over DDS; with --soak --hours, the
-estimator drives for so long in this process, as fast as it goes.
+estimator drives for so long in this process, as fast as it goes. With --small, such nodes hold graphs of several sizes
+on one core and on two, for who chooses a machine: memory and CPU.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from rotavg_ros.cli.arguments import positive_number, positive_whole_number, thr
 from rotavg_ros.evaluation.names import BENCHMARK_CONTENDERS, BENCHMARK_FAMILIES
 
 SOAK_KEYFRAMES, SOAK_SECONDS = 10_000, 60.0
+SMALL_KEYFRAMES = (1000, 10_000)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,11 +59,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--threads", type=thread_count, metavar="N", help="CPU threads (default: torch's)")
     parser.add_argument("--soak", action="store_true", help="the node under load instead of the solvers")
+    parser.add_argument("--small", action="store_true", help="the node on one core and on two instead")
     parser.add_argument(
-        "--seconds", type=positive_number, metavar="S", help=f"of a soak, for each rate (default: {SOAK_SECONDS:g})"
+        "--seconds", type=positive_number, metavar="S", help=f"of each run of a node (default: {SOAK_SECONDS:g})"
     )
     parser.add_argument(
-        "--keyframes", type=positive_whole_number, metavar="N", help=f"of a soak (default: {SOAK_KEYFRAMES})"
+        "--keyframes",
+        type=positive_whole_number,
+        nargs="+",
+        metavar="N",
+        help=f"of a soak (default: {SOAK_KEYFRAMES}), or several, of --small "
+        f"(default: {' '.join(map(str, SMALL_KEYFRAMES))})",
     )
     parser.add_argument(
         "--hours",

@@ -167,6 +167,11 @@ class Kind:
     is_random: bool = True
 
 
+def num_drawings(kinds: Iterable[Kind], seeds: Sequence[int]) -> int:
+    """How many cases :func:`drawings` gives at most: it leaves out what cannot be drawn."""
+    return sum(len(seeds) if kind.is_random else 1 for kind in kinds)
+
+
 def drawings(kinds: Iterable[Kind], seeds: Sequence[int]) -> Iterator[Case]:
     """Every kind with every seed, drawn when it is its turn."""
     for kind in kinds:

@@ -46,6 +46,7 @@ class Answer:
             marginalised.
         outlier_score: ``(M,)`` float64 in [0, 1].
         outlier: ``(M,)`` bool, score above the edge's threshold; a user's label decides where there is one.
+        waits: ``(M,)`` bool, closures that are no part of the solve yet; their scores come from their residuals.
         was_cold: solved from scratch, as ``rotavg solve`` would.
         seconds: of the whole tick.
         stage_seconds: of the solver's stages.
@@ -78,6 +79,7 @@ class Answer:
     steps: NDArray[np.float64]
     outlier_score: NDArray[np.float64]
     outlier: NDArray[np.bool_]
+    waits: NDArray[np.bool_]
     was_cold: bool
     seconds: float
     stage_seconds: dict[str, float]
@@ -130,6 +132,7 @@ class Answer:
             steps=graph.steps.numpy(),
             outlier_score=score.numpy(),
             outlier=score.numpy() > outlier_threshold,
+            waits=np.zeros(graph.num_edges, dtype=bool),
             was_cold=was_cold,
             seconds=0.0,  # known when the tick is over
             stage_seconds=dict(solution.stage_seconds),

@@ -139,8 +139,8 @@ class ClosureFilter(Generic[_Item]):
 
 
 def _closures(answer: Answer) -> tuple[NDArray[np.int64], NDArray[np.uint64]]:
-    """Rows of an answer's closures, and their names as numbers."""
-    rows = np.flatnonzero(answer.kind == EdgeKind.LOOP_CLOSURE)
+    """Rows of the closures that an answer has solved, and their names as numbers."""
+    rows = np.flatnonzero((answer.kind == EdgeKind.LOOP_CLOSURE) & ~answer.waits)
     robot_keys = np.array([_robot_key(robot) for robot in answer.robots], dtype=np.uint64)
     if not len(rows):
         return rows, np.empty(0, dtype=np.uint64)

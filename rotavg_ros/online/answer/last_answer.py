@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rotavg_ros.online.answer.closure_queue import ClosureQueue
+from rotavg_ros.online.answer.screening import Known
 from rotavg_ros.online.compaction.renumbering import Renumbering
 
 
@@ -16,6 +18,8 @@ class LastAnswer:
         body_from_world: ``(n, 4)``; None before the first answer.
         component: ``(n,)``; None where it is not known.
         outlier: ``(m,)`` flags.
+        known: what else it knows of these nodes; None before the first answer.
+        queue: closures of the graph that wait to be solved.
     """
 
     def __init__(
@@ -23,19 +27,28 @@ class LastAnswer:
         body_from_world: Tensor | None = None,
         component: Tensor | None = None,
         outlier: NDArray[np.bool_] | None = None,
+        queued: NDArray[np.bool_] | None = None,
     ) -> None:
+        """Begin with what is known.
+
+        Args:
+            body_from_world, component, outlier: see above.
+            queued: ``(M,)`` closures of the graph that wait; the other edges have entered.
+        """
         self.body_from_world = body_from_world
         self.component = component
         self.outlier: NDArray[np.bool_] = np.zeros(0, dtype=bool) if outlier is None else outlier
+        self.known = None if body_from_world is None else Known.of_orientations(body_from_world)
+        self.queue = ClosureQueue() if queued is None else ClosureQueue(queued)
         self._since_problem: Renumbering | None = None
 
     def begin_problem(self) -> None:
         """From now on an answer comes in the graph's present numbers."""
         self._since_problem = None
 
-    def replace(self, body_from_world: Tensor, component: Tensor, outlier: NDArray[np.bool_]) -> None:
-        """Take the answer to the last problem, ``(N, 4)``, ``(N,)`` and ``(M,)`` in the numbers of that time."""
-        self.body_from_world, self.component, self.outlier = body_from_world, component, outlier
+    def replace(self, body_from_world: Tensor, component: Tensor, outlier: NDArray[np.bool_], known: Known) -> None:
+        """Take the answer to the last problem, of N nodes and M edges in the numbers of that time."""
+        self.body_from_world, self.component, self.outlier, self.known = body_from_world, component, outlier, known
         if self._since_problem is not None:
             self._apply(self._since_problem)
 
@@ -43,6 +56,7 @@ class LastAnswer:
         """Follow the graph."""
         earlier = self._since_problem
         self._since_problem = renumbering if earlier is None else earlier.then(renumbering)
+        self.queue.renumber(renumbering)
         self._apply(renumbering)
 
     def _apply(self, renumbering: Renumbering) -> None:
@@ -50,4 +64,6 @@ class LastAnswer:
             self.body_from_world = renumbering.nodes(self.body_from_world)
         if self.component is not None:
             self.component = renumbering.nodes(self.component)
+        if self.known is not None:
+            self.known = self.known.of_keyframes(renumbering.nodes)
         self.outlier = renumbering.flags(self.outlier)

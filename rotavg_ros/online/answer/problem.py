@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from rotavg_ros.online.answer.gauge import extend_along_edges, joins_components
+from rotavg_ros.online.answer.screening import Known, score_of
 from rotavg_ros.online.graph.snapshot import GraphSnapshot
+from rotavg_ros.solver.solution import Solution
+from rotavg_ros.view_graph import EdgeKind, ViewGraph
 
 # While data flows, a flag changes only if the score passes the threshold by this share of the way to 0 or 1: on a
 # real robot's graph that halves the changes, and no more flags are wrong.
@@ -27,6 +32,7 @@ class Problem:
         component: ``(n,)`` of the last answer; None where it is not known.
         outlier: ``(m,)`` flags of the last answer, of the first edges.
         memory: what the solver remembers of the last answer.
+        order: edges to be solved, in the order in which they have entered; None: all, in their own. The others wait.
     """
 
     snapshot: GraphSnapshot
@@ -35,14 +41,29 @@ class Problem:
     component: Tensor | None
     outlier: NDArray[np.bool_]
     memory: object | None
+    order: NDArray[np.int64] | None = None
+
+    @cached_property
+    def graph(self) -> ViewGraph:
+        """What is solved: all keyframes, and the edges that have entered."""
+        graph = self.snapshot.graph
+        return graph if self.order is None else graph.select_edges(torch.from_numpy(self.order))
+
+    @cached_property
+    def waits(self) -> NDArray[np.bool_]:
+        """Closures that are not solved yet ``(M,)``."""
+        waits = np.full(self.snapshot.graph.num_edges, self.order is not None)
+        if self.order is not None:
+            waits[self.order] = False
+        return waits
 
     def warm_start(self) -> Tensor | None:
         """The last answer carried on to all keyframes ``(N, 4)``; None where it is no good start."""
         if self.cold or self.answered is None or self.component is None:
             return None
-        if joins_components(self.component, self.snapshot.graph.components()):
+        if joins_components(self.component, self.graph.components()):
             return None
-        return extend_along_edges(self.answered, self.snapshot.graph)
+        return extend_along_edges(self.answered, self.graph)
 
     def thresholds(self, threshold: float, was_cold: bool) -> NDArray[np.float64]:
         """The score above which each edge is an outlier ``(M,)``; the last answer's flags are kept when in doubt.
@@ -54,3 +75,29 @@ class Problem:
             margin = _FLAG_HYSTERESIS * min(threshold, 1 - threshold)
             thresholds[: len(self.outlier)] += np.where(self.outlier, -margin, margin)
         return thresholds
+
+    def known(self, solution: Solution, threshold: float) -> Known:
+        """What a solution of :attr:`graph` tells of closures that are no part of it."""
+        believed = solution.outlier_score.cpu().numpy() <= threshold
+        believed &= self.graph.kind.numpy() == EdgeKind.LOOP_CLOSURE
+        return Known.of_solution(self.graph, solution, believed)
+
+    def of_all_edges(self, solution: Solution, known: Known) -> Solution:
+        """A solution of :attr:`graph` as one of the whole graph: what waits has a score by its residual, and no weight.
+
+        Args:
+            solution: of M' edges.
+            known: what it tells.
+        """
+        if self.order is None:
+            return solution
+        graph, order, waits = self.snapshot.graph, torch.from_numpy(self.order), torch.from_numpy(self.waits)
+        score = torch.empty(graph.num_edges, dtype=torch.float64)
+        score[order] = solution.outlier_score.cpu().double()
+        score[waits] = torch.from_numpy(score_of(known.log_odds(graph.select_edges(waits))))
+        rotation_score, precision = solution.rotation_score, solution.edge_precision
+        if rotation_score is not None:
+            rotation_score = score.clone().index_copy(0, order, rotation_score.cpu())
+        if precision is not None:
+            precision = precision.new_zeros(graph.num_edges, 2).cpu().index_copy(0, order, precision.cpu())
+        return replace(solution, outlier_score=score, rotation_score=rotation_score, edge_precision=precision)

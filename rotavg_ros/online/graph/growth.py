@@ -67,12 +67,12 @@ class Growth:
 
     def has_room_for_edge(self) -> bool:
         """Whether one may come, if need be after others have gone."""
-        if self.graph.num_edges >= self.options.max_edges:
+        if self.graph.num_edges >= self.options.most_edges:
             self._make_room()
-        return self.graph.num_edges < self.options.max_edges
+        return self.graph.num_edges < self.options.most_edges
 
     def _make_room(self) -> None:
-        if self.room.make(self.graph, self.options.max_keyframes, self.options.max_edges, self.answer):
+        if self.room.make(self.graph, self.options.max_keyframes, self.options.most_edges, self.answer):
             for robot, track in self.tracks.items():
                 track.samples.release_keyframes(*self.graph.moments(robot))
 

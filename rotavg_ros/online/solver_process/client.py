@@ -27,7 +27,9 @@ _EXIT_TIMEOUT_S = 5.0
 _SERVER = """\
 import sys
 sys.path[:] = [folder for folder in sys.path if folder]
-from rotavg_ros.online.solver_process.server import main
+from rotavg_ros.startup import loading
+with loading():
+    from rotavg_ros.online.solver_process.server import main
 main()
 """
 

@@ -66,7 +66,7 @@ def collect(content: ContentState) -> State:
     arrays: Arrays = {name: getattr(snapshot, name) for name in _KEYFRAME_COLUMNS}
     arrays |= {name: getattr(snapshot.graph, name).numpy() for name in _GRAPH_COLUMNS}
     arrays["answered"] = np.empty((0, 4)) if last.body_from_world is None else last.body_from_world.numpy()
-    arrays["outlier"] = last.outlier
+    arrays["outlier"], arrays["queued"] = last.outlier, np.flatnonzero(last.queue.waits)
     arrays |= _prefixed(_FINGERPRINTS, growth.fingerprints.arrays())
     arrays |= _prefixed(_MARGINALIZED, marginalized.keyframes.arrays())
     for index, track in enumerate(growth.tracks.values()):
@@ -109,7 +109,9 @@ def _restore(arrays: Arrays, header: dict[str, Any], options: EstimatorOptions) 
         raise ValueError("more orientations than keyframes")
     if arrays["outlier"].dtype != bool or len(arrays["outlier"]) > graph.num_edges:
         raise ValueError("more flags than edges")
-    last = LastAnswer(answered if len(answered) else None, outlier=arrays["outlier"])
+    queued = np.zeros(graph.num_edges, dtype=bool)
+    queued[arrays["queued"]] = True
+    last = LastAnswer(answered if len(answered) else None, outlier=arrays["outlier"], queued=queued)
     growth = Growth(
         options,
         last,

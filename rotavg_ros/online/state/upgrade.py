@@ -13,6 +13,8 @@ from rotavg_ros.online.state.file import Arrays
 _FIRST_WITH_STEPS = 3
 # Before it, every robot had one time line, and waiting edges did not say what they wait for.
 _FIRST_WITH_TIME_LINES = 4
+# Before it, every closure was part of the next solve.
+_FIRST_WITH_QUEUE = 5
 
 
 def upgraded(arrays: Arrays, header: dict[str, Any]) -> tuple[Arrays, dict[str, Any]]:
@@ -27,6 +29,8 @@ def upgraded(arrays: Arrays, header: dict[str, Any]) -> tuple[Arrays, dict[str, 
         arrays |= {f"marginalized_{name}": values for name, values in nothing.items()}
     if header["format_version"] < _FIRST_WITH_TIME_LINES:
         arrays, header = _with_time_lines(arrays), _with_surroundings(header, arrays)
+    if header["format_version"] < _FIRST_WITH_QUEUE:
+        arrays = arrays | {"queued": np.zeros(0, dtype=np.int64)}
     return arrays, header
 
 

@@ -6,9 +6,8 @@ import os
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import rclpy
@@ -22,6 +21,7 @@ from rotavg_ros import rotations
 from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.datasets.simulation.trajectories import World
 from rotavg_ros.evaluation.common.tables import Column, Table
+from rotavg_ros.ros.harness import process_family
 from rotavg_ros.ros.harness.live_run import LiveRunError, installed_node, keep_to_this_machine, stop_process
 from rotavg_ros.ros.harness.recorder import Recorder
 from rotavg_ros.ros.node.output.conversions import to_quaternion_message
@@ -38,10 +38,28 @@ _ODOMETRY_TOPIC, _EDGE_TOPIC = "odom", "relative_rotation_arrays"
 
 
 @dataclass(frozen=True)
-class SoakRow:
-    """What the node reported at one rate: milliseconds and counts; and the share of a core that it took.
+class Load:
+    """What a node has to bear.
 
-    Ticks are those after the graph was solved; ``start_max_ms`` is the longest of those until then.
+    Attributes:
+        keyframes: that it holds, with as many loop closures.
+        seconds: for so long, once the graph has been solved; four keyframes a second go on coming.
+        rate_hz: of odometry.
+        cores: that it may run on; 0: all.
+    """
+
+    keyframes: int
+    seconds: float
+    rate_hz: float
+    cores: int = 0
+
+
+@dataclass(frozen=True)
+class SoakRow:
+    """What the node reported at one rate: milliseconds and counts; and what it took.
+
+    Ticks are those after the graph was solved; ``start_max_ms`` is the longest of those until then. ``cpu_share`` is
+    of a core, the solver's process included; ``node_mb`` and ``solver_mb`` are the peaks of either process, 10⁶ bytes.
     """
 
     rate_hz: float
@@ -57,6 +75,9 @@ class SoakRow:
     cpu_share: float
     sent: int
     lost: int
+    node_mb: float
+    solver_mb: float
+    cores: int
 
 
 def table(rows: Sequence[SoakRow]) -> Table:
@@ -75,36 +96,57 @@ def table(rows: Sequence[SoakRow]) -> Table:
         Column("cores busy", ".2f"),
         Column("messages sent"),
         Column("lost"),
+        Column("node MB", ".0f"),
+        Column("solver MB", ".0f"),
     )
-    return Table("Ticks and callbacks", columns, tuple(tuple(vars(row).values()) for row in rows))
+    return Table("Ticks and callbacks", columns, tuple(tuple(vars(row).values())[: len(columns)] for row in rows))
 
 
 def run(num_keyframes: int, seconds: float, rates_hz: Sequence[float] = RATES_HZ) -> list[SoakRow]:
-    """One node per rate, for so many seconds each once the graph has arrived.
+    """One node per rate, see :func:`run_loads`."""
+    return run_loads([Load(num_keyframes, seconds, rate_hz) for rate_hz in rates_hz])
+
+
+def run_loads(
+    loads: Sequence[Load], watch: Callable[[Iterable[Load]], Iterable[Load]] = lambda loads: loads
+) -> list[SoakRow]:
+    """One node after the other.
+
+    Args:
+        loads: what each has to bear.
+        watch: passes them through and may show how far they are.
 
     Raises:
         LiveRunError: the node is not installed, died, or did not take the graph.
     """
     keep_to_this_machine()
-    coming = round(seconds * _KEYFRAMES_PER_SECOND)
+    return [_soak(_city(load), load) for load in watch(loads)]
+
+
+def _city(load: Load) -> ViewGraph:
+    coming = round(load.seconds * _KEYFRAMES_PER_SECOND)
     config = SlamSimulationConfig(
         world=World.CITY,
-        num_keyframes=num_keyframes + coming,
+        num_keyframes=load.keyframes + coming,
         laps=8,
         keyframe_distance_m=2.0,
         closure_radius_m=6.0,
         closures_per_keyframe=1.0,
         false_share=0.1,
     )
-    graph = simulate_slam_graph(config, np.random.default_rng(0)).graph
-    return [_soak(graph, num_keyframes, seconds, rate) for rate in rates_hz]
+    return simulate_slam_graph(config, np.random.default_rng(0)).graph
 
 
-def _soak(graph: ViewGraph, num_keyframes: int, seconds: float, rate_hz: float) -> SoakRow:
+def _soak(graph: ViewGraph, load: Load) -> SoakRow:
+    num_keyframes, seconds, rate_hz = load.keyframes, load.seconds, load.rate_hz
     settings = ["-p", "keyframe_source:=edges", "-p", "unknown_keyframes:=create"]
+    pinned = ["taskset", "-c", ",".join(map(str, _cores(load.cores)))] if load.cores else []
     with tempfile.TemporaryFile() as log, Recorder() as recorder, _Sender(graph) as sender:
         node = subprocess.Popen(
-            [installed_node(), "--ros-args", *settings], stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
+            [*pinned, installed_node(), "--ros-args", *settings],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
         )
         try:
             _wait(recorder, node, lambda _: sender.is_heard, "did not start")
@@ -113,12 +155,14 @@ def _soak(graph: ViewGraph, num_keyframes: int, seconds: float, rate_hz: float) 
             _wait(recorder, node, lambda report: int(report["keyframes"]) >= num_keyframes, "did not take the graph")
             before = _wait(recorder, node, lambda report: report["answer cold"] == "true", "did not solve the graph")
             recorder.forget_reports()
-            start, cpu_start = time.monotonic(), _cpu_seconds(node)
+            start, cpu_start = time.monotonic(), process_family.cpu_seconds(node.pid)
             while (elapsed := time.monotonic() - start) < seconds:
                 sender.send_odometry_up_to(round(elapsed * rate_hz), rate_hz)
                 sender.send_edges_up_to(num_keyframes + int(elapsed * _KEYFRAMES_PER_SECOND))
                 recorder.spin(0.5 / rate_hz)
-            cpu_share = (_cpu_seconds(node) - cpu_start) / (time.monotonic() - start)
+            cpu_share = (process_family.cpu_seconds(node.pid) - cpu_start) / (time.monotonic() - start)
+            solvers_mb = sum(map(process_family.peak_memory_mb, process_family.children(node.pid)))
+            node_mb = process_family.peak_memory_mb(node.pid)
             known = len(recorder.reports)
             report = _wait(recorder, node, lambda _: len(recorder.reports) > known, "fell silent")
             ticks_ms = [float(tick) for one in recorder.reports for tick in one["latest ticks ms"].split()]
@@ -139,7 +183,15 @@ def _soak(graph: ViewGraph, num_keyframes: int, seconds: float, rate_hz: float) 
         cpu_share,
         sender.odometry_sent,
         int(report["lost messages"]),
+        node_mb,
+        solvers_mb,
+        load.cores,
     )
+
+
+def _cores(count: int) -> list[int]:
+    """The first so many of those that this process may use."""
+    return sorted(os.sched_getaffinity(0))[:count]
 
 
 def _wait(
@@ -154,12 +206,6 @@ def _wait(
         if time.monotonic() > deadline:
             raise LiveRunError(f"the node {failure} within {_TIMEOUT_S:.0f} s")
     return report
-
-
-def _cpu_seconds(process: subprocess.Popen[bytes]) -> float:
-    """User and system time so far, of all threads."""
-    after_name = Path(f"/proc/{process.pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-    return (int(after_name[11]) + int(after_name[12])) / os.sysconf("SC_CLK_TCK")
 
 
 class _Sender:

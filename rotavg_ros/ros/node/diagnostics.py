@@ -56,6 +56,8 @@ class Reporter:
         if counts.time_is_back:
             errors.append("time went back and odometry is refused since; call ~/reset to begin anew")
         warnings = [*health.mistakes, *_of_waiting(counts, parameters), *_warnings(health, parameters, now)]
+        if counts.queued:
+            warnings.append(f"more closures came at once than a tick takes in: {counts.queued} wait to be solved")
         if counts.is_full:
             warnings.append("the graph is full and nothing can be spared: no new keyframes (max_keyframes)")
         if health.lost > self._lost:
@@ -150,6 +152,7 @@ def _values(health: Health, counts: Counts, paused: bool, now: float) -> dict[st
         "marginalized keyframes": str(counts.marginalized),
         "dropped closures": str(counts.dropped_closures),
         "pending": str(counts.pending),
+        "queued closures": str(counts.queued),
         "held back": str(health.held_back),
         "waiting for frames": str(health.waiting_for_frames),
         "answer version": str(0 if answer is None else answer.version),

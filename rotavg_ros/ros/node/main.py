@@ -9,6 +9,7 @@ import traceback
 from types import FrameType
 
 from rotavg_ros.errors import UserError
+from rotavg_ros.startup import loading
 
 # A wait of the executor is not interrupted by a signal, so it must be short.
 _LONGEST_WAIT_S = 0.1
@@ -68,9 +69,10 @@ class _StopSignal:
 
 def _run(stop: _StopSignal) -> int:
     try:
-        from rclpy.executors import SingleThreadedExecutor
+        with loading():
+            from rclpy.executors import SingleThreadedExecutor
 
-        from rotavg_ros.ros.node.estimator_node import RotavgNode
+            from rotavg_ros.ros.node.estimator_node import RotavgNode
     except ModuleNotFoundError as error:
         return _fail_without(error)
     executor = SingleThreadedExecutor()

@@ -122,13 +122,20 @@ def _solve_by_posterior(graph: ViewGraph, stages: SlamStages, run: Run) -> Estim
             modes = all_fine_tuned(modes, run.networks.load(SlamFineNet))
         published = publish(found.drawn.problem, modes)
     with run.watch.stage("expand"):
-        estimate = estimate_of(published, modes[0].state.noise)
-        if not stages.without:
-            estimate = replace(estimate, memory=PosteriorMemory.of(graph, found, estimate))
-    if "translations" in stages.without or not has_places(graph):
-        return estimate
-    with run.watch.stage("poses"):
-        return _with_poses(graph, estimate, likeliest_poses(graph, modes))
+        estimate, likeliest, poses = estimate_of(published, modes[0].state.noise), modes[0], None
+    if "translations" not in stages.without and has_places(graph):
+        with run.watch.stage("poses"):
+            poses, likeliest = likeliest_poses(_unbiased(graph, found.bias), modes)
+    if not stages.without:
+        # Updates go on from a labelling as the search left it.
+        mode = next(before for before, after in zip(found.modes, modes, strict=True) if after is likeliest)
+        estimate = replace(estimate, memory=PosteriorMemory.of(graph, found.bias, mode, estimate))
+    return estimate if poses is None else _with_poses(graph, estimate, poses)
+
+
+def _unbiased(graph: ViewGraph, bias: np.ndarray | None) -> ViewGraph:
+    """The graph without a gyroscope's bias, rad per step, if one was taken out of its odometry."""
+    return graph if bias is None else without_bias(graph, bias)
 
 
 def _with_poses(graph: ViewGraph, estimate: Estimate, memory: PoseMemory) -> Estimate:
@@ -209,7 +216,7 @@ def _updated_by_search(graph: ViewGraph, memory: PosteriorMemory, start: Tensor,
     if found is None or before is None:
         return None if found is None else found.estimate
     with run.watch.stage("poses"):
-        unbiased = graph if memory.bias is None else without_bias(graph, memory.bias)
+        unbiased = _unbiased(graph, memory.bias)
         poses = before.extended(unbiased) if found.mode is None else poses_of_update(unbiased, found.mode, before)
         return None if poses is None else _with_poses(graph, found.estimate, poses)
 

@@ -23,6 +23,7 @@ def answer(verdicts: list[tuple[str, int, bool]], odometry: int = 3) -> SimpleNa
         edge_id=np.array([edge_id for _, edge_id, _ in named], dtype=np.uint64),
         kind=np.array([EdgeKind.ODOMETRY] * odometry + [EdgeKind.LOOP_CLOSURE] * len(verdicts)),
         outlier=np.array([is_false for _, _, is_false in named]),
+        waits=np.zeros(len(named), dtype=bool),
     )
 
 
@@ -39,6 +40,16 @@ def test_what_is_believed_passes_once_and_in_order():
     verdicts[1] = ("a", 5, False)
     assert closures.decide(answer(verdicts), now=3.0, delay_s=0.0).passed == ["a5", "a9"]
     assert len(closures) == 0
+
+
+def test_a_closure_that_is_not_solved_yet_does_not_pass_however_well_it_fits():
+    closures: ClosureFilter[str] = ClosureFilter()
+    closures.take(("a", 1), "it", now=0.0)
+    queued = answer([("a", 1, False)])
+    queued.waits[-1] = True
+    assert closures.decide(queued, now=1.0, delay_s=0.0).passed == []
+    queued.waits[-1] = False
+    assert closures.decide(queued, now=2.0, delay_s=0.0).passed == ["it"]
 
 
 def test_a_closure_waits_until_it_is_old_enough():

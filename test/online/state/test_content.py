@@ -136,6 +136,8 @@ def content(online: OnlineEstimator, path: Path) -> dict[str, object]:
         arrays = {name: archive[name] for name in archive.files if name != "header"}
         header = json.loads(archive["header"].tobytes())
     del header["version"]
+    turns = header.pop("world_from_odometry")
+    arrays |= {f"world_from_odometry of {robot}": np.array(turn, dtype=float) for robot, turn in turns.items()}
     return arrays | header
 
 

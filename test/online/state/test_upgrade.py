@@ -34,7 +34,7 @@ def as_of_version(path: Path, version: int) -> dict:
     header = json.loads(arrays.pop("header").tobytes())
     names = ("older", "younger", "newest")
     arrays["fingerprints"] = np.concatenate([arrays.pop(f"fingerprints_{name}") for name in names])
-    added = ("time_line", "limit", "refused_", "begins_time_line", "outlier")
+    added = ("time_line", "limit", "refused_", "begins_time_line", "outlier", "queued")
     arrays = {name: values for name, values in arrays.items() if not any(word in name for word in added)}
     room = header.pop("room")
     old = {

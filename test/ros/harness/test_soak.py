@@ -3,19 +3,34 @@
 from __future__ import annotations
 
 import math
+import os
 
 import pytest
 
 pytest.importorskip("rclpy")
 
-from rotavg_ros.ros.harness import soak
+from rotavg_ros.ros.harness import small_robots, soak
 
 pytestmark = pytest.mark.ros
 
 
-def test_a_node_under_load(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True)
+def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
     for variable in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
         monkeypatch.setenv(variable, "")  # the soak chooses; this puts them back
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="this process may use one core alone")
+def test_a_node_on_one_core_and_on_two() -> None:
+    rows = small_robots.run([80], 2.0)
+    assert [row.cores for row in rows] == [1, 2]
+    for row in rows:
+        assert row.cpu_share < row.cores + 0.1
+        assert row.node_mb > 50 and row.solver_mb > 50  # each has torch loaded
+    assert small_robots.table(rows).to_markdown().count("\n| 8") == 2
+
+
+def test_a_node_under_load() -> None:
     (row,) = soak.run(80, 3.0, rates_hz=(50.0,))
     assert 80 <= row.keyframes <= 92
     assert row.edges >= row.keyframes - 1

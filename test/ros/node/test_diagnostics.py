@@ -106,6 +106,12 @@ def test_edges_that_wait_for_what_hardly_comes(health: Health) -> None:
     assert "one clock" in of(longest_pending=KeyframeReference("robot", None, 5), longest_pending_s=100.0)
 
 
+def test_closures_that_wait_to_be_solved(health: Health) -> None:
+    status = Reporter("rotavg: estimator").report(health, Counts(10, 12, 0, {}, queued=20), NodeParameters(), False)
+    assert status.level == WARN and "at once than a tick takes in: 20 wait to be solved" in status.message
+    assert {pair.key: pair.value for pair in status.values}["queued closures"] == "20"
+
+
 def test_slow_solves_losses_and_refusals_warn(health: Health) -> None:
     health.ticks.add(20.0)
     assert "longer" in report(health).message

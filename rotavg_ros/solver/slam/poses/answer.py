@@ -12,6 +12,7 @@ from rotavg_ros.solver.slam.noise.judging import OUTLIER_ANGLE
 from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart, estimate_poses
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.solver.slam.posterior.modes import median
 from rotavg_ros.view_graph import FALSE_CLOSURE_M, ViewGraph
 
 # So many rival labellings are compared by their translations at most; those that are less likely by no more nats than
@@ -70,32 +71,24 @@ def rival_poses(graph: ViewGraph, translation: np.ndarray, modes: list[Mode]) ->
 
 
 def answer(rivals: list[tuple[PoseMode, float]]) -> Poses:
-    """The average over rival labellings."""
+    """Scores' average over rival labellings, and the poses of their median."""
     single = [_of_mode(pose) for pose, _ in rivals]
     share = np.array([each for _, each in rivals])
-    first = single[0]
-    base = np.ascontiguousarray(first.body_from_world.T)
-    turns = np.array(
-        [
-            quaternion_rows.log(
-                quaternion_rows.multiply(quaternion_rows.inverse(base), np.ascontiguousarray(other.body_from_world.T))
-            )
-            for other in single
-        ]
-    )
-    mean = np.tensordot(share, turns, 1)
-    shift = np.array([other.position for other in single])
-    position = np.tensordot(share, shift, 1)
+    orientations = [np.ascontiguousarray(other.body_from_world.T) for other in single]
+    middle = median(orientations, share)
+    chosen, base = single[middle], quaternion_rows.inverse(orientations[middle])
+    turns = np.array([quaternion_rows.log(quaternion_rows.multiply(base, other)) for other in orientations])
+    shifts = np.array([other.position - chosen.position for other in single])
     k, m = rivals[0][0].problem.turns, rivals[0][0].problem.shifts
 
     def mixed(name: str) -> np.ndarray:
         return np.tensordot(share, np.array([getattr(other, name) for other in single]), 1)
 
     return Poses(
-        quaternion_rows.normalize(quaternion_rows.multiply(base, quaternion_rows.exp(mean))).T,
-        position,
-        mixed("variance") + np.tensordot(share, ((turns - mean) ** 2).sum(axis=1), 1) / k,
-        mixed("position_variance") + np.tensordot(share, ((shift - position) ** 2).sum(axis=2), 1) / m,
+        chosen.body_from_world,
+        chosen.position,
+        mixed("variance") + np.tensordot(share, (turns**2).sum(axis=1), 1) / k,
+        mixed("position_variance") + np.tensordot(share, (shifts**2).sum(axis=2), 1) / m,
         np.clip(mixed("outlier_probability"), 0.0, 1.0),
         np.clip(mixed("rotation_probability"), 0.0, 1.0),
         mixed("precision"),

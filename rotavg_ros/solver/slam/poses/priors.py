@@ -48,5 +48,5 @@ class PlacePriors:
     turned_in_place: float = 0.5
     wrong_place: float = 0.5
     counted: float = 3.0
-    repeats: float = 0.9
+    repeats: float = 0.7
     least_wrong: float = 4.0

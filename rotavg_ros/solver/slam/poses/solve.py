@@ -39,7 +39,7 @@ def poses_of(graph: ViewGraph, mode: Mode, memory: PoseMemory | None = None) -> 
         mode: the labels, and the same graph drawn together.
         memory: where to begin; default: from nothing.
     """
-    return _going_on(graph, mode, memory) or likeliest_poses(graph, [mode])
+    return _going_on(graph, mode, memory) or likeliest_poses(graph, [mode])[0]
 
 
 def mode_of_passes(prepared: Prepared, network_log_odds: np.ndarray, verdicts: Verdicts) -> Mode:
@@ -50,10 +50,16 @@ def mode_of_passes(prepared: Prepared, network_log_odds: np.ndarray, verdicts: V
     return Mode(problem, *polish(problem, state, hold_noise=True), "passes")
 
 
-def likeliest_poses(graph: ViewGraph, modes: list[Mode]) -> PoseMemory:
-    """Of several labellings, the likeliest by rotations and translations; those that are nearly as likely averaged."""
+def likeliest_poses(graph: ViewGraph, modes: list[Mode]) -> tuple[PoseMemory, Mode]:
+    """Poses, and the labelling of ``modes`` that rotations and translations together make likeliest.
+
+    Args:
+        graph: without its bias, with translations.
+        modes: labellings of its rotations.
+    """
     rivals = rival_poses(graph, _translations(graph), modes)
-    return PoseMemory.of(rivals[0][0], answer(rivals))
+    likeliest = rivals[0][0]
+    return PoseMemory.of(likeliest, answer(rivals)), likeliest.problem.mode
 
 
 def poses_of_update(graph: ViewGraph, mode: Mode, memory: PoseMemory) -> PoseMemory | None:

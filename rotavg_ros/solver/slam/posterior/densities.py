@@ -9,8 +9,8 @@ import numpy as np
 from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 
-# An angle of less, rad, has the density of this one.
-_LEAST_ANGLE = 1e-3
+# Rad.
+_QUARTER_TURN = np.pi / 2
 
 
 def log_normal(square: np.ndarray, variance: np.ndarray | float, components: int) -> np.ndarray:
@@ -115,11 +115,15 @@ def log_false(
 
 
 def log_half_turn(angle: np.ndarray, variance: np.ndarray | float, components: int) -> np.ndarray:
-    """Of turns by ``angle``, rad, that are normal about half a turn about any axis, with ``variance`` rad²."""
+    """Of turns by ``angle``, rad, that are normal about half a turn about any axis, with ``variance`` rad².
+
+    In three components angles of less than a quarter turn count as one in the volume that they share out: however
+    broad the density, none of it gathers at the identity.
+    """
     angle = np.minimum(angle, np.pi)
     density = log_normal((np.pi - angle) ** 2, variance, 1)
     if components == 3:  # from the angle's density, all axes alike
-        density = density + np.log(2.0) - np.log(4 * np.pi * np.maximum(angle, _LEAST_ANGLE) ** 2)
+        density = density + np.log(2.0) - np.log(4 * np.pi * np.maximum(angle, _QUARTER_TURN) ** 2)
     return np.asarray(density)
 
 

@@ -1,4 +1,4 @@
-"""What is published: the average over the rival labellings, each with single closures as probabilities."""
+"""What is published of the rival labellings, in each of which single closures are probabilities: their median."""
 
 from __future__ import annotations
 
@@ -51,26 +51,37 @@ class Published:
 
 
 def publish(problem: Problem, modes: list[Mode]) -> Published:
-    """The average of distinct modes (the best first), weighted by exp(−F)."""
+    """Of distinct modes (the best first), by exp(−F): the average of their scores, the orientations of their median."""
     rivals, share = (modes[:1], np.ones(1)) if "rivals" in problem.without else distinct(problem, modes)
     answers = [of_mode(mode) for mode in rivals]
-    first = answers[0]
+    middle = median([answer.correction for answer in answers], share)
+    chosen = answers[middle]
     turns = [
-        quaternion_rows.log(quaternion_rows.multiply(quaternion_rows.inverse(first.correction), answer.correction))
+        quaternion_rows.log(quaternion_rows.multiply(quaternion_rows.inverse(chosen.correction), answer.correction))
         for answer in answers
     ]
-    mean = sum(weight * turn for weight, turn in zip(share, turns, strict=True))
-    correction = quaternion_rows.multiply(first.correction, quaternion_rows.exp(np.asarray(mean)))
     score = sum(weight * answer.outlier_probability for weight, answer in zip(share, answers, strict=True))
-    graph, k = first.graph, problem.components
-    variance = np.zeros(len(first.variance))
+    graph, k = chosen.graph, problem.components
+    variance = np.zeros(len(chosen.variance))
     for weight, answer, turn in zip(share, answers, turns, strict=True):
-        off = np.sqrt(((turn - mean) ** 2).sum(axis=0) / k)
+        off = np.sqrt((turn**2).sum(axis=0) / k)
         spread = (1 - graph.fraction) * off[graph.above] + graph.fraction * off[graph.below]
         variance += weight * (answer.variance + spread**2)
     warnings = _warnings(problem, rivals, share, turns)
     # Shares add up to one but for rounding.
-    return Published(graph, correction, np.clip(score, 0.0, 1.0), variance, tuple(share.tolist()), warnings)
+    return Published(graph, chosen.correction, np.clip(score, 0.0, 1.0), variance, tuple(share.tolist()), warnings)
+
+
+def median(corrections: list[np.ndarray], share: np.ndarray) -> int:
+    """Which of several orientations ``(4, K)`` each has the least mean angle to all, weighted by their shares.
+
+    Where two maps are folded otherwise nothing lies halfway that either of them is near.
+    """
+    if len(corrections) == 1:
+        return 0
+    cosine = np.array([[np.abs((one * other).sum(axis=0)) for other in corrections] for one in corrections])
+    angle = 2 * np.arccos(np.minimum(cosine, 1.0)).mean(axis=2)
+    return int(np.argmin(angle @ share))
 
 
 def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: list[np.ndarray]) -> tuple[str, ...]:
@@ -89,7 +100,7 @@ def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: li
     return (
         f"Other answers are nearly as likely ({100 * share[others].sum():.0f} %): they disagree about {closures} "
         f"closures and {steps} stretches of odometry, and turn parts of the map by up to {turned:.0f}°. What is "
-        "published is the average; see its uncertainty, and label the closures that you know.",
+        "published is their median; see its uncertainty, and label the closures that you know.",
     )
 
 

@@ -79,6 +79,12 @@ class Found:
         """F of the best mode, nats."""
         return self.modes[0].cost
 
+    @property
+    def bias(self) -> np.ndarray | None:
+        """``(3,)`` rad per step that was taken out of the odometry, if any was."""
+        bias = self.drawn.problem.bias
+        return None if bias is None else bias.vector
+
 
 Begin = Callable[[Prepared, CleanedClosures], Tensor]
 

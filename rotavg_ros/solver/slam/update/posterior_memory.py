@@ -28,7 +28,7 @@ from rotavg_ros.solver.slam.posterior.left_out import relabelled
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.modes import Published, publish
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
-from rotavg_ros.solver.slam.posterior.solve import Drawn, Found
+from rotavg_ros.solver.slam.posterior.solve import Drawn
 from rotavg_ros.solver.slam.posterior.state import Noise, Others, State
 from rotavg_ros.solver.slam.stages import outlier_scores
 from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over
@@ -78,10 +78,16 @@ class PosteriorMemory:
     poses: PoseMemory | None = None
 
     @classmethod
-    def of(cls, graph: ViewGraph, found: Found, estimate: Estimate) -> PosteriorMemory:
-        """After a whole search."""
-        problem, state = found.drawn.problem, found.modes[0].state
-        bias = None if problem.bias is None else problem.bias.vector
+    def of(cls, graph: ViewGraph, bias: np.ndarray | None, mode: Mode, estimate: Estimate) -> PosteriorMemory:
+        """After a whole search.
+
+        Args:
+            graph: that was solved.
+            bias: ``(3,)`` rad per step that was taken out of its odometry, if any.
+            mode: the labelling to go on from.
+            estimate: what was published, by rotations alone.
+        """
+        problem, state = mode.problem, mode.state
         trusted = problem.graph.edge_values(state.trusted)
         told = estimate.body_from_world, estimate.outlier_score, estimate.variance
         return cls(graph, trusted, state.noise, bias, *told, searched=len(problem.closure))

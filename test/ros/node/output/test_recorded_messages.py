@@ -12,6 +12,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` instal
 from rclpy.serialization import deserialize_message, serialize_message
 
 from rotavg_ros.bags import answer_messages as recorded
+from rotavg_ros.bags import bulk
 from rotavg_ros.bags.message_types import typestore
 from rotavg_ros.datasets.simulation.robot_run import RobotRun
 from rotavg_ros.datasets.simulation.slam_simulation import simulate_slam_graph
@@ -71,7 +72,7 @@ CASES: dict[str, tuple[str, Callable[..., Any], Callable[..., Any]]] = {
 def test_recorded_and_published_messages_agree(answered: tuple[Answer, Trajectory], what: str) -> None:
     """Read by the other side each; bytes between fields are anything in what rclpy serialises."""
     type_name, of_bag, of_node = CASES[what]
-    recorded_bytes = bytes(typestore().serialize_cdr(of_bag(*answered), type_name))
+    recorded_bytes = bulk.serialize(of_bag(*answered), type_name)
     message = of_node(*answered)
     published_bytes = serialize_message(message)
     kind = type(message)

@@ -123,7 +123,7 @@ def test_a_slip_is_predicted_by_what_its_witnesses_tell_together() -> None:
 
 
 def test_without_repeats_slips_are_invented() -> None:
-    name = "drive: 26 closures, 16 agree exactly"
+    name = "sphere: 30 % grouped"
     case = drawn(name, 0)
     solution = solve(case.graph, profile="slam", method=without("repeats"))
     assert error_deg(case.graph, solution, case.body_from_world) > 10
@@ -225,7 +225,7 @@ def test_there_are_few_numbers() -> None:
 # Numbers of the posterior's modules that are neither beliefs nor bounds of the search: quadrature nodes, convergence,
 # numerical floors.
 STRUCTURAL = {
-    "densities": {"_LEAST_ANGLE"},
+    "densities": {"_QUARTER_TURN"},
     "em": {"_SETTLED_TURN", "_MAX_UNSETTLED", "_NOISE_CONVERGED", "_SLOWEST", "_PROBABILITY_CONVERGED"}
     | {"_NEWTON_STEPS", "_NEWTON_CONVERGED", "_FARTHEST"},
     "inference": {"_GAIN", "_BEAM"},

@@ -1,0 +1,132 @@
+"""Closures that wait to be solved, so that a flood of them takes many short ticks instead of one long one.
+
+What a tick costs follows the closures that are new to it, and how many of those in it are false. So in each tick only
+so many enter: those first that the last answer explains, the nearest to the newest keyframes before others. One closure
+that enters is one unit of work; nothing here knows of seconds, so a bag leads to the same answers on every machine.
+A closure that waits is no part of the solve. Its score comes from its residual
+(:mod:`~rotavg_ros.online.answer.screening`). While nothing comes, twice as many enter with each tick, until all are in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rotavg_ros.online.answer.screening import Known
+from rotavg_ros.online.compaction.renumbering import Renumbering
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
+
+_MOST_DOUBLINGS = 30
+
+
+@dataclass(frozen=True)
+class EntryLimits:
+    """How many closures enter a solve in one tick. Ordinary ticks, which bring fewer, are what they were without it.
+
+    Attributes:
+        at_least: in any graph. The solver goes on from its last answer with so many; with many more it begins anew.
+        share: of the closures that are solved already, so many more. The solver begins anew after 5 % more.
+        per_keyframe: for each keyframe that is new since the last answer, so many more: a robot that drives on, and a
+            graph that is loaded, bring closures with their keyframes, a flood brings them without.
+        contradicting: of those that enter, the share of those that the last answer contradicts, at most.
+        flagged: while data flows, none but those at the newest keyframes of these enter once so many of the closures in
+            the solve are flagged, by the number of those believed. Each of them makes every tick dearer.
+        newest: so many keyframes of the last answer count as the newest, besides those that it does not know.
+    """
+
+    at_least: int = 100
+    share: float = 0.01
+    per_keyframe: int = 4
+    contradicting: float = 0.25
+    flagged: float = 0.1
+    newest: int = 10
+
+
+@dataclass
+class ClosureQueue:
+    """Which of a growing graph's edges wait, and in which order the others have entered the solve.
+
+    Attributes:
+        waits: ``(m,)`` of the first m edges, those that were there when it was last asked.
+        order: edges that have entered, in that order; what the solver remembers of its last solve goes by it. None: all
+            are in, in their own order.
+        idle_ticks: how often in a row it was asked while nothing came.
+    """
+
+    waits: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    order: NDArray[np.int64] | None = None
+    idle_ticks: int = 0
+    limits: EntryLimits = field(default_factory=EntryLimits)
+
+    def __len__(self) -> int:
+        """How many wait."""
+        return int(self.waits.sum())
+
+    def renumber(self, renumbering: Renumbering) -> None:
+        """Follow a compaction of the graph; what the solver remembers fits no graph after one."""
+        self.waits, self.order = renumbering.flags(self.waits), None
+
+    def let_in_all(self, graph: ViewGraph) -> None:
+        """The next solve is of the whole graph."""
+        self.waits = np.zeros(graph.num_edges, dtype=bool)
+        self.order, self.idle_ticks = None, 0
+
+    def let_in(self, graph: ViewGraph, known: Known | None, outlier: NDArray[np.bool_], *, idle: bool) -> None:
+        """Choose what enters the next solve.
+
+        Args:
+            graph: N keyframes, M ≥ m edges.
+            known: by the last answer; None before the first, when all enter. All enter as well where there is no
+                odometry: such a graph grows by closures.
+            outlier: ``(m',)`` flags of the last answer, of the first edges.
+            idle: nothing has come since the last tick.
+        """
+        self.idle_ticks = self.idle_ticks + 1 if idle and len(self) else 0
+        entered = np.flatnonzero(~self.waits) if self.order is None else self.order
+        in_own_order = self.order is None and not self.waits.any()
+        was_in = np.zeros(graph.num_edges, dtype=bool)
+        was_in[entered] = True
+        is_closure = graph.kind.numpy() == EdgeKind.LOOP_CLOSURE
+        waits = ~was_in & is_closure & (graph.label.numpy() == EdgeLabel.AUTOMATIC)
+        if known is not None and waits.any() and bool(graph.is_odometry.any()):
+            flagged = np.zeros(graph.num_edges, dtype=bool)
+            flagged[: len(outlier)] = outlier
+            solved = flagged[was_in & is_closure]
+            waits[self._chosen(graph, waits, known, solved)] = False
+        else:
+            waits[:] = False
+        self.waits = waits
+        self.order = None if in_own_order and not waits.any() else np.concatenate((entered, _new(waits, was_in)))
+
+    def _chosen(
+        self, graph: ViewGraph, waits: NDArray[np.bool_], known: Known, solved: NDArray[np.bool_]
+    ) -> NDArray[np.int64]:
+        """Which of the closures that wait ``(M,)`` enter, given the flags ``(C,)`` of those that are in the solve."""
+        candidates, limits = np.flatnonzero(waits), self.limits
+        num_known = len(known.body_from_world)
+        most = limits.at_least + limits.share * len(solved) + limits.per_keyframe * (graph.num_nodes - num_known)
+        most = int(most * 2.0 ** min(self.idle_ticks, _MOST_DOUBLINGS))
+        if len(candidates) <= most:
+            return candidates
+        closures = graph.select_edges(torch.from_numpy(candidates))
+        log_odds = known.carried_on(graph.select_edges(torch.from_numpy(~waits))).log_odds(closures)
+        later_end = torch.maximum(closures.source, closures.target).numpy()
+        at_newest = later_end >= num_known - limits.newest
+        explained = np.flatnonzero(log_odds >= 0)
+        explained = explained[np.argsort(-later_end[explained], kind="stable")][:most]
+        may_enter, spare = log_odds < 0, most - len(explained)
+        if not self.idle_ticks:
+            spare = min(spare, int(limits.contradicting * most))
+            if solved.sum() > max(limits.at_least, limits.flagged * (~solved).sum()):
+                may_enter &= at_newest
+        others = np.flatnonzero(may_enter)
+        others = others[np.lexsort((-log_odds[others], ~at_newest[others]))][:spare]
+        return candidates[np.concatenate((explained, others))]
+
+
+def _new(waits: NDArray[np.bool_], was_in: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Edges that enter now."""
+    return np.flatnonzero(~waits & ~was_in)
