@@ -42,7 +42,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "devices": set(),
         "algebra": set(),
         "estimate": {"neurora"},
-        "closures": {"slam"},
+        "learning": {"diagnosis", "neurora", "slam"},
         "diagnosis": {"neurora", "slam"},
         "odometry_lengths": set(),
         "positions": {"algebra", "odometry_lengths"},
@@ -94,10 +94,15 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "refinement": {"graph", "moves", "noise", "passes"},
         "moves": {"graph", "noise", "passes", "preparation"},
         "poses": {"graph", "noise", "passes", "posterior", "preparation", "stages"},
-        "update": {"graph", "network", "noise", "passes", "poses", "posterior", "preparation", "refinement", "stages"},
+        "fine_net": {"graph", "posterior"},
+        "update": {
+            *("fine_net", "graph", "network", "noise", "passes", "poses"),
+            *("posterior", "preparation", "refinement", "stages"),
+        },
         "stages": {"graph", "moves", "network", "noise", "options", "passes", "preparation", "refinement"},
         "posterior": {"graph", "moves", "network", "noise", "preparation", "stages"},
         "solve": {
+            "fine_net",
             "graph",
             "network",
             "noise",
@@ -110,6 +115,17 @@ ROOMS: dict[str, dict[str, set[str]]] = {
             "stages",
             "update",
         },
+    },
+    "solver/slam/fine_net": {
+        "": set(),
+        "evidence": set(),
+        "scale": set(),
+        "sparse_solve": set(),
+        "features": {"evidence"},
+        "network": {"features"},
+        "tuning": {"evidence", "features", "network", "scale"},
+        "sample": {"evidence", "features", "scale", "sparse_solve", "tuning"},
+        "robot_noise": {"evidence", "network", "tuning"},
     },
     "solver/slam/poses": {
         "": set(),
@@ -211,7 +227,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
 }
 # What those outside may import from the inside of a wing, besides its face.
 FACES = {
-    "solver": {"batch", "closures", "devices", "diagnosis", "methods", "networks", "pipeline", "positions", "solution"}
+    "solver": {"batch", "learning", "devices", "diagnosis", "methods", "networks", "pipeline", "positions", "solution"}
 }
 INSIDERS = {"baselines": {"algebra", "neurora"}, "training": {"algebra", "neurora"}}
 # What a robot runs needs no more.

@@ -59,7 +59,11 @@ NOT_RUN = {
 # Where the lines of the diagnostics come from.
 WARNING = (diagnostics, forwarding, wiring, frame_correction, parameter_server)
 # What makes a command take seconds instead of minutes or hours.
-SMALLER = {"--laps 4": "--laps 1", "replay my_bag --output": "replay my_bag --duration 10 --no-report --output"}
+SMALLER = {
+    "--laps 4": "--laps 1",
+    "--minutes 10": "--minutes 0.02",
+    "replay my_bag --output": "replay my_bag --duration 10 --no-report --output",
+}
 
 
 TINY_TRAINING = """\

@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import torch
 
+from rotavg_ros.cli import train_on_robot
 from rotavg_ros.cli.progress import working
 from rotavg_ros.errors import UserError
 from rotavg_ros.results import make_folder
@@ -17,6 +18,7 @@ from rotavg_ros.solver.networks import NETWORKS, WEIGHTS_FOLDER, CleanNet, Paper
 from rotavg_ros.training.config import TrainingConfig, TrainingConfigError
 from rotavg_ros.training.paper_tasks import PaperCleanTask, PaperFineTask
 from rotavg_ros.training.sfm_tasks import SfmCleanTask, SfmFineTask
+from rotavg_ros.training.slam_fine_tasks import SlamFineTask
 from rotavg_ros.training.slam_tasks import SlamCleanTask
 from rotavg_ros.training.trainer import Trainer, TrainingTask, fingerprint
 
@@ -31,11 +33,16 @@ def run(arguments: argparse.Namespace) -> int:
     """Train to the end of the configuration's epochs."""
     if arguments.threads is not None:
         torch.set_num_threads(arguments.threads)
-    config = load_config(arguments.config)
+    if (arguments.network == "slam") != (arguments.runs is not None):
+        raise TrainCommandError("slam fine-tunes on your runs and needs --from GRAPH…; other networks take none")
+    if arguments.network == "slam":
+        return train_on_robot.run(arguments)
+    name = arguments.config or arguments.network
+    config = load_config(name)
     trainer = make_trainer(
         arguments.network,
         config,
-        Inputs(arguments.config, arguments.clean_net, arguments.start),
+        Inputs(name, arguments.clean_net, arguments.start),
         arguments.output,
         arguments.device,
     )
@@ -79,14 +86,18 @@ class Inputs:
 
 
 def make_trainer(network: str, config: TrainingConfig, given: Inputs, output: Path, device: str) -> Trainer:
-    """Task and trainer for a network ("clean-net" or "fine-net") of the configuration's family.
+    """Task and trainer for a network of the configuration's family.
 
     Args:
+        network: "clean-net" or "fine-net"; "slam-clean-net" and "slam-fine-net" are those of that family alone.
         device: "auto", "cpu" or "cuda".
 
     Raises:
         UserError: options that do not fit, weights or a checkpoint that cannot be used.
     """
+    if network.startswith("slam-") and config.family != "slam":
+        raise TrainCommandError(f"{given.config}: is of the family {config.family}, {network} of the family slam")
+    asked, network = network, network.removeprefix("slam-")
     if network == "clean-net" and given.clean_net is not None:
         raise TrainCommandError("--clean-net is for fine-net; to go on with a CleanNet, give the same --output")
     if config.goes_on_from and given.start is None:
@@ -94,10 +105,12 @@ def make_trainer(network: str, config: TrainingConfig, given: Inputs, output: Pa
             f"{given.config}: goes on from the weights that `rotavg train {network} {config.goes_on_from}` makes; "
             "name them with --start"
         )
-    if config.family == "slam" and network == "fine-net":
-        raise TrainCommandError("the SLAM profile has no FineNet; its refinement does that work")
+    if config.family == "slam" and network == "fine-net" and config.recipe != "robots":
+        raise TrainCommandError(f"{given.config}: FineNet of robots' graphs needs `recipe: robots`")
+    if config.family == "slam" and given.clean_net is not None:
+        raise TrainCommandError("--clean-net is for SfM's fine-net; robots' graphs are solved with the package's")
     if config.family == "slam" and device == "cuda":
-        raise TrainCommandError("the SLAM profile's CleanNet trains on the CPU, where its graphs live")
+        raise TrainCommandError("the SLAM profile's networks train on the CPU, where its graphs live")
     name = f"{config.family}-{network}"
     # What is wrong with any of the files shows before the minutes that drawing graphs takes.
     weights = None if given.start is None else read_network(NETWORKS[name], given.start)
@@ -106,7 +119,7 @@ def make_trainer(network: str, config: TrainingConfig, given: Inputs, output: Pa
     task: TrainingTask
     if config.family == "slam":
         with working("simulating pose graphs"):
-            task = SlamCleanTask(config)
+            task = SlamCleanTask(config) if network == "clean-net" else SlamFineTask(config)
     elif network == "clean-net":
         with working("drawing view-graphs"):
             make = PaperCleanTask if config.family == "paper" else SfmCleanTask
@@ -121,7 +134,7 @@ def make_trainer(network: str, config: TrainingConfig, given: Inputs, output: Pa
         inputs["clean_net_fingerprint"] = fingerprint(before)
         with working("drawing view-graphs"):
             task = SfmFineTask(config, _torch_device(device), before)
-    command = f"rotavg train {network} {Path(given.config).stem if Path(given.config).exists() else given.config}"
+    command = f"rotavg train {asked} {Path(given.config).stem if Path(given.config).exists() else given.config}"
     if given.clean_net is not None:
         command += " --clean-net WEIGHTS"
     if weights is not None:

@@ -22,7 +22,7 @@ from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.solve import Drawn, Found, search
 from rotavg_ros.view_graph import ViewGraph
 
-__all__ = ["Comparison", "SlamPriors", "compare_with_truth", "orientations_under"]
+__all__ = ["Comparison", "SlamPriors", "compare_with_truth", "from_truth", "orientations_under"]
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,12 @@ def compare_with_truth(
     problem, modes = found.drawn.problem, found.modes
     published = publish(problem, modes)
 
-    from_truth = _from_truth(found.drawn, body_from_world, is_wrong)
+    truthful = from_truth(found.drawn, body_from_world, is_wrong)
     if problem.bias is not None:
         # The odometry may as well be without a bias.
-        as_it_is = _from_truth(Drawn.of(graph, network, without), body_from_world, is_wrong)
-        from_truth = min(from_truth, as_it_is, key=lambda either: either.cost)
-    truth = from_truth.modes[0]
+        as_it_is = from_truth(Drawn.of(graph, network, without), body_from_world, is_wrong)
+        truthful = min(truthful, as_it_is, key=lambda either: either.cost)
+    truth = truthful.modes[0]
     terms = {name: nats - truth.evaluation.terms.get(name, 0.0) for name, nats in modes[0].evaluation.terms.items()}
     return Comparison(
         published.body_from_world,
@@ -103,17 +103,17 @@ def orientations_under(graph: ViewGraph, priors: SlamPriors, *, weights: Path | 
     return publish(found.drawn.problem, found.modes).body_from_world
 
 
-def _from_truth(drawn: Drawn, body_from_world: Tensor, is_wrong: Tensor) -> Found:
+def from_truth(drawn: Drawn, body_from_world: Tensor, is_wrong: Tensor) -> Found:
     """What single flips and other noise find from the true labels ``(M,)`` and orientations ``(N, 4)``."""
     problem, closure_graph = drawn.problem, drawn.prepared.closure_graph
     trusted = np.ones(len(closure_graph.source))
     trusted[closure_graph.num_segments :] = ~is_wrong.numpy()[closure_graph.view_graph_edge]
     slipped = closure_graph.segment_of_edge[is_wrong.numpy() & (closure_graph.segment_of_edge >= 0)]
     trusted[slipped] = 0.0
-    from_truth = Search(problem)
+    begun = Search(problem)
     correction = closure_graph.corrections(body_from_world)
     start = at(problem, correction, trusted, noise_of(problem, drawn.prepared.noise))
-    from_truth.keep(from_truth.flipped(from_truth.polished(start, "truth")))
-    for mode in tuned(from_truth.modes[0]):
-        from_truth.keep(mode)
-    return Found(drawn, from_truth.modes)
+    begun.keep(begun.flipped(begun.polished(start, "truth")))
+    for mode in tuned(begun.modes[0]):
+        begun.keep(mode)
+    return Found(drawn, begun.modes)

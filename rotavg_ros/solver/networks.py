@@ -12,6 +12,7 @@ from rotavg_ros.solver.neurora.network_store import (
     read_network,
 )
 from rotavg_ros.solver.neurora.paper import PaperCleanNet, PaperFineNet
+from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.network import SlamCleanNet
 
 __all__ = [
@@ -27,5 +28,5 @@ __all__ = [
 ]
 
 NETWORKS: dict[str, type[StoredNetwork]] = {
-    kind.NAME: kind for kind in (CleanNet, FineNet, PaperCleanNet, PaperFineNet, SlamCleanNet)
+    kind.NAME: kind for kind in (CleanNet, FineNet, PaperCleanNet, PaperFineNet, SlamCleanNet, SlamFineNet)
 }

@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from rotavg_ros.datasets.simulation.stress.family import RobotFamily, RobotFamilyError
 from rotavg_ros.errors import UserError
 
 
@@ -24,7 +25,8 @@ class TrainingConfig:
         family: "sfm" or "slam", the networks' profile, or "paper": SfM as the paper's text has it.
         recipe: SfM: "released", "released-spatial" (axes anywhere), "paper", "wide" (small and large noise, mostly on
             topologies of dense clusters with a sparse fringe), "released-round" (noise axes alone anywhere), "mixture"
-            (the first three), "broad" or "mostly-released" (the first four), "any-axes" (all five); SLAM: "wide".
+            (the first three), "broad" or "mostly-released" (the first four), "any-axes" (all five); SLAM: "wide", or
+            "robots", runs whose noise is uneven, as ``robots`` has it.
         nodes: cameras or keyframes of the training graphs, drawn uniformly (SLAM: in the logarithm).
         graphs: number of training graphs; each epoch sees all of them once.
         validation_nodes, validation_graphs: the same for the graphs that decide which weights are kept.
@@ -39,6 +41,7 @@ class TrainingConfig:
             and fewer are likelier.
         seed: of data, initial weights and order.
         goes_on_from: the configuration whose weights this one begins with (``rotavg train --start``); empty: none.
+        robots: of the recipe "robots": worlds, noise, false closures and how uneven they are; None: as usual.
     """
 
     family: str = "sfm"
@@ -57,13 +60,14 @@ class TrainingConfig:
     passes: int = 1
     seed: int = 0
     goes_on_from: str = ""
+    robots: RobotFamily | None = None
 
     def __post_init__(self) -> None:
         of_photos = (
             *("released", "released-spatial", "released-round", "paper", "wide"),
             *("mixture", "broad", "mostly-released", "any-axes"),
         )
-        recipes = {"sfm": of_photos, "slam": ("wide",), "paper": of_photos}
+        recipes = {"sfm": of_photos, "slam": ("wide", "robots"), "paper": of_photos}
         if self.family not in recipes:
             raise TrainingConfigError(f"family is {self.family!r}; choose from {', '.join(recipes)}")
         if self.recipe not in recipes[self.family]:
@@ -77,6 +81,8 @@ class TrainingConfig:
             low, high = getattr(self, name)
             if not 10 <= low <= high:
                 raise TrainingConfigError(f"{name} is [{low}, {high}]; use an ascending pair of at least 10")
+        if self.robots is not None and self.recipe != "robots":
+            raise TrainingConfigError("robots is for `recipe: robots` of the family slam; add that line")
         if self.warmup_epochs < 0:
             raise TrainingConfigError(f"warmup_epochs is {self.warmup_epochs}; it must not be negative")
         if not 0 < self.learning_rate < math.inf:
@@ -117,6 +123,9 @@ class TrainingConfig:
             if key not in defaults:
                 raise TrainingConfigError(f"{origin}: unknown key {key!r}; known are {', '.join(defaults)}")
             kind = type(defaults[key])
+            if key == "robots":
+                values[key] = None if value is None else _family(value, origin)
+                continue
             try:
                 values[key] = tuple(int(item) for item in value) if kind is tuple else kind(value)
             except (TypeError, ValueError, OverflowError):
@@ -130,4 +139,18 @@ class TrainingConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as :meth:`from_dict` takes them."""
-        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+        plain = {key: value for key, value in asdict(self).items() if key != "robots" or value is not None}
+        return {key: _plain(value) for key, value in plain.items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(part) for key, part in value.items()}
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _family(content: Any, origin: str) -> RobotFamily:
+    try:
+        return RobotFamily.of(content)
+    except RobotFamilyError as error:
+        raise TrainingConfigError(f"{origin}: robots: {error}") from None

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from rotavg_ros.datasets.simulation.slam_simulation import random_slam_config, simulate_slam_graph
+from rotavg_ros.datasets.simulation.stress.family import RobotFamily
 from rotavg_ros.metrics.calibration import expected_calibration_error
-from rotavg_ros.solver.closures import ClosureFeatures, SlamCleanNet, closure_inputs
+from rotavg_ros.solver.learning.closures import ClosureFeatures, SlamCleanNet, closure_inputs
 from rotavg_ros.solver.neurora.message_passing import DirectedEdges
 from rotavg_ros.training.config import TrainingConfig
 
@@ -29,15 +30,22 @@ class SlamSample:
     is_false: Tensor
 
 
-def sample_run(nodes: tuple[int, int], rng: np.random.Generator) -> SlamSample | None:
-    """One graph of the wide family; None if it has fewer than two closures."""
+def sample_run(
+    nodes: tuple[int, int], rng: np.random.Generator, family: RobotFamily | None = None
+) -> SlamSample | None:
+    """One graph of a family, else of the wide one; None if it has fewer than two closures."""
     keyframes = round(float(np.exp(rng.uniform(*np.log(nodes)))))
-    run = simulate_slam_graph(random_slam_config(rng, keyframes), rng)
-    inputs = closure_inputs(run.graph)
+    if family is None:
+        run = simulate_slam_graph(random_slam_config(rng, keyframes), rng)
+        graph, is_false = run.graph, run.closure_is_false
+    else:
+        drawn = family.drawn(keyframes, rng)
+        graph, is_false = drawn.graph, drawn.is_false
+    inputs = closure_inputs(graph)
     if inputs is None:
         return None
     features, closures = inputs
-    return SlamSample(features, torch.from_numpy(run.closure_is_false[closures]))
+    return SlamSample(features, torch.from_numpy(is_false[closures]))
 
 
 def join(samples: Sequence[SlamSample]) -> SlamSample:
@@ -58,9 +66,10 @@ class SlamCleanTask:
 
     def __init__(self, config: TrainingConfig) -> None:
         self.config = config
-        self.samples = _draw(config.graphs, config.nodes, np.random.default_rng((config.seed, 1)))
+        family = (config.robots or RobotFamily()) if config.recipe == "robots" else None
+        self.samples = _draw(config.graphs, config.nodes, np.random.default_rng((config.seed, 1)), family)
         self.validation = _draw(
-            config.validation_graphs, config.validation_nodes, np.random.default_rng((config.seed, 2))
+            config.validation_graphs, config.validation_nodes, np.random.default_rng((config.seed, 2)), family
         )
         torch.manual_seed(config.seed)
         self.network = SlamCleanNet()
@@ -89,10 +98,10 @@ class SlamCleanTask:
         }
 
 
-def _draw(count: int, nodes: tuple[int, int], rng: np.random.Generator) -> list[SlamSample]:
+def _draw(count: int, nodes: tuple[int, int], rng: np.random.Generator, family: RobotFamily | None) -> list[SlamSample]:
     samples: list[SlamSample] = []
     while len(samples) < count:
-        sample = sample_run(nodes, rng)
+        sample = sample_run(nodes, rng, family)
         if sample is not None:
             samples.append(sample)
     return samples

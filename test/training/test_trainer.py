@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 from safetensors.torch import load_file
 
+from rotavg_ros.datasets.simulation.stress.family import RobotFamily
 from rotavg_ros.errors import UserError
 from rotavg_ros.solver.networks import NETWORKS
 from rotavg_ros.solver.neurora.clean_net import CleanNet
@@ -21,6 +23,7 @@ from rotavg_ros.training import checkpoint
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.paper_tasks import PaperCleanTask, PaperFineTask
 from rotavg_ros.training.sfm_tasks import SfmCleanTask, SfmFineTask
+from rotavg_ros.training.slam_fine_tasks import SlamFineTask
 from rotavg_ros.training.slam_tasks import SlamCleanTask
 from rotavg_ros.training.trainer import Trainer, TrainingTask, fingerprint
 
@@ -40,6 +43,9 @@ SLAM = TrainingConfig(
     batch_graphs=2,
 )
 PAPER = replace(SFM, family="paper", recipe="paper", edge_dropout=0.25)
+ROBOTS = replace(
+    SLAM, recipe="robots", passes=2, robots=RobotFamily(worlds=("building", "grid"), false_share=(0.0, 0.2))
+)
 CPU = torch.device("cpu")
 
 
@@ -55,6 +61,8 @@ def _one_thread() -> Iterator[None]:
 def make_task(name: str) -> tuple[TrainingTask, TrainingConfig]:
     if name == "slam-clean-net":
         return SlamCleanTask(SLAM), SLAM
+    if name == "slam-fine-net":
+        return SlamFineTask(ROBOTS), ROBOTS
     if name == "sfm-clean-net":
         return SfmCleanTask(SFM, CPU), SFM
     if name == "paper-clean-net":
@@ -82,7 +90,7 @@ def log(folder: Path, name: str) -> list[dict[str, float]]:
 
 
 @pytest.mark.parametrize(
-    "name", ["sfm-clean-net", "sfm-fine-net", "slam-clean-net", "paper-clean-net", "paper-fine-net"]
+    "name", ["sfm-clean-net", "sfm-fine-net", "slam-clean-net", "slam-fine-net", "paper-clean-net", "paper-fine-net"]
 )
 def test_resumed_run_equals_unbroken_run_bit_for_bit(name: str, tmp_path: Path) -> None:
     make_trainer(name, tmp_path / "unbroken").run()
@@ -231,3 +239,27 @@ def test_training_reduces_the_loss(tmp_path: Path) -> None:
     Trainer(SfmCleanTask(config, CPU), config, tmp_path, "sfm-clean-net").run()
     losses = [row["loss"] for row in log(tmp_path, "sfm-clean-net")]
     assert losses[-1] < 0.7 * losses[0]
+
+
+def test_a_stated_family_is_what_both_networks_of_robots_see() -> None:
+    """All closures of one false share, in flat worlds alone."""
+    family = RobotFamily(
+        worlds=("building",), planar_share=1.0, false_share=(0.3, 0.3), closures_per_keyframe=(0.5, 0.5)
+    )
+    config = replace(SLAM, recipe="robots", robots=family)
+    false = torch.cat([sample.is_false for sample in SlamCleanTask(config).samples])
+    assert float(false.double().mean()) == pytest.approx(0.3, abs=0.05)
+    runs = SlamFineTask(replace(config, graphs=2, validation_graphs=1)).runs
+    assert all(run.first.told.components == 1 for run in runs)
+
+
+def test_a_family_survives_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "robots.yaml"
+    path.write_text(yaml.safe_dump(ROBOTS.to_dict()))
+    assert TrainingConfig.load(path) == ROBOTS
+    path.write_text("family: slam\nrecipe: robots\nrobots:\n  worlds: [moon]\n")
+    with pytest.raises(UserError, match=r"robots.yaml: robots: worlds is \['moon'\]; choose some of building"):
+        TrainingConfig.load(path)
+    path.write_text("family: slam\nrecipe: wide\nrobots:\n  planar_share: 1\n")
+    with pytest.raises(UserError, match="robots is for `recipe: robots`"):
+        TrainingConfig.load(path)

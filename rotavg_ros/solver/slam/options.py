@@ -7,6 +7,8 @@ from dataclasses import dataclass
 # Terms of the posterior, moves and starts of its search, and the network, each with what is left without it.
 SWITCHES: dict[str, str] = {
     "cleannet": "closures are judged beforehand by their discrepancy with the odometry alone",
+    "tree": "the search begins at odometry's orientations, not along CleanNet's tree",
+    "fine-net": "all edges of a kind err as the noise's densities have it, whatever their neighbours say",
     "tails": "good edges are Gaussian",
     "near-misses": "false closures are uniform over all rotations",
     "repeats": "every false closure is wrong by itself",

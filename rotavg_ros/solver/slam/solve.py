@@ -12,6 +12,8 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.estimate import Estimate, Places, Run
 from rotavg_ros.solver.slam import refinement as slam_refinement
 from rotavg_ros.solver.slam import stages as slam_stages
+from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
+from rotavg_ros.solver.slam.fine_net.tuning import all_fine_tuned
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract_along
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
@@ -108,18 +110,25 @@ def _solve_by_posterior(graph: ViewGraph, stages: SlamStages, run: Run) -> Estim
     def begin(prepared: Prepared, cleaned: slam_stages.CleanedClosures) -> Tensor:
         if run.warm_start is not None:
             return prepared.closure_graph.corrections(run.warm_start.double())
+        if "tree" in stages.without:
+            return rotations.identity(prepared.closure_graph.num_nodes)
         return slam_stages.bootstrap(prepared, cleaned)
 
     network = None if "cleannet" in stages.without else run.networks.load(SlamCleanNet)
     with run.watch.stage("refine"):
         found = search(graph, network, begin, stages.without)
-        published = publish(found.drawn.problem, found.modes)
+        modes = found.modes
+        if "fine-net" not in stages.without:
+            modes = all_fine_tuned(modes, run.networks.load(SlamFineNet))
+        published = publish(found.drawn.problem, modes)
     with run.watch.stage("expand"):
-        estimate, mode, poses = estimate_of(published, found.modes[0].state.noise), found.modes[0], None
+        estimate, likeliest, poses = estimate_of(published, modes[0].state.noise), modes[0], None
     if "translations" not in stages.without and has_places(graph):
         with run.watch.stage("poses"):
-            poses, mode = likeliest_poses(_unbiased(graph, found.bias), found.modes)
+            poses, likeliest = likeliest_poses(_unbiased(graph, found.bias), modes)
     if not stages.without:
+        # Updates go on from a labelling as the search left it.
+        mode = next(before for before, after in zip(found.modes, modes, strict=True) if after is likeliest)
         estimate = replace(estimate, memory=PosteriorMemory.of(graph, found.bias, mode, estimate))
     return estimate if poses is None else _with_poses(graph, estimate, poses)
 
@@ -201,7 +210,8 @@ def update_slam(graph: ViewGraph, memory: SlamMemory | PosteriorMemory, run: Run
 
 def _updated_by_search(graph: ViewGraph, memory: PosteriorMemory, start: Tensor, run: Run) -> Estimate | None:
     with run.watch.stage("update"):
-        found = memory.updated(graph, run.networks.load(SlamCleanNet), start)
+        networks = run.networks.load(SlamCleanNet), run.networks.load(SlamFineNet)
+        found = memory.updated(graph, networks, start)
     before = memory.poses
     if found is None or before is None:
         return None if found is None else found.estimate

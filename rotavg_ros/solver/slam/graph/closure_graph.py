@@ -128,6 +128,12 @@ class ClosureGraph:
         fraction = np.divide(passed - start, length, out=self.fraction.copy(), where=length > 0)
         return replace(self, fraction=fraction, length=length)
 
+    def varying(self, relative: np.ndarray) -> ClosureGraph:
+        """The graph whose edges have ``relative`` ``(E,)`` times the variance; a segment has it all along."""
+        of_node = np.ones(self.num_nodes)
+        of_node[self.target[: self.num_segments]] = relative[: self.num_segments]
+        return replace(self, length=self.length * of_node[self.below])
+
 
 def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
     """Draw the odometry chains of ``graph`` (on the CPU) together along ``forest``."""

@@ -119,6 +119,8 @@ def _precision(pose: PoseMode) -> np.ndarray:
     problem, noise, drawn = pose.problem, pose.state.noise, pose.problem.drawn
     graph, closure, edges = problem.graph, problem.mode.problem.closure, problem.closures
     variance = np.stack((noise.turn * graph.steps.numpy(), noise.way * problem.lengths_passed), axis=1)
+    if (relative := problem.mode.problem.relative) is not None:
+        variance[:, 0] *= drawn.edge_values(relative)
     slipped = drawn.edge_values((drawn.is_odometry & ~problem.mode.state.is_good).astype(np.float64))
     slip = np.radians(problem.mode.problem.priors.slip_deg), problem.priors.slip * problem.typical
     variance += (slipped * drawn.share_of_segment)[:, None] * np.square(slip)

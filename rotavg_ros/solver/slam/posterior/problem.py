@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -39,6 +40,8 @@ class Problem:
         without: names of terms and moves that are switched off (:data:`rotavg_ros.solver.slam.options.SWITCHES`).
         bias: what was taken out of all odometry beforehand, if anything.
         turned: ``(N,)`` rad², squares of the turns of odometry's steps from each node's root on; None if unknown.
+        travelled: ``(N,)`` metres of odometry from each node's root on; None if unknown.
+        relative: ``(E,)`` each edge's own variance over what noise makes of it, as FineNet has it; None: 1.
     """
 
     graph: ClosureGraph
@@ -51,6 +54,8 @@ class Problem:
     without: frozenset[str] = frozenset()
     bias: Bias | None = None
     turned: np.ndarray | None = None
+    travelled: np.ndarray | None = None
+    relative: np.ndarray | None = None
     _systems: dict[float, NormalEquations] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @classmethod
@@ -86,6 +91,12 @@ class Problem:
         return cls(
             graph, components, told, chain, follows, priors, without=frozenset(without), bias=bias, turned=turned
         )
+
+    def with_relative(self, relative: np.ndarray) -> Problem:
+        """The same, but for ``relative`` ``(E,)`` times the variances; what is known of the pattern is shared."""
+        other = copy.copy(self)
+        object.__setattr__(other, "relative", relative)
+        return other
 
     @cached_property
     def closure(self) -> np.ndarray:
@@ -169,32 +180,45 @@ class Problem:
 
     @cached_property
     def _passed(self) -> np.ndarray:
-        """``(2, N)`` steps and turn steps of odometry from each node's root on."""
+        """``(3, N)`` steps of odometry from each node's root on; as many in all, by the squares of turns, by metres."""
+        steps = np.asarray(self.graph.paths.depth, dtype=np.float64)
+        turned = None if "turns" in self.without else self.turned
+        return np.stack((steps, self._as_steps(turned), self._as_steps(self.travelled)))
+
+    def _as_steps(self, passed: np.ndarray | None) -> np.ndarray:
+        """``(N,)`` of what was passed from the root on, all of odometry as long as its steps; these if unknown."""
         graph = self.graph
         steps = np.asarray(graph.paths.depth, dtype=np.float64)
+        if passed is None:
+            return steps
         segments = slice(graph.num_segments)
-        turned = np.zeros_like(steps) if self.turned is None or "turns" in self.without else self.turned
-        of_segments = turned[graph.nodes[graph.target[segments]]] - turned[graph.nodes[graph.source[segments]]]
+        of_segments = passed[graph.nodes[graph.target[segments]]] - passed[graph.nodes[graph.source[segments]]]
         total = float(of_segments.sum())
-        scaled = turned * float(graph.own_steps[segments].sum()) / total if total > 0 else steps
-        return np.stack((steps, scaled))
+        return passed * float(graph.own_steps[segments].sum()) / total if total > 0 else steps
 
     @cached_property
     def turn_steps(self) -> np.ndarray:
         """``(E,)`` as many steps in all, shared out among segments by the squares of their turns."""
+        return self._of_segments(1)
+
+    @cached_property
+    def length_steps(self) -> np.ndarray:
+        """``(E,)`` as many steps in all, shared out among segments by the metres that they pass."""
+        return self._of_segments(2)
+
+    def _of_segments(self, row: int) -> np.ndarray:
         graph = self.graph
         segments = np.arange(graph.num_segments)
-        passed = self._passed[1][graph.nodes]
+        passed = self._passed[row][graph.nodes]
         steps = graph.own_steps.copy()
         steps[segments] = passed[graph.target[segments]] - passed[graph.source[segments]]
         return np.asarray(steps)
 
     def drawn(self, noise: Noise) -> ClosureGraph:
         """The graph whose nodes lie along their segments as odometry's variance does under ``noise``."""
-        if noise.turn_share == 0:
-            return self.graph
-        steps, turns = self._passed
-        return self.graph.passing(steps + noise.turn_share * (turns - steps))
+        steps, turns, _ = self._passed
+        drawn = self.graph if noise.turn_share == 0 else self.graph.passing(steps + noise.turn_share * (turns - steps))
+        return drawn if self.relative is None else drawn.varying(self.relative)
 
     @cached_property
     def turns_vary(self) -> bool:

@@ -30,6 +30,8 @@ def variances(problem: Problem, noise: Noise) -> np.ndarray:
     closure = problem.closure
     own = np.where(system.shared[closure], 1 - noise.common_share, 1.0)
     variance[closure] = own * np.exp(noise.exponent * problem.stated_ratio) * noise.closure_variance
+    if problem.relative is not None:
+        variance *= problem.relative
     common = np.full(system.num_runs, noise.common_share * noise.closure_variance)
     return np.concatenate((variance, common))
 

@@ -59,6 +59,7 @@ class Drawn:
         problem = Problem.of(
             prepared, cleaned.network_log_odds, priors=priors, without=without, bias=of_bias, turned=turned
         )
+        problem = replace(problem, travelled=_travelled(graph, prepared))
         return cls(prepared, cleaned, problem)
 
     def orientations(self, state: State) -> Tensor:
@@ -148,9 +149,23 @@ def _with_better_bias(
 
 def _turned(graph: ViewGraph, prepared: Prepared) -> np.ndarray:
     """``(N,)`` rad², squares of the turns of odometry's steps from each node's root on."""
-    square = ((rotations.log(graph.target_from_source) ** 2).sum(dim=1) * graph.is_odometry).numpy()
+    return _from_root((rotations.log(graph.target_from_source) ** 2).sum(dim=1) * graph.is_odometry, prepared)
+
+
+def _travelled(graph: ViewGraph, prepared: Prepared) -> np.ndarray | None:
+    """``(N,)`` metres of odometry from each node's root on; None unless all of it is known."""
+    if graph.translation is None:
+        return None
+    length = torch.linalg.vector_norm(graph.translation, dim=1)
+    if not bool(torch.isfinite(length[graph.is_odometry]).all()):
+        return None
+    return _from_root(torch.where(graph.is_odometry, length, 0.0), prepared)
+
+
+def _from_root(of_edge: Tensor, prepared: Prepared) -> np.ndarray:
+    """``(N,)`` sums of values ``(M,)`` of edges along the forest, from each node's root on."""
     parent_edge = prepared.forest.parent_edge
-    return accumulate_to_root(prepared.forest, np.where(parent_edge >= 0, square[parent_edge], 0.0))
+    return accumulate_to_root(prepared.forest, np.where(parent_edge >= 0, of_edge.double().numpy()[parent_edge], 0.0))
 
 
 def _moved(mode: Mode, before: Drawn, after: Drawn) -> State:

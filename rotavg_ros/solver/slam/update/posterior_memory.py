@@ -16,6 +16,8 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.estimate import Estimate
+from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
+from rotavg_ros.solver.slam.fine_net.tuning import fine_tuned
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
@@ -90,12 +92,14 @@ class PosteriorMemory:
         told = estimate.body_from_world, estimate.outlier_score, estimate.variance
         return cls(graph, trusted, state.noise, bias, *told, searched=len(problem.closure))
 
-    def updated(self, graph: ViewGraph, network: SlamCleanNet, body_from_world: Tensor) -> SearchedOn | None:
+    def updated(
+        self, graph: ViewGraph, networks: tuple[SlamCleanNet, SlamFineNet], body_from_world: Tensor
+    ) -> SearchedOn | None:
         """Solve a graph that has grown from this one; None if it has not, or the whole search should run.
 
         Args:
             graph: N nodes.
-            network: CleanNet.
+            networks: CleanNet and FineNet, which is applied once.
             body_from_world: ``(N, 4)`` start, where a closure is new.
         """
         num_closures = int((~graph.is_odometry).sum())
@@ -104,7 +108,7 @@ class PosteriorMemory:
             return None
         if (appended := self._appended(graph)) is not None:
             return SearchedOn(appended, None)
-        drawn = Drawn.of(graph, network, bias=self.bias)
+        drawn = Drawn.of(graph, networks[0], bias=self.bias)
         problem = drawn.problem
         before = carried_over(self.trusted, problem.graph, _NEW)
         is_new = before == _NEW
@@ -118,7 +122,8 @@ class PosteriorMemory:
         is_old_closure = problem.graph.is_closure & ~is_new
         if (mode.state.trusted != start.trusted)[is_old_closure].sum() > _MAX_TURNED:
             return None
-        estimate = estimate_of(publish(problem, [mode]), mode.state.noise)
+        fine = fine_tuned(mode, networks[1], passes=1)
+        estimate = estimate_of(publish(problem, [fine]), fine.state.noise)
         memory = replace(
             self,
             graph=graph,
@@ -129,7 +134,7 @@ class PosteriorMemory:
             variance=estimate.variance,
             updates=self.updates + 1,
         )
-        return SearchedOn(replace(estimate, memory=memory), mode)
+        return SearchedOn(replace(estimate, memory=memory), fine)
 
     def _appended(self, graph: ViewGraph) -> Estimate | None:
         """The answer if each new node hangs on an older one by one edge of odometry, and nothing else is new.

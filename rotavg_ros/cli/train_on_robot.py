@@ -1,0 +1,100 @@
+"""What ``rotavg train slam --from`` does: it fine-tunes FineNet of robots' graphs on how the user's own robot errs."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+
+from rotavg_ros.cli.convert import format_of
+from rotavg_ros.cli.progress import working
+from rotavg_ros.datasets.files.ground_truth import attach_truth
+from rotavg_ros.errors import UserError
+from rotavg_ros.results import make_folder
+from rotavg_ros.solver.learning.fine_tuning import SlamFineNet
+from rotavg_ros.solver.learning.robot_runs import RobotNoise, RobotRun
+from rotavg_ros.training.own_robot import Verdict, compare, family_of, fine_tune
+
+_LEAST_CLOSURES = 12
+_TRIED = "tried"
+
+
+class OwnRobotError(UserError):
+    """Runs that say too little of how a robot errs."""
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Look, simulate, train, compare; keep what is better."""
+    truths = arguments.truth or [None] * len(arguments.runs)
+    if len(truths) != len(arguments.runs):
+        raise OwnRobotError(f"--truth names {len(truths)} files, --from {len(arguments.runs)}; give one for each")
+    for name in ("config", "clean_net", "start"):
+        if getattr(arguments, name) is not None:
+            raise OwnRobotError(f"slam takes no {name.replace('_', '-')}: it begins with the package's network")
+    runs = [_read(path, truth) for path, truth in zip(arguments.runs, truths, strict=True)]
+    noises = [each.noise() for each in runs]
+    for path, noise in zip(arguments.runs, noises, strict=True):
+        print(f"{path}: {_told(noise)}", flush=True)
+    family = family_of(noises)
+    tried = arguments.output / _TRIED
+    if tried.exists():
+        raise OwnRobotError(f"{tried}: is there from before; remove it or choose another --output")
+    make_folder(tried)
+    plain = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(family).items()}
+    (tried / "robots.yaml").write_text(yaml.safe_dump({"robots": plain}, sort_keys=False))
+    network = fine_tune(family, noises, tried, arguments.minutes, lambda line: print(line, flush=True))
+    with working("comparing on stretches that are held back"):
+        verdict = compare(runs, network)
+    print(_said(verdict))
+    if verdict.is_better:
+        for suffix in (".safetensors", ".json"):
+            shutil.copy(tried / f"{SlamFineNet.NAME}{suffix}", arguments.output)
+        print(f"{arguments.output / SlamFineNet.NAME}.safetensors: use it by `--weights {arguments.output}`")
+    else:
+        print(f"the package's network stays; what was tried lies in {tried}")
+    (arguments.output / "verdict.json").write_text(json.dumps({**asdict(verdict), "kept": verdict.is_better}) + "\n")
+    return 0
+
+
+def _read(path: Path, truth: Path | None) -> RobotRun:
+    with working(f"solving {path}"):
+        graph_file = format_of(path).read_graph(path)
+        if truth is not None:
+            graph_file = attach_truth(graph_file, truth)
+        closures = int((~graph_file.graph.is_odometry).sum())
+        if closures < _LEAST_CLOSURES or closures == graph_file.graph.num_edges:
+            raise OwnRobotError(f"{path}: has {closures} closures; need odometry and {_LEAST_CLOSURES} at least")
+        known = graph_file.body_from_world_gt if truth is not None else None
+        if known is not None and not np.isfinite(known).all():
+            raise OwnRobotError(f"{truth}: does not tell all orientations of {path}; leave it out")
+        return RobotRun.of(graph_file.graph, None if known is None else torch.from_numpy(known))
+
+
+def _told(noise: RobotNoise) -> str:
+    parts = [
+        f"odometry {noise.odometry_deg:.3g}° a step",
+        f"level spread {noise.step_spread:.2f}",
+        f"closures {noise.closure_deg:.3g}°",
+        f"level spread {noise.closure_spread:.2f}",
+        f"{100 * noise.false_share:.0f} % false, {100 * noise.grouped_share:.0f} % of these in groups",
+    ]
+    if noise.per_turn > 0:
+        parts.append(f"{100 * noise.per_turn:.1f} % of the angle in turns")
+    if noise.common_share > 0:
+        parts.append(f"closures of a run share {100 * noise.common_share:.0f} % of their variance")
+    return ("planar; " if noise.planar else "") + ", ".join(parts)
+
+
+def _said(verdict: Verdict) -> str:
+    if verdict.stretches < 2:
+        return "too few closures to hold stretches of them back: nothing can be said"
+    return (
+        f"{verdict.stretches} stretches held back: {verdict.gain:+.3f} ± {verdict.standard_error:.3f} nats a closure "
+        f"beside the package's network, which gains {verdict.without:+.3f} over none"
+    )

@@ -1,0 +1,1 @@
+"""What training sees of robots' graphs and their solves."""

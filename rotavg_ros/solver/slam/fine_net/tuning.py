@@ -1,0 +1,132 @@
+"""A labelling's orientations with each edge weighing what FineNet says it errs by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros.solver.slam.fine_net.evidence import Evidence
+from rotavg_ros.solver.slam.fine_net.features import fine_features
+from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
+from rotavg_ros.solver.slam.fine_net.scale import Told
+from rotavg_ros.solver.slam.posterior.em import step
+from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.solver.slam.posterior.objective import Evaluation
+from rotavg_ros.solver.slam.posterior.problem import Problem
+from rotavg_ros.solver.slam.posterior.rows import residuals
+from rotavg_ros.solver.slam.posterior.state import Noise, State
+from rotavg_ros.solver.slam.posterior.system import Factorised
+
+# NeuRoRA-v2 applies its FineNet twice.
+PASSES = 2
+# What it says of a kind of edges counts once it explains them better by more nats than the first, and wholly after as
+# many more as the second: on graphs whose edges of a kind err alike it gains up to some 15 by chance.
+_CHANCE, _SURE = 12.0, 12.0
+# Sparse solves after each.
+_SOLVES = 1
+# Fewer edges of odometry or closures tell nothing of how they differ.
+_LEAST_EDGES = 3
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """A labelling under weights of FineNet's.
+
+    Attributes:
+        problem: with those variances.
+        state: the same labels.
+        factorised: the last solve.
+    """
+
+    problem: Problem
+    state: State
+    factorised: Factorised
+
+
+def all_fine_tuned(modes: list[Mode], network: SlamFineNet) -> list[Mode]:
+    """The modes (the best first), rivals of the best fine-tuned; what is published is made of these."""
+    farthest = modes[0].cost + modes[0].problem.limits.rival
+    return [fine_tuned(mode, network) if mode.cost <= farthest else mode for mode in modes]
+
+
+def fine_tuned(mode: Mode, network: SlamFineNet, passes: int = PASSES) -> Mode:
+    """The mode's labels, orientations and noise under variances that FineNet predicts.
+
+    F and so the mode's probability among its rivals stay as they were found: labellings are compared by one model.
+
+    Args:
+        mode: at its optimum.
+        network: FineNet.
+        passes: how often it is applied.
+    """
+    closures = len(mode.problem.closure)
+    if min(closures, len(mode.problem.graph.source) - closures) < _LEAST_EDGES:
+        return mode
+    tuned = Tuned(mode.problem, mode.state, mode.evaluation.factorised)
+    for _ in range(passes):
+        tuned = applied(network, tuned)
+    residual = residuals(tuned.problem, tuned.state)
+    evaluation = Evaluation(mode.evaluation.terms, residual, tuned.factorised.weight, tuned.factorised)
+    return replace(mode, problem=tuned.problem, state=tuned.state, evaluation=evaluation)
+
+
+@torch.inference_mode()
+def applied(network: SlamFineNet, before: Tuned) -> Tuned:
+    """After FineNet once more: its variances take the place of the noise's tails."""
+    evidence = Evidence.of(before.problem, before.state)
+    log_noise = network(fine_features(evidence)).double()
+    used = torch.from_numpy(1 / evidence.weight)
+    edges = told(evidence)
+    variance = used * (believed(evidence, edges, used, log_noise) * log_noise).exp()
+    scale = edges.log_scale(used, variance)
+    usual = evidence.own * np.exp(-evidence.log_relative)
+    problem = before.problem.with_relative(variance.numpy() / usual)
+    state = replace(before.state, noise=_scaled(before.state.noise, *scale.exp().tolist()))
+    for _ in range(_SOLVES):
+        state, _, factorised = step(problem, state)
+    return Tuned(problem, state, factorised)
+
+
+def believed(evidence: Evidence, edges: Told, used: Tensor, log_noise: Tensor) -> Tensor:
+    """``(E,)`` how far FineNet is believed of each kind of edges, 0 to 1, by what it explains of them.
+
+    It has seen the discrepancies that it explains, so that it gains some nats where all edges of a kind err alike.
+
+    Args:
+        evidence: of the solve.
+        edges: the same, as the noise's scale needs it.
+        used: ``(E,)`` rad², variances without it.
+        log_noise: ``(E,)`` logarithms of what it says over these.
+    """
+    kind = edges.is_odometry.long()
+    variance = used * log_noise.exp()
+    total = variance * edges.log_scale(used, variance).exp()[kind] + edges.predicted
+    k = edges.components
+    log_density = -edges.square / (2 * total) - k / 2 * torch.log(2 * np.pi * total)
+    gained = edges.good * (log_density - torch.from_numpy(evidence.log_density))
+    nats = torch.zeros(2, dtype=torch.float64).index_add(0, kind, gained)
+    return ((nats - _CHANCE) / _SURE).clamp(0.0, 1.0)[kind]
+
+
+def told(evidence: Evidence) -> Told:
+    """What others say of edges."""
+    return Told(
+        torch.from_numpy(evidence.is_odometry),
+        torch.from_numpy(evidence.is_good.astype(np.float64)),
+        torch.from_numpy(evidence.square),
+        torch.from_numpy(evidence.predicted),
+        evidence.components,
+    )
+
+
+def _scaled(noise: Noise, closures: float, steps: float) -> Noise:
+    return replace(
+        noise,
+        step_variance=noise.step_variance * steps,
+        closure_variance=noise.closure_variance * closures,
+        step_tails=0.0,
+        closure_tails=0.0,
+    )

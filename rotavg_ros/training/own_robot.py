@@ -1,0 +1,146 @@
+"""Fine-tuning on a user's own robot: how it errs, runs that err alike, and whether the outcome explains it better."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from rotavg_ros.datasets.simulation.stress.family import RobotFamily
+from rotavg_ros.datasets.simulation.trajectories import PLANAR_WORLDS
+from rotavg_ros.datasets.worlds import World
+from rotavg_ros.solver.learning.fine_tuning import SlamFineNet, SolvedRun
+from rotavg_ros.solver.learning.robot_runs import RobotNoise, RobotRun
+from rotavg_ros.solver.networks import load_network, read_network
+from rotavg_ros.training.config import TrainingConfig
+from rotavg_ros.training.slam_fine_tasks import SlamFineTask, draw_runs
+from rotavg_ros.training.trainer import Trainer
+
+# What is measured on few runs may be off by this factor; shares by this much.
+_FACTOR, _SHARE = 1.5, 0.1
+# A cause of unevenness is as likely as this where runs show it, and where not.
+_SEEN, _UNSEEN = 0.8, 0.1
+# Levels that spread by less, in the logarithm of σ, are as good as even.
+_EVEN = 0.15
+# Part of the time in which runs are simulated and solved; every this many of them one is for validation.
+_DRAWING, _EVERY = 0.45, 8
+_LEAST_RUNS, _MOST_KEYFRAMES, _MOST_EPOCHS = 16, 800, 60
+_STANDARD_ERRORS = 2.0
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a network explains held-back stretches better than another.
+
+    Attributes:
+        gain: nats a closure, in the mean over stretches.
+        standard_error: of that.
+        stretches: how many there were.
+        without: by how much the other one is better than no FineNet, nats a closure.
+    """
+
+    gain: float
+    standard_error: float
+    stretches: int
+    without: float
+
+    @property
+    def is_better(self) -> bool:
+        """By more than two standard errors."""
+        return self.stretches > 1 and self.gain > _STANDARD_ERRORS * self.standard_error
+
+
+def family_of(noises: Sequence[RobotNoise]) -> RobotFamily:
+    """Runs that err as these do, give or take what few runs can tell."""
+
+    def around(values: Sequence[float], least: float, most: float) -> tuple[float, float]:
+        low, high = min(values) / _FACTOR, max(values) * _FACTOR
+        return float(np.clip(low, least, most)), float(np.clip(high, least, most))
+
+    def seen(values: Sequence[bool]) -> float:
+        return _SEEN if any(values) else _UNSEEN
+
+    false = [noise.false_share for noise in noises]
+    steps, closures = [noise.step_spread for noise in noises], [noise.closure_spread for noise in noises]
+    turning = [noise.per_turn for noise in noises if noise.per_turn > 0]
+    common = [noise.common_share for noise in noises if noise.common_share > 0]
+    planar = float(np.mean([noise.planar for noise in noises]))
+    worlds = PLANAR_WORLDS if planar > 0 else tuple(World)
+    usual = RobotFamily()
+    return RobotFamily(
+        worlds=tuple(world.value for world in worlds),
+        planar_share=planar,
+        odometry_deg=around([noise.odometry_deg for noise in noises], 1e-3, 20.0),
+        closure_deg=around([noise.closure_deg for noise in noises], 1e-2, 30.0),
+        closures_per_keyframe=around([noise.closures_per_keyframe for noise in noises], 1e-3, 3.0),
+        false_share=(max(min(false) - _SHARE, 0.0), min(max(false) + _SHARE, 0.9)),
+        grouped_share=float(np.mean([noise.grouped_share for noise in noises])),
+        even=0.0,
+        uneven=seen([spread > _EVEN for spread in steps]),
+        level=seen([spread > _EVEN for spread in steps]),
+        level_spread=around([max(*steps, *closures, _EVEN)], 0.0, 3.0),
+        single=seen([noise.closure_spread > _EVEN for noise in noises]) / 2,
+        turns=seen([bool(turning)]),
+        per_turn=around(turning, 0.0, 1.0) if turning else usual.per_turn,
+        qualities=seen([spread > _EVEN for spread in closures]) / 2,
+        heavy=seen([spread > _EVEN for spread in closures]),
+        common=seen([bool(common)]),
+        common_share=around(common, 0.0, 0.95) if common else usual.common_share,
+        stated=seen([noise.states_precision for noise in noises]),
+    )
+
+
+def fine_tune(
+    family: RobotFamily, noises: Sequence[RobotNoise], folder: Path, minutes: float, told: Callable[[str], None]
+) -> SlamFineNet:
+    """The package's network after training on runs of a family.
+
+    Args:
+        family: that errs as the robot does.
+        noises: of its runs, whose lengths the simulated ones have.
+        folder: of the weights, their card and log.
+        minutes: for all of it.
+        told: gets a line on how far it is.
+    """
+    begun = time.monotonic()
+    lengths = sorted(min(max(noise.keyframes, 60), _MOST_KEYFRAMES) for noise in noises)
+    nodes = max(lengths[0] // 2, 50), lengths[-1]
+    runs: list[SolvedRun] = []
+    rng = np.random.default_rng(0)
+    while len(runs) < _LEAST_RUNS or time.monotonic() - begun < _DRAWING * 60 * minutes:
+        runs += draw_runs(family, 1, nodes, rng)
+    told(f"{len(runs)} simulated runs of {nodes[0]}–{nodes[1]} keyframes")
+    config = TrainingConfig(
+        family="slam", recipe="robots", nodes=nodes, graphs=len(runs), validation_nodes=nodes, batch_graphs=8,
+        learning_rate=5e-4, weight_decay=0.0, edge_dropout=0.0, passes=2, robots=family,
+    )  # fmt: skip
+    task = SlamFineTask.on(config, [run for number, run in enumerate(runs) if number % _EVERY], runs[::_EVERY])
+    start = load_network(SlamFineNet).state_dict()
+    task.network.load_state_dict(start)
+    clocked = time.monotonic()
+    for terms in task.batches(np.random.default_rng(0)):
+        terms["loss"].backward()  # type: ignore[no-untyped-call]
+    with torch.no_grad():
+        task.validate()
+    an_epoch = time.monotonic() - clocked
+    left = 60 * minutes - (time.monotonic() - begun)
+    config = replace(config, epochs=int(np.clip(left / an_epoch, 2, _MOST_EPOCHS)))
+    task.config = config
+    told(f"{config.epochs} epochs of {an_epoch:.0f} s")
+    trainer = Trainer(task, config, folder, SlamFineNet.NAME, command="rotavg train slam --from …")
+    trainer.run()
+    return read_network(SlamFineNet, trainer.weights_path)
+
+
+def compare(runs: Sequence[RobotRun], network: SlamFineNet) -> Verdict:
+    """The network beside the package's, on held-back stretches of runs."""
+    rows = np.concatenate([run.explained([network, load_network(SlamFineNet), None]) for run in runs])
+    if len(rows) < 2:
+        return Verdict(0.0, 0.0, len(rows), 0.0)
+    gain = rows[:, 0] - rows[:, 1]
+    error = float(gain.std(ddof=1) / np.sqrt(len(gain)))
+    return Verdict(float(gain.mean()), error, len(gain), float((rows[:, 1] - rows[:, 2]).mean()))

@@ -1,0 +1,79 @@
+"""Training of FineNet of the SLAM profile: how far edges err, end to end through the sparse solve."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros.datasets.simulation.stress.family import RobotFamily
+from rotavg_ros.solver.learning.fine_tuning import Losses, SlamFineNet, SolvedRun, losses_of, losses_under, solved_run
+from rotavg_ros.training.config import TrainingConfig
+
+# A nat per edge by which its variance differs from the true one counts as so much of the logarithm of the mean error:
+# single drawings' errors say little of what weights are worth, all their edges together much.
+NATS_WEIGHT = 0.3
+# Such a share of the runs is shown as it is after FineNet was applied once, so that it learns to be applied twice.
+_SECOND_SHARE = 0.2
+
+
+class SlamFineTask:
+    """SlamFineNet on solved runs of a family, each counting the same."""
+
+    def __init__(self, config: TrainingConfig) -> None:
+        family = config.robots or RobotFamily()
+        runs = draw_runs(family, config.graphs, config.nodes, np.random.default_rng((config.seed, 3)))
+        validation = draw_runs(
+            family, config.validation_graphs, config.validation_nodes, np.random.default_rng((config.seed, 4))
+        )
+        self._begin(config, runs, validation)
+
+    @classmethod
+    def on(cls, config: TrainingConfig, runs: list[SolvedRun], validation: list[SolvedRun]) -> SlamFineTask:
+        """On runs that are there already."""
+        task = cls.__new__(cls)
+        task._begin(config, runs, validation)
+        return task
+
+    def _begin(self, config: TrainingConfig, runs: list[SolvedRun], validation: list[SolvedRun]) -> None:
+        self.config, self.runs, self.validation = config, runs, validation
+        torch.manual_seed(config.seed)
+        self.network = SlamFineNet()
+
+    def num_batches(self) -> int:
+        return -(-len(self.runs) // self.config.batch_graphs)
+
+    def batches(self, rng: np.random.Generator) -> Iterator[dict[str, Tensor]]:
+        order = rng.permutation(len(self.runs))
+        share = _SECOND_SHARE if self.config.passes > 1 else 0.0
+        for start in range(0, len(order), self.config.batch_graphs):
+            runs = [self.runs[index] for index in order[start : start + self.config.batch_graphs]]
+            samples = [run.again(self.network) if rng.random() < share else run.first for run in runs]
+            terms = Losses(*(values.mean() for values in losses_of(self.network, samples, rng)))
+            loss = terms.log_error + terms.log_expected + NATS_WEIGHT * terms.nats
+            yield {"loss": loss, **terms._asdict()}
+
+    def validate(self) -> dict[str, float]:
+        """Logarithms of errors over those without FineNet, and nats, in the mean, as it is applied once."""
+        samples = [run.first for run in self.validation]
+        nothing = [torch.zeros_like(sample.used) for sample in samples]
+        # The same errors are drawn anew every time.
+        before = losses_under(nothing, samples, np.random.default_rng(self.config.seed))
+        after = losses_of(self.network, samples, np.random.default_rng(self.config.seed))
+        figures = {name: float((after._asdict()[name] - value).mean()) for name, value in before._asdict().items()}
+        return {"objective": figures["log_error"] + figures["log_expected"] + NATS_WEIGHT * figures["nats"], **figures}
+
+
+def draw_runs(family: RobotFamily, count: int, nodes: tuple[int, int], rng: np.random.Generator) -> list[SolvedRun]:
+    """So many runs that were solved well enough to learn from."""
+    runs: list[SolvedRun] = []
+    while len(runs) < count:
+        keyframes = round(float(np.exp(rng.uniform(*np.log(nodes)))))
+        drawn = family.drawn(keyframes, rng)
+        told = (torch.from_numpy(each) for each in (drawn.body_from_world, drawn.is_false, drawn.sigma**2))
+        run = solved_run(drawn.graph, *told)
+        if run is not None:
+            runs.append(run)
+    return runs

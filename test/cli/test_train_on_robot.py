@@ -1,0 +1,125 @@
+"""`rotavg train slam --from`: what it prints, writes and refuses."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from rotavg_ros.cli.main import main
+from rotavg_ros.datasets.files.formats import write_graph
+from rotavg_ros.datasets.simulation.stress.drawn import DrawnGraph
+from rotavg_ros.datasets.simulation.stress.family import RobotFamily
+from rotavg_ros.solver.learning.robot_runs import RobotNoise
+from rotavg_ros.training import own_robot
+from rotavg_ros.training.own_robot import Verdict, family_of
+
+NOISE = RobotNoise(
+    keyframes=400,
+    planar=True,
+    odometry_deg=0.3,
+    closure_deg=1.0,
+    closures_per_keyframe=0.4,
+    false_share=0.2,
+    grouped_share=0.5,
+    step_spread=0.8,
+    closure_spread=0.0,
+    per_turn=0.0,
+    common_share=0.0,
+    states_precision=False,
+)
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def write_run(path: Path, seed: int, closures: float = 0.4) -> DrawnGraph:
+    family = RobotFamily(
+        ("building",), planar_share=1, closures_per_keyframe=(closures, closures), false_share=(0.2, 0.2)
+    )
+    drawn = family.drawn(150, np.random.default_rng(seed))
+    write_graph(path, drawn.to_graph_file())
+    return drawn
+
+
+@pytest.mark.parametrize("is_better", [True, False])
+def test_a_network_is_kept_only_if_it_is_better(
+    is_better: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a run without and one with known truth; the verdict itself is tested below."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(own_robot, "_LEAST_RUNS", 4)
+    monkeypatch.setattr(Verdict, "is_better", is_better)
+    drawn = write_run(Path("run.g2o"), 1)
+    quaternion = drawn.body_from_world * [-1, -1, -1, 1]  # files have world_from_body
+    rows = np.column_stack((np.arange(len(quaternion)), quaternion))
+    np.savetxt("truth.csv", rows, delimiter=",", header="id,qx,qy,qz,qw", comments="", fmt=["%d", *["%.17g"] * 4])
+    command = ["train", "slam", "--from", "run.g2o", "--truth", "truth.csv", "--minutes", "0.01", "--output", "robot"]
+    assert main(command) == 0
+    told = capsys.readouterr().out
+    assert "run.g2o: planar; odometry " in told and "stretches held back" in told
+    assert Path("robot/slam-fine-net.safetensors").exists() == is_better
+    verdict = json.loads(Path("robot/verdict.json").read_text())
+    assert verdict["kept"] == is_better and verdict["stretches"] > 1
+    family = RobotFamily.of(yaml.safe_load(Path("robot/tried/robots.yaml").read_text())["robots"])
+    assert family.planar_share == 1.0
+    if is_better:
+        assert main(["solve", "run.g2o", "--method", "neurora-posterior", "--weights", "robot", "--output", "out"]) == 0
+    assert main(command) == 2
+    assert "is there from before" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["slam"], "slam fine-tunes on your runs and needs --from"),
+        (["slam-fine-net", "--from", "run.g2o"], "other networks take none"),
+        (["slam", "my.yaml", "--from", "run.g2o"], "slam takes no config"),
+        (["slam", "--from", "run.g2o", "--truth", "a.csv", "b.csv"], "--truth names 2 files, --from 1"),
+        (["slam", "--from", "few.g2o"], "few.g2o: has .* closures; need odometry and 12 at least"),
+        (["slam-clean-net", "sfm-clean-net"], "is of the family sfm, slam-clean-net of the family slam"),
+        (["slam-fine-net", "slam-clean-net"], "needs `recipe: robots`"),
+    ],
+)
+def test_what_does_not_fit_is_refused(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_run(Path("run.g2o"), 1)
+    write_run(Path("few.g2o"), 1, closures=0.04)
+    assert main(["train", *words, "--output", "robot"]) == 2
+    assert re.search(message, capsys.readouterr().err)
+
+
+def test_the_family_has_what_runs_show() -> None:
+    family = family_of([NOISE])
+    assert family.planar_share == 1.0
+    assert family.odometry_deg == pytest.approx((0.2, 0.45))
+    assert family.false_share == pytest.approx((0.1, 0.3))
+    assert family.uneven > 0.5 > family.turns
+    assert family.qualities < 0.1
+    spatial = family_of([NOISE, RobotNoise(**{**NOISE.__dict__, "planar": False, "per_turn": 0.1})])
+    assert spatial.planar_share == 0.5
+    assert spatial.turns > 0.5
+    assert spatial.per_turn[0] < 0.1 < spatial.per_turn[1]
+
+
+def test_better_is_by_more_than_two_standard_errors() -> None:
+    assert Verdict(0.1, 0.04, 10, 0.0).is_better
+    assert not Verdict(0.1, 0.06, 10, 0.0).is_better
+    assert not Verdict(0.0, 0.0, 1, 0.0).is_better
