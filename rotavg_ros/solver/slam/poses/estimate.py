@@ -15,9 +15,10 @@ import numpy as np
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.small_matrices import inverse
 from rotavg_ros.solver.slam.poses.block_system import BlockFactor
+from rotavg_ros.solver.slam.poses.closures import Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.evidence import translation_cost
 from rotavg_ros.solver.slam.poses.noise import likeliest_noise
-from rotavg_ros.solver.slam.poses.places import Judge, Places, Predictions, Scale
+from rotavg_ros.solver.slam.poses.places import Judge
 from rotavg_ros.solver.slam.poses.rows import ANYHOW, PoseNoise, PoseProblem, PoseState
 from rotavg_ros.solver.slam.poses.solved import Solved
 

@@ -15,8 +15,8 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.odometry_lengths import lengths_passed
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.poses.answer import Poses
+from rotavg_ros.solver.slam.poses.closures import Places
 from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart
-from rotavg_ros.solver.slam.poses.places import Places
 from rotavg_ros.solver.slam.poses.rows import PoseNoise, PoseProblem, PoseState
 from rotavg_ros.view_graph import ViewGraph
 

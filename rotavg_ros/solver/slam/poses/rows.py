@@ -15,8 +15,8 @@ from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.odometry_lengths import lengths_passed, typical_length
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.poses.block_system import BlockEquations
+from rotavg_ros.solver.slam.poses.closures import Told
 from rotavg_ros.solver.slam.poses.displacements import Displacements, DrawnSteps
-from rotavg_ros.solver.slam.poses.places import Told
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 from rotavg_ros.solver.slam.posterior.densities import log_false, log_good
 from rotavg_ros.solver.slam.posterior.mode import Mode

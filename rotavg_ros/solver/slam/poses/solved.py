@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rotavg_ros.solver.slam.poses.block_system import BlockFactor
+from rotavg_ros.solver.slam.poses.closures import Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.displacements import Displacements
-from rotavg_ros.solver.slam.poses.places import Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.rows import PoseState
 
 

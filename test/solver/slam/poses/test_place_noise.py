@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from rotavg_ros import ViewGraph, solve
-from rotavg_ros.solver.slam.poses.places import Judge, Scale, _wrong_share
+from rotavg_ros.solver.slam.poses.closures import Scale
+from rotavg_ros.solver.slam.poses.neighbours import wrong_share
+from rotavg_ros.solver.slam.poses.places import Judge
 
 from .test_poses import errors, graph_of, pose_mode, simulated
 
@@ -102,4 +104,4 @@ def test_before_any_solve_as_many_places_may_be_wrong_as_is_believed_beforehand(
     scale = Scale(np.ones(count), np.ones(count), 100.0)
     places = judge.nothing_known(np.ones(count, dtype=bool), np.zeros(count), scale)
     wrong = problem.priors.wrong_place / problem.priors.counted
-    np.testing.assert_allclose(_wrong_share(places.chance, problem.told, problem.priors), wrong)
+    np.testing.assert_allclose(wrong_share(places.chance, problem.told, problem.priors), wrong)
