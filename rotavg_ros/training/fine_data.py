@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.datasets.simulation.synthetic import SyntheticGraph
-from rotavg_ros.metrics.orientations import gauge_alignment
+from rotavg_ros.metrics.orientations import gauge_alignment, orientation_errors
 from rotavg_ros.solver.algebra.residuals import edge_residual
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.cleaned import Cleaned
@@ -20,6 +21,31 @@ from rotavg_ros.solver.neurora.message_passing import DirectedEdges
 from rotavg_ros.solver.neurora.stages import clean
 from rotavg_ros.solver.neurora.tiled.networks import typical_size
 from rotavg_ros.solver.neurora.tree import bootstrap
+
+
+class Started(Protocol):
+    """A graph where a FineNet begins: what CleanNet says of it, orientations ``(N, 4)``, and truth in their gauge."""
+
+    @property
+    def cleaned(self) -> Cleaned: ...
+    @property
+    def start(self) -> Tensor: ...
+    @property
+    def truth(self) -> Tensor: ...
+
+
+def validated(graphs: Iterable[Started], fine_tune: Callable[[Cleaned, Tensor], Tensor]) -> dict[str, float]:
+    """Mean and median errors, degrees, of the start and of FineNet applied once and twice; what training lowers."""
+    rows = []
+    for graph in graphs:
+        errors, estimate = [orientation_errors(graph.start, graph.truth)], graph.start
+        for _ in range(2):
+            estimate = fine_tune(graph.cleaned, estimate)
+            errors.append(orientation_errors(estimate, graph.truth))
+        rows.append([float(torch.rad2deg(f(e))) for e in errors for f in (torch.mean, torch.median)])
+    names = ("tree_mean_deg", "tree_median_deg", "mean_deg", "median_deg", "v2_mean_deg", "v2_median_deg")
+    figures = dict(zip(names, np.mean(rows, axis=0).tolist(), strict=True))
+    return {"objective": figures["mean_deg"] + figures["median_deg"], **figures}
 
 
 @dataclass(frozen=True)

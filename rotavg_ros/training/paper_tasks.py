@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -11,7 +12,6 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.datasets.simulation.synthetic import SyntheticGraph
-from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.solver.algebra.residuals import edge_residual
 from rotavg_ros.solver.neurora.cleaned import Cleaned
 from rotavg_ros.solver.neurora.message_passing import DirectedEdges
@@ -19,6 +19,7 @@ from rotavg_ros.solver.neurora.paper import PaperCleanNet, PaperFineNet, paper_f
 from rotavg_ros.solver.neurora.stages import clean
 from rotavg_ros.solver.neurora.tree import breadth_first
 from rotavg_ros.training.config import TrainingConfig
+from rotavg_ros.training.fine_data import validated
 from rotavg_ros.training.losses import paper_fine_net_loss
 from rotavg_ros.training.sfm_tasks import GivenGraphs, SfmCleanTask, drawn_graphs
 
@@ -99,13 +100,4 @@ class PaperFineTask:
         return paper_fine_net_loss(self.network(start, residual, edges), truth, edges)
 
     def validate(self) -> dict[str, float]:
-        rows = []
-        for graph in self._validation:
-            errors, estimate = [orientation_errors(graph.start, graph.truth)], graph.start
-            for _ in range(2):
-                estimate = paper_fine_tune(self.network, graph.cleaned, estimate)
-                errors.append(orientation_errors(estimate, graph.truth))
-            rows.append([float(torch.rad2deg(f(e))) for e in errors for f in (torch.mean, torch.median)])
-        names = ("tree_mean_deg", "tree_median_deg", "mean_deg", "median_deg", "v2_mean_deg", "v2_median_deg")
-        figures = dict(zip(names, np.mean(rows, axis=0).tolist(), strict=True))
-        return {"objective": figures["mean_deg"] + figures["median_deg"], **figures}
+        return validated(self._validation, partial(paper_fine_tune, self.network))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -11,12 +12,11 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.datasets.simulation.synthetic import SyntheticGraph
-from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.fine_net import FineNet
 from rotavg_ros.solver.neurora.stages import fine_tune
 from rotavg_ros.training.config import TrainingConfig
-from rotavg_ros.training.fine_data import FineBatch, StartedGraph
+from rotavg_ros.training.fine_data import FineBatch, StartedGraph, validated
 from rotavg_ros.training.losses import clean_net_loss, fine_net_loss
 from rotavg_ros.training.sfm_data import SfmBatch, in_canonical_form, join, sample_graph
 
@@ -131,13 +131,4 @@ class SfmFineTask(_SfmTask):
             yield fine_net_loss(fine, batch.truth, scale, batch.graph, batch.edges)
 
     def validate(self) -> dict[str, float]:
-        rows = []
-        for graph in self._validation_started:
-            errors, estimate = [orientation_errors(graph.start, graph.truth)], graph.start
-            for _ in range(2):
-                estimate = fine_tune(self.network, graph.cleaned, estimate)
-                errors.append(orientation_errors(estimate, graph.truth))
-            rows.append([float(torch.rad2deg(f(e))) for e in errors for f in (torch.mean, torch.median)])
-        names = ("tree_mean_deg", "tree_median_deg", "mean_deg", "median_deg", "v2_mean_deg", "v2_median_deg")
-        figures = dict(zip(names, np.mean(rows, axis=0).tolist(), strict=True))
-        return {"objective": figures["mean_deg"] + figures["median_deg"], **figures}
+        return validated(self._validation_started, partial(fine_tune, self.network))
