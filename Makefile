@@ -13,10 +13,11 @@ demo: setup
 	@$(BIN)/rotavg demo $(if $(GRAPH),--graph "$(GRAPH)") $(if $(TRUTH),--truth "$(TRUTH)") \
 		$(if $(STAMPS),--stamps "$(STAMPS)")
 
-# make test [ARGS="-k node -x"]; without ARGS several files at a time: those over DDS mostly wait
+# make test [ARGS="-k node -x"]; without ARGS several files at a time (those over DDS mostly wait, and have few tests each:
+# by number of tests they would come last), without the largest graphs
 test:
 	@$(PYTHON) tools/setup_environment.py --for-tests
-	@$(BIN)/python -m pytest $(if $(strip $(ARGS)),$(ARGS),-n 3 --dist loadfile)
+	@$(BIN)/python -m pytest $(if $(strip $(ARGS)),$(ARGS),-n 3 --dist loadfile --no-loadscope-reorder -m "not large")
 
 # make bench [ARGS="--minutes 5 --max-pairs 200000"]: beside COLMAP and GTSAM, and the node under load; docs/results/
 bench: setup

@@ -30,7 +30,7 @@ from rotavg_ros.evaluation.slam import (
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS, ROSTER, ROWS
 from rotavg_ros.evaluation.slam.search_or_model import Diagnosis, diagnose
 from rotavg_ros.evaluation.slam.stress_calibration import Calibration
-from rotavg_ros.solver.methods import POSTERIOR, SWITCHES, without
+from rotavg_ros.solver.methods import SWITCHES, without
 
 _UNCERTAINTY_GRAPHS = ("CSAIL", "intel", "manhattan", "sphere2500")
 _UNCERTAINTY_DRAWS = 20
@@ -74,8 +74,8 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
     chosen = contenders(names, ROSTER, keep=arguments.keep)
     with working("warming up"):
         warm_up(contenders(names, ROSTER).values(), ROSTER)
-    calibrations = {name: Calibration() for name in (OURS, POSTERIOR) if name in chosen}
-    chosen |= {name: calibration.watching(chosen[name]) for name, calibration in calibrations.items()}
+    calibration = Calibration()
+    chosen[OURS] = calibration.watching(chosen[OURS])
 
     scores = score_all(drawings(kinds, seeds), chosen, _watch(len(kinds) * len(seeds) * len(chosen)))
     diagnoses: list[Diagnosis] = []
@@ -88,7 +88,7 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
         with suppress(KeyboardInterrupt):
             cases_again = progress(drawings(kinds, seeds), total=len(kinds) * len(seeds), description="other priors")
             priors.extend([*sensitivity.answers(case)] for case in cases_again)
-    findings = stress_report.Findings(calibrations, diagnoses, priors)
+    findings = stress_report.Findings(calibration, diagnoses, priors)
     with working("writing the report"):
         return stress_report.report(arguments.output, scores, findings, arguments.command_line)
 
@@ -144,7 +144,7 @@ def _methods(arguments: argparse.Namespace, roster: Roster, default: Iterable[st
     """Those asked for, or all by default that can run here; always with ours and the oracle, which ratios need."""
     names = arguments.methods or [name for name in default if roster.can_run(name) and name not in _ABLATIONS]
     if arguments.without:
-        names = [*names, POSTERIOR, *(without(name) for name in arguments.without)]
+        names = [*names, *(without(name) for name in arguments.without)]
     if not arguments.peers:
         names = [name for name in names if not roster.is_peer(name)]
     return list(dict.fromkeys((OURS, *names, ORACLE)))

@@ -49,8 +49,8 @@ class Job:
 def run(arguments: argparse.Namespace) -> int:
     """Solve every graph; a bad one does not keep the others from being solved."""
     if arguments.without:
-        if arguments.method != methods.POSTERIOR:
-            raise SolveError(f"--without is for --method {methods.POSTERIOR}, not {arguments.method}")
+        if arguments.method != methods.DEFAULT_METHOD:
+            raise SolveError(f"--without is for --method {methods.DEFAULT_METHOD}, not {arguments.method}")
         arguments.method = methods.without(*arguments.without)
     jobs = plan(arguments.graphs, arguments.output, poses=arguments.poses)
     _check_weights(arguments.weights)

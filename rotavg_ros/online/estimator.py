@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 # The signature of :func:`rotavg_ros.solve`.
 Solver = Callable[..., "Solution"]
 
+# About a fifth of a second.
+TICK_WORK = 200.0
+
 
 class TickAbandonedError(Exception):
     """A tick was given up, since nobody waits for its answer any more; the message says why."""
@@ -280,11 +283,13 @@ class OnlineEstimator:
             state.version = max(state.version, self._content.version)
             self._start_over(state)
 
-    def tick(self, force_cold: bool = False) -> Answer | None:
+    def tick(self, force_cold: bool = False, work: float = TICK_WORK) -> Answer | None:
         """Solve, if there is anything new.
 
         Args:
             force_cold: from scratch, and even while paused.
+            work: units that the solver may spend, as far as what is due at once, or one step of what is not, does not
+                cost more; the next tick goes on. Of a solve from scratch there is no end before its end.
 
         Returns:
             the new answer; None if the last one still stands.
@@ -295,13 +300,13 @@ class OnlineEstimator:
         """
         with self._tick_lock:
             started = time.perf_counter()
-            answer = self._tick(force_cold)
+            answer = self._tick(force_cold, work)
             if answer is None:
                 return None
             free_memory.give_back_after(len(answer.source), answer.stage_seconds)
             return replace(answer, seconds=time.perf_counter() - started)
 
-    def _tick(self, force_cold: bool) -> Answer | None:
+    def _tick(self, force_cold: bool, work: float) -> Answer | None:
         with self._lock:
             content, options = self._content, self.options
             problem = None if self._paused and not force_cold else content.next_problem(force_cold)
@@ -319,6 +324,7 @@ class OnlineEstimator:
                     refinement_steps=options.max_refinement_steps,
                     warm_start=warm_start,
                     memory=None if warm_start is None else problem.memory,
+                    work=work,
                 )
         except Abandoned:
             raise TickAbandonedError(f"abandoned: {running.abandoned_by}") from None

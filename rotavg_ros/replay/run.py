@@ -22,7 +22,6 @@ from rotavg_ros.replay.pace import Pace
 from rotavg_ros.replay.plan import Plan
 from rotavg_ros.replay.record import TickRecord
 from rotavg_ros.replay.recording import Recording
-from rotavg_ros.view_graph import EdgeKind
 
 _NANOSECONDS = 1_000_000_000
 _NAP_S = 0.1
@@ -219,7 +218,7 @@ class _Loop:
             outliers=int(answer.outlier.sum()),
             flips=0 if self._last is None else _flips(self._last, answer),
         )
-        self._pace.spend(tick.keyframes + tick.edges, int((answer.kind == EdgeKind.LOOP_CLOSURE).sum()))
+        self._pace.spend(tick.keyframes + tick.edges, answer.work)
         self.ticks.append(tick)
         self._last = answer
         return True

@@ -95,6 +95,13 @@ class NodeParameters:
     solve_period_s: float = option(
         0.5, "how often to look for something new to solve", within=(0.01, 3600.0), live=True
     )
+    tick_budget_s: float = option(
+        0.2,
+        "what a tick may take where everything is judged anew: that goes on with the next one; a step of it, and what "
+        "is due at once, may take longer",
+        within=(0.0, 3600.0),
+        live=True,
+    )
     solver_process: bool = option(
         True,
         "solve in a process of its own, which costs memory and keeps odometry from waiting while a solve runs; false: "

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rotavg_ros.solver.algebra.abandonment import Abandoned, abandonable, stop_if_abandoned
+    from rotavg_ros.solver.algebra.running import Abandoned, abandonable, stop_if_abandoned
     from rotavg_ros.solver.batch import solve_batch
     from rotavg_ros.solver.methods import DEVICES, METHODS, PROFILES, TRANSLATION_SCALES
     from rotavg_ros.solver.pipeline import solve
@@ -34,9 +34,9 @@ def __getattr__(name: str) -> Any:
 
         return getattr(methods, name)
     if name in {"Abandoned", "abandonable", "stop_if_abandoned"}:
-        from rotavg_ros.solver.algebra import abandonment
+        from rotavg_ros.solver.algebra import running
 
-        return getattr(abandonment, name)
+        return getattr(running, name)
     if name == "Solution":
         from rotavg_ros.solver import solution
 

@@ -71,6 +71,7 @@ class Run:
         refinement_steps: at most, 0 for none; None: as many as the stages like.
         warm_start: ``(N, 4)`` body_from_world to begin with instead of the tree's.
         memory: of the profile's last solve, if the method is the same; the graph may be another one.
+        work: units that an update may spend, as far as a step of a whole solve does not cost more; None: all it takes.
     """
 
     networks: Networks
@@ -78,3 +79,4 @@ class Run:
     refinement_steps: int | None = None
     warm_start: Tensor | None = None
     memory: object | None = None
+    work: float | None = None

@@ -28,9 +28,8 @@ def _as_written(clean: bool, fine_tunings: int, but_for: frozenset[str] = frozen
 
 
 DEFAULT_METHOD = "neurora"
-POSTERIOR = "neurora-posterior"
 PAPER = "neurora-paper"
-# "neurora-posterior~slips,cleannet" is the posterior without these, "neurora-paper~tree" the paper's with our tree.
+# "neurora~slips,cleannet" is ours on robots' graphs without these, "neurora-paper~tree" the paper's with our tree.
 _WITHOUT, _AND = "~", ","
 NETWORK_METHODS = {
     DEFAULT_METHOD: Method(),
@@ -52,10 +51,6 @@ NETWORK_METHODS = {
     "neurora-without-both": Method(SfmStages(clean=False, fine_tunings=0), SlamStages(clean=False)),
     "neurora-round": Method(sfm=SfmStages(shaped=False)),
     "neurora-equal-precisions": Method(sfm=SfmStages(stated=False)),
-    "neurora-odometry-start": Method(slam=SlamStages(tree_start=False)),
-    "neurora-stated-precisions": Method(slam=SlamStages(scale_estimation=False)),
-    POSTERIOR: Method(slam=SlamStages(posterior=True)),
-    "neurora-without-slip-search": Method(slam=SlamStages(slip_search=False)),
 }
 # Others' methods, to compare with.
 BASELINES = ("chatterjee", "geman-mcclure", "weiszfeld", "arrigoni", "wang")
@@ -70,7 +65,7 @@ def method_named(name: str) -> Method | None:
     """The stages of a network method, None if there is none of that name.
 
     Args:
-        name: of :data:`NETWORK_METHODS`; "neurora-posterior~A,B" is the posterior without A and B, which are of
+        name: of :data:`NETWORK_METHODS`; "neurora~A,B" is ours on robots' graphs without A and B, which are of
             :data:`rotavg_ros.solver.slam.options.SWITCHES`; "neurora-paper~A,B" is the paper's with A and B, which
             are of :data:`rotavg_ros.solver.sfm.options.PAPER_PARTS`, as this package has them.
     """
@@ -80,9 +75,9 @@ def method_named(name: str) -> Method | None:
     without = frozenset(switched_off[0].split(_AND))
     if whole == PAPER and len(switched_off) == 1 and without <= PAPER_PARTS:
         return _as_written(clean=True, fine_tunings=1, but_for=without)
-    if whole != POSTERIOR or len(switched_off) > 1 or not without <= SWITCHES.keys():
+    if whole != DEFAULT_METHOD or len(switched_off) > 1 or not without <= SWITCHES.keys():
         return None
-    return Method(slam=SlamStages(posterior=True, without=without))
+    return Method(slam=SlamStages(without=without))
 
 
 def is_method(name: str) -> bool:
@@ -91,5 +86,5 @@ def is_method(name: str) -> bool:
 
 
 def without(*names: str) -> str:
-    """Name of the posterior's method without some of :data:`rotavg_ros.solver.slam.options.SWITCHES`."""
-    return _WITHOUT.join((POSTERIOR, _AND.join(names))) if names else POSTERIOR
+    """Name of the default method without some of :data:`rotavg_ros.solver.slam.options.SWITCHES`."""
+    return _WITHOUT.join((DEFAULT_METHOD, _AND.join(names))) if names else DEFAULT_METHOD

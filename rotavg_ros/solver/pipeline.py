@@ -12,30 +12,21 @@ from torch import Tensor
 from rotavg_ros import baselines, rotations
 from rotavg_ros.errors import UserError
 from rotavg_ros.solver import devices, warnings
+from rotavg_ros.solver.algebra.running import metered
 from rotavg_ros.solver.algebra.threads import workers
 from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
-from rotavg_ros.solver.methods import (
-    DEFAULT_METHOD,
-    DEVICES,
-    METHODS,
-    POSTERIOR,
-    PROFILES,
-    is_method,
-    method_named,
-)
+from rotavg_ros.solver.methods import DEFAULT_METHOD, DEVICES, METHODS, PROFILES, is_method, method_named
 from rotavg_ros.solver.neurora.network_store import Networks
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.solve import solve_sfm
-from rotavg_ros.solver.slam import refinement
-from rotavg_ros.solver.slam.noise import judging
+from rotavg_ros.solver.slam.noise import exceedance
 from rotavg_ros.solver.slam.solve import solve_slam, update_slam
-from rotavg_ros.solver.slam.update.memory import SlamMemory, WholeSolveMemory
-from rotavg_ros.solver.slam.update.posterior_memory import PosteriorMemory
+from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel, HoldsViewGraph, ViewGraph, view_graph_of
 
 # The noise that makes an edge an outlier, in radians.
-_OUTLIER_ANGLE = {"sfm": NUMBERS.outlier_angle, "slam": judging.OUTLIER_ANGLE}
+_OUTLIER_ANGLE = {"sfm": NUMBERS.outlier_angle, "slam": exceedance.OUTLIER_ANGLE}
 
 
 @torch.no_grad()
@@ -49,6 +40,7 @@ def solve(
     refinement_steps: int | None = None,
     warm_start: Tensor | None = None,
     memory: object | None = None,
+    work: float | None = None,
     weights: Path | None = None,
 ) -> Solution:
     """Absolute orientations and outlier scores of a view-graph; every connected component by itself.
@@ -56,7 +48,7 @@ def solve(
     Args:
         graph: N nodes, M edges; or what has it as its ``graph``, as the result of ``read_graph`` does.
         method: one of :data:`METHODS`, or several joined by "+", of which each starts from the answer of the one
-            before. "neurora-posterior~A,B" is the posterior without A and B
+            before. "neurora~A,B" is the default on robots' graphs without A and B
             (:data:`rotavg_ros.solver.slam.options.SWITCHES`); "neurora-paper~A,B" is the paper's with A and B as this
             package has them (:data:`rotavg_ros.solver.sfm.options.PAPER_PARTS`).
         profile: "slam" for odometry chains with loop closures, "sfm" for unordered view-graphs, "auto": "slam" if any
@@ -64,12 +56,15 @@ def solve(
         device: where the SfM profile runs, whole: "cpu", "cuda", or "auto" (a GPU if torch finds one). Where there is
             none that works, or it has too little memory, the CPU does it, which is logged. The SLAM profile and the
             baselines are small and sparse; they run on the CPU.
-        refinement_steps: refinement steps at most, 0 for none; default: the method's and profile's own number.
-        warm_start: ``(N, 4)`` body_from_world of an earlier solution to start from; the SLAM profile then takes fewer
-            refinement steps.
+        refinement_steps: refinement steps at most, 0 for none; default: the method's own number. The SLAM profile
+            has 0 or all.
+        warm_start: ``(N, 4)`` body_from_world of an earlier solution to start from.
         memory: that of the earlier solution by the same method, if the graph has only grown since; with it a warm start
-            of a large SLAM graph judges the new edges and goes on from all other verdicts. Now and then, and where too
-            much has changed, everything is judged anew.
+            of a SLAM graph judges the new edges and goes on from all other verdicts. Where many closures are not
+            explained by these, everything is judged anew beside it.
+        work: units (:attr:`~rotavg_ros.solver.solution.Solution.work`) that such a solve may spend, as far as one step
+            of judging everything anew, a tenth of a second on large graphs, is not more; the next solve goes on with
+            it. The same on every machine. Default: all that it takes.
         weights: folder of networks trained with ``rotavg train``; what it lacks comes from the package.
 
     Returns:
@@ -89,6 +84,8 @@ def solve(
     _check_choice("device", device, DEVICES)
     if refinement_steps is not None and refinement_steps < 0:
         raise UserError(f"refinement steps must not be negative, got {refinement_steps}")
+    if work is not None and not work >= 0:
+        raise UserError(f"work must be a number of units, 0 or more, got {work}")
     if warm_start is not None and tuple(warm_start.shape) != (graph.num_nodes, 4):
         raise UserError(f"the warm start has shape {tuple(warm_start.shape)}, the graph needs ({graph.num_nodes}, 4)")
     if profile == "auto":
@@ -101,15 +98,16 @@ def solve(
     steps = refinement_steps
     goes_on_from = _memory_of(names, memory) if steps is None and warm_start is not None else None
     watch = Stopwatch()
-    try:
-        estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start, goes_on_from))
-    except devices.GPU_ERRORS as error:
-        if where == "cpu":
-            raise
-        devices.fall_back(error)
-        where = "cpu"
-        watch = Stopwatch()
-        estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start))
+    with metered() as meter:
+        try:
+            estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start, goes_on_from, work))
+        except devices.GPU_ERRORS as error:
+            if where == "cpu":
+                raise
+            devices.fall_back(error)
+            where = "cpu"
+            watch = Stopwatch()
+            estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start))
     score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, estimate.outlier_score.cpu())
     score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
     places = estimate.places
@@ -129,6 +127,7 @@ def solve(
         None if places is None else places.rotation_score,
         None if places is None else places.precision,
         math.sqrt(estimate.step_variance),
+        meter.spent,
     )
 
 
@@ -142,44 +141,37 @@ class _Job:
     profile: str
 
 
-def _memory_of(names: list[str], memory: object | None) -> SlamMemory | WholeSolveMemory | PosteriorMemory | None:
+def _memory_of(names: list[str], memory: object | None) -> SlamMemory | None:
     """What a method by these names can go on from, if it is that."""
-    if names == [DEFAULT_METHOD] and isinstance(memory, (SlamMemory, WholeSolveMemory)):
-        return memory
-    return memory if names == [POSTERIOR] and isinstance(memory, PosteriorMemory) else None
+    return memory if names == [DEFAULT_METHOD] and isinstance(memory, SlamMemory) else None
 
 
 def _run(job: _Job, run: Run) -> Estimate:
     """Every link of the method; the last may go on from what an earlier solve of the graph remembers."""
-    device, last_steps = run.networks.device, run.refinement_steps
-    if last_steps is None and run.warm_start is not None and _refines_slam(job):
-        last_steps = refinement.WARM_PASSES
+    device = run.networks.device
     job = replace(job, graph=job.graph.to(device), component=job.component.to(device))
     for name in job.names[:-1]:
         before = _solve_once(job, name, replace(run, refinement_steps=None))
         run = replace(run, warm_start=before.body_from_world)
     memory = run.memory
-    if isinstance(memory, (SlamMemory, PosteriorMemory)) and run.warm_start is not None and job.profile == "slam":
+    if isinstance(memory, SlamMemory) and run.warm_start is not None and job.profile == "slam":
         estimate = update_slam(job.graph, memory, run)
         if estimate is not None:
-            return replace(estimate, warnings=memory.warnings)
-    estimate = _solve_once(job, job.names[-1], replace(run, refinement_steps=last_steps))
+            return _with_warnings(job.graph, estimate)
+    estimate = _solve_once(job, job.names[-1], run)
     return _with_warnings(job.graph, estimate) if job.profile == "slam" else estimate
 
 
 def _with_warnings(graph: ViewGraph, estimate: Estimate) -> Estimate:
     """With those about a whole solve of a robot's graph, which hold until the next one."""
+    goes_on = estimate.memory
+    if isinstance(goes_on, SlamMemory) and goes_on.warnings is not None:
+        return replace(estimate, warnings=goes_on.warnings)
     found = warnings.of_whole_solve(graph, estimate.body_from_world, estimate.outlier_score)
     found = (*estimate.warnings, *found)
-    goes_on = estimate.memory
-    if isinstance(goes_on, (SlamMemory, PosteriorMemory)):
+    if isinstance(goes_on, SlamMemory):
         goes_on = replace(goes_on, warnings=found)
     return replace(estimate, warnings=found, memory=goes_on)
-
-
-def _refines_slam(job: _Job) -> bool:
-    last = method_named(job.names[-1])
-    return job.profile == "slam" and last is not None and last.slam.refine
 
 
 def _solve_once(job: _Job, name: str, run: Run) -> Estimate:

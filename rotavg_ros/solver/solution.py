@@ -37,6 +37,8 @@ class Solution:
             translation is unknown; None likewise.
         warnings: why it should not be trusted, a sentence each: what was seen, what may be the cause, what to do.
         step_deviation: radians, by which each component of a step of odometry errs; NaN where the method says nothing.
+        work: units that the solve has cost, about a millisecond each; counted where robots' graphs are solved, and the
+            same on every machine.
     """
 
     body_from_world: Tensor
@@ -54,6 +56,7 @@ class Solution:
     rotation_score: Tensor | None = None
     edge_precision: Tensor | None = None
     step_deviation: float = math.nan
+    work: float = 0.0
 
     @property
     def world_from_body(self) -> Tensor:

@@ -69,11 +69,11 @@ def test_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Simulated kinds need no data; ours and the oracle are always there, others' packages not with --no-peers."""
     command = ["evaluate", "slam", "--suite", "poses", "--output", str(tmp_path), "--threads", "1", "--no-peers"]
     kinds = ["--kinds", "SPARSE building: 30 % parallel", "--seeds", "1000"]
-    assert main([*command, *kinds, "--methods", "gnc-true", "pcm", "neurora-posterior"]) == 0
+    assert main([*command, *kinds, "--methods", "gnc-true", "pcm", "neurora~cleannet"]) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'poses.md'}\n"
     with (tmp_path / "poses-cases.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [row["method"] for row in rows] == ["neurora", "pcm", "neurora-posterior", "oracle"] * 2
+    assert [row["method"] for row in rows] == ["neurora", "pcm", "neurora~cleannet", "oracle"] * 2
     assert {(row["graph"], row["seed"]) for row in rows} == {("sparse building", "1000")}
     assert all(float(row["ate_m"]) > 0 for row in rows)
     text = (tmp_path / "poses.md").read_text(encoding="utf-8")
@@ -123,12 +123,12 @@ def test_stress_tells_why_answers_are_wrong_and_what_parts_earn(tmp_path: Path) 
     assert main([*command, "--without", "repeats", "--search-or-model"]) == 0
     with (tmp_path / "stress-cases.csv").open() as file:
         methods = [row["method"] for row in csv.DictReader(file)]
-    assert methods == ["neurora", "odometry", "neurora-posterior", "neurora-posterior~repeats", "oracle"]
+    assert methods == ["neurora", "odometry", "neurora~repeats", "oracle"]
     with (tmp_path / "stress-causes.csv").open() as file:
         everything, kind = csv.DictReader(file)
     assert (everything["kind"], everything["drawings"]) == ("all", "1")
     assert sum(float(kind[f"{cause} %"]) for cause in ("right", "search", "model", "divided")) == pytest.approx(100)
-    assert (tmp_path / "stress-calibration-neurora-posterior.csv").exists()
+    assert (tmp_path / "stress-calibration.csv").exists()
 
 
 def test_why_answers_are_wrong_is_known_of_the_stress_suite_alone(

@@ -201,7 +201,9 @@ def test_installed_command(graph_path: Path, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "orientations.csv").exists()
 
 
-@pytest.mark.parametrize(("name", "bound_deg"), [("sphere2500", 6), ("manhattan", 6)])
+@pytest.mark.parametrize(
+    ("name", "bound_deg"), [pytest.param("sphere2500", 6, marks=pytest.mark.large), ("manhattan", 6)]
+)
 def test_clean_graphs_come_close_to_the_truth(shared_data: Path, tmp_path: Path, name: str, bound_deg: float) -> None:
     assert main(["solve", str(shared_data / "slam" / f"{name}.g2o"), "--output", str(tmp_path)]) == 0
     estimate, truth = (
@@ -218,8 +220,8 @@ def test_parts_of_the_posterior_can_be_switched_off(
     graph_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["solve", str(graph_path), "--output", str(tmp_path / "out"), "--without", "slips", "cleannet"]
-    assert main([*command, "--method", "neurora-posterior"]) == 0
+    assert main(command) == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["method"] == "neurora-posterior~slips,cleannet"
-    assert main(command) == 2
-    assert "--without is for --method neurora-posterior" in capsys.readouterr().err
+    assert summary["method"] == "neurora~slips,cleannet"
+    assert main([*command, "--method", "cleannet-spt"]) == 2
+    assert "--without is for --method neurora, not cleannet-spt" in capsys.readouterr().err

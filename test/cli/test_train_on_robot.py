@@ -75,7 +75,7 @@ def test_a_network_is_kept_only_if_it_is_better(
     family = RobotFamily.of(yaml.safe_load(Path("robot/tried/robots.yaml").read_text())["robots"])
     assert family.planar_share == 1.0
     if is_better:
-        assert main(["solve", "run.g2o", "--method", "neurora-posterior", "--weights", "robot", "--output", "out"]) == 0
+        assert main(["solve", "run.g2o", "--weights", "robot", "--output", "out"]) == 0
     assert main(command) == 2
     assert "is there from before" in capsys.readouterr().err
 

@@ -29,6 +29,7 @@ class TreeSolution:
     rotation_score: None = None
     edge_precision: None = None
     step_deviation: float = 0.0
+    work: float = 0.0
 
 
 @dataclass

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online import Answer, EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
 from rotavg_ros.online.estimator import TickAbandonedError
-from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
+from rotavg_ros.solver.algebra.running import stop_if_abandoned
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
 SECOND = 1_000_000_000

@@ -107,6 +107,7 @@ def test_a_turned_world_turns_nothing_else() -> None:
 
 
 def test_components_are_solved_separately() -> None:
+    """But for the noise, of which twice as much is known."""
     graph, _, _ = _slam_graph(6)
     first = solve(graph)
     joined = ViewGraph.create(
@@ -119,7 +120,7 @@ def test_components_are_solved_separately() -> None:
     second = solve(joined)
     assert second.component.tolist() == [0] * 300 + [1] * 300 + [2]
     for half in (second.body_from_world[:300], second.body_from_world[300:600]):
-        assert float(rotations.angle_between(half, first.body_from_world).max()) < np.radians(0.5)
+        assert float(rotations.angle_between(half, first.body_from_world).max()) < np.radians(1.0)
     assert torch.isfinite(second.body_from_world).all()
 
 
@@ -166,8 +167,9 @@ def test_tiny_graphs(method: str, profile: str, num_nodes: int) -> None:
 
 def test_stages_follow_the_method() -> None:
     graph, _, _ = _slam_graph(8)
-    assert list(solve(graph).stage_seconds) == ["contract", "clean", "bootstrap", "refine", "expand"]
-    assert "refine" not in solve(graph, refinement_steps=0).stage_seconds
+    assert list(solve(graph).stage_seconds) == ["refine", "expand"]
+    for without_search in ({"refinement_steps": 0}, {"method": "cleannet-spt"}):
+        assert list(solve(graph, **without_search).stage_seconds) == ["contract", "clean", "bootstrap", "expand"]
     paper = solve(graph, profile="sfm", method="neurora-v1").stage_seconds
     assert list(paper) == ["order", "clean", "bootstrap", "fine-tune"]
     whole = solve(graph, profile="sfm").stage_seconds
@@ -221,6 +223,8 @@ def test_the_networks_beat_the_tree(recipe: ReleasedRecipe | PaperRecipe) -> Non
         ({"profile": "drone"}, "unknown profile 'drone'"),
         ({"device": "tpu"}, "unknown device 'tpu'"),
         ({"refinement_steps": -1}, "must not be negative"),
+        ({"work": -1.0}, "work must be a number of units"),
+        ({"work": float("nan")}, "work must be a number of units"),
         ({"warm_start": torch.zeros(3, 4)}, r"the warm start has shape \(3, 4\)"),
     ],
 )
@@ -231,7 +235,9 @@ def test_mistakes_are_one_line(options: dict[str, object], message: str) -> None
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(("name", "odometry_deg"), [("sphere2500", 47.0), ("manhattan", 24.2)])
+@pytest.mark.parametrize(
+    ("name", "odometry_deg"), [pytest.param("sphere2500", 47.0, marks=pytest.mark.large), ("manhattan", 24.2)]
+)
 def test_classic_graphs_with_thirty_percent_false_closures(shared_data: Path, name: str, odometry_deg: float) -> None:
     folder = shared_data / "slam"
     graph_file = attach_truth(read_graph(folder / f"{name}.g2o"), folder / f"{name}_ground_truth.csv")

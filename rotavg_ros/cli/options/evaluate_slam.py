@@ -7,7 +7,7 @@ import argparse
 from rotavg_ros.cli.arguments import share, whole_number
 from rotavg_ros.cli.data_folder import add_data_argument
 from rotavg_ros.evaluation.names import SLAM_GRAPHS, SLAM_SHARES, SLAM_SUITES
-from rotavg_ros.solver.methods import POSTERIOR, SWITCHES
+from rotavg_ros.solver.methods import SWITCHES
 
 _INCREMENTAL = ("B25b_0.000",)
 
@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=(),
         choices=SWITCHES,
         metavar="PART",
-        help=f"also {POSTERIOR} without each of these: {', '.join(SWITCHES)}",
+        help=f"also ours without each of these: {', '.join(SWITCHES)}",
     )
     parser.add_argument(
         "--translations",

@@ -12,7 +12,7 @@ import argparse
 from pathlib import Path
 
 from rotavg_ros.cli.arguments import whole_number
-from rotavg_ros.solver.methods import DEVICES, METHODS, POSTERIOR, PROFILES, SWITCHES, TRANSLATION_SCALES
+from rotavg_ros.solver.methods import DEFAULT_METHOD, DEVICES, METHODS, PROFILES, SWITCHES, TRANSLATION_SCALES
 
 EDGE_FORMATS = ("csv", "npz")
 
@@ -21,6 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``rotavg solve``."""
     parser.add_argument("graphs", nargs="+", type=Path, metavar="GRAPH", help="view-graph file")
     parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for the answer")
+    switches = f"terms, moves or networks to switch off, of {', '.join(SWITCHES)}"
     methods = f"{', '.join(METHODS)}, or A+B: B starts from A's answer (default: neurora)"
     parser.add_argument("--method", default="neurora", metavar="NAME", help=methods)
     parser.add_argument(
@@ -29,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=(),
         choices=SWITCHES,
         metavar="PART",
-        help=f"with --method {POSTERIOR}: terms, moves or networks to switch off, of {', '.join(SWITCHES)}",
+        help=f"with --method {DEFAULT_METHOD} on robots' graphs: {switches}",
     )
     parser.add_argument(
         "--profile", default="auto", choices=PROFILES, help="auto (default): slam if any edge is odometry"
@@ -46,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--refine",
         type=whole_number,
         metavar="N",
-        help="at most N refinement steps; 0 skips (default: the method's); of the posterior's search, 0 or all",
+        help="at most N refinement steps; 0 skips (default: the method's); of a robot's graph, 0 or all",
     )
     parser.add_argument(
         "--weights", type=Path, metavar="DIR", help="networks of `rotavg train`; what DIR lacks comes from the package"

@@ -11,7 +11,7 @@ from rotavg_ros.baselines.least_squares import least_squares
 from rotavg_ros.baselines.start import start_orientations
 from rotavg_ros.evaluation.common.cases import SLAM, Case
 from rotavg_ros.evaluation.common.contenders import Roster
-from rotavg_ros.solver.methods import POSTERIOR, SWITCHES, without
+from rotavg_ros.solver.methods import SWITCHES, without
 
 OURS, ORACLE, GNC = "neurora", "oracle", "gnc"
 
@@ -44,13 +44,8 @@ ROSTER = Roster(
 )
 ROWS: dict[str, str] = {
     OURS: "**ours** (NeuRoRA for SLAM)",
-    "neurora-without-cleannet": "· without CleanNet",
-    "neurora-odometry-start": "· without the weighted tree",
-    "neurora-stated-precisions": "· without scale estimation",
-    "neurora-without-slip-search": "· without the slip search",
-    "cleannet-spt": "· without refinement",
+    "cleannet-spt": "· without the search",
     "spt": "· tree alone",
-    POSTERIOR: "**ours**, one posterior",
     **{without(name): f"· without {name}" for name in SWITCHES},
     "gnc": "GNC (GTSAM), told that odometry is right",
     "isam2": "iSAM2 with Huber's loss (GTSAM), incremental",

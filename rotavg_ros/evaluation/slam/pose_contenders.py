@@ -19,7 +19,6 @@ from rotavg_ros.evaluation.common.contenders import OwnContender, Roster
 from rotavg_ros.evaluation.common.peers import MissingPeerError, PeerError
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS
 from rotavg_ros.solver import solve
-from rotavg_ros.solver.methods import POSTERIOR
 from rotavg_ros.solver.positions import Translations, fit_positions
 from rotavg_ros.view_graph import FALSE_CLOSURE_M
 
@@ -165,7 +164,6 @@ ROSTER = Roster(
 )
 ROWS: dict[str, str] = {
     OURS: "**ours** (NeuRoRA for SLAM)",
-    POSTERIOR: "**ours**, one posterior",
     ROTATIONS_ALONE: "· without translations, positions fitted afterwards",
     GNC_STATED: "GNC on poses (GTSAM), stated deviations",
     GNC_TRUE: "GNC on poses (GTSAM), true deviations",
@@ -177,7 +175,6 @@ ROWS: dict[str, str] = {
 }
 TOLD: dict[str, str] = {
     OURS: "rotations, translations, stated precisions of rotations (treated with suspicion); no deviation of a shift",
-    POSTERIOR: "the same",
     ROTATIONS_ALONE: "the same, but no translations in the solve",
     GNC_STATED: "deviations as edges state them: simulated graphs the true ones, others what their files state; that "
     "odometry is right",

@@ -15,11 +15,12 @@ from rotavg_ros.evaluation.slam import plots, uncertainty
 from rotavg_ros.evaluation.slam.cases import AS_RECORDED
 from rotavg_ros.evaluation.slam.contenders import GNC, ORACLE, OURS, ROWS
 from rotavg_ros.evaluation.slam.uncertainty import UncertaintyCheck
+from rotavg_ros.solver.methods import without
 
 _KITTI = "KITTI"
 _NUM_WORST = 12
 # Whose verdicts on closures are told: those that give some.
-_JUDGES = (OURS, "neurora-without-cleannet", GNC)
+_JUDGES = (OURS, without("cleannet"), GNC)
 _CASE_KEY = {"graph": "name", "condition": "kind", "seed": "seed"}
 _CASE_FIGURES = (
     Figure("mean_deg", "error_deg"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,12 +52,12 @@ class Findings:
     """What was looked at besides errors.
 
     Attributes:
-        calibrations: of ours, by method.
+        calibration: of ours.
         diagnoses: of the posterior's answers.
         priors: answers under other priors, of every case.
     """
 
-    calibrations: Mapping[str, Calibration]
+    calibration: Calibration
     diagnoses: Sequence[Diagnosis] = ()
     priors: Sequence[Sequence[sensitivity.Answer]] = ()
 
@@ -85,11 +85,9 @@ def report(
         "stress-kinds": _kinds(scores, names),
         "stress-cases": per_case("Every case", scores, _CASE_FIGURES, _CASE_KEY),
     }
-    for name, calibration in findings.calibrations.items():
-        of_kinds, title = calibration.of_kinds(scores.cases), f"Calibration of {ROWS[name].replace('**', '')}"
-        stem = "stress-calibration" if name == OURS else f"stress-calibration-{name}"
-        tables[stem] = stress_calibration.table(title, of_kinds, every_kind=False)
-        long[f"{stem}-kinds"] = stress_calibration.table(title, of_kinds, every_kind=True)
+    of_kinds, title = findings.calibration.of_kinds(scores.cases), f"Calibration of {ROWS[OURS].replace('**', '')}"
+    tables["stress-calibration"] = stress_calibration.table(title, of_kinds, every_kind=False)
+    long["stress-calibration-kinds"] = stress_calibration.table(title, of_kinds, every_kind=True)
     if diagnoses := findings.diagnoses:
         tables["stress-causes"] = search_or_model.shares("Why the posterior's answers are wrong", diagnoses)
         tables["stress-failures"] = search_or_model.failures("Wrong answers that are not divided", diagnoses)

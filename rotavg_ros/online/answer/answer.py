@@ -49,6 +49,7 @@ class Answer:
         waits: ``(M,)`` bool, closures that are no part of the solve yet; their scores come from their residuals.
         was_cold: solved from scratch, as ``rotavg solve`` would.
         seconds: of the whole tick.
+        work: units that the solver has spent, see :attr:`rotavg_ros.solver.solution.Solution.work`.
         stage_seconds: of the solver's stages.
         method, profile, device: as the solver resolved them.
         warnings: why it should not be trusted, a sentence each.
@@ -92,6 +93,7 @@ class Answer:
     rotation_score: NDArray[np.float64] | None = None
     edge_precision: NDArray[np.float64] | None = None
     step_deviation: float = math.nan
+    work: float = 0.0
 
     @classmethod
     def of_solution(
@@ -145,6 +147,7 @@ class Answer:
             rotation_score=_numbers(solution.rotation_score),
             edge_precision=_numbers(solution.edge_precision),
             step_deviation=solution.step_deviation,
+            work=solution.work,
         )
 
     @cached_property

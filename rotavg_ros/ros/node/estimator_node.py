@@ -63,6 +63,7 @@ class RotavgNode(parameter_server.ParameterNode):
         listening = Subscriptions(self, listened, self._estimator, self._health, self._outputs, self._on_time_jump)
         self._listening, self._forwarding = listening, listening.forwarding
         self._solving = Solving(self, self._estimator, self._health, self._outputs, self._forwarding, state_file)
+        self._solving.tick_budget_s = parameters.tick_budget_s
         workers = Workers(solver=self._worker, saver=self._saver)
         Services(self, self._estimator, self._solving, workers, parameters.robots[0])
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -113,6 +114,7 @@ class RotavgNode(parameter_server.ParameterNode):
         self._settings = parameters
         self._outputs.set_parameters(parameters)
         self._forwarding.set_parameters(parameters)
+        self._solving.tick_budget_s = parameters.tick_budget_s
         if parameters.solve_period_s != old.solve_period_s:
             self.destroy_timer(self._solve_timer)
             self._solve_timer = self._create_timer(parameters.solve_period_s, self._on_solve_timer)

@@ -6,6 +6,7 @@ reset on the executor's thread, which give the running solve up.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -22,12 +23,16 @@ from rotavg_ros.ros.node.diagnostics import KEPT, NOT_KEPT
 from rotavg_ros.ros.node.health import Health
 from rotavg_ros.ros.node.intake.forwarding import Forwarding
 from rotavg_ros.ros.node.output.outputs import Outputs
+from rotavg_ros.ros.node.tick_budget import TickBudget
 
 _LOG_PERIOD_S = 5.0
 
 
 class Solving:
     """Jobs for the workers, and :meth:`reset`, which takes milliseconds.
+
+    Attributes:
+        tick_budget_s: what a tick may take where it can stop; inf by itself.
 
     Those that a service asks for return what to tell the caller, or raise.
 
@@ -50,6 +55,8 @@ class Solving:
         self._outputs = outputs
         self._forwarding = forwarding
         self._state_file = state_file
+        self._budget = TickBudget()
+        self.tick_budget_s = math.inf
         self._publishing = threading.Lock()  # an answer goes out before it is forgotten, or not at all
         self._lock: StateFileLock | None = None
         if state_file is not None:
@@ -62,7 +69,7 @@ class Solving:
         if self._estimator.is_behind:
             health.fell_behind()
         try:
-            answer = self._estimator.tick(force_cold)
+            answer = self._estimator.tick(force_cold, self._budget.units(self.tick_budget_s))
         except TickAbandonedError:
             raise
         except Exception as error:
@@ -70,6 +77,7 @@ class Solving:
             raise
         health.tick_went_well()
         if answer is not None:
+            self._budget.learn(answer)
             self._publish(answer)
             self._outputs.draw(answer)
         self._forwarding.decide(health.answer)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
+from rotavg_ros.solver.algebra.running import stop_if_abandoned
 
 
 class Systems(Protocol):
@@ -23,19 +22,6 @@ class Systems(Protocol):
 
     def spread(self, value: Tensor) -> Tensor:
         """A number of each system ``(S,)`` → what multiplies vectors by it."""
-
-
-class Columns:
-    """One matrix, and a right-hand side in each column of ``(N, S)``; they end together."""
-
-    def dot(self, a: Tensor, b: Tensor) -> Tensor:
-        return (a * b).sum(dim=0)
-
-    def largest(self, x: Tensor) -> Tensor:
-        return x.abs().amax().reshape(1) if x.numel() else x.new_zeros(1)
-
-    def spread(self, value: Tensor) -> Tensor:
-        return value
 
 
 class Stop(NamedTuple):
@@ -87,19 +73,3 @@ def conjugate_gradients(
         ratio = systems.spread(torch.where(previous > 0, energy / previous, 0.0))
         direction = torch.addcmul(scaled, ratio, direction)
     return solution, not bool((largest > goal).any())
-
-
-def iterate(
-    product: Callable[[np.ndarray], np.ndarray],
-    precondition: Callable[[np.ndarray], np.ndarray],
-    right_hand_side: np.ndarray,
-    stop: Stop,
-) -> np.ndarray | None:
-    """The same on arrays with columns ``(N, S)``; None if it is not as good as asked for."""
-
-    def on_tensors(operator: Callable[[np.ndarray], np.ndarray]) -> Callable[[Tensor], Tensor]:
-        return lambda x: torch.from_numpy(operator(x.numpy()))
-
-    columns = torch.from_numpy(right_hand_side)
-    solution, is_solved = conjugate_gradients(on_tensors(product), on_tensors(precondition), columns, Columns(), stop)
-    return solution.numpy() if is_solved else None

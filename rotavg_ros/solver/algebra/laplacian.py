@@ -19,8 +19,7 @@ from scipy.linalg import cho_solve
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import SuperLU, splu
 
-from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
-from rotavg_ros.solver.algebra.conjugate_gradients import Stop, iterate
+from rotavg_ros.solver.algebra.running import stop_if_abandoned
 
 # How much stiffer than its own edges a root is tied to zero.
 _GROUNDING = 1e6
@@ -34,8 +33,6 @@ _DENSE_MAX_NODES = 5000
 # Six are on one thread only in smaller graphs: with them ticks of 10 000 keyframes took twice the CPU time.
 _COLUMNS_AT_ONCE = 4
 _ENTRIES_AT_ONCE = 100_000
-# Conjugate gradients from a factorisation with other weights; after so many iterations another one is cheaper.
-_NEARLY = Stop(tolerance=0.0, relative_tolerance=1e-3, max_iterations=8)
 
 
 def incidence_matrix(num_nodes: int, source: np.ndarray, target: np.ndarray) -> csr_array:
@@ -58,21 +55,14 @@ class LaplacianPattern:
         num_nodes: N.
         source, target: ``(E,)`` ends of the edges.
         roots: one node of each connected component; their solution is zero.
-        rank: ``(N,)`` where each node stands in the order of elimination; default: sought by the first factorisation.
     """
 
-    def __init__(
-        self,
-        num_nodes: int,
-        source: np.ndarray,
-        target: np.ndarray,
-        roots: np.ndarray,
-        rank: np.ndarray | None = None,
-    ) -> None:
+    def __init__(self, num_nodes: int, source: np.ndarray, target: np.ndarray, roots: np.ndarray) -> None:
         self.num_nodes, self.source, self.target, self.roots = num_nodes, source, target, roots
         self._incidence = incidence_matrix(num_nodes, source, target)
-        self.rank = rank
-        self._lay_out(np.arange(num_nodes) if rank is None else rank)
+        # Where each node stands in the order of elimination, which the first factorisation finds.
+        self._rank: np.ndarray | None = None
+        self._lay_out(np.arange(num_nodes))
 
     def _lay_out(self, rank: np.ndarray) -> None:
         """Find where weights and degrees go in a matrix in compressed columns, rows and columns ordered by ``rank``."""
@@ -88,7 +78,7 @@ class LaplacianPattern:
     def factorize(self, weight: np.ndarray) -> FactorisedLaplacian:
         """The system with positive weights ``(E,)``; a node reached by tiny weights alone stays solvable."""
         stop_if_abandoned()
-        matrix = self.matrix(weight)
+        matrix = self._matrix(weight)
         num_edges, num_nodes = len(self.source), self.num_nodes
         is_dense = num_edges > max(_DENSE_SHARE * num_nodes**2 / 2, _DENSE_EDGES_PER_NODE * num_nodes)
         if is_dense and num_nodes <= _DENSE_MAX_NODES:
@@ -97,19 +87,10 @@ class LaplacianPattern:
                 # SciPy's cho_factor would keep Python's global lock, and with it every other thread, for seconds.
                 lower = np.linalg.cholesky(matrix.toarray())
                 factor = partial(cho_solve, (lower.T, False))
-                return FactorisedLaplacian(self._incidence, weight, factor, num_nodes**2)
-        return FactorisedLaplacian(self._incidence, weight, *self._factorize_sparse(matrix))
+                return FactorisedLaplacian(self._incidence, weight, factor)
+        return FactorisedLaplacian(self._incidence, weight, self._factorize_sparse(matrix))
 
-    def near(self, weight: np.ndarray, factorised: FactorisedLaplacian) -> FactorisedLaplacian:
-        """The system with other weights, solved by conjugate gradients that an earlier factorisation preconditions.
-
-        Each solution is exact to a thousandth of what the earlier weights would give; where that takes too many
-        iterations, the system is factorised after all.
-        """
-        solve = _Iteration(self, weight, factorised)
-        return FactorisedLaplacian(self._incidence, weight, solve, factorised.num_entries)
-
-    def matrix(self, weight: np.ndarray) -> csc_array:
+    def _matrix(self, weight: np.ndarray) -> csc_array:
         """``L``, rows and columns in the order of elimination as far as it is known."""
         values = np.bincount(self._slot, np.concatenate((-weight, -weight, weight, weight)), len(self._row))
         # Counts of nothing are integers, also with weights.
@@ -117,9 +98,9 @@ class LaplacianPattern:
         values[self._root_slot] += root_stiffness(weight)
         return csc_array((values, self._row, self._first), shape=(self.num_nodes, self.num_nodes))
 
-    def _factorize_sparse(self, matrix: csc_array) -> tuple[Callable[[np.ndarray], np.ndarray], int]:
-        """How to solve, and the number of entries in both factors."""
-        is_ordered = self.rank is not None
+    def _factorize_sparse(self, matrix: csc_array) -> Callable[[np.ndarray], np.ndarray]:
+        """How to solve."""
+        is_ordered = self._rank is not None
         factor = splu(
             matrix,
             permc_spec="NATURAL" if is_ordered else "MMD_AT_PLUS_A",
@@ -129,12 +110,12 @@ class LaplacianPattern:
             panel_size=1,
             options={"SymmetricMode": True},
         )
-        rank = np.arange(self.num_nodes) if self.rank is None else self.rank
+        rank = np.arange(self.num_nodes) if self._rank is None else self._rank
         if not is_ordered:
             # This one is in the nodes' own order; from the next one on, the matrix is laid out in that of elimination.
-            self.rank = factor.perm_c.astype(np.int64)
-            self._lay_out(self.rank)
-        return partial(_solve_sparse, factor, np.argsort(rank), rank), factor.nnz
+            self._rank = factor.perm_c.astype(np.int64)
+            self._lay_out(self._rank)
+        return partial(_solve_sparse, factor, np.argsort(rank), rank)
 
 
 def _solve_sparse(factor: SuperLU, node: np.ndarray, rank: np.ndarray, right_hand_side: np.ndarray) -> np.ndarray:
@@ -150,23 +131,6 @@ def solve_in_parts(factor: SuperLU, right_hand_side: np.ndarray) -> np.ndarray:
     return np.concatenate(parts, axis=1) if parts else columns
 
 
-class _Iteration:
-    """``L⁻¹ b`` by conjugate gradients, see :meth:`LaplacianPattern.near`."""
-
-    def __init__(self, pattern: LaplacianPattern, weight: np.ndarray, factorised: FactorisedLaplacian) -> None:
-        self._pattern, self._weight, self._precondition = pattern, weight, factorised.solve
-        self._matrix = pattern.matrix(weight)
-        rank = np.arange(pattern.num_nodes) if pattern.rank is None else pattern.rank
-        self._node, self._rank = np.argsort(rank), rank
-
-    def __call__(self, right_hand_side: np.ndarray) -> np.ndarray:
-        solution = iterate(self._product, self._precondition, right_hand_side, _NEARLY)
-        return self._pattern.factorize(self._weight).solve(right_hand_side) if solution is None else solution
-
-    def _product(self, columns: np.ndarray) -> np.ndarray:
-        return np.asarray((self._matrix @ columns.take(self._node, axis=0)).take(self._rank, axis=0))
-
-
 class FactorisedLaplacian:
     """``L`` for one choice of weights.
 
@@ -174,7 +138,6 @@ class FactorisedLaplacian:
         incidence: Bᵀ, ``(N, E)``.
         weight: ``(E,)``.
         solve: ``L⁻¹ b`` for ``(N, k)`` columns.
-        num_entries: numbers that the factorisation consists of.
     """
 
     def __init__(
@@ -182,9 +145,8 @@ class FactorisedLaplacian:
         incidence: csr_array,
         weight: np.ndarray,
         solve: Callable[[np.ndarray], np.ndarray],
-        num_entries: int,
     ) -> None:
-        self._incidence, self.weight, self._solve, self.num_entries = incidence, weight, solve, num_entries
+        self._incidence, self.weight, self._solve = incidence, weight, solve
 
     def incidence_sum(self, edge_values: np.ndarray) -> np.ndarray:
         """``Bᵀ x``: at every node the values ``(E, k)`` of edges that end there, less those that start there."""
@@ -219,4 +181,4 @@ class LaplacianSystem(FactorisedLaplacian):
         self, num_nodes: int, source: np.ndarray, target: np.ndarray, weight: np.ndarray, roots: np.ndarray
     ) -> None:
         once = LaplacianPattern(num_nodes, source, target, roots).factorize(weight)
-        super().__init__(once._incidence, weight, once._solve, once.num_entries)
+        super().__init__(once._incidence, weight, once._solve)

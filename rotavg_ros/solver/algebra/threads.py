@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import torch
 
-from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
+from rotavg_ros.solver.algebra.running import stop_if_abandoned
 
 Item = TypeVar("Item")
 

@@ -18,11 +18,14 @@ SWITCHES: dict[str, str] = {
     "slips": "odometry does not slip",
     "bias": "no gyroscope has a bias",
     "turns": "odometry errs alike however far it turns",
+    "settling": "labels are flipped as they are, never gone on from as probabilities",
+    "shifts": "a slip, once found, stays in its segment",
     "mending": "a slip, once found, is not taken back together with what it explains",
     "annealing": "no start anneals the closures",
     "robust-start": "no start weighs odometry down as it does closures",
     "minimum-cuts": "no start turns whole parts",
     "translations": "closures are judged by their rotations alone",
+    "relabelling": "rivals are compared by places under the labels that rotations alone gave them",
     "rivals": "the best labelling alone is published",
 }
 
@@ -33,20 +36,10 @@ class SlamStages:
 
     Attributes:
         clean: CleanNet judges the closures.
-        refine: the refinement ends the solve.
-        tree_start: it starts from the tree of least expected error; otherwise from the odometry.
-        scale_estimation: it estimates the noise; otherwise it believes the precisions that edges state.
-        group_search: it looks for groups of closures that are false though each by itself looks good.
-        slip_search: it looks for slips in the odometry where closures speak of them.
-        posterior: one posterior is searched (:mod:`rotavg_ros.solver.slam.posterior`) instead of the passes above.
+        refine: the posterior is searched (:mod:`rotavg_ros.solver.slam.posterior`); otherwise the tree is the answer.
         without: what of :data:`SWITCHES` is switched off in it.
     """
 
     clean: bool = True
     refine: bool = True
-    tree_start: bool = True
-    scale_estimation: bool = True
-    group_search: bool = True
-    slip_search: bool = True
-    posterior: bool = False
     without: frozenset[str] = frozenset()

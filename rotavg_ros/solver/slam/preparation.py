@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, minimum_spanning_forest
-from rotavg_ros.solver.slam.graph.agreement import NO_PAIRS, AgreementPairs, agreement_pairs
+from rotavg_ros.solver.slam.graph.agreement import AgreementPairs, agreement_pairs
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract
 from rotavg_ros.solver.slam.noise.gyro_bias import estimate_bias, without_bias
 from rotavg_ros.solver.slam.noise.model import (
@@ -48,7 +47,6 @@ class Prepared:
         pairs: which closures agree.
         noise: estimated scales.
         forest: along which the chains were drawn together.
-        is_unbiased: whether a gyroscope bias was taken out of the odometry beforehand.
     """
 
     closure_graph: ClosureGraph
@@ -57,34 +55,36 @@ class Prepared:
     pairs: AgreementPairs
     noise: NoiseModel
     forest: SpanningForest
-    is_unbiased: bool = False
 
     @property
     def num_segments(self) -> int:
         return self.closure_graph.num_segments
 
 
-def prepare(graph: ViewGraph, *, scale_estimation: bool = True) -> Prepared:
+def prepare(graph: ViewGraph) -> Prepared:
     """Contract the odometry chains and estimate the noise of steps and closures. Rejected edges take no part.
 
     If most closures disagree with the odometry, a constant bias may be why; it is taken out if fewer do without it.
-
-    Args:
-        scale_estimation: if not, the noise is what edges of either kind state in the median.
     """
-    prepared = _contract(graph, scale_estimation)
-    bias = likely_bias(graph, prepared) if scale_estimation else None
+    prepared = prepare_as_it_is(graph)
+    bias = likely_bias(graph, prepared)
     if bias is None:
         return prepared
     unbiased = prepare_as_it_is(without_bias(graph, bias))
     fewer_disagree = unbiased.noise.outlier_share < prepared.noise.outlier_share - _BIAS_GAIN
     is_better = fewer_disagree and unbiased.noise.step_variance < prepared.noise.step_variance
-    return replace(unbiased, is_unbiased=True) if is_better else prepared
+    return unbiased if is_better else prepared
 
 
 def prepare_as_it_is(graph: ViewGraph) -> Prepared:
     """The same whatever the odometry's bias."""
-    return _contract(graph, scale_estimation=True)
+    closure_graph, forest = draw_together(graph)
+    closure = closure_graph.is_closure
+    squared_angle = (rotations.log(closure_graph.residual) ** 2).sum(dim=1).numpy()[closure]
+    path_steps = closure_graph.path_steps[closure]
+    pairs = agreement_pairs(closure_graph)
+    noise = estimate_noise(discrepancies(squared_angle, path_steps, pairs), rotation_components(graph))
+    return Prepared(closure_graph, squared_angle, path_steps, pairs, noise, forest)
 
 
 def likely_bias(graph: ViewGraph, prepared: Prepared) -> np.ndarray | None:
@@ -112,37 +112,6 @@ def _may_be_biased(prepared: Prepared) -> bool:
     return bool((disagrees & is_confirmed).mean() > _BIAS_CONFIRMED * _BIAS_GAIN)
 
 
-def _contract(graph: ViewGraph, scale_estimation: bool) -> Prepared:
-    """As :func:`prepare`, believing the odometry."""
-    closure_graph, forest = draw_together(graph)
-    components = rotation_components(graph)
-
-    def noise(squared_angle: np.ndarray, path_steps: np.ndarray, pairs: AgreementPairs) -> NoiseModel:
-        if scale_estimation:
-            return estimate_noise(discrepancies(squared_angle, path_steps, pairs), components)
-        return _stated_noise(graph, components)
-
-    return _prepared(closure_graph, forest, noise)
-
-
-def prepared_with(closure_graph: ClosureGraph, forest: SpanningForest, noise: NoiseModel) -> Prepared:
-    """A graph that has been drawn together along ``forest``, whose noise is known."""
-    return _prepared(closure_graph, forest, lambda *_: noise)
-
-
-def _prepared(
-    closure_graph: ClosureGraph,
-    forest: SpanningForest,
-    noise: Callable[[np.ndarray, np.ndarray, AgreementPairs], NoiseModel],
-) -> Prepared:
-    closure = closure_graph.is_closure
-    squared_angle = (rotations.log(closure_graph.residual) ** 2).sum(dim=1).numpy()[closure]
-    path_steps = closure_graph.path_steps[closure]
-    pairs = agreement_pairs(closure_graph)
-    found = noise(squared_angle, path_steps, pairs)
-    return Prepared(closure_graph, squared_angle, path_steps, pairs, found, forest)
-
-
 def draw_together(graph: ViewGraph) -> tuple[ClosureGraph, SpanningForest]:
     """The closure graph, and the forest along which the chains were drawn together; rejected edges take no part."""
     usable = graph.label != EdgeLabel.REJECTED
@@ -150,18 +119,6 @@ def draw_together(graph: ViewGraph) -> tuple[ClosureGraph, SpanningForest]:
     # A rejected edge may only be used where nothing else connects.
     forest = minimum_spanning_forest(graph, torch.where(usable, cost, _CLOSURE_COST**2))
     return contract(graph, forest), forest
-
-
-def _stated_noise(graph: ViewGraph, components: int) -> NoiseModel:
-    """Medians of what the edges of either kind state; the prior where they state nothing."""
-    prior = estimate_noise(discrepancies(np.empty(0), np.empty(0), NO_PAIRS), components)
-    stated = {True: prior.step_variance, False: prior.closure_variance}
-    precision = graph.precision.numpy()
-    for kind in stated:
-        of_kind = precision[(graph.is_odometry.numpy() == kind) & np.isfinite(precision)]
-        if len(of_kind):
-            stated[kind] = float(1 / np.median(of_kind))
-    return replace(prior, step_variance=stated[True], closure_variance=stated[False])
 
 
 def rotation_components(graph: ViewGraph) -> int:

@@ -1,44 +1,33 @@
-"""The SLAM profile: contract the odometry, clean, bootstrap, refine, expand; or go on from the last solve."""
+"""The SLAM profile: the posterior of a robot's graph, or its tree alone; or go on from the last solve."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.estimate import Estimate, Places, Run
-from rotavg_ros.solver.slam import refinement as slam_refinement
+from rotavg_ros.solver.algebra.running import Steps, done, metered
+from rotavg_ros.solver.estimate import Estimate, Places, Run, Stopwatch
 from rotavg_ros.solver.slam import stages as slam_stages
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
-from rotavg_ros.solver.slam.fine_net.tuning import all_fine_tuned
-from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract_along
+from rotavg_ros.solver.slam.fine_net.tuning import all_fine_tuned, fine_tuned
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.options import SlamStages
-from rotavg_ros.solver.slam.passes.alternation import Verdicts
 from rotavg_ros.solver.slam.poses.memory import PoseMemory
-from rotavg_ros.solver.slam.poses.solve import (
-    has_places,
-    likeliest_poses,
-    mode_of_passes,
-    poses_of,
-    poses_of_update,
-)
-from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.solver.slam.poses.solve import has_places, median_poses, poses_of_update
 from rotavg_ros.solver.slam.posterior.modes import publish
-from rotavg_ros.solver.slam.posterior.solve import search
-from rotavg_ros.solver.slam.preparation import Prepared, prepare, prepared_with
-from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over
-from rotavg_ros.solver.slam.update.memory import SlamMemory, Updated, WholeSolveMemory
-from rotavg_ros.solver.slam.update.posterior_memory import PosteriorMemory, estimate_of
+from rotavg_ros.solver.slam.posterior.solve import searching
+from rotavg_ros.solver.slam.preparation import Prepared, prepare
+from rotavg_ros.solver.slam.update.ahead import WholeSolve
+from rotavg_ros.solver.slam.update.memory import SlamMemory, estimate_of
 from rotavg_ros.view_graph import ViewGraph
-
-# A graph of more key nodes is updated by rotations alone.
-_MAX_JOINT_UPDATE = 2000
 
 
 def solve_slam(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
@@ -56,81 +45,59 @@ def solve_slam(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
 
 def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     """The same for a graph without repetitions."""
+    refines = stages.refine if run.refinement_steps is None else run.refinement_steps > 0
+    return done(whole(graph, stages, run)) if refines else _solve_by_tree(graph, stages, run)
+
+
+def _solve_by_tree(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
+    """Odometry drawn together, closures judged, orientations along the tree of least expected error."""
     watch = run.watch
-    steps = run.refinement_steps
-    if steps is None:
-        steps = slam_refinement.MAX_PASSES if stages.refine else 0
-    if steps > 0 and stages.posterior:
-        return _solve_by_posterior(graph, stages, run)
     with watch.stage("contract"):
-        prepared = prepare(graph, scale_estimation=stages.scale_estimation)
+        prepared = prepare(graph)
     with watch.stage("clean"):
-        has_network = stages.clean and "cleannet" not in stages.without
-        network = run.networks.load(SlamCleanNet) if has_network else None
-        cleaned = slam_stages.clean(network, prepared, graph.label)
+        cleaned = slam_stages.clean(_clean_net(stages, run), prepared, graph.label)
     with watch.stage("bootstrap"):
-        if run.warm_start is not None:
-            correction = prepared.closure_graph.corrections(run.warm_start.double())
-        elif stages.tree_start:
-            correction = slam_stages.bootstrap(prepared, cleaned)
-        else:
-            correction = rotations.identity(prepared.closure_graph.num_nodes)
-    if steps > 0:
-        with watch.stage("refine"):
-            estimate = slam_stages.refine_and_search(prepared, cleaned, correction, steps, stages=stages)
-        with watch.stage("expand"):
-            closure_graph = prepared.closure_graph
-            variance = closure_graph.variance(estimate.samples, estimate.stated_step_variance)
-            is_default = stages == SlamStages()
-            memory = SlamMemory.of(graph, prepared, cleaned, estimate, variance) if is_default else None
-        rotations_alone = _slam_estimate(closure_graph, estimate, variance, memory)
-        if not is_default or not has_places(graph):
-            return rotations_alone
-        with watch.stage("poses"):
-            mode = mode_of_passes(prepared, cleaned.network_log_odds, estimate)
-            found = poses_of(graph, mode, _poses_before(graph, run))
-            return _with_poses(graph, rotations_alone, found)
+        correction = _begin(stages, run, prepared, cleaned)
     with watch.stage("expand"):
         score = slam_stages.outlier_scores(prepared.closure_graph, 1 - cleaned.inlier_probability)
         orientations = prepared.closure_graph.orientations(correction)
     return Estimate(orientations, torch.from_numpy(score), torch.full((graph.num_nodes,), torch.nan))
 
 
-def _poses_before(graph: ViewGraph, run: Run) -> PoseMemory | None:
-    """Where those of the passes begin, if the graph has grown from one that was solved so."""
-    before = run.memory
-    if isinstance(before, (SlamMemory, WholeSolveMemory)) and begins_with(graph, before.graph):
-        return before.poses
-    return None
+def whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Steps[Estimate]:
+    """By one posterior: the search from all starts, FineNet, what is published of the labellings, and their poses.
 
-
-def _solve_by_posterior(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
-    """The same by one posterior, which draws the graph together and cleans it as often as odometry may be biased."""
-
-    def begin(prepared: Prepared, cleaned: slam_stages.CleanedClosures) -> Tensor:
-        if run.warm_start is not None:
-            return prepared.closure_graph.corrections(run.warm_start.double())
-        if "tree" in stages.without:
-            return rotations.identity(prepared.closure_graph.num_nodes)
-        return slam_stages.bootstrap(prepared, cleaned)
-
-    network = None if "cleannet" in stages.without else run.networks.load(SlamCleanNet)
+    The graph is drawn together and cleaned as often as odometry may be biased. Left after each start and move.
+    """
     with run.watch.stage("refine"):
-        found = search(graph, network, begin, stages.without)
-        modes = found.modes
-        if "fine-net" not in stages.without:
-            modes = all_fine_tuned(modes, run.networks.load(SlamFineNet))
-        published = publish(found.drawn.problem, modes)
+        found = yield from searching(graph, _clean_net(stages, run), partial(_begin, stages, run), stages.without)
+        fine_net = None if "fine-net" in stages.without else run.networks.load(SlamFineNet)
+        tuned = found.modes if fine_net is None else all_fine_tuned(found.modes, fine_net)
+        published = publish(found.drawn.problem, tuned)
     with run.watch.stage("expand"):
-        estimate, likeliest, poses = estimate_of(published, modes[0].state.noise), modes[0], None
+        estimate, mode, poses = estimate_of(published, tuned[0].state.noise), found.modes[published.chosen], None
+    yield
     if "translations" not in stages.without and has_places(graph):
         with run.watch.stage("poses"):
-            poses, likeliest = likeliest_poses(_unbiased(graph, found.bias), modes)
-    if not stages.without:
-        # Updates go on from a labelling as the search left it.
-        mode = next(before for before, after in zip(found.modes, modes, strict=True) if after is likeliest)
-        estimate = replace(estimate, memory=PosteriorMemory.of(graph, found.bias, mode, estimate))
+            tune = (lambda mode: mode) if fine_net is None else partial(fine_tuned, network=fine_net)
+            poses, mode = yield from median_poses(_unbiased(graph, found.bias), found.modes, tune)
+    if stages == SlamStages():
+        is_divided = bool(published.warnings) if poses is None else poses.poses.is_divided
+        estimate = replace(estimate, memory=SlamMemory.of(graph, found.bias, mode, estimate, is_divided))
     return estimate if poses is None else _with_poses(graph, estimate, poses)
+
+
+def _clean_net(stages: SlamStages, run: Run) -> SlamCleanNet | None:
+    return run.networks.load(SlamCleanNet) if stages.clean and "cleannet" not in stages.without else None
+
+
+def _begin(stages: SlamStages, run: Run, prepared: Prepared, cleaned: slam_stages.CleanedClosures) -> Tensor:
+    """Corrections ``(K, 4)`` to begin with."""
+    if run.warm_start is not None:
+        return prepared.closure_graph.corrections(run.warm_start.double())
+    if "tree" in stages.without:
+        return rotations.identity(prepared.closure_graph.num_nodes)
+    return slam_stages.bootstrap(prepared, cleaned)
 
 
 def _unbiased(graph: ViewGraph, bias: np.ndarray | None) -> ViewGraph:
@@ -143,7 +110,7 @@ def _with_poses(graph: ViewGraph, estimate: Estimate, memory: PoseMemory) -> Est
 
     Whether odometry slipped is told by rotations.
     """
-    poses = memory.poses
+    poses, goes_on = memory.poses, estimate.memory
     by_both = (poses.outlier_probability, poses.rotation_probability)
     score, rotation_score = (
         torch.where(graph.is_odometry, estimate.outlier_score, torch.from_numpy(probability)) for probability in by_both
@@ -160,10 +127,10 @@ def _with_poses(graph: ViewGraph, estimate: Estimate, memory: PoseMemory) -> Est
         outlier_score=score,
         variance=torch.from_numpy(poses.variance),
         places=places,
-        memory=_remembering(graph, estimate.memory, memory),
+        memory=goes_on.with_poses(memory) if isinstance(goes_on, SlamMemory) else None,
         step_variance=_step_variance(graph, poses.precision),
         # The posterior's is of answers that rotations alone do not tell apart.
-        warnings=estimate.warnings if len(poses.rivals) > 1 else (),
+        warnings=estimate.warnings if poses.is_divided else (),
     )
 
 
@@ -173,83 +140,53 @@ def _step_variance(graph: ViewGraph, precision: np.ndarray) -> float:
     return float(np.median(1 / (precision[odometry, 0] * graph.steps.numpy()[odometry])))
 
 
-def _remembering(graph: ViewGraph, memory: object | None, poses: PoseMemory) -> object:
-    """The memory of rotations, if there is one, with that of poses."""
-    if isinstance(memory, (SlamMemory, PosteriorMemory)):
-        return replace(memory, poses=poses)
-    return WholeSolveMemory(graph, poses)
+def update_slam(graph: ViewGraph, memory: SlamMemory, run: Run) -> Estimate | None:
+    """The solve of a graph that has grown by a few edges since ``memory``; None if nothing can be gone on from.
 
-
-def _slam_estimate(
-    graph: ClosureGraph, verdicts: Verdicts, variance: np.ndarray, memory: SlamMemory | None
-) -> Estimate:
-    """From the closure graph's nodes and edges to the view-graph's, of whose nodes ``variance`` ``(N,)`` is."""
-    return Estimate(
-        graph.orientations(verdicts.correction),
-        torch.from_numpy(slam_stages.outlier_scores(graph, verdicts.outlier_probability)),
-        torch.from_numpy(variance),
-        memory,
-        step_variance=max(verdicts.noise.step_variance, verdicts.noise.likely_step_variance),
-    )
-
-
-def update_slam(graph: ViewGraph, memory: SlamMemory | PosteriorMemory, run: Run) -> Estimate | None:
-    """The solve of a graph that has grown by a few edges since ``memory``; None if the whole of it is due.
-
-    ``run`` has the warm start.
+    Where the whole search is due it runs beside updates, as far as ``run`` has work for it each time; once it is
+    through, updates go on from what it has found. ``run`` has the warm start.
     """
+    with metered() as meter:
+        estimate = _updated(graph, memory, run)
+    if estimate is None:
+        return None
+    goes_on = estimate.memory
+    assert isinstance(goes_on, SlamMemory)
+    ahead = goes_on.ahead
+    if ahead is None or ahead.has_failed:
+        if not goes_on.is_due:
+            return estimate
+        ahead = WholeSolve(whole(graph, SlamStages(), replace(run, watch=Stopwatch())))
+    with run.watch.stage("search"):
+        found = ahead.go_on(math.inf if run.work is None else run.work - meter.spent)
+    if found is None:
+        return replace(estimate, memory=replace(goes_on, ahead=ahead))
+    assert isinstance(found.memory, SlamMemory)
+    searched = found.memory.graph
+    if (searched.num_nodes, searched.num_edges) != (graph.num_nodes, graph.num_edges):
+        found = _updated(graph, found.memory, run) or replace(estimate, memory=replace(goes_on, ahead=None))
+    return found
+
+
+def _updated(graph: ViewGraph, memory: SlamMemory, run: Run) -> Estimate | None:
+    """From the labelling before, closures that are new judged by it."""
     assert run.warm_start is not None
     before = memory.poses
     start = run.warm_start.double() if before is None else before.start_alone(graph)
     if start is None or (before is None) is has_places(graph):
         return None
-    if isinstance(memory, PosteriorMemory):
-        return _updated_by_search(graph, memory, start, run)
-    return _updated_by_passes(graph, memory, start, run)
-
-
-def _updated_by_search(graph: ViewGraph, memory: PosteriorMemory, start: Tensor, run: Run) -> Estimate | None:
     with run.watch.stage("update"):
         networks = run.networks.load(SlamCleanNet), run.networks.load(SlamFineNet)
         found = memory.updated(graph, networks, start)
-    before = memory.poses
-    if found is None or before is None:
-        return None if found is None else found.estimate
-    with run.watch.stage("poses"):
-        unbiased = _unbiased(graph, memory.bias)
-        poses = before.extended(unbiased) if found.mode is None else poses_of_update(unbiased, found.mode, before)
-        return None if poses is None else _with_poses(graph, found.estimate, poses)
-
-
-def _updated_by_passes(graph: ViewGraph, memory: SlamMemory, start: Tensor, run: Run) -> Estimate | None:
-    with run.watch.stage("update"):
-        updated = memory.updated(graph, run.networks.load(SlamCleanNet), start)
-        if updated is None:
-            return None
-        estimate = _slam_estimate(*updated)
-    before = memory.poses
-    if before is None:
-        return estimate
-    with run.watch.stage("poses"):
-        if (extended := before.extended(graph)) is not None:
-            return _with_poses(graph, estimate, extended)
-        if updated.closure_graph.num_nodes > _MAX_JOINT_UPDATE:
-            return _with_places_of_before(estimate, before)
-        poses = poses_of_update(graph, _mode_of(graph, updated), before)
-        return None if poses is None else _with_poses(graph, estimate, poses)
-
-
-def _mode_of(graph: ViewGraph, updated: Updated) -> Mode:
-    """Labels and noise of an update by the passes, as the posterior sees them."""
-    memory = updated.memory
-    prepared = prepared_with(contract_along(graph, memory.paths), memory.paths.forest, memory.chain_noise)
-    told = carried_over(memory.network_log_odds, prepared.closure_graph, 0.0)
-    return mode_of_passes(prepared, told, updated.verdicts)
-
-
-def _with_places_of_before(estimate: Estimate, before: PoseMemory) -> Estimate:
-    """With what was known of closures' places; new ones are judged by their rotations until the next whole solve."""
-    wrong = torch.zeros(len(estimate.outlier_score), dtype=torch.float64)
-    wrong[: before.num_edges] = torch.from_numpy(before.wrong_place)
-    score = 1 - (1 - estimate.outlier_score) * (1 - wrong)
-    return replace(estimate, outlier_score=score)
+    if found is None:
+        return None
+    estimate = found.estimate
+    if before is not None:
+        with run.watch.stage("poses"):
+            unbiased = _unbiased(graph, memory.bias)
+            poses = before.extended(unbiased) if found.mode is None else poses_of_update(unbiased, found.mode, before)
+            if poses is None:
+                return None
+            estimate = _with_poses(graph, estimate, poses)
+    assert isinstance(estimate.memory, SlamMemory)
+    return replace(estimate, memory=estimate.memory.since(memory, estimate.outlier_score))

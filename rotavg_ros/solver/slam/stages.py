@@ -10,23 +10,17 @@ from scipy.special import expit
 from torch import Tensor
 
 from rotavg_ros.solver.algebra.spanning_forest import compose_orientations, shortest_path_forest
-from rotavg_ros.solver.slam import refinement as slam_refinement
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
-from rotavg_ros.solver.slam.moves.group_search import without_false_groups
-from rotavg_ros.solver.slam.moves.slip_doubt import Doubt, measure_doubt
-from rotavg_ros.solver.slam.moves.slip_search import search_for_slips
 from rotavg_ros.solver.slam.network import SlamCleanNet, closure_features, false_log_odds
 from rotavg_ros.solver.slam.noise.model import NoiseModel, judge_by_chain
-from rotavg_ros.solver.slam.options import SlamStages
-from rotavg_ros.solver.slam.passes.alternation import SlamEstimate, Start
 from rotavg_ros.solver.slam.preparation import Prepared
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-# What a closure's verdict counts for in the tree: nobody is trusted beyond this, and a false one is off by about this.
+# What a closure's probability counts for in the tree: none is trusted beyond this, and a false one is off by so much.
 _MIN_DISTRUST = 0.02
 _FALSE_SQUARE = np.pi**2 / 3 + 2
-# How much of the network's log-odds the refinement adds to its own: a part, since both have seen some of the same
+# How much of the network's log-odds the posterior adds to its own: a part, since both have seen some of the same
 # evidence, and the less the more closures are false, since agreement by chance is then as common as by truth.
 _NETWORK_SHARE = 0.6
 _MAX_NETWORK_LOG_ODDS = 4.0
@@ -34,11 +28,11 @@ _MAX_NETWORK_LOG_ODDS = 4.0
 
 @dataclass(frozen=True)
 class CleanedClosures:
-    """Verdicts on the E edges of a closure graph before the global solve.
+    """What is known of the E edges of a closure graph before the search.
 
     Attributes:
         inlier_probability: ``(E,)``; 1 for odometry.
-        network_log_odds: ``(E,)`` log-odds of being good that the refinement adds to its own evidence; ±inf by label.
+        network_log_odds: ``(E,)`` log-odds of being good that the posterior's prior has; ±inf by label.
     """
 
     inlier_probability: np.ndarray
@@ -49,7 +43,7 @@ def clean(network: SlamCleanNet | None, prepared: Prepared, label: Tensor) -> Cl
     """Judge every closure by its discrepancy with the odometry and, with a network, by the closures that agree with it.
 
     A closure starts as good only if both say so: a group of false closures agrees with itself, and odometry that has
-    drifted far believes anything. What the network says counts in the refinement's verdicts, too.
+    drifted far believes anything. What the network says counts in the posterior's prior, too.
 
     Args:
         label: ``(M,)`` of the view-graph's edges.
@@ -74,7 +68,7 @@ def judge_closures(
     path_steps: np.ndarray,
     pairs: AgreementPairs,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Log-odds ``(C,)`` of closures to be good before the global solve, and those that the refinement is to add."""
+    """Log-odds ``(C,)`` of closures to be good before the search, and those of the posterior's prior."""
     by_chain = judge_by_chain(noise, squared_angle, path_steps) + noise.prior_log_odds
     if network is None or len(by_chain) == 0:
         return by_chain, np.zeros(len(by_chain))
@@ -92,39 +86,11 @@ def bootstrap(prepared: Prepared, cleaned: CleanedClosures) -> Tensor:
     graph, noise = prepared.closure_graph, prepared.noise
     distrust = np.maximum(1 - cleaned.inlier_probability, _MIN_DISTRUST)
     cost = np.where(
-        graph.is_odometry, graph.steps * noise.step_variance, noise.closure_variance + distrust * _FALSE_SQUARE
+        graph.is_odometry, graph.own_steps * noise.step_variance, noise.closure_variance + distrust * _FALSE_SQUARE
     )
     closure_graph = ViewGraph.create(graph.source, graph.target, graph.residual, num_nodes=graph.num_nodes)
     forest = shortest_path_forest(closure_graph, torch.from_numpy(cost), root="first")
     return compose_orientations(forest, closure_graph)
-
-
-def refine_and_search(
-    prepared: Prepared,
-    cleaned: CleanedClosures,
-    correction: Tensor,
-    max_passes: int = slam_refinement.MAX_PASSES,
-    *,
-    stages: SlamStages | None = None,
-) -> SlamEstimate:
-    """Refine from corrections ``(K, 4)``; again where groups of closures are false that were believed.
-
-    If the outcome looks as if odometry had slipped, from a second start, too.
-    """
-    stages = SlamStages() if stages is None else stages
-
-    def run(start: Start, rank: np.ndarray | None = None) -> SlamEstimate:
-        return slam_refinement.refine(
-            start, prepared.pairs, max_passes=max_passes, hold_noise=not stages.scale_estimation, rank=rank
-        )
-
-    prior = cleaned.network_log_odds
-    estimate = run(Start(prepared.closure_graph, correction, cleaned.inlier_probability, prepared.noise, prior))
-    doubt = measure_doubt(prepared, estimate) if stages.slip_search else Doubt.NONE
-    without = without_false_groups(run, estimate, prepared, prior, doubt) if stages.group_search else estimate
-    rivals = [estimate.correction] if without is estimate else [estimate.correction, without.correction]
-    second = search_for_slips(prepared, estimate, prior, doubt, rivals)
-    return without if second is None else run(second, estimate.rank)
 
 
 def outlier_scores(graph: ClosureGraph, outlier_probability: np.ndarray) -> np.ndarray:

@@ -42,9 +42,7 @@ def read(path: Path) -> list[dict[str, str]]:
 
 
 def test_report(tmp_path: Path) -> None:
-    stress_report.report(
-        tmp_path, made_up(), Findings({"neurora": Calibration()}), "rotavg evaluate slam --suite stress"
-    )
+    stress_report.report(tmp_path, made_up(), Findings(Calibration()), "rotavg evaluate slam --suite stress")
     (hard,) = (
         row for row in read(tmp_path / "stress-kinds.csv") if (row["kind"], row["method"]) == ("hard", "neurora")
     )
@@ -65,7 +63,7 @@ def test_report(tmp_path: Path) -> None:
 
 def test_a_report_of_nothing(tmp_path: Path) -> None:
     """Interrupted before the first case was done."""
-    assert stress_report.report(tmp_path, Scores(), Findings({"neurora": Calibration()}), "rotavg").exists()
+    assert stress_report.report(tmp_path, Scores(), Findings(Calibration()), "rotavg").exists()
 
 
 def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
@@ -80,7 +78,7 @@ def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
 
     scores = score_all([spoiled(seed=seed) for seed in range(3)], {"neurora": calibration.watching(contender)})
     assert scores.interrupted
-    stress_report.report(tmp_path, scores, Findings({"neurora": calibration}), "rotavg")
+    stress_report.report(tmp_path, scores, Findings(calibration), "rotavg")
     assert len(read(tmp_path / "stress-cases.csv")) == 2
     assert int(read(tmp_path / "stress-calibration.csv")[0]["edges judged"]) > 0
 

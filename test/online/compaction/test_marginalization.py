@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -12,8 +13,6 @@ from rotavg_ros.datasets.simulation.trajectories import World
 from rotavg_ros.online.compaction.marginalization import Columns, can_be_marginalized, marginalize
 from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedIndex, MarginalizedKeyframes
 from rotavg_ros.solver import solve
-from rotavg_ros.solver.algebra.probes import probe_signs
-from rotavg_ros.solver.slam.passes import system as slam_system
 from rotavg_ros.view_graph import ViewGraph
 
 COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
@@ -111,13 +110,9 @@ def test_what_is_left_is_the_schur_complement_and_true_to_the_poses(drive, seed)
         np.testing.assert_allclose(place[end] + body[end].apply(offset), position[keyframe], atol=1e-7)
 
 
-def test_the_solver_says_the_same_of_those_that_are_left(monkeypatch):
-    def signs_by_rank(source: np.ndarray, target: np.ndarray, count: int) -> np.ndarray:
-        ranks = np.unique(np.concatenate((source, target)), return_inverse=True)[1]
-        return probe_signs(ranks[: len(source)], ranks[len(source) :], count)
-
-    # Uncertainties are estimated with random signs that hang on the nodes' numbers; here these must not matter.
-    monkeypatch.setattr(slam_system, "probe_signs", signs_by_rank)
+@pytest.mark.parametrize(("method", "relative", "score"), [("neurora~turns", 1e-6, 1e-6), ("neurora", 0.05, 1e-3)])
+def test_the_solver_says_the_same_of_those_that_are_left(method, relative, score):
+    """How far steps that are gone turned is not kept: a labelling by which odometry errs in turns is another one."""
     config = SlamSimulationConfig(
         World.CITY, num_keyframes=600, laps=3, keyframe_distance_m=2.0, closures_per_keyframe=0.1, false_share=0.2
     )
@@ -127,10 +122,10 @@ def test_the_solver_says_the_same_of_those_that_are_left(monkeypatch):
     assert remove.sum() > 300
     done = marginalize(keyframes_of(600), edges, remove, MarginalizedKeyframes.none())
     left = ViewGraph.create(**{name: done.edges[name] for name in COLUMNS}, num_nodes=len(done.kept))
-    full, small = solve(graph), solve(left)
+    full, small = solve(graph, method=method), solve(left, method=method)
     turned = Rotation.from_quat(small.body_from_world) * Rotation.from_quat(full.body_from_world[done.kept]).inv()
     assert np.degrees(turned.magnitude().max()) < 1e-5
-    np.testing.assert_allclose(small.uncertainty, full.uncertainty[done.kept], atol=1e-6)
+    np.testing.assert_allclose(small.uncertainty, full.uncertainty[done.kept], rtol=relative, atol=1e-6)
     # What an edge of several steps is suspected of is what all of them are.
     together = np.bincount(done.edge_of, full.outlier_score, len(done.last))
-    np.testing.assert_allclose(small.outlier_score, together, atol=1e-6)
+    np.testing.assert_allclose(small.outlier_score, together, atol=score)

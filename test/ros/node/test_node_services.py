@@ -191,7 +191,8 @@ def test_load_goes_back_and_refuses_a_broken_file(live_node, tmp_path) -> None:
 def test_autosave_says_once_that_it_cannot_and_catches_up(live_node, tmp_path) -> None:
     path = tmp_path / "states" / "state.npz"
     path.parent.mkdir()
-    live_node.start(*EVERY_MESSAGE, f"state_file:={path}", "autosave_period_s:=0.2")
+    patient = "odometry_timeout_s:=1000.0"  # on a busy machine all of this takes a while
+    live_node.start(*EVERY_MESSAGE, f"state_file:={path}", "autosave_period_s:=0.2", patient)
     feed(live_node, 0, 10)
     live_node.spin_until(path.exists)
     path.parent.rename(tmp_path / "gone")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.sparse.linalg import SuperLU, splu
 
+from rotavg_ros.solver.algebra import laplacian
 from rotavg_ros.solver.algebra.laplacian import LaplacianPattern, LaplacianSystem
 from rotavg_ros.solver.algebra.probes import likeliest_leverage, probe_signs
 
@@ -18,13 +20,20 @@ def random_graph(num_nodes: int, num_edges: int, rng: np.random.Generator) -> tu
 
 
 @pytest.mark.parametrize(("num_edges", "is_dense"), [(200, True), (60, False)], ids=["dense", "sparse"])
-def test_fit_is_the_least_squares_solution(num_edges: int, is_dense: bool) -> None:
+def test_fit_is_the_least_squares_solution(num_edges: int, is_dense: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    sparse = []
+
+    def counted(*arguments: object, **options: object) -> SuperLU:
+        sparse.append(arguments)
+        return splu(*arguments, **options)
+
+    monkeypatch.setattr(laplacian, "splu", counted)
     rng = np.random.default_rng(0)
     source, target = random_graph(20, num_edges, rng)
     weight, difference = rng.uniform(0.1, 10, len(source)), rng.standard_normal((len(source), 3))
     pattern = LaplacianPattern(20, source, target, np.array([3]))
     pattern.factorize(rng.uniform(0.1, 10, len(source)))  # from then on the order of elimination is known
-    assert (pattern.factorize(weight).num_entries == 20**2) is is_dense
+    assert (not sparse) is is_dense
     fitted = [system.fit(difference) for system in (pattern.factorize(weight), pattern.factorize(weight))]
     fitted.append(LaplacianSystem(20, source, target, weight, np.array([3])).fit(difference))
     incidence = np.zeros((len(source), 20))
@@ -41,22 +50,6 @@ def test_weights_over_the_whole_range_of_doubles_stay_finite() -> None:
     weight = 10.0 ** np.array([-200, 200, -30, 30, -300, 0, 300, 5, -5])
     fitted = LaplacianSystem(10, source, target, weight, np.array([0])).fit(np.ones((9, 1)))
     assert np.isfinite(fitted).all()
-
-
-def test_other_weights_and_a_known_order_give_the_same_solution() -> None:
-    rng = np.random.default_rng(1)
-    source, target = random_graph(400, 300, rng)
-    weight, difference = rng.uniform(0.1, 10, len(source)), rng.standard_normal((len(source), 3))
-    pattern = LaplacianPattern(400, source, target, np.array([0]))
-    factorised = pattern.factorize(weight)
-    again = LaplacianPattern(400, source, target, np.array([0]), pattern.rank).factorize(weight)
-    np.testing.assert_allclose(again.fit(difference), factorised.fit(difference), rtol=1e-9, atol=1e-9)
-    # A little iteration is enough for the first, and not for the second.
-    for spread in (0.1, 3.0):
-        changed = weight * np.exp(spread * rng.standard_normal(len(weight)))
-        exact = pattern.factorize(changed).fit(difference)
-        error = np.abs(pattern.near(changed, factorised).fit(difference) - exact).max()
-        assert error < 1e-2 * np.abs(exact).max()
 
 
 def test_leverage_is_told_from_a_few_probes_however_large_it_is() -> None:

@@ -223,15 +223,12 @@ def test_each_component_has_axes_of_its_own() -> None:
 
 
 def test_all_methods_that_photos_have_are_tried() -> None:
-    """Whoever adds one with networks of its own adds it above, or here, if it is an ablation or of robots' graphs."""
+    """Whoever adds one with networks of its own adds it above, or here, if it is an ablation."""
     ablations = {
         f"neurora-{name}"
         for name in ("unweighted", "equal-precisions", "without-finenet", "without-cleannet", "without-both")
     }
-    of_robots = {
-        f"neurora-{name}" for name in ("odometry-start", "stated-precisions", "posterior", "without-slip-search")
-    }
-    assert set(METHODS) == {*NETWORK_METHODS, *AS_WRITTEN, *BASELINES, *ablations, *of_robots}
+    assert set(METHODS) == {*NETWORK_METHODS, *AS_WRITTEN, *BASELINES, *ablations}
 
 
 def test_the_papers_parts_are_switched_one_by_one() -> None:

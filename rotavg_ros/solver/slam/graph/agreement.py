@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from rotavg_ros import rotations
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 
-NUM_NEIGHBOURS = 16
+_NUM_NEIGHBOURS = 16
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class AgreementPairs:
     squared_angle: np.ndarray
 
 
-NO_PAIRS = AgreementPairs(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0), np.empty(0))
+_NO_PAIRS = AgreementPairs(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0), np.empty(0))
 
 
 def closure_ends(graph: ClosureGraph, closure: np.ndarray) -> np.ndarray:
@@ -43,18 +43,12 @@ def closure_ends(graph: ClosureGraph, closure: np.ndarray) -> np.ndarray:
     return np.sort(ends, axis=1)
 
 
-def agreement_pairs(
-    graph: ClosureGraph, closure: np.ndarray | None = None, num_neighbours: int = NUM_NEIGHBOURS
-) -> AgreementPairs:
-    """The nearest closures of every closure, by steps along the odometry, that connect the same chains of it.
-
-    Args:
-        closure: ``(C,)`` edges of the graph to pair; default: all of its closures.
-    """
-    closure = np.flatnonzero(graph.is_closure) if closure is None else closure
-    count = min(num_neighbours, len(closure) - 1)
+def agreement_pairs(graph: ClosureGraph) -> AgreementPairs:
+    """The nearest closures of every closure, by steps along the odometry, that connect the same chains of it."""
+    closure = np.flatnonzero(graph.is_closure)
+    count = min(_NUM_NEIGHBOURS, len(closure) - 1)
     if count < 1:
-        return NO_PAIRS
+        return _NO_PAIRS
     residual = graph.residual[torch.from_numpy(closure)]
     # Closures run old → new and new → old; residuals compare in one direction only.
     turned = torch.from_numpy(graph.position[graph.source[closure]] > graph.position[graph.target[closure]])[:, None]

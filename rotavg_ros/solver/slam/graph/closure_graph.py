@@ -38,8 +38,7 @@ class ClosureGraph:
         residual: ``(E, 4)`` float64 e⁰; the identity on segments.
         is_odometry: ``(E,)`` bool; all segments, and odometry edges outside the forest.
         own_steps: ``(E,)`` variance of each edge's own noise in units of one edge of its kind: odometry steps passed;
-            of closures 1, or what they state as far as that is believed.
-        steps: ``(E,)`` the variance by which it weighs, likewise; more where closures err together.
+            of closures 1.
         stated_variance: ``(E,)`` rad², what closures state; NaN where unknown, and of odometry.
         path_steps: ``(E,)`` odometry steps between the edge's ends along the forest; inf where a bridge is passed.
         view_graph_edge: ``(E - S,)`` the view-graph edge of each edge that is no segment.
@@ -56,7 +55,6 @@ class ClosureGraph:
     residual: Tensor
     is_odometry: np.ndarray
     own_steps: np.ndarray
-    steps: np.ndarray
     stated_variance: np.ndarray
     path_steps: np.ndarray
     view_graph_edge: np.ndarray
@@ -137,16 +135,12 @@ class ClosureGraph:
 
 def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
     """Draw the odometry chains of ``graph`` (on the CPU) together along ``forest``."""
-    return contract_along(graph, OdometryPaths.along(graph, forest))
-
-
-def contract_along(graph: ViewGraph, paths: OdometryPaths) -> ClosureGraph:
-    """The same where what lies along the forest is known."""
+    paths = OdometryPaths.along(graph, forest)
     num_nodes, num_edges = graph.num_nodes, graph.num_edges
     source, target = graph.source.numpy(), graph.target.numpy()
     is_odometry = graph.is_odometry.numpy()
     steps = graph.steps.numpy()
-    parent, parent_edge = paths.forest.parent, paths.forest.parent_edge
+    parent, parent_edge = forest.parent, forest.parent_edge
     hangs_on_odometry, depth, other = paths.hangs_on_odometry, paths.depth, paths.outside
 
     children = np.bincount(parent[hangs_on_odometry], minlength=num_nodes)
@@ -183,13 +177,12 @@ def contract_along(graph: ViewGraph, paths: OdometryPaths) -> ClosureGraph:
     return ClosureGraph(
         nodes=nodes,
         position=(depth + 4.0 * max(num_nodes, depth.max(initial=0.0)) * chain_number)[nodes],
-        roots=key_of_node[paths.forest.roots],
+        roots=key_of_node[forest.roots],
         source=key_of_node[np.concatenate((segment_start, source[other]))],
         target=key_of_node[np.concatenate((segment_end, target[other]))],
         residual=torch.cat((rotations.identity(len(segment_end)), paths.residual)),
         is_odometry=np.concatenate((np.ones(len(segment_end), dtype=bool), is_odometry[other])),
         own_steps=own_steps,
-        steps=own_steps,
         stated_variance=np.concatenate((np.full(len(segment_end), np.nan), stated_variance)),
         path_steps=np.concatenate((segment_steps, paths.path_steps)),
         view_graph_edge=other,

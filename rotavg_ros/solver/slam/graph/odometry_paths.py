@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -50,75 +50,19 @@ class OdometryPaths:
         on_tree &= graph.is_odometry.numpy()
         hangs_on_odometry = (parent_edge >= 0) & np.append(on_tree, False)[parent_edge]
         steps = np.append(graph.steps.numpy(), 0.0)[parent_edge]
-        nothing = np.empty(0, dtype=np.int64)
-        paths = cls(
-            forest,
-            compose_orientations(forest, graph),
-            hangs_on_odometry,
-            accumulate_to_root(forest, np.where(hangs_on_odometry, steps, 0.0)),
-            accumulate_to_root(forest, np.ones(num_nodes)).astype(np.int64),
-            follow(np.where(hangs_on_odometry, parent, np.arange(num_nodes))),
-            nothing,
-            rotations.identity(0),
-            np.empty(0),
-        )
-        return paths._with_edges(graph, np.flatnonzero(~on_tree))
-
-    def grown(self, graph: ViewGraph) -> OdometryPaths | None:
-        """The same of a graph that begins with this one; None where the forest would not simply grow on.
-
-        It does if each new node hangs on an older one by one odometry edge, and the other new edges are closures within
-        components.
-        """
-        num_edges = len(self.outside) + int(self.hangs_on_odometry.sum())
-        edge = np.arange(num_edges, graph.num_edges)
-        is_odometry = graph.is_odometry.numpy()[num_edges:]
-        source, target = graph.source.numpy()[edge], graph.target.numpy()[edge]
-        new = Growth.of(graph, edge[is_odometry], len(self.depth))
-        if new is None:
-            return None
-        anchor = new.anchor
-        orientation = rotations.multiply(new.turn, self.orientation[anchor])
-        paths = replace(
-            self,
-            forest=SpanningForest(
-                np.append(self.forest.parent, new.parent),
-                np.append(self.forest.parent_edge, new.edge),
-                np.append(self.forest.component, self.forest.component[anchor]),
-            ),
-            orientation=torch.cat((self.orientation, rotations.normalize(orientation))),
-            hangs_on_odometry=np.append(self.hangs_on_odometry, np.ones(len(anchor), dtype=bool)),
-            depth=np.append(self.depth, self.depth[anchor] + new.along(graph.steps.numpy()[new.edge])),
-            level=np.append(
-                self.level,
-                self.level[anchor] + new.along(np.ones(len(anchor))).astype(np.int64),
-            ),
-            chain=np.append(self.chain, self.chain[anchor]),
-        )
-        component, closure = paths.forest.component, ~is_odometry
-        if not np.array_equal(component[source[closure]], component[target[closure]]):
-            return None
-        return paths._with_edges(graph, edge[closure])
-
-    def _with_edges(self, graph: ViewGraph, edges: np.ndarray) -> OdometryPaths:
-        """With more edges outside the forest."""
-        source, target = graph.source.numpy()[edges], graph.target.numpy()[edges]
-        residual = edge_residual(
-            self.orientation, graph.target_from_source[edges], graph.source[edges], graph.target[edges]
-        )
-        path_steps = np.where(
-            self.chain[source] == self.chain[target],
-            _path_length(self, source, target),
-            np.inf,
-        )
-        outside = np.concatenate((self.outside, edges))
-        order = _canonical_order(graph, outside)
-        return replace(
-            self,
-            outside=outside[order],
-            residual=torch.cat((self.residual, rotations.canonical(residual)))[torch.from_numpy(order)],
-            path_steps=np.concatenate((self.path_steps, path_steps))[order],
-        )
+        orientation = compose_orientations(forest, graph)
+        depth = accumulate_to_root(forest, np.where(hangs_on_odometry, steps, 0.0))
+        level = accumulate_to_root(forest, np.ones(num_nodes)).astype(np.int64)
+        chain = follow(np.where(hangs_on_odometry, parent, np.arange(num_nodes)))
+        outside = np.flatnonzero(~on_tree)
+        outside = outside[_canonical_order(graph, outside)]
+        source, target = graph.source[outside], graph.target[outside]
+        residual = edge_residual(orientation, graph.target_from_source[outside], source, target)
+        between = source.numpy(), target.numpy()
+        length = _path_length(forest.parent, depth, level, *between)
+        path_steps = np.where(chain[between[0]] == chain[between[1]], length, np.inf)
+        canonical = rotations.canonical(residual)
+        return cls(forest, orientation, hangs_on_odometry, depth, level, chain, outside, canonical, path_steps)
 
 
 @dataclass(frozen=True)
@@ -177,9 +121,8 @@ def _canonical_order(graph: ViewGraph, edges: np.ndarray) -> np.ndarray:
     return np.lexsort((cosine, np.maximum(source, target), np.minimum(source, target)))
 
 
-def _path_length(paths: OdometryPaths, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _path_length(parent: np.ndarray, depth: np.ndarray, level: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Length of the ways between nodes of the same tree, by lifting both to their lowest common ancestor."""
-    parent, depth, level = paths.forest.parent, paths.depth, paths.level
     jumps = [parent, *(farther for _, farther in doublings(parent))]
     low, high = np.where(level[a] >= level[b], a, b), np.where(level[a] >= level[b], b, a)
     excess = level[low] - level[high]

@@ -5,6 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtr
 
+from rotavg_ros.view_graph import FALSE_CLOSURE_DEG
+
+# The noise that makes a closure false.
+OUTLIER_ANGLE = np.radians(FALSE_CLOSURE_DEG)
 _SMALLEST = 1e-9
 
 

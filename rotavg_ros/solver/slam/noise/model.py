@@ -3,7 +3,7 @@
 An inlier's discrepancy with another estimate is Gaussian in k components (k = 1 where all rotations share an axis, else
 3); a false closure is uniform over all rotations. Stated precisions are often nonsense, so both variances are
 estimated: at first by expectation–maximisation over the closures' discrepancies against odometry, which grow with
-the number of steps passed while the closures' own noise does not, and later from fitted residuals and their redundancy.
+the number of steps passed while the closures' own noise does not.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from rotavg_ros.solver.slam.noise.mixture import Discrepancies, MixtureFit, Mixt
 # What is assumed where there is nothing to estimate from.
 _PRIOR_STEP_VARIANCE = np.radians(0.3) ** 2
 _PRIOR_CLOSURE_VARIANCE = np.radians(2.0) ** 2
-_PRIOR_OUTLIER_COUNTS = (1.0, 3.0)
 # Neighbours tell the noise of good closures, but not how many are false.
 _NEIGHBOURS_OUTLIER_SHARE = 0.3
 _EM_STARTS_STEP_DEG = (0.02, 0.1, 0.5, 2.0)
@@ -53,14 +52,12 @@ class NoiseModel:
         step_variance: of one odometry edge.
         closure_variance: of a good loop closure.
         outlier_share: share of the closures that are false.
-        likely_step_variance: the likeliest, where ``step_variance`` is kept low; what uncertainty is stated by.
     """
 
     components: int
     step_variance: float
     closure_variance: float
     outlier_share: float
-    likely_step_variance: float = 0.0
 
     def inlier_log_odds(self, squared_angle: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Log-odds of good against false, without the prior, for discrepancies of given total variance.
@@ -86,12 +83,6 @@ def pair_variance(pairs: AgreementPairs, noise: NoiseModel) -> np.ndarray:
 def agree(pairs: AgreementPairs, noise: NoiseModel) -> np.ndarray:
     """Which pairs differ by so little that both are rather good than random, ``(P,)`` bool."""
     return noise.inlier_log_odds(pairs.squared_angle, pair_variance(pairs, noise)) > 0
-
-
-def outlier_share(inlier_probability: np.ndarray) -> float:
-    """Share of false closures, kept off 0 and 1 by a prior of a few counts."""
-    false_count, total_count = _PRIOR_OUTLIER_COUNTS[0], sum(_PRIOR_OUTLIER_COUNTS)
-    return float(((1 - inlier_probability).sum() + false_count) / (len(inlier_probability) + total_count))
 
 
 def discrepancies(
@@ -128,8 +119,7 @@ def estimate_noise(data: Sequence[Discrepancies], components: int) -> NoiseModel
     likeliest = _likeliest(data, few, components)
     if likeliest is None:
         return _prior(components)
-    least = _least_drift(few, likeliest)
-    return replace(_model(least, components), likely_step_variance=float(likeliest.step_variance[0]))
+    return _model(_least_drift(few, likeliest), components)
 
 
 def _prior(components: int) -> NoiseModel:

@@ -7,17 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from rotavg_ros.solver.algebra import quaternion_rows
-from rotavg_ros.solver.slam.noise.exceedance import exceedance
-from rotavg_ros.solver.slam.noise.judging import OUTLIER_ANGLE
-from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart, estimate_poses
-from rotavg_ros.solver.slam.poses.rows import PoseProblem
-from rotavg_ros.solver.slam.posterior.mode import Mode
-from rotavg_ros.solver.slam.posterior.modes import median
-from rotavg_ros.view_graph import FALSE_CLOSURE_M, ViewGraph
-
-# So many rival labellings are compared by their translations at most; those that are less likely by no more nats than
-# this are averaged.
-_MAX_RIVALS, _FAR = 5, 5.0
+from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
+from rotavg_ros.solver.slam.poses.estimate import PoseMode
+from rotavg_ros.solver.slam.posterior.modes import FAR_TURN, LIKELY, median
+from rotavg_ros.view_graph import FALSE_CLOSURE_M
 
 
 @dataclass(frozen=True)
@@ -32,7 +25,7 @@ class Poses:
         outlier_probability: ``(M,)`` that a closure is false, in rotation or place; of odometry its label.
         rotation_probability: ``(M,)`` that its rotation is; of odometry likewise.
         precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count; 0 of translations that are not known.
-        rivals: probabilities of the labellings that were averaged.
+        is_divided: whether another labelling is nearly as likely, by which a part of the map is turned.
     """
 
     body_from_world: np.ndarray
@@ -42,49 +35,29 @@ class Poses:
     outlier_probability: np.ndarray
     rotation_probability: np.ndarray
     precision: np.ndarray
-    rivals: tuple[float, ...]
+    is_divided: bool = False
 
 
-def rival_poses(graph: ViewGraph, translation: np.ndarray, modes: list[Mode]) -> list[tuple[PoseMode, float]]:
-    """Poses of labellings that translations do not rule out, with their probabilities; the likeliest first.
+def answer(rivals: list[PoseMode], share: np.ndarray) -> tuple[Poses, int]:
+    """Scores' average over rival labellings, and the poses of their median; also which that is.
 
     Args:
-        graph: whose odometry was drawn together, without its bias.
-        translation: ``(M, 3)`` metres.
-        modes: labellings of its rotations.
+        rivals: their poses.
+        share: their probabilities.
     """
-    rivals: list[Mode] = []
-    for mode in modes:
-        if len(rivals) < _MAX_RIVALS and not any(mode.is_turned_like(other.state) for other in rivals):
-            rivals.append(mode)
-    problems = [PoseProblem(graph, translation, mode) for mode in rivals]
-    if len(problems) == 1:
-        return [(estimate_poses(problems[0]), 1.0)]
-    held = [estimate_poses(problem, hold=True) for problem in problems]
-    cost = np.array([rival.cost + pose.cost for rival, pose in zip(rivals, held, strict=True)])
-    order = [number for number in np.argsort(cost, kind="stable") if cost[number] <= cost.min() + _FAR]
-    share = np.exp(cost.min() - cost[order])
-    return [
-        (estimate_poses(problems[number], start=PoseStart.at(held[number])), float(each))
-        for number, each in zip(order, share / share.sum(), strict=True)
-    ]
-
-
-def answer(rivals: list[tuple[PoseMode, float]]) -> Poses:
-    """Scores' average over rival labellings, and the poses of their median."""
-    single = [_of_mode(pose) for pose, _ in rivals]
-    share = np.array([each for _, each in rivals])
+    single = [_of_mode(pose) for pose in rivals]
     orientations = [np.ascontiguousarray(other.body_from_world.T) for other in single]
     middle = median(orientations, share)
     chosen, base = single[middle], quaternion_rows.inverse(orientations[middle])
     turns = np.array([quaternion_rows.log(quaternion_rows.multiply(base, other)) for other in orientations])
     shifts = np.array([other.position - chosen.position for other in single])
-    k, m = rivals[0][0].problem.turns, rivals[0][0].problem.shifts
+    k, m = rivals[0].problem.turns, rivals[0].problem.shifts
 
     def mixed(name: str) -> np.ndarray:
         return np.tensordot(share, np.array([getattr(other, name) for other in single]), 1)
 
-    return Poses(
+    farthest = np.sqrt((turns**2).sum(axis=1).max(axis=1))
+    poses = Poses(
         chosen.body_from_world,
         chosen.position,
         mixed("variance") + np.tensordot(share, (turns**2).sum(axis=1), 1) / k,
@@ -92,8 +65,9 @@ def answer(rivals: list[tuple[PoseMode, float]]) -> Poses:
         np.clip(mixed("outlier_probability"), 0.0, 1.0),
         np.clip(mixed("rotation_probability"), 0.0, 1.0),
         mixed("precision"),
-        tuple(share.tolist()),
+        bool(((share >= LIKELY) & (farthest > FAR_TURN)).any()),
     )
+    return poses, middle
 
 
 def _of_mode(pose: PoseMode) -> Poses:
@@ -109,9 +83,7 @@ def _of_mode(pose: PoseMode) -> Poses:
     length = np.where(segment >= 0, pose.solved.way.length[np.maximum(segment, 0)], 0.0)
     between += passed * (1 - passed) * length * pose.state.noise.way
     score, rotation = (drawn.edge_values(value) for value in _scores(pose))
-    return Poses(
-        np.ascontiguousarray(orientation.T), position, variance, between, score, rotation, _precision(pose), (1.0,)
-    )
+    return Poses(np.ascontiguousarray(orientation.T), position, variance, between, score, rotation, _precision(pose))
 
 
 def _precision(pose: PoseMode) -> np.ndarray:
@@ -169,9 +141,12 @@ def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
     part = own / (own + predicted)
     exceeds = exceedance(part * turn, part * predicted, OUTLIER_ANGLE, k)
     good = places.rotation_good
+    if_false = exceedance(turn, predicted, OUTLIER_ANGLE, k)
     rotation = 1 - mode.state.trusted
-    rotation[closure] = good * exceeds + (1 - good) * exceedance(turn, predicted, OUTLIER_ANGLE, k)
+    rotation[closure] = good * exceeds + (1 - good) * if_false
+    # An outlier errs by too much in rotation or place, whatever it is called.
+    turned = np.concatenate((np.broadcast_to(exceeds, (len(places.chance) - 1, len(exceeds))), if_false[None]))
+    elsewhere = places.beyond(FALSE_CLOSURE_M) * problem.told.is_known
     score = rotation.copy()
-    wrong = np.where(problem.told.is_known, places.false(FALSE_CLOSURE_M), 1 - good)
-    score[closure] = np.maximum(1 - (1 - exceeds) * (1 - wrong), rotation[closure])
+    score[closure] = (places.chance * (1 - (1 - turned) * (1 - elsewhere))).sum(axis=0)
     return score, rotation

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import SuperLU, splu
 
-from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
 from rotavg_ros.solver.algebra.laplacian import solve_in_parts
+from rotavg_ros.solver.algebra.running import spend, stop_if_abandoned
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
 
 _NUM_PROBES, _SEED = 48, 0
@@ -37,14 +37,21 @@ class BlockEquations:
         ends: ``(E, 2)`` sources and targets.
         run: ``(E,)`` in 0 … R − 1, or -1.
         roots: nodes that stay where they are.
+        loose: nodes of which something is known beforehand: first ones of chains that odometry does not tie to a root.
     """
 
     def __init__(
-        self, size: tuple[int, int], num_nodes: int, ends: np.ndarray, run: np.ndarray, roots: np.ndarray
+        self,
+        size: tuple[int, int],
+        num_nodes: int,
+        ends: np.ndarray,
+        run: np.ndarray,
+        roots: np.ndarray,
+        loose: np.ndarray,
     ) -> None:
         num_runs = int(run.max(initial=-1)) + 1
         self.turns, self.size, self.num_edges = size[0], sum(size), len(ends)
-        self.num_blocks, self.roots = num_nodes + num_runs, roots
+        self.num_blocks, self.roots, self.loose = num_nodes + num_runs, roots, loose
         nowhere = self.num_blocks
         source, target = ends.T
         block = np.stack((target, source, np.where(run >= 0, num_nodes + run, nowhere)), axis=1)
@@ -96,22 +103,30 @@ class BlockEquations:
         rows.data = jacobian.ravel()
         return rows
 
-    def factorise(self, jacobian: np.ndarray, root_weight: np.ndarray) -> BlockFactor:
+    def factorise(
+        self, jacobian: np.ndarray, root_weight: np.ndarray, loose_weight: np.ndarray | None = None
+    ) -> BlockFactor:
         """Of whitened rows.
 
         Args:
             jacobian: ``(E + R, d, 3 d)`` W^½ J.
             root_weight: what ties roots down, ``(d,)``.
+            loose_weight: how much is known beforehand of loose nodes, ``(d,)``; None: nothing.
         """
         stop_if_abandoned()
+        spend(self._matrix.nnz)
         blocks = np.matmul(jacobian.transpose(0, 2, 1), jacobian).ravel().take(self._used)
         values = np.bincount(self._slot, blocks, self._matrix.nnz)
         values[self._diagonal] += np.finfo(np.float64).tiny
         values[self._diagonal[self.rank[self.roots]]] += root_weight
+        grounding = len(self.roots) * np.log(root_weight).sum()
+        if loose_weight is not None:
+            values[self._diagonal[self.rank[self.loose]]] += loose_weight
+            grounding += len(self.loose) * np.log(loose_weight).sum()
         self._matrix.data = values
         options = {"SymmetricMode": True}
         factor = splu(self._matrix, "NATURAL", 0.0, relax=_RELAX, panel_size=_PANEL, options=options)
-        return BlockFactor(self, self.rows(jacobian), factor, len(self.roots) * float(np.log(root_weight).sum()))
+        return BlockFactor(self, self.rows(jacobian), factor, float(grounding))
 
 
 def _elimination_order(block: np.ndarray, num_blocks: int) -> np.ndarray:
@@ -139,7 +154,7 @@ class BlockFactor:
 
     @property
     def log_det(self) -> float:
-        """Log det H, without what ties the roots down."""
+        """Log det H, without what ties the roots down and what is known of loose nodes beforehand."""
         return float(np.log(np.abs(self._factor.U.diagonal())).sum()) - self._grounding
 
     def fit(self, whitened: np.ndarray) -> np.ndarray:

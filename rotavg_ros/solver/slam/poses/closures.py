@@ -82,7 +82,8 @@ class Places:
         squares, freedom: ``(3,)`` sums over good closures for the variances of their turns, of their translations
             whatever their length, and of what goes with that, in those.
         log_density: ``(C,)`` nats, of each with its classes summed over.
-        error, error_variance: ``(J, C)`` m and m² per component, of ε in each class: length of its mean, and variance.
+        error, error_variance: ``(J + 1, C)`` m and m² per component, of ε in each class, the last of a false rotation:
+            length of its mean, and variance.
     """
 
     chance: np.ndarray
@@ -99,13 +100,10 @@ class Places:
         """``(C,)`` probability that a closure's rotation is no false one."""
         return np.asarray(1 - self.chance[-1])
 
-    def false(self, metres: float) -> np.ndarray:
-        """``(C,)`` probability that the rotation is false or a known translation errs by more than some metres."""
-        beyond = [
-            exceedance(length, variance, metres, _DIMENSIONS)
-            for length, variance in zip(self.error, self.error_variance, strict=True)
-        ]
-        return np.asarray(self.chance[-1] + (self.chance[:-1] * np.array(beyond)).sum(axis=0))
+    def beyond(self, metres: float) -> np.ndarray:
+        """``(J + 1, C)`` probability that a translation errs by more than some metres, in each class."""
+        pairs = zip(self.error, self.error_variance, strict=True)
+        return np.array([exceedance(length, variance, metres, _DIMENSIONS) for length, variance in pairs])
 
 
 @dataclass(frozen=True)

@@ -31,14 +31,25 @@ def _normal(problem: PoseProblem, solved: Solved) -> float:
     """−log evidence of the normal densities, but for what both have in common."""
     k, m, drawn = problem.turns, problem.shifts, problem.drawn
     odometry = np.flatnonzero(drawn.is_odometry)
-    cost = float((solved.left**2).sum() + solved.factor.log_det) / 2
+    cost = float((solved.left**2).sum() + _log_det(problem, solved)) / 2
     cost += float(np.linalg.slogdet(solved.covariance[odometry])[1].sum()) / 2
     cost -= (float(np.log(solved.closure_weight).sum()) * m + float(np.log(solved.rotation_weight).sum()) * k) / 2
     cost += m / 2 * problem.num_runs * float(np.log(problem.priors.common * solved.state.noise.closure))
     cost += k / 2 * problem.num_runs * float(np.log(problem.common_turn(solved.state.noise)))
-    # Rows less unknowns, per component of a shift.
-    redundant = len(drawn.source) - drawn.num_nodes + len(drawn.roots)
+    # Rows less unknowns, per component of a shift; of loose nodes something is known beforehand.
+    redundant = len(drawn.source) - drawn.num_nodes + len(drawn.roots) + len(problem.loose)
     return cost + m / 2 * redundant * float(np.log(2 * np.pi))
+
+
+def _log_det(problem: PoseProblem, solved: Solved) -> float:
+    """Log det H, where chains that nothing joins are somewhere on the map, turned anyhow: they count for no more."""
+    if len(problem.loose) == 0:
+        return solved.factor.log_det
+    state = solved.state
+    root = problem.whitening(solved.covariance, solved.rotation_weight, solved.closure_weight, state)
+    jacobian = np.matmul(root, problem.jacobian(solved.way))
+    root_weight = problem.root_weight(solved.rotation_weight, state)
+    return problem.equations.factorise(jacobian, root_weight, problem.loose_weight(solved.scale.extent)).log_det
 
 
 def _normal_of_rotations(problem: PoseProblem) -> float:

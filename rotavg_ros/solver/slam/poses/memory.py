@@ -20,10 +20,6 @@ from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart
 from rotavg_ros.solver.slam.poses.rows import PoseNoise, PoseProblem, PoseState
 from rotavg_ros.view_graph import ViewGraph
 
-# Places are judged from nothing again once there are more closures by this share: the fewer there were, the more each
-# new one may change what is believed of the others.
-_MAX_GROWTH = 0.25
-
 
 @dataclass(frozen=True)
 class PoseMemory:
@@ -36,7 +32,6 @@ class PoseMemory:
         roots: nodes that stayed where they were.
         edge: ``(C,)`` the view-graph's edges of closures.
         places: their classes.
-        from_nothing: C when places were last judged from nothing.
     """
 
     poses: Poses
@@ -45,16 +40,13 @@ class PoseMemory:
     roots: np.ndarray
     edge: np.ndarray
     places: Places
-    from_nothing: int
 
     @classmethod
-    def of(cls, pose: PoseMode, poses: Poses, before: PoseMemory | None = None) -> PoseMemory:
-        """After a solve; ``before``: where it began."""
-        edge = pose.problem.closures
-        from_nothing = len(edge) if before is None else before.from_nothing
+    def of(cls, pose: PoseMode, poses: Poses) -> PoseMemory:
+        """After a solve."""
         drawn, mode = pose.problem.drawn, pose.problem.mode
         alone = drawn.orientations(torch.from_numpy(np.ascontiguousarray(mode.state.correction.T)))
-        return cls(poses, alone, pose.state.noise, drawn.nodes[drawn.roots], edge, pose.solved.places, from_nothing)
+        return cls(poses, alone, pose.state.noise, drawn.nodes[drawn.roots], pose.problem.closures, pose.solved.places)
 
     @property
     def num_nodes(self) -> int:
@@ -65,12 +57,6 @@ class PoseMemory:
     def num_edges(self) -> int:
         """M."""
         return len(self.poses.precision)
-
-    @property
-    def wrong_place(self) -> np.ndarray:
-        """``(M,)`` probability that an edge's place is wrong if its rotation is right, as far as it is remembered."""
-        right = (1 - self.poses.outlier_probability) / np.maximum(1 - self.poses.rotation_probability, _TINY)
-        return np.asarray(np.clip(1 - right, 0.0, 1.0))
 
     def start_alone(self, graph: ViewGraph) -> torch.Tensor | None:
         """``(N, 4)`` where rotations alone go on in a graph that has grown; None where new nodes hang otherwise."""
@@ -88,7 +74,7 @@ class PoseMemory:
         drawn, closures = problem.drawn, problem.closures
         grown = self._grown(graph)
         is_merged = not np.array_equal(drawn.nodes[drawn.roots], self.roots)
-        if grown is None or is_merged or len(closures) > (1 + _MAX_GROWTH) * self.from_nothing:
+        if grown is None or is_merged:
             return None
         orientation, position, _ = grown
         correction = drawn.corrections(orientation).numpy().T
@@ -158,7 +144,6 @@ def _lengths_passed(graph: ViewGraph) -> np.ndarray:
     return np.asarray(lengths_passed(translation, graph.steps.numpy(), graph.is_odometry.numpy()))
 
 
-_TINY = 1e-12
 # A walk's heading errs along its way by a third of the variance at its end; of a lever's two or three components one
 # lies along the way, which it does not move.
 _WALK, _ACROSS = 3.0, 0.5

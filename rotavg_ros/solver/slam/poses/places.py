@@ -100,9 +100,27 @@ class Judge:
             np.append(turn_squares.sum(), (at_good * own * along[good] ** 2 / total[good] ** 2).sum(axis=axes)),
             np.append(turn_freedom.sum(), (at_good * own / total[good]).sum(axis=axes)),
             log_density,
-            np.sqrt(((variance[:, :, None] * along / total) ** 2).sum(axis=2)),
-            (variance[:, :, None] * spread / total).mean(axis=2),
+            *self._errors(predictions, scale, (along, spread, variance)),
         )
+
+    def _errors(
+        self, predictions: Predictions, scale: Scale, classes: tuple[np.ndarray, np.ndarray, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """``(J + 1, C)`` metres and m² per component: length of ε's mean, and its variance.
+
+        Args:
+            predictions: what all else says.
+            scale: of errors.
+            classes: ``(J, C, m)`` means and variances of what is said along axes, ``(J, C)`` variances of ε. A false
+                rotation may be anywhere, whatever its turn says.
+        """
+        along, spread = (
+            np.concatenate((of_classes, anywhere[None]))
+            for of_classes, anywhere in zip(classes[:2], along_axes(predictions, self.turns), strict=True)
+        )
+        variance = np.concatenate((classes[2], np.full((1, along.shape[1]), scale.extent)))[:, :, None]
+        total = spread + variance
+        return np.sqrt(((variance * along / total) ** 2).sum(axis=2)), (variance * spread / total).mean(axis=2)
 
     def nothing_known(self, is_good: np.ndarray, square: np.ndarray, scale: Scale) -> Places:
         """Before any solve: no translation pulls, rotations do as labelled, and as many places are wrong as may be.
@@ -116,7 +134,7 @@ class Judge:
         chance = np.zeros((GOOD + _ELSEWHERE + 1, count))
         wrong = self.priors.wrong_place / self.priors.counted
         chance[0], chance[GOOD], chance[-1] = is_good * (1 - wrong), is_good * wrong, ~is_good
-        none = np.zeros((GOOD + _ELSEWHERE, count))
+        none = np.zeros((GOOD + _ELSEWHERE + 1, count))
         turn = np.where(is_good, 1.0, _NOTHING) / self.told.rotation_variance
         return Places(
             chance,

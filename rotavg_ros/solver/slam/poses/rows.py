@@ -257,7 +257,15 @@ class PoseProblem:
         """The pattern of the joint system."""
         drawn = self.drawn
         ends = np.stack((drawn.source, drawn.target), axis=1)
-        return BlockEquations((self.turns, self.shifts), drawn.num_nodes, ends, self.run, drawn.roots)
+        return BlockEquations((self.turns, self.shifts), drawn.num_nodes, ends, self.run, drawn.roots, self.loose)
+
+    @cached_property
+    def loose(self) -> np.ndarray:
+        """Key nodes that chains of odometry begin with, but for those that hold a root."""
+        drawn = self.drawn
+        chain = drawn.paths.chain[drawn.nodes]
+        first = np.unique(chain, return_index=True)[1]
+        return np.asarray(first[~np.isin(chain[first], chain[drawn.roots])])
 
     def orientations(self, state: PoseState) -> np.ndarray:
         """``(4, N)`` body_from_world of all nodes."""
@@ -365,6 +373,10 @@ class PoseProblem:
             common[:, :k, :k] = np.eye(k) / np.sqrt(self.common_turn(state.noise))
             common[:, k:, k:] = np.eye(m) / np.sqrt(self.priors.common * state.noise.closure)
         return root
+
+    def loose_weight(self, extent: float) -> np.ndarray:
+        """``(d,)`` of chains that nothing joins: turned anyhow, and anywhere on a map of ``extent`` m²."""
+        return np.concatenate((np.full(self.turns, 1 / ANYHOW), np.full(self.shifts, 1 / extent)))
 
     def root_weight(self, rotation_weight: np.ndarray, state: PoseState) -> np.ndarray:
         """``(d,)`` what ties roots down."""

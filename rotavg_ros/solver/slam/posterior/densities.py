@@ -13,6 +13,12 @@ from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 _QUARTER_TURN = np.pi / 2
 
 
+def anyhow(components: int) -> float:
+    """rad², variance of the normal density that has at zero the height of the uniform one over rotations."""
+    volume = 2 * np.pi if components == 1 else 8 * np.pi**2
+    return float(volume ** (2 / components) / (2 * np.pi))
+
+
 def log_normal(square: np.ndarray, variance: np.ndarray | float, components: int) -> np.ndarray:
     """Log N(r; variance) in k components for ‖r‖² = ``square``."""
     return np.asarray(-square / (2 * variance) - components / 2 * np.log(2 * np.pi * variance))
@@ -110,7 +116,7 @@ def log_false(
     variance = np.radians(priors.near_miss_deg) ** 2
     uniform = log_uniform_density(np.sqrt(square), components) + np.log1p(-share)
     near = log_normal(square, variance + predicted, components)
-    half_turn = log_half_turn(np.sqrt(square), variance, components)
+    half_turn = log_half_turn(np.sqrt(square), variance + predicted, components)
     return np.asarray(np.logaddexp(uniform, np.logaddexp(near, half_turn) + np.log(share / 2)))
 
 

@@ -43,7 +43,7 @@ def step(problem: Problem, state: State) -> tuple[State, float, Factorised]:
     if_good = weights_if_good(state, own, sites(problem, state, residual, variance))
     factorised = problem.system(state.noise).factorise(weights(problem, state, if_good, variance))
     turn = factorised.fit(residual)
-    state = with_others(moved(state, turn), factorised, if_good, own)
+    state = with_others(moved(state, turn), factorised, if_good, own, problem.components)
     return state, float(np.abs(turn).max(initial=0.0)), factorised
 
 

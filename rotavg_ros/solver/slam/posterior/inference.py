@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 from torch import Tensor
 
-from rotavg_ros.solver.slam.posterior.em import polish, step
+from rotavg_ros.solver.slam.posterior.em import polish, settle, step
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.moves import noise, slips
 from rotavg_ros.solver.slam.posterior.moves.flips import flipped
@@ -37,8 +38,10 @@ class Search:
         self._tuned: list[Mode] = []
         self._tried = 0
 
-    def run(self, prepared: Prepared, cleaned: CleanedClosures, correction: Tensor) -> list[Mode]:
+    def run(self, prepared: Prepared, cleaned: CleanedClosures, correction: Tensor) -> Iterator[None]:
         """From starts until some end alike, move on from the best modes until no move is predicted to lower F.
+
+        It may be left for a while after every start and every move.
 
         Args:
             prepared: the graph drawn together.
@@ -48,12 +51,14 @@ class Search:
         begun: list[Mode] = []
         for name, state in starts(self.problem, prepared, cleaned, correction):
             begun.append(self._begun(name, state))
+            yield
             if sum(mode.is_like(self.modes[0].state) for mode in begun) >= self.problem.limits.alike:
                 break
         may_cut = "minimum-cuts" not in self.problem.without and len(prepared.pairs.first) > 0
         if may_cut and self._seems_slipped(self.modes[0]):
             self._begun("minimum cuts", turned_parts(self.problem, prepared, correction))
-        return self.move_on()
+            yield
+        yield from self.move_on()
 
     def _begun(self, name: str, state: State) -> Mode:
         """The mode of a start, under such noise as the best one has; the first one tells what noise that is."""
@@ -79,7 +84,7 @@ class Search:
             return False
         return len(mode.slipped) > 0 or any(slip.predicted <= slip.slack for slip in slips.propose_slips(mode))
 
-    def move_on(self) -> list[Mode]:
+    def move_on(self) -> Iterator[None]:
         """The search from the modes that are kept."""
         done: list[Mode] = []
         while (mode := self._next(done)) is not None:
@@ -91,12 +96,13 @@ class Search:
                 self._tried += 1
                 found = self.flipped(self.polished(proposal.make(), proposal.name))
                 self.keep(found)
+                yield
                 if found.cost < mode.cost - _GAIN:
                     break
             if self._next(done) is None:
                 for near in self._near():
                     self._tune(near)
-        return self.modes
+                    yield
 
     def _tune(self, mode: Mode) -> None:
         """The labels of a mode under their best noise, and what other labels cost under that."""
@@ -146,8 +152,13 @@ class Search:
 
 def proposals(mode: Mode) -> Iterator[Proposal]:
     """Of all moves that are switched on."""
-    without = mode.problem.without
+    problem, without = mode.problem, mode.problem.without
+    if "settling" not in without:
+        # Labels as probabilities come past what stops single flips; what it gives is not known before.
+        yield Proposal("settle", 0.0, partial(settle, problem, mode.state), problem.limits.slack)
     if "slips" not in without:
         yield from slips.propose_slips(mode)
+    if not without & {"slips", "shifts"}:
+        yield from slips.propose_shifts(mode)
     if not without & {"slips", "mending"}:
         yield from slips.propose_mending(mode)

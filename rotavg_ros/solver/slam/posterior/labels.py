@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from scipy.special import betaln
 
 from rotavg_ros.solver.algebra import quaternion_rows
-from rotavg_ros.solver.slam.posterior.densities import log_false
+from rotavg_ros.solver.slam.posterior.densities import anyhow, log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 
@@ -32,6 +32,8 @@ _KERNELS = len(_REPEAT_DEG) + 1
 _GRID = len(_NEAR_SHARES), len(_FAR_SHARES), len(_NEAR_MISS_QUANTILES), _KERNELS
 # Of closures detected at about the same time, one from about the same older place counts for so many others.
 _IN_RUN = 10.0
+# Predicted to less than this share of the variance of any rotation.
+_TOLD = 0.5
 # A kernel ends at so many widths, where it is 4e-6 of its height.
 _FARTHEST = 5.0
 # The least density that counts.
@@ -65,7 +67,12 @@ class FalseDensity:
 
 
 def false_density(
-    problem: Problem, is_false: np.ndarray, residual: np.ndarray, rows: np.ndarray, both_sides: bool = False
+    problem: Problem,
+    is_false: np.ndarray,
+    residual: np.ndarray,
+    predicted: np.ndarray,
+    rows: np.ndarray,
+    both_sides: bool = False,
 ) -> FalseDensity:
     """Closures wrong by themselves, or by the same turn of the world as other false ones.
 
@@ -76,16 +83,21 @@ def false_density(
     Args:
         is_false: ``(C,)`` bool, of the others.
         residual: ``(C, 3)`` rad, of the closures, from source to target.
+        predicted: ``(C,)`` rad², variance of what these are counted from.
         rows: ``(n,)`` closures to be told of.
         both_sides: given all others, not those before alone.
     """
     k, count = problem.components, len(rows)
     square = (residual[rows] ** 2).sum(axis=1)
-    alone = np.exp(log_false(square, k, problem.priors, _near_miss_shares(problem.priors)[:, None]))
+    near_misses = _near_miss_shares(problem.priors)[:, None]
+    alone = np.exp(log_false(square, k, problem.priors, near_misses, predicted[rows]))
     if count == 0 or not is_false.any() or "repeats" in problem.without:
         nothing, none = np.zeros((_KERNELS, count)), np.zeros(count, dtype=bool)
         return FalseDensity(alone, nothing, nothing, none, none)
     other, there = _others(problem, is_false, rows, both_sides)
+    # Of a closure that nothing else predicts it is not known by what turn it is wrong.
+    is_told = predicted < _TOLD * anyhow(k)
+    there &= is_told[rows, None] & is_told.take(other)
     older, newer = problem.ends.T
     between = np.abs(newer.take(other) - newer[rows, None])
     is_near = there & (between <= problem.priors.run_gap_steps)

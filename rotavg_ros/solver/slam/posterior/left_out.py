@@ -7,10 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import expit
 
-from rotavg_ros.solver.slam.noise.exceedance import exceedance
-from rotavg_ros.solver.slam.noise.judging import OUTLIER_ANGLE
+from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
 from rotavg_ros.solver.slam.posterior.densities import log_false, log_good, log_slipped
-from rotavg_ros.solver.slam.posterior.labels import false_density, label_log_odds, log_slip_odds, repeat_rates
+from rotavg_ros.solver.slam.posterior.labels import (
+    false_density,
+    label_log_odds,
+    log_false_set,
+    log_label_prior,
+    log_slip_odds,
+    repeat_rates,
+)
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import residuals, sites, tails, variances, with_others
 from rotavg_ros.solver.slam.posterior.state import State
@@ -45,14 +51,16 @@ def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> Lef
     num_edges = len(graph.source)
     residual, variance = residuals(problem, state), variances(problem, state.noise)
     own = variance[:num_edges]
-    site = sites(problem, with_others(state, factorised, state.others.relative / own, own), residual, variance)
+    told = with_others(state, factorised, state.others.relative / own, own, k)
+    site = sites(problem, told, residual, variance)
     square, predicted = site.square, site.predicted
 
     # The prior's log-odds, less the density of what an edge is if it is not good.
     odds = problem.log_odds.copy()
     is_false = ~state.is_good[closure]
-    rates = repeat_rates(problem, false_density(problem, is_false, residual[closure], np.flatnonzero(is_false)))
-    each = false_density(problem, is_false, residual[closure], np.arange(len(closure)), both_sides=True)
+    of_closures = residual[closure], told.others.predicted[closure]
+    rates = repeat_rates(problem, false_density(problem, is_false, *of_closures, np.flatnonzero(is_false)))
+    each = false_density(problem, is_false, *of_closures, np.arange(len(closure)), both_sides=True)
     label_odds = label_log_odds(problem, is_false)
     odds[closure] = label_odds - np.log(np.exp(rates) @ each.mixed)
     odometry = np.flatnonzero(graph.is_odometry)
@@ -96,8 +104,15 @@ def relabelled(problem: Problem, state: State) -> np.ndarray:
 
 
 def rough_cost(problem: Problem, state: State) -> float:
-    """What edges cost by their residuals as they are, each by its better label, nats: F without what is integrated."""
-    return -float(np.maximum(*_log_densities(problem, state)).sum())
+    """F without what is integrated, nats: edges by residuals and labels as they are, false closures all together."""
+    good, otherwise = _log_densities(problem, state)
+    closure, is_false = problem.closure, ~state.is_good[problem.closure]
+    odometry = problem.graph.is_odometry
+    told = np.where(state.is_good, good, otherwise)[odometry].sum() + good[closure[~is_false]].sum()
+    told -= np.clip(problem.log_odds, -CERTAIN, CERTAIN)[closure[~is_false]].sum()  # counted with the labels
+    predicted = state.others.predicted[closure]
+    density = false_density(problem, is_false, residuals(problem, state)[closure], predicted, np.flatnonzero(is_false))
+    return -float(told) - log_false_set(problem, density) - log_label_prior(problem, is_false)
 
 
 def _log_densities(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarray]:

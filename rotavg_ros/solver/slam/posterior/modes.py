@@ -18,7 +18,7 @@ from rotavg_ros.solver.slam.posterior.problem import Problem
 # No labelling counts that is less likely by so many nats, and no other noise of the same labels.
 _FAR, _FAR_NOISE = 5.0, 2.0
 # Rivals as likely as this that turn a node by more than this, rad, are worth a warning.
-_LIKELY, _FAR_TURN = 0.05, np.radians(5.0)
+LIKELY, FAR_TURN = 0.05, np.radians(5.0)
 # What is less likely good than this does not pull at all.
 _SURELY_FALSE = 0.05
 _ROUNDS = 2
@@ -33,6 +33,7 @@ class Published:
         correction: ``(4, K)``.
         outlier_probability: ``(E,)``.
         variance: ``(N,)`` rad², of the view-graph's nodes.
+        chosen: number of the mode whose orientations these are, the median.
         rivals: probabilities of the labellings that were averaged, the best first.
         warnings: where rivals are likely and differ.
     """
@@ -41,6 +42,7 @@ class Published:
     correction: np.ndarray
     outlier_probability: np.ndarray
     variance: np.ndarray
+    chosen: int
     rivals: tuple[float, ...]
     warnings: tuple[str, ...] = ()
 
@@ -68,8 +70,10 @@ def publish(problem: Problem, modes: list[Mode]) -> Published:
         spread = (1 - graph.fraction) * off[graph.above] + graph.fraction * off[graph.below]
         variance += weight * (answer.variance + spread**2)
     warnings = _warnings(problem, rivals, share, turns)
+    number = next(number for number, mode in enumerate(modes) if mode is rivals[middle])
     # Shares add up to one but for rounding.
-    return Published(graph, chosen.correction, np.clip(score, 0.0, 1.0), variance, tuple(share.tolist()), warnings)
+    score = np.clip(score, 0.0, 1.0)
+    return Published(graph, chosen.correction, score, variance, number, tuple(share.tolist()), warnings)
 
 
 def median(corrections: list[np.ndarray], share: np.ndarray) -> int:
@@ -90,7 +94,7 @@ def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: li
     others = [
         number
         for number in range(1, len(rivals))
-        if share[number] >= _LIKELY and largest[number] > _FAR_TURN and not rivals[number].is_like(rivals[0].state)
+        if share[number] >= LIKELY and largest[number] > FAR_TURN and not rivals[number].is_like(rivals[0].state)
     ]
     if not others:
         return ()
@@ -156,4 +160,4 @@ def of_mode(mode: Mode) -> Published:
     samples = factorised.samples[: problem.graph.num_nodes]
     graph = problem.drawn(state.noise)
     variance = graph.variance(samples, state.noise.step_variance)
-    return Published(graph, state.correction, score, variance, (1.0,))
+    return Published(graph, state.correction, score, variance, 0, (1.0,))

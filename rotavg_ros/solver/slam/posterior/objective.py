@@ -77,7 +77,8 @@ def evaluate(problem: Problem, state: State, *, is_moving: bool = False) -> Eval
     own, common = np.split(variance, [num_edges])
     if_good = weights_if_good(state, own, sites(problem, state, residual, variance))
     factorised = system.factorise(weights(problem, state, if_good, variance))
-    site = sites(problem, with_others(state, factorised, if_good, own), residual, variance)
+    told = with_others(state, factorised, if_good, own, k)
+    site = sites(problem, told, residual, variance)
     weight, square = factorised.weight, (residual**2).sum(axis=1)
     # Each as the normal density that stands for it, and by how much more its own density makes of what others say.
     log_if_good = log_normal(square[:num_edges], 1 / weight[:num_edges], k) + site.log_density
@@ -85,7 +86,8 @@ def evaluate(problem: Problem, state: State, *, is_moving: bool = False) -> Eval
     slipped = np.flatnonzero(graph.is_odometry & ~good)
     log_if_slipped = log_slipped(square[slipped], own[slipped], 0.0, k, priors)
     is_false = ~good[problem.closure]
-    false = false_density(problem, is_false, residual[problem.closure], np.flatnonzero(is_false))
+    predicted = told.others.predicted[problem.closure]
+    false = false_density(problem, is_false, residual[problem.closure], predicted, np.flatnonzero(is_false))
     unknowns = system.size - len(graph.roots)
     terms = {
         "odometry": -float(log_if_good[graph.is_odometry & good].sum()),

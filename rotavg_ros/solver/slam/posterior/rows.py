@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from rotavg_ros.solver.algebra import quaternion_rows
-from rotavg_ros.solver.slam.posterior.densities import Sites
+from rotavg_ros.solver.slam.posterior.densities import Sites, anyhow
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.state import Noise, Others, State
 from rotavg_ros.solver.slam.posterior.system import Factorised
@@ -90,18 +90,24 @@ def weights_if_good(state: State, own: np.ndarray, site: Sites) -> np.ndarray:
     return np.asarray(np.sqrt(state.others.relative / own * site.weight))
 
 
-def with_others(state: State, factorised: Factorised, if_good: np.ndarray, own: np.ndarray) -> State:
+def with_others(state: State, factorised: Factorised, if_good: np.ndarray, own: np.ndarray, components: int) -> State:
     """The state after a solve, with what that tells of each edge from all others.
+
+    That is taken together with what holds of any edge: its residual is a rotation. So of one that alone holds two parts
+    together nothing is told, and nothing speaks against it.
 
     Args:
         state: before.
         factorised: H of the solve.
         if_good: ``(E,)`` rad⁻², what edges weighed in it as good ones.
         own: ``(E,)`` rad², their variances.
+        components: k.
     """
     resistance = factorised.resistance[: len(own)]
     rest = np.maximum(1 - factorised.weight[: len(own)] * resistance, _LEAST_REST)
-    return replace(state, others=Others(rest, resistance / rest, if_good * own))
+    predicted = resistance / rest
+    limited = 1 + predicted / anyhow(components)
+    return replace(state, others=Others(rest * limited, predicted / limited, if_good * own))
 
 
 def weights(problem: Problem, state: State, good: np.ndarray, variance: np.ndarray) -> np.ndarray:
@@ -146,7 +152,6 @@ def _bridged(problem: Problem, state: State, weight: np.ndarray) -> np.ndarray:
     # Which of several edges between two parts it is makes no difference.
     bridges = coo_array((1.0 + np.arange(len(between)), np.divmod(between, parts)), shape=(parts, parts))
     chosen = minimum_spanning_tree(bridges.tocsr()).data.astype(np.int64) - 1
-    volume = 2 * np.pi if problem.components == 1 else 8 * np.pi**2
     weight = weight.copy()
-    weight[loose[first[chosen]]] = 2 * np.pi * volume ** (-2 / problem.components)
+    weight[loose[first[chosen]]] = 1 / anyhow(problem.components)
     return weight

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.running import Steps, done
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
@@ -105,46 +106,61 @@ def search(
         without: terms and moves that are switched off.
         priors: other ones than usual.
     """
+    return done(searching(graph, network, begin, without, priors))
 
-    def from_starts(drawn: Drawn) -> Found:
+
+def searching(
+    graph: ViewGraph,
+    network: SlamCleanNet | None,
+    begin: Begin,
+    without: Collection[str] = (),
+    priors: SlamPriors | None = None,
+) -> Steps[Found]:
+    """The same, left for a while after every start and every move; the arguments are those of :func:`search`."""
+
+    def from_starts(drawn: Drawn) -> Steps[Found]:
         correction = begin(drawn.prepared, drawn.cleaned)
-        return Found(drawn, Search(drawn.problem).run(drawn.prepared, drawn.cleaned, correction))
+        begun = Search(drawn.problem)
+        yield from begun.run(drawn.prepared, drawn.cleaned, correction)
+        return Found(drawn, begun.modes)
 
-    found = from_starts(Drawn.of(graph, network, without, None, priors))
+    found = yield from from_starts(Drawn.of(graph, network, without, None, priors))
     if "bias" in without:
         return found
     if (bias := likely_bias(graph, found.drawn.prepared)) is not None:
-        found = min(found, from_starts(Drawn.of(graph, network, without, bias, priors)), key=lambda either: either.cost)
-    for better in _with_better_bias(graph, network, found, without):
+        biased = yield from from_starts(Drawn.of(graph, network, without, bias, priors))
+        found = min(found, biased, key=lambda either: either.cost)
+    for _ in range(_BIAS_ROUNDS):
+        better = yield from _with_better_bias(graph, network, found, without)
+        if better is None:
+            break
         found = better
     return found
 
 
 def _with_better_bias(
     graph: ViewGraph, network: SlamCleanNet | None, found: Found, without: Collection[str]
-) -> Iterator[Found]:
-    """What is found from the best mode with Newton's step on the bias, as long as F falls."""
-    for _ in range(_BIAS_ROUNDS):
-        best, drawn = found.modes[0], found.drawn
-        problem, evaluation = best.problem, best.evaluation
-        bias = problem.bias or Bias.of(graph, drawn.prepared, np.zeros(3))
-        information, change = bias.information(
-            problem.graph.source, best.state, evaluation.residual, evaluation.factorised, problem.priors
-        )
-        predicted = -float(change @ information @ change) / 2
-        if problem.bias is None:
-            predicted += bias.cost(information, problem.priors)
-        if predicted > -_LEAST_GAIN:
-            return
-        again = Drawn.of(graph, network, without, bias.vector + change @ bias.axes, problem.priors)
-        moved = _moved(best, drawn, again)
-        goes_on = Search(again.problem)
-        goes_on.keep(goes_on.flipped(goes_on.polished(moved, "bias")))
-        better = Found(again, goes_on.move_on())
-        if better.cost > found.cost - _LEAST_GAIN:
-            return
-        yield better
-        found = better
+) -> Steps[Found | None]:
+    """What is found from the best mode with Newton's step on the bias; None if F does not fall by it."""
+    best, drawn = found.modes[0], found.drawn
+    problem, evaluation = best.problem, best.evaluation
+    bias = problem.bias or Bias.of(graph, drawn.prepared, np.zeros(3))
+    information, change = bias.information(
+        problem.graph.source, best.state, evaluation.residual, evaluation.factorised, problem.priors
+    )
+    predicted = -float(change @ information @ change) / 2
+    if problem.bias is None:
+        predicted += bias.cost(information, problem.priors)
+    if predicted > -_LEAST_GAIN:
+        return None
+    again = Drawn.of(graph, network, without, bias.vector + change @ bias.axes, problem.priors)
+    moved = _moved(best, drawn, again)
+    goes_on = Search(again.problem)
+    goes_on.keep(goes_on.flipped(goes_on.polished(moved, "bias")))
+    yield
+    yield from goes_on.move_on()
+    better = Found(again, goes_on.modes)
+    return None if better.cost > found.cost - _LEAST_GAIN else better
 
 
 def _turned(graph: ViewGraph, prepared: Prepared) -> np.ndarray:

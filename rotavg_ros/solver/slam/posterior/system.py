@@ -10,14 +10,18 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import coo_array, csc_array, csr_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
-from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
 from rotavg_ros.solver.algebra.laplacian import root_stiffness, solve_in_parts
 from rotavg_ros.solver.algebra.probes import likeliest_leverage, probe_signs
+from rotavg_ros.solver.algebra.running import spend, stop_if_abandoned
 
 _NUM_PROBES = 48
+# Rows that weigh less than this share of the heaviest one are nothing; so many of them are worth a pattern without
+# them, of which some are kept.
+_NO_WEIGHT, _WORTH_LEAVING_OUT, _MAX_PARTS = 1e-9, 200, 8
 _MAX_LEVERAGE = 1 - 1e-6
 
 
@@ -61,37 +65,84 @@ class NormalEquations:
         rows = np.repeat(np.arange(len(column)), 3)
         self.rows: csr_array = csr_array((value.ravel(), (rows, column.ravel())), shape=(len(column), self.size))
         self._transposed = self.rows.T.tocsr()
-        self._rank = np.arange(self.size)
-        self._is_ordered = False
-        self._lay_out()
+        self._whole = _Pattern(self, np.arange(len(column)))
+        self._parts: dict[bytes, _Pattern] = {}
         self.probes = probe_signs(
             np.concatenate((source, num_nodes + np.arange(self.num_runs))),
             np.concatenate((target, 2 * num_nodes + self.num_runs + np.arange(self.num_runs))),
             _NUM_PROBES,
         ).astype(np.float64)
 
-    def _lay_out(self) -> None:
-        column = self._rank[self.column]
-        first, second = np.repeat(column, 3, axis=1), np.tile(column, 3)
-        keys = np.concatenate(((second * self.size + first).ravel(), self._rank * (self.size + 1)))
-        occupied, slot = np.unique(keys, return_inverse=True)
-        slot, diagonal = np.split(slot, [first.size])
-        self._root_slot = diagonal[self.roots]
-        product = (np.repeat(self.value, 3, axis=1) * np.tile(self.value, 3)).ravel()
-        row = np.repeat(np.arange(len(column)), 9)
-        # Entries of H as a linear map of the weights.
-        self._entries: csr_array = csr_array((product, (slot, row)), shape=(len(occupied), len(column)))
-        first_of_column = np.searchsorted(occupied, np.arange(self.size + 1) * self.size)
-        self._matrix: csc_array = csc_array(
-            (np.ones(len(occupied)), (occupied % self.size).astype(np.int32), first_of_column.astype(np.int32)),
-            shape=(self.size, self.size),
-        )
-
     def factorise(self, weight: np.ndarray) -> Factorised:
         """With weights ``(E + R,)``, rad⁻²."""
         stop_if_abandoned()
-        values = self._entries @ weight
+        pattern = self._pattern(weight)
+        spend(pattern.num_entries)
         stiffness = root_stiffness(weight)
+        factor, rank = pattern.factorise(weight, stiffness)
+        return Factorised(self, weight, factor, rank, len(self.roots) * np.log(stiffness))
+
+    def _pattern(self, weight: np.ndarray) -> _Pattern:
+        """Of the rows that weigh anything: others fill the factor of a graph with many false closures for nothing."""
+        counts = weight > _NO_WEIGHT * weight.max()
+        if len(weight) - counts.sum() < _WORTH_LEAVING_OUT:
+            return self._whole
+        key = np.packbits(counts).tobytes()
+        if key not in self._parts:
+            if len(self._parts) == _MAX_PARTS:
+                del self._parts[next(iter(self._parts))]
+            # Where nothing else holds a part together, next to nothing does.
+            self._parts[key] = _Pattern(self, np.flatnonzero(counts)) if self._is_held(counts) else self._whole
+        return self._parts[key]
+
+    def _is_held(self, counts: np.ndarray) -> bool:
+        """Whether some rows alone tie every unknown to a root."""
+        edges = self.column[: len(self.run)][counts[: len(self.run)]]
+        ends = edges[:, 0], edges[:, 1]
+        links = coo_array((np.ones(len(edges)), ends), shape=(self.num_nodes,) * 2)
+        return bool(connected_components(links, directed=False)[0] == len(self.roots))
+
+
+class _Pattern:
+    """Where the entries of H stand that some of the rows make, in an order of elimination with little fill."""
+
+    def __init__(self, system: NormalEquations, rows: np.ndarray) -> None:
+        self._system, self._rows = system, rows
+        self._rank = np.arange(system.size)
+        self._is_ordered = False
+        self._lay_out()
+
+    def _lay_out(self) -> None:
+        system, size = self._system, self._system.size
+        column, value = self._rank[system.column[self._rows]], system.value[self._rows]
+        first, second = np.repeat(column, 3, axis=1), np.tile(column, 3)
+        keys = np.concatenate(((second * size + first).ravel(), self._rank * (size + 1)))
+        occupied, slot = np.unique(keys, return_inverse=True)
+        slot, diagonal = np.split(slot, [first.size])
+        self._root_slot = diagonal[system.roots]
+        product = (np.repeat(value, 3, axis=1) * np.tile(value, 3)).ravel()
+        row = np.repeat(self._rows, 9)
+        # Entries of H as a linear map of the weights.
+        self._entries: csr_array = csr_array((product, (slot, row)), shape=(len(occupied), len(system.column)))
+        first_of_column = np.searchsorted(occupied, np.arange(size + 1) * size)
+        self._matrix: csc_array = csc_array(
+            (np.ones(len(occupied)), (occupied % size).astype(np.int32), first_of_column.astype(np.int32)),
+            shape=(size, size),
+        )
+
+    @property
+    def num_entries(self) -> int:
+        """Of H."""
+        return int(self._matrix.nnz)
+
+    def factorise(self, weight: np.ndarray, stiffness: float) -> tuple[SuperLU, np.ndarray]:
+        """H's factor, and where each unknown stands in it.
+
+        Args:
+            weight: ``(E + R,)`` rad⁻².
+            stiffness: rad⁻², what ties roots down.
+        """
+        values = self._entries @ weight
         values[self._root_slot] += stiffness
         self._matrix.data = values
         factor = splu(
@@ -106,7 +157,7 @@ class NormalEquations:
         if not self._is_ordered:
             self._rank, self._is_ordered = factor.perm_c.astype(np.int64), True
             self._lay_out()
-        return Factorised(self, weight, factor, rank, len(self.roots) * np.log(stiffness))
+        return factor, rank
 
 
 class Factorised:

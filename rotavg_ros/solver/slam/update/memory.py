@@ -1,321 +1,216 @@
-"""What a SLAM solve remembers for the next one of the same graph, grown by a handful of edges.
+"""What a solve by the posterior remembers for the next one of the same graph, grown by a few edges.
 
-A node's tick that judged ten thousand closures need not judge them from nothing when five more have come: their
-verdicts, the noise and the order of elimination are still right. New closures are judged by their neighbours as ever;
-then a few passes of the refinement go on from where the last ones ended. All closures are judged again in these, so
-that a verdict can still change; when several do, or the graph has grown by some percent, or some number of updates
-later, the whole solve runs again, and with it the search for slips and biases.
-
-An update of a large graph *follows* the one before: it solves from an earlier factorisation (``grown_laplacian.py``),
-believes its noise, and takes what the rest of the graph predicts of an old closure, and the uncertainty of an old
-keyframe, to be what they were. An update of a small one *renews* these.
+The labelling that was found, its noise and its bias are where the next solve begins and, but for labels of single
+closures, where it ends. The whole search is due again once enough closures have come that this labelling does not
+explain: others only make it likelier. Odometry that no closure judges yet says nothing of what was there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from rotavg_ros.solver.algebra.laplacian import LaplacianPattern
-from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract_along
-from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths
+from rotavg_ros import rotations
+from rotavg_ros.solver.estimate import Estimate
+from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
+from rotavg_ros.solver.slam.fine_net.tuning import fine_tuned
+from rotavg_ros.solver.slam.graph.odometry_paths import Growth
+from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
-from rotavg_ros.solver.slam.noise.model import NoiseModel
-from rotavg_ros.solver.slam.noise.stated_precision import StatedTrust, believing
-from rotavg_ros.solver.slam.passes.alternation import SlamEstimate, Verdicts
-from rotavg_ros.solver.slam.passes.system import ITERATING_PAYS, StaleFactorError
+from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.poses.memory import PoseMemory
-from rotavg_ros.solver.slam.preparation import Prepared, draw_together
-from rotavg_ros.solver.slam.stages import CleanedClosures
+from rotavg_ros.solver.slam.posterior.inference import Search
+from rotavg_ros.solver.slam.posterior.left_out import relabelled
+from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.solver.slam.posterior.modes import Published, publish
+from rotavg_ros.solver.slam.posterior.priors import SlamPriors
+from rotavg_ros.solver.slam.posterior.solve import Drawn
+from rotavg_ros.solver.slam.posterior.state import Noise, Others, State
+from rotavg_ros.solver.slam.stages import outlier_scores
+from rotavg_ros.solver.slam.update.ahead import WholeSolve
 from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over
-from rotavg_ros.solver.slam.update.grown_laplacian import GrownLaplacian, OlderFactor
-from rotavg_ros.solver.slam.update.grown_system import GrownSystem
-from rotavg_ros.solver.slam.update.new_closures import judge_new_closures
-from rotavg_ros.solver.slam.update.passes import GrownStart, follow, grown_variance, renew
 from rotavg_ros.view_graph import ViewGraph
 
-_NEXT_TO_NOTHING = 1e-9
+# The whole search is due once closures that are not explained are more than this share of those that were searched, or
+# new ones more than the second; with any new one where other answers were nearly as likely.
+_MAX_UNEXPLAINED, _MAX_GROWTH = 0.05, 0.25
+_FLAGGED = 0.5
+# In the place of labels that are not known; more than any.
+_NEW = 2.0
+_GOOD = 0.5
 
 
-@dataclass(frozen=True)
-class UpdateLimits:
-    """How far updates go before the whole solve runs again, and what they may cost.
+class SearchedOn(NamedTuple):
+    """The outcome of an update: the answer, and the labelling; None if only odometry was appended."""
 
-    Attributes:
-        updates: the whole solve runs again after so many.
-        growth: … or once there are more closures by this share. Of few closures that is none: while little is known,
-            each new one may change what is believed of the others.
-        turned, share_turned: … or when more verdicts turn in an update than either.
-        columns: new closures that an update solves for from an older factorisation; with more, another one is cheaper.
-            If so many are new at once, the whole solve runs.
-        large_graph: key nodes; a graph of fewer is factorised anew in each update.
-        entries: a factorisation with more entries of 12 bytes per node and edge is not kept.
-    """
-
-    updates: int = 60
-    growth: float = 0.05
-    turned: int = 2
-    share_turned: float = 0.002
-    columns: int = 128
-    large_graph: int = ITERATING_PAYS
-    entries: int = 24
-
-
-class Updated(NamedTuple):
-    """The outcome of an update: the closure graph, its verdicts, and variance ``(N,)`` of the nodes in rad²."""
-
-    closure_graph: ClosureGraph
-    verdicts: Verdicts
-    variance: np.ndarray
-    memory: SlamMemory
-
-
-@dataclass(frozen=True)
-class WholeSolveMemory:
-    """Where an update could not go on: the next solve is a whole one, and begins with these poses."""
-
-    graph: ViewGraph
-    poses: PoseMemory
+    estimate: Estimate
+    mode: Mode | None
 
 
 @dataclass(frozen=True)
 class SlamMemory:
-    """Of a graph of N nodes and M edges.
+    """Of a graph of N nodes and M edges, C of them closures.
 
     Attributes:
         graph: the view-graph.
-        inlier_probability: ``(M,)`` that an edge is not a false one; all of a segment have that of the segment.
-        outlier_probability: ``(M,)`` that its true noise exceeds 10°, likewise.
-        network_log_odds: ``(M,)`` what the network said of closures; ±inf by label.
-        steps: ``(M,)`` variance by which a closure weighs in units of the closures', see
-            :class:`~rotavg_ros.solver.slam.graph.closure_graph.ClosureGraph`.
-        trust: how far the variances that closures state are believed.
-        exact_share: ``(M,)`` probability of a good closure to err no more than most.
-        prediction_variance: ``(M,)`` rad², of what the rest of the graph predicts of a closure.
-        variance: ``(N,)`` rad², of the orientations.
-        chain_noise: the noise as the odometry has it.
-        noise: the noise as the refinement left it.
-        max_step_variance: rad², as the refinement kept it.
-        elimination: ``(K,)`` nodes in the order of elimination; None if there was none.
-        paths: of the closure graph.
-        factor: what the next update may solve from; None where it factorises anew.
-        closures: how many there were when the whole solve ran.
-        updates: how many there have been since.
-        limits: of the updates.
-        warnings: about the answer of the whole solve.
+        trusted: ``(M,)`` 1 for good closures and sound odometry, 0 for others; all of a segment have its label.
+        noise: of that labelling.
+        bias: ``(3,)`` rad per step that was taken out of the odometry; None if none was.
+        body_from_world: ``(N, 4)`` that was found, in its own gauge.
+        outlier_score: ``(M,)`` that was published.
+        variance: ``(N,)`` rad², likewise.
+        searched: C when the whole search began.
+        is_divided: whether another answer was nearly as likely then.
+        unexplained: closures that came since and were flagged, and older ones whose label has changed.
+        warnings: about the answer of the whole search; None before somebody has looked.
         poses: where translations are known.
+        ahead: the next whole solve, if one is under way.
     """
 
     graph: ViewGraph
-    inlier_probability: np.ndarray
-    outlier_probability: np.ndarray
-    network_log_odds: np.ndarray
-    steps: np.ndarray
-    trust: StatedTrust
-    exact_share: np.ndarray
-    prediction_variance: np.ndarray
-    variance: np.ndarray
-    chain_noise: NoiseModel
-    noise: NoiseModel
-    max_step_variance: float
-    elimination: np.ndarray | None
-    paths: OdometryPaths
-    factor: OlderFactor | None
-    closures: int
-    updates: int = 0
-    limits: UpdateLimits = field(default_factory=UpdateLimits)
-    warnings: tuple[str, ...] = ()
+    trusted: np.ndarray
+    noise: Noise
+    bias: np.ndarray | None
+    body_from_world: Tensor
+    outlier_score: Tensor
+    variance: Tensor
+    searched: int
+    is_divided: bool = False
+    unexplained: int = 0
+    warnings: tuple[str, ...] | None = None
     poses: PoseMemory | None = None
+    ahead: WholeSolve | None = None
 
     @classmethod
     def of(
-        cls,
-        graph: ViewGraph,
-        prepared: Prepared,
-        cleaned: CleanedClosures,
-        estimate: SlamEstimate,
-        variance: np.ndarray,
-    ) -> SlamMemory | None:
-        """After a whole solve, with variances of the nodes ``(N,)``; None where an update could not go on from it."""
-        closure_graph = prepared.closure_graph
-        closures = int(closure_graph.is_closure.sum())
-        if prepared.is_unbiased:
-            return None
-        return cls(
-            **_by_edge(closure_graph, estimate, cleaned.network_log_odds),
-            **_of_estimate(graph, closure_graph, estimate, UpdateLimits()),
-            graph=graph,
-            variance=variance,
-            trust=estimate.trust,
-            chain_noise=prepared.noise,
-            max_step_variance=estimate.max_step_variance,
-            closures=closures,
-        )
-
-    def updated(self, graph: ViewGraph, network: SlamCleanNet | None, body_from_world: torch.Tensor) -> Updated | None:
-        """Solve a graph that has grown from this one; None if it has not, or the whole solve should run.
+        cls, graph: ViewGraph, bias: np.ndarray | None, mode: Mode, estimate: Estimate, is_divided: bool
+    ) -> SlamMemory:
+        """After a whole search.
 
         Args:
-            body_from_world: ``(N, 4)`` start.
+            graph: that was solved.
+            bias: ``(3,)`` rad per step that was taken out of its odometry, if any.
+            mode: the labelling to go on from.
+            estimate: what was published, by rotations alone.
+            is_divided: whether another answer is nearly as likely.
         """
-        if self.updates >= self.limits.updates or not begins_with(graph, self.graph):
-            return None
-        num_closures = int((~graph.is_odometry).sum())
-        num_new = num_closures - int((~self.graph.is_odometry).sum())
-        if num_closures > (1 + self.limits.growth) * self.closures or num_new > self.limits.columns:
-            return None
-        paths = self.paths.grown(graph)
-        closure_graph = draw_together(graph)[0] if paths is None else contract_along(graph, paths)
-        start = self._start(closure_graph, network, body_from_world)
-        if paths is not None and not start.is_new.any():
-            return self._extend(graph, start)
-        updated = self._follow(graph, start) or self._renew(graph, start)
-        if updated is None:
-            return None
-        turned = np.abs(updated.verdicts.inlier_probability - start.inlier_probability) > 0.5
-        turned[start.is_new] = False
-        return None if turned.sum() > max(self.limits.turned, self.limits.share_turned * num_closures) else updated
+        problem, state = mode.problem, mode.state
+        trusted = problem.graph.edge_values(state.trusted)
+        told = estimate.body_from_world, estimate.outlier_score, estimate.variance
+        return cls(graph, trusted, state.noise, bias, *told, len(problem.closure), is_divided)
 
-    def _extend(self, graph: ViewGraph, start: GrownStart) -> Updated:
-        """With odometry alone, which says nothing of what was there."""
-        closure_graph = start.graph
-        outlier_probability = carried_over(self.outlier_probability, closure_graph, 0.0)
-        verdicts = Verdicts(
-            start.correction,
-            start.inlier_probability,
-            np.where(closure_graph.is_closure, outlier_probability, 1 - start.inlier_probability),
-            self.noise,
-            closure_graph.steps,
-            start.exact_share,
-            start.prediction_variance,
-        )
-        return self._updated(graph, start, verdicts, self.factor)
+    @property
+    def is_due(self) -> bool:
+        """Whether the whole search should run again."""
+        num_closures = int((~self.graph.is_odometry).sum())
+        grown = num_closures > (1 if self.is_divided else 1 + _MAX_GROWTH) * self.searched
+        return grown or self.unexplained > _MAX_UNEXPLAINED * self.searched
 
-    def _follow(self, graph: ViewGraph, start: GrownStart) -> Updated | None:
-        """With noise and predictions of before; None where they are not for that, or no longer serve."""
-        if start.graph.num_nodes < self.limits.large_graph:
+    def with_poses(self, poses: PoseMemory) -> SlamMemory:
+        """The same with what is known of places, by which closures' labels go."""
+        trusted = self.trusted.copy()
+        trusted[poses.edge] = poses.places.rotation_good > _GOOD
+        return replace(self, poses=poses, trusted=trusted)
+
+    def since(self, before: SlamMemory, score: Tensor) -> SlamMemory:
+        """The same, with a count of what the labelling does not explain since the whole search.
+
+        Args:
+            before: of the solve before.
+            score: ``(M,)`` that is published.
+        """
+        if self.graph.num_edges == before.graph.num_edges:
+            return self
+        known = before.graph.num_edges
+        is_closure = ~self.graph.is_odometry
+        flagged = int((score > _FLAGGED)[known:][is_closure[known:]].sum())
+        changed = (self.trusted[:known] > _GOOD) != (before.trusted > _GOOD)
+        turned = int(changed[is_closure[:known].numpy()].sum())
+        return replace(self, unexplained=before.unexplained + flagged + turned)
+
+    def updated(
+        self, graph: ViewGraph, networks: tuple[SlamCleanNet, SlamFineNet], body_from_world: Tensor
+    ) -> SearchedOn | None:
+        """Solve a graph that has grown from this one; None if it has not.
+
+        Args:
+            graph: N nodes.
+            networks: CleanNet and FineNet, which is applied once.
+            body_from_world: ``(N, 4)`` start, where a closure is new.
+        """
+        if not begins_with(graph, self.graph) or first_of_each(graph) is not None:
             return None
-        closure_graph, weight, verdicts = start.graph, start.weight, None
-        for older in self._factors(start, weight):
-            laplacian = GrownLaplacian(older, closure_graph, weight)
-            with suppress(StaleFactorError):
-                verdicts = follow(start, GrownSystem(laplacian, start.prediction_variance))
-                break
-        if verdicts is None:
-            return None
-        return self._updated(graph, start, verdicts, _if_small(laplacian.factor, graph, self.limits))
-
-    def _updated(self, graph: ViewGraph, start: GrownStart, verdicts: Verdicts, factor: OlderFactor | None) -> Updated:
-        """With the noise and predictions of before."""
-        variance = grown_variance(self.variance, start.graph, start.weight)
-        by_edge = _by_edge(start.graph, verdicts, start.network_log_odds)
-        memory = replace(self, **by_edge, graph=graph, variance=variance, factor=factor, updates=self.updates + 1)
-        return Updated(start.graph, verdicts, variance, memory)
-
-    def _factors(self, start: GrownStart, weight: np.ndarray) -> Iterator[OlderFactor]:
-        """What may be solved from: the factor there is, as long as not too much is new, and another one."""
-        graph, older = start.graph, self.factor
-        if (
-            older is not None
-            and older.fits(graph)
-            and (graph.view_graph_edge >= older.num_edges).sum() <= self.limits.columns
-        ):
-            yield older
-        pattern = LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots, self._rank(graph))
-        # Without what has just come, so that predictions of it are exact.
-        factorised = pattern.factorize(np.where(self._came_later(graph), _NEXT_TO_NOTHING * weight, weight))
-        yield replace(OlderFactor.of(graph, factorised), num_edges=self.graph.num_edges)
-
-    def _renew(self, graph: ViewGraph, start: GrownStart) -> Updated | None:
-        """Factorised and estimated anew; None if orientations turn by too much."""
-        closure_graph = start.graph
-        estimate = renew(start, self._rank(closure_graph), self.trust, self.max_step_variance)
-        if estimate is None:
-            return None
-        variance = closure_graph.variance(estimate.samples, estimate.stated_step_variance)
+        if (appended := self._appended(graph)) is not None:
+            return SearchedOn(appended, None)
+        drawn = Drawn.of(graph, networks[0], bias=self.bias)
+        problem = drawn.problem
+        before = carried_over(self.trusted, problem.graph, _NEW)
+        is_new = before == _NEW
+        correction = problem.graph.corrections(body_from_world).numpy().T
+        common = np.zeros((problem.system(self.noise).num_runs, 3))
+        trusted, others = np.minimum(before, 1.0), Others.before_any(len(before))
+        start = State(np.ascontiguousarray(correction), common, trusted, self.noise, others)
+        start = replace(start, trusted=np.where(is_new, relabelled(problem, start), before))
+        search = Search(problem)
+        mode = search.polished(start, "update")
+        if self.poses is None:  # else places have a say in it
+            mode = search.flipped(mode)
+        fine = fine_tuned(mode, networks[1], passes=1)
+        estimate = estimate_of(publish(problem, [fine]), fine.state.noise)
         memory = replace(
             self,
-            **_by_edge(closure_graph, estimate, start.network_log_odds),
-            **_of_estimate(graph, closure_graph, estimate, self.limits),
             graph=graph,
-            variance=variance,
-            updates=self.updates + 1,
+            trusted=problem.graph.edge_values(mode.state.trusted),
+            noise=mode.state.noise,
+            body_from_world=estimate.body_from_world,
+            outlier_score=estimate.outlier_score,
+            variance=estimate.variance,
         )
-        return Updated(closure_graph, estimate, variance, memory)
+        return SearchedOn(replace(estimate, memory=memory), fine)
 
-    def _start(self, graph: ClosureGraph, network: SlamCleanNet | None, body_from_world: torch.Tensor) -> GrownStart:
-        """What is known of all edges, and of new closures what those around them say."""
-        closure = np.flatnonzero(graph.is_closure)
-        is_new = graph.is_closure & self._came_later(graph)
-        new = np.flatnonzero(is_new)
-        inlier_probability, prior = (
-            carried_over(value, graph, otherwise)
-            for value, otherwise in ((self.inlier_probability, 1.0), (self.network_log_odds, 0.0))
-        )
-        graph = believing(graph, self.trust)
-        # By how much a closure weighs less for those that err as it does.
-        factor = np.ones(len(graph.source))
-        factor[closure] = carried_over(self.steps, graph, 1.0)[closure] / graph.own_steps[closure]
-        if len(new):
-            judged = judge_new_closures(network, self.chain_noise, graph, closure, new, factor)
-            inlier_probability[new], prior[new], factor[new] = judged
-        return GrownStart(
-            replace(graph, steps=factor * graph.own_steps),
-            graph.corrections(body_from_world),
-            inlier_probability,
-            self.noise,
-            prior,
-            exact_share=carried_over(self.exact_share, graph, 1.0),
-            is_new=is_new,
-            prediction_variance=carried_over(self.prediction_variance, graph, 0.0),
-        )
+    def _appended(self, graph: ViewGraph) -> Estimate | None:
+        """The answer if each new node hangs on an older one by one edge of odometry, and nothing else is new.
 
-    def _came_later(self, graph: ClosureGraph) -> np.ndarray:
-        """Edges ``(E,)`` outside the forest that this knows nothing of."""
-        return np.append(np.zeros(graph.num_segments, dtype=bool), graph.view_graph_edge >= self.graph.num_edges)
-
-    def _rank(self, graph: ClosureGraph) -> np.ndarray | None:
-        """Order of elimination ``(K,)``: as it was, and what is new comes last."""
-        if self.elimination is None:
+        Variances grow by the steps passed, whatever odometry does in turns.
+        """
+        edge = np.arange(self.graph.num_edges, graph.num_edges)
+        if not bool(graph.is_odometry[edge].all()):
             return None
-        place = np.full(len(graph.odometry_orientation), np.iinfo(np.int64).max)
-        place[self.elimination] = np.arange(len(self.elimination))
-        rank = np.empty(graph.num_nodes, dtype=np.int64)
-        rank[np.argsort(place[graph.nodes], kind="stable")] = np.arange(graph.num_nodes)
-        return rank
+        new = Growth.of(graph if self.bias is None else without_bias(graph, self.bias), edge, self.graph.num_nodes)
+        if new is None:
+            return None
+        steps = graph.steps.numpy()
+        orientation = rotations.normalize(rotations.multiply(new.turn, self.body_from_world[new.anchor]))
+        passed = torch.from_numpy(new.along(steps[new.edge]) * self.noise.step_variance)
+        priors = SlamPriors()
+        slipped = torch.from_numpy(steps[edge] * priors.slip_count / (priors.slip_steps + steps[edge]))
+        memory = replace(
+            self,
+            graph=graph,
+            trusted=np.append(self.trusted, np.ones(len(edge))),
+            body_from_world=torch.cat((self.body_from_world, orientation)),
+            outlier_score=torch.cat((self.outlier_score, slipped)),
+            variance=torch.cat((self.variance, self.variance[new.anchor] + passed)),
+        )
+        return Estimate(
+            memory.body_from_world,
+            memory.outlier_score,
+            memory.variance,
+            memory,
+            step_variance=self.noise.step_variance,
+        )
 
 
-def _by_edge(graph: ClosureGraph, verdicts: Verdicts, network_log_odds: np.ndarray) -> dict[str, Any]:
-    """What is remembered of every edge of the view-graph, ``(M,)`` each."""
-    return {
-        "inlier_probability": graph.edge_values(verdicts.inlier_probability),
-        "outlier_probability": graph.edge_values(verdicts.outlier_probability),
-        "network_log_odds": graph.edge_values(network_log_odds),
-        "steps": graph.edge_values(verdicts.steps),
-        "exact_share": graph.edge_values(verdicts.exact_share),
-        "prediction_variance": graph.edge_values(verdicts.prediction_variance),
-        "paths": graph.paths,
-    }
-
-
-def _of_estimate(
-    graph: ViewGraph, closure_graph: ClosureGraph, estimate: SlamEstimate, limits: UpdateLimits
-) -> dict[str, Any]:
-    """What is remembered of the passes."""
-    is_large = closure_graph.num_nodes >= limits.large_graph
-    factor = OlderFactor.of(closure_graph, estimate.factorised) if is_large else None
-    return {
-        "noise": estimate.noise,
-        "elimination": None if estimate.rank is None else closure_graph.nodes[np.argsort(estimate.rank)],
-        "factor": None if factor is None else _if_small(factor, graph, limits),
-    }
-
-
-def _if_small(factor: OlderFactor, graph: ViewGraph, limits: UpdateLimits) -> OlderFactor | None:
-    """What is worth its memory."""
-    return factor if factor.num_entries <= limits.entries * (graph.num_nodes + graph.num_edges) else None
+def estimate_of(published: Published, noise: Noise) -> Estimate:
+    """The posterior's answer on the view-graph's nodes and edges; ``noise`` is of the likeliest labelling."""
+    return Estimate(
+        published.body_from_world,
+        torch.from_numpy(outlier_scores(published.graph, published.outlier_probability)),
+        torch.from_numpy(published.variance),
+        warnings=published.warnings,
+        step_variance=noise.step_variance,
+    )

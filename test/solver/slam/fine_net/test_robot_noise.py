@@ -71,6 +71,7 @@ def test_false_closures_that_agree_show() -> None:
         assert run_of(replace(USUAL, planar_share=planar), 4)[1].noise().grouped_share < 0.5
 
 
+@pytest.mark.large
 def test_held_back_stretches_are_explained_better_by_a_network_that_knows_such_noise() -> None:
     rows = np.concatenate(
         [run_of(UNEVEN, seed)[1].explained([Networks("cpu").load(SlamFineNet), None]) for seed in (4, 5)]

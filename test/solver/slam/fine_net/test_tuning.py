@@ -14,7 +14,7 @@ from rotavg_ros.datasets.simulation.stress.drawn import DrawnGraph
 from rotavg_ros.datasets.simulation.stress.kinds import KINDS
 from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver import Solution, solve
-from rotavg_ros.solver.methods import POSTERIOR, without
+from rotavg_ros.solver.methods import DEFAULT_METHOD, without
 from rotavg_ros.solver.networks import NETWORKS, WEIGHTS_FOLDER
 from rotavg_ros.solver.neurora.network_store import Networks
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
@@ -48,7 +48,7 @@ def test_errors_are_smaller_where_odometry_is_uneven() -> None:
             case = drawn(kind, seed)
             with_it, without_it = (
                 error_deg(case, solve(case.graph, profile="slam", method=method))
-                for method in (POSTERIOR, without("fine-net"))
+                for method in (DEFAULT_METHOD, without("fine-net"))
             )
             ratios.append(with_it / without_it)
     assert float(np.exp(np.log(ratios).mean())) < 0.97
@@ -91,7 +91,7 @@ def test_the_answer_is_the_same_in_every_frame() -> None:
     relative = case.graph.target_from_source
     other = rotations.multiply(rotations.multiply(axes, relative), rotations.inverse(axes))
     turned = replace(case.graph, target_from_source=rotations.canonical(other))
-    one, two = (solve(graph, profile="slam", method=POSTERIOR) for graph in (case.graph, turned))
+    one, two = (solve(graph, profile="slam") for graph in (case.graph, turned))
     back = rotations.multiply(rotations.inverse(axes), two.body_from_world)
     errors = orientation_errors(back, one.body_from_world)
     assert float(np.degrees(errors.numpy().max())) < 0.02

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import networkx
 import numpy as np
 import pytest
@@ -16,7 +14,7 @@ from rotavg_ros.solver.algebra.laplacian import LaplacianSystem
 from rotavg_ros.solver.algebra.residuals import edge_residual
 from rotavg_ros.solver.algebra.spanning_forest import minimum_spanning_forest
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract
-from rotavg_ros.solver.slam.graph.odometry_paths import OdometryPaths
+from rotavg_ros.solver.slam.graph.odometry_paths import Growth, OdometryPaths
 from test.solver.graphs import measured, random_truth, slam_edges, small_noise
 
 
@@ -38,7 +36,7 @@ def test_every_edge_lies_in_one_place(num_nodes: int, num_closures: int, seed: i
     assert sorted(np.flatnonzero(~on_segment)) == sorted(contracted.view_graph_edge)
     assert graph.is_odometry.numpy()[on_segment].all()
     counts = np.bincount(contracted.segment_of_edge[on_segment], minlength=contracted.num_segments)
-    assert np.array_equal(counts, contracted.steps[: contracted.num_segments])
+    assert np.array_equal(counts, contracted.own_steps[: contracted.num_segments])
     ends = set(graph.source[num_nodes - 1 :].tolist()) | set(graph.target[num_nodes - 1 :].tolist())
     assert set(contracted.nodes.tolist()) == ends | {0, num_nodes - 1}
 
@@ -85,7 +83,7 @@ def test_least_squares_on_the_contraction_is_least_squares_on_the_graph(seed: in
     whole = LaplacianSystem(80, graph.source.numpy(), graph.target.numpy(), 1 / variance, np.array([0]))
     expected = rotations.multiply(start, rotations.exp(torch.from_numpy(whole.fit(residual))))
 
-    weight = 1 / (contracted.steps * np.where(contracted.is_odometry, 2.0, 5.0))
+    weight = 1 / (contracted.own_steps * np.where(contracted.is_odometry, 2.0, 5.0))
     small = LaplacianSystem(contracted.num_nodes, contracted.source, contracted.target, weight, contracted.roots)
     step = small.fit(rotations.log(contracted.residual).numpy())
     actual = contracted.orientations(rotations.exp(torch.from_numpy(step)))
@@ -101,45 +99,31 @@ def test_corrections_invert_orientations_at_key_nodes() -> None:
 
 def test_graphs_without_closures_or_without_odometry() -> None:
     chain = _contract(_slam_graph(30, 0, 0))
-    assert chain.num_nodes == 2 and chain.num_segments == 1 and chain.steps.tolist() == [29]
+    assert chain.num_nodes == 2 and chain.num_segments == 1 and chain.own_steps.tolist() == [29]
     loops = measured(random_truth(3, 0), np.array([0, 1, 2]), np.array([1, 2, 0]))
     contracted = _contract(loops)
     assert contracted.num_segments == 0 and contracted.num_nodes == 3
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_paths_that_grow_are_those_of_the_grown_graph(seed: int) -> None:
-    graph = _slam_graph(60, 20, seed)
-    arrival = torch.maximum(graph.source, graph.target)
-    graph = graph.select_edges(torch.argsort(arrival, stable=True))
-    arrival = arrival.sort().values
-    paths: OdometryPaths | None = None
-    for num_nodes in (30, 31, 45, 45, 60):
-        part = replace(graph.select_edges(arrival < num_nodes), num_nodes=num_nodes)
-        forest = minimum_spanning_forest(part, torch.where(part.is_odometry, 1.0, 1e6))
-        whole = OdometryPaths.along(part, forest)
-        paths = whole if paths is None else paths.grown(part)
-        assert paths is not None
-        for name in ("hangs_on_odometry", "depth", "level", "chain", "outside", "path_steps"):
-            np.testing.assert_array_equal(getattr(paths, name), getattr(whole, name), err_msg=name)
-        for name in ("parent", "parent_edge", "component"):
-            np.testing.assert_array_equal(getattr(paths.forest, name), getattr(whole.forest, name), err_msg=name)
-        torch.testing.assert_close(paths.orientation, whole.orientation, rtol=0, atol=1e-12)
-        torch.testing.assert_close(paths.residual, whole.residual, rtol=0, atol=1e-12)
+def test_nodes_that_hang_on_a_graph_by_odometry_lie_as_in_the_grown_one(seed: int) -> None:
+    """On branches, edges in either direction."""
+    rng = np.random.default_rng(seed)
+    parent = np.array([rng.integers(max(0, node - 4), node) for node in range(1, 60)])
+    backward = rng.random(59) < 0.5
+    source, target = np.where(backward, np.arange(1, 60), parent), np.where(backward, parent, np.arange(1, 60))
+    kind = [EdgeKind.ODOMETRY] * 59
+    graph = measured(random_truth(60, seed), source, target, small_noise(59, 5.0, seed), kind=kind)
+    paths = OdometryPaths.along(graph, minimum_spanning_forest(graph, torch.ones(59)))
+    growth = Growth.of(graph, 39 + rng.permutation(20), 40)
+    assert growth is not None and (growth.anchor < 40).all()
+    orientation = rotations.multiply(growth.turn, paths.orientation[growth.anchor])
+    assert float(rotations.angle_between(orientation, paths.orientation[40:]).max()) < 1e-7
+    np.testing.assert_allclose(paths.depth[growth.anchor] + growth.along(np.ones(20)), paths.depth[40:])
 
 
-def test_paths_that_would_have_to_be_laid_anew_do_not_grow() -> None:
-    graph = _slam_graph(30, 8, 2)
-    early = replace(graph.select_edges(torch.maximum(graph.source, graph.target) < 20), num_nodes=20)
-    paths = OdometryPaths.along(early, minimum_spanning_forest(early, torch.where(early.is_odometry, 1.0, 1e6)))
-
-    def with_edge(source: int, target: int, kind: EdgeKind, num_nodes: int = 20) -> ViewGraph:
-        ends = [*early.source.tolist(), source], [*early.target.tolist(), target]
-        measured_too = torch.cat((early.target_from_source, rotations.identity(1)))
-        kinds = torch.cat((early.kind, torch.tensor([int(kind)])))
-        return ViewGraph.create(*ends, measured_too, kind=kinds, num_nodes=num_nodes)
-
-    assert paths.grown(with_edge(19, 20, EdgeKind.ODOMETRY, 21)) is not None
-    assert paths.grown(with_edge(2, 12, EdgeKind.LOOP_CLOSURE)) is not None
-    assert paths.grown(with_edge(2, 12, EdgeKind.ODOMETRY)) is None  # another way along odometry
-    assert paths.grown(with_edge(2, 20, EdgeKind.LOOP_CLOSURE, 21)) is None  # a chain of its own
+def test_nodes_that_hang_otherwise_do_not_grow() -> None:
+    graph = _slam_graph(21, 0, 2)
+    assert Growth.of(graph, np.array([19]), 20) is not None
+    assert Growth.of(graph, np.array([19]), 19) is None  # a node has no edge
+    assert Growth.of(graph, np.array([18, 19]), 20) is None  # another way along odometry

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros import ViewGraph, solve
+from rotavg_ros.view_graph import EdgeLabel
 
 LENGTH = 60
 
@@ -95,3 +98,14 @@ def test_robots_of_which_only_one_moves():
         source, target, source_from_target=quaternions, kind=kind, translation=np.array(translation)
     )
     assert (scores(graph) < 0.5).all()
+
+
+@pytest.mark.parametrize("with_places", [True, False])
+def test_a_lone_bridge_repeats_no_other_closures_mistake(with_places: bool) -> None:
+    """A user rejects a closure that fits. Nothing predicts the bridge: nobody knows it to be wrong by the same turn."""
+    graph, _ = two_robots(1, 0, 4, False, 0)
+    closures = np.flatnonzero(~graph.is_odometry.numpy())
+    label = graph.label.clone()
+    label[closures[2]] = int(EdgeLabel.REJECTED)
+    labelled = replace(graph, label=label, translation=graph.translation if with_places else None)
+    assert scores(labelled)[0] < 0.5

@@ -392,12 +392,12 @@ def test_priors_are_normalised() -> None:
     # A second false closure, new or repeating the first by any turn.
     is_false = np.arange(len(problem.closure)) == problem.detection[0]
     second = problem.detection[1:2]
-    densities = []
+    densities, exact = [], np.zeros(len(problem.closure))
     turns = np.union1d(angle[::20], np.linspace(-0.02, 0.02, 401))
     for turn in turns:
         residual = np.zeros((len(problem.closure), 3))
         residual[second, 2] = turn
-        densities.append(false_density(problem, is_false, residual, second).mixed[:, 0])
+        densities.append(false_density(problem, is_false, residual, exact, second).mixed[:, 0])
     np.testing.assert_allclose(np.trapezoid(densities, turns, axis=0), 1.0, atol=0.02)
     chain = _problem(ViewGraph.create(np.arange(6), np.arange(1, 7), _yaw(np.zeros(6)), kind=[0] * 6))
     # Every node an end of closures would make six segments of one step; here their prior is asked for as if.
@@ -428,7 +428,8 @@ def _repeated(problem: Problem) -> FalseDensity:
     """The density of a closure that repeats the turn of the one before it."""
     first, second = problem.detection[:2]
     is_false = np.arange(len(problem.closure)) == first
-    return false_density(problem, is_false, np.zeros((len(problem.closure), 3)), np.array([second]))
+    count = len(problem.closure)
+    return false_density(problem, is_false, np.zeros((count, 3)), np.zeros(count), np.array([second]))
 
 
 def _stickiness(problem: Problem) -> float:

@@ -126,7 +126,8 @@ def _log_labelled(mode: Mode, is_false: np.ndarray) -> float:
     """Log density of false closures and of all labels, residuals as they are."""
     problem = mode.problem
     residual = mode.evaluation.residual[problem.closure]
-    density = false_density(problem, is_false, residual, np.flatnonzero(is_false))
+    predicted = mode.state.others.predicted[problem.closure]
+    density = false_density(problem, is_false, residual, predicted, np.flatnonzero(is_false))
     return log_false_set(problem, density) + log_label_prior(problem, is_false)
 
 
@@ -143,6 +144,25 @@ def propose_mending(mode: Mode) -> Iterator[Proposal]:
                 yield Proposal(name, predicted, partial(settle, mode.problem, state, _SETTLING), slack)
         bends = -float(mode.left_out.log_odds[edge])
         yield Proposal("mend and bend", bends - _OPTIMISM, partial(_bent, mode, int(edge)), slack)
+
+
+def propose_shifts(mode: Mode) -> Iterator[Proposal]:
+    """Move each slip to the next sound segment of its chain, before or after."""
+    graph, limits = mode.problem.graph, mode.problem.limits
+    segment = np.flatnonzero(graph.is_odometry[: graph.num_segments])
+    start = np.minimum(graph.position[graph.source[segment]], graph.position[graph.target[segment]])
+    order = segment[np.argsort(start, kind="stable")]
+    chain = graph.paths.chain[graph.nodes[graph.source]]
+    before = rough_cost(mode.problem, mode.state)
+    slipped = mode.slipped[mode.slipped < graph.num_segments]
+    for edge in slipped[: limits.slips]:
+        (at,) = np.flatnonzero(order == edge)
+        for place in (at - 1, at + 1):
+            other = int(order[place]) if 0 <= place < len(order) else -1
+            if other >= 0 and mode.state.is_good[other] and chain[other] == chain[edge]:
+                state = _shifted(mode, int(edge), other, is_later=place > at)
+                predicted = rough_cost(mode.problem, state) - before
+                yield Proposal("shift", predicted, partial(settle, mode.problem, state, _SETTLING), limits.rival)
 
 
 def _after(mode: Mode, edge: int) -> np.ndarray:
@@ -169,15 +189,31 @@ def _with_slip(mode: Mode, edge: int, turn: np.ndarray) -> State:
     return settle(mode.problem, replace(state, trusted=trusted), _SETTLING)
 
 
-def _mended(mode: Mode, edge: int, following: int | None) -> State:
-    graph = mode.problem.graph
-    pair = np.array([edge])
+def _turn_of(mode: Mode, edge: int) -> np.ndarray:
+    """``(4, 1)`` by which what follows a segment is to be turned if it did not slip."""
+    graph, pair = mode.problem.graph, np.array([edge])
     turn = quaternion_rows.residual(
         mode.state.correction, mode.problem.measured[:, pair], graph.source[pair], graph.target[pair]
     )
-    nodes = _after(mode, edge)
-    if graph.position[graph.source[edge]] > graph.position[graph.target[edge]]:
-        turn = quaternion_rows.inverse(turn)
+    is_backward = graph.position[graph.source[edge]] > graph.position[graph.target[edge]]
+    return quaternion_rows.inverse(turn) if is_backward else turn
+
+
+def _shifted(mode: Mode, edge: int, other: int, *, is_later: bool) -> State:
+    turn, after = _turn_of(mode, edge), _after(mode, edge)
+    if is_later:
+        state = _turned(mode, after & ~_after(mode, other), turn)
+    else:
+        state = _turned(mode, _after(mode, other) & ~after, quaternion_rows.inverse(turn))
+    trusted = relabelled(mode.problem, state)
+    odometry = mode.problem.graph.is_odometry
+    trusted[odometry] = mode.state.trusted[odometry]
+    trusted[edge], trusted[other] = 1.0, 0.0
+    return replace(state, trusted=trusted)
+
+
+def _mended(mode: Mode, edge: int, following: int | None) -> State:
+    graph, turn, nodes = mode.problem.graph, _turn_of(mode, edge), _after(mode, edge)
     if following is not None:
         nodes &= ~_after(mode, following)
     state = _turned(mode, nodes, turn)

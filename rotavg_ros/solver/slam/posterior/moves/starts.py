@@ -11,12 +11,11 @@ from torch import Tensor
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.spanning_forest import compose_orientations, shortest_path_forest
-from rotavg_ros.solver.slam.moves.jumps import jump_to_optimum
-from rotavg_ros.solver.slam.moves.slip_search import no_slip_log_odds
-from rotavg_ros.solver.slam.moves.truncated_cost import TruncatedCost
 from rotavg_ros.solver.slam.noise.model import NoiseModel, agree, noise_between_neighbours
 from rotavg_ros.solver.slam.posterior.em import settle
 from rotavg_ros.solver.slam.posterior.left_out import relabelled
+from rotavg_ros.solver.slam.posterior.moves.jumps import jump_to_optimum
+from rotavg_ros.solver.slam.posterior.moves.truncated_cost import TruncatedCost, no_slip_log_odds
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import moved, residuals, variances
@@ -157,14 +156,14 @@ def _robust(problem: Problem, state: State) -> State:
 def _turned_parts(problem: Problem, prepared: Prepared, correction: Tensor, model: NoiseModel) -> Tensor:
     """Parts turned by minimum cuts under a truncated cost, first with cheap slips; corrections ``(K, 4)``."""
     graph, pairs = problem.graph, prepared.pairs
-    is_agreed, everyone = agree(pairs, model), np.ones(len(problem.closure), dtype=bool)
+    is_agreed = agree(pairs, model)
     for number, probability in enumerate(_ANNEALED_SLIPS):
-        no_slip = no_slip_log_odds(graph.steps, problem.components, probability)
+        no_slip = no_slip_log_odds(graph.own_steps, problem.components, probability)
         prior = np.where(graph.is_odometry, no_slip, model.prior_log_odds + problem.log_odds)
         cost = TruncatedCost.create(graph, model, prior)
         if number == 0:
-            correction = cost.descend(correction, np.ones(len(graph.source)))
-        correction = jump_to_optimum(cost, correction, pairs, is_agreed, everyone)
+            correction = cost.anneal(correction)
+        correction = jump_to_optimum(cost, correction, pairs, is_agreed)
     return correction
 
 

@@ -15,10 +15,10 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.abandonment import stop_if_abandoned
 from rotavg_ros.solver.algebra.minimum_cut import FlowNetwork, TwoLabels
+from rotavg_ros.solver.algebra.running import stop_if_abandoned
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
-from rotavg_ros.solver.slam.moves.truncated_cost import TruncatedCost
+from rotavg_ros.solver.slam.posterior.moves.truncated_cost import TruncatedCost
 
 _MAX_ROUNDS = 3
 _MAX_CANDIDATES = 40
@@ -28,18 +28,15 @@ _MIN_GAIN = 0.5
 _MIN_CARRIED = 1e-6
 
 
-def jump_to_optimum(
-    cost: TruncatedCost, correction: Tensor, pairs: AgreementPairs, is_agreed: np.ndarray, is_trusted: np.ndarray
-) -> Tensor:
+def jump_to_optimum(cost: TruncatedCost, correction: Tensor, pairs: AgreementPairs, is_agreed: np.ndarray) -> Tensor:
     """Jumps and descents in turn until neither helps; corrections ``(K, 4)``.
 
     Args:
         correction: ``(K, 4)`` start.
         pairs: neighbouring closures; of those that agree one stands for all.
         is_agreed: ``(P,)`` bool, the pairs that agree.
-        is_trusted: ``(C,)`` bool, closures whose residual is worth a jump.
     """
-    jumps = _Jumps(cost, pairs, is_agreed, is_trusted)
+    jumps = _Jumps(cost, pairs, is_agreed)
     for _ in range(_MAX_ROUNDS):
         jumped, gained = jumps.one_round(correction)
         if gained < _MIN_GAIN:
@@ -51,10 +48,8 @@ def jump_to_optimum(
 class _Jumps:
     """Rounds of jumps under one cost; the arguments are those of :func:`jump_to_optimum`."""
 
-    def __init__(
-        self, cost: TruncatedCost, pairs: AgreementPairs, is_agreed: np.ndarray, is_trusted: np.ndarray
-    ) -> None:
-        self._cost, self._pairs, self._is_agreed, self._is_trusted = cost, pairs, is_agreed, is_trusted
+    def __init__(self, cost: TruncatedCost, pairs: AgreementPairs, is_agreed: np.ndarray) -> None:
+        self._cost, self._pairs, self._is_agreed = cost, pairs, is_agreed
         # Of every edge, what its jump might have gained when it gained nothing.
         self._hopeless = np.zeros(len(cost.cap))
         self._network = FlowNetwork(cost.graph.num_nodes, cost.graph.source, cost.graph.target)
@@ -65,7 +60,7 @@ class _Jumps:
         residual = cost.residual(correction)
         costs = cost.of_edges(residual)
         gained = 0.0
-        candidates = _candidates(cost, costs, self._pairs, self._is_agreed, self._is_trusted)
+        candidates = _candidates(cost, costs, self._pairs, self._is_agreed)
         if len(candidates) == 0:
             return correction, gained
         # What an edge loses if one end turns is what it is yet short of its cap, or less if it turns but a little.
@@ -103,13 +98,11 @@ class _Jumps:
         return correction, gained
 
 
-def _candidates(
-    cost: TruncatedCost, costs: np.ndarray, pairs: AgreementPairs, is_agreed: np.ndarray, is_trusted: np.ndarray
-) -> np.ndarray:
+def _candidates(cost: TruncatedCost, costs: np.ndarray, pairs: AgreementPairs, is_agreed: np.ndarray) -> np.ndarray:
     """Wrong segments, and of every group of wrong closures that agree with each other the best supported one."""
     closure = np.flatnonzero(cost.graph.is_closure)
     is_wrong = (costs > 0.5 * cost.cap) & (cost.cap > 0)
-    wrong = is_wrong[closure] & is_trusted
+    wrong = is_wrong[closure]
     linked = is_agreed & wrong[pairs.first] & wrong[pairs.second]
     links = coo_array(
         (np.ones(int(linked.sum())), (pairs.first[linked], pairs.second[linked])), shape=(len(wrong),) * 2

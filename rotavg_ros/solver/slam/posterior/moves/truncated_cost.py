@@ -34,6 +34,8 @@ _UNEVEN_RATIO = 16.0
 # A slip is less than a right angle; a segment that turns by more has slipped twice.
 _MAX_SLIP = np.pi / 2
 _COSINE_OF_MAX_SLIP = np.cos(_MAX_SLIP / 2)
+# Of a long segment only so many steps count for a slip: what is left of it after one says nothing more.
+_MAX_LOCATED_STEPS = 3.0
 # What a real part may be off by.
 _ROUNDING = 1e-9
 # Weight of what is believed wrong: enough to keep a graph solvable that falls apart without it.
@@ -48,7 +50,6 @@ class TruncatedCost:
         graph: the closure graph.
         variance: ``(E,)`` rad² per component.
         cap: ``(E,)`` what a wrong edge costs, ≥ 0.
-        rank: ``(K,)`` where each key node stands in the order of elimination, if that is known.
         measured: ``(4, E)``, the graph's residuals, components in rows.
         cap_of_two: ``(E,)`` what it costs if it is wrong by more than one slip.
         uneven_cost: ``(E,)`` what a segment costs beforehand that drifts more than its length tells; inf for closures.
@@ -58,22 +59,15 @@ class TruncatedCost:
     graph: ClosureGraph
     variance: np.ndarray
     cap: np.ndarray
-    rank: np.ndarray | None
     measured: np.ndarray
     cap_of_two: np.ndarray
     uneven_cost: np.ndarray
     reach: np.ndarray
 
     @staticmethod
-    def create(
-        graph: ClosureGraph, noise: NoiseModel, log_odds: np.ndarray, rank: np.ndarray | None = None
-    ) -> TruncatedCost:
-        """From the noise and each edge's prior log-odds of being good, ``(E,)``; ±inf decide it.
-
-        Args:
-            rank: ``(K,)`` where each key node stands in the order of elimination, if that is known.
-        """
-        variance = graph.steps * np.where(graph.is_odometry, noise.step_variance, noise.closure_variance)
+    def create(graph: ClosureGraph, noise: NoiseModel, log_odds: np.ndarray) -> TruncatedCost:
+        """From the noise and each edge's prior log-odds of being good, ``(E,)``; ±inf decide it."""
+        variance = graph.own_steps * np.where(graph.is_odometry, noise.step_variance, noise.closure_variance)
         # Without the edge, the way round passes at least one closure more; a segment's, two.
         around = variance + np.where(graph.is_odometry, 2.0, 1.0) * noise.closure_variance
         cap = noise.inlier_log_odds(np.zeros(len(variance)), around) + np.clip(log_odds, -100, 100)
@@ -85,13 +79,13 @@ class TruncatedCost:
         measured = np.ascontiguousarray(graph.residual.numpy().T)
         cap_of_two = np.where(graph.is_odometry, 2 * cap, cap)
         uneven_cost = np.where(graph.is_odometry, uneven, np.inf)
-        return TruncatedCost(graph, variance, cap, rank, measured, cap_of_two, uneven_cost, reach)
+        return TruncatedCost(graph, variance, cap, measured, cap_of_two, uneven_cost, reach)
 
     @cached_property
     def pattern(self) -> LaplacianPattern:
         """The graph's Laplacian."""
         graph = self.graph
-        return LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots, self.rank)
+        return LaplacianPattern(graph.num_nodes, graph.source, graph.target, graph.roots)
 
     def residual(self, correction: Tensor) -> Tensor:
         """``(E, 4)`` of either sign."""
@@ -126,35 +120,29 @@ class TruncatedCost:
         """Cost of a solution ``(K, 4)``, in nats."""
         return float(self.of_edges(self.residual(correction)).sum())
 
-    def log_odds(self, correction: Tensor) -> np.ndarray:
-        """``(E,)`` of each edge to be good, by its residual."""
-        square = (quaternion_rows.log(self._residual(_rows(correction))) ** 2).sum(axis=0)
-        return np.asarray(self.cap - self._if_good(square, slice(None)))
+    def descend(self, correction: Tensor) -> Tensor:
+        """Gauss–Newton with Geman–McClure weights, the smooth sibling of the truncated cost; corrections ``(K, 4)``."""
+        scale, rows = 2 * self.cap, _rows(correction)
+        for _ in range(_DESCENT_STEPS):
+            vectors, square = self._vectors(rows)
+            rows, moved = self._step(rows, vectors, (scale / (square + scale + 1e-12)) ** 2)
+            if moved < _SETTLED_STEP:
+                break
+        return _tensor(rows)
 
-    def descend(self, correction: Tensor, trust: np.ndarray | None = None) -> Tensor:
-        """Gauss–Newton with Geman–McClure weights, the smooth sibling of the truncated cost; corrections ``(K, 4)``.
+    def anneal(self, correction: Tensor) -> Tensor:
+        """The same with a loss annealed from least squares on (graduated non-convexity, Yang et al. 2020).
 
-        Args:
-            correction: ``(K, 4)`` start.
-            trust: ``(E,)`` factors on the weights; if given, the loss is annealed from least squares on (graduated
-                non-convexity, Yang et al. 2020), and the start matters only as far as angles are not linear.
+        The start ``(K, 4)`` matters only as far as angles are not linear.
         """
-        scale = 2 * self.cap
-        rows = _rows(correction)
-        if trust is None:
-            for _ in range(_DESCENT_STEPS):
-                vectors, square = self._vectors(rows)
-                rows, moved = self._step(rows, vectors, (scale / (square + scale + 1e-12)) ** 2)
-                if moved < _SETTLED_STEP:
-                    break
-            return _tensor(rows)
+        scale, rows = 2 * self.cap, _rows(correction)
         for _ in range(_SETTLING_STEPS):
-            rows, _ = self._step(rows, self._vectors(rows)[0], trust)
+            rows, _ = self._step(rows, self._vectors(rows)[0], np.ones(len(scale)))
         vectors, square = self._vectors(rows)
         convexity = float((2 * square / np.maximum(scale, 1e-12)).max(initial=0.0, where=scale > 0)) + 1
         while convexity > 1 / _ANNEALING_FACTOR:
             annealed = max(convexity, 1.0) * scale + 1e-12
-            rows, _ = self._step(rows, vectors, trust * (annealed / (square + annealed)) ** 2)
+            rows, _ = self._step(rows, vectors, (annealed / (square + annealed)) ** 2)
             convexity /= _COARSE_FACTOR if convexity > _COARSE_CONVEXITY else _ANNEALING_FACTOR
             vectors, square = self._vectors(rows)
         return _tensor(rows)
@@ -169,6 +157,19 @@ class TruncatedCost:
         step = self.pattern.factorize(np.maximum(factor, _MIN_WEIGHT) / self.variance).fit(vectors)
         turned = quaternion_rows.multiply(correction, quaternion_rows.exp(step.T))
         return quaternion_rows.normalize(turned), float(np.abs(step).max(initial=0.0))
+
+
+def no_slip_log_odds(steps: np.ndarray, components: int, slip_probability: float) -> np.ndarray:
+    """Log-odds of segments to be good beforehand, a slip being less than a right angle and as likely to be any.
+
+    Args:
+        steps: ``(E,)`` that each passes.
+        components: 1 or 3.
+        slip_probability: of one step.
+    """
+    narrower = np.log(2.0) if components == 1 else np.log(2 / (1 - np.cos(np.pi / 4)))
+    none = np.log1p(-slip_probability) * np.minimum(steps, _MAX_LOCATED_STEPS)
+    return np.asarray(none - np.log(-np.expm1(none)) - narrower)
 
 
 def _squared_angle(cosine: np.ndarray) -> np.ndarray:

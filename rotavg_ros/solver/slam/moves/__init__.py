@@ -1,1 +1,0 @@
-"""The search for slips and false groups, where no small step leads to a better solution."""

@@ -1,1 +1,0 @@
-"""The alternation of sparse solves and verdicts."""

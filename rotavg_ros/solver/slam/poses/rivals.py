@@ -1,0 +1,140 @@
+"""Rival labellings by rotations and translations together.
+
+A labelling that rotations alone make likeliest need not be so with places: where places speak against a rotation's
+label the label follows, rotations are solved anew, and so on as long as both together become likelier.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rotavg_ros.solver.algebra.running import Steps
+from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart, estimate_poses
+from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.posterior.em import polish
+from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.view_graph import ViewGraph
+
+# So many rival labellings are compared by their translations at most, none that rotations alone make less likely by
+# more nats than the first of these; those that are less likely by no more than the second are published together.
+_MAX_RIVALS, _FARTHEST, _FAR = 5, 20.0, 5.0
+# Labels follow places so many times at most, as long as −log p falls by this, nats, and may come near the least so far.
+_ROUNDS, _LEAST_GAIN, _HOPELESS = 4, 0.1, 20.0
+_GOOD = 0.5
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A labelling of rotations that places leave as it is.
+
+    Attributes:
+        mode: the labelling.
+        pose: its poses, its labels held.
+    """
+
+    mode: Mode
+    pose: PoseMode
+
+    @property
+    def cost(self) -> float:
+        """−log p of rotations and translations, nats."""
+        return self.mode.cost + self.pose.cost
+
+
+@dataclass(frozen=True)
+class Rivals:
+    """What translations do not rule out, the likeliest first.
+
+    Attributes:
+        modes: labellings.
+        poses: of each, rotations judged by places, too.
+        share: probabilities.
+    """
+
+    modes: list[Mode]
+    poses: list[PoseMode]
+    share: np.ndarray
+
+
+def rival_poses(
+    graph: ViewGraph, translation: np.ndarray, modes: Sequence[Mode], tuned: Callable[[Mode], Mode] = lambda mode: mode
+) -> Steps[Rivals]:
+    """Poses of labellings that translations do not rule out; left for a while after each estimate.
+
+    Args:
+        graph: whose odometry was drawn together, without its bias.
+        translation: ``(M, 3)`` metres.
+        modes: labellings of its rotations, the likeliest first.
+        tuned: the same labelling with the noise of each edge as FineNet has it, for its poses.
+    """
+    begun: list[Mode] = []
+    for mode in modes:
+        if len(begun) == _MAX_RIVALS or mode.cost > modes[0].cost + _FARTHEST:
+            break
+        if not any(mode.is_turned_like(other.state) for other in begun):
+            begun.append(mode)
+    ended: list[Rival] = []
+    for mode in begun:
+        least = min((rival.cost for rival in ended), default=np.inf)
+        ended.append((yield from settling(graph, translation, mode, least)))
+    rivals: list[Rival] = []
+    for rival in sorted(ended, key=lambda rival: rival.cost):
+        is_far = rivals and rival.cost > rivals[0].cost + _FAR
+        if not is_far and not any(rival.mode.labels == other.mode.labels for other in rivals):
+            rivals.append(rival)
+    cost = np.array([rival.cost for rival in rivals])
+    share = np.exp(cost[0] - cost)
+    poses: list[PoseMode] = []
+    for rival in rivals:
+        problem = PoseProblem(graph, translation, tuned(rival.mode))
+        poses.append(estimate_poses(problem, start=PoseStart.at(rival.pose)))
+        yield
+    return Rivals([rival.mode for rival in rivals], poses, share / share.sum())
+
+
+def settling(graph: ViewGraph, translation: np.ndarray, mode: Mode, least: float = np.inf) -> Steps[Rival]:
+    """A labelling with labels of rotations as places have them, as long as both together become likelier by it.
+
+    Args:
+        graph: whose odometry was drawn together, without its bias.
+        translation: ``(M, 3)`` metres.
+        mode: the labelling to begin with.
+        least: −log p of another one, nats; of one that is far from it no more is asked.
+    """
+    pose, best = estimate_poses(PoseProblem(graph, translation, mode)), None
+    yield
+    for _ in range(_ROUNDS):
+        mode = relabelled(pose)
+        if best is not None and mode.labels == best.mode.labels:
+            break
+        problem = PoseProblem(graph, translation, mode)
+        rival = Rival(mode, estimate_poses(problem, hold=True, start=PoseStart.at(pose)))
+        if best is not None and rival.cost > best.cost - _LEAST_GAIN:
+            break
+        best = rival
+        yield
+        if best.cost > least + _HOPELESS:
+            break
+        pose = estimate_poses(problem, start=PoseStart.at(rival.pose))
+        yield
+    assert best is not None
+    return best
+
+
+def relabelled(pose: PoseMode) -> Mode:
+    """The labelling by which closures' rotations are right where places and rotations together say so."""
+    before = pose.problem.mode
+    problem = before.problem
+    closure = problem.closure
+    is_told = np.isinf(problem.log_odds[closure])
+    if "relabelling" in problem.without:
+        return before
+    trusted = before.state.trusted.copy()
+    trusted[closure] = np.where(is_told, trusted[closure], pose.solved.places.rotation_good > _GOOD)
+    if np.array_equal(trusted, before.state.trusted):
+        return before
+    state = replace(before.state, correction=pose.state.correction, trusted=trusted)
+    return Mode(problem, *polish(problem, state), before.origin)

@@ -1,0 +1,56 @@
+"""Labellings of rotations that are compared by their poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros.evaluation.slam import stress
+from rotavg_ros.solver.algebra.running import done
+from rotavg_ros.solver.neurora.network_store import load_network
+from rotavg_ros.solver.slam import stages
+from rotavg_ros.solver.slam.network import SlamCleanNet
+from rotavg_ros.solver.slam.poses.estimate import estimate_poses
+from rotavg_ros.solver.slam.poses.rivals import rival_poses, settling
+from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.posterior.em import polish
+from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.solver.slam.posterior.solve import Found, search
+from rotavg_ros.view_graph import ViewGraph
+
+
+def found_of(kind: str, seed: int) -> tuple[ViewGraph, np.ndarray, Found]:
+    (case,) = (one.draw(seed) for one in stress.kinds([kind], translations=True) if one.name == kind)
+    assert case is not None and case.graph.translation is not None
+    graph = case.graph
+    return graph, graph.translation.numpy(), search(graph, load_network(SlamCleanNet), stages.bootstrap)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("kind", "gain"), [("hills: 30 % near misses", 50.0), ("3 robots: half random", -1.0)])
+def test_a_labelling_follows_its_places_to_one_that_is_likelier(kind: str, gain: float) -> None:
+    """Near misses of rotation whose places are far off; and where rotations are right already, nothing is lost."""
+    graph, translation, found = found_of(kind, 6)
+    mode = found.modes[0]
+    as_it_was = mode.cost + estimate_poses(PoseProblem(graph, translation, mode), hold=True).cost
+    rival = done(settling(graph, translation, mode))
+    assert rival.cost < as_it_was - gain
+    changed = int((rival.mode.is_false != mode.is_false).sum())
+    assert changed > 10 if gain > 0 else changed < 10
+
+
+@torch.no_grad()
+def test_tearing_robots_apart_makes_nothing_likelier() -> None:
+    """All closures false: where three robots are then is known by nobody, and no room to be anywhere is gained."""
+    graph, translation, found = found_of("3 robots: half random", 6)
+    mode = found.modes[0]
+    all_false = mode.state.trusted.copy()
+    all_false[mode.problem.closure] = 0.0
+    torn = Mode(mode.problem, *polish(mode.problem, replace(mode.state, trusted=all_false)), "torn")
+    costs = [each.cost + estimate_poses(PoseProblem(graph, translation, each), hold=True).cost for each in (mode, torn)]
+    assert costs[1] > costs[0] + 100
+    rivals = done(rival_poses(graph, translation, found.modes))
+    assert rivals.share[0] > 0.9 and not rivals.modes[0].is_false.all()
