@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
+import socket
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +21,9 @@ from rotavg_ros import solve
 from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import EstimatorOptions, OnlineEstimator
+from rotavg_ros.online.solver_process import server as server_module
 from rotavg_ros.online.solver_process.client import SolverProcess
+from rotavg_ros.online.solver_process.wire import Request, to_arrays
 from rotavg_ros.solver import Abandoned, abandonable
 from rotavg_ros.view_graph import ViewGraph
 
@@ -110,6 +115,17 @@ def test_a_process_that_dies_is_an_error_and_the_next_solve_starts_another():
             solver(large, **OPTIONS)
     finally:
         solver.close()
+
+
+def test_an_answer_that_nobody_takes_any_more_ends_it_without_a_word(monkeypatch):
+    """Whoever asked has gone, and the thread that listens has not heard of it yet."""
+    ours, theirs = socket.socketpair()
+    request = Request(1, to_arrays(graph(20)), None, None, OPTIONS)
+    server = server_module._Server(Connection(theirs.detach()))
+    server._requests.put(pickle.dumps(request))
+    monkeypatch.setattr(server, "_listen", lambda: None)
+    ours.close()
+    server.run()
 
 
 def test_an_estimator_solves_with_it(process):

@@ -36,7 +36,10 @@ class _Server:
                 answer = error
             except Exception as error:
                 answer = RuntimeError(f"{type(error).__name__}: {error}")
-            self._connection.send_bytes(pickle.dumps(answer, protocol=5))
+            try:
+                self._connection.send_bytes(pickle.dumps(answer, protocol=5))
+            except OSError:  # the other side has gone, and the listener has not heard of it yet
+                return
 
     def _listen(self) -> None:
         try:
