@@ -22,7 +22,7 @@ from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.poses.memory import PoseMemory
 from rotavg_ros.solver.slam.poses.solve import has_places, median_poses, poses_of_update
-from rotavg_ros.solver.slam.posterior.modes import publish
+from rotavg_ros.solver.slam.posterior.modes import of_slips, publish
 from rotavg_ros.solver.slam.posterior.solve import searching
 from rotavg_ros.solver.slam.preparation import Prepared, prepare
 from rotavg_ros.solver.slam.update.ahead import WholeSolve
@@ -84,7 +84,8 @@ def whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Steps[Estimate]:
     if stages == SlamStages():
         is_divided = bool(published.warnings) if poses is None else poses.poses.is_divided
         estimate = replace(estimate, memory=SlamMemory.of(graph, found.bias, mode, estimate, is_divided))
-    return estimate if poses is None else _with_poses(graph, estimate, poses)
+    estimate = estimate if poses is None else _with_poses(graph, estimate, poses)
+    return replace(estimate, warnings=(*estimate.warnings, *of_slips(mode)))
 
 
 def _clean_net(stages: SlamStages, run: Run) -> SlamCleanNet | None:

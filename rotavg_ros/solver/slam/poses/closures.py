@@ -59,6 +59,7 @@ class Told:
         own_share: ``(C,)`` share of its error's variance that it does not share with its run.
         follows: ``(C,)`` the closure before each, or -1.
         sign: ``(C,)`` +1 where it runs from its older to its newer end, else −1.
+        detection, detected: ``(C,)`` closures in the order in which they were detected, and when each was, as a rank.
     """
 
     rotation_variance: np.ndarray
@@ -69,6 +70,8 @@ class Told:
     own_share: np.ndarray
     follows: np.ndarray
     sign: np.ndarray
+    detection: np.ndarray
+    detected: np.ndarray
 
 
 @dataclass(frozen=True)

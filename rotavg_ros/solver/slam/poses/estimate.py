@@ -17,6 +17,7 @@ from rotavg_ros.solver.algebra.small_matrices import inverse
 from rotavg_ros.solver.slam.poses.block_system import BlockFactor
 from rotavg_ros.solver.slam.poses.closures import Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.evidence import translation_cost
+from rotavg_ros.solver.slam.poses.map_turns import MapTurns
 from rotavg_ros.solver.slam.poses.noise import likeliest_noise
 from rotavg_ros.solver.slam.poses.places import Judge
 from rotavg_ros.solver.slam.poses.rows import ANYHOW, PoseNoise, PoseProblem, PoseState
@@ -129,7 +130,7 @@ def estimate_poses(problem: PoseProblem, *, hold: bool = False, start: PoseStart
         return PoseMode(problem, solved, math.nan)
     used = problem.rotation_variance(solved.state.noise)[problem.mode.problem.closure]
     judge = replace(judge, told=replace(judge.told, rotation_variance=used))
-    in_order = judge(solved.predictions, solved.places.chance, solved.scale, in_order=True)
+    in_order = judge(solved.predictions, solved.maps, solved.places.chance, solved.scale, in_order=True)
     return PoseMode(problem, solved, translation_cost(problem, solved, in_order))
 
 
@@ -166,7 +167,8 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     anywhere = scale.extent + (problem.lengths[problem.closures] ** 2).sum(axis=1)
     predictions = _left_out(factor, root, left, closure).within(k, ANYHOW, anywhere)
     judge = replace(judge, told=replace(judge.told, rotation_variance=rotation_variance[closure]))
-    judged = judge(predictions, places.chance, scale)
+    maps = MapTurns.of(problem, state.position, predictions, scale.good)
+    judged = judge(predictions, maps, places.chance, scale)
     return Solved(
         state,
         way,
@@ -178,6 +180,7 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
         moved_by,
         scale,
         predictions,
+        maps,
         judged,
     )
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import expit
 
 from rotavg_ros.solver.slam.poses.closures import (
     Places,
@@ -19,6 +20,7 @@ from rotavg_ros.solver.slam.poses.closures import (
     given_turn,
     log_from_behind,
 )
+from rotavg_ros.solver.slam.poses.map_turns import MapTurns
 from rotavg_ros.solver.slam.poses.neighbours import GOOD, Repeats, repeats_of, wrong_share
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 
@@ -46,11 +48,14 @@ class Judge:
     priors: PlacePriors
     held: np.ndarray | None = None
 
-    def __call__(self, predictions: Predictions, before: np.ndarray, scale: Scale, *, in_order: bool = False) -> Places:
+    def __call__(
+        self, predictions: Predictions, maps: MapTurns, before: np.ndarray, scale: Scale, *, in_order: bool = False
+    ) -> Places:
         """Classes under one choice of noise.
 
         Args:
             predictions: what all else says.
+            maps: by what turns of the map closures are off from that.
             before: ``(J + 1, C)`` chances as they were, for how common wrong places are.
             scale: of errors.
             in_order: given the closures before alone, so that densities multiply to that of all; else given all others.
@@ -69,7 +74,10 @@ class Judge:
         repeats = repeats_of(shift, before, told, scale.closure, in_order)
         log_shift[-1] = 0.0
         share = wrong_share(before, told, self.priors)
-        log_false = told.false_odds + np.where(known, self._log_unrelated(predictions, scale, repeats), 0.0)
+        log_wrong, log_right = self._by_itself(predictions, scale)
+        wrong = before[-1] * expit(log_wrong - log_right)
+        turned = maps.repeats(wrong, np.logaddexp(log_wrong, log_right), told, in_order=in_order)
+        log_false = told.false_odds + np.where(known, self._log_unrelated(predictions, scale, repeats, turned), 0.0)
         log_behind = log_from_behind(predictions, seen_alike, k) + self._log_behind(predictions, scale, repeats)
         log_false = np.where(known, np.logaddexp(log_false, log_behind + np.log(share)), log_false)
         log_class = log_shift + self._log_classes(share, repeats)
@@ -196,15 +204,31 @@ class Judge:
         log_alone = log_alone + np.log(self.priors.from_behind) + self._log_anywhere(predictions, scale)
         return np.asarray(np.logaddexp(log_alone, log_repeat))
 
-    def _log_unrelated(self, predictions: Predictions, scale: Scale, repeats: Repeats) -> np.ndarray:
-        """``(C,)`` nats, of shifts of closures whose rotation is false: wrong places, or the right one turned."""
+    def _by_itself(self, predictions: Predictions, scale: Scale) -> tuple[np.ndarray, np.ndarray]:
+        """``(C,)`` nats each, of shifts of closures whose rotation is false: at wrong places, and at the right one."""
         along, spread = along_axes(predictions, self.turns)
         right = spread + (scale.good * self.told.own_share)[:, None]
         log_right = -(along**2 / right + np.log(2 * np.pi * right)).sum(axis=1) / 2
         share = self.priors.turned_in_place
+        return self._log_anywhere(predictions, scale) + np.log1p(-share), log_right + np.log(share)
+
+    def _log_unrelated(
+        self, predictions: Predictions, scale: Scale, repeats: Repeats, elsewhere: tuple[np.ndarray, np.ndarray]
+    ) -> np.ndarray:
+        """``(C,)`` nats, of shifts of closures whose rotation is false: wrong places, or the right one turned.
+
+        Args:
+            predictions, scale: of errors.
+            repeats: of those before and after.
+            elsewhere: of those anywhere, by the same turn of the map.
+        """
         log_alone, log_repeat = self._log_repeats(repeats.turned, repeats)
-        log_wrong = self._log_anywhere(predictions, scale)
-        log_alone = log_alone + np.logaddexp(log_wrong + np.log1p(-share), log_right + np.log(share))
+        log_by_itself = np.logaddexp(*self._by_itself(predictions, scale))
+        chance, density = elsewhere
+        share = self.priors.elsewhere
+        with np.errstate(divide="ignore"):
+            log_elsewhere = np.maximum(np.log(share * density), _LOG_NOTHING)
+        log_alone = log_alone + np.logaddexp(log_by_itself + np.log1p(-share * chance), log_elsewhere)
         return np.asarray(np.logaddexp(log_alone, log_repeat))
 
     def _as_labelled(self, log_all: np.ndarray) -> np.ndarray:

@@ -25,6 +25,8 @@ class PlacePriors:
         turned_deg: standard deviation of how much another place that looks alike is seen turned.
         from_behind: share of places that look alike that do so from the other side, half a turn off.
         turned_in_place: share of false rotations at the right place: symmetric rooms, registrations that flip.
+        elsewhere: share of false rotations that are seen as others far from them, by the same turn of the map, where
+            others are turned alike.
         wrong_place: closures of a plausible rotation that join wrong places: a priori that many in as many as are
             counted beforehand, …
         counted: … in all; what all tell counts for one closure within a run.
@@ -39,13 +41,14 @@ class PlacePriors:
     closure_spread: float = 1.0
     relative: float = 0.05
     relative_spread: float = 1.5
-    slip: float = 3.0
+    slip: float = 1.0
     common: float = 0.5
     tails: float = 0.1
     tail_ratio: float = 16.0
     turned_deg: float = 10.0
     from_behind: float = 0.5
     turned_in_place: float = 0.5
+    elsewhere: float = 0.5
     wrong_place: float = 0.5
     counted: float = 3.0
     repeats: float = 0.7

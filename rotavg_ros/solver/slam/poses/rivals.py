@@ -70,14 +70,8 @@ def rival_poses(
         modes: labellings of its rotations, the likeliest first.
         tuned: the same labelling with the noise of each edge as FineNet has it, for its poses.
     """
-    begun: list[Mode] = []
-    for mode in modes:
-        if len(begun) == _MAX_RIVALS or mode.cost > modes[0].cost + _FARTHEST:
-            break
-        if not any(mode.is_turned_like(other.state) for other in begun):
-            begun.append(mode)
     ended: list[Rival] = []
-    for mode in begun:
+    for mode in _first(modes):
         least = min((rival.cost for rival in ended), default=np.inf)
         ended.append((yield from settling(graph, translation, mode, least)))
     rivals: list[Rival] = []
@@ -93,6 +87,24 @@ def rival_poses(
         poses.append(estimate_poses(problem, start=PoseStart.at(rival.pose)))
         yield
     return Rivals([rival.mode for rival in rivals], poses, share / share.sum())
+
+
+def _first(modes: Sequence[Mode]) -> list[Mode]:
+    """Those to begin with, of which none turns everything as another one does.
+
+    Odometry that slipped by rotations alone may have had to jump: places are asked of the likeliest labelling without
+    slips, too, however unlikely rotations alone make it.
+    """
+    first: list[Mode] = []
+    for mode in modes:
+        if len(first) == _MAX_RIVALS or mode.cost > modes[0].cost + _FARTHEST:
+            break
+        if not any(mode.is_turned_like(other.state) for other in first):
+            first.append(mode)
+    unslipped = next((mode for mode in modes if len(mode.slipped) == 0), None)
+    if unslipped is not None and not any(unslipped.is_turned_like(other.state) for other in first):
+        first.append(unslipped)
+    return first
 
 
 def settling(graph: ViewGraph, translation: np.ndarray, mode: Mode, least: float = np.inf) -> Steps[Rival]:

@@ -250,7 +250,8 @@ class PoseProblem:
         is_known = np.isfinite(self.translation).all(axis=1)[self.closures]
         shared = np.where(self.run[closure] >= 0, self.priors.common, 0.0)
         own = self.rotation_variance(self.turn_noise)[closure]
-        return Told(own, false_odds, is_known, label, problem.run, 1 - shared, problem.follows, problem.sign)
+        order = problem.detection, problem.detected
+        return Told(own, false_odds, is_known, label, problem.run, 1 - shared, problem.follows, problem.sign, *order)
 
     @cached_property
     def equations(self) -> BlockEquations:

@@ -9,6 +9,7 @@ import numpy as np
 from rotavg_ros.solver.slam.poses.block_system import BlockFactor
 from rotavg_ros.solver.slam.poses.closures import Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.displacements import Displacements
+from rotavg_ros.solver.slam.poses.map_turns import MapTurns
 from rotavg_ros.solver.slam.poses.rows import PoseState
 
 
@@ -27,6 +28,7 @@ class Solved:
         moved: root mean square of the step, in standard errors of the answer.
         scale: of closures' errors.
         predictions: what all else says of closures.
+        maps: by what turns of the map they are off from that.
         places: their classes, by that.
     """
 
@@ -40,4 +42,5 @@ class Solved:
     moved: float
     scale: Scale
     predictions: Predictions
+    maps: MapTurns
     places: Places

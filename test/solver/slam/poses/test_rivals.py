@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from rotavg_ros.evaluation.slam import stress
+from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.running import done
 from rotavg_ros.solver.neurora.network_store import load_network
 from rotavg_ros.solver.slam import stages
@@ -54,3 +55,28 @@ def test_tearing_robots_apart_makes_nothing_likelier() -> None:
     assert costs[1] > costs[0] + 100
     rivals = done(rival_poses(graph, translation, found.modes))
     assert rivals.share[0] > 0.9 and not rivals.modes[0].is_false.all()
+
+
+@torch.no_grad()
+def test_places_are_asked_of_the_labelling_without_slips_too() -> None:
+    """Rotations alone prefer a slip, by far more than what rivals are compared for; places know that nothing jumped."""
+    graph, translation, found = found_of("building: 30 % random", 6)
+    sound = next(mode for mode in found.modes if len(mode.slipped) == 0)
+    problem = sound.problem
+    trusted, correction = sound.state.trusted.copy(), sound.state.correction.copy()
+    edge = int(problem.graph.num_segments // 2)
+    trusted[edge] = 0.0
+    later = problem.graph.position
+    after = later >= later[problem.graph.target[edge]]
+    quarter = np.array([[0.0], [0.0], [np.sqrt(0.5)], [np.sqrt(0.5)]])
+    correction[:, after] = quaternion_rows.multiply(correction[:, after], quarter)
+    across = after[problem.graph.source[problem.closure]] != after[problem.graph.target[problem.closure]]
+    trusted[problem.closure[across]] = 0.0
+    state = replace(sound.state, trusted=trusted, correction=correction)
+    slipped = Mode(problem, *polish(problem, state), "slip")
+    assert len(slipped.slipped) == 1
+    # As rotations would have it in a building that looks alike turned.
+    gap = 100.0 + slipped.cost - sound.cost
+    unlikely = replace(sound, evaluation=replace(sound.evaluation, terms=sound.evaluation.terms | {"gap": gap}))
+    rivals = done(rival_poses(graph, translation, [slipped, unlikely]))
+    assert [len(mode.slipped) for mode in rivals.modes] == [0]

@@ -246,7 +246,7 @@ STRUCTURAL = {
     }
     | {"_LOG_FIRST", "_LOG_FOLLOWS", "_LOG_STEPS"},
     "left_out": {"CERTAIN"},
-    "modes": {"_FAR", "_FAR_NOISE", "LIKELY", "FAR_TURN", "_SURELY_FALSE", "_ROUNDS"},
+    "modes": {"_FAR", "_FAR_NOISE", "LIKELY", "FAR_TURN", "FAR_SLIP", "_SURELY_FALSE", "_ROUNDS"},
     "moves/flips": {"_PART", "_DECIDED", "_HOPE", "_LEAST_GAIN"},
     "mode": {"OTHER_NOISE", "_SAME", "_MAX_DENSE"},
     "moves/jumps": {"_MAX_ROUNDS", "_MAX_CANDIDATES", "_MIN_GAIN", "_MIN_CARRIED"},
