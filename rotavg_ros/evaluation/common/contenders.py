@@ -137,11 +137,13 @@ def _run_method(name: str, weights: Path | None, case: Case) -> Answer:
     clock = Clock()
     with clock.running():
         solution = solve(case.graph, method=name, profile=case.family.profile, weights=weights)
+    # Where nobody knows positions an edge is false by its rotation alone.
+    of_rotation = case.poses is None and solution.rotation_score is not None
     return Answer(
         solution.body_from_world,
         clock.seconds,
         clock.cpu_seconds,
-        solution.outlier_score,
+        solution.rotation_score if of_rotation else solution.outlier_score,
         solution.uncertainty,
         solution.position,
     )

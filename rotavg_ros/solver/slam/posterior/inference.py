@@ -36,6 +36,7 @@ class Search:
         self.problem = problem
         self.modes: list[Mode] = []
         self._tuned: list[Mode] = []
+        self._done: list[Mode] = []
         self._tried = 0
 
     def run(self, prepared: Prepared, cleaned: CleanedClosures, correction: Tensor) -> Iterator[None]:
@@ -56,9 +57,14 @@ class Search:
                 break
         may_cut = "minimum-cuts" not in self.problem.without and len(prepared.pairs.first) > 0
         if may_cut and self._seems_slipped(self.modes[0]):
+            may_cut = False
             self._begun("minimum cuts", turned_parts(self.problem, prepared, correction))
             yield
         yield from self.move_on()
+        if may_cut and self._seems_slipped(self.modes[0]):  # as moves have found since
+            self._begun("minimum cuts", turned_parts(self.problem, prepared, correction))
+            yield
+            yield from self.move_on()
 
     def _begun(self, name: str, state: State) -> Mode:
         """The mode of a start, under such noise as the best one has; the first one tells what noise that is."""
@@ -86,7 +92,7 @@ class Search:
 
     def move_on(self) -> Iterator[None]:
         """The search from the modes that are kept."""
-        done: list[Mode] = []
+        done = self._done
         while (mode := self._next(done)) is not None:
             done.append(mode)
             promising = (proposal for proposal in proposals(mode) if proposal.predicted <= proposal.slack)
