@@ -114,7 +114,7 @@ def test_groups_of_false_closures_do_not_pass_for_slips() -> None:
         pytest.param("intel", slam_cases.SLIPS, 0.3, 4, 10.0, id="some agreeing closures rejected, of most"),
         # A false group that no good closure crosses passed for a slip: 3.3 times.
         pytest.param("KITTI_06", slam_cases.GROUPED, 0.3, 18, 1.5, id="a step that a group contradicts"),
-        # Nine slips, none of which pays by itself where most closures are held false; parts were not cut then: 67 times.
+        # Nine slips, none of which pays by itself where most closures are held false, and no cuts: 67 times.
         pytest.param("CSAIL", slam_cases.LOCATABLE_SLIPS, 0.3, 100, 1.5, id="slips that only together pay"),
         # A slip that one bundle of closures spans was not searched for: 3.8 times.
         pytest.param("KITTI_05", slam_cases.SLIPS, 0.3, 42, 1.5, id="a step that all closures contradict"),
