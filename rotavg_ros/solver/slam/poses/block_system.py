@@ -11,7 +11,8 @@ from copy import copy
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import coo_array, csc_array, csr_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
 from rotavg_ros.solver.algebra.laplacian import solve_in_parts
@@ -21,6 +22,9 @@ from rotavg_ros.solver.algebra.small_matrices import inverse_root
 _NUM_PROBES, _SEED = 48, 0
 # SuperLU merges no columns of unlike pattern: blocks are dense as they are, and merging fills in, on a sphere sixfold.
 _RELAX, _PANEL = 1, 4
+# Rows that tell each of their blocks less than this share of what all tell it are nothing; so many of them are worth a
+# pattern without them.
+_NEXT_TO_NOTHING, _WORTH_LEAVING_OUT = 1e-8, 200
 # What a row decides itself is no more than all but this: nothing else may tell of it.
 _LEAST = 1e-9
 # What is left of a turn and of a shift has less in common than this share, squared.
@@ -56,52 +60,9 @@ class BlockEquations:
         source, target = ends.T
         block = np.stack((target, source, np.where(run >= 0, num_nodes + run, nowhere)), axis=1)
         of_runs = np.stack((num_nodes + np.arange(num_runs), *[np.full(num_runs, nowhere)] * 2), axis=1)
-        block = np.concatenate((block, of_runs))
-        self.rank = _elimination_order(block, self.num_blocks)
-        self._lay_out(np.append(self.rank, nowhere)[block])
-        self.probes = np.random.default_rng(_SEED).standard_normal((len(block), self.size, _NUM_PROBES))
-
-    def _lay_out(self, block: np.ndarray) -> None:
-        """Where in compressed rows J's numbers stand and in compressed columns H's, blocks in the order of elimination.
-
-        What a row has of no block stands beyond all columns of J.
-        """
-        d, num_blocks = self.size, self.num_blocks
-        columns = (block[:, :, None] * d + np.arange(d)).reshape(len(block), 1, 3 * d)
-        entries = np.broadcast_to(columns, (len(block), d, 3 * d)).ravel().astype(np.int32)
-        begins = np.arange(0, len(entries) + 1, 3 * d, dtype=np.int32)
-        shape = len(block) * d, (num_blocks + 1) * d
-        self._rows: csr_array = csr_array((np.ones(len(entries)), entries, begins), shape=shape)
-        row, column = np.broadcast_arrays(block[:, :, None], block[:, None, :])
-        is_used = ((row < num_blocks) & (column < num_blocks)).ravel()
-        key = (column * num_blocks + row).ravel()[is_used]
-        occupied, slot = np.unique(np.concatenate((key, np.arange(num_blocks) * (num_blocks + 1))), return_inverse=True)
-        count = np.bincount(occupied // num_blocks, minlength=num_blocks)
-        before = np.append(0, np.cumsum(count))
-        within = np.arange(len(occupied)) - before[occupied // num_blocks]
-        # Of a block the first number, and from one of its columns to the next as many as the blocks there have.
-        start, stride = d * (d * before[occupied // num_blocks] + within), d * count[occupied // num_blocks]
-        inside = np.arange(d)
-        place = start[:, None, None] + stride[:, None, None] * inside + inside[:, None]
-        self._used = np.flatnonzero(
-            np.broadcast_to(is_used.reshape(-1, 3, 1, 3, 1), (len(block), 3, d, 3, d)).reshape(-1)
-        )
-        slots = np.zeros((len(is_used), d, d), dtype=np.int64)
-        slots[is_used] = place[slot[: len(key)]]
-        slots = slots.reshape(-1, 3, 3, d, d).transpose(0, 1, 3, 2, 4).ravel()
-        self._slot = slots[self._used]
-        self._diagonal = place[slot[len(key) :]][:, inside, inside]
-        rows = np.empty(d * d * len(occupied), dtype=np.int32)
-        rows[place] = ((occupied % num_blocks) * d)[:, None, None] + inside[:, None]
-        first = np.append(0, np.cumsum(np.repeat(d * count, d))).astype(np.int32)
-        self._matrix: csc_array = csc_array((np.ones(len(rows)), rows, first), shape=(num_blocks * d, num_blocks * d))
-
-    def rows(self, jacobian: np.ndarray) -> csr_array:
-        """W^½ J, ``((E + R) d, (blocks + 1) d)``, columns in the order of elimination and those of no block."""
-        # SciPy's constructors check each time what stays as it is.
-        rows = copy(self._rows)
-        rows.data = jacobian.ravel()
-        return rows
+        self.block = np.concatenate((block, of_runs))
+        self.probes = np.random.default_rng(_SEED).standard_normal((len(self.block), self.size, _NUM_PROBES))
+        self._pattern: _Pattern | None = None
 
     def factorise(
         self, jacobian: np.ndarray, root_weight: np.ndarray, loose_weight: np.ndarray | None = None
@@ -114,19 +75,115 @@ class BlockEquations:
             loose_weight: how much is known beforehand of loose nodes, ``(d,)``; None: nothing.
         """
         stop_if_abandoned()
-        spend(self._matrix.nnz)
-        blocks = np.matmul(jacobian.transpose(0, 2, 1), jacobian).ravel().take(self._used)
-        values = np.bincount(self._slot, blocks, self._matrix.nnz)
-        values[self._diagonal] += np.finfo(np.float64).tiny
-        values[self._diagonal[self.rank[self.roots]]] += root_weight
+        pattern = self._pattern_of(jacobian)
+        spend(pattern.matrix.nnz)
+        matrix = pattern.matrix
+        rows = jacobian if pattern.is_whole else jacobian[pattern.kept]
+        blocks = np.matmul(rows.transpose(0, 2, 1), rows).ravel().take(pattern.used)
+        values = np.bincount(pattern.slot, blocks, matrix.nnz)
+        values[pattern.diagonal] += np.finfo(np.float64).tiny
+        values[pattern.diagonal[pattern.rank[self.roots]]] += root_weight
         grounding = len(self.roots) * np.log(root_weight).sum()
         if loose_weight is not None:
-            values[self._diagonal[self.rank[self.loose]]] += loose_weight
+            values[pattern.diagonal[pattern.rank[self.loose]]] += loose_weight
             grounding += len(self.loose) * np.log(loose_weight).sum()
-        self._matrix.data = values
+        matrix.data = values
         options = {"SymmetricMode": True}
-        factor = splu(self._matrix, "NATURAL", 0.0, relax=_RELAX, panel_size=_PANEL, options=options)
-        return BlockFactor(self, self.rows(jacobian), factor, float(grounding))
+        factor = splu(matrix, "NATURAL", 0.0, relax=_RELAX, panel_size=_PANEL, options=options)
+        return BlockFactor(self, pattern, pattern.rows(jacobian), factor, float(grounding))
+
+    def _pattern_of(self, jacobian: np.ndarray) -> _Pattern:
+        """Of the rows that tell anything: others fill the factor of a graph with many false closures for nothing."""
+        counts = self._count(jacobian)
+        pattern = self._pattern
+        if pattern is None or not pattern.covers(counts):
+            pattern = self._pattern = _Pattern(self, counts)
+        return pattern
+
+    def _count(self, jacobian: np.ndarray) -> np.ndarray:
+        """``(E + R,)`` bool, rows that tell one of their blocks more than next to nothing beside the others.
+
+        All of them, unless many do not and the rest ties every block to what these do.
+        """
+        d, num_blocks = self.size, self.num_blocks
+        told = (jacobian**2).sum(axis=1).reshape(-1, 3, d).max(axis=2)
+        of_block = np.bincount(self.block.ravel(), told.ravel(), num_blocks + 1)
+        of_block[num_blocks] = np.inf
+        counts: np.ndarray = (told > _NEXT_TO_NOTHING * of_block[self.block]).any(axis=1)
+        is_worth = len(counts) - counts.sum() >= _WORTH_LEAVING_OUT
+        everything = np.ones_like(counts)
+        return counts if is_worth and self._num_parts(counts) == self._num_parts(everything) else everything
+
+    def _num_parts(self, counts: np.ndarray) -> int:
+        """How many parts some of the rows tie nodes together to; a run is held by what is known of it beforehand."""
+        target, source = self.block[: self.num_edges][counts[: self.num_edges], :2].T
+        links = coo_array((np.ones(len(target)), (target, source)), shape=(self.num_blocks,) * 2)
+        return int(connected_components(links, directed=False)[0])
+
+
+class _Pattern:
+    """Where in compressed rows J's numbers stand and in compressed columns H's, blocks in the order of elimination.
+
+    What a row has of no block stands beyond all columns of J.
+
+    Args:
+        equations: of B blocks and rows with blocks ``(E + R, 3)``.
+        counts: ``(E + R,)`` bool, rows that H is made of.
+
+    Attributes:
+        kept: those rows.
+        is_whole: whether they are all.
+        rank: ``(B,)`` where each block stands in the order of elimination.
+        matrix: H, of which ``data`` is to be set.
+        used, slot: which entries of the products of rows make H, and where in its ``data`` they belong.
+        diagonal: ``(B, d)`` likewise, of the block at each rank.
+    """
+
+    def __init__(self, equations: BlockEquations, counts: np.ndarray) -> None:
+        self.kept, self.is_whole, self._counts = np.flatnonzero(counts), bool(counts.all()), counts
+        d, num_blocks, nowhere = equations.size, equations.num_blocks, equations.num_blocks
+        self.rank = _elimination_order(equations.block[self.kept], num_blocks)
+        block = np.append(self.rank, nowhere)[equations.block]
+        columns = (block[:, :, None] * d + np.arange(d)).reshape(len(block), 1, 3 * d)
+        entries = np.broadcast_to(columns, (len(block), d, 3 * d)).ravel().astype(np.int32)
+        begins = np.arange(0, len(entries) + 1, 3 * d, dtype=np.int32)
+        shape = len(block) * d, (num_blocks + 1) * d
+        self._rows: csr_array = csr_array((np.ones(len(entries)), entries, begins), shape=shape)
+        block = block[self.kept]
+        row, column = np.broadcast_arrays(block[:, :, None], block[:, None, :])
+        is_used = ((row < num_blocks) & (column < num_blocks)).ravel()
+        key = (column * num_blocks + row).ravel()[is_used]
+        occupied, slot = np.unique(np.concatenate((key, np.arange(num_blocks) * (num_blocks + 1))), return_inverse=True)
+        count = np.bincount(occupied // num_blocks, minlength=num_blocks)
+        before = np.append(0, np.cumsum(count))
+        within = np.arange(len(occupied)) - before[occupied // num_blocks]
+        # Of a block the first number, and from one of its columns to the next as many as the blocks there have.
+        start, stride = d * (d * before[occupied // num_blocks] + within), d * count[occupied // num_blocks]
+        inside = np.arange(d)
+        place = start[:, None, None] + stride[:, None, None] * inside + inside[:, None]
+        self.used = np.flatnonzero(
+            np.broadcast_to(is_used.reshape(-1, 3, 1, 3, 1), (len(block), 3, d, 3, d)).reshape(-1)
+        )
+        slots = np.zeros((len(is_used), d, d), dtype=np.int64)
+        slots[is_used] = place[slot[: len(key)]]
+        self.slot = slots.reshape(-1, 3, 3, d, d).transpose(0, 1, 3, 2, 4).ravel()[self.used]
+        self.diagonal = place[slot[len(key) :]][:, inside, inside]
+        rows = np.empty(d * d * len(occupied), dtype=np.int32)
+        rows[place] = ((occupied % num_blocks) * d)[:, None, None] + inside[:, None]
+        first = np.append(0, np.cumsum(np.repeat(d * count, d))).astype(np.int32)
+        self.matrix: csc_array = csc_array((np.ones(len(rows)), rows, first), shape=(num_blocks * d, num_blocks * d))
+
+    def covers(self, counts: np.ndarray) -> bool:
+        """Whether it has all of these rows and few others."""
+        missing, needless = counts & ~self._counts, self._counts & ~counts
+        return not missing.any() and int(needless.sum()) < _WORTH_LEAVING_OUT
+
+    def rows(self, jacobian: np.ndarray) -> csr_array:
+        """W^½ J, ``((E + R) d, (B + 1) d)``, columns in the order of elimination and those of no block."""
+        # SciPy's constructors check each time what stays as it is.
+        rows = copy(self._rows)
+        rows.data = jacobian.ravel()
+        return rows
 
 
 def _elimination_order(block: np.ndarray, num_blocks: int) -> np.ndarray:
@@ -149,13 +206,21 @@ def _elimination_order(block: np.ndarray, num_blocks: int) -> np.ndarray:
 class BlockFactor:
     """H for one choice of J and W, here in the order of elimination."""
 
-    def __init__(self, system: BlockEquations, rows: csr_array, factor: SuperLU, grounding: float) -> None:
-        self._system, self._rows, self._factor, self._grounding = system, rows, factor, grounding
+    def __init__(
+        self, system: BlockEquations, pattern: _Pattern, rows: csr_array, factor: SuperLU, grounding: float
+    ) -> None:
+        self._system, self._rank, self._rows = system, pattern.rank, rows
+        self._factor, self._grounding = factor, grounding
 
     @property
     def log_det(self) -> float:
         """Log det H, without what ties the roots down and what is known of loose nodes beforehand."""
         return float(np.log(np.abs(self._factor.U.diagonal())).sum()) - self._grounding
+
+    @property
+    def num_entries(self) -> int:
+        """Of the factor."""
+        return int(self._factor.nnz)
 
     def fit(self, whitened: np.ndarray) -> np.ndarray:
         """Unknowns ``(blocks, d, n)`` that explain whitened rows ``(E + R, d, n)`` best."""
@@ -170,12 +235,12 @@ class BlockFactor:
     def _by_block(self, ordered: np.ndarray) -> np.ndarray:
         """``(blocks, d, n)``, in which block v stood at its rank."""
         system = self._system
-        return ordered.reshape(system.num_blocks, system.size, -1).take(system.rank, axis=0)
+        return ordered.reshape(system.num_blocks, system.size, -1).take(self._rank, axis=0)
 
     def predicted(self, unknowns: np.ndarray) -> np.ndarray:
         """Whitened rows ``(E + R, d, n)`` of unknowns ``(blocks, d, n)``."""
         ordered = np.empty_like(unknowns)
-        ordered[self._system.rank] = unknowns
+        ordered[self._rank] = unknowns
         return self._predicted(ordered.reshape(-1, unknowns.shape[2]))
 
     def _predicted(self, ordered: np.ndarray) -> np.ndarray:
