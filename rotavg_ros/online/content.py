@@ -206,14 +206,17 @@ class Content:
         snapshot, last = self.builder.graph.snapshot(), state.last
         state.ticked_revision = snapshot.revision
         last.begin_problem()
-        is_last = force_cold or (idle and not len(last.queue))
-        if is_last:
+        waited = len(last.queue)
+        # In silence the answer comes to what a solve from scratch says, beside ticks where the solver can do that.
+        is_last = idle and not waited
+        anew = is_last and not force_cold and self.builder.options.warm_start and self._memory is not None
+        if force_cold or (is_last and not anew):
             last.queue.let_in_all(snapshot.graph)
         else:
             last.queue.let_in(snapshot.graph, last.known, last.outlier, idle=idle)
-        cold = is_last or not self.builder.options.warm_start
-        order = last.queue.order
-        return Problem(snapshot, cold, last.body_from_world, last.component, last.outlier, self._memory, order)
+        cold = force_cold or (is_last and not anew) or not self.builder.options.warm_start
+        answered = last.body_from_world, last.component, last.outlier
+        return Problem(snapshot, cold, *answered, self._memory, last.queue.order, anew)
 
     def accept(self, answer: AcceptedAnswer) -> None:
         """Make the answer to the last problem the last answer."""
@@ -224,6 +227,15 @@ class Content:
         state.version += 1
         assert self.answered is not None
         state.world_from_odometry = corrections(self.builder, self.answered)
+
+    @property
+    def memory(self) -> object | None:
+        """What the solver remembers of the last answer."""
+        return self._memory
+
+    def remember(self, memory: object | None) -> None:
+        """What the solver is about, where the answer stays as it was."""
+        self._memory = memory
 
     def counts(self, time_jumps: int) -> Counts:
         """Sizes and refusals now."""

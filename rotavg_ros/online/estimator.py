@@ -32,8 +32,11 @@ if TYPE_CHECKING:
 # The signature of :func:`rotavg_ros.solve`.
 Solver = Callable[..., "Solution"]
 
-# About a fifth of a second.
-TICK_WORK = 200.0
+# The signature of :func:`rotavg_ros.solver.advance`.
+Advance = Callable[[object | None, float], float]
+
+# About a tenth of a second before an answer, and one after it.
+TICK_WORK = 100.0
 
 
 class TickAbandonedError(Exception):
@@ -69,6 +72,7 @@ class OnlineEstimator:
         options: EstimatorOptions | None = None,
         solver: Solver | None = None,
         on_discard: Callable[[Discarded], None] | None = None,
+        advance: Advance | None = None,
     ) -> None:
         """Start empty.
 
@@ -77,9 +81,10 @@ class OnlineEstimator:
             solver: default: :func:`rotavg_ros.solve`.
             on_discard: told of every graph that is forgotten (:meth:`reset`, time that goes back) or replaced
                 (:meth:`load`), unless it is empty. Called within these methods, so it must be quick.
+            advance: default: :func:`rotavg_ros.solver.advance` with the default solver, nothing with another.
         """
         self.options = options or EstimatorOptions()
-        self._solver = solver or _default_solver()
+        self._solver, self._advance = (solver, advance) if solver else _default_solver()
         self._lock = threading.Lock()
         self._tick_lock = threading.Lock()  # one tick at a time; taken before ``_lock``
         self._paused = False
@@ -288,8 +293,9 @@ class OnlineEstimator:
 
         Args:
             force_cold: from scratch, and even while paused.
-            work: units that the solver may spend, as far as what is due at once, or one step of what is not, does not
-                cost more; the next tick goes on. Of a solve from scratch there is no end before its end.
+            work: units that the solver may spend. Where it takes more, what is new is laid on what is known, and
+                :meth:`go_on` does the rest. Of a solve from scratch that is forced, or the first, there is no end
+                before its end.
 
         Returns:
             the new answer; None if the last one still stands.
@@ -305,6 +311,32 @@ class OnlineEstimator:
                 return None
             free_memory.give_back_after(len(answer.source), answer.stage_seconds)
             return replace(answer, seconds=time.perf_counter() - started)
+
+    def go_on(self, work: float = TICK_WORK) -> float:
+        """After a tick, with what it has left; the next one goes by it.
+
+        Args:
+            work: units that the solver may spend, and up to one factorisation more.
+
+        Returns:
+            the units that it has spent.
+
+        Raises:
+            UserError, TickAbandonedError: as :meth:`tick`.
+        """
+        if self._advance is None:
+            return 0.0
+        with self._tick_lock:
+            with self._lock:
+                if self._paused:
+                    return 0.0
+                memory, running = self._content.memory, _Tick(False)
+                self._running = running
+            try:
+                with abandonable(running.is_abandoned):
+                    return self._advance(memory, work)
+            except Abandoned:
+                raise TickAbandonedError(f"abandoned: {running.abandoned_by}") from None
 
     def _tick(self, force_cold: bool, work: float) -> Answer | None:
         with self._lock:
@@ -325,15 +357,20 @@ class OnlineEstimator:
                     warm_start=warm_start,
                     memory=None if warm_start is None else problem.memory,
                     work=work,
+                    anew=problem.anew,
                 )
         except Abandoned:
             raise TickAbandonedError(f"abandoned: {running.abandoned_by}") from None
+        if problem.anew and not solution.is_anew:
+            with self._lock:  # nothing but what the solver is about has changed
+                content.remember(solution.memory)
+            return None
         component = solution.component.cpu()
         known = problem.known(solution, options.outlier_threshold)
         with self._lock:
             roots = root_orientations(content.builder, snapshot, component, problem.answered)
         body_from_world = fix_gauge(solution.body_from_world.cpu(), component, roots)
-        was_cold = warm_start is None
+        was_cold = warm_start is None or (problem.anew and solution.is_anew)
         answer = Answer.of_solution(
             snapshot,
             problem.of_all_edges(solution, known),
@@ -355,10 +392,10 @@ class OnlineEstimator:
         return answer
 
 
-def _default_solver() -> Solver:
-    from rotavg_ros.solver import solve  # loads the networks: not before somebody solves
+def _default_solver() -> tuple[Solver, Advance]:
+    from rotavg_ros.solver import advance, solve  # loads the networks: not before somebody solves
 
-    return solve
+    return solve, advance
 
 
 def _solved_graph(graph: ViewGraph, options: EstimatorOptions) -> ViewGraph:

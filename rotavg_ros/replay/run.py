@@ -170,8 +170,7 @@ class _Loop:
             self._next_tick_ns += self._period_ns
             if not self._pace.strikes():
                 continue
-            answered = self._tick()
-            if not answered and not self._estimator.is_behind:
+            if not self._tick() and not self._estimator.is_behind:
                 # Nothing will change before the message: skip the strikes until then.
                 skipped = max(0, time_ns - self._next_tick_ns) // self._period_ns
                 self._next_tick_ns += skipped * self._period_ns
@@ -197,14 +196,17 @@ class _Loop:
         return self._last
 
     def _tick(self) -> bool:
+        """Whether anything was done."""
         try:
             answer = self._estimator.tick()
+            if answer is not None:
+                self._recorder.answer(self._now_ns, answer)
+            work = self._estimator.go_on()
         except UserError:  # as in the node: the next tick tries again
             self.failures += 1
             return False
-        if answer is not None:
-            self._recorder.answer(self._now_ns, answer)
-        return self._note(answer)
+        self._pace.spend(0, work)
+        return self._note(answer) or work > 0
 
     def _note(self, answer: Answer | None) -> bool:
         if answer is None:

@@ -8,10 +8,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rotavg_ros.solver.algebra.running import Abandoned, abandonable, stop_if_abandoned
     from rotavg_ros.solver.batch import solve_batch
     from rotavg_ros.solver.methods import DEVICES, METHODS, PROFILES, TRANSLATION_SCALES
-    from rotavg_ros.solver.pipeline import solve
+    from rotavg_ros.solver.pipeline import advance, solve
+    from rotavg_ros.solver.running.work import Abandoned, abandonable, stop_if_abandoned
     from rotavg_ros.solver.solution import Solution
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "Abandoned",
     "Solution",
     "abandonable",
+    "advance",
     "solve",
     "solve_batch",
     "stop_if_abandoned",
@@ -34,9 +35,9 @@ def __getattr__(name: str) -> Any:
 
         return getattr(methods, name)
     if name in {"Abandoned", "abandonable", "stop_if_abandoned"}:
-        from rotavg_ros.solver.algebra import running
+        from rotavg_ros.solver.running import work
 
-        return getattr(running, name)
+        return getattr(work, name)
     if name == "Solution":
         from rotavg_ros.solver import solution
 
@@ -44,7 +45,7 @@ def __getattr__(name: str) -> Any:
     if name in __all__:  # how to solve
         from rotavg_ros.solver import batch, pipeline
 
-        return {"solve": pipeline.solve, "solve_batch": batch.solve_batch}[name]
+        return {"advance": pipeline.advance, "solve": pipeline.solve, "solve_batch": batch.solve_batch}[name]
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

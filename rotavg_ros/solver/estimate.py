@@ -19,7 +19,8 @@ class Estimate:
 
     ``memory`` is what makes the profile's next solve of the same graph, grown a little, cheaper; nobody else reads it.
     ``warnings`` say why it should not be trusted, a sentence each. ``places`` are there where translations are known.
-    ``step_variance`` is how far a step of odometry errs, rad² per component.
+    ``step_variance`` is how far a step of odometry errs, rad² per component. ``is_anew`` says that it is what a solve
+    without a memory leads to.
     """
 
     body_from_world: Tensor
@@ -29,6 +30,7 @@ class Estimate:
     warnings: tuple[str, ...] = ()
     places: Places | None = None
     step_variance: float = math.nan
+    is_anew: bool = True
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ class Run:
         refinement_steps: at most, 0 for none; None: as many as the stages like.
         warm_start: ``(N, 4)`` body_from_world to begin with instead of the tree's.
         memory: of the profile's last solve, if the method is the same; the graph may be another one.
-        work: units that an update may spend, as far as a step of a whole solve does not cost more; None: all it takes.
+        work: units that an update may spend; it leaves the rest to be gone on with. None: all it takes.
+        anew: an update is to lead to what a solve without a memory does.
     """
 
     networks: Networks
@@ -80,3 +83,4 @@ class Run:
     warm_start: Tensor | None = None
     memory: object | None = None
     work: float | None = None
+    anew: bool = False

@@ -12,15 +12,17 @@ from torch import Tensor
 from rotavg_ros import baselines, rotations
 from rotavg_ros.errors import UserError
 from rotavg_ros.solver import devices, warnings
-from rotavg_ros.solver.algebra.running import metered
-from rotavg_ros.solver.algebra.threads import workers
 from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
 from rotavg_ros.solver.methods import DEFAULT_METHOD, DEVICES, METHODS, PROFILES, is_method, method_named
 from rotavg_ros.solver.neurora.network_store import Networks
 from rotavg_ros.solver.neurora.numbers import NUMBERS
+from rotavg_ros.solver.running.threads import workers
+from rotavg_ros.solver.running.work import metered
 from rotavg_ros.solver.sfm.solve import solve_sfm
+from rotavg_ros.solver.slam.live import advance as advance_slam
+from rotavg_ros.solver.slam.live import update_slam
 from rotavg_ros.solver.slam.noise import exceedance
-from rotavg_ros.solver.slam.solve import solve_slam, update_slam
+from rotavg_ros.solver.slam.solve import solve_slam
 from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel, HoldsViewGraph, ViewGraph, view_graph_of
@@ -41,6 +43,7 @@ def solve(
     warm_start: Tensor | None = None,
     memory: object | None = None,
     work: float | None = None,
+    anew: bool = False,
     weights: Path | None = None,
 ) -> Solution:
     """Absolute orientations and outlier scores of a view-graph; every connected component by itself.
@@ -62,9 +65,11 @@ def solve(
         memory: that of the earlier solution by the same method, if the graph has only grown since; with it a warm start
             of a SLAM graph judges the new edges and goes on from all other verdicts. Where many closures are not
             explained by these, everything is judged anew beside it.
-        work: units (:attr:`~rotavg_ros.solver.solution.Solution.work`) that such a solve may spend, as far as one step
-            of judging everything anew, a tenth of a second on large graphs, is not more; the next solve goes on with
-            it. The same on every machine. Default: all that it takes.
+        work: units (:attr:`~rotavg_ros.solver.solution.Solution.work`) that such a solve may spend. Where it takes
+            more, the answer is what is known with what has come laid on, and :func:`advance` goes on with the rest.
+            The same on every machine. Default: all that it takes.
+        anew: such a solve is to lead to what one without a memory does;
+            :attr:`~rotavg_ros.solver.solution.Solution.is_anew` says when it has.
         weights: folder of networks trained with ``rotavg train``; what it lacks comes from the package.
 
     Returns:
@@ -100,7 +105,7 @@ def solve(
     watch = Stopwatch()
     with metered() as meter:
         try:
-            estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start, goes_on_from, work))
+            estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start, goes_on_from, work, anew))
         except devices.GPU_ERRORS as error:
             if where == "cpu":
                 raise
@@ -128,7 +133,24 @@ def solve(
         None if places is None else places.precision,
         math.sqrt(estimate.step_variance),
         meter.spent,
+        estimate.is_anew,
     )
+
+
+def advance(memory: object | None, work: float) -> float:
+    """Go on with what a solve with a limit to its work has left; the next solve with this memory finds it done.
+
+    Args:
+        memory: of its solution.
+        work: units to spend, and up to one factorisation more.
+
+    Returns:
+        the units that were spent.
+    """
+    with metered() as meter:
+        if isinstance(memory, SlamMemory):
+            advance_slam(memory, work)
+    return meter.spent
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.solver.algebra.laplacian import LaplacianPattern
-from rotavg_ros.solver.odometry_lengths import lengths_passed, typical_length
+from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed, typical_length
 
 # A closure is worth as much as this many typical steps of odometry in a row.
 _CLOSURE_STEPS = 30.0

@@ -39,6 +39,7 @@ class Solution:
         step_deviation: radians, by which each component of a step of odometry errs; NaN where the method says nothing.
         work: units that the solve has cost, about a millisecond each; counted where robots' graphs are solved, and the
             same on every machine.
+        is_anew: whether it is what a solve without a memory leads to.
     """
 
     body_from_world: Tensor
@@ -57,6 +58,7 @@ class Solution:
     edge_precision: Tensor | None = None
     step_deviation: float = math.nan
     work: float = 0.0
+    is_anew: bool = True
 
     @property
     def world_from_body(self) -> Tensor:

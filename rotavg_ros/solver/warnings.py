@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +24,7 @@ from rotavg_ros.solver.algebra.spanning_forest import (
     compose_orientations,
     shortest_path_forest,
 )
+from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # The probability above which an edge counts as flagged.

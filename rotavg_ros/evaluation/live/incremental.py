@@ -98,6 +98,7 @@ def play(
             )
             given += 1
         answer = estimator.tick()
+        estimator.go_on()
         if answer is None:
             continue
         node = torch.from_numpy(answer.keyframe_id.astype(np.int64))

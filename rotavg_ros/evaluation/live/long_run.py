@@ -171,6 +171,7 @@ def run(
         if start // _RATE_HZ % _TICK_EVERY_S == _TICK_EVERY_S - 1 or now + 1 == total:
             before = time.process_time()
             answer = online.tick()
+            online.go_on()
             spent.tick_s.append(time.process_time() - before)
             if answer is not None and (now + 1) // every > len(rows):
                 errors_deg = course.errors_deg(answer)

@@ -33,6 +33,7 @@ class Problem:
         outlier: ``(m,)`` flags of the last answer, of the first edges.
         memory: what the solver remembers of the last answer.
         order: edges to be solved, in the order in which they have entered; None: all, in their own. The others wait.
+        anew: nothing is new, and the answer is to become what a solve from scratch says.
     """
 
     snapshot: GraphSnapshot
@@ -42,6 +43,7 @@ class Problem:
     outlier: NDArray[np.bool_]
     memory: object | None
     order: NDArray[np.int64] | None = None
+    anew: bool = False
 
     @cached_property
     def graph(self) -> ViewGraph:

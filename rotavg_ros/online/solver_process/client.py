@@ -16,7 +16,7 @@ from typing import Any
 from torch import Tensor
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.online.solver_process.wire import ABANDON, Request, from_arrays, to_arrays
+from rotavg_ros.online.solver_process.wire import ABANDON, Advance, Request, from_arrays, to_arrays
 from rotavg_ros.solver import Abandoned, Solution, stop_if_abandoned
 from rotavg_ros.view_graph import ViewGraph
 
@@ -103,18 +103,36 @@ class SolverProcess:
             request = Request(self._solves, to_arrays(graph), None, remembered, options)
             if warm_start is not None:
                 request.warm_start = warm_start.numpy()
-            try:
-                return self._answer(request)
-            except (EOFError, OSError) as error:
-                with suppress(subprocess.TimeoutExpired):
-                    self._process.wait(_EXIT_TIMEOUT_S)
-                how = self._process.returncode
-                raise UserError(
-                    f"the solver's process has died (exit code {how}; -9 is what a lack of memory looks like); it is "
-                    "started again"
-                ) from error
+            solution: dict[str, Any] = from_arrays(self._outcome(request))
+            if solution.pop("remembers"):
+                solution["memory"] = _Remembered(request.number)
+            return Solution(**solution)
 
-    def _answer(self, request: Request) -> Solution:
+    def advance(self, memory: object | None, work: float) -> float:
+        """See :func:`rotavg_ros.solver.advance`.
+
+        Raises:
+            UserError: the process has died.
+            Abandoned: nobody waits for it any more.
+        """
+        if not isinstance(memory, _Remembered):
+            return 0.0
+        with self._lock:
+            return float(self._outcome(Advance(memory.number, work))) if self.is_alive else 0.0
+
+    def _outcome(self, request: Request | Advance) -> Any:
+        try:
+            return self._answer(request)
+        except (EOFError, OSError) as error:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(_EXIT_TIMEOUT_S)
+            how = self._process.returncode
+            raise UserError(
+                f"the solver's process has died (exit code {how}; -9 is what a lack of memory looks like); it is "
+                "started again"
+            ) from error
+
+    def _answer(self, request: Request | Advance) -> Any:
         self._connection.send_bytes(pickle.dumps(request, protocol=5))
         while not self._connection.poll(_PATIENCE_S):
             try:
@@ -126,10 +144,7 @@ class SolverProcess:
         outcome = pickle.loads(self._connection.recv_bytes())  # noqa: S301 - of our own process
         if isinstance(outcome, BaseException):
             raise outcome
-        solution: dict[str, Any] = from_arrays(outcome)
-        if solution.pop("remembers"):
-            solution["memory"] = _Remembered(request.number)
-        return Solution(**solution)
+        return outcome
 
     def close(self) -> None:
         """End the process, in the middle of a solve as well."""

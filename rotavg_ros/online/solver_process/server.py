@@ -13,8 +13,8 @@ import torch
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import free_memory
-from rotavg_ros.online.solver_process.wire import ABANDON, Request, from_arrays, to_arrays
-from rotavg_ros.solver import Abandoned, abandonable, solve
+from rotavg_ros.online.solver_process.wire import ABANDON, Advance, Request, from_arrays, to_arrays
+from rotavg_ros.solver import Abandoned, abandonable, advance, solve
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -29,9 +29,9 @@ class _Server:
         """Solve until the other side has gone."""
         threading.Thread(target=self._listen, name="listener", daemon=True).start()
         while True:
-            request: Request = pickle.loads(self._requests.get())  # noqa: S301 - of the process that started this one
+            request: Request | Advance = pickle.loads(self._requests.get())  # noqa: S301 - of the process that started this one
             try:
-                answer: object = self._solve(request)
+                answer: object = self._solve(request) if isinstance(request, Request) else self._advance(request)
             except (UserError, Abandoned) as error:
                 answer = error
             except Exception as error:
@@ -52,6 +52,11 @@ class _Server:
                     self._requests.put(message)
         except (EOFError, OSError):
             os._exit(0)  # in the middle of a solve, perhaps, that nobody waits for
+
+    def _advance(self, request: Advance) -> float:
+        number, memory = self._memory
+        with abandonable(lambda: self._is_abandoned):
+            return advance(memory, request.work) if number == request.remembered else 0.0
 
     def _solve(self, request: Request) -> dict[str, object]:
         number, memory = self._memory

@@ -32,6 +32,19 @@ class Request:
     options: dict[str, Any]
 
 
+@dataclass
+class Advance:
+    """Going on with what a solve has left is asked for.
+
+    Attributes:
+        remembered: number of the solve.
+        work: units.
+    """
+
+    remembered: int
+    work: float
+
+
 def to_arrays(content: Any) -> dict[str, Any]:
     """A dataclass's fields, with arrays for tensors."""
     values = {each.name: getattr(content, each.name) for each in fields(content)}

@@ -49,7 +49,9 @@ class RotavgNode(parameter_server.ParameterNode):
         self._settings = parameters = parameter_server.declare(self)
         self._solver = Solver(parameters)
         device = self._solver.warm_up(parameters.estimator)
-        self._estimator = OnlineEstimator(parameters.estimator, self._solver.solve, self._on_discard)
+        self._estimator = OnlineEstimator(
+            parameters.estimator, self._solver.solve, self._on_discard, self._solver.advance
+        )
         self._health = Health()
         self._reporter = Reporter(f"{self.get_fully_qualified_name().lstrip('/')}: estimator")
         self._worker = Worker(executor, "rotavg_worker")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from rotavg_ros.online import EstimatorOptions
+from rotavg_ros.online.estimator import Advance
 from rotavg_ros.online.estimator import Solver as Solve
 from rotavg_ros.online.solver_process.client import SolverProcess
 from rotavg_ros.settings.parameters import NodeParameters
@@ -16,19 +17,21 @@ class Solver:
 
     Attributes:
         solve: as :func:`rotavg_ros.solve`.
+        advance: as :func:`rotavg_ros.solver.advance`.
     """
 
     def __init__(self, parameters: NodeParameters) -> None:
         threads = parameters.solver_threads or max(1, torch.get_num_threads() - 1)
         self._process = SolverProcess(threads) if parameters.solver_process else None
         self.solve: Solve
+        self.advance: Advance
         if self._process is not None:
-            self.solve = self._process
+            self.solve, self.advance = self._process, self._process.advance
             torch.set_num_threads(1)  # what is left to do here is small
         else:
-            from rotavg_ros.solver import solve  # loads the networks
+            from rotavg_ros.solver import advance, solve  # loads the networks
 
-            self.solve = solve
+            self.solve, self.advance = solve, advance
             torch.set_num_threads(threads)
 
     def warm_up(self, options: EstimatorOptions) -> str:

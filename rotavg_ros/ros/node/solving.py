@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -32,7 +33,7 @@ class Solving:
     """Jobs for the workers, and :meth:`reset`, which takes milliseconds.
 
     Attributes:
-        tick_budget_s: what a tick may take where it can stop; inf by itself.
+        tick_budget_s: what a tick may take where it can stop, half of it before its answer; inf by itself.
 
     Those that a service asks for return what to tell the caller, or raise.
 
@@ -69,7 +70,7 @@ class Solving:
         if self._estimator.is_behind:
             health.fell_behind()
         try:
-            answer = self._estimator.tick(force_cold, self._budget.units(self.tick_budget_s))
+            answer = self._estimator.tick(force_cold, self._budget.units(self.tick_budget_s / 2))
         except TickAbandonedError:
             raise
         except Exception as error:
@@ -77,11 +78,21 @@ class Solving:
             raise
         health.tick_went_well()
         if answer is not None:
-            self._budget.learn(answer)
+            self._budget.learn(answer.seconds, answer.work)
             self._publish(answer)
             self._outputs.draw(answer)
         self._forwarding.decide(health.answer)
         return answer
+
+    def _go_on(self) -> None:
+        """What the tick has left, once its answer is out."""
+        started = time.perf_counter()
+        work = self._estimator.go_on(self._budget.units(self.tick_budget_s / 2))
+        self._budget.learn(time.perf_counter() - started, work)
+
+    def _tick_and_go_on(self) -> None:
+        self.tick()
+        self._go_on()
 
     def solve_now(self) -> str:
         answer = self.tick(force_cold=True)
@@ -114,7 +125,7 @@ class Solving:
 
     def tick_quietly(self) -> None:
         """As :meth:`tick`; what goes wrong is logged."""
-        self._quietly("solving failed: ", self.tick)
+        self._quietly("solving failed: ", self._tick_and_go_on)
 
     def autosave_quietly(self, at_the_end: bool = False) -> None:
         """Save what has changed since it was last saved; what goes wrong is logged once, until it goes well again.

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections import deque
 from statistics import median
 
-from rotavg_ros.online.answer.answer import Answer
-
 # Of so many ticks the median tells what a unit costs; a unit costs about a millisecond before any has told.
 _TICKS = 20
 _SECONDS_PER_UNIT = 1e-3
@@ -25,7 +23,7 @@ class TickBudget:
         costs = median(self._seconds_per_unit) if self._seconds_per_unit else _SECONDS_PER_UNIT
         return seconds / costs
 
-    def learn(self, answer: Answer) -> None:
-        """What a tick has cost."""
-        if answer.work >= _LEAST_WORK:
-            self._seconds_per_unit.append(answer.seconds / answer.work)
+    def learn(self, seconds: float, work: float) -> None:
+        """What so many units have cost."""
+        if work >= _LEAST_WORK:
+            self._seconds_per_unit.append(seconds / work)

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from rotavg_ros.solver.algebra.running import stop_if_abandoned
+from rotavg_ros.solver.running.work import stop_if_abandoned
 
 
 class Systems(Protocol):

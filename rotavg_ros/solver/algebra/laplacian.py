@@ -19,7 +19,7 @@ from scipy.linalg import cho_solve
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import SuperLU, splu
 
-from rotavg_ros.solver.algebra.running import stop_if_abandoned
+from rotavg_ros.solver.running.work import stop_if_abandoned
 
 # How much stiffer than its own edges a root is tied to zero.
 _GROUNDING = 1e6

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.threads import for_each, slices
+from rotavg_ros.solver.running.threads import for_each, slices
 from rotavg_ros.view_graph import ViewGraph
 
 SLICE_EDGES = 16_384

@@ -11,12 +11,12 @@ from torch import Tensor, nn
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.residuals import SLICE_EDGES, EdgeResiduals
-from rotavg_ros.solver.algebra.threads import for_each, slices
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.cleaned import Cleaned
 from rotavg_ros.solver.neurora.message_passing import HIDDEN_WIDTH, DirectedEdges, MessagePassingNetwork, Wiring
 from rotavg_ros.solver.neurora.network_store import StoredNetwork
 from rotavg_ros.solver.neurora.tiled.passes import node_states
+from rotavg_ros.solver.running.threads import for_each, slices
 
 _FORGETFUL = Wiring(remembers=False)
 

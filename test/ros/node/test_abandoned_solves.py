@@ -26,7 +26,7 @@ import sys, time
 from pathlib import Path
 import rotavg_ros.solver
 from rotavg_ros.ros.node.main import main
-from rotavg_ros.solver.algebra.running import Abandoned, stop_if_abandoned
+from rotavg_ros.solver.running.work import Abandoned, stop_if_abandoned
 notes, order, solve = Path(sys.argv.pop(1)), Path(sys.argv.pop(1)), rotavg_ros.solver.solve
 
 def note(what):

@@ -18,7 +18,6 @@ from rotavg_ros import ViewGraph, rotations
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.solver.algebra.residuals import EdgeResiduals, edge_residual
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
-from rotavg_ros.solver.algebra.threads import workers
 from rotavg_ros.solver.networks import NETWORKS
 from rotavg_ros.solver.neurora.cleaned import Cleaned
 from rotavg_ros.solver.neurora.fine_net import edge_features
@@ -29,6 +28,7 @@ from rotavg_ros.solver.neurora.tiled import passes as inference
 from rotavg_ros.solver.neurora.tiled import tuning
 from rotavg_ros.solver.neurora.tiled.networks import clean_edges, fine_tuned
 from rotavg_ros.solver.neurora.tiled.passes import Tuning
+from rotavg_ros.solver.running.threads import workers
 
 SIZES = st.tuples(st.integers(2, 40), st.integers(1, 150), st.integers(0, 10**6))
 

@@ -10,7 +10,6 @@ from torch import Tensor
 from rotavg_ros.solver.algebra.medians import median_by_group
 from rotavg_ros.solver.algebra.residuals import SLICE_EDGES, EdgeResiduals, multiply_rows
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges, Tile
-from rotavg_ros.solver.algebra.threads import for_each, slices
 from rotavg_ros.solver.neurora.clean_net import CleanEdges, CleanNet
 from rotavg_ros.solver.neurora.cleaned import Cleaned
 from rotavg_ros.solver.neurora.fine_net import (
@@ -23,6 +22,7 @@ from rotavg_ros.solver.neurora.fine_net import (
 from rotavg_ros.solver.neurora.message_passing import MessagePassingLayer
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.neurora.tiled.passes import node_states, visit_activations
+from rotavg_ros.solver.running.threads import for_each, slices
 
 
 def clean_edges(network: CleanNet, target_from_source: Tensor, edges: SortedEdges) -> CleanEdges:

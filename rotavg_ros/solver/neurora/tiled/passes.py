@@ -15,11 +15,11 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
-from rotavg_ros.solver.algebra.running import stop_if_abandoned
 from rotavg_ros.solver.algebra.scratch import scratch
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges, Tile
-from rotavg_ros.solver.algebra.threads import for_each, stretches
 from rotavg_ros.solver.neurora.message_passing import MessagePassingLayer, MessagePassingNetwork
+from rotavg_ros.solver.running.threads import for_each, stretches
+from rotavg_ros.solver.running.work import stop_if_abandoned
 
 
 class Tuning(NamedTuple):

@@ -9,10 +9,10 @@ import torch
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
-from rotavg_ros.solver.algebra.threads import num_workers, workers
 from rotavg_ros.solver.neurora.message_passing import HIDDEN_WIDTH, MessagePassingNetwork
 from rotavg_ros.solver.neurora.tiled import passes as inference
 from rotavg_ros.solver.neurora.tiled.passes import Tuning
+from rotavg_ros.solver.running.threads import num_workers, workers
 from rotavg_ros.view_graph import ViewGraph
 
 # Half a core's second-level cache, up to several times that.

@@ -8,7 +8,6 @@ and W; samples of N(0, H⁻¹) tell what everything else predicts of a row.
 from __future__ import annotations
 
 from copy import copy
-from functools import cached_property
 
 import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array
@@ -16,8 +15,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
 from rotavg_ros.solver.algebra.laplacian import solve_in_parts
-from rotavg_ros.solver.algebra.running import spend, stop_if_abandoned
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
+from rotavg_ros.solver.running.cached import cached_property
+from rotavg_ros.solver.running.work import rest, spend, stop_if_abandoned
 
 _NUM_PROBES, _SEED = 48, 0
 # SuperLU merges no columns of unlike pattern: blocks are dense as they are, and merging fills in, on a sphere sixfold.
@@ -229,6 +229,7 @@ class BlockFactor:
     def _fit(self, whitened: np.ndarray) -> np.ndarray:
         """The same in the order of elimination, ``(blocks d, n)``."""
         stop_if_abandoned()
+        rest()
         right = self._rows.T @ whitened.reshape(-1, whitened.shape[2])
         return solve_in_parts(self._factor, right[: -self._system.size])
 
@@ -236,6 +237,12 @@ class BlockFactor:
         """``(blocks, d, n)``, in which block v stood at its rank."""
         system = self._system
         return ordered.reshape(system.num_blocks, system.size, -1).take(self._rank, axis=0)
+
+    def solve(self, columns: np.ndarray) -> np.ndarray:
+        """H⁻¹ of columns ``(blocks, d, n)``."""
+        ordered = np.empty_like(columns)
+        ordered[self._rank] = columns
+        return self._by_block(solve_in_parts(self._factor, ordered.reshape(-1, columns.shape[2])))
 
     def predicted(self, unknowns: np.ndarray) -> np.ndarray:
         """Whitened rows ``(E + R, d, n)`` of unknowns ``(blocks, d, n)``."""

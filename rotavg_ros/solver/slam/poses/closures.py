@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
+from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.noise.exceedance import exceedance
 from rotavg_ros.solver.slam.posterior.densities import log_half_turn
 

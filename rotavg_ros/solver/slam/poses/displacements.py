@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.odometry_lengths import lengths_passed
+from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.view_graph import ViewGraph
 

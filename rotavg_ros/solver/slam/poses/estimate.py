@@ -14,6 +14,7 @@ import numpy as np
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.small_matrices import inverse
+from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.poses.block_system import BlockFactor
 from rotavg_ros.solver.slam.poses.closures import Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.evidence import translation_cost
@@ -167,6 +168,7 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     anywhere = scale.extent + (problem.lengths[problem.closures] ** 2).sum(axis=1)
     predictions = _left_out(factor, root, left, closure).within(k, ANYHOW, anywhere)
     judge = replace(judge, told=replace(judge.told, rotation_variance=rotation_variance[closure]))
+    rest()
     maps = MapTurns.of(problem, state.position, predictions, scale.good)
     judged = judge(predictions, maps, places.chance, scale)
     return Solved(

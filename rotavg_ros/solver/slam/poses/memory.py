@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.odometry_lengths import lengths_passed
+from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.poses.answer import Poses
 from rotavg_ros.solver.slam.poses.closures import Places
@@ -32,6 +32,7 @@ class PoseMemory:
         roots: nodes that stayed where they were.
         edge: ``(C,)`` the view-graph's edges of closures.
         places: their classes.
+        pose: the joint solve.
     """
 
     poses: Poses
@@ -40,13 +41,15 @@ class PoseMemory:
     roots: np.ndarray
     edge: np.ndarray
     places: Places
+    pose: PoseMode
 
     @classmethod
     def of(cls, pose: PoseMode, poses: Poses) -> PoseMemory:
         """After a solve."""
         drawn, mode = pose.problem.drawn, pose.problem.mode
         alone = drawn.orientations(torch.from_numpy(np.ascontiguousarray(mode.state.correction.T)))
-        return cls(poses, alone, pose.state.noise, drawn.nodes[drawn.roots], pose.problem.closures, pose.solved.places)
+        closures, places = pose.problem.closures, pose.solved.places
+        return cls(poses, alone, pose.state.noise, drawn.nodes[drawn.roots], closures, places, pose)
 
     @property
     def num_nodes(self) -> int:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rotavg_ros.solver.algebra.running import Steps
 from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart, estimate_poses
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.posterior.em import polish
@@ -61,8 +60,8 @@ class Rivals:
 
 def rival_poses(
     graph: ViewGraph, translation: np.ndarray, modes: Sequence[Mode], tuned: Callable[[Mode], Mode] = lambda mode: mode
-) -> Steps[Rivals]:
-    """Poses of labellings that translations do not rule out; left for a while after each estimate.
+) -> Rivals:
+    """Poses of labellings that translations do not rule out.
 
     Args:
         graph: whose odometry was drawn together, without its bias.
@@ -73,7 +72,7 @@ def rival_poses(
     ended: list[Rival] = []
     for mode in _first(modes):
         least = min((rival.cost for rival in ended), default=np.inf)
-        ended.append((yield from settling(graph, translation, mode, least)))
+        ended.append(settling(graph, translation, mode, least))
     rivals: list[Rival] = []
     for rival in sorted(ended, key=lambda rival: rival.cost):
         is_far = rivals and rival.cost > rivals[0].cost + _FAR
@@ -85,7 +84,6 @@ def rival_poses(
     for rival in rivals:
         problem = PoseProblem(graph, translation, tuned(rival.mode))
         poses.append(estimate_poses(problem, start=PoseStart.at(rival.pose)))
-        yield
     return Rivals([rival.mode for rival in rivals], poses, share / share.sum())
 
 
@@ -107,7 +105,7 @@ def _first(modes: Sequence[Mode]) -> list[Mode]:
     return first
 
 
-def settling(graph: ViewGraph, translation: np.ndarray, mode: Mode, least: float = np.inf) -> Steps[Rival]:
+def settling(graph: ViewGraph, translation: np.ndarray, mode: Mode, least: float = np.inf) -> Rival:
     """A labelling with labels of rotations as places have them, as long as both together become likelier by it.
 
     Args:
@@ -117,7 +115,6 @@ def settling(graph: ViewGraph, translation: np.ndarray, mode: Mode, least: float
         least: −log p of another one, nats; of one that is far from it no more is asked.
     """
     pose, best = estimate_poses(PoseProblem(graph, translation, mode)), None
-    yield
     for _ in range(_ROUNDS):
         mode = relabelled(pose)
         if best is not None and mode.labels == best.mode.labels:
@@ -127,11 +124,9 @@ def settling(graph: ViewGraph, translation: np.ndarray, mode: Mode, least: float
         if best is not None and rival.cost > best.cost - _LEAST_GAIN:
             break
         best = rival
-        yield
         if best.cost > least + _HOPELESS:
             break
         pose = estimate_poses(problem, start=PoseStart.at(rival.pose))
-        yield
     assert best is not None
     return best
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 import torch
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed, typical_length
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
-from rotavg_ros.solver.odometry_lengths import lengths_passed, typical_length
+from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.poses.block_system import BlockEquations
 from rotavg_ros.solver.slam.poses.closures import Told

@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rotavg_ros.solver.algebra.running import Steps
 from rotavg_ros.solver.slam.poses.answer import answer
 from rotavg_ros.solver.slam.poses.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.memory import PoseMemory
@@ -31,15 +30,15 @@ def has_places(graph: ViewGraph) -> bool:
 
 def median_poses(
     graph: ViewGraph, modes: list[Mode], tuned: Callable[[Mode], Mode] = lambda mode: mode
-) -> Steps[tuple[PoseMemory, Mode]]:
-    """Poses, and the labelling that they are of, the median of those that both make likely; left now and then.
+) -> tuple[PoseMemory, Mode]:
+    """Poses, and the labelling that they are of, the median of those that both make likely.
 
     Args:
         graph: without its bias, with translations.
         modes: labellings of its rotations, the likeliest first.
         tuned: a labelling with the noise of each edge as FineNet has it.
     """
-    rivals = yield from rival_poses(graph, _translations(graph), modes, tuned)
+    rivals = rival_poses(graph, _translations(graph), modes, tuned)
     poses, middle = answer(rivals.poses, rivals.share)
     return PoseMemory.of(rivals.poses[middle], poses), rivals.modes[middle]
 

@@ -39,10 +39,8 @@ class Search:
         self._done: list[Mode] = []
         self._tried = 0
 
-    def run(self, prepared: Prepared, cleaned: CleanedClosures, correction: Tensor) -> Iterator[None]:
+    def run(self, prepared: Prepared, cleaned: CleanedClosures, correction: Tensor) -> None:
         """From starts until some end alike, move on from the best modes until no move is predicted to lower F.
-
-        It may be left for a while after every start and every move.
 
         Args:
             prepared: the graph drawn together.
@@ -52,19 +50,16 @@ class Search:
         begun: list[Mode] = []
         for name, state in starts(self.problem, prepared, cleaned, correction):
             begun.append(self._begun(name, state))
-            yield
             if sum(mode.is_like(self.modes[0].state) for mode in begun) >= self.problem.limits.alike:
                 break
         may_cut = "minimum-cuts" not in self.problem.without and len(prepared.pairs.first) > 0
         if may_cut and self._seems_slipped(self.modes[0]):
             may_cut = False
             self._begun("minimum cuts", turned_parts(self.problem, prepared, correction))
-            yield
-        yield from self.move_on()
+        self.move_on()
         if may_cut and self._seems_slipped(self.modes[0]):  # as moves have found since
             self._begun("minimum cuts", turned_parts(self.problem, prepared, correction))
-            yield
-            yield from self.move_on()
+            self.move_on()
 
     def _begun(self, name: str, state: State) -> Mode:
         """The mode of a start, under such noise as the best one has; the first one tells what noise that is."""
@@ -90,7 +85,7 @@ class Search:
             return False
         return len(mode.slipped) > 0 or any(slip.predicted <= slip.slack for slip in slips.propose_slips(mode))
 
-    def move_on(self) -> Iterator[None]:
+    def move_on(self) -> None:
         """The search from the modes that are kept."""
         done = self._done
         while (mode := self._next(done)) is not None:
@@ -102,13 +97,11 @@ class Search:
                 self._tried += 1
                 found = self.flipped(self.polished(proposal.make(), proposal.name))
                 self.keep(found)
-                yield
                 if found.cost < mode.cost - _GAIN:
                     break
             if self._next(done) is None:
                 for near in self._near():
                     self._tune(near)
-                    yield
 
     def _tune(self, mode: Mode) -> None:
         """The labels of a mode under their best noise, and what other labels cost under that."""

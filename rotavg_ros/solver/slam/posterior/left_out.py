@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import expit
 
+from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
 from rotavg_ros.solver.slam.posterior.densities import log_false, log_good, log_slipped
 from rotavg_ros.solver.slam.posterior.labels import (
@@ -47,6 +48,7 @@ class LeftOut:
 
 def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> LeftOut:
     """What the rest of the graph says of every edge, the labels of all others given."""
+    rest()
     graph, k, priors, closure = problem.graph, problem.components, problem.priors, problem.closure
     num_edges = len(graph.source)
     residual, variance = residuals(problem, state), variances(problem, state.noise)

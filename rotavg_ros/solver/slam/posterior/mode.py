@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
+from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.posterior.left_out import LeftOut, leave_one_out
 from rotavg_ros.solver.slam.posterior.objective import Evaluation
 from rotavg_ros.solver.slam.posterior.problem import Problem

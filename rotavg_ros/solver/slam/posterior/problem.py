@@ -5,12 +5,12 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs, closure_ends
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.posterior.bias import Bias

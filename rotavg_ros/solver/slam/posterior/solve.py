@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.running import Steps, done
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
@@ -106,32 +105,21 @@ def search(
         without: terms and moves that are switched off.
         priors: other ones than usual.
     """
-    return done(searching(graph, network, begin, without, priors))
 
-
-def searching(
-    graph: ViewGraph,
-    network: SlamCleanNet | None,
-    begin: Begin,
-    without: Collection[str] = (),
-    priors: SlamPriors | None = None,
-) -> Steps[Found]:
-    """The same, left for a while after every start and every move; the arguments are those of :func:`search`."""
-
-    def from_starts(drawn: Drawn) -> Steps[Found]:
+    def from_starts(drawn: Drawn) -> Found:
         correction = begin(drawn.prepared, drawn.cleaned)
         begun = Search(drawn.problem)
-        yield from begun.run(drawn.prepared, drawn.cleaned, correction)
+        begun.run(drawn.prepared, drawn.cleaned, correction)
         return Found(drawn, begun.modes)
 
-    found = yield from from_starts(Drawn.of(graph, network, without, None, priors))
+    found = from_starts(Drawn.of(graph, network, without, None, priors))
     if "bias" in without:
         return found
     if (bias := likely_bias(graph, found.drawn.prepared)) is not None:
-        biased = yield from from_starts(Drawn.of(graph, network, without, bias, priors))
+        biased = from_starts(Drawn.of(graph, network, without, bias, priors))
         found = min(found, biased, key=lambda either: either.cost)
     for _ in range(_BIAS_ROUNDS):
-        better = yield from _with_better_bias(graph, network, found, without)
+        better = _with_better_bias(graph, network, found, without)
         if better is None:
             break
         found = better
@@ -140,7 +128,7 @@ def searching(
 
 def _with_better_bias(
     graph: ViewGraph, network: SlamCleanNet | None, found: Found, without: Collection[str]
-) -> Steps[Found | None]:
+) -> Found | None:
     """What is found from the best mode with Newton's step on the bias; None if F does not fall by it."""
     best, drawn = found.modes[0], found.drawn
     problem, evaluation = best.problem, best.evaluation
@@ -157,8 +145,7 @@ def _with_better_bias(
     moved = _moved(best, drawn, again)
     goes_on = Search(again.problem)
     goes_on.keep(goes_on.flipped(goes_on.polished(moved, "bias")))
-    yield
-    yield from goes_on.move_on()
+    goes_on.move_on()
     better = Found(again, goes_on.modes)
     return None if better.cost > found.cost - _LEAST_GAIN else better
 

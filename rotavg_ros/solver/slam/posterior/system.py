@@ -7,8 +7,6 @@ what everything else predicts of a row.
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.csgraph import connected_components
@@ -16,7 +14,8 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from rotavg_ros.solver.algebra.laplacian import root_stiffness, solve_in_parts
 from rotavg_ros.solver.algebra.probes import likeliest_leverage, probe_signs
-from rotavg_ros.solver.algebra.running import spend, stop_if_abandoned
+from rotavg_ros.solver.running.cached import cached_property
+from rotavg_ros.solver.running.work import rest, spend, stop_if_abandoned
 
 _NUM_PROBES = 48
 # Rows that weigh less than this share of the heaviest one are nothing; so many of them are worth a pattern without
@@ -174,9 +173,15 @@ class Factorised:
         """Log det H, without the rows that tie the roots down."""
         return float(np.log(np.abs(self._factor.U.diagonal())).sum()) - self._grounding
 
+    @property
+    def num_entries(self) -> int:
+        """Of the factor."""
+        return int(self._factor.nnz)
+
     def solve(self, right_hand_side: np.ndarray) -> np.ndarray:
         """``H⁻¹ b`` for ``(K + R, k)`` columns."""
         stop_if_abandoned()
+        rest()
         return solve_in_parts(self._factor, right_hand_side.take(self._node, axis=0)).take(self._rank, axis=0)
 
     def fit(self, difference: np.ndarray) -> np.ndarray:

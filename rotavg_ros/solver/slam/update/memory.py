@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.estimate import Estimate
+from rotavg_ros.solver.estimate import Estimate, Places
+from rotavg_ros.solver.running.resumable import Resumable
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.fine_net.tuning import fine_tuned
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
@@ -31,7 +32,7 @@ from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.solve import Drawn
 from rotavg_ros.solver.slam.posterior.state import Noise, Others, State
 from rotavg_ros.solver.slam.stages import outlier_scores
-from rotavg_ros.solver.slam.update.ahead import WholeSolve
+from rotavg_ros.solver.slam.update.conditioned import Columns
 from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over
 from rotavg_ros.view_graph import ViewGraph
 
@@ -45,10 +46,10 @@ _GOOD = 0.5
 
 
 class SearchedOn(NamedTuple):
-    """The outcome of an update: the answer, and the labelling; None if only odometry was appended."""
+    """The outcome of an update: the answer, and the labelling."""
 
     estimate: Estimate
-    mode: Mode | None
+    mode: Mode
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,7 @@ class SlamMemory:
         graph: the view-graph.
         trusted: ``(M,)`` 1 for good closures and sound odometry, 0 for others; all of a segment have its label.
         noise: of that labelling.
+        mode: that labelling, as of the last solve; odometry alone has come since.
         bias: ``(3,)`` rad per step that was taken out of the odometry; None if none was.
         body_from_world: ``(N, 4)`` that was found, in its own gauge.
         outlier_score: ``(M,)`` that was published.
@@ -66,14 +68,20 @@ class SlamMemory:
         searched: C when the whole search began.
         is_divided: whether another answer was nearly as likely then.
         unexplained: closures that came since and were flagged, and older ones whose label has changed.
-        warnings: about the answer of the whole search; None before somebody has looked.
+        notes: what the whole search says of its answer.
+        warnings: all that is to be told of it; None before somebody has looked.
         poses: where translations are known.
         ahead: the next whole solve, if one is under way.
+        anew: whether that begins with nothing, as a solve without a memory does.
+        update: the solve with closures that are new, if one is under way.
+        update_work: units that the last one took.
+        columns: of closures that are new, until that has ended.
     """
 
     graph: ViewGraph
     trusted: np.ndarray
     noise: Noise
+    mode: Mode
     bias: np.ndarray | None
     body_from_world: Tensor
     outlier_score: Tensor
@@ -81,9 +89,14 @@ class SlamMemory:
     searched: int
     is_divided: bool = False
     unexplained: int = 0
+    notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] | None = None
     poses: PoseMemory | None = None
-    ahead: WholeSolve | None = None
+    ahead: Resumable[Estimate] | None = None
+    anew: bool = False
+    update: Resumable[SlamMemory | None] | None = None
+    update_work: float = 0.0
+    columns: Columns | None = None
 
     @classmethod
     def of(
@@ -101,7 +114,8 @@ class SlamMemory:
         problem, state = mode.problem, mode.state
         trusted = problem.graph.edge_values(state.trusted)
         told = estimate.body_from_world, estimate.outlier_score, estimate.variance
-        return cls(graph, trusted, state.noise, bias, *told, len(problem.closure), is_divided)
+        notes = estimate.warnings
+        return cls(graph, trusted, state.noise, mode, bias, *told, len(problem.closure), is_divided, notes=notes)
 
     @property
     def is_due(self) -> bool:
@@ -132,20 +146,20 @@ class SlamMemory:
         turned = int(changed[is_closure[:known].numpy()].sum())
         return replace(self, unexplained=before.unexplained + flagged + turned)
 
+    def is_grown_to(self, graph: ViewGraph) -> bool:
+        """Whether a graph has grown from this one, and states nothing twice."""
+        return begins_with(graph, self.graph) and first_of_each(graph) is None
+
     def updated(
         self, graph: ViewGraph, networks: tuple[SlamCleanNet, SlamFineNet], body_from_world: Tensor
-    ) -> SearchedOn | None:
-        """Solve a graph that has grown from this one; None if it has not.
+    ) -> SearchedOn:
+        """Solve a graph that has grown from this one.
 
         Args:
             graph: N nodes.
             networks: CleanNet and FineNet, which is applied once.
             body_from_world: ``(N, 4)`` start, where a closure is new.
         """
-        if not begins_with(graph, self.graph) or first_of_each(graph) is not None:
-            return None
-        if (appended := self._appended(graph)) is not None:
-            return SearchedOn(appended, None)
         drawn = Drawn.of(graph, networks[0], bias=self.bias)
         problem = drawn.problem
         before = carried_over(self.trusted, problem.graph, _NEW)
@@ -166,13 +180,14 @@ class SlamMemory:
             graph=graph,
             trusted=problem.graph.edge_values(mode.state.trusted),
             noise=mode.state.noise,
+            mode=fine,
             body_from_world=estimate.body_from_world,
             outlier_score=estimate.outlier_score,
             variance=estimate.variance,
         )
         return SearchedOn(replace(estimate, memory=memory), fine)
 
-    def _appended(self, graph: ViewGraph) -> Estimate | None:
+    def along_odometry(self, graph: ViewGraph) -> Estimate | None:
         """The answer if each new node hangs on an older one by one edge of odometry, and nothing else is new.
 
         Variances grow by the steps passed, whatever odometry does in turns.
@@ -180,8 +195,12 @@ class SlamMemory:
         edge = np.arange(self.graph.num_edges, graph.num_edges)
         if not bool(graph.is_odometry[edge].all()):
             return None
-        new = Growth.of(graph if self.bias is None else without_bias(graph, self.bias), edge, self.graph.num_nodes)
+        unbiased = self.unbiased(graph)
+        new = Growth.of(unbiased, edge, self.graph.num_nodes)
         if new is None:
+            return None
+        poses = None if self.poses is None else self.poses.extended(unbiased)
+        if poses is None and self.poses is not None:
             return None
         steps = graph.steps.numpy()
         orientation = rotations.normalize(rotations.multiply(new.turn, self.body_from_world[new.anchor]))
@@ -196,13 +215,20 @@ class SlamMemory:
             outlier_score=torch.cat((self.outlier_score, slipped)),
             variance=torch.cat((self.variance, self.variance[new.anchor] + passed)),
         )
-        return Estimate(
+        estimate = Estimate(
             memory.body_from_world,
             memory.outlier_score,
             memory.variance,
             memory,
+            self.notes,
             step_variance=self.noise.step_variance,
+            is_anew=False,
         )
+        return estimate if poses is None else with_poses(graph, estimate, poses)
+
+    def unbiased(self, graph: ViewGraph) -> ViewGraph:
+        """The graph without a gyroscope's bias, if one was taken out of its odometry."""
+        return graph if self.bias is None else without_bias(graph, self.bias)
 
 
 def estimate_of(published: Published, noise: Noise) -> Estimate:
@@ -214,3 +240,36 @@ def estimate_of(published: Published, noise: Noise) -> Estimate:
         warnings=published.warnings,
         step_variance=noise.step_variance,
     )
+
+
+def with_poses(graph: ViewGraph, estimate: Estimate, memory: PoseMemory) -> Estimate:
+    """The estimate of rotations alone, with orientations, positions and closures' scores by translations as well.
+
+    Whether odometry slipped is told by rotations.
+    """
+    poses, goes_on = memory.poses, estimate.memory
+    by_both = (poses.outlier_probability, poses.rotation_probability)
+    score, rotation_score = (
+        torch.where(graph.is_odometry, estimate.outlier_score, torch.from_numpy(probability)) for probability in by_both
+    )
+    places = Places(
+        torch.from_numpy(poses.position),
+        torch.from_numpy(poses.position_variance),
+        rotation_score,
+        torch.from_numpy(poses.precision),
+    )
+    return replace(
+        estimate,
+        body_from_world=torch.from_numpy(np.ascontiguousarray(poses.body_from_world)),
+        outlier_score=score,
+        variance=torch.from_numpy(poses.variance),
+        places=places,
+        memory=goes_on.with_poses(memory) if isinstance(goes_on, SlamMemory) else None,
+        step_variance=_step_variance(graph, poses.precision),
+    )
+
+
+def _step_variance(graph: ViewGraph, precision: np.ndarray) -> float:
+    """rad², of one step of sound odometry, from the precisions ``(M, 2)`` with which edges count."""
+    odometry = graph.is_odometry.numpy()
+    return float(np.median(1 / (precision[odometry, 0] * graph.steps.numpy()[odometry])))

@@ -10,7 +10,6 @@ import torch
 
 from rotavg_ros.evaluation.slam import stress
 from rotavg_ros.solver.algebra import quaternion_rows
-from rotavg_ros.solver.algebra.running import done
 from rotavg_ros.solver.neurora.network_store import load_network
 from rotavg_ros.solver.slam import stages
 from rotavg_ros.solver.slam.network import SlamCleanNet
@@ -37,7 +36,7 @@ def test_a_labelling_follows_its_places_to_one_that_is_likelier(kind: str, gain:
     graph, translation, found = found_of(kind, 6)
     mode = found.modes[0]
     as_it_was = mode.cost + estimate_poses(PoseProblem(graph, translation, mode), hold=True).cost
-    rival = done(settling(graph, translation, mode))
+    rival = settling(graph, translation, mode)
     assert rival.cost < as_it_was - gain
     changed = int((rival.mode.is_false != mode.is_false).sum())
     assert changed > 10 if gain > 0 else changed < 10
@@ -53,7 +52,7 @@ def test_tearing_robots_apart_makes_nothing_likelier() -> None:
     torn = Mode(mode.problem, *polish(mode.problem, replace(mode.state, trusted=all_false)), "torn")
     costs = [each.cost + estimate_poses(PoseProblem(graph, translation, each), hold=True).cost for each in (mode, torn)]
     assert costs[1] > costs[0] + 100
-    rivals = done(rival_poses(graph, translation, found.modes))
+    rivals = rival_poses(graph, translation, found.modes)
     assert rivals.share[0] > 0.9 and not rivals.modes[0].is_false.all()
 
 
@@ -78,5 +77,5 @@ def test_places_are_asked_of_the_labelling_without_slips_too() -> None:
     # As rotations would have it in a building that looks alike turned.
     gap = 100.0 + slipped.cost - sound.cost
     unlikely = replace(sound, evaluation=replace(sound.evaluation, terms=sound.evaluation.terms | {"gap": gap}))
-    rivals = done(rival_poses(graph, translation, [slipped, unlikely]))
+    rivals = rival_poses(graph, translation, [slipped, unlikely])
     assert [len(mode.slipped) for mode in rivals.modes] == [0]

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.minimum_cut import FlowNetwork, TwoLabels
-from rotavg_ros.solver.algebra.running import stop_if_abandoned
+from rotavg_ros.solver.running.work import stop_if_abandoned
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
 from rotavg_ros.solver.slam.posterior.moves.truncated_cost import TruncatedCost
 

@@ -8,7 +8,6 @@ how much is wrong.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -17,6 +16,7 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.laplacian import LaplacianPattern
+from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.noise.model import NoiseModel
 

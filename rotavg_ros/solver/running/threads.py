@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import torch
 
-from rotavg_ros.solver.algebra.running import stop_if_abandoned
+from rotavg_ros.solver.running.work import stop_if_abandoned
 
 Item = TypeVar("Item")
 
@@ -99,6 +99,16 @@ def workers() -> Iterator[None]:
         yield
     finally:
         _crew.leave()
+
+
+@contextmanager
+def without_workers() -> Iterator[None]:
+    """Inside, while the solve that is inside :func:`workers` waits, as if it were not."""
+    _crew.leave()
+    try:
+        yield
+    finally:
+        _crew.enter()
 
 
 def num_workers() -> int:

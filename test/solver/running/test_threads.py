@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import pytest
 import torch
 
-from rotavg_ros.solver.algebra.threads import for_each, num_workers, workers
+from rotavg_ros.solver.running.threads import for_each, num_workers, workers
 
 FOUND = 3
 WAIT_S = 60.0  # for what happens at once; only a deadlock takes longer

@@ -1,20 +1,14 @@
-"""A solve while it runs: given up where nobody waits for it, left for a while between two steps, its work counted.
+"""A solve while it runs: given up where nobody waits for it, its work counted, left for a while.
 
-Both the question whether it is given up and the count belong to the context of a solve, so solves that overlap in
-threads have one each.
+All of it belongs to the context of a solve, so solves that overlap in threads have one each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TypeVar
-
-Result = TypeVar("Result")
-# What may be left after each of its steps and gone on with later; its result comes at the end.
-Steps = Generator[None, None, Result]
 
 # Entries of a sparse matrix to one unit, which is about a millisecond with all that is done around a factorisation.
 _ENTRIES = 500.0
@@ -82,18 +76,41 @@ def metered() -> Iterator[Meter]:
             around.spent += meter.spent
 
 
+_rests: ContextVar[Callable[[float], None] | None] = ContextVar("rests", default=None)
+
+
+@contextmanager
+def resting(rest: Callable[[float], None]) -> Iterator[None]:
+    """Inside, ``rest`` is called with the units of each factorisation before it, and may wait."""
+    token = _rests.set(rest)
+    try:
+        yield
+    finally:
+        _rests.reset(token)
+
+
 def spend(entries: int) -> None:
-    """Call it once per factorisation of a matrix of so many entries."""
+    """Call it once before a factorisation of a matrix of so many entries."""
+    count(entries / _ENTRIES)
+    rest = _rests.get()
+    if rest is not None:
+        rest(entries / _ENTRIES)
+
+
+def rest() -> None:
+    """Call it where a good deal of work lies between two factorisations."""
+    waits = _rests.get()
+    if waits is not None:
+        waits(0.0)
+
+
+def count(units: float) -> None:
+    """Add what was spent elsewhere for this solve."""
     meter = _meter.get()
     if meter is not None:
-        meter.spent += entries / _ENTRIES
+        meter.spent += units
 
 
-def done(steps: Steps[Result]) -> Result:
-    """The result of all steps, one after the other."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            result: Result = end.value
-            return result
+def abandonment() -> Callable[[], bool]:
+    """What says whether the solve around this is given up."""
+    return _is_abandoned.get()

@@ -1,24 +1,10 @@
-"""Solves that are left for a while, and whose work is counted."""
+"""Solves whose work is counted."""
 
 from __future__ import annotations
 
 import threading
 
-from rotavg_ros.solver.algebra.running import Steps, done, metered, spend
-
-
-def count_to(number: int) -> Steps[int]:
-    for _ in range(number):
-        spend(500)
-        yield
-    return number
-
-
-def test_all_steps_lead_to_the_result() -> None:
-    assert done(count_to(0)) == 0
-    with metered() as meter:
-        assert done(count_to(3)) == 3
-    assert meter.spent == 3.0
+from rotavg_ros.solver.running.work import metered, spend
 
 
 def test_a_meter_counts_what_meters_inside_it_do() -> None:

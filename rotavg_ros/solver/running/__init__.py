@@ -1,0 +1,1 @@
+"""Solves while they run: given up, counted, left for a while, on several threads."""

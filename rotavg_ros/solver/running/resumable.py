@@ -1,0 +1,134 @@
+"""A solve that is left where it has done enough for now, and gone on with later.
+
+It runs on a thread of its own, of which nothing runs but while somebody waits for it in :meth:`Resumable.go_on`: two
+threads in turn, never at once. So it is the same code as a solve in one go, ends alike to the last bit, and can be left
+at each factorisation.
+"""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+import torch
+
+from rotavg_ros.solver.running.threads import without_workers, workers
+from rotavg_ros.solver.running.work import Abandoned, abandonable, abandonment, count, resting
+
+Result = TypeVar("Result")
+
+# It rests where it is told to end, so that this is never waited for.
+_PATIENCE_S = 5.0
+
+
+class Resumable(Generic[Result]):
+    """A solve that has not begun yet; it is given up when nobody holds it any more.
+
+    Args:
+        solve: what it does.
+    """
+
+    def __init__(self, solve: Callable[[], Result]) -> None:
+        self._turns = _Turns(solve)
+        weakref.finalize(self, self._turns.give_up)
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether it has raised something, as where a tick is abandoned; it cannot be gone on with."""
+        return self._turns.error is not None
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether there is a result."""
+        return self._turns.has_ended
+
+    @property
+    def spent(self) -> float:
+        """Units of work so far."""
+        return self._turns.spent
+
+    @property
+    def result(self) -> Result:
+        """Once it :attr:`has_ended`."""
+        (result,) = self._turns.results
+        return result
+
+    def go_on(self, units: float) -> bool:
+        """Solve until so many units of work are spent, and the factorisation that passes them; whether it has ended.
+
+        Raises:
+            Exception: what the solve raises, :class:`~rotavg_ros.solver.running.work.Abandoned` among them where
+                the solve around this call is given up.
+        """
+        turns = self._turns
+        before = turns.spent
+        try:
+            turns.take(units)
+        finally:
+            count(turns.spent - before)
+        if turns.error is not None:
+            raise turns.error
+        return turns.has_ended
+
+
+class _Turns(Generic[Result]):
+    """What both threads know."""
+
+    def __init__(self, solve: Callable[[], Result]) -> None:
+        self._solve = solve
+        self._theirs, self._ours = threading.Semaphore(0), threading.Semaphore(0)
+        self._until = 0.0
+        self._is_given_up = False
+        self._is_abandoned: Callable[[], bool] = lambda: False
+        self._thread: threading.Thread | None = None
+        self.spent = 0.0
+        self.has_ended = False
+        self.results: list[Result] = []
+        self.error: BaseException | None = None
+
+    def take(self, units: float) -> None:
+        """Let the other thread run, until it rests or ends."""
+        if self.has_ended or self.error is not None:
+            return
+        self._until, self._is_abandoned = self.spent + units, abandonment()
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="rotavg-resumable", daemon=True)
+            self._thread.start()
+        self._theirs.release()
+        try:
+            self._ours.acquire()
+        except BaseException as interrupt:  # Ctrl-C, while the other thread runs
+            self.error, self._is_given_up = interrupt, True
+            raise
+
+    def give_up(self) -> None:
+        """Have the thread end; it is not to be cut off in the middle of something when the interpreter ends."""
+        self._is_given_up = True
+        self._theirs.release()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(_PATIENCE_S)
+
+    def _run(self) -> None:
+        self._theirs.acquire()
+        try:
+            with torch.no_grad(), workers(), abandonable(self._asks), resting(self._rest):
+                self.results.append(self._solve())
+            self.has_ended = True
+        except BaseException as error:
+            self.error = self.error or error
+        del self._solve  # what it has used is not held by whoever holds its result
+        self._ours.release()
+
+    def _asks(self) -> bool:
+        return self._is_given_up or self._is_abandoned()
+
+    def _rest(self, units: float) -> None:
+        if self.spent >= self._until and threading.current_thread() is self._thread:
+            with without_workers():
+                self._ours.release()
+                self._theirs.acquire()
+            if self._is_given_up:
+                raise Abandoned
+        self.spent += units

@@ -1,0 +1,234 @@
+"""A robot's graph while it grows: what each tick answers, and what is done beside it.
+
+What is known of the graph is the last solve's. Odometry that has come since is laid on; closures that have come ask for
+a solve that goes on from the last one (an update), and those it does not explain for a whole search. Both are left
+where the tick has spent its work, and gone on with in the next one. Until the update has ended, new closures count by
+the tangent of the last solve (:mod:`~rotavg_ros.solver.slam.update.conditioned`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from typing import cast
+
+import numpy as np
+import torch
+
+from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
+from rotavg_ros.solver.running.resumable import Resumable
+from rotavg_ros.solver.running.work import metered
+from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
+from rotavg_ros.solver.slam.graph.odometry_paths import Growth
+from rotavg_ros.solver.slam.network import SlamCleanNet
+from rotavg_ros.solver.slam.options import SlamStages
+from rotavg_ros.solver.slam.poses.solve import has_places, poses_of_update
+from rotavg_ros.solver.slam.solve import whole
+from rotavg_ros.solver.slam.update.conditioned import Columns, Conditioned, LaidOn, conditioned
+from rotavg_ros.solver.slam.update.linear import Linear
+from rotavg_ros.solver.slam.update.memory import SlamMemory, with_poses
+from rotavg_ros.view_graph import ViewGraph
+
+# Of the work that a tick leaves an update has so much while a whole search waits for the rest; of the tick's own new
+# closures' columns have so much.
+_UPDATES, _COLUMNS = 0.5, 0.2
+# No more closures than this are reckoned in by the tangent.
+_MOST = 100
+_FLAGGED = 0.5
+
+
+def update_slam(graph: ViewGraph, memory: SlamMemory, run: Run) -> Estimate | None:
+    """The answer of a graph that has grown since ``memory``; None if nothing can be gone on from.
+
+    Args:
+        graph: N nodes, M edges.
+        memory: of the last answer.
+        run: with the units of work that may be spent, as far as one factorisation does not cost more.
+    """
+    with run.watch.stage("update"):
+        known = _caught_up(graph, memory, run)
+    if known is None:
+        return None
+    known = _searched_ahead(graph, known, run)
+    if known.ahead is not None and (run.work is None or run.anew):
+        with run.watch.stage("search"):  # in silence there is nothing else to do
+            known.ahead.go_on(math.inf if run.work is None else run.work)
+    if known.ahead is not None and known.ahead.has_ended:
+        found, was_anew = known.ahead.result, known.anew
+        assert isinstance(found.memory, SlamMemory)
+        if was_anew and _is_same(found.memory.graph, graph):
+            return found
+        with run.watch.stage("update"):
+            known = _caught_up(graph, found.memory, run) or replace(known, ahead=None, anew=False)
+        known = _searched_ahead(graph, known, run)
+    with run.watch.stage("update"):
+        return _laid_on(graph, known, math.inf if run.work is None else run.work)
+
+
+def advance(memory: SlamMemory, work: float) -> None:
+    """Go on with what a tick has left, for so many units of work; the next one finds it there."""
+    update, ahead = memory.update, memory.ahead
+    with metered() as meter:
+        if update is not None and not update.has_failed:
+            update.go_on(work if ahead is None else _UPDATES * work)
+        if ahead is not None and not ahead.has_failed:
+            ahead.go_on(work - meter.spent)
+
+
+def _searched_ahead(graph: ViewGraph, known: SlamMemory, run: Run) -> SlamMemory:
+    """With a whole search under way where one is due."""
+    ahead = known.ahead
+    if ahead is not None and ahead.has_failed:
+        known = replace(known, ahead=None, anew=False)
+    if (known.ahead is not None and known.anew >= run.anew) or not (run.anew or known.is_due):
+        return known
+    own = _by_itself(run)
+    own = replace(own, warm_start=None) if run.anew else own
+    return replace(known, ahead=Resumable(partial(whole, graph, SlamStages(), own)), anew=run.anew)
+
+
+def _is_same(graph: ViewGraph, other: ViewGraph) -> bool:
+    return (graph.num_nodes, graph.num_edges) == (other.num_nodes, other.num_edges)
+
+
+def _by_itself(run: Run) -> Run:
+    """What a solve that outlives this one is given."""
+    return replace(run, watch=Stopwatch(), memory=None, work=None, anew=False)
+
+
+def _caught_up(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | None:
+    """What is known once closures that are new are solved, as far as the work goes; None if that leads nowhere.
+
+    Where it would not go to the end, it is not begun with: the answer comes first.
+    """
+    known, ration = memory, math.inf if run.work is None else run.work
+    with metered() as meter:
+        while True:
+            if not known.is_grown_to(graph):
+                return None
+            new = slice(known.graph.num_edges, graph.num_edges)
+            hangs_on = _growth(graph, known, known.graph) is not None
+            if hangs_on and bool(graph.is_odometry[new].all()):
+                return known
+            update = known.update
+            if update is None or update.has_failed:
+                before = replace(known, ahead=None, update=None, columns=None)
+                update = Resumable(partial(_updated, graph, before, _by_itself(run)))
+            # What hangs otherwise cannot be laid on meanwhile.
+            left = ration - meter.spent if hangs_on else math.inf
+            if not update.has_ended and (known.update_work > left or not update.go_on(left)):
+                return replace(known, update=update)
+            if (after := update.result) is None:
+                return None
+            if after.columns is None:
+                after = replace(after, update_work=update.spent)
+                if _num_new_closures(graph, after) > _most_columns(_linear(after), left):
+                    update = Resumable(partial(_with_columns, graph, after))
+                    return replace(known, update=update, update_work=after.update_work)
+            known = replace(after, ahead=known.ahead, anew=known.anew)
+
+
+def _growth(graph: ViewGraph, known: SlamMemory, since: ViewGraph | Linear) -> Growth | None:
+    """How nodes that are new since then hang on those before by odometry; None where they do not."""
+    new = np.arange(since.num_edges, graph.num_edges)
+    return Growth.of(known.unbiased(graph), new[graph.is_odometry[new].numpy()], since.num_nodes)
+
+
+def _updated(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | None:
+    """What is known once the graph is solved from the labelling before, closures that are new judged by it."""
+    assert run.warm_start is not None
+    before = memory.poses
+    unbiased = memory.unbiased(graph)
+    start = run.warm_start.double() if before is None else before.start_alone(unbiased)
+    if start is None or (before is None) is has_places(graph):
+        return None
+    networks = run.networks.load(SlamCleanNet), run.networks.load(SlamFineNet)
+    found = memory.updated(graph, networks, start)
+    estimate = found.estimate
+    if before is not None:
+        poses = poses_of_update(unbiased, found.mode, before)
+        if poses is None:
+            return None
+        estimate = with_poses(graph, estimate, poses)
+    assert isinstance(estimate.memory, SlamMemory)
+    return estimate.memory.since(memory, estimate.outlier_score)
+
+
+def _laid_on(graph: ViewGraph, known: SlamMemory, ration: float) -> Estimate | None:
+    """The answer by what is known, odometry and closures that have come since laid on it."""
+    edges = np.arange(graph.num_edges)
+    waits = (edges >= known.graph.num_edges) & ~graph.is_odometry.numpy()
+    kept, closure = np.flatnonzero(~waits), np.flatnonzero(waits)
+    if len(closure) == 0:
+        return known.along_odometry(graph)
+    estimate = known.along_odometry(graph.select_edges(torch.from_numpy(kept)))
+    linear = _linear(known)
+    growth = _growth(graph, known, linear)
+    if estimate is None or growth is None:
+        return None
+    places = estimate.places
+    variance = np.stack((estimate.variance.numpy(), np.zeros(graph.num_nodes)))
+    if places is not None:
+        variance[1] = places.variance.numpy()
+    laid = LaidOn(
+        known.unbiased(graph),
+        estimate.body_from_world,
+        None if places is None else places.position.numpy(),
+        variance,
+    )
+    columns = known.columns or Columns.none(linear)
+    most = min(_most_columns(linear, ration), _MOST - len(columns.edge))
+    told = conditioned(linear, laid, growth, closure, columns, most)
+    memory = replace(known, columns=told.columns)
+    return replace(_with_closures(estimate, told, linear, (kept, closure)), memory=memory)
+
+
+def _linear(known: SlamMemory) -> Linear:
+    """The normal density about the last solve."""
+    return Linear.of_rotations(known.mode) if known.poses is None else Linear.of_poses(known.poses.pose)
+
+
+def _most_columns(linear: Linear, ration: float) -> int:
+    """Of how many closures a tick may work out the columns."""
+    return int(min(max(1.0, _COLUMNS * ration / (linear.column_work * linear.size)), _MOST))
+
+
+def _num_new_closures(graph: ViewGraph, known: SlamMemory) -> int:
+    return int((~graph.is_odometry[known.graph.num_edges :]).sum())
+
+
+def _with_columns(graph: ViewGraph, known: SlamMemory) -> SlamMemory | None:
+    """What is known, with the columns of closures that have come since: no closure counts less once it counts."""
+    estimate = _laid_on(graph, known, math.inf)
+    return None if estimate is None else cast(SlamMemory, estimate.memory)
+
+
+def _with_closures(
+    estimate: Estimate, told: Conditioned, linear: Linear, edges: tuple[np.ndarray, np.ndarray]
+) -> Estimate:
+    """The estimate with closures that it does not know.
+
+    Args:
+        estimate: of m edges.
+        told: of n closures.
+        linear: that they were told by.
+        edges: ``(m,)`` and ``(n,)`` their numbers in the whole graph.
+    """
+    order = torch.from_numpy(np.argsort(np.concatenate(edges)))
+    laid = told.laid
+
+    def merged(before: torch.Tensor, value: np.ndarray) -> torch.Tensor:
+        return torch.cat((before, torch.from_numpy(value)))[order]
+
+    places = estimate.places
+    if places is not None and laid.position is not None:
+        weight = np.array([1 / linear.noise.closure_turn, 1 / linear.noise.closure])
+        places = replace(
+            places,
+            position=torch.from_numpy(laid.position),
+            rotation_score=merged(places.rotation_score, told.rotation_score),
+            precision=merged(places.precision, np.where((told.score > _FLAGGED)[:, None], 0.0, weight)),
+        )
+    score = merged(estimate.outlier_score, told.score)
+    return replace(estimate, body_from_world=laid.body_from_world, outlier_score=score, places=places)

@@ -1,0 +1,359 @@
+"""Closures that have come since the last solve, by the normal density that its answer is: judged and reckoned in.
+
+Of new closures' residuals r all else says N(0, S), S = A H⁻¹ Aᵀ + what odometry since errs + their own noise. Those
+that are good move the unknowns by H⁻¹ Aᵀ S⁻¹ r (the matrix inversion lemma, as recursive least squares has it), which
+costs a solve with the factor that is there for each component of each closure, and no factorisation. It is as exact as
+the last solve's tangent: noise, labels and FineNet's weights stay as they were until the next solve.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.sparse import csr_array
+from scipy.special import expit
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.small_matrices import inverse
+from rotavg_ros.solver.running.work import count as count_units
+from rotavg_ros.solver.running.work import rest
+from rotavg_ros.solver.slam.graph.odometry_paths import Growth
+from rotavg_ros.solver.slam.posterior.densities import log_false
+from rotavg_ros.solver.slam.posterior.priors import SlamPriors
+from rotavg_ros.solver.slam.update.linear import Linear
+from rotavg_ros.view_graph import ViewGraph
+
+# Columns of so many closures are worked out at once.
+_AT_ONCE = 8
+# Which of the new closures are good is asked so many times, given those that were last.
+_ROUNDS = 3
+# A walk's heading errs along its way by a third of the variance at its end, across two components of three or one.
+_WALK, _ACROSS = 3.0, 0.5
+
+
+@dataclass(frozen=True)
+class Columns:
+    """H⁻¹ Aᵀ of new closures, which stays as it is until the next solve.
+
+    Attributes:
+        edge: ``(n,)`` edges of the view-graph.
+        value: ``(K + R, d, n d)``.
+    """
+
+    edge: np.ndarray
+    value: np.ndarray
+
+    @classmethod
+    def none(cls, linear: Linear) -> Columns:
+        """Of no closures."""
+        return cls(np.empty(0, dtype=np.int64), np.empty((linear.num_blocks, linear.size, 0)))
+
+
+@dataclass(frozen=True)
+class LaidOn:
+    """A graph of N' ≥ N nodes, those that came since a solve along odometry from its answer.
+
+    Attributes:
+        graph: without its bias.
+        body_from_world: ``(N', 4)``.
+        position: ``(N', 3)`` metres; None by rotations alone.
+        variance: ``(2, N')`` rad², m² per component.
+    """
+
+    graph: ViewGraph
+    body_from_world: torch.Tensor
+    position: np.ndarray | None
+    variance: np.ndarray
+
+
+@dataclass(frozen=True)
+class Conditioned:
+    """After n new closures.
+
+    Attributes:
+        laid: with what the good ones of these move.
+        score, rotation_score: ``(n,)`` probability that each is false, and that its rotation is.
+        columns: of those that could be reckoned in.
+    """
+
+    laid: LaidOn
+    score: np.ndarray
+    rotation_score: np.ndarray
+    columns: Columns
+
+
+def conditioned(
+    linear: Linear, laid: LaidOn, growth: Growth, edge: np.ndarray, columns: Columns, most: int
+) -> Conditioned:
+    """New closures judged, and those that are good reckoned in.
+
+    Args:
+        linear: of the last solve.
+        laid: the graph, along odometry from that.
+        growth: how its nodes hang on those of the last solve.
+        edge: ``(n,)`` the closures, in the order in which they came.
+        columns: of the first ones.
+        most: of so many more columns are worked out now; what is left has a score by its residual, and moves nothing.
+    """
+    system = _System.of(linear, laid, growth, edge)
+    known = len(columns.edge)
+    values = [columns.value]
+    for first in range(known, min(known + most, len(edge)), _AT_ONCE):
+        some = slice(first, min(first + _AT_ONCE, known + most))
+        count_units(linear.column_work * linear.size * len(edge[some]))
+        rest()
+        values.append(linear.solve(system.columns(some)))
+    columns = Columns(edge[: known + most], np.concatenate(values, axis=2))
+    count = len(columns.edge)
+    covariance = system.covariance(columns.value, count)
+    accepted = np.zeros(count, dtype=bool)
+    for _ in range(_ROUNDS):
+        mean, left_out = _left_out(covariance, system.residual[:count], accepted)
+        odds, rotation_odds = system.log_odds(mean, left_out, slice(count))
+        accepted = odds > 0
+    apart = system.log_odds(system.residual[count:], system.independent(slice(count, None)), slice(count, None))
+    score = expit(-np.append(odds, apart[0]))
+    rotation_score = expit(-np.append(rotation_odds, apart[1]))
+    return Conditioned(system.moved(columns, covariance, accepted), score, np.minimum(score, rotation_score), columns)
+
+
+def _left_out(covariance: np.ndarray, residual: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals ``(n, d, q)`` less what those that are ``given`` say of them, and their covariances ``(n, d, d)``.
+
+    Args:
+        covariance: ``(n, d, n, d)``.
+        residual: ``(n, d, q)``.
+        given: ``(n,)`` bool; of one that is given the others say it.
+    """
+    count, size = residual.shape[:2]
+    inside = np.arange(count)
+    own = covariance[inside, :, inside]
+    if not given.any():
+        return residual, own
+    among = covariance[given][:, :, given].reshape(-1, given.sum() * size)
+    precision = np.linalg.inv((among + among.T) / 2)
+    pulled = (precision @ residual[given].reshape(len(precision), -1)).reshape(-1, size, residual.shape[2])
+    gain = covariance[:, :, given].reshape(count * size, -1) @ precision
+    mean = residual - (gain @ residual[given].reshape(len(precision), -1)).reshape(residual.shape)
+    taken = np.einsum("iak,ibk->iab", gain.reshape(count, size, -1), covariance[:, :, given].reshape(count, size, -1))
+    left = own - taken
+    among_given = np.arange(given.sum())
+    blocks = precision.reshape(-1, size, len(among_given), size)[among_given, :, among_given]
+    left[given] = inverse((blocks + blocks.transpose(0, 2, 1)) / 2)
+    mean[given] = left[given] @ pulled
+    return mean, (left + left.transpose(0, 2, 1)) / 2
+
+
+@dataclass(frozen=True)
+class _System:
+    """Rows of n new closures.
+
+    Attributes:
+        anchor: ``(N',)`` node of the last solve that each node moves with, its own among these.
+        way: ``(N', 3)`` metres from there.
+        along: ``(2, N')`` rad², m², by which odometry from there errs.
+        residual: ``(n, d, q)``, q = 1, or d = 1 and q = 3 by rotations alone.
+        own: ``(2, n)`` rad², m², of closures.
+        is_known: ``(n,)`` bool, whether their translations are.
+    """
+
+    linear: Linear
+    laid: LaidOn
+    source: np.ndarray
+    target: np.ndarray
+    anchor: np.ndarray
+    way: np.ndarray
+    along: np.ndarray
+    residual: np.ndarray
+    displacement: np.ndarray
+    own: np.ndarray
+    is_known: np.ndarray
+
+    @classmethod
+    def of(cls, linear: Linear, laid: LaidOn, growth: Growth, edge: np.ndarray) -> _System:
+        graph, noise = laid.graph, linear.noise
+        known = np.arange(linear.num_nodes)
+        anchor = np.append(known, growth.anchor)
+        position = np.zeros((len(anchor), 3)) if laid.position is None else laid.position
+        way = position - position[anchor]
+        steps = growth.along(graph.steps.numpy()[growth.edge])
+        length = np.zeros(len(growth.edge))
+        if laid.position is not None and graph.translation is not None:
+            step_lengths = torch.linalg.vector_norm(graph.translation, dim=1).nan_to_num().numpy()
+            length = growth.along(step_lengths[growth.edge])
+        turned = noise.turn * steps
+        lever = turned / _WALK * (way[linear.num_nodes :] ** 2).sum(axis=1) * _ACROSS
+        along = np.zeros((2, len(anchor)))
+        along[:, linear.num_nodes :] = turned, noise.way * length + lever
+        source, target = graph.source[edge], graph.target[edge]
+        body_from_world = laid.body_from_world
+        expected = rotations.multiply(graph.target_from_source[edge].double(), body_from_world[source])
+        turn = rotations.log(rotations.multiply(rotations.inverse(body_from_world[target]), expected)).numpy()
+        displacement, square = np.zeros((len(edge), 3)), np.zeros(len(edge))
+        is_known = np.zeros(len(edge), dtype=bool)
+        if linear.turns is None or linear.shifts is None or graph.translation is None:
+            residual = turn[:, None, :]
+        else:
+            translation = graph.translation[edge]
+            is_known = torch.isfinite(translation).all(dim=1).numpy()
+            translation = translation.nan_to_num()
+            displacement = rotations.rotate(rotations.inverse(body_from_world[source]), translation).numpy()
+            shift = displacement - (position[target.numpy()] - position[source.numpy()])
+            shift *= is_known[:, None]
+            square = (translation**2).sum(dim=1).numpy()
+            residual = np.concatenate((turn @ linear.turns, shift @ linear.shifts), axis=1)[:, :, None]
+        own_shift = np.where(is_known, noise.closure + noise.relative * square, linear.extent / _NOTHING)
+        own = np.stack((np.full(len(edge), noise.closure_turn), own_shift))
+        return cls(
+            linear, laid, source.numpy(), target.numpy(), anchor, way, along, residual, displacement, own, is_known
+        )
+
+    @property
+    def _widths(self) -> tuple[int, int]:
+        """Components of turns and of shifts in a row."""
+        turns, shifts = self.linear.turns, self.linear.shifts
+        return (1, 0) if turns is None or shifts is None else (turns.shape[1], shifts.shape[1])
+
+    def columns(self, which: slice) -> np.ndarray:
+        """``(K + R, d, n d)`` Aᵀ of some closures."""
+        linear, d = self.linear, self.linear.size
+        rows = self._rows(which)
+        return np.asarray(rows.toarray().T.reshape(linear.num_blocks, d, -1))
+
+    def _rows(self, which: slice) -> csr_array:
+        """``(n d, (K + R) d)`` A."""
+        linear, (k, m), d = self.linear, self._widths, self.linear.size
+        source, target = self.source[which], self.target[which]
+        count = len(source)
+        blocks, values = [], []
+        for node, sign, lever in ((target, 1.0, 0.0), (source, -1.0, self.displacement[which])):
+            anchor = self.anchor[node]
+            value = np.zeros((count, d, d))
+            value[:, :k, :k] = sign * np.eye(k)
+            if m:
+                value[:, k:, k:] = sign * np.eye(m)
+                value[:, k:, :k] = self._crossed(sign * self.way[node] - lever)
+            share = np.repeat(linear.share[:, anchor], (k, m), axis=0).T[:, None, :]
+            for block, part in ((linear.above, 1 - share), (linear.below, share)):
+                blocks.append(block[anchor])
+                values.append(value * part)
+        row = (np.arange(count)[:, None] * d + np.arange(d))[None, :, :, None]
+        column = (np.stack(blocks)[:, :, None] * d + np.arange(d))[:, :, None, :]
+        row, column = np.broadcast_arrays(row, column)
+        shape = count * d, linear.num_blocks * d
+        return csr_array((np.stack(values).ravel(), (row.ravel(), column.ravel())), shape=shape)
+
+    def _crossed(self, vector: np.ndarray) -> np.ndarray:
+        """``(n, m, k)`` of v × in the axes."""
+        turns, shifts = self.linear.turns, self.linear.shifts
+        assert turns is not None and shifts is not None
+        crossing = np.cross(turns.T[None], shifts.T[:, None]).reshape(-1, 3).T
+        return np.asarray((vector @ crossing).reshape(len(vector), shifts.shape[1], turns.shape[1]))
+
+    def covariance(self, value: np.ndarray, count: int) -> np.ndarray:
+        """``(n, d, n, d)`` S of the first closures, by their columns."""
+        d, (k, m) = self.linear.size, self._widths
+        rows: np.ndarray = self._rows(slice(count)) @ value.reshape(-1, count * d)
+        between = np.asarray((rows + rows.T) / 2).reshape(count, d, count, d)
+        walked = self._walked(np.stack((self.target[:count], self.source[:count])), np.array([1.0, -1.0]), count)
+        component = np.repeat([0, 1], (k, m))
+        inside = np.arange(count)
+        for axis, kind in enumerate(component):
+            between[:, axis, :, axis] += walked[kind]
+            between[inside, axis, inside, axis] += self._besides(slice(count))[kind]
+        return between
+
+    def _walked(self, node: np.ndarray, sign: np.ndarray, count: int) -> np.ndarray:
+        """``(2, …, n)`` rad², m², what errors that odometry has made since have in common with those of closures.
+
+        Args:
+            node: ``(2, …)`` nodes, which count with a sign each.
+            sign: ``(2,)`` theirs.
+            count: n, of the first closures.
+        """
+        total = np.zeros((2, *node.shape[1:], count))
+        for one, own_sign in zip(node, sign, strict=True):
+            for other, its_sign in ((self.target[:count], 1.0), (self.source[:count], -1.0)):
+                is_same = self.anchor[one][..., None] == self.anchor[other]
+                shared = np.minimum(self.along[:, one][..., None], self.along[:, other].reshape(2, *[1] * one.ndim, -1))
+                total += own_sign * its_sign * is_same * shared
+        return total
+
+    def _besides(self, which: slice) -> np.ndarray:
+        """``(2, n)`` rad², m², closures' own noise and what nodes err between key nodes."""
+        ends = self.anchor[self.source[which]], self.anchor[self.target[which]]
+        return np.asarray(self.own[:, which] + self.linear.bridge[:, ends[0]] + self.linear.bridge[:, ends[1]])
+
+    def independent(self, which: slice) -> np.ndarray:
+        """``(n, d, d)`` covariance of residuals, as if closures' ends erred by themselves."""
+        variance = self.own[:, which] + sum(self.laid.variance[:, end[which]] for end in (self.source, self.target))
+        of_row = np.repeat(variance, self._widths, axis=0).T
+        return np.asarray(of_row[:, :, None] * np.eye(self.linear.size))
+
+    def log_odds(self, mean: np.ndarray, covariance: np.ndarray, which: slice) -> tuple[np.ndarray, np.ndarray]:
+        """``(n,)`` nats each, that closures are good, and that their rotations are.
+
+        Args:
+            mean, covariance: ``(n, d, q)``, ``(n, d, d)`` of residuals, by all else.
+            which: closures.
+        """
+        linear, priors, (k, m) = self.linear, SlamPriors(), self._widths
+        share, count = priors.outlier_share, priors.outlier_count
+        told = np.log((linear.good + (1 - share) * count) / (linear.false + share * count))
+        turn = covariance[:, :k, :k]
+        times = linear.components if m == 0 else 1
+        square = (mean[:, :k] ** 2).sum(axis=(1, 2))
+        predicted = np.trace(turn, axis1=1, axis2=2) / k - self.own[0, which]
+        false_turn = log_false(square, linear.components, priors, predicted=np.maximum(predicted, 0.0))
+        good_turn = _log_normal(mean[:, :k], turn, times)
+        rotation = told + good_turn - false_turn
+        if m == 0:
+            return rotation, rotation
+        anywhere = covariance[:, k:, k:] + linear.extent * np.eye(m)
+        false_place = _log_normal(mean[:, k:], anywhere, 1)
+        both = told + _log_normal(mean, covariance, 1) - false_turn - false_place
+        return np.where(self.is_known[which], both, rotation), rotation
+
+    def moved(self, columns: Columns, covariance: np.ndarray, accepted: np.ndarray) -> LaidOn:
+        """All nodes, as closures that are ``accepted`` ``(n,)`` of those with columns move them."""
+        if not accepted.any():
+            return self.laid
+        linear, d, k, count = self.linear, self.linear.size, self._widths[0], len(accepted)
+        q = self.residual.shape[2]
+        among = covariance[accepted][:, :, accepted].reshape(-1, accepted.sum() * d)
+        pull = np.zeros((count, d, q))
+        pull[accepted] = np.linalg.solve(among, self.residual[:count][accepted].reshape(-1, q)).reshape(-1, d, q)
+        step = (columns.value.reshape(-1, count * d) @ pull.reshape(-1, q)).reshape(-1, d, q)
+        walked = self._walked(np.arange(len(self.anchor))[None], np.ones(1), count)
+        turn = self._at_nodes(0, step[:, :k]) + np.einsum("nc,cdq->ndq", walked[0], pull[:, :k])
+        turn = turn[:, 0] if linear.turns is None else turn[:, :, 0] @ linear.turns.T
+        rotated = rotations.exp(torch.from_numpy(turn))
+        orientation = rotations.normalize(rotations.multiply(self.laid.body_from_world, rotated))
+        if linear.shifts is None or self.laid.position is None:
+            return replace(self.laid, body_from_world=orientation)
+        shift = self._at_nodes(1, step[:, k:])[:, :, 0] @ linear.shifts.T
+        shift += np.einsum("nc,cd->nd", walked[1], pull[:, k:, 0]) @ linear.shifts.T
+        # The way from its anchor turns with that.
+        at_anchor = rotations.inverse(rotated[torch.from_numpy(self.anchor)])
+        shift += rotations.rotate(at_anchor, torch.from_numpy(self.way)).numpy() - self.way
+        return replace(self.laid, body_from_world=orientation, position=self.laid.position + shift)
+
+    def _at_nodes(self, kind: int, step: np.ndarray) -> np.ndarray:
+        """``(N', …)`` of unknowns ``(K + R, …)``, at the nodes that all nodes move with."""
+        linear = self.linear
+        share = linear.share[kind][self.anchor][:, None, None]
+        return np.asarray((1 - share) * step[linear.above[self.anchor]] + share * step[linear.below[self.anchor]])
+
+
+def _log_normal(mean: np.ndarray, covariance: np.ndarray, times: int) -> np.ndarray:
+    """``(n,)`` log N(0, covariance) of ``(n, d, q)``; the determinant counts so many times."""
+    size = mean.shape[1]
+    square = (mean * np.linalg.solve(covariance, mean)).sum(axis=(1, 2))
+    log_det = np.linalg.slogdet(covariance)[1] + size * np.log(2 * np.pi)
+    return np.asarray(-(square + times * log_det) / 2)
+
+
+# The precision of a translation that is not known, in that of one anywhere on the map.
+_NOTHING = 1e-6

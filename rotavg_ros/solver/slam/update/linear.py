@@ -1,0 +1,126 @@
+"""A solve's answer as a normal density about it: what closures that come later are compared with, and what they move.
+
+The unknowns of the last solve (K key nodes and R runs, d components each) are N(0, H⁻¹) about their estimates, H as it
+was factorised. Nodes between key nodes follow those by their shares; nodes that odometry has appended since move with
+the node that they hang on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from rotavg_ros.solver.slam.poses.estimate import PoseMode
+from rotavg_ros.solver.slam.poses.neighbours import GOOD
+from rotavg_ros.solver.slam.poses.rows import PoseNoise
+from rotavg_ros.solver.slam.posterior.mode import Mode
+
+# Of a factor, that a column passes in one unit of work.
+_ENTRIES = 1.2e6
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Of N nodes and M edges; k components of turns and, where translations are known, m of shifts, d = k + m.
+
+    Rotations alone have one unknown for all components of a turn: there d is 1, k says how many these are.
+
+    Attributes:
+        num_edges: M.
+        above, below: ``(N,)`` key nodes that each node lies between.
+        share: ``(2, N)`` how far from the one to the other, for turns and for shifts.
+        bridge: ``(2, N)`` rad², m², by which a node errs besides.
+        num_blocks: K + R.
+        components: k.
+        turns, shifts: ``(3, k)``, ``(3, m)`` axes; None by rotations alone, all three then.
+        noise: how far odometry and closures err; 0 metres by rotations alone.
+        good, false: how many closures are.
+        extent: m² per component, of the map.
+        solve: H⁻¹ of columns ``(K + R, d, n)``.
+        column_work: units that one of these costs.
+    """
+
+    num_edges: int
+    above: np.ndarray
+    below: np.ndarray
+    share: np.ndarray
+    bridge: np.ndarray
+    num_blocks: int
+    components: int
+    turns: np.ndarray | None
+    shifts: np.ndarray | None
+    noise: PoseNoise
+    good: int
+    false: int
+    extent: float
+    solve: Callable[[np.ndarray], np.ndarray]
+    column_work: float
+
+    @property
+    def num_nodes(self) -> int:
+        """Nodes, N."""
+        return len(self.above)
+
+    @property
+    def size(self) -> int:
+        """How many components a node has, d."""
+        return 1 if self.turns is None or self.shifts is None else self.turns.shape[1] + self.shifts.shape[1]
+
+    @classmethod
+    def of_rotations(cls, mode: Mode) -> Linear:
+        """Of a labelling at its optimum."""
+        problem, noise, factorised = mode.problem, mode.state.noise, mode.evaluation.factorised
+        drawn = problem.drawn(noise)
+        between = drawn.fraction * (1 - drawn.fraction) * drawn.length * noise.step_variance
+
+        def solve(columns: np.ndarray) -> np.ndarray:
+            return np.asarray(factorised.solve(columns[:, 0]))[:, None]
+
+        is_good = mode.state.is_good[problem.closure]
+        return cls(
+            len(drawn.segment_of_edge),
+            drawn.above,
+            drawn.below,
+            np.stack((drawn.fraction, np.zeros(len(drawn.fraction)))),
+            np.stack((between, np.zeros(len(between)))),
+            factorised.system.size,
+            problem.components,
+            None,
+            None,
+            PoseNoise(noise.step_variance, noise.closure_variance, 0.0, 0.0, 0.0),
+            int(is_good.sum()),
+            int((~is_good).sum()),
+            1.0,
+            solve,
+            factorised.num_entries / _ENTRIES,
+        )
+
+    @classmethod
+    def of_poses(cls, pose: PoseMode) -> Linear:
+        """Of a joint solve."""
+        problem, solved, noise, drawn = pose.problem, pose.solved, pose.state.noise, pose.problem.drawn
+        turns, shifts = problem.bases
+        segment = problem.segment_of_node
+        length = np.where(segment >= 0, solved.way.length[np.maximum(segment, 0)], 0.0)
+        passed = np.where(segment >= 0, solved.way.passed / np.maximum(length, np.finfo(np.float64).tiny), 0.0)
+        between = drawn.fraction * (1 - drawn.fraction) * drawn.length * noise.turn
+        good = float(solved.places.chance[:GOOD].sum())
+        return cls(
+            len(drawn.segment_of_edge),
+            drawn.above,
+            drawn.below,
+            np.stack((drawn.fraction, passed)),
+            np.stack((between, passed * (1 - passed) * length * noise.way)),
+            problem.equations.num_blocks,
+            turns.shape[1],
+            turns,
+            shifts,
+            noise,
+            round(good),
+            solved.places.chance.shape[1] - round(good),
+            solved.scale.extent,
+            solved.factor.solve,
+            solved.factor.num_entries / _ENTRIES,
+        )

@@ -1,0 +1,177 @@
+"""A robot's graph that grows while updates and whole searches run beside its answers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from rotavg_ros.datasets.simulation.stress.drawn import DrawnGraph
+from rotavg_ros.solver import Solution, advance, solve
+from rotavg_ros.solver.estimate import Run, Stopwatch
+from rotavg_ros.solver.neurora.network_store import Networks
+from rotavg_ros.solver.running.resumable import Resumable
+from rotavg_ros.solver.running.work import Abandoned, abandonable, metered
+from rotavg_ros.solver.slam.options import SlamStages
+from rotavg_ros.solver.slam.solve import whole
+from rotavg_ros.solver.slam.update.memory import SlamMemory
+from rotavg_ros.view_graph import ViewGraph
+
+from .test_memory import drawn, error_deg, grown, until
+
+# Less than an update takes: each tick lays on what is new.
+LITTLE = 2.0
+
+
+def whole_of(graph: ViewGraph) -> Resumable:
+    return Resumable(lambda: whole(graph, SlamStages(), Run(Networks("cpu"), Stopwatch())))
+
+
+def remembered(solution: Solution) -> SlamMemory:
+    assert isinstance(solution.memory, SlamMemory)
+    return solution.memory
+
+
+def go_on(graph: ViewGraph, solution: Solution, work: float | None = LITTLE, anew: bool = False) -> Solution:
+    start = grown(graph, solution)
+    return solve(graph, profile="slam", warm_start=start, memory=solution.memory, work=work, anew=anew)
+
+
+@torch.no_grad()
+def test_little_by_little_it_ends_where_it_does_at_once() -> None:
+    case = drawn("building: 30 % random", 1)
+    with metered() as meter:
+        at_once = whole(case.graph, SlamStages(), Run(Networks("cpu"), Stopwatch()))
+    ahead, calls = whole_of(case.graph), 1
+    while not ahead.go_on(0.0):
+        calls += 1
+    assert calls > 100
+    assert ahead.spent == pytest.approx(meter.spent)
+    assert torch.equal(ahead.result.body_from_world, at_once.body_from_world)
+    assert torch.equal(ahead.result.outlier_score, at_once.outlier_score)
+
+
+def test_ticks_answer_at_once_and_the_rest_leads_to_the_same_answer() -> None:
+    case = drawn("building: 30 % random", 1)
+    graph = until(case.graph, count := 300)
+    solution = solve(graph, profile="slam")
+    searched, answers, laid_on, errors = 0, [], 0, []
+    for number in range(count + 2, case.graph.num_nodes + 1, 2):
+        graph = until(case.graph, number)
+        solution = go_on(graph, solution)
+        answers.append(solution.work)
+        laid_on += remembered(solution).update is not None
+        errors.append(error_deg(graph, solution.body_from_world, case.body_from_world))
+        assert len(solution.outlier_score) == graph.num_edges
+        was_searching = remembered(solution).ahead is not None
+        advance(solution.memory, 10 * LITTLE)
+        searched += was_searching and remembered(solution).ahead.has_ended
+    assert laid_on > 20
+    assert searched >= 2
+    cold = solve(graph, profile="slam")
+    # Nobody waits for more than a factorisation, of which a whole solve has hundreds.
+    assert max(answers) < 0.1 * cold.work
+    error = error_deg(graph, cold.body_from_world, case.body_from_world)
+    assert errors[-1] < 1.2 * error + 0.1
+    assert sum(errors) / len(errors) < 1.5 * error + 0.2
+
+
+def test_closures_that_are_explained_ask_for_no_search() -> None:
+    case = drawn("building: 30 % random", 1)
+    graph = case.graph
+    closures = torch.nonzero(~graph.is_odometry)[:, 0]
+    false = torch.from_numpy(case.is_false)[closures]
+    good, wrong = closures[~false], closures[false]
+    odometry = torch.nonzero(graph.is_odometry)[:, 0]
+    known = graph.select_edges(torch.cat((odometry, good[:-5])))
+    before = solve(known, profile="slam")
+    searches = []
+    for more in (good[-5:], torch.cat((good[-5:], wrong[: len(good) // 10]))):
+        after = graph.select_edges(torch.cat((odometry, good[:-5], more)))
+        found = go_on(after, before, work=1e6)
+        searches.append(remembered(found).ahead is not None)
+    assert searches == [False, True]
+
+
+def searching(case: DrawnGraph) -> tuple[ViewGraph, Solution]:
+    """A graph that has grown until a whole search is under way, and its answer."""
+    number, graph = 300, until(case.graph, 300)
+    solution = solve(graph, profile="slam")
+    while remembered(solution).ahead is None:
+        number += 2
+        graph = until(case.graph, number)
+        solution = go_on(graph, solution, work=1e6)
+    advance(solution.memory, 1.0)
+    return graph, solution
+
+
+def test_a_search_that_was_abandoned_begins_anew() -> None:
+    """A tick that is paused in the middle leaves what was remembered as it was, and no dead search in it."""
+    case = drawn("building: 30 % random", 1)
+    graph, solution = searching(case)
+    asked = 0
+
+    def after_a_while() -> bool:
+        nonlocal asked
+        asked += 1
+        return asked > 20
+
+    with pytest.raises(Abandoned), abandonable(after_a_while):
+        advance(solution.memory, 1e9)
+    assert remembered(solution).ahead.has_failed
+    assert advance(solution.memory, 1e9) == 0  # and does no harm
+    graph = until(case.graph, graph.num_nodes + 2)
+    found = go_on(graph, solution, work=None)
+    assert remembered(found).ahead is None
+    whole_one = solve(graph, profile="slam")
+    errors = [error_deg(graph, one.body_from_world, case.body_from_world) for one in (found, whole_one)]
+    assert errors[0] < 1.2 * errors[1] + 0.1
+
+
+def test_a_keyframe_without_edges_comes_while_a_search_ends() -> None:
+    """Another robot begins: its first keyframe hangs on nothing yet."""
+    graph, solution = searching(drawn("building: 30 % random", 1))
+    more = replace(graph, num_nodes=graph.num_nodes + 1)
+    found = go_on(more, solution, work=None)
+    assert len(found.body_from_world) == len(found.uncertainty) == more.num_nodes
+    assert int(found.component[-1]) == 1
+
+
+def test_without_a_budget_the_search_is_done_at_once() -> None:
+    case = drawn("building: 30 % random", 1)
+    graph = case.graph
+    is_false = torch.from_numpy(case.is_false) & ~graph.is_odometry
+    order = torch.argsort(is_false.long(), stable=True)
+    most = order[: graph.num_edges - int(is_false.sum()) + 2]
+    before = solve(graph.select_edges(most), profile="slam")
+    found = go_on(graph.select_edges(order), before, work=None)
+    assert "search" in found.stage_seconds
+    assert remembered(found).ahead is None and remembered(found).unexplained == 0
+
+
+def test_in_silence_the_answer_becomes_that_of_a_solve_from_scratch() -> None:
+    case = drawn("building: 30 % random", 1)
+    graph = until(case.graph, 500)
+    solution, ticks = go_on(graph, solve(until(case.graph, 480), profile="slam")), 0
+    while not (solution := go_on(graph, solution, anew=True)).is_anew:
+        advance(solution.memory, 100.0)
+        ticks += 1
+    assert ticks > 2
+    cold = solve(graph, profile="slam")
+    assert torch.equal(solution.body_from_world, cold.body_from_world)
+    assert torch.equal(solution.outlier_score, cold.outlier_score)
+
+
+def test_a_solve_from_scratch_goes_on_as_a_search_when_silence_is_broken() -> None:
+    case = drawn("building: 30 % random", 1)
+    graph = until(case.graph, 500)
+    solution = go_on(graph, solve(until(case.graph, 480), profile="slam"), anew=True)
+    ahead = remembered(solution).ahead
+    assert ahead is not None and not solution.is_anew
+    solution = go_on(until(case.graph, 502), solution)
+    assert remembered(solution).ahead is ahead
+    advance(solution.memory, 1e6)
+    solution = go_on(until(case.graph, 504), solution, work=1e6)
+    assert not solution.is_anew
+    assert remembered(solution).ahead is not ahead
