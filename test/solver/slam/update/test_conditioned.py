@@ -1,0 +1,117 @@
+"""Closures reckoned in by the tangent of the last solve, against the solves that follow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros import rotations
+from rotavg_ros.datasets.simulation.slam_config import SlamSimulationConfig
+from rotavg_ros.datasets.simulation.slam_simulation import simulate_slam_graph
+from rotavg_ros.datasets.worlds import World
+from rotavg_ros.solver import Solution, solve
+from rotavg_ros.solver.slam.update.memory import SlamMemory
+from rotavg_ros.view_graph import ViewGraph
+
+from .test_memory import grown
+
+KNOWN, NEW = 600, 20
+
+
+def drawn(*, translations: bool, planar: bool, seed: int = 0) -> tuple[ViewGraph, np.ndarray]:
+    """A graph in the order in which it came, and which of its edges are false."""
+    world = World.BUILDING if planar else World.GARAGE
+    config = SlamSimulationConfig(
+        world=world,
+        dimensions=2 if planar else 3,
+        num_keyframes=KNOWN + NEW,
+        closures_per_keyframe=0.8,
+        false_share=0.2,
+    )
+    run = simulate_slam_graph(config, np.random.default_rng(seed))
+    graph = run.graph
+    if translations:
+        graph = replace(graph, translation=torch.from_numpy(run.edge_translation))
+    order = np.argsort(torch.maximum(graph.source, graph.target).numpy(), kind="stable")
+    return graph.select_edges(torch.from_numpy(order)), np.asarray(run.closure_is_false)[order]
+
+
+def first(graph: ViewGraph, count: int) -> ViewGraph:
+    kept = torch.maximum(graph.source, graph.target) < count
+    return replace(graph.select_edges(kept), num_nodes=count)
+
+
+def turned_deg(one: Solution, other: Solution) -> np.ndarray:
+    return np.degrees(rotations.angle_between(one.body_from_world, other.body_from_world).numpy())
+
+
+@pytest.mark.parametrize("planar", [True, False])
+@pytest.mark.parametrize("translations", [False, True])
+def test_it_is_near_the_solve_that_follows(translations: bool, planar: bool) -> None:
+    graph, is_false = drawn(translations=translations, planar=planar)
+    before = solve(first(graph, KNOWN), profile="slam")
+    start = grown(graph, before)
+    given = {"profile": "slam", "warm_start": start, "memory": before.memory}
+    quick = solve(graph, **given, work=1e4)
+    assert isinstance(quick.memory, SlamMemory)
+    memory = before.memory
+    assert isinstance(memory, SlamMemory)
+    given["memory"] = replace(memory, update_work=1e9)  # which no tick waits for
+    quick, after = solve(graph, **given, work=1e4), solve(graph, **given)
+    count = int((~graph.is_odometry[memory.graph.num_edges :]).sum())
+    assert isinstance(quick.memory, SlamMemory) and quick.memory.update is not None
+    assert quick.memory.columns is not None and len(quick.memory.columns.edge) == count > 10
+    new = np.flatnonzero((np.arange(graph.num_edges) >= memory.graph.num_edges) & ~graph.is_odometry.numpy())
+    assert is_false[new].sum() >= 2
+    flags = [(one.outlier_score > 0.5).numpy()[new] for one in (quick, after)]
+    wrong = [int((flagged != is_false[new]).sum()) for flagged in flags]
+    assert wrong[0] <= wrong[1] + 1
+    assert (flags[0] == flags[1]).mean() > 0.9
+    kept = (torch.arange(graph.num_edges) < memory.graph.num_edges) | graph.is_odometry
+    odometry = solve(graph.select_edges(kept), **{**given, "memory": memory})
+    off, without = turned_deg(quick, after), turned_deg(odometry, after)
+    assert off[KNOWN:].mean() < 0.4 * without[KNOWN:].mean()
+    assert off.mean() < 0.3 * np.degrees(float(after.uncertainty.mean()))
+    if translations:
+        assert quick.position is not None and after.position is not None and odometry.position is not None
+        moved, missed = ((one.position - after.position).norm(dim=1)[KNOWN:].mean() for one in (quick, odometry))
+        assert moved < 0.5 * missed
+        assert quick.rotation_score is not None and len(quick.rotation_score) == graph.num_edges
+        assert quick.edge_precision is not None and bool((quick.edge_precision[new[flags[0]]] == 0).all())
+
+
+def test_the_gauge_and_the_order_of_ends_change_nothing() -> None:
+    graph, _ = drawn(translations=False, planar=False)
+    new = slice(first(graph, KNOWN).num_edges, None)
+    swapped = {name: getattr(graph, name).clone() for name in ("source", "target", "target_from_source")}
+    closure = torch.nonzero(~graph.is_odometry[new])[:, 0] + new.start
+    some = closure[::2]
+    swapped["source"][some], swapped["target"][some] = graph.target[some], graph.source[some]
+    swapped["target_from_source"][some] = rotations.inverse(graph.target_from_source[some])
+    before = solve(first(graph, KNOWN), profile="slam")
+    memory = before.memory
+    assert isinstance(memory, SlamMemory)
+    given = {"profile": "slam", "memory": replace(memory, update_work=1e9), "work": 1e4}
+    start = grown(graph, before)
+    gauge = rotations.exp(torch.tensor([0.3, -0.2, 0.9], dtype=torch.float64))
+    plain = solve(graph, warm_start=start, **given)
+    turned = solve(replace(graph, **swapped), warm_start=rotations.multiply(start, gauge.expand_as(start)), **given)
+    assert turned_deg(plain, turned).max() < 1e-6
+    torch.testing.assert_close(plain.outlier_score, turned.outlier_score, atol=1e-9, rtol=0)
+
+
+def test_what_is_not_reckoned_in_yet_has_a_score_by_its_residual() -> None:
+    graph, is_false = drawn(translations=True, planar=True)
+    before = solve(first(graph, KNOWN), profile="slam")
+    memory = before.memory
+    assert isinstance(memory, SlamMemory)
+    memory = replace(memory, update_work=1e9)
+    quick = solve(graph, profile="slam", warm_start=grown(graph, before), memory=memory, work=0.0)
+    assert isinstance(quick.memory, SlamMemory) and quick.memory.columns is not None
+    assert len(quick.memory.columns.edge) == 1
+    new = np.flatnonzero((np.arange(graph.num_edges) >= memory.graph.num_edges) & ~graph.is_odometry.numpy())
+    flagged = (quick.outlier_score > 0.5).numpy()[new]
+    assert (flagged == is_false[new]).mean() > 0.8
