@@ -35,8 +35,8 @@ Solver = Callable[..., "Solution"]
 # The signature of :func:`rotavg_ros.solver.advance`.
 Advance = Callable[[object | None, float], float]
 
-# About a tenth of a second before an answer, and one after it.
-TICK_WORK = 100.0
+# About a tenth of a second before an answer, and two after it.
+TICK_WORK, WORK_AFTER = 100.0, 200.0
 
 
 class TickAbandonedError(Exception):
@@ -312,7 +312,7 @@ class OnlineEstimator:
             free_memory.give_back_after(len(answer.source), answer.stage_seconds)
             return replace(answer, seconds=time.perf_counter() - started)
 
-    def go_on(self, work: float = TICK_WORK) -> float:
+    def go_on(self, work: float = WORK_AFTER) -> float:
         """After a tick, with what it has left; the next one goes by it.
 
         Args:

@@ -33,7 +33,8 @@ class Solving:
     """Jobs for the workers, and :meth:`reset`, which takes milliseconds.
 
     Attributes:
-        tick_budget_s: what a tick may take where it can stop, half of it before its answer; inf by itself.
+        tick_budget_s: what may be spent after a tick's answer on what that has left, and half as much before it; inf by
+            itself.
 
     Those that a service asks for return what to tell the caller, or raise.
 
@@ -87,7 +88,7 @@ class Solving:
     def _go_on(self) -> None:
         """What the tick has left, once its answer is out."""
         started = time.perf_counter()
-        work = self._estimator.go_on(self._budget.units(self.tick_budget_s / 2))
+        work = self._estimator.go_on(self._budget.units(self.tick_budget_s))
         self._budget.learn(time.perf_counter() - started, work)
 
     def _tick_and_go_on(self) -> None:
