@@ -13,7 +13,7 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.benchmark import report, schedule
 from rotavg_ros.evaluation.benchmark.measure import ENOUGH_S
 from rotavg_ros.evaluation.common.tables import Report, Table
-from rotavg_ros.evaluation.live import long_run
+from rotavg_ros.evaluation.live import long_run, ticks
 from rotavg_ros.results import make_folder
 
 # The load average below which nothing else ran to speak of.
@@ -55,6 +55,17 @@ runs beside the node.
 `{command}`
 """
 
+_TICKS_INTRODUCTION = """\
+The estimator in this process, and iSAM2 (GTSAM) after it, on a simulated city of {keyframes} keyframes with as many
+loop closures, a tenth of them false; two keyframes a tick go on coming, with two closures. An answer is of all
+keyframes: ours orientations and flags, or poses; iSAM2's poses. What goes on after an answer is at most 200 units of
+work, about a millisecond each. iSAM2 knows the noise's deviations, has Cauchy's loss on closures and judges none.
+Wall-clock milliseconds; loops beside them that keep a core busy each: {busy}. The load average was {load} before the
+run.
+
+`{command}`
+"""
+
 _HOURS_INTRODUCTION = """\
 The estimator in this process: odometry at 50 Hz of a robot that drives a figure of eight of 200 s again and again, a
 loop closure a second to a moment some laps ago, 20 % of them false, a tick every five minutes. Memory is what the
@@ -77,6 +88,8 @@ def run(arguments: argparse.Namespace) -> int:
     make_folder(arguments.output)
     if arguments.hours is not None:
         print(_long_run(arguments))
+    elif arguments.ticks is not None:
+        print(_ticks(arguments))
     elif arguments.small:
         print(_small(arguments))
     else:
@@ -88,14 +101,18 @@ def _check(arguments: argparse.Namespace) -> None:
     """An option of another kind of run would pass unheard."""
     hours, several = arguments.hours is not None, len(arguments.keyframes or ()) > 1
     is_live = (arguments.soak and not hours) or arguments.small
+    of_ticks = arguments.ticks is not None
     for option, is_heard, remedy in (
         ("--hours", arguments.soak, "add --soak"),
         ("--max-keyframes", arguments.soak and hours, "add --soak --hours H"),
         ("--seconds", is_live, "give it with --small, or with --soak and without --hours"),
-        ("--keyframes", is_live, "give it with --small, or with --soak and without --hours"),
+        ("--keyframes", is_live or of_ticks, "give it with --small or --ticks, or with --soak and without --hours"),
+        ("--busy", of_ticks, "add --ticks N"),
     ):
         if getattr(arguments, option[2:].replace("-", "_")) is not None and not is_heard:
             raise BenchmarkUsageError(f"{option} means nothing here; {remedy}")
+    if of_ticks and (arguments.soak or arguments.small or several):
+        raise BenchmarkUsageError("--ticks is a run of its own, of one size; leave --soak and --small out")
     if arguments.soak and (arguments.small or several):
         raise BenchmarkUsageError("--soak is of one size, on all cores; give --small without it")
     if arguments.min_pairs > arguments.max_pairs:
@@ -156,6 +173,20 @@ def _small(arguments: argparse.Namespace) -> Path:
     introduction = _SMALL_INTRODUCTION.format(load=load, command=arguments.command_line)
     tables = {"benchmark-small": small_robots.table(rows)}
     return Report("benchmark-small", "The node on a small machine", introduction, tables).write(arguments.output)
+
+
+def _ticks(arguments: argparse.Namespace) -> Path:
+    load = _load()
+    (keyframes,) = arguments.keyframes or (SOAK_KEYFRAMES,)
+    if arguments.threads is None:
+        torch.set_num_threads(1)
+    drive = ticks.Drive(keyframes, arguments.ticks, arguments.busy or 0)
+    rows = ticks.run(drive, lambda numbers: progress(numbers, description="ticks", unit="tick"))
+    introduction = _TICKS_INTRODUCTION.format(
+        keyframes=keyframes, busy=drive.busy, load=load, command=arguments.command_line
+    )
+    name = f"benchmark-ticks-{keyframes}" + (f"-busy-{drive.busy}" if drive.busy else "")
+    return Report(name, "Ticks beside iSAM2", introduction, {name: ticks.table(rows)}).write(arguments.output)
 
 
 def _long_run(arguments: argparse.Namespace) -> Path:

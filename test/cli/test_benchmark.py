@@ -40,16 +40,28 @@ def test_hours_of_driving_with_a_limit(tmp_path: Path) -> None:
     assert float(last["error °"]) < 0.8 * float(last["odometry's °"])
 
 
+def test_ticks_beside_isam2(tmp_path: Path) -> None:
+    options = ["--ticks", "12", "--keyframes", "150", "--busy", "1"]
+    assert main(["benchmark", *options, "--output", str(tmp_path)]) == 0
+    with (tmp_path / "benchmark-ticks-150-busy-1.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["ticks"] for row in rows] == ["12"] * 3
+    assert all(float(row["last answer's error °"]) < 3 for row in rows)
+    assert all(0 < float(row["answer p50 ms"]) <= float(row["answer max ms"]) for row in rows)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        ("--busy 2", "--busy means nothing here; add --ticks N"),
+        ("--ticks 10 --soak", "--ticks is a run of its own, of one size"),
         ("--hours 1", "--hours means nothing here; add --soak"),
         ("--max-keyframes 100", "--max-keyframes means nothing here; add --soak --hours H"),
         ("--soak --max-keyframes 100", "--max-keyframes means nothing here"),
         ("--soak --hours 1 --seconds 3", "--seconds means nothing here"),
         ("--soak --keyframes 10 20", "--soak is of one size, on all cores; give --small without it"),
         ("--soak --small", "--soak is of one size, on all cores; give --small without it"),
-        ("--keyframes 100", "--keyframes means nothing here; give it with --small, or with --soak and without --hours"),
+        ("--keyframes 100", "--keyframes means nothing here; give it with --small or --ticks, or with --soak"),
         ("--soak --hours -1", "--hours: is -1; it must be positive"),
         ("--soak --hours 1 --max-keyframes 0", "--max-keyframes: is 0; it must be 1 or more"),
         ("--min-pairs 100 --max-pairs 10", "--min-pairs 100 is more than --max-pairs 10"),

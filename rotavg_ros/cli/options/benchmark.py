@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rotavg_ros.cli.arguments import positive_number, positive_whole_number, thread_count
+from rotavg_ros.cli.arguments import positive_number, positive_whole_number, thread_count, whole_number
 from rotavg_ros.evaluation.names import BENCHMARK_CONTENDERS, BENCHMARK_FAMILIES
 
 SOAK_KEYFRAMES, SOAK_SECONDS = 10_000, 60.0
@@ -61,6 +61,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--soak", action="store_true", help="the node under load instead of the solvers")
     parser.add_argument("--small", action="store_true", help="the node on one core and on two instead")
     parser.add_argument(
+        "--ticks",
+        type=positive_whole_number,
+        metavar="N",
+        help="so many ticks of the estimator beside iSAM2's instead, on a graph that grows",
+    )
+    parser.add_argument(
+        "--busy",
+        type=whole_number,
+        metavar="N",
+        help="of --ticks: so many loops beside them, each on a core (default: 0)",
+    )
+    parser.add_argument(
         "--seconds", type=positive_number, metavar="S", help=f"of each run of a node (default: {SOAK_SECONDS:g})"
     )
     parser.add_argument(
@@ -68,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=positive_whole_number,
         nargs="+",
         metavar="N",
-        help=f"of a soak (default: {SOAK_KEYFRAMES}), or several, of --small "
+        help=f"of a soak, and before --ticks (default: {SOAK_KEYFRAMES}), or several, of --small "
         f"(default: {' '.join(map(str, SMALL_KEYFRAMES))})",
     )
     parser.add_argument(

@@ -11,15 +11,14 @@ import torch
 from rotavg_ros import rotations
 from rotavg_ros.baselines.start import start_orientations
 from rotavg_ros.evaluation.common.cases import Case
+from rotavg_ros.evaluation.live.feed import Feed
 from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.online.estimator import OnlineEstimator
-from rotavg_ros.online.measurements import EdgeMeasurement, KeyframeReference
 from rotavg_ros.online.options import EstimatorOptions
 
 KEYFRAMES_PER_TICK = 10
 # Early on a truth of few keyframes says little, and nothing can be known yet.
 SETTLED_KEYFRAMES = 2000
-_ROBOT = "robot"
 
 
 @dataclass(frozen=True)
@@ -72,31 +71,13 @@ def play(
     is_closure, is_false, is_good = (mask.numpy() for mask in (case.is_closure, case.is_false, case.is_good))
     options = options or EstimatorOptions(keyframe_source="edges", gauge="identity")
     estimator = OnlineEstimator(options)
-    arrival = torch.maximum(graph.source, graph.target).numpy()
-    # Odometry makes the keyframes that closures of the same moment refer to.
-    order = np.lexsort((is_closure, arrival))
-    odometry = start_orientations(graph, None)[0]
-    source, target = graph.source.tolist(), graph.target.tolist()
-    rotation, kind = graph.target_from_source.tolist(), graph.kind.tolist()
-    precision = torch.nan_to_num(graph.precision).tolist()
-    translation = [None] * graph.num_edges if graph.translation is None else graph.translation.tolist()
+    feed = Feed(graph, estimator)
+    arrival, odometry = feed.arrival, start_orientations(graph, None)[0]
     flags, orientations = np.zeros(graph.num_edges, dtype=bool), rotations.identity(0)
-    given, rows = 0, []
+    rows = []
     ends = [*range(KEYFRAMES_PER_TICK, graph.num_nodes, KEYFRAMES_PER_TICK), graph.num_nodes]
     for end in watch(ends):
-        for edge in order[given : np.searchsorted(arrival[order], end)].tolist():
-            estimator.add_edge(
-                EdgeMeasurement(
-                    edge,
-                    KeyframeReference(_ROBOT, source[edge]),
-                    KeyframeReference(_ROBOT, target[edge]),
-                    rotation[edge],
-                    kind[edge],
-                    precision[edge],
-                    translation[edge],
-                )
-            )
-            given += 1
+        feed.until(end)
         answer = estimator.tick()
         estimator.go_on()
         if answer is None:

@@ -73,37 +73,57 @@ def gnc_on_poses(graph: ViewGraph, sigma: FloatArray, odometry: tuple[FloatArray
     return _answer(words, found, graph.num_nodes, clock, score)
 
 
-def isam2_on_poses(graph: ViewGraph, sigma: FloatArray, odometry: tuple[FloatArray, FloatArray]) -> Answer:
-    """iSAM2 with Cauchy's loss on closures, one update per node; it judges no edges.
+class Isam2:
+    """iSAM2 with Cauchy's loss on closures, one update per node.
 
     Args:
         graph: one chain of odometry through all nodes in their order, every edge with a translation.
         sigma: ``(M, 2)`` rad and metres per component, what it is told.
         odometry: positions ``(N, 3)`` metres and world_from_body ``(N, 4)`` xyzw along it.
     """
-    gtsam = load("gtsam")
-    words = _words(gtsam, is_planar(graph))
-    start = [words.pose(q, p) for p, q in zip(*odometry, strict=True)]
-    loss = gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY_THRESHOLD)
-    factors = [*_between_factors(gtsam, words, graph, sigma, loss)]
-    arrival = np.maximum(graph.source.numpy(), graph.target.numpy())
-    by_arrival = np.argsort(arrival, kind="stable")
-    bounds = np.searchsorted(arrival[by_arrival], np.arange(graph.num_nodes + 1))
-    isam = gtsam.ISAM2(gtsam.ISAM2Params())
-    clock = Clock()
-    last = start[0]
-    for node in range(graph.num_nodes):
+
+    def __init__(self, graph: ViewGraph, sigma: FloatArray, odometry: tuple[FloatArray, FloatArray]) -> None:
+        self._gtsam = gtsam = load("gtsam")
+        self._words = words = _words(gtsam, is_planar(graph))
+        self._start = [words.pose(q, p) for p, q in zip(*odometry, strict=True)]
+        loss = gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY_THRESHOLD)
+        self._factors = [*_between_factors(gtsam, words, graph, sigma, loss)]
+        arrival = np.maximum(graph.source.numpy(), graph.target.numpy())
+        self._by_arrival = np.argsort(arrival, kind="stable")
+        self._bounds = np.searchsorted(arrival[self._by_arrival], np.arange(graph.num_nodes + 1))
+        self._isam = gtsam.ISAM2(gtsam.ISAM2Params())
+        self._last, self._node = self._start[0], 0
+
+    def add_node(self, clock: Clock) -> None:
+        """The next node with its edges; what iSAM2 needs for it is counted."""
+        gtsam, words, node = self._gtsam, self._words, self._node
         added, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for edge in by_arrival[bounds[node] : bounds[node + 1]].tolist():
-            added.add(factors[edge])
+        for edge in self._by_arrival[self._bounds[node] : self._bounds[node + 1]].tolist():
+            added.add(self._factors[edge])
         if node == 0:
-            added.add(_anchor(gtsam, words, start[0]))
-        step = start[max(node - 1, 0)].between(start[node])
+            added.add(_anchor(gtsam, words, self._start[0]))
+        step = self._start[max(node - 1, 0)].between(self._start[node])
         with timed(clock):
-            values.insert(node, last.compose(step))
-            isam.update(added, values)
-            last = words.at(isam, node)
-    return _answer(words, isam.calculateEstimate(), graph.num_nodes, clock, None)
+            values.insert(node, self._last.compose(step))
+            self._isam.update(added, values)
+            self._last = words.at(self._isam, node)
+        self._node += 1
+
+    def estimate(self) -> Any:
+        """All poses so far, GTSAM's values."""
+        return self._isam.calculateEstimate()
+
+    def answer(self, clock: Clock) -> Answer:
+        """The same as every peer has it; it judges no edges."""
+        return _answer(self._words, self.estimate(), self._node, clock, None)
+
+
+def isam2_on_poses(graph: ViewGraph, sigma: FloatArray, odometry: tuple[FloatArray, FloatArray]) -> Answer:
+    """:class:`Isam2` on all of a graph."""
+    isam, clock = Isam2(graph, sigma, odometry), Clock()
+    for _ in range(graph.num_nodes):
+        isam.add_node(clock)
+    return isam.answer(clock)
 
 
 def _words(gtsam: Any, planar: bool) -> _Poses:

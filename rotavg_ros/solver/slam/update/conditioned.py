@@ -326,15 +326,17 @@ class _System:
         pull = np.zeros((count, d, q))
         pull[accepted] = np.linalg.solve(among, self.residual[:count][accepted].reshape(-1, q)).reshape(-1, d, q)
         step = (columns.value.reshape(-1, count * d) @ pull.reshape(-1, q)).reshape(-1, d, q)
-        walked = self._walked(np.arange(len(self.anchor))[None], np.ones(1), count)
-        turn = self._at_nodes(0, step[:, :k]) + np.einsum("nc,cdq->ndq", walked[0], pull[:, :k])
+        new = np.arange(linear.num_nodes, len(self.anchor))
+        walked = self._walked(new[None], np.ones(1), count)
+        turn = self._at_nodes(0, step[:, :k])
+        turn[new] += np.einsum("nc,cdq->ndq", walked[0], pull[:, :k])
         turn = turn[:, 0] if linear.turns is None else turn[:, :, 0] @ linear.turns.T
         rotated = rotations.exp(torch.from_numpy(turn))
         orientation = rotations.normalize(rotations.multiply(self.laid.body_from_world, rotated))
         if linear.shifts is None or self.laid.position is None:
             return replace(self.laid, body_from_world=orientation)
         shift = self._at_nodes(1, step[:, k:])[:, :, 0] @ linear.shifts.T
-        shift += np.einsum("nc,cd->nd", walked[1], pull[:, k:, 0]) @ linear.shifts.T
+        shift[new] += np.einsum("nc,cd->nd", walked[1], pull[:, k:, 0]) @ linear.shifts.T
         # The way from its anchor turns with that.
         at_anchor = rotations.inverse(rotated[torch.from_numpy(self.anchor)])
         shift += rotations.rotate(at_anchor, torch.from_numpy(self.way)).numpy() - self.way
