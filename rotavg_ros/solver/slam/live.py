@@ -60,7 +60,9 @@ def update_slam(graph: ViewGraph, memory: SlamMemory, run: Run) -> Estimate | No
         if was_anew and _is_same(found.memory.graph, graph):
             return found
         with run.watch.stage("update"):
-            known = _caught_up(graph, found.memory, run) or replace(known, ahead=None, anew=False)
+            known = _caught_up(graph, _going_on_from(found.memory, graph, known, run), run)
+        if known is None:
+            return None
         known = _searched_ahead(graph, known, run)
     with run.watch.stage("update"):
         return _laid_on(graph, known, math.inf if run.work is None else run.work)
@@ -88,6 +90,16 @@ def _searched_ahead(graph: ViewGraph, known: SlamMemory, run: Run) -> SlamMemory
     return replace(known, ahead=Resumable(partial(whole, graph, SlamStages(), own)), anew=run.anew)
 
 
+def _going_on_from(found: SlamMemory, graph: ViewGraph, known: SlamMemory, run: Run) -> SlamMemory:
+    """What is known once a whole search has ended: what came meanwhile counts as it did until it is solved from there."""
+    found = replace(found, update_work=known.update_work)
+    if _num_new_closures(graph, found) == 0:
+        return found
+    searched = replace(known, searched=found.searched, is_divided=found.is_divided, unexplained=0)
+    update = Resumable(partial(_updated, graph, found, _by_itself(run)))
+    return replace(searched, ahead=None, anew=False, update=update)
+
+
 def _is_same(graph: ViewGraph, other: ViewGraph) -> bool:
     return (graph.num_nodes, graph.num_edges) == (other.num_nodes, other.num_edges)
 
@@ -107,12 +119,12 @@ def _caught_up(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | N
         while True:
             if not known.is_grown_to(graph):
                 return None
-            new = slice(known.graph.num_edges, graph.num_edges)
-            hangs_on = _growth(graph, known, known.graph) is not None
-            if hangs_on and bool(graph.is_odometry[new].all()):
-                return known
             update = known.update
-            if update is None or update.has_failed:
+            has_none = update is None or update.has_failed
+            hangs_on = _growth(graph, known, known.graph) is not None
+            if has_none and hangs_on and _num_new_closures(graph, known) == 0:
+                return replace(known, update=None)
+            if update is None or has_none:
                 before = replace(known, ahead=None, update=None, columns=None)
                 update = Resumable(partial(_updated, graph, before, _by_itself(run)))
             # What hangs otherwise cannot be laid on meanwhile.
