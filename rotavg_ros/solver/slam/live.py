@@ -91,7 +91,7 @@ def _searched_ahead(graph: ViewGraph, known: SlamMemory, run: Run) -> SlamMemory
 
 
 def _going_on_from(found: SlamMemory, graph: ViewGraph, known: SlamMemory, run: Run) -> SlamMemory:
-    """What is known once a whole search has ended: what came meanwhile counts as it did until it is solved from there."""
+    """What is known after a whole search: what came meanwhile counts as it did until it is solved from there."""
     found = replace(found, update_work=known.update_work)
     if _num_new_closures(graph, found) == 0:
         return found
