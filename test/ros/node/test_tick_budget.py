@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 
 pytest.importorskip("rclpy")
@@ -15,10 +13,10 @@ def test_units_go_by_what_ticks_have_cost() -> None:
     budget = TickBudget()
     assert budget.units(0.2) == pytest.approx(200.0)  # a millisecond each, before any has told
     for seconds in (0.4, 0.5, 30.0):  # once the machine was asleep
-        budget.learn(SimpleNamespace(work=100.0, seconds=seconds))
+        budget.learn(seconds, 100.0)
     assert budget.units(0.2) == pytest.approx(40.0)
-    budget.learn(SimpleNamespace(work=1.0, seconds=1.0))  # a tick that hardly solved
+    budget.learn(1.0, 1.0)  # a tick that hardly solved
     assert budget.units(0.2) == pytest.approx(40.0)
     for _ in range(50):
-        budget.learn(SimpleNamespace(work=100.0, seconds=0.05))
+        budget.learn(0.05, 100.0)
     assert budget.units(0.2) == pytest.approx(400.0)
