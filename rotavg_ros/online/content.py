@@ -209,7 +209,10 @@ class Content:
         waited = len(last.queue)
         # In silence the answer comes to what a solve from scratch says, beside ticks where the solver can do that.
         is_last = idle and not waited
-        anew = is_last and not force_cold and self.builder.options.warm_start and self._memory is not None
+        may_go_on = self.builder.options.warm_start and self._memory is not None
+        anew = is_last and not force_cold and may_go_on
+        if anew and self.is_behind:  # the last tick failed: what is new comes first
+            is_last = anew = False
         if force_cold or (is_last and not anew):
             last.queue.let_in_all(snapshot.graph)
         else:
