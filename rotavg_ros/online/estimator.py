@@ -35,8 +35,8 @@ Solver = Callable[..., "Solution"]
 # The signature of :func:`rotavg_ros.solver.advance`.
 Advance = Callable[[object | None, float], float]
 
-# About a tenth of a second before an answer, and two after it.
-TICK_WORK, WORK_AFTER = 100.0, 200.0
+# Some hundredths of a second before an answer, two tenths after it.
+TICK_WORK, WORK_AFTER = 30.0, 200.0
 
 
 class TickAbandonedError(Exception):

@@ -97,8 +97,8 @@ class NodeParameters:
     )
     tick_budget_s: float = option(
         0.2,
-        "what may be spent after a tick's answer on solves that take longer than a tick, and half as much before it; "
-        "one factorisation may take longer",
+        "what may be spent after a tick's answer on solves that take longer than 15 % of it, which may be spent "
+        "before; one factorisation may take longer",
         within=(0.0, 3600.0),
         live=True,
     )

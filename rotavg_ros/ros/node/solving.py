@@ -17,7 +17,7 @@ from rclpy.node import Node
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import Answer, Discarded, OnlineEstimator
 from rotavg_ros.online.answer.joins import joins
-from rotavg_ros.online.estimator import TickAbandonedError
+from rotavg_ros.online.estimator import TICK_WORK, WORK_AFTER, TickAbandonedError
 from rotavg_ros.online.state.file import StateFileError, StateFileInUseError, check_kind, remove_leftovers
 from rotavg_ros.online.state.lock import StateFileLock
 from rotavg_ros.ros.node.diagnostics import KEPT, NOT_KEPT
@@ -27,13 +27,15 @@ from rotavg_ros.ros.node.output.outputs import Outputs
 from rotavg_ros.ros.node.tick_budget import TickBudget
 
 _LOG_PERIOD_S = 5.0
+# Of a tick's budget, before its answer.
+_BEFORE = TICK_WORK / WORK_AFTER
 
 
 class Solving:
     """Jobs for the workers, and :meth:`reset`, which takes milliseconds.
 
     Attributes:
-        tick_budget_s: what may be spent after a tick's answer on what that has left, and half as much before it; inf by
+        tick_budget_s: what may be spent after a tick's answer on what that has left; a part of it before it. Inf by
             itself.
 
     Those that a service asks for return what to tell the caller, or raise.
@@ -71,7 +73,7 @@ class Solving:
         if self._estimator.is_behind:
             health.fell_behind()
         try:
-            answer = self._estimator.tick(force_cold, self._budget.units(self.tick_budget_s / 2))
+            answer = self._estimator.tick(force_cold, self._budget.units(_BEFORE * self.tick_budget_s))
         except TickAbandonedError:
             raise
         except Exception as error:

@@ -239,8 +239,12 @@ def _with_closures(
         places = replace(
             places,
             position=torch.from_numpy(laid.position),
+            variance=torch.from_numpy(laid.variance[1]),
             rotation_score=merged(places.rotation_score, told.rotation_score),
             precision=merged(places.precision, np.where((told.score > _FLAGGED)[:, None], 0.0, weight)),
         )
     score = merged(estimate.outlier_score, told.score)
-    return replace(estimate, body_from_world=laid.body_from_world, outlier_score=score, places=places)
+    variance = torch.from_numpy(laid.variance[0])
+    return replace(
+        estimate, body_from_world=laid.body_from_world, outlier_score=score, variance=variance, places=places
+    )

@@ -29,6 +29,8 @@ from rotavg_ros.view_graph import ViewGraph
 _AT_ONCE = 8
 # Which of the new closures are good is asked so many times, given those that were last.
 _ROUNDS = 3
+# Both variances are estimates: what closures tell leaves so much of them at least.
+_SUREST = 0.02
 # A walk's heading errs along its way by a third of the variance at its end, across two components of three or one.
 _WALK, _ACROSS = 3.0, 0.5
 
@@ -323,6 +325,7 @@ class _System:
         linear, d, k, count = self.linear, self.linear.size, self._widths[0], len(accepted)
         q = self.residual.shape[2]
         among = covariance[accepted][:, :, accepted].reshape(-1, accepted.sum() * d)
+        laid = replace(self.laid, variance=self._surer(columns, np.linalg.inv((among + among.T) / 2), accepted))
         pull = np.zeros((count, d, q))
         pull[accepted] = np.linalg.solve(among, self.residual[:count][accepted].reshape(-1, q)).reshape(-1, d, q)
         step = (columns.value.reshape(-1, count * d) @ pull.reshape(-1, q)).reshape(-1, d, q)
@@ -334,19 +337,47 @@ class _System:
         rotated = rotations.exp(torch.from_numpy(turn))
         orientation = rotations.normalize(rotations.multiply(self.laid.body_from_world, rotated))
         if linear.shifts is None or self.laid.position is None:
-            return replace(self.laid, body_from_world=orientation)
+            return replace(laid, body_from_world=orientation)
         shift = self._at_nodes(1, step[:, k:])[:, :, 0] @ linear.shifts.T
         shift[new] += np.einsum("nc,cd->nd", walked[1], pull[:, k:, 0]) @ linear.shifts.T
         # The way from its anchor turns with that.
         at_anchor = rotations.inverse(rotated[torch.from_numpy(self.anchor)])
         shift += rotations.rotate(at_anchor, torch.from_numpy(self.way)).numpy() - self.way
-        return replace(self.laid, body_from_world=orientation, position=self.laid.position + shift)
+        return replace(laid, body_from_world=orientation, position=self.laid.position + shift)
 
-    def _at_nodes(self, kind: int, step: np.ndarray) -> np.ndarray:
-        """``(N', …)`` of unknowns ``(K + R, …)``, at the nodes that all nodes move with."""
-        linear = self.linear
-        share = linear.share[kind][self.anchor][:, None, None]
-        return np.asarray((1 - share) * step[linear.above[self.anchor]] + share * step[linear.below[self.anchor]])
+    def _surer(self, columns: Columns, precision: np.ndarray, accepted: np.ndarray) -> np.ndarray:
+        """``(2, N')`` rad², m² of nodes, of new ones with what ``accepted`` closures tell of them; no older one is less sure.
+
+        Args:
+            columns: of n closures.
+            precision: ``(a d, a d)`` S⁻¹ of those that are accepted.
+            accepted: ``(n,)`` bool.
+        """
+        linear, d, (k, m), count = self.linear, self.linear.size, self._widths, len(accepted)
+        new = np.arange(linear.num_nodes, len(self.anchor))
+        value = columns.value.reshape(-1, d, count * d)
+        walked = self._walked(new[None], np.ones(1), count)
+        told = [self._at_nodes(kind, value, new) for kind in (0, 1)]
+        both = np.concatenate((told[0][:, :k], told[1][:, k:]), axis=1).reshape(len(new), d, count, d)
+        if m:
+            lever = self._crossed(self.way[new])
+            both[:, k:] += np.einsum("nmk,nkcd->nmcd", lever, both[:, :k])
+        for axis, kind in enumerate(np.repeat([0, 1], (k, m))):
+            both[:, axis, :, axis] += walked[kind]
+        both = both[:, :, accepted].reshape(len(new), d, -1)
+        fallen = np.einsum("nac,cb,nab->na", both, precision, both, optimize=True)
+        variance = self.laid.variance.copy()
+        for kind, part in enumerate((fallen[:, :k], fallen[:, k:])):
+            if part.shape[1]:
+                before = variance[kind, new]
+                variance[kind, new] = np.maximum(before - part.mean(axis=1), _SUREST * before)
+        return variance
+
+    def _at_nodes(self, kind: int, step: np.ndarray, nodes: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """``(N', …)`` of unknowns ``(K + R, …)``, at the nodes that all nodes, or some, move with."""
+        linear, anchor = self.linear, self.anchor[nodes]
+        share = linear.share[kind][anchor][:, None, None]
+        return np.asarray((1 - share) * step[linear.above[anchor]] + share * step[linear.below[anchor]])
 
 
 def _log_normal(mean: np.ndarray, covariance: np.ndarray, times: int) -> np.ndarray:

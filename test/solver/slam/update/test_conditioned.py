@@ -75,6 +75,11 @@ def test_it_is_near_the_solve_that_follows(translations: bool, planar: bool) -> 
     off, without = turned_deg(quick, after), turned_deg(odometry, after)
     assert off[KNOWN:].mean() < 0.4 * without[KNOWN:].mean()
     assert off.mean() < 0.3 * np.degrees(float(after.uncertainty.mean()))
+    # New keyframes are surer by it, about as sure as they turn out to be.
+    surer = [float(one.uncertainty[KNOWN:].mean()) for one in (odometry, quick, after)]
+    assert surer[1] < 0.9 * surer[0]
+    assert 0.7 < surer[1] / surer[2] < 1.4
+    torch.testing.assert_close(quick.uncertainty[:KNOWN], odometry.uncertainty[:KNOWN])
     if translations:
         assert quick.position is not None and after.position is not None and odometry.position is not None
         moved, missed = ((one.position - after.position).norm(dim=1)[KNOWN:].mean() for one in (quick, odometry))
