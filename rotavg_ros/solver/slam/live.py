@@ -245,6 +245,5 @@ def _with_closures(
         )
     score = merged(estimate.outlier_score, told.score)
     variance = torch.from_numpy(laid.variance[0])
-    return replace(
-        estimate, body_from_world=laid.body_from_world, outlier_score=score, variance=variance, places=places
-    )
+    estimate = replace(estimate, body_from_world=laid.body_from_world, variance=variance)
+    return replace(estimate, outlier_score=score, places=places)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.estimate import Estimate, Run
+from rotavg_ros.solver.running.work import metered
 from rotavg_ros.solver.slam import stages as slam_stages
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.fine_net.tuning import all_fine_tuned, fine_tuned
@@ -24,6 +25,9 @@ from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.preparation import Prepared, prepare
 from rotavg_ros.solver.slam.update.memory import SlamMemory, estimate_of, with_poses
 from rotavg_ros.view_graph import ViewGraph
+
+# Of the work of a whole solve, what an update takes about, before one has told.
+_UPDATE = 0.1
 
 
 def solve_slam(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
@@ -65,6 +69,15 @@ def whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
 
     The graph is drawn together and cleaned as often as odometry may be biased.
     """
+    with metered() as meter:
+        estimate = _whole(graph, stages, run)
+    memory = estimate.memory
+    if not isinstance(memory, SlamMemory):
+        return estimate
+    return replace(estimate, memory=replace(memory, update_work=_UPDATE * meter.spent))
+
+
+def _whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     with run.watch.stage("refine"):
         found = search(graph, _clean_net(stages, run), partial(_begin, stages, run), stages.without)
         fine_net = None if "fine-net" in stages.without else run.networks.load(SlamFineNet)

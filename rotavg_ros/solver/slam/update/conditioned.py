@@ -346,7 +346,7 @@ class _System:
         return replace(laid, body_from_world=orientation, position=self.laid.position + shift)
 
     def _surer(self, columns: Columns, precision: np.ndarray, accepted: np.ndarray) -> np.ndarray:
-        """``(2, N')`` rad², m² of nodes, of new ones with what ``accepted`` closures tell of them; no older one is less sure.
+        """``(2, N')`` rad², m² of nodes: of new ones with what ``accepted`` closures tell; older ones stay as they were.
 
         Args:
             columns: of n closures.
@@ -364,9 +364,9 @@ class _System:
             both[:, k:] += np.einsum("nmk,nkcd->nmcd", lever, both[:, :k])
         for axis, kind in enumerate(np.repeat([0, 1], (k, m))):
             both[:, axis, :, axis] += walked[kind]
-        both = both[:, :, accepted].reshape(len(new), d, -1)
-        fallen = np.einsum("nac,cb,nab->na", both, precision, both, optimize=True)
-        variance = self.laid.variance.copy()
+        pulled = both[:, :, accepted].reshape(len(new), d, -1)
+        fallen = ((pulled @ precision) * pulled).sum(axis=2)
+        variance: np.ndarray = self.laid.variance.copy()
         for kind, part in enumerate((fallen[:, :k], fallen[:, k:])):
             if part.shape[1]:
                 before = variance[kind, new]
