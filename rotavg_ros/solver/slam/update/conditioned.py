@@ -346,7 +346,7 @@ class _System:
         return replace(laid, body_from_world=orientation, position=self.laid.position + shift)
 
     def _surer(self, columns: Columns, precision: np.ndarray, accepted: np.ndarray) -> np.ndarray:
-        """``(2, N')`` rad², m² of nodes: of new ones with what ``accepted`` closures tell; older ones stay as they were.
+        """``(2, N')`` rad², m² of nodes: of new ones with what closures tell of them; older ones stay as they were.
 
         Args:
             columns: of n closures.
