@@ -26,8 +26,9 @@ for now in range(LAPS * LAP):
         source, target = (KeyframeReference("robot", stamp_ns=pose * PERIOD_NS) for pose in (now - LAP, now))
         estimator.add_edge(EdgeMeasurement.from_ros(now, source, target, seen.as_quat()))
     if now % 10 == 0:
-        estimator.tick()  # solves if there is anything new; the robot's corrected orientation is then
+        estimator.tick()  # answers what is new; the robot's corrected orientation is then
         latest = estimator.current_orientation("robot")  # xyzw, world_from_body, up to the last odometry
+        estimator.go_on()  # with what takes longer than a tick may; the next one goes by it
 
 answer = estimator.tick(force_cold=True)  # all of it once more: what `rotavg solve` says of the same graph
 corrected, pose = Rotation.from_quat(answer.world_from_body), answer.stamp_ns // PERIOD_NS
