@@ -364,7 +364,7 @@ class _System:
             both[:, k:] += np.einsum("nmk,nkcd->nmcd", lever, both[:, :k])
         for axis, kind in enumerate(np.repeat([0, 1], (k, m))):
             both[:, axis, :, axis] += walked[kind]
-        pulled = both[:, :, accepted].reshape(len(new), d, -1)
+        pulled = both[:, :, accepted].reshape(len(new), d, len(precision))
         fallen = ((pulled @ precision) * pulled).sum(axis=2)
         variance: np.ndarray = self.laid.variance.copy()
         for kind, part in enumerate((fallen[:, :k], fallen[:, k:])):

@@ -120,3 +120,27 @@ def test_what_is_not_reckoned_in_yet_has_a_score_by_its_residual() -> None:
     new = np.flatnonzero((np.arange(graph.num_edges) >= memory.graph.num_edges) & ~graph.is_odometry.numpy())
     flagged = (quick.outlier_score > 0.5).numpy()[new]
     assert (flagged == is_false[new]).mean() > 0.8
+
+
+@pytest.mark.parametrize("translations", [False, True])
+@pytest.mark.parametrize("number", [1, 5])
+def test_closures_between_keyframes_that_are_known(translations: bool, number: int) -> None:
+    """Nothing is new but closures: one, and some of them false."""
+    graph, is_false = drawn(translations=translations, planar=False)
+    known = first(graph, KNOWN)
+    closure = torch.nonzero(~known.is_odometry)[:, 0]
+    late = closure[:: len(closure) // number][:number]
+    kept = torch.ones(known.num_edges, dtype=torch.bool)
+    kept[late] = False
+    order = torch.cat((torch.nonzero(kept)[:, 0], late))
+    grown_graph = known.select_edges(order)
+    before = solve(known.select_edges(order[: -len(late)]), profile="slam")
+    memory = before.memory
+    assert isinstance(memory, SlamMemory)
+    given = {"profile": "slam", "warm_start": before.body_from_world, "work": 1e4}
+    quick = solve(grown_graph, **given, memory=replace(memory, update_work=1e9))
+    assert isinstance(quick.memory, SlamMemory) and quick.memory.update is not None
+    after = solve(grown_graph, **{**given, "work": None}, memory=memory)
+    assert turned_deg(quick, after).mean() < 0.1
+    flags = [(one.outlier_score > 0.5).numpy()[-len(late) :] for one in (quick, after)]
+    np.testing.assert_array_equal(*flags)
