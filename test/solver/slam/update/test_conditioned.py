@@ -126,7 +126,7 @@ def test_what_is_not_reckoned_in_yet_has_a_score_by_its_residual() -> None:
 @pytest.mark.parametrize("number", [1, 5])
 def test_closures_between_keyframes_that_are_known(translations: bool, number: int) -> None:
     """Nothing is new but closures: one, and some of them false."""
-    graph, is_false = drawn(translations=translations, planar=False)
+    graph, _ = drawn(translations=translations, planar=False)
     known = first(graph, KNOWN)
     closure = torch.nonzero(~known.is_odometry)[:, 0]
     late = closure[:: len(closure) // number][:number]
