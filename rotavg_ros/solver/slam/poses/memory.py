@@ -99,7 +99,7 @@ class PoseMemory:
         # Beyond its anchor a node's way turns with the anchor's heading, and with its own steps'.
         way = np.linalg.norm(position[self.num_nodes :] - position[growth.anchor], axis=1)
         turned = noise.turn * growth.along(steps[growth.edge])
-        lever = (poses.variance[growth.anchor] + turned / _WALK) * way**2 * _ACROSS
+        lever = (poses.variance[growth.anchor] + turned / WALK) * way**2 * ACROSS
         shifted = lever + noise.way * growth.along(length[growth.edge])
         variance = np.append(poses.variance, poses.variance[growth.anchor] + turned)
         position_variance = np.append(poses.position_variance, poses.position_variance[growth.anchor] + shifted)
@@ -149,4 +149,4 @@ def _lengths_passed(graph: ViewGraph) -> np.ndarray:
 
 # A walk's heading errs along its way by a third of the variance at its end; of a lever's two or three components one
 # lies along the way, which it does not move.
-_WALK, _ACROSS = 3.0, 0.5
+WALK, ACROSS = 3.0, 0.5

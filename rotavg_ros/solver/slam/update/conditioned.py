@@ -20,6 +20,7 @@ from rotavg_ros.solver.algebra.small_matrices import inverse
 from rotavg_ros.solver.running.work import count as count_units
 from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
+from rotavg_ros.solver.slam.poses.memory import ACROSS, WALK
 from rotavg_ros.solver.slam.posterior.densities import log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.update.linear import Linear
@@ -31,8 +32,6 @@ _AT_ONCE = 8
 _ROUNDS = 3
 # Both variances are estimates: what closures tell leaves so much of them at least.
 _SUREST = 0.02
-# A walk's heading errs along its way by a third of the variance at its end, across two components of three or one.
-_WALK, _ACROSS = 3.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -157,7 +156,7 @@ class _System:
         way: ``(N', 3)`` metres from there.
         along: ``(2, N')`` rad², m², by which odometry from there errs.
         residual: ``(n, d, q)``, q = 1, or d = 1 and q = 3 by rotations alone.
-        own: ``(2, n)`` rad², m², of closures.
+        own: ``(2, n)`` rad², m², of good closures, as if all stated what is typical.
         is_known: ``(n,)`` bool, whether their translations are.
     """
 
@@ -186,7 +185,7 @@ class _System:
             step_lengths = torch.linalg.vector_norm(graph.translation, dim=1).nan_to_num().numpy()
             length = growth.along(step_lengths[growth.edge])
         turned = noise.turn * steps
-        lever = turned / _WALK * (way[linear.num_nodes :] ** 2).sum(axis=1) * _ACROSS
+        lever = turned / WALK * (way[linear.num_nodes :] ** 2).sum(axis=1) * ACROSS
         along = np.zeros((2, len(anchor)))
         along[:, linear.num_nodes :] = turned, noise.way * length + lever
         source, target = graph.source[edge], graph.target[edge]
