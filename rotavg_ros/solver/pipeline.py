@@ -180,6 +180,8 @@ def _run(job: _Job, run: Run) -> Estimate:
         estimate = update_slam(job.graph, memory, run)
         if estimate is not None:
             return _with_warnings(job.graph, estimate)
+    if run.anew:  # nothing can be gone on from, and nothing is to be begun with
+        run = replace(run, warm_start=None)
     estimate = _solve_once(job, job.names[-1], run)
     return _with_warnings(job.graph, estimate) if job.profile == "slam" else estimate
 

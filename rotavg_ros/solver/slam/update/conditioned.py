@@ -30,6 +30,8 @@ from rotavg_ros.view_graph import ViewGraph
 _AT_ONCE = 8
 # Which of the new closures are good is asked so many times, given those that were last.
 _ROUNDS = 3
+# The precision of a translation that is not known, in that of one anywhere on the map.
+_NOTHING = 1e-6
 # Both variances are estimates: what closures tell leaves so much of them at least.
 _SUREST = 0.02
 
@@ -324,9 +326,10 @@ class _System:
         linear, d, k, count = self.linear, self.linear.size, self._widths[0], len(accepted)
         q = self.residual.shape[2]
         among = covariance[accepted][:, :, accepted].reshape(-1, accepted.sum() * d)
-        laid = replace(self.laid, variance=self._surer(columns, np.linalg.inv((among + among.T) / 2), accepted))
+        precision = np.linalg.inv((among + among.T) / 2)
+        laid = replace(self.laid, variance=self._surer(columns, precision, accepted))
         pull = np.zeros((count, d, q))
-        pull[accepted] = np.linalg.solve(among, self.residual[:count][accepted].reshape(-1, q)).reshape(-1, d, q)
+        pull[accepted] = (precision @ self.residual[:count][accepted].reshape(-1, q)).reshape(-1, d, q)
         step = (columns.value.reshape(-1, count * d) @ pull.reshape(-1, q)).reshape(-1, d, q)
         new = np.arange(linear.num_nodes, len(self.anchor))
         walked = self._walked(new[None], np.ones(1), count)
@@ -385,7 +388,3 @@ def _log_normal(mean: np.ndarray, covariance: np.ndarray, times: int) -> np.ndar
     square = (mean * np.linalg.solve(covariance, mean)).sum(axis=(1, 2))
     log_det = np.linalg.slogdet(covariance)[1] + size * np.log(2 * np.pi)
     return np.asarray(-(square + times * log_det) / 2)
-
-
-# The precision of a translation that is not known, in that of one anywhere on the map.
-_NOTHING = 1e-6

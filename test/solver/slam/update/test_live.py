@@ -175,3 +175,15 @@ def test_a_solve_from_scratch_goes_on_as_a_search_when_silence_is_broken() -> No
     solution = go_on(until(case.graph, 504), solution, work=1e6)
     assert not solution.is_anew
     assert remembered(solution).ahead is not ahead
+
+
+def test_what_cannot_be_gone_on_from_is_solved_from_scratch_in_silence_too() -> None:
+    """A memory of another graph, as after a compaction, and a start that is no good."""
+    case = drawn("building: 30 % random", 1)
+    before = solve(until(case.graph, 300), profile="slam")
+    graph = until(case.graph, 200)
+    start = torch.nn.functional.normalize(torch.randn(200, 4, generator=torch.Generator().manual_seed(0)).double())
+    found = solve(graph, profile="slam", warm_start=start, memory=before.memory, work=LITTLE, anew=True)
+    cold = solve(graph, profile="slam")
+    assert found.is_anew
+    assert torch.equal(found.body_from_world, cold.body_from_world)
