@@ -83,7 +83,8 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "series": set(),
         "stated_precision": {"priors"},
         "uncertainty": {"priors"},
-        "solve": {"options", "refinement", "series", "stated_precision", "step", "uncertainty"},
+        "consensus": {"priors"},
+        "solve": {"consensus", "options", "refinement", "series", "stated_precision", "step", "uncertainty"},
     },
     "solver/slam": {
         "": set(),

@@ -184,6 +184,7 @@ def test_rgbd(tmp_path: Path) -> None:
     assert {row["scenes"] for row in rows.values()} == {"4"}
     assert rows["neurora-v1"]["mean °"] != rows["package: neurora-v1"]["mean °"]
     of_package = Counter(path.name.rpartition("-")[0] for path in keep.iterdir())
-    ours = ("chatterjee", "weiszfeld", "geman-mcclure", "neurora-equal-precisions", "oracle")
+    ours = ("chatterjee", "weiszfeld", "geman-mcclure", "oracle")
+    ours += ("neurora-equal-precisions", "neurora-without-consensus")
     peers = [name for name in ("colmap", "shonan") if is_available(name)]
     assert of_package == dict.fromkeys((*ours, *peers, "cleannet-spt", "neurora-v1", "neurora"), 4)

@@ -19,7 +19,10 @@ from rotavg_ros.evaluation.common.tables import Column, Table
 from rotavg_ros.training.sfm_tasks import GivenGraphs
 
 # Methods without networks, and those that are trained in every fold.
-UNTRAINED = ("chatterjee", "weiszfeld", "geman-mcclure", "colmap", "shonan", "neurora-equal-precisions", "oracle")
+UNTRAINED = (
+    *("chatterjee", "weiszfeld", "geman-mcclure", "colmap", "shonan"),
+    *("neurora-equal-precisions", "neurora-without-consensus", "oracle"),
+)
 TRAINED = ("cleannet-spt", "neurora-v1", "neurora")
 # Before the name of a method with the package's own networks.
 PACKAGE_PREFIX = "package: "

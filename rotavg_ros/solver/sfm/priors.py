@@ -59,6 +59,48 @@ class PrecisionPriors:
 
 
 @dataclass(frozen=True)
+class ConsensusPriors:
+    """When another answer is looked for, and by which density the two are compared (``consensus/``).
+
+    Chosen on every third scene of the four sets of scans (``docs/diary/sfm-scans.md``).
+
+    Attributes:
+        contradicting: another answer is looked for where more triangles that close have an edge that the answer rejects
+            than would by chance, by so many of its standard deviations.
+        closing: rad; what a triangle closes by, in steps of which other answers begin.
+        glance: triangles that tell whether there may be another answer.
+        max_triangles: of a component, evenly spread over all that it has; so many that every edge of a complete graph
+            of a hundred nodes has all of its own.
+        freedom: degrees of freedom of Student's t, the density of good edges: a tenth of them err four times as much as
+            typical ones.
+        least_scale: rad; of that density. What registrations state they hardly know better, and without it a few edges
+            that repeat each other are explained ever more exactly.
+        shells: rad; false edges have any density of the angle that they state, constant in each shell between these.
+            Failed registrations lie near where they began, some of them exactly there, for which the first shell is.
+        shell_edges: edges that a shell of the whole sphere's volume has beforehand.
+        curvature: precision of the two coefficients by which an edge's chances depend on how far its ends are turned.
+        max_rounds: of expectation and maximisation.
+        settled: nats by which a last round betters the likelihood at most.
+        ahead: nats by which another answer has to be likelier; two rounds' rounding, where it is the same one.
+    """
+
+    contradicting: float = 5.0
+    closing: tuple[float, ...] = (float(np.radians(1.0)), float(np.radians(3.0)))
+    glance: int = 60_000
+    max_triangles: int = 200_000
+    freedom: float = 3.0
+    least_scale: float = float(np.radians(0.3))
+    shells: tuple[float, ...] = tuple(
+        float(np.radians(degrees)) for degrees in (0.0, 0.001, 5, 10, 15, 20, 30, 45, 60, 90, 120, 150, 180)
+    )
+    shell_edges: float = 2.0
+    curvature: float = 0.1
+    max_rounds: int = 100
+    settled: float = 0.01
+    ahead: float = 1.0
+
+
+@dataclass(frozen=True)
 class RefinementPriors:
     """How the refinement weighs edges and when it ends (``refinement.py``).
 

@@ -20,6 +20,7 @@ from rotavg_ros.solver.neurora.scores import residual_and_uncertainty, residual_
 from rotavg_ros.solver.neurora.stages import apply_labels, clean, fine_tune, trust_all
 from rotavg_ros.solver.neurora.tiled.tuning import tune
 from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap, breadth_first
+from rotavg_ros.solver.sfm.consensus.search import CONSENSUS, consensus
 from rotavg_ros.solver.sfm.options import SfmStages
 from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
 from rotavg_ros.solver.sfm.series import EdgesInSeries
@@ -63,6 +64,7 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
                 orientations = paper_fine_tune(networks.load(PaperFineNet), cleaned, orientations)
             else:
                 orientations = fine_tune(networks.load(FineNet), cleaned, orientations, component)
+    warnings: tuple[str, ...] = ()
     steps = run.refinement_steps
     if steps is None:
         steps = PRIORS.max_steps if stages.refine else 0
@@ -79,6 +81,13 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             if ratio is not None:
                 weights = EdgeWeights(weights.shaped * ratio**-0.25, weights.coarse * ratio**-0.5)
                 orientations = refinement(orientations, weights=weights)
+        if stages.consensus:
+            with watch.stage("consensus"):
+                other = consensus(graph, orientations, component, CONSENSUS)
+                if other is not None:
+                    warnings = other.warnings
+                    weights = EdgeWeights(*(weight * other.weight for weight in weights))
+                    orientations = refinement(other.body_from_world, weights=weights)
     score, variance = cleaned.outlier_probability.double(), torch.full((graph.num_nodes,), torch.nan)
     by_residuals = stages.fine_tunings > 0 and not ("cleannet" in stages.as_written and stages.clean)
     if steps > 0 or by_residuals:
@@ -92,7 +101,8 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             with watch.stage("uncertainty"):
                 stated = variances(graph, angle, score, References(component, form.first_nodes()))
             variance = variance if stated is None else form.of_nodes(stated)
-    return Estimate(form.orientations(orientations), score.index_select(0, form.edge), variance)
+    score = score.index_select(0, form.edge)
+    return Estimate(form.orientations(orientations), score, variance, warnings=warnings)
 
 
 def _relative_variance(graph: ViewGraph, orientations: Tensor, structure: Structure) -> Tensor | None:

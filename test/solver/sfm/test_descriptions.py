@@ -226,7 +226,10 @@ def test_all_methods_that_photos_have_are_tried() -> None:
     """Whoever adds one with networks of its own adds it above, or here, if it is an ablation."""
     ablations = {
         f"neurora-{name}"
-        for name in ("unweighted", "equal-precisions", "without-finenet", "without-cleannet", "without-both")
+        for name in (
+            *("unweighted", "equal-precisions", "without-consensus"),
+            *("without-finenet", "without-cleannet", "without-both"),
+        )
     }
     assert set(METHODS) == {*NETWORK_METHODS, *AS_WRITTEN, *BASELINES, *ablations}
 

@@ -1,0 +1,1 @@
+"""Another answer, where edges that the first one rejects agree with each other."""

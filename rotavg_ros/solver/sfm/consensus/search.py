@@ -1,0 +1,126 @@
+"""Another answer is looked for where edges that the first one rejects agree with each other.
+
+Robust costs settle for what most edges near the start agree on roughly. Where false edges agree roughly, as failed
+registrations of scans do near the identity, the good ones still agree exactly: their triangles close. So other answers
+begin with the trees of those edges of which most triangles close. Of all answers the one is taken that makes the edges
+likeliest.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.residuals import EdgeResiduals
+from rotavg_ros.solver.algebra.spanning_forest import compose_orientations, minimum_spanning_forest
+from rotavg_ros.solver.neurora.numbers import NUMBERS
+from rotavg_ros.solver.sfm.consensus.density import Edges, Fitted, fitted
+from rotavg_ros.solver.sfm.priors import ConsensusPriors
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+
+CONSENSUS = ConsensusPriors()
+# Edges without a triangle that closes are taken last.
+_NO_VOTE = 1e-6
+
+
+class Consensus(NamedTuple):
+    """Of a graph of N nodes and M edges.
+
+    Attributes:
+        body_from_world: ``(N, 4)``, another answer in some components.
+        weight: ``(M,)`` probability that an edge is good; 1 in all others.
+        warnings: a sentence, where another one was found.
+    """
+
+    body_from_world: Tensor
+    weight: Tensor
+    warnings: tuple[str, ...]
+
+
+def consensus(
+    graph: ViewGraph, body_from_world: Tensor, component: Tensor, priors: ConsensusPriors
+) -> Consensus | None:
+    """Another answer, in those components where one is likelier; None if there is none.
+
+    Args:
+        graph: N nodes, M edges.
+        body_from_world: ``(N, 4)`` the first answer.
+        component: ``(N,)`` of every node.
+    """
+    whole, of_node = graph.to("cpu"), component.cpu()
+    answer, weight = body_from_world.double().cpu().clone(), torch.ones(graph.num_edges, dtype=torch.float64)
+    is_off = EdgeResiduals(whole, answer).angles() > NUMBERS.outlier_angle
+    judged = whole.label != EdgeLabel.REJECTED
+    of_edge, num_apart, is_other = of_node[whole.source], 0, False
+    for number in torch.unique(of_edge[is_off & judged]).tolist():
+        node, edge = (of_node == number).nonzero()[:, 0], (judged & (of_edge == number)).nonzero()[:, 0]
+        edges = _edges(whole, node, edge)
+        found = _searched(edges, answer[node], is_off[edge].numpy(), priors)
+        if found is not None:
+            other = torch.from_numpy(np.ascontiguousarray(found.body_from_world.T))
+            num_apart += _num_apart(answer[node], other)
+            answer[node], weight[edge] = other, torch.from_numpy(found.good)
+            is_other = True
+    if not is_other:
+        return None
+    warnings = (_warning(num_apart, graph.num_nodes),) if num_apart else ()
+    return Consensus(answer.to(graph.device), weight.to(graph.device), warnings)
+
+
+def _edges(graph: ViewGraph, node: Tensor, edge: Tensor) -> Edges:
+    """The edges ``edge`` ``(m,)`` of a graph, all among ``node`` ``(n,)``, which are numbered anew."""
+    number = torch.empty(graph.num_nodes, dtype=torch.int64)
+    number[node] = torch.arange(len(node))
+    source, target = (number[end[edge]].numpy() for end in (graph.source, graph.target))
+    measured = np.ascontiguousarray(graph.target_from_source[edge].double().numpy().T)
+    measured[:3, source > target] *= -1.0
+    source, target = np.minimum(source, target), np.maximum(source, target)
+    is_trusted = graph.label[edge] == EdgeLabel.ACCEPTED
+    return Edges(len(node), source, target, measured, is_trusted.numpy())
+
+
+def _searched(edges: Edges, answer: Tensor, is_off: np.ndarray, priors: ConsensusPriors) -> Fitted | None:
+    """The likeliest answer, if it is another one than ``answer`` ``(n, 4)``.
+
+    Args:
+        edges: m.
+        answer: the first.
+        is_off: ``(m,)`` bool, what that rejects.
+        priors: the numbers.
+    """
+    closing = priors.closing[0]
+    if edges.triangles(priors.glance).contradicting(is_off, closing) <= priors.contradicting:
+        return None
+    graph = ViewGraph.create(edges.source, edges.target, edges.measured.T, num_nodes=edges.num_nodes)
+    if bool((graph.components() > 0).any()):
+        return None  # edges that a user has rejected hold it together
+    triangles = edges.triangles(priors.max_triangles)
+    first = fitted(edges, np.ascontiguousarray(answer.numpy().T), priors)
+    others = [fitted(edges, _along_tree(graph, triangles.votes(each, len(is_off))), priors) for each in priors.closing]
+    best = max(others, key=lambda other: other.log_likelihood)
+    return best if best.log_likelihood > first.log_likelihood + priors.ahead else None
+
+
+def _along_tree(graph: ViewGraph, votes: np.ndarray) -> np.ndarray:
+    """``(4, n)`` along the tree of those edges that have most ``votes`` ``(m,)``."""
+    forest = minimum_spanning_forest(graph, torch.from_numpy(1 / (_NO_VOTE + votes)))
+    return np.ascontiguousarray(compose_orientations(forest, graph).numpy().T)
+
+
+def _num_apart(one: Tensor, other: Tensor) -> int:
+    """How many orientations of two answers, each ``(n, 4)`` in its own gauge, are far from each other."""
+    turn = rotations.multiply(rotations.inverse(one), other)
+    mean = torch.linalg.eigh(turn.t() @ turn).eigenvectors[:, -1]
+    return int((rotations.angle_between(turn, mean.expand_as(turn)) > NUMBERS.outlier_angle).sum())
+
+
+def _warning(num_apart: int, num_nodes: int) -> str:
+    return (
+        f"edges that contradict each other agree among themselves: of two answers, in which {num_apart} of {num_nodes} "
+        "orientations differ by more than 20°, the likelier one was taken; false edges that agree can be likelier than "
+        "good ones, so look whether these views fit"
+    )
