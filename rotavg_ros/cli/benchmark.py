@@ -69,7 +69,7 @@ run.
 
 _HOURS_INTRODUCTION = """\
 The estimator in this process: odometry at 50 Hz of a robot that drives a figure of eight of 200 s again and again, a
-loop closure a second to a moment some laps ago, 20 % of them false, a tick every five minutes. Memory is what the
+loop closure a second to a moment some laps ago, 20 % of them false, a tick every ten seconds. Memory is what the
 process has grown by since its first, tiny solve; what a tick needs for itself is part of it. Errors are against the
 truth. The load average was {load} before the run.
 

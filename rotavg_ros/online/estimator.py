@@ -89,6 +89,7 @@ class OnlineEstimator:
         self._tick_lock = threading.Lock()  # one tick at a time; taken before ``_lock``
         self._paused = False
         self._running: _Tick | None = None
+        self._after_work = free_memory.AfterWork()
         self._generation = 0
         self._time_jumps = 0
         self._on_discard = on_discard
@@ -334,9 +335,11 @@ class OnlineEstimator:
                 self._running = running
             try:
                 with abandonable(running.is_abandoned):
-                    return self._advance(memory, work)
+                    spent = self._advance(memory, work)
             except Abandoned:
                 raise TickAbandonedError(f"abandoned: {running.abandoned_by}") from None
+            self._after_work.spent(spent)
+            return spent
 
     def _tick(self, force_cold: bool, work: float) -> Answer | None:
         with self._lock:

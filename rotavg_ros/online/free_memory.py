@@ -9,12 +9,28 @@ from functools import cache
 # Whole solves of so many edges take memory that is worth the milliseconds of giving it back.
 _MANY_EDGES = 1000
 _STAGES_OF_UPDATES = {"update", "poses"}
+# What goes on after answers takes that much in so many units of work, some seconds.
+_MUCH_WORK = 3000.0
 
 
 def give_back_after(num_edges: int, stages: Iterable[str]) -> None:
     """Return it after a whole solve of a large graph, given the stages that ran."""
     if num_edges >= _MANY_EDGES and not set(stages) <= _STAGES_OF_UPDATES:
         give_back()
+
+
+class AfterWork:
+    """Returns it now and then, while work goes on in parts."""
+
+    def __init__(self) -> None:
+        self._units = 0.0
+
+    def spent(self, units: float) -> None:
+        """So many units of work were done."""
+        self._units += units
+        if self._units >= _MUCH_WORK:
+            self._units = 0.0
+            give_back()
 
 
 def give_back() -> None:

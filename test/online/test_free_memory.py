@@ -49,3 +49,15 @@ def test_ticks_of_large_graphs_give_memory_back(monkeypatch: pytest.MonkeyPatch,
     # What goes on from the answer before takes little.
     online.add_odometry("robot", 3 * 10**9, (0.0, 0.0, 0.0, 1.0), (3, 0.0, 0.0))
     assert online.tick() is not None and len(calls) == times
+
+
+def test_work_after_answers_gives_memory_back_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[None] = []
+    monkeypatch.setattr(free_memory, "_MUCH_WORK", 10.0)
+    monkeypatch.setattr(free_memory, "give_back", lambda: calls.append(None))
+    online = OnlineEstimator(solver=lambda *_, **__: None, advance=lambda _, work: work)
+    for _ in range(5):
+        online.go_on(4.0)
+    assert len(calls) == 1
+    online.go_on(4.0)
+    assert len(calls) == 2

@@ -24,6 +24,7 @@ class _Server:
         self._requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._is_abandoned = False
         self._memory: tuple[int, object | None] = (0, None)
+        self._after_work = free_memory.AfterWork()
 
     def run(self) -> None:
         """Solve until the other side has gone."""
@@ -55,8 +56,12 @@ class _Server:
 
     def _advance(self, request: Advance) -> float:
         number, memory = self._memory
+        if number != request.remembered:
+            return 0.0
         with abandonable(lambda: self._is_abandoned):
-            return advance(memory, request.work) if number == request.remembered else 0.0
+            spent = advance(memory, request.work)
+        self._after_work.spent(spent)
+        return spent
 
     def _solve(self, request: Request) -> dict[str, object]:
         number, memory = self._memory

@@ -17,8 +17,8 @@ from functools import partial
 import numpy as np
 from scipy.linalg import cho_solve
 from scipy.sparse import csc_array, csr_array
-from scipy.sparse.linalg import SuperLU, splu
 
+from rotavg_ros.solver.algebra.sparse_factor import SparseFactor
 from rotavg_ros.solver.running.work import stop_if_abandoned
 
 # How much stiffer than its own edges a root is tied to zero.
@@ -101,29 +101,21 @@ class LaplacianPattern:
     def _factorize_sparse(self, matrix: csc_array) -> Callable[[np.ndarray], np.ndarray]:
         """How to solve."""
         is_ordered = self._rank is not None
-        factor = splu(
-            matrix,
-            permc_spec="NATURAL" if is_ordered else "MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            # Supernodes of pose graphs are small: a quarter faster than SuperLU's default, and a third more.
-            relax=1,
-            panel_size=1,
-            options={"SymmetricMode": True},
-        )
+        factor = SparseFactor(matrix, is_ordered=is_ordered)
         rank = np.arange(self.num_nodes) if self._rank is None else self._rank
         if not is_ordered:
             # This one is in the nodes' own order; from the next one on, the matrix is laid out in that of elimination.
-            self._rank = factor.perm_c.astype(np.int64)
+            self._rank = factor.rank
             self._lay_out(self._rank)
         return partial(_solve_sparse, factor, np.argsort(rank), rank)
 
 
-def _solve_sparse(factor: SuperLU, node: np.ndarray, rank: np.ndarray, right_hand_side: np.ndarray) -> np.ndarray:
+def _solve_sparse(factor: SparseFactor, node: np.ndarray, rank: np.ndarray, right_hand_side: np.ndarray) -> np.ndarray:
     """Solve ``(N, k)`` columns; the matrix has ``node[i]`` in row i, and node v in row ``rank[v]``."""
     return solve_in_parts(factor, right_hand_side.take(node, axis=0)).take(rank, axis=0)
 
 
-def solve_in_parts(factor: SuperLU, right_hand_side: np.ndarray) -> np.ndarray:
+def solve_in_parts(factor: SparseFactor, right_hand_side: np.ndarray) -> np.ndarray:
     """Solve ``(N, k)`` columns, a few at a time."""
     columns = np.asfortranarray(right_hand_side)
     starts = range(0, columns.shape[1], _COLUMNS_AT_ONCE)

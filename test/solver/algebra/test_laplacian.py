@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse import csc_array
 
 from rotavg_ros.solver.algebra import laplacian
 from rotavg_ros.solver.algebra.laplacian import LaplacianPattern, LaplacianSystem
 from rotavg_ros.solver.algebra.probes import likeliest_leverage, probe_signs
+from rotavg_ros.solver.algebra.sparse_factor import SparseFactor
 
 
 def random_graph(num_nodes: int, num_edges: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -23,11 +24,11 @@ def random_graph(num_nodes: int, num_edges: int, rng: np.random.Generator) -> tu
 def test_fit_is_the_least_squares_solution(num_edges: int, is_dense: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     sparse = []
 
-    def counted(*arguments: object, **options: object) -> SuperLU:
-        sparse.append(arguments)
-        return splu(*arguments, **options)
+    def counted(matrix: csc_array, *, is_ordered: bool) -> SparseFactor:
+        sparse.append(matrix)
+        return SparseFactor(matrix, is_ordered=is_ordered)
 
-    monkeypatch.setattr(laplacian, "splu", counted)
+    monkeypatch.setattr(laplacian, "SparseFactor", counted)
     rng = np.random.default_rng(0)
     source, target = random_graph(20, num_edges, rng)
     weight, difference = rng.uniform(0.1, 10, len(source)), rng.standard_normal((len(source), 3))

@@ -12,10 +12,10 @@ from copy import copy
 import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import SuperLU, splu
 
 from rotavg_ros.solver.algebra.laplacian import solve_in_parts
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
+from rotavg_ros.solver.algebra.sparse_factor import SparseFactor
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.running.work import rest, spend, stop_if_abandoned
 
@@ -88,8 +88,7 @@ class BlockEquations:
             values[pattern.diagonal[pattern.rank[self.loose]]] += loose_weight
             grounding += len(self.loose) * np.log(loose_weight).sum()
         matrix.data = values
-        options = {"SymmetricMode": True}
-        factor = splu(matrix, "NATURAL", 0.0, relax=_RELAX, panel_size=_PANEL, options=options)
+        factor = SparseFactor(matrix, is_ordered=True, relax=_RELAX, panel=_PANEL)
         return BlockFactor(self, pattern, pattern.rows(jacobian), factor, float(grounding))
 
     def _pattern_of(self, jacobian: np.ndarray) -> _Pattern:
@@ -199,15 +198,14 @@ def _elimination_order(block: np.ndarray, num_blocks: int) -> np.ndarray:
     graph: csc_array = csc_array(
         (values, (np.concatenate((row, diagonal)), np.concatenate((column, diagonal)))), shape=shape
     )
-    order = splu(graph, "MMD_AT_PLUS_A", 0.0, relax=_RELAX, panel_size=_PANEL, options={"SymmetricMode": True})
-    return np.asarray(order.perm_c.astype(np.int64))
+    return SparseFactor(graph, is_ordered=False, relax=_RELAX, panel=_PANEL).rank
 
 
 class BlockFactor:
     """H for one choice of J and W, here in the order of elimination."""
 
     def __init__(
-        self, system: BlockEquations, pattern: _Pattern, rows: csr_array, factor: SuperLU, grounding: float
+        self, system: BlockEquations, pattern: _Pattern, rows: csr_array, factor: SparseFactor, grounding: float
     ) -> None:
         self._system, self._rank, self._rows = system, pattern.rank, rows
         self._factor, self._grounding = factor, grounding
@@ -215,12 +213,12 @@ class BlockFactor:
     @property
     def log_det(self) -> float:
         """Log det H, without what ties the roots down and what is known of loose nodes beforehand."""
-        return float(np.log(np.abs(self._factor.U.diagonal())).sum()) - self._grounding
+        return self._factor.log_det - self._grounding
 
     @property
     def num_entries(self) -> int:
         """Of the factor."""
-        return int(self._factor.nnz)
+        return self._factor.num_entries
 
     def fit(self, whitened: np.ndarray) -> np.ndarray:
         """Unknowns ``(blocks, d, n)`` that explain whitened rows ``(E + R, d, n)`` best."""

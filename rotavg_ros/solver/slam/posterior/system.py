@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import SuperLU, splu
 
 from rotavg_ros.solver.algebra.laplacian import root_stiffness, solve_in_parts
 from rotavg_ros.solver.algebra.probes import likeliest_leverage, probe_signs
+from rotavg_ros.solver.algebra.sparse_factor import SparseFactor
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.running.work import rest, spend, stop_if_abandoned
 
@@ -134,7 +134,7 @@ class _Pattern:
         """Of H."""
         return int(self._matrix.nnz)
 
-    def factorise(self, weight: np.ndarray, stiffness: float) -> tuple[SuperLU, np.ndarray]:
+    def factorise(self, weight: np.ndarray, stiffness: float) -> tuple[SparseFactor, np.ndarray]:
         """H's factor, and where each unknown stands in it.
 
         Args:
@@ -144,17 +144,10 @@ class _Pattern:
         values = self._entries @ weight
         values[self._root_slot] += stiffness
         self._matrix.data = values
-        factor = splu(
-            self._matrix,
-            permc_spec="NATURAL" if self._is_ordered else "MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            relax=1,
-            panel_size=1,
-            options={"SymmetricMode": True},
-        )
+        factor = SparseFactor(self._matrix, is_ordered=self._is_ordered)
         rank = self._rank
         if not self._is_ordered:
-            self._rank, self._is_ordered = factor.perm_c.astype(np.int64), True
+            self._rank, self._is_ordered = factor.rank, True
             self._lay_out()
         return factor, rank
 
@@ -163,7 +156,7 @@ class Factorised:
     """H for one choice of weights."""
 
     def __init__(
-        self, system: NormalEquations, weight: np.ndarray, factor: SuperLU, rank: np.ndarray, grounding: float
+        self, system: NormalEquations, weight: np.ndarray, factor: SparseFactor, rank: np.ndarray, grounding: float
     ) -> None:
         self.system, self.weight = system, weight
         self._factor, self._rank, self._node, self._grounding = factor, rank, np.argsort(rank), grounding
@@ -171,12 +164,12 @@ class Factorised:
     @property
     def log_det(self) -> float:
         """Log det H, without the rows that tie the roots down."""
-        return float(np.log(np.abs(self._factor.U.diagonal())).sum()) - self._grounding
+        return self._factor.log_det - self._grounding
 
     @property
     def num_entries(self) -> int:
         """Of the factor."""
-        return int(self._factor.nnz)
+        return self._factor.num_entries
 
     def solve(self, right_hand_side: np.ndarray) -> np.ndarray:
         """``H⁻¹ b`` for ``(K + R, k)`` columns."""
