@@ -4,15 +4,20 @@ SciPy's SuperLU lists the memory that it takes in a dictionary of the thread tha
 the thread that lets go of it has. A factor that is made on one thread and let go of on another stays in the process for
 good. Solves run on threads of their own here, and factors outlive them; so one thread, which lasts as long as the
 process, makes them all and lets them all go. Any thread may solve with them.
+
+Where the interpreter takes down a thread whose list is not empty, at exit and in a forked process, SciPy leaves an
+error behind that nobody has raised. So before either all factors are let go of; one that is asked again is made again.
 """
 
 from __future__ import annotations
 
+import atexit
 import os
 import threading
 import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
+from copy import copy
 from functools import partial
 from queue import SimpleQueue
 
@@ -38,27 +43,43 @@ class SparseFactor:
         # Nobody else may hold what is inside: the last to let go of it has to be the keeper.
         self._held: list[SuperLU] = []
         order = "NATURAL" if is_ordered else "MMD_AT_PLUS_A"
-        _keeper.wait_for(partial(_factorise, self._held, matrix, order, (relax, panel)))
+        # Whoever has the matrix may give it other values, in another array.
+        self._make = partial(_factorise, self._held, copy(matrix), order, (relax, panel))
+        _keeper.wait_for(self._make)
+        _live.add(self)
         weakref.finalize(self, _keeper.leave, self._held.clear).atexit = False
+
+    @property
+    def _factor(self) -> SuperLU:
+        if not self._held:
+            _keeper.wait_for(self._make)
+        return self._held[0]
+
+    def let_go(self) -> None:
+        """Of what is inside, on the thread of the keeper."""
+        self._held.clear()
 
     def solve(self, right_hand_side: np.ndarray) -> np.ndarray:
         """The solution of ``(N,)`` or ``(N, k)`` right-hand sides."""
-        return np.asarray(self._held[0].solve(right_hand_side))
+        return np.asarray(self._factor.solve(right_hand_side))
 
     @property
     def rank(self) -> np.ndarray:
         """``(N,)`` where each row stands in the order of elimination."""
-        return np.asarray(self._held[0].perm_c.astype(np.int64))
+        return np.asarray(self._factor.perm_c.astype(np.int64))
 
     @property
     def num_entries(self) -> int:
         """Of L and U together."""
-        return int(self._held[0].nnz)
+        return int(self._factor.nnz)
 
     @property
     def log_det(self) -> float:
         """Of the matrix."""
-        return float(np.log(np.abs(self._held[0].U.diagonal())).sum())
+        return float(np.log(np.abs(self._factor.U.diagonal())).sum())
+
+
+_live: weakref.WeakSet[SparseFactor] = weakref.WeakSet()
 
 
 def _factorise(held: list[SuperLU], matrix: csc_array, order: str, widths: tuple[int, int]) -> None:
@@ -66,18 +87,34 @@ def _factorise(held: list[SuperLU], matrix: csc_array, order: str, widths: tuple
     held.append(splu(matrix, order, 0.0, relax=relax, panel_size=panel, options={"SymmetricMode": True}))
 
 
+def _let_all_go() -> None:
+    """Before a fork, and at exit."""
+
+    def let_go() -> None:
+        for factor in list(_live):
+            factor.let_go()
+
+    if _keeper.has_begun:
+        _keeper.wait_for(let_go)
+
+
 class _Keeper:
     """A thread that does what it is given, one after another."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
         self.begin()
 
     def begin(self) -> None:
         """Anew, as in a process that was forked, which has none of its parent's threads."""
+        self._lock = threading.Lock()
         # Finalizers put into it, in the middle of anything.
         self._tasks: SimpleQueue[tuple[Callable[[], None], Future[None] | None]] = SimpleQueue()
         self._thread: threading.Thread | None = None
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether it has been given anything."""
+        return self._thread is not None
 
     def wait_for(self, task: Callable[[], None]) -> None:
         """Until it is done; what it raises is raised here."""
@@ -108,4 +145,6 @@ class _Keeper:
 
 
 _keeper = _Keeper()
-os.register_at_fork(after_in_child=_keeper.begin)
+atexit.register(_let_all_go)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_let_all_go, after_in_child=_keeper.begin)
