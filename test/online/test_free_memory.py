@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rotavg_ros.online import free_memory
 from rotavg_ros.online.estimator import OnlineEstimator
 from rotavg_ros.online.measurements import EdgeMeasurement, KeyframeReference
+from rotavg_ros.solver.algebra import sparse_factor
 
 MEGABYTE = 1_000_000
 
@@ -61,3 +64,23 @@ def test_work_after_answers_gives_memory_back_now_and_then(monkeypatch: pytest.M
     assert len(calls) == 1
     online.go_on(4.0)
     assert len(calls) == 2
+
+
+def test_ticks_leave_no_factors_behind() -> None:
+    """Each update has some of its own; what stays is what the next one goes on from."""
+    rng = np.random.default_rng(0)
+    online = OnlineEstimator()
+    alive = []
+    for index in range(240):
+        online.add_odometry("robot", index * 10**9, (0.0, 0.0, 0.0, 1.0), (index, 0.0, 0.0))
+        if index >= 40:
+            ends = KeyframeReference("robot", index - 20 - int(rng.integers(20))), KeyframeReference("robot", index)
+            turn = np.radians(rng.normal(0.0, 1.0)) / 2
+            online.add_edge(EdgeMeasurement(index, *ends, (0.0, 0.0, np.sin(turn), np.cos(turn))))
+        if index % 5 == 4:
+            online.tick()
+            online.go_on()
+            gc.collect()
+            alive.append(len(sparse_factor._live))
+    assert online.counts().edges > 400
+    assert max(alive[-10:]) <= max(alive[:20]) + 2 < 20
