@@ -225,7 +225,7 @@ class Content:
         """Make the answer to the last problem the last answer."""
         state = self.state
         state.last.replace(answer.body_from_world, answer.component, answer.outlier, answer.known)
-        # After a compaction the memory fits no graph, and the solver sees that.
+        # After a compaction the labels alone of what is remembered fit the graph, and the solver sees that.
         self._answered_revision, self._answer_was_cold, self._memory = answer.revision, answer.was_cold, answer.memory
         state.version += 1
         assert self.answered is not None

@@ -23,7 +23,7 @@ from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.options import SlamStages
-from rotavg_ros.solver.slam.poses.solve import has_places, poses_of_update
+from rotavg_ros.solver.slam.poses.solve import has_places, poses_of_labels, poses_of_update
 from rotavg_ros.solver.slam.solve import whole
 from rotavg_ros.solver.slam.update.conditioned import Columns, Conditioned, LaidOn, conditioned
 from rotavg_ros.solver.slam.update.linear import Linear
@@ -48,6 +48,8 @@ def update_slam(graph: ViewGraph, memory: SlamMemory, run: Run) -> Estimate | No
     """
     with run.watch.stage("update"):
         known = _caught_up(graph, memory, run)
+        if known is None and not run.anew:
+            known = _thinned_out(graph, memory, run)
     if known is None:
         return None
     known = _searched_ahead(graph, known, run)
@@ -139,6 +141,23 @@ def _caught_up(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | N
                     update = Resumable(partial(_with_columns, graph, after))
                     return replace(known, update=update, update_work=after.update_work)
             known = replace(after, ahead=known.ahead, anew=known.anew)
+
+
+def _thinned_out(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | None:
+    """What is known once a graph that has lost keyframes is solved with the labels that are left; None if it cannot.
+
+    There is nothing to answer by meanwhile, so it goes to the end.
+    """
+    before = memory.thinned_to(graph)
+    if before is None or run.warm_start is None or (memory.poses is None) is has_places(graph):
+        return None
+    networks = run.networks.load(SlamCleanNet), run.networks.load(SlamFineNet)
+    found = before.updated(graph, networks, run.warm_start.double())
+    estimate = found.estimate
+    if memory.poses is not None:
+        estimate = with_poses(graph, estimate, poses_of_labels(before.unbiased(graph), found.mode))
+    assert isinstance(estimate.memory, SlamMemory)
+    return estimate.memory
 
 
 def _growth(graph: ViewGraph, known: SlamMemory, since: ViewGraph | Linear) -> Growth | None:

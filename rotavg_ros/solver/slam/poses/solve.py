@@ -53,6 +53,12 @@ def poses_of_update(graph: ViewGraph, mode: Mode, memory: PoseMemory) -> PoseMem
     return PoseMemory.of(pose, answer([pose], np.ones(1))[0])
 
 
+def poses_of_labels(graph: ViewGraph, mode: Mode) -> PoseMemory:
+    """Of a graph without its bias, with the labels of its rotations, from nothing else."""
+    pose = estimate_poses(PoseProblem(graph, _translations(graph), mode))
+    return PoseMemory.of(pose, answer([pose], np.ones(1))[0])
+
+
 def _translations(graph: ViewGraph) -> np.ndarray:
     assert graph.translation is not None
     return np.asarray(graph.translation.numpy())

@@ -32,3 +32,39 @@ def carried_over(value: np.ndarray, closure_graph: ClosureGraph, otherwise: floa
     np.minimum.at(out, closure_graph.segment_of_edge[on_segment], of_edge[on_segment])
     out[closure_graph.num_segments :] = of_edge[closure_graph.view_graph_edge]
     return out
+
+
+def thinned_out(value: np.ndarray, earlier: ViewGraph, graph: ViewGraph, otherwise: float) -> np.ndarray | None:
+    """Values ``(M,)`` of an earlier graph's closures → edges of one that has lost keyframes and edges since, ``(M',)``.
+
+    A closure is known by what it measures, to the last bit; nodes have other numbers since. Odometry has 1.
+
+    Args:
+        value: of the earlier graph's edges.
+        earlier, graph: the graphs.
+        otherwise: of closures that are new.
+
+    Returns:
+        None if more closures are new than known, or labels have changed.
+    """
+    old, new = (np.flatnonzero(~each.is_odometry.numpy()) for each in (earlier, graph))
+    if len(old) == 0 or len(new) == 0:
+        return None
+    both = np.concatenate((_measured(earlier, old), _measured(graph, new)))
+    was, now = np.split(np.unique(both, return_inverse=True)[1].ravel(), [len(old)])
+    order = np.argsort(was, kind="stable")
+    place = np.minimum(np.searchsorted(was, now, sorter=order), len(was) - 1)
+    match = order[place]
+    is_known = was[match] == now
+    label = np.where(is_known, earlier.label.numpy()[old[match]], EdgeLabel.AUTOMATIC)
+    if 2 * is_known.sum() < len(new) or (label != graph.label.numpy()[new]).any():
+        return None
+    out = np.ones(graph.num_edges)
+    out[new] = np.where(is_known, value[old[match]], otherwise)
+    return out
+
+
+def _measured(graph: ViewGraph, edges: np.ndarray) -> np.ndarray:
+    """``(n,)`` the bytes of what edges measure."""
+    rows = np.ascontiguousarray(graph.target_from_source.numpy()[edges])
+    return rows.view(f"V{rows.shape[1] * rows.itemsize}").ravel()

@@ -33,7 +33,7 @@ from rotavg_ros.solver.slam.posterior.solve import Drawn
 from rotavg_ros.solver.slam.posterior.state import Noise, Others, State
 from rotavg_ros.solver.slam.stages import outlier_scores
 from rotavg_ros.solver.slam.update.conditioned import Columns
-from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over
+from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over, thinned_out
 from rotavg_ros.view_graph import ViewGraph
 
 # The whole search is due once closures that are not explained are more than this share of those that were searched, or
@@ -149,6 +149,22 @@ class SlamMemory:
     def is_grown_to(self, graph: ViewGraph) -> bool:
         """Whether a graph has grown from this one, and states nothing twice."""
         return begins_with(graph, self.graph) and first_of_each(graph) is None
+
+    def thinned_to(self, graph: ViewGraph) -> SlamMemory | None:
+        """The labels of a graph that has lost keyframes since, for :meth:`updated`; None where that would not do.
+
+        Where odometry slipped is not known any more once edges of it were drawn together.
+        """
+        odometry = self.graph.is_odometry.numpy()
+        if (self.trusted[odometry] <= _GOOD).any() or first_of_each(graph) is not None:
+            return None
+        trusted = thinned_out(self.trusted, self.graph, graph, _NEW)
+        if trusted is None:
+            return None
+        share = int((~graph.is_odometry).sum()) / max(int((~odometry).sum()), 1)
+        searched, unexplained = (round(min(share, 1.0) * count) for count in (self.searched, self.unexplained))
+        before = replace(self, graph=graph, trusted=trusted, searched=searched, unexplained=unexplained)
+        return replace(before, ahead=None, anew=False, update=None, columns=None)
 
     def updated(
         self, graph: ViewGraph, networks: tuple[SlamCleanNet, SlamFineNet], body_from_world: Tensor

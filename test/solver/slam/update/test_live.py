@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from rotavg_ros import rotations
 from rotavg_ros.datasets.simulation.stress.drawn import DrawnGraph
+from rotavg_ros.evaluation.live.feed import Feed
+from rotavg_ros.metrics import orientation_errors
+from rotavg_ros.online import EstimatorOptions, OnlineEstimator
 from rotavg_ros.solver import Solution, advance, solve
 from rotavg_ros.solver.estimate import Run, Stopwatch
 from rotavg_ros.solver.neurora.network_store import Networks
@@ -16,7 +21,7 @@ from rotavg_ros.solver.running.work import Abandoned, abandonable, metered
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.solve import whole
 from rotavg_ros.solver.slam.update.memory import SlamMemory
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 from .test_memory import drawn, error_deg, grown, until
 
@@ -187,3 +192,57 @@ def test_what_cannot_be_gone_on_from_is_solved_from_scratch_in_silence_too() -> 
     cold = solve(graph, profile="slam")
     assert found.is_anew
     assert torch.equal(found.body_from_world, cold.body_from_world)
+
+
+@pytest.mark.parametrize("with_places", [False, True])
+def test_a_graph_that_has_lost_keyframes_is_gone_on_from_by_its_labels(with_places: bool) -> None:
+    """A full map drops keyframes every now and then: no tick waits for a whole search, and nothing is forgotten."""
+    case = drawn("building: 30 % random", 1)
+    translation = torch.from_numpy(case.edge_translation) if with_places else None
+    graph = replace(case.graph, translation=translation)
+    options = EstimatorOptions(keyframe_source="edges", gauge="identity", max_keyframes=260)
+    online = OnlineEstimator(options)
+    feed, dropped, thinned = Feed(graph, online), 0, 0
+    for end in range(200, graph.num_nodes + 1, 5):
+        feed.until(end)
+        answer = online.tick(work=LITTLE)
+        online.go_on()
+        assert answer is not None
+        if online.counts().marginalized > dropped:
+            dropped, thinned = online.counts().marginalized, thinned + 1
+            assert set(answer.stage_seconds) == {"update"}
+            at = torch.from_numpy(answer.keyframe_id.astype(np.int64))
+            cold = solve(answer_graph(online), profile="slam")
+            assert (torch.from_numpy(answer.outlier) == (cold.outlier_score > 0.5)).float().mean() > 0.99
+            found = rotations.inverse(torch.from_numpy(answer.world_from_body.copy()))
+            truth = torch.from_numpy(case.body_from_world)[at]
+            assert error_of(found, truth) < error_of(cold.body_from_world, truth) + 0.2
+        if thinned == 3:
+            return
+    pytest.fail("too few keyframes were dropped")
+
+
+def answer_graph(online: OnlineEstimator) -> ViewGraph:
+    """What the last answer is of."""
+    return online.snapshot().graph
+
+
+def error_of(body_from_world: torch.Tensor, truth: torch.Tensor) -> float:
+    return float(torch.rad2deg(orientation_errors(body_from_world, truth)).mean())
+
+
+def test_another_graph_or_other_labels_are_no_thinned_one() -> None:
+    case = drawn("building: 30 % random", 1)
+    graph = until(case.graph, 300)
+    memory = remembered(solve(graph, profile="slam"))
+    assert memory.thinned_to(graph) is not None
+    closures = (~graph.is_odometry).nonzero()[:, 0]
+    label = graph.label.clone()
+    label[closures[3]] = EdgeLabel.REJECTED
+    assert memory.thinned_to(replace(graph, label=label)) is None
+    other = graph.target_from_source.clone()
+    other[closures] = torch.nn.functional.normalize(torch.randn(len(closures), 4).to(other))
+    assert memory.thinned_to(replace(graph, target_from_source=other)) is None
+    slipped = memory.trusted.copy()
+    slipped[int(graph.is_odometry.nonzero()[5, 0])] = 0.0
+    assert replace(memory, trusted=slipped).thinned_to(graph) is None
