@@ -173,7 +173,7 @@ def test_stages_follow_the_method() -> None:
     paper = solve(graph, profile="sfm", method="neurora-v1").stage_seconds
     assert list(paper) == ["order", "clean", "bootstrap", "fine-tune"]
     whole = solve(graph, profile="sfm").stage_seconds
-    assert list(whole) == ["order", "clean", "bootstrap", "fine-tune", "refine", "uncertainty"]
+    assert list(whole) == ["order", "clean", "bootstrap", "fine-tune", "refine", "consensus", "uncertainty"]
 
 
 @pytest.mark.parametrize("profile", ["slam", "sfm"])

@@ -23,7 +23,6 @@ from scipy.special import expit, log_expit
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.laplacian import LaplacianPattern
 from rotavg_ros.solver.running.cached import cached_property
-from rotavg_ros.solver.sfm.consensus.triangles import Triangles
 from rotavg_ros.solver.sfm.priors import ConsensusPriors
 
 # A round of Newton's method for a and b is cut there; both are of order one to ten.
@@ -36,7 +35,7 @@ class Edges:
 
     Attributes:
         num_nodes: N.
-        source, target: ``(M,)``, source < target.
+        source, target: ``(M,)``.
         measured: ``(4, M)`` target_from_source.
         is_trusted: ``(M,)`` bool, labelled as good.
     """
@@ -51,10 +50,6 @@ class Edges:
     def pattern(self) -> LaplacianPattern:
         """Of steps."""
         return LaplacianPattern(self.num_nodes, self.source, self.target, np.zeros(1, dtype=np.int64))
-
-    def triangles(self, most: int) -> Triangles:
-        """About so many at most."""
-        return Triangles.of(np.stack((self.source, self.target)), self.measured, most)
 
 
 @dataclass(frozen=True)

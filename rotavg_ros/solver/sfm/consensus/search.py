@@ -19,6 +19,7 @@ from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.algebra.spanning_forest import compose_orientations, minimum_spanning_forest
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.consensus.density import Edges, Fitted, fitted
+from rotavg_ros.solver.sfm.consensus.triangles import Triangles
 from rotavg_ros.solver.sfm.priors import ConsensusPriors
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
@@ -47,19 +48,26 @@ def consensus(
     """Another answer, in those components where one is likelier; None if there is none.
 
     Args:
-        graph: N nodes, M edges.
+        graph: N nodes, M edges, which run from lower to higher nodes.
         body_from_world: ``(N, 4)`` the first answer.
         component: ``(N,)`` of every node.
     """
-    whole, of_node = graph.to("cpu"), component.cpu()
-    answer, weight = body_from_world.double().cpu().clone(), torch.ones(graph.num_edges, dtype=torch.float64)
-    is_off = EdgeResiduals(whole, answer).angles() > NUMBERS.outlier_angle
-    judged = whole.label != EdgeLabel.REJECTED
-    of_edge, num_apart, is_other = of_node[whole.source], 0, False
-    for number in torch.unique(of_edge[is_off & judged]).tolist():
-        node, edge = (of_node == number).nonzero()[:, 0], (judged & (of_edge == number)).nonzero()[:, 0]
-        edges = _edges(whole, node, edge)
-        found = _searched(edges, answer[node], is_off[edge].numpy(), priors)
+    is_judged = graph.label != EdgeLabel.REJECTED
+    judged = graph if bool(is_judged.all()) else graph.select_edges(is_judged.nonzero()[:, 0])
+    is_off = EdgeResiduals(judged, body_from_world.float()).angles() > NUMBERS.outlier_angle
+    count = int(component.max()) + 1
+    contradicting = Triangles.of(judged, count * priors.glance).contradicting(
+        is_off, component[judged.source], count, priors.closing[0]
+    )
+    numbers = (contradicting > priors.contradicting).nonzero()[:, 0].tolist()
+    if not numbers:
+        return None
+    judged, of_node = judged.to("cpu"), component.cpu()
+    answer, weight = body_from_world.double().cpu().clone(), torch.ones(judged.num_edges, dtype=torch.float64)
+    of_edge, num_apart, is_other = of_node[judged.source], 0, False
+    for number in numbers:
+        node, edge = ((of == number).nonzero()[:, 0] for of in (of_node, of_edge))
+        found = _searched(_edges(judged, node, edge), answer[node], priors)
         if found is not None:
             other = torch.from_numpy(np.ascontiguousarray(found.body_from_world.T))
             num_apart += _num_apart(answer[node], other)
@@ -68,7 +76,9 @@ def consensus(
     if not is_other:
         return None
     warnings = (_warning(num_apart, graph.num_nodes),) if num_apart else ()
-    return Consensus(answer.to(graph.device), weight.to(graph.device), warnings)
+    of_all = torch.ones(graph.num_edges, dtype=torch.float64, device=graph.device)
+    of_all[is_judged] = weight.to(graph.device)
+    return Consensus(answer.to(graph.device), of_all, warnings)
 
 
 def _edges(graph: ViewGraph, node: Tensor, edge: Tensor) -> Edges:
@@ -77,37 +87,28 @@ def _edges(graph: ViewGraph, node: Tensor, edge: Tensor) -> Edges:
     number[node] = torch.arange(len(node))
     source, target = (number[end[edge]].numpy() for end in (graph.source, graph.target))
     measured = np.ascontiguousarray(graph.target_from_source[edge].double().numpy().T)
-    measured[:3, source > target] *= -1.0
-    source, target = np.minimum(source, target), np.maximum(source, target)
     is_trusted = graph.label[edge] == EdgeLabel.ACCEPTED
     return Edges(len(node), source, target, measured, is_trusted.numpy())
 
 
-def _searched(edges: Edges, answer: Tensor, is_off: np.ndarray, priors: ConsensusPriors) -> Fitted | None:
-    """The likeliest answer, if it is another one than ``answer`` ``(n, 4)``.
-
-    Args:
-        edges: m.
-        answer: the first.
-        is_off: ``(m,)`` bool, what that rejects.
-        priors: the numbers.
-    """
-    closing = priors.closing[0]
-    if edges.triangles(priors.glance).contradicting(is_off, closing) <= priors.contradicting:
-        return None
+def _searched(edges: Edges, answer: Tensor, priors: ConsensusPriors) -> Fitted | None:
+    """The likeliest answer, if it is another one than ``answer`` ``(n, 4)``, the first."""
     graph = ViewGraph.create(edges.source, edges.target, edges.measured.T, num_nodes=edges.num_nodes)
     if bool((graph.components() > 0).any()):
         return None  # edges that a user has rejected hold it together
-    triangles = edges.triangles(priors.max_triangles)
+    triangles = Triangles.of(graph, priors.max_triangles)
     first = fitted(edges, np.ascontiguousarray(answer.numpy().T), priors)
-    others = [fitted(edges, _along_tree(graph, triangles.votes(each, len(is_off))), priors) for each in priors.closing]
+    others = [
+        fitted(edges, _along_tree(graph, triangles.votes(closing, graph.num_edges)), priors)
+        for closing in priors.closing
+    ]
     best = max(others, key=lambda other: other.log_likelihood)
     return best if best.log_likelihood > first.log_likelihood + priors.ahead else None
 
 
-def _along_tree(graph: ViewGraph, votes: np.ndarray) -> np.ndarray:
+def _along_tree(graph: ViewGraph, votes: Tensor) -> np.ndarray:
     """``(4, n)`` along the tree of those edges that have most ``votes`` ``(m,)``."""
-    forest = minimum_spanning_forest(graph, torch.from_numpy(1 / (_NO_VOTE + votes)))
+    forest = minimum_spanning_forest(graph, 1 / (_NO_VOTE + votes))
     return np.ascontiguousarray(compose_orientations(forest, graph).numpy().T)
 
 

@@ -2,73 +2,78 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
-import numpy as np
+import torch
+from torch import Tensor
 
-from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros import rotations
+from rotavg_ros.view_graph import ViewGraph
 
 
 @dataclass(frozen=True)
 class Triangles:
-    """T triangles of a graph of M edges.
+    """T triangles of a graph of M edges, on its device.
 
     Attributes:
         edge: ``(3, T)``.
         angle: ``(T,)`` rad, by which each does not close.
     """
 
-    edge: np.ndarray
-    angle: np.ndarray
+    edge: Tensor
+    angle: Tensor
 
     @classmethod
-    def of(cls, ends: np.ndarray, measured: np.ndarray, most: int) -> Triangles:
-        """Of edges that run from lower to higher nodes.
+    def of(cls, graph: ViewGraph, most: int) -> Triangles:
+        """Of a graph whose edges run from lower to higher nodes.
 
         Args:
-            ends: ``(2, M)`` source and target.
-            measured: ``(4, M)`` target_from_source.
-            most: triangles at most; about so many paths of two edges are looked at, evenly spread over all.
+            graph: M edges.
+            most: triangles at most; so many paths of two edges are looked at, evenly spread over all.
         """
-        num_nodes = int(ends.max(initial=-1)) + 1
-        key = ends[0] * num_nodes + ends[1]
-        order = np.argsort(key, kind="stable")  # fast where they are sorted, as a canonical form's are
-        key, (source, target) = key[order], ends[:, order]
-        first = np.searchsorted(source, np.arange(num_nodes + 1))
+        key = graph.source * graph.num_nodes + graph.target
+        order = torch.arange(graph.num_edges, device=graph.device)
+        if not bool((key[1:] >= key[:-1]).all()):
+            key, order = key.sort(stable=True)
+        source, target = graph.source[order], graph.target[order]
+        first = torch.searchsorted(source, torch.arange(graph.num_nodes + 1, device=graph.device))
         # Each edge u→v is followed by every edge v→w.
         count = (first[1:] - first[:-1])[target]
-        before = np.cumsum(count) - count
-        path = np.arange(0, int(count.sum()), max(1, -(-int(count.sum()) // most)))
-        one = np.searchsorted(before, path, side="right") - 1
-        two = first[target[one]] + path - before[one]
-        wanted = source[one] * num_nodes + target[two]
-        three = np.searchsorted(key, wanted)
-        closes = three < len(key)
-        closes[closes] = key[three[closes]] == wanted[closes]
-        edge = order[np.stack((one, two, three))[:, closes]]
-        passed = quaternion_rows.multiply(measured[:, edge[1]], measured[:, edge[0]])
-        dot = np.abs(np.einsum("in,in->n", passed, measured[:, edge[2]]))
-        sine = np.sqrt(np.maximum(1 - np.minimum(dot, 1.0) ** 2, 0.0))
-        return cls(edge, np.asarray(2 * np.arctan2(sine, dot)))
+        up_to = count.cumsum(0)
+        paths = int(up_to[-1]) if graph.num_edges else 0
+        path = torch.arange(0, paths, max(1, -(-paths // most)), device=graph.device)
+        one = torch.searchsorted(up_to, path, right=True)
+        two = first[target[one]] + path - (up_to - count)[one]
+        wanted = source[one] * graph.num_nodes + target[two]
+        three = torch.searchsorted(key, wanted).clamp(max=max(graph.num_edges - 1, 0))
+        edge = order[torch.stack((one, two, three))[:, key[three] == wanted]]
+        measured = [graph.target_from_source[each].double() for each in edge]
+        passed = rotations.multiply(measured[1], measured[0])
+        return cls(edge, rotations.angle_between(passed, measured[2]))
 
-    def votes(self, closing: float, num_edges: int) -> np.ndarray:
+    def votes(self, closing: float, num_edges: int) -> Tensor:
         """``(M,)`` how many triangles of each edge close, to within about ``closing`` rad."""
-        vote = np.exp(-((self.angle / closing) ** 2) / 2)
-        return np.bincount(self.edge.ravel(), np.tile(vote, 3), num_edges)
+        vote = torch.exp(-((self.angle / closing) ** 2) / 2)
+        return torch.bincount(self.edge.ravel(), vote.repeat(3), num_edges)
 
-    def contradicting(self, rejected: np.ndarray, closing: float) -> float:
+    def contradicting(self, rejected: Tensor, group: Tensor, num_groups: int, closing: float) -> Tensor:
         """Triangles with a rejected edge that close to within ``closing`` rad, beyond those that do so by chance.
 
         By chance triangles close by any rotation near none, of which one in 27 is three times as near.
 
         Args:
             rejected: ``(M,)`` bool.
+            group: ``(M,)`` of each edge, the same for all of a triangle.
+            num_groups: how many there are.
             closing: rad.
 
         Returns:
-            their number, in standard deviations of what is by chance.
+            ``(num_groups,)`` their number, in standard deviations of what is by chance.
         """
-        angle = self.angle[rejected[self.edge].any(axis=0)]
-        by_chance = float((angle < 3 * closing).sum()) / 27
-        return (float((angle < closing).sum()) - by_chance) / math.sqrt(by_chance + 1)
+        is_rejected = rejected[self.edge].any(dim=0)
+        near, nearest = (
+            torch.bincount(group[self.edge[0, is_rejected & (self.angle < limit)]], minlength=num_groups)
+            for limit in (3 * closing, closing)
+        )
+        by_chance = near.double() / 27
+        return (nearest - by_chance) / (by_chance + 1).sqrt()

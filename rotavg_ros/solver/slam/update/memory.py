@@ -156,6 +156,8 @@ class SlamMemory:
         Where odometry slipped is not known any more once edges of it were drawn together.
         """
         odometry = self.graph.is_odometry.numpy()
+        if graph.num_nodes >= self.graph.num_nodes:
+            return None
         if (self.trusted[odometry] <= _GOOD).any() or first_of_each(graph) is not None:
             return None
         trusted = thinned_out(self.trusted, self.graph, graph, _NEW)

@@ -6,6 +6,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros.solver.sfm.consensus.density import Edges, _Density, fitted
 from rotavg_ros.solver.sfm.consensus.search import CONSENSUS
 from rotavg_ros.solver.sfm.consensus.triangles import Triangles
+from rotavg_ros.view_graph import ViewGraph
 
 
 def _graph(seed: int, num_nodes: int, false: float, noise_deg: float) -> tuple[Edges, Rotation, np.ndarray]:
@@ -26,13 +28,23 @@ def _graph(seed: int, num_nodes: int, false: float, noise_deg: float) -> tuple[E
     return Edges(num_nodes, source, target, measured.T.copy(), np.zeros(len(source), dtype=bool)), truth, is_false
 
 
+def _triangles(edges: Edges, most: int = 10**6) -> Triangles:
+    graph = ViewGraph.create(edges.source, edges.target, edges.measured.T, num_nodes=edges.num_nodes)
+    return Triangles.of(graph, most)
+
+
+def _contradicting(edges: Edges, rejected: np.ndarray, closing: float) -> float:
+    one_group = torch.zeros(len(rejected), dtype=torch.int64)
+    return float(_triangles(edges).contradicting(torch.from_numpy(rejected), one_group, 1, closing))
+
+
 @settings(max_examples=20)
 @given(st.integers(3, 9), st.integers(0, 2**16))
 def test_triangles_are_those_of_the_graph(num_nodes: int, seed: int) -> None:
     edges, _, _ = _graph(seed, num_nodes, 0.5, 5.0)
     kept = np.random.default_rng(seed).permutation(len(edges.source))[: 2 * num_nodes]
     ends, measured = np.stack((edges.source, edges.target))[:, kept], edges.measured[:, kept]
-    found = Triangles.of(ends, measured, 10**6)
+    found = Triangles.of(ViewGraph.create(*ends, measured.T, num_nodes=num_nodes), 10**6)
     at = {(int(s), int(t)): number for number, (s, t) in enumerate(ends.T)}
     expected = {}
     for u, v, w in combinations(range(num_nodes), 3):
@@ -40,14 +52,14 @@ def test_triangles_are_those_of_the_graph(num_nodes: int, seed: int) -> None:
             one, two, three = (Rotation.from_quat(measured[:, at[pair]]) for pair in ((u, v), (v, w), (u, w)))
             expected[at[u, v], at[v, w], at[u, w]] = (three.inv() * two * one).magnitude()
     assert {tuple(edge) for edge in found.edge.T.tolist()} == expected.keys()
-    for edge, angle in zip(found.edge.T.tolist(), found.angle, strict=True):
+    for edge, angle in zip(found.edge.T.tolist(), found.angle.tolist(), strict=True):
         assert angle == pytest.approx(expected[tuple(edge)], abs=1e-6)
 
 
 def test_so_many_triangles_at_most() -> None:
     edges, _, _ = _graph(0, 40, 0.5, 5.0)
-    assert len(edges.triangles(10**6).angle) == 40 * 39 * 38 / 6
-    assert 0 < len(edges.triangles(1000).angle) <= 1000
+    assert len(_triangles(edges).angle) == 40 * 39 * 38 / 6
+    assert 0 < len(_triangles(edges, 1000).angle) <= 1000
 
 
 def test_edges_that_are_false_by_chance_contradict_nothing() -> None:
@@ -56,11 +68,11 @@ def test_edges_that_are_false_by_chance_contradict_nothing() -> None:
     by_chance = []
     for seed in range(10):
         edges, _, is_false = _graph(seed, 50, 0.5, 0.3)
-        by_chance.append(edges.triangles(10**6).contradicting(is_false, closing))
+        by_chance.append(_contradicting(edges, is_false, closing))
     assert max(by_chance) < CONSENSUS.contradicting
     edges, _, _ = _graph(0, 50, 0.0, 0.3)
     agreeing = np.isin(edges.source, range(10)) & np.isin(edges.target, range(10))
-    assert edges.triangles(10**6).contradicting(agreeing, closing) > CONSENSUS.contradicting
+    assert _contradicting(edges, agreeing, closing) > CONSENSUS.contradicting
 
 
 @pytest.mark.parametrize("chance", [(0.0, 0.0), (3.0, -4.0)])
