@@ -69,6 +69,7 @@ class ConsensusPriors:
             than would by chance, by so many of its standard deviations.
         closing: rad; what a triangle closes by, in steps of which other answers begin.
         glance: triangles that tell whether there may be another answer.
+        max_nodes, max_edges: of a component that is looked at; larger ones would take half a minute and more.
         max_triangles: of a component, evenly spread over all that it has; so many that every edge of a complete graph
             of a hundred nodes has all of its own.
         freedom: degrees of freedom of Student's t, the density of good edges: a tenth of them err four times as much as
@@ -87,6 +88,8 @@ class ConsensusPriors:
     contradicting: float = 5.0
     closing: tuple[float, ...] = (float(np.radians(1.0)), float(np.radians(3.0)))
     glance: int = 60_000
+    max_nodes: int = 1_000
+    max_edges: int = 100_000
     max_triangles: int = 200_000
     freedom: float = 3.0
     least_scale: float = float(np.radians(0.3))

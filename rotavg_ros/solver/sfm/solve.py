@@ -86,7 +86,8 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
                 other = consensus(graph, orientations, component, CONSENSUS)
                 if other is not None:
                     warnings = other.warnings
-                    weights = EdgeWeights(*(weight * other.weight for weight in weights))
+                if other is not None and other.body_from_world is not None and other.weight is not None:
+                    weights = EdgeWeights(weights.shaped * other.weight, weights.coarse * other.weight)
                     orientations = refinement(other.body_from_world, weights=weights)
     score, variance = cleaned.outlier_probability.double(), torch.full((graph.num_nodes,), torch.nan)
     by_residuals = stages.fine_tunings > 0 and not ("cleannet" in stages.as_written and stages.clean)

@@ -26,26 +26,35 @@ from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 CONSENSUS = ConsensusPriors()
 # Edges without a triangle that closes are taken last.
 _NO_VOTE = 1e-6
+_OTHER = (
+    "edges that contradict each other agree among themselves: of two answers, in which {apart} of {all} orientations "
+    "differ by more than 20°, the likelier one was taken; false edges that agree can be likelier than good ones, so "
+    "look whether these views fit"
+)
+_TOO_LARGE = (
+    "edges that contradict the answer agree among themselves, so that there may be another one; the graph is too large "
+    "for it to be looked for: look whether the views fit, or solve a part of them"
+)
 
 
 class Consensus(NamedTuple):
     """Of a graph of N nodes and M edges.
 
     Attributes:
-        body_from_world: ``(N, 4)``, another answer in some components.
-        weight: ``(M,)`` probability that an edge is good; 1 in all others.
-        warnings: a sentence, where another one was found.
+        body_from_world: ``(N, 4)``, another answer in some components; None if none is likelier.
+        weight: ``(M,)`` probability that an edge is good; 1 in all others. None likewise.
+        warnings: a sentence, where another one was found, or could not be looked for.
     """
 
-    body_from_world: Tensor
-    weight: Tensor
+    body_from_world: Tensor | None
+    weight: Tensor | None
     warnings: tuple[str, ...]
 
 
 def consensus(
     graph: ViewGraph, body_from_world: Tensor, component: Tensor, priors: ConsensusPriors
 ) -> Consensus | None:
-    """Another answer, in those components where one is likelier; None if there is none.
+    """Another answer, in those components where one is likelier; None if edges contradict it nowhere.
 
     Args:
         graph: N nodes, M edges, which run from lower to higher nodes.
@@ -64,18 +73,22 @@ def consensus(
         return None
     judged, of_node = judged.to("cpu"), component.cpu()
     answer, weight = body_from_world.double().cpu().clone(), torch.ones(judged.num_edges, dtype=torch.float64)
-    of_edge, num_apart, is_other = of_node[judged.source], 0, False
+    of_edge, num_apart, is_other, is_too_large = of_node[judged.source], 0, False, False
     for number in numbers:
         node, edge = ((of == number).nonzero()[:, 0] for of in (of_node, of_edge))
+        if len(node) > priors.max_nodes or len(edge) > priors.max_edges:
+            is_too_large = True
+            continue
         found = _searched(_edges(judged, node, edge), answer[node], priors)
         if found is not None:
             other = torch.from_numpy(np.ascontiguousarray(found.body_from_world.T))
             num_apart += _num_apart(answer[node], other)
             answer[node], weight[edge] = other, torch.from_numpy(found.good)
             is_other = True
+    warnings = (_OTHER.format(apart=num_apart, all=graph.num_nodes),) if num_apart else ()
+    warnings = (*warnings, _TOO_LARGE) if is_too_large else warnings
     if not is_other:
-        return None
-    warnings = (_warning(num_apart, graph.num_nodes),) if num_apart else ()
+        return Consensus(None, None, warnings)
     of_all = torch.ones(graph.num_edges, dtype=torch.float64, device=graph.device)
     of_all[is_judged] = weight.to(graph.device)
     return Consensus(answer.to(graph.device), of_all, warnings)
@@ -117,11 +130,3 @@ def _num_apart(one: Tensor, other: Tensor) -> int:
     turn = rotations.multiply(rotations.inverse(one), other)
     mean = torch.linalg.eigh(turn.t() @ turn).eigenvectors[:, -1]
     return int((rotations.angle_between(turn, mean.expand_as(turn)) > NUMBERS.outlier_angle).sum())
-
-
-def _warning(num_apart: int, num_nodes: int) -> str:
-    return (
-        f"edges that contradict each other agree among themselves: of two answers, in which {num_apart} of {num_nodes} "
-        "orientations differ by more than 20°, the likelier one was taken; false edges that agree can be likelier than "
-        "good ones, so look whether these views fit"
-    )

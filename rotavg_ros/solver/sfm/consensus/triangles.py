@@ -31,11 +31,10 @@ class Triangles:
             graph: M edges.
             most: triangles at most; so many paths of two edges are looked at, evenly spread over all.
         """
-        key = graph.source * graph.num_nodes + graph.target
-        order = torch.arange(graph.num_edges, device=graph.device)
-        if not bool((key[1:] >= key[:-1]).all()):
+        key, source, target, order = graph.source * graph.num_nodes + graph.target, graph.source, graph.target, None
+        if not bool((key[1:] >= key[:-1]).all()):  # a canonical form is sorted, and copies of a large one cost memory
             key, order = key.sort(stable=True)
-        source, target = graph.source[order], graph.target[order]
+            source, target = source[order], target[order]
         first = torch.searchsorted(source, torch.arange(graph.num_nodes + 1, device=graph.device))
         # Each edge u→v is followed by every edge v→w.
         count = (first[1:] - first[:-1])[target]
@@ -46,7 +45,8 @@ class Triangles:
         two = first[target[one]] + path - (up_to - count)[one]
         wanted = source[one] * graph.num_nodes + target[two]
         three = torch.searchsorted(key, wanted).clamp(max=max(graph.num_edges - 1, 0))
-        edge = order[torch.stack((one, two, three))[:, key[three] == wanted]]
+        edge = torch.stack((one, two, three))[:, key[three] == wanted]
+        edge = edge if order is None else order[edge]
         measured = [graph.target_from_source[each].double() for each in edge]
         passed = rotations.multiply(measured[1], measured[0])
         return cls(edge, rotations.angle_between(passed, measured[2]))

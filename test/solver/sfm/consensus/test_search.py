@@ -90,7 +90,7 @@ def test_components_are_judged_by_themselves() -> None:
     start = torch.cat((solve(one, method=_WITHOUT, device="cpu").body_from_world, other_truth))
     component = torch.arange(2).repeat_interleave(one.num_nodes)
     found = consensus(both, start, component, CONSENSUS)
-    assert found is not None
+    assert found is not None and found.body_from_world is not None and found.weight is not None
     assert torch.equal(found.body_from_world[one.num_nodes :], other_truth)
     assert bool((found.weight[one.num_edges :] == 1).all())
     assert float(torch.rad2deg(orientation_errors(found.body_from_world[: one.num_nodes], truth)).mean()) < 5
@@ -104,9 +104,19 @@ def test_labels_count() -> None:
     beside = ((graph.target - graph.source) < 4).to(graph.label)
     chained = replace(graph, label=torch.where(beside > 0, EdgeLabel.ACCEPTED, EdgeLabel.AUTOMATIC).to(graph.label))
     found = consensus(chained, first, component, CONSENSUS)
-    assert found is not None
+    assert found is not None and found.weight is not None
     assert bool((found.weight[beside > 0] == 1).all())
     last = (graph.source == graph.num_nodes - 1) | (graph.target == graph.num_nodes - 1)
     cut = replace(graph, label=torch.where(last, EdgeLabel.REJECTED, EdgeLabel.AUTOMATIC).to(graph.label))
-    assert consensus(cut, first, component, CONSENSUS) is None
+    kept = consensus(cut, first, component, CONSENSUS)
+    assert kept is not None and kept.body_from_world is None
     assert truth.shape == first.shape
+
+
+def test_of_a_graph_that_is_too_large_it_is_said_that_there_may_be_another_answer() -> None:
+    graph, _ = _scans(0)
+    first = solve(graph, method=_WITHOUT, device="cpu").body_from_world
+    small = replace(CONSENSUS, max_nodes=graph.num_nodes - 1)
+    found = consensus(graph, first, torch.zeros(graph.num_nodes, dtype=torch.int64), small)
+    assert found is not None and found.body_from_world is None
+    assert "too large" in found.warnings[0]
