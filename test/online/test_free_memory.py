@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -66,21 +68,43 @@ def test_work_after_answers_gives_memory_back_now_and_then(monkeypatch: pytest.M
     assert len(calls) == 2
 
 
-def test_ticks_leave_no_factors_behind() -> None:
-    """Each update has some of its own; what stays is what the next one goes on from."""
-    rng = np.random.default_rng(0)
-    online = OnlineEstimator()
-    alive = []
-    for index in range(240):
+def _ticks(online: OnlineEstimator, first: int, last: int, *, has_places: bool) -> Iterator[None]:
+    """A robot that drives straight on and sees that it does, a tick every five keyframes."""
+    rng = np.random.default_rng(first)
+    for index in range(first, last):
         online.add_odometry("robot", index * 10**9, (0.0, 0.0, 0.0, 1.0), (index, 0.0, 0.0))
         if index >= 40:
-            ends = KeyframeReference("robot", index - 20 - int(rng.integers(20))), KeyframeReference("robot", index)
+            before = index - 20 - int(rng.integers(20))
+            ends = KeyframeReference("robot", before), KeyframeReference("robot", index)
             turn = np.radians(rng.normal(0.0, 1.0)) / 2
-            online.add_edge(EdgeMeasurement(index, *ends, (0.0, 0.0, np.sin(turn), np.cos(turn))))
+            edge = EdgeMeasurement(index, *ends, (0.0, 0.0, np.sin(turn), np.cos(turn)))
+            way = (index - before + rng.normal(0.0, 0.1), rng.normal(0.0, 0.1), 0.0)
+            online.add_edge(replace(edge, translation=way) if has_places else edge)
         if index % 5 == 4:
             online.tick()
             online.go_on()
-            gc.collect()
+            yield
+
+
+@pytest.mark.parametrize("has_places", [False, True])
+def test_ticks_leave_nothing_behind(has_places: bool) -> None:
+    """What stays is what the next one goes on from, and a search under way; no garbage waits to be collected."""
+    online = OnlineEstimator()
+    alive = []
+    for _ in _ticks(online, 0, 120, has_places=has_places):
+        alive.append(len(sparse_factor._live))
+    gc.collect()
+    gc.disable()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    try:
+        for _ in _ticks(online, 120, 240, has_places=has_places):
             alive.append(len(sparse_factor._live))
+        gc.collect()
+        garbage = [type(each).__name__ for each in gc.garbage if type(each).__module__.startswith("rotavg_ros")]
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+    assert garbage == []
     assert online.counts().edges > 400
-    assert max(alive[-10:]) <= max(alive[:20]) + 2 < 20
+    assert max(alive[-10:]) < 40

@@ -106,23 +106,25 @@ class _Pattern:
     """Where the entries of H stand that some of the rows make, in an order of elimination with little fill."""
 
     def __init__(self, system: NormalEquations, rows: np.ndarray) -> None:
-        self._system, self._rows = system, rows
+        # Not the system itself, which holds this: both would stay until the garbage collector comes round to them.
+        self._rows, self._num_rows, self._size, self._roots = rows, len(system.column), system.size, system.roots
+        self._column, self._value = system.column[rows], system.value[rows]
         self._rank = np.arange(system.size)
         self._is_ordered = False
         self._lay_out()
 
     def _lay_out(self) -> None:
-        system, size = self._system, self._system.size
-        column, value = self._rank[system.column[self._rows]], system.value[self._rows]
+        size = self._size
+        column, value = self._rank[self._column], self._value
         first, second = np.repeat(column, 3, axis=1), np.tile(column, 3)
         keys = np.concatenate(((second * size + first).ravel(), self._rank * (size + 1)))
         occupied, slot = np.unique(keys, return_inverse=True)
         slot, diagonal = np.split(slot, [first.size])
-        self._root_slot = diagonal[system.roots]
+        self._root_slot = diagonal[self._roots]
         product = (np.repeat(value, 3, axis=1) * np.tile(value, 3)).ravel()
         row = np.repeat(self._rows, 9)
         # Entries of H as a linear map of the weights.
-        self._entries: csr_array = csr_array((product, (slot, row)), shape=(len(occupied), len(system.column)))
+        self._entries: csr_array = csr_array((product, (slot, row)), shape=(len(occupied), self._num_rows))
         first_of_column = np.searchsorted(occupied, np.arange(size + 1) * size)
         self._matrix: csc_array = csc_array(
             (np.ones(len(occupied)), (occupied % size).astype(np.int32), first_of_column.astype(np.int32)),
