@@ -8,6 +8,7 @@ at each factorisation.
 from __future__ import annotations
 
 import threading
+import traceback
 import weakref
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -68,6 +69,8 @@ class Resumable(Generic[Result]):
             turns.take(units)
         finally:
             count(turns.spent - before)
+        if isinstance(turns.error, Abandoned):
+            raise Abandoned
         if turns.error is not None:
             raise turns.error
         return turns.has_ended
@@ -117,7 +120,9 @@ class _Turns(Generic[Result]):
                 self.results.append(self._solve())
             self.has_ended = True
         except BaseException as error:
-            self.error = self.error or error
+            # What the solve held would stay with the error, and the error with this, which it holds.
+            traceback.clear_frames(error.__traceback__)
+            self.error = self.error or (Abandoned() if isinstance(error, Abandoned) else error)
         del self._solve  # what it has used is not held by whoever holds its result
         self._ours.release()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import threading
 import time
+import weakref
 
 import pytest
 import torch
@@ -154,3 +155,35 @@ def test_one_that_rests_keeps_no_other_one_waiting() -> None:
     assert first.go_on(1e9)
     slow = Slow()
     assert slow.value == slow.value == 1
+
+
+class _Large:
+    """What a solve has in its hands."""
+
+
+def _holding(held: list[weakref.ref[_Large]]) -> None:
+    large = _Large()
+    held.append(weakref.ref(large))
+    while True:
+        spend(500)
+        stop_if_abandoned()
+
+
+@pytest.mark.parametrize("is_abandoned", [False, True])
+def test_one_that_is_given_up_leaves_nothing_behind(is_abandoned: bool) -> None:
+    """Without a collection of garbage: there is none."""
+    held: list[weakref.ref[_Large]] = []
+    solve = Resumable(lambda: _holding(held))
+    gc.collect()
+    gc.disable()
+    try:
+        solve.go_on(3.0)
+        if is_abandoned:
+            with abandonable(lambda: True), pytest.raises(Abandoned):
+                solve.go_on(3.0)
+            assert solve.has_failed
+        else:
+            del solve
+        until(lambda: held[0]() is None)
+    finally:
+        gc.enable()
