@@ -70,7 +70,7 @@ class Fitted:
 
 
 @dataclass
-class _Density:
+class Density:
     """What expectation and maximisation go on from."""
 
     priors: ConsensusPriors
@@ -121,7 +121,7 @@ def fitted(edges: Edges, body_from_world: np.ndarray, priors: ConsensusPriors) -
     """The likeliest answer near ``body_from_world`` ``(4, N)``."""
     stated = _length(quaternion_rows.log(edges.measured))
     shell = np.clip(np.searchsorted(priors.shells, stated, side="right") - 1, 0, len(priors.shells) - 2)
-    density = _Density(priors, shell, priors.closing[-1])
+    density = Density(priors, shell, priors.closing[-1])
     last = -math.inf
     for _ in range(priors.max_rounds):
         at_source, at_target = body_from_world[:, edges.source], body_from_world[:, edges.target]

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.solver.sfm.consensus.density import Edges, _Density, fitted
+from rotavg_ros.solver.sfm.consensus.density import Density, Edges, fitted
 from rotavg_ros.solver.sfm.consensus.search import CONSENSUS
 from rotavg_ros.solver.sfm.consensus.triangles import Triangles
 from rotavg_ros.view_graph import ViewGraph
@@ -82,7 +82,7 @@ def test_it_integrates_to_one(chance: tuple[float, float]) -> None:
     predicted = Rotation.from_euler("z", 25, degrees=True)
     square = (predicted.inv() * stated).magnitude() ** 2
     shell = np.searchsorted(CONSENSUS.shells, stated.magnitude(), side="right") - 1
-    density = _Density(CONSENSUS, shell, np.radians(6.0))
+    density = Density(CONSENSUS, shell, np.radians(6.0))
     density.chance = np.array(chance)
     good, false = density.logs(square, np.full(len(square), predicted.magnitude()))
     # Its tails, the measure of large turns and the samples leave a few hundredths.
