@@ -36,6 +36,8 @@ _IN_RUN = 10.0
 _TOLD = 0.5
 # A kernel ends at so many widths, where it is 4e-6 of its height.
 _FARTHEST = 5.0
+# So many closures and those that each is compared with stay in a core's cache.
+_ROWS_AT_ONCE = 1000
 # The least density that counts.
 _LEAST = 1e-300
 
@@ -64,6 +66,24 @@ class FalseDensity:
         any_one = (1 - far_share) * self.alone[:, None] + far_share * self.far
         both = (1 - near_share) * any_one + near_share * self.near
         return np.asarray(np.maximum(both, _LEAST).reshape(math.prod(_GRID), self.alone.shape[1]))
+
+    def mean(self, log_rates: np.ndarray) -> np.ndarray:
+        """``(n,)`` what ``mixed`` is in the mean over the grid, whose points have these logarithms ``(G,)``.
+
+        It is linear in all three, so what each counts for is summed over the grid beforehand.
+        """
+        rates = np.exp(log_rates).reshape(_GRID)
+        c, g = _NEAR_SHARES[:, None, None, None], _FAR_SHARES[:, None, None]
+        mean = np.zeros(self.alone.shape[1])
+        for has_near, has_far in np.ndindex(2, 2):
+            rows = np.flatnonzero((self.has_near == bool(has_near)) & (self.has_far == bool(has_far)))
+            of_far = rates * (1 - has_near * c)
+            mean[rows] = (of_far * (1 - has_far * g)).sum(axis=(0, 1, 3)) @ self.alone[:, rows]
+            if has_far:
+                mean[rows] += (of_far * g).sum(axis=(0, 1, 2)) @ self.far[:, rows]
+            if has_near:
+                mean[rows] += (rates * c).sum(axis=(0, 1, 2)) @ self.near[:, rows]
+        return np.asarray(np.maximum(mean, _LEAST))
 
 
 def false_density(
@@ -94,22 +114,43 @@ def false_density(
     if count == 0 or not is_false.any() or "repeats" in problem.without:
         nothing, none = np.zeros((_KERNELS, count)), np.zeros(count, dtype=bool)
         return FalseDensity(alone, nothing, nothing, none, none)
-    other, there = _others(problem, is_false, rows, both_sides)
+    turn = quaternion_rows.exp((residual * problem.sign[:, None]).T)
     # Of a closure that nothing else predicts it is not known by what turn it is wrong.
     is_told = predicted < _TOLD * anyhow(k)
+    parts = [
+        _repeats(problem, is_false, turn, is_told, rows[start : start + _ROWS_AT_ONCE], both_sides)
+        for start in range(0, count, _ROWS_AT_ONCE)
+    ]
+    return FalseDensity(alone, *(np.concatenate(values, axis=-1) for values in zip(*parts, strict=True)))
+
+
+def _repeats(
+    problem: Problem,
+    is_false: np.ndarray,
+    turn: np.ndarray,
+    is_told: np.ndarray,
+    rows: np.ndarray,
+    both_sides: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """``near``, ``far``, ``has_near`` and ``has_far`` of :class:`FalseDensity`.
+
+    Args:
+        turn: ``(4, C)`` of the world, by which each closure is wrong if it is false.
+        is_told: ``(C,)`` bool, whether anything else tells that turn.
+    """
+    k = problem.components
+    other, there = _others(problem, is_false, rows, both_sides)
     there &= is_told[rows, None] & is_told.take(other)
     older, newer = problem.ends.T
     between = np.abs(newer.take(other) - newer[rows, None])
     is_near = there & (between <= problem.priors.run_gap_steps)
     between += np.abs(older.take(other) - older[rows, None])
     weights = is_near * np.where(between <= problem.priors.run_gap_steps, _IN_RUN, 1.0), there.astype(np.float64)
-    turn = quaternion_rows.exp((residual * problem.sign[:, None]).T)
     cosine = np.abs(sum(part.take(other) * part[rows, None] for part in turn))
     alike = np.nonzero(there & (cosine > np.cos(_FARTHEST * np.radians(_REPEAT_DEG[-1]) / 2)))
     kernel = _kernels((2 * np.arccos(np.minimum(cosine[alike], 1.0))) ** 2, k)
     near, far = _mean_kernels(weights, alike, kernel)
-    has_near, has_far = (np.asarray(some.any(axis=1)) for some in (is_near, there))
-    return FalseDensity(alone, near, far, has_near, has_far)
+    return near, far, np.asarray(is_near.any(axis=1)), np.asarray(there.any(axis=1))
 
 
 def _others(

@@ -64,7 +64,7 @@ def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> Lef
     rates = repeat_rates(problem, false_density(problem, is_false, *of_closures, np.flatnonzero(is_false)))
     each = false_density(problem, is_false, *of_closures, np.arange(len(closure)), both_sides=True)
     label_odds = label_log_odds(problem, is_false)
-    odds[closure] = label_odds - np.log(np.exp(rates) @ each.mixed)
+    odds[closure] = label_odds - np.log(each.mean(rates))
     odometry = np.flatnonzero(graph.is_odometry)
     slips = int((~state.is_good[odometry]).sum())
     odds[odometry] -= log_slip_odds(problem, graph.own_steps[odometry], slips)

@@ -424,6 +424,18 @@ def test_a_term_is_there_until_it_is_switched_off(name: str, is_off: Callable[[P
     assert is_off(_problem(graph, SlamPriors(), without={name}))
 
 
+def test_the_mean_over_rates_is_that_of_the_mixture() -> None:
+    rng = np.random.default_rng(0)
+    count = 40
+    has_near, has_far = rng.random((2, count)) < 0.5
+    density = FalseDensity(
+        rng.random((3, count)), rng.random((10, count)) * has_near, rng.random((10, count)) * has_far, has_near, has_far
+    )
+    rates = rng.normal(size=len(density.mixed))
+    rates -= logsumexp(rates)
+    np.testing.assert_allclose(density.mean(rates), np.exp(rates) @ density.mixed, rtol=1e-12)
+
+
 def _repeated(problem: Problem) -> FalseDensity:
     """The density of a closure that repeats the turn of the one before it."""
     first, second = problem.detection[:2]

@@ -240,6 +240,7 @@ STRUCTURAL = {
         "_IN_RUN",
         "_TOLD",
         "_FARTHEST",
+        "_ROWS_AT_ONCE",
         "_LEAST",
         "_GRID",
         "_NEAR_MISS_QUANTILES",
