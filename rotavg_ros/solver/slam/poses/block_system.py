@@ -264,7 +264,7 @@ class BlockFactor:
 
     @cached_property
     def leverage(self) -> np.ndarray:
-        """``(E, d, d)`` Λ, what of a whitened row its own measurement decides.
+        """``(E + R, d, d)`` Λ, what of a whitened row its own measurement decides.
 
         Of a row's own probe z ~ N(0, I) the fit takes up y, and y ~ N(0, Λ), z − y ~ N(0, I − Λ) are independent. Of
         turns and of shifts by themselves their moments A and B make L⁻¹ A L⁻ᵀ with L Lᵀ = A + B (a matrix-variate
@@ -274,14 +274,14 @@ class BlockFactor:
 
     @cached_property
     def redundancy(self) -> np.ndarray:
-        """``(E, d, d)`` I − Λ, positive definite."""
+        """``(E + R, d, d)`` I − Λ, positive definite."""
         return self._shares[1]
 
     @cached_property
     def _shares(self) -> tuple[np.ndarray, np.ndarray]:
-        k, d, num_edges = self._system.turns, self._system.size, self._system.num_edges
-        taken = self._predicted(self._samples)[:num_edges]
-        left = self._system.probes[:num_edges] - taken
+        k, d = self._system.turns, self._system.size
+        taken = self._predicted(self._samples)
+        left = self._system.probes - taken
         moments = [np.matmul(part, part.transpose(0, 2, 1)) / _NUM_PROBES for part in (taken, left)]
         both = moments[0] + moments[1]
         # A turn's moments with a shift's are noise where one of the two hardly counts, and it is as slight as that in y

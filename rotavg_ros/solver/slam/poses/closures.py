@@ -56,7 +56,6 @@ class Told:
         is_known: ``(C,)`` bool, whether a translation is stated.
         label: ``(C,)`` +1 if somebody has accepted it, −1 if rejected, 0 else.
         run: ``(C,)`` number of its run.
-        own_share: ``(C,)`` share of its error's variance that it does not share with its run.
         follows: ``(C,)`` the closure before each, or -1.
         sign: ``(C,)`` +1 where it runs from its older to its newer end, else −1.
         detection, detected: ``(C,)`` closures in the order in which they were detected, and when each was, as a rank.
@@ -67,7 +66,6 @@ class Told:
     is_known: np.ndarray
     label: np.ndarray
     run: np.ndarray
-    own_share: np.ndarray
     follows: np.ndarray
     sign: np.ndarray
     detection: np.ndarray
@@ -115,11 +113,13 @@ class Scale:
 
     Attributes:
         good: ``(C,)`` each, if it is good.
-        floor_share: ``(C,)`` the share of that which does not go with its length.
+        own: ``(C,)`` what of that it does not share with its run.
+        floor_share: ``(C,)`` the share of its own which does not go with its length.
         extent: how far two places of the map are apart.
     """
 
     good: np.ndarray
+    own: np.ndarray
     floor_share: np.ndarray
     extent: float
 

@@ -19,20 +19,23 @@ from rotavg_ros.solver.slam.poses.block_system import BlockFactor
 from rotavg_ros.solver.slam.poses.closures import Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.evidence import translation_cost
 from rotavg_ros.solver.slam.poses.map_turns import MapTurns
-from rotavg_ros.solver.slam.poses.noise import likeliest_noise
+from rotavg_ros.solver.slam.poses.neighbours import GOOD
+from rotavg_ros.solver.slam.poses.noise import likeliest_noise, log_noise_prior
 from rotavg_ros.solver.slam.poses.places import Judge
 from rotavg_ros.solver.slam.poses.rows import ANYHOW, PoseNoise, PoseProblem, PoseState
 from rotavg_ros.solver.slam.poses.solved import Solved
 
-_MAX_SOLVES = 24
+_MAX_SOLVES = 28
 # An update goes no further: the next one goes on from there.
 _MAX_UPDATE_SOLVES = 6
 # A step turns nothing by more than this, rad.
 _MAX_TURN = 0.3
 # Variances change by no more than this factor from solve to solve; most of them stay while places are sorted out.
-_SLOWEST, _HELD = 16.0, 3
-# Variances before this one are not those of closures' shifts.
-_OF_CLOSURES = 3
+_SLOWEST, _HELD = 16.0, 8
+# Which variances do not: those of closures' shifts by themselves.
+_FREE = np.array([False, False, False, True, True, False])
+# Variances of shifts to begin with, in those that are believed beforehand.
+USUAL, _LEVELS = 1.0, (1.0, 1 / 16, 1 / 256)
 # A variance whose change is a constant multiple of the one before is set to where that leads; of these at most. The
 # multiple of one that swings is negative.
 _LEAST_RATIO, _LARGEST_RATIO = -2.0, 0.6
@@ -40,6 +43,8 @@ _LEAST_RATIO, _LARGEST_RATIO = -2.0, 0.6
 _SHARE, _LEAST_SHARE = 0.5, 0.1
 # At rest: a step's root mean square in standard errors; chances of classes; logarithms of variances.
 _STEP_CONVERGED, _CHANCE_CONVERGED, _NOISE_CONVERGED = 0.05, 0.1, 0.1
+# A place is held to be right beyond this; variances are others if they differ by this, in the logarithm.
+_RIGHT, _OTHER_NOISE = 0.5, 1.0
 # No two places are nearer than so many typical steps.
 _LEAST_EXTENT = 3.0
 
@@ -62,6 +67,12 @@ class PoseMode:
     def state(self) -> PoseState:
         """Where the key nodes are, and the noise."""
         return self.solved.state
+
+    def is_like(self, other: PoseMode) -> bool:
+        """Whether the same closures join right places, under about the same noise."""
+        right, others = (pose.solved.places.chance[:GOOD].sum(axis=0) > _RIGHT for pose in (self, other))
+        apart = np.abs(self.state.noise.logarithms - other.state.noise.logarithms).max()
+        return bool((right == others).all() and apart < _OTHER_NOISE)
 
 
 @dataclass(frozen=True)
@@ -96,17 +107,20 @@ class PoseStart:
         )
 
 
-def estimate_poses(problem: PoseProblem, *, hold: bool = False, start: PoseStart | None = None) -> PoseMode:
+def estimate_poses(
+    problem: PoseProblem, *, hold: bool = False, start: PoseStart | None = None, level: float = USUAL
+) -> PoseMode:
     """Poses of a labelling.
 
     Args:
         problem: the labelling, and translations.
         hold: leave the labels of rotations as they are.
-        start: where to begin; default: at what rotations say, no closure's translation believed.
+        start: where to begin; default: at what rotations say, no closure's translation believed, …
+        level: … with variances of shifts so many times what is believed beforehand.
     """
     is_good = problem.mode.state.is_good[problem.mode.problem.closure]
     judge = Judge(problem.told, problem.turns, problem.priors, is_good if hold else None)
-    state = _begin(problem) if start is None else start.state
+    state = _begin(problem, level) if start is None else start.state
     places, is_new = _nothing_known(problem, state, judge), np.ones(len(is_good), dtype=bool)
     if start is not None:
         places, is_new = start.over(places), start.column < 0
@@ -187,14 +201,30 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     )
 
 
-def _begin(problem: PoseProblem) -> PoseState:
+def likeliest_level(problem: PoseProblem) -> float:
+    """The level of noise under which closures are likeliest, each by itself, before any of them pulls.
+
+    Where odometry begins too badly, what errs by anything has room for every false closure, and they keep it so; where
+    it begins too well, true regions are held to be wrong. What odometry alone tells of closures is no more than a
+    guess; which level it was the end tells.
+    """
+    told: list[float] = []
+    judge = Judge(problem.told, problem.turns, problem.priors)
+    for level in _LEVELS:
+        state = _begin(problem, level)
+        solved = _solve(problem, state, _nothing_known(problem, state, judge), judge)
+        told.append(float(solved.places.log_density.sum()) + log_noise_prior(problem, state.noise))
+    return _LEVELS[int(np.argmax(told))]
+
+
+def _begin(problem: PoseProblem, level: float) -> PoseState:
     """Orientations by rotations alone, positions along odometry."""
     mode = problem.mode
     common = np.zeros((problem.num_runs, 6))
     if problem.turns_share:
         common[:, :3] = mode.state.common
     nowhere = np.zeros((problem.drawn.num_nodes, 3))
-    state = PoseState(mode.state.correction, nowhere, common, problem.turn_noise)
+    state = PoseState(mode.state.correction, nowhere, common, problem.turn_noise.of_shifts_times(level))
     return replace(state, position=problem.along_odometry(problem.displacements(problem.orientations(state))))
 
 
@@ -207,8 +237,8 @@ def _nothing_known(problem: PoseProblem, state: PoseState, judge: Judge) -> Plac
 
 def _scale(problem: PoseProblem, state: PoseState) -> Scale:
     spread = float(np.var(state.position @ problem.bases[1], axis=0).mean())
-    good = problem.closure_variance(state.noise)
-    return Scale(good, state.noise.closure / good, 2 * spread + (_LEAST_EXTENT * problem.typical) ** 2)
+    good, own = problem.closure_variance(state.noise), problem.own_variance(state.noise)
+    return Scale(good, own, state.noise.closure / own, 2 * spread + (_LEAST_EXTENT * problem.typical) ** 2)
 
 
 def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.ndarray) -> Predictions:
@@ -254,7 +284,7 @@ class Pace:
 
 def _following(places: Places, problem: PoseProblem, before: PoseNoise, after: PoseNoise) -> Places:
     """With weights that are what they were in those of good closures, of which the variances are others."""
-    shift = problem.closure_variance(before) / problem.closure_variance(after)
+    shift = problem.own_variance(before) / problem.own_variance(after)
     turn = before.closure_turn / after.closure_turn
     return replace(places, weight=places.weight * shift, rotation_weight=places.rotation_weight * turn)
 
@@ -274,13 +304,13 @@ def _with_noise(
 
     Args:
         state: before.
-        noise: ``(5,)`` logarithms of variances as estimated.
-        last: ``(5,)`` how they changed before; zero where that is not to be gone on from.
+        noise: ``(6,)`` logarithms of variances as estimated.
+        last: ``(6,)`` how they changed before; zero where that is not to be gone on from.
         is_held: all but closures' shifts stay.
     """
     before = state.noise.logarithms
     change = noise - before
-    change[:_OF_CLOSURES] *= not is_held
+    change[~_FREE] *= not is_held
     ratio = change * last / np.maximum(last * last, np.finfo(np.float64).tiny)
     goes_on = last != 0
     reached = np.where(goes_on, change / (1 - np.clip(ratio, _LEAST_RATIO, _LARGEST_RATIO)), change)

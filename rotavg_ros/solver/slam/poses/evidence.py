@@ -34,7 +34,7 @@ def _normal(problem: PoseProblem, solved: Solved) -> float:
     cost = float((solved.left**2).sum() + _log_det(problem, solved)) / 2
     cost += float(np.linalg.slogdet(solved.covariance[odometry])[1].sum()) / 2
     cost -= (float(np.log(solved.closure_weight).sum()) * m + float(np.log(solved.rotation_weight).sum()) * k) / 2
-    cost += m / 2 * problem.num_runs * float(np.log(problem.priors.common * solved.state.noise.closure))
+    cost += m / 2 * problem.num_runs * float(np.log(solved.state.noise.common))
     cost += k / 2 * problem.num_runs * float(np.log(problem.common_turn(solved.state.noise)))
     # Rows less unknowns, per component of a shift; of loose nodes something is known beforehand.
     redundant = len(drawn.source) - drawn.num_nodes + len(drawn.roots) + len(problem.loose)

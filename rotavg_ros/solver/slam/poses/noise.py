@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
@@ -33,29 +35,36 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     redundant = np.trace(redundancy[:, :k, :k], axis1=1, axis2=2).sum()
     by_turns += np.array([(solved.left[segments, :k] ** 2).sum(), redundant])
     by_closures = np.stack((places.squares, places.freedom), axis=1)
-    found = (by_turns, by_closures[0], by_way, *by_closures[1:])
+    runs = slice(len(problem.drawn.source), None)
+    alike = (solved.left[runs, k:] ** 2).sum(), np.trace(solved.factor.redundancy[runs, k:, k:], axis1=1, axis2=2).sum()
+    found = (by_turns, by_closures[0], by_way, *by_closures[1:], alike)
     logarithms = [
         likeliest_variance(before * squares, max(freedom, 0.0), np.log(before), median, spread)
         for (squares, freedom), before, (median, spread) in zip(
-            found, np.exp(noise.logarithms).tolist(), priors_of(problem), strict=True
+            found, np.exp(noise.logarithms).tolist(), priors_of(problem, noise), strict=True
         )
     ]
-    return PoseNoise.of(np.log(logarithms))
+    noise = PoseNoise.of(np.log(logarithms))
+    # Runs that join wrong places have more than that in common, and would make room for themselves.
+    most = problem.priors.most_common
+    return replace(noise, common=min(noise.common, most / (1 - most) * noise.closure))
 
 
 def log_noise_prior(problem: PoseProblem, noise: PoseNoise) -> float:
     """Of all variances, nats, but for a constant."""
-    median, spread = np.array(priors_of(problem)).T
+    median, spread = np.array(priors_of(problem, noise)).T
     return -float(((noise.logarithms - median) ** 2 / (8 * spread**2)).sum())
 
 
-def priors_of(problem: PoseProblem) -> tuple[_Prior, ...]:
-    """Logarithms of median variances, and how far those of their roots spread."""
+def priors_of(problem: PoseProblem, noise: PoseNoise) -> tuple[_Prior, ...]:
+    """Logarithms of median variances, and how far those of their roots spread; what runs share goes with the noise."""
     of_turns, of_shifts, typical = problem.mode.problem.priors, problem.priors, problem.typical
+    own = 2 * float(np.log(of_shifts.closure * typical)) + float(np.log1p(-of_shifts.common))
     return (
         (2 * float(np.log(np.radians(of_turns.step_deg))), of_turns.noise_spread),
         (2 * float(np.log(np.radians(of_turns.closure_deg))), of_turns.noise_spread),
         (float(np.log(of_shifts.step**2 * typical)), of_shifts.step_spread),
-        (2 * float(np.log(of_shifts.closure * typical)), of_shifts.closure_spread),
+        (own, of_shifts.closure_spread),
         (2 * float(np.log(of_shifts.relative)), of_shifts.relative_spread),
+        (float(np.log(noise.closure * of_shifts.common / (1 - of_shifts.common))), of_shifts.common_spread),
     )

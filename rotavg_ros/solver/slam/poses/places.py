@@ -157,7 +157,7 @@ class Judge:
 
     def _variances(self, scale: Scale) -> np.ndarray:
         """``(J, C)`` m² per component, of ε in each class."""
-        good = scale.good * self.told.own_share * np.array([[1.0], [self.priors.tail_ratio]])
+        good = scale.own * np.array([[1.0], [self.priors.tail_ratio]])
         wrong = np.append(self._wrong(scale), scale.extent)
         return np.concatenate((good, np.broadcast_to(wrong[:, None], (_ELSEWHERE, good.shape[1]))))
 
@@ -207,7 +207,7 @@ class Judge:
     def _by_itself(self, predictions: Predictions, scale: Scale) -> tuple[np.ndarray, np.ndarray]:
         """``(C,)`` nats each, of shifts of closures whose rotation is false: at wrong places, and at the right one."""
         along, spread = along_axes(predictions, self.turns)
-        right = spread + (scale.good * self.told.own_share)[:, None]
+        right = spread + scale.own[:, None]
         log_right = -(along**2 / right + np.log(2 * np.pi * right)).sum(axis=1) / 2
         share = self.priors.turned_in_place
         return self._log_anywhere(predictions, scale) + np.log1p(-share), log_right + np.log(share)

@@ -19,7 +19,9 @@ class PlacePriors:
         relative: median of what a good closure's translation errs by, of its own length, …
         relative_spread: … and standard deviation of its logarithm: most front ends measure lengths, some guess them.
         slip: standard deviation of how far a step is off by where it slipped, beside what its turn bends.
-        common: share of a closure's variance that it has in common with those near it.
+        common: share of a closure's variance that it has in common with those near it, in the median; …
+        common_spread: … standard deviation of the logarithm of what they share over what they do not; …
+        most_common: … and the largest share.
         tails: share of good closures whose translation errs by far more than others', …
         tail_ratio: … by so many times the variance.
         turned_deg: standard deviation of how much another place that looks alike is seen turned.
@@ -43,6 +45,8 @@ class PlacePriors:
     relative_spread: float = 1.5
     slip: float = 1.0
     common: float = 0.5
+    common_spread: float = 1.0
+    most_common: float = 0.85
     tails: float = 0.1
     tail_ratio: float = 16.0
     turned_deg: float = 10.0

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart, estimate_poses
+from rotavg_ros.solver.slam.poses.estimate import USUAL, PoseMode, PoseStart, estimate_poses, likeliest_level
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode
@@ -71,8 +71,9 @@ def rival_poses(
     """
     ended: list[Rival] = []
     for mode in _first(modes):
-        least = min((rival.cost for rival in ended), default=np.inf)
-        ended.append(settling(graph, translation, mode, least))
+        for pose in _begun(PoseProblem(graph, translation, mode)):
+            least = min((rival.cost for rival in ended), default=np.inf)
+            ended.append(settling(pose, least))
     rivals: list[Rival] = []
     for rival in sorted(ended, key=lambda rival: rival.cost):
         is_far = rivals and rival.cost > rivals[0].cost + _FAR
@@ -105,21 +106,28 @@ def _first(modes: Sequence[Mode]) -> list[Mode]:
     return first
 
 
-def settling(graph: ViewGraph, translation: np.ndarray, mode: Mode, least: float = np.inf) -> Rival:
+def _begun(problem: PoseProblem) -> list[PoseMode]:
+    """Poses of a labelling, begun with the noise that is believed beforehand, and with that which odometry tells of."""
+    usual, level = estimate_poses(problem), likeliest_level(problem)
+    if level == USUAL:
+        return [usual]
+    other = estimate_poses(problem, level=level)
+    return [usual] if other.is_like(usual) else [usual, other]
+
+
+def settling(pose: PoseMode, least: float = np.inf) -> Rival:
     """A labelling with labels of rotations as places have them, as long as both together become likelier by it.
 
     Args:
-        graph: whose odometry was drawn together, without its bias.
-        translation: ``(M, 3)`` metres.
-        mode: the labelling to begin with.
+        pose: of the labelling to begin with.
         least: −log p of another one, nats; of one that is far from it no more is asked.
     """
-    pose, best = estimate_poses(PoseProblem(graph, translation, mode)), None
+    begun, best = pose.problem, None
     for _ in range(_ROUNDS):
         mode = relabelled(pose)
         if best is not None and mode.labels == best.mode.labels:
             break
-        problem = PoseProblem(graph, translation, mode)
+        problem = replace(begun, mode=mode)
         rival = Rival(mode, estimate_poses(problem, hold=True, start=PoseStart.at(pose)))
         if best is not None and rival.cost > best.cost - _LEAST_GAIN:
             break

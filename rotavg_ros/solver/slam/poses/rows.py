@@ -51,6 +51,7 @@ class PoseNoise:
         way: m² per metre passed, of odometry.
         closure: m², of a good closure's translation, and …
         relative: … by what of its squared length that grows: some front ends tell directions rather than lengths.
+        common: m², of what closures near each other err alike, on top.
     """
 
     turn: float
@@ -58,16 +59,26 @@ class PoseNoise:
     way: float
     closure: float
     relative: float
+    common: float
 
     @property
     def logarithms(self) -> np.ndarray:
-        """``(5,)``."""
-        return np.log([self.turn, self.closure_turn, self.way, self.closure, self.relative])
+        """``(6,)``."""
+        return np.log([self.turn, self.closure_turn, self.way, self.closure, self.relative, self.common])
 
     @classmethod
     def of(cls, logarithms: np.ndarray) -> PoseNoise:
-        """From ``(5,)``."""
+        """From ``(6,)``."""
         return cls(*np.exp(logarithms).tolist())
+
+    def of_closures(self, square_length: np.ndarray) -> np.ndarray:
+        """m² per component, of good closures' translations of this squared length, m²; all that they err by."""
+        return np.asarray(self.closure + self.common + self.relative * square_length)
+
+    def of_shifts_times(self, factor: float) -> PoseNoise:
+        """With all variances of shifts this factor times as large, but for what goes with their length."""
+        shifts = {name: factor * getattr(self, name) for name in ("way", "closure", "common")}
+        return replace(self, **shifts)
 
 
 @dataclass(frozen=True)
@@ -187,7 +198,8 @@ class PoseProblem:
         """Turns' as rotations alone have it, shifts' as it is believed to be."""
         noise, priors, typical = self.mode.state.noise, self.priors, self.typical
         way, closure = priors.step**2 * typical, (priors.closure * typical) ** 2
-        return PoseNoise(noise.step_variance, noise.closure_variance, way, closure, priors.relative**2)
+        own, common = (1 - priors.common) * closure, priors.common * closure
+        return PoseNoise(noise.step_variance, noise.closure_variance, way, own, priors.relative**2, common)
 
     @cached_property
     def slipped(self) -> np.ndarray:
@@ -229,7 +241,12 @@ class PoseProblem:
 
     def closure_variance(self, noise: PoseNoise) -> np.ndarray:
         """``(C,)`` m² per component, of good closures' translations."""
-        return np.asarray(noise.closure + noise.relative * (self.lengths[self.closures] ** 2).sum(axis=1))
+        return noise.of_closures((self.lengths[self.closures] ** 2).sum(axis=1))
+
+    def own_variance(self, noise: PoseNoise) -> np.ndarray:
+        """``(C,)`` m², what of that each does not share with its run."""
+        is_shared = self.run[self.mode.problem.closure] >= 0
+        return np.asarray(self.closure_variance(noise) - is_shared * noise.common)
 
     @cached_property
     def told(self) -> Told:
@@ -248,10 +265,9 @@ class PoseProblem:
         broad = predicted / (1 + predicted / ANYHOW)
         false_odds += log_false(square, k, priors, predicted=broad) - log_false(square, k, priors)
         is_known = np.isfinite(self.translation).all(axis=1)[self.closures]
-        shared = np.where(self.run[closure] >= 0, self.priors.common, 0.0)
         own = self.rotation_variance(self.turn_noise)[closure]
         order = problem.detection, problem.detected
-        return Told(own, false_odds, is_known, label, problem.run, 1 - shared, problem.follows, problem.sign, *order)
+        return Told(own, false_odds, is_known, label, problem.run, problem.follows, problem.sign, *order)
 
     @cached_property
     def equations(self) -> BlockEquations:
@@ -337,7 +353,7 @@ class PoseProblem:
         variance += np.where(slipped, (self.priors.slip * self.typical) ** 2, 0.0)
         # Odometry beside the chain that is not believed, which nothing hangs on, does not pull.
         variance[num_segments:] = np.where(slipped, variance / _NOTHING, variance)[num_segments:]
-        variance[self.mode.problem.closure] = self.closure_variance(noise) * self.told.own_share
+        variance[self.mode.problem.closure] = self.own_variance(noise)
         covariance = variance[:, None, None] * unit
         covariance[: drawn.num_segments] += self.bridge_variance(noise)[:, None, None] * self.bent(way)
         return np.asarray(covariance)
@@ -372,7 +388,7 @@ class PoseProblem:
         edges[self.mode.problem.closure, k:, k:] = np.sqrt(closure_weight)[:, None, None] * np.eye(m)
         if self.num_runs:
             common[:, :k, :k] = np.eye(k) / np.sqrt(self.common_turn(state.noise))
-            common[:, k:, k:] = np.eye(m) / np.sqrt(self.priors.common * state.noise.closure)
+            common[:, k:, k:] = np.eye(m) / np.sqrt(state.noise.common)
         return root
 
     def loose_weight(self, extent: float) -> np.ndarray:

@@ -207,7 +207,7 @@ class _System:
             shift *= is_known[:, None]
             square = (translation**2).sum(dim=1).numpy()
             residual = np.concatenate((turn @ linear.turns, shift @ linear.shifts), axis=1)[:, :, None]
-        own_shift = np.where(is_known, noise.closure + noise.relative * square, linear.extent / _NOTHING)
+        own_shift = np.where(is_known, noise.of_closures(square), linear.extent / _NOTHING)
         own = np.stack((np.full(len(edge), noise.closure_turn), own_shift))
         return cls(
             linear, laid, source.numpy(), target.numpy(), anchor, way, along, residual, displacement, own, is_known

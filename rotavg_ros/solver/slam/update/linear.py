@@ -89,7 +89,7 @@ class Linear:
             problem.components,
             None,
             None,
-            PoseNoise(noise.step_variance, noise.closure_variance, 0.0, 0.0, 0.0),
+            PoseNoise(noise.step_variance, noise.closure_variance, 0.0, 0.0, 0.0, 0.0),
             int(is_good.sum()),
             int((~is_good).sum()),
             1.0,

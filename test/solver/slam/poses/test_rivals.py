@@ -36,7 +36,7 @@ def test_a_labelling_follows_its_places_to_one_that_is_likelier(kind: str, gain:
     graph, translation, found = found_of(kind, 6)
     mode = found.modes[0]
     as_it_was = mode.cost + estimate_poses(PoseProblem(graph, translation, mode), hold=True).cost
-    rival = settling(graph, translation, mode)
+    rival = settling(estimate_poses(PoseProblem(graph, translation, mode)))
     assert rival.cost < as_it_was - gain
     changed = int((rival.mode.is_false != mode.is_false).sum())
     assert changed > 10 if gain > 0 else changed < 10
