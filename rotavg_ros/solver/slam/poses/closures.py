@@ -11,6 +11,8 @@ from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.noise.exceedance import exceedance
 from rotavg_ros.solver.slam.posterior.densities import log_half_turn
 
+# Classes of good closures come first.
+GOOD = 2
 # In which errors are longer than a limit: in a plane, too, where that is a little too often.
 _DIMENSIONS = 3
 
@@ -95,6 +97,11 @@ class Places:
     log_density: np.ndarray
     error: np.ndarray
     error_variance: np.ndarray
+
+    @property
+    def right(self) -> np.ndarray:
+        """``(C,)`` probability that a closure joins the right places by the right rotation."""
+        return np.asarray(self.chance[:GOOD].sum(axis=0))
 
     @property
     def rotation_good(self) -> np.ndarray:

@@ -19,7 +19,6 @@ from rotavg_ros.solver.slam.poses.block_system import BlockFactor
 from rotavg_ros.solver.slam.poses.closures import Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.evidence import translation_cost
 from rotavg_ros.solver.slam.poses.map_turns import MapTurns
-from rotavg_ros.solver.slam.poses.neighbours import GOOD
 from rotavg_ros.solver.slam.poses.noise import likeliest_noise, log_noise_prior
 from rotavg_ros.solver.slam.poses.places import Judge
 from rotavg_ros.solver.slam.poses.rows import ANYHOW, PoseNoise, PoseProblem, PoseState
@@ -43,8 +42,8 @@ _LEAST_RATIO, _LARGEST_RATIO = -2.0, 0.6
 _SHARE, _LEAST_SHARE = 0.5, 0.1
 # At rest: a step's root mean square in standard errors; chances of classes; logarithms of variances.
 _STEP_CONVERGED, _CHANCE_CONVERGED, _NOISE_CONVERGED = 0.05, 0.1, 0.1
-# A place is held to be right beyond this; variances are others if they differ by this, in the logarithm.
-_RIGHT, _OTHER_NOISE = 0.5, 1.0
+# Two judge a closure's place otherwise if its chances to be right differ by this.
+_OTHERWISE = 0.5
 # No two places are nearer than so many typical steps.
 _LEAST_EXTENT = 3.0
 
@@ -69,10 +68,8 @@ class PoseMode:
         return self.solved.state
 
     def is_like(self, other: PoseMode) -> bool:
-        """Whether the same closures join right places, under about the same noise."""
-        right, others = (pose.solved.places.chance[:GOOD].sum(axis=0) > _RIGHT for pose in (self, other))
-        apart = np.abs(self.state.noise.logarithms - other.state.noise.logarithms).max()
-        return bool((right == others).all() and apart < _OTHER_NOISE)
+        """Whether the same closures join right places."""
+        return _is_like(self.solved.places, other.solved.places)
 
 
 @dataclass(frozen=True)
@@ -108,7 +105,12 @@ class PoseStart:
 
 
 def estimate_poses(
-    problem: PoseProblem, *, hold: bool = False, start: PoseStart | None = None, level: float = USUAL
+    problem: PoseProblem,
+    *,
+    hold: bool = False,
+    start: PoseStart | None = None,
+    level: float = USUAL,
+    until: PoseMode | None = None,
 ) -> PoseMode:
     """Poses of a labelling.
 
@@ -117,6 +119,7 @@ def estimate_poses(
         hold: leave the labels of rotations as they are.
         start: where to begin; default: at what rotations say, no closure's translation believed, …
         level: … with variances of shifts so many times what is believed beforehand.
+        until: no further than where these poses' closures join right places, too.
     """
     is_good = problem.mode.state.is_good[problem.mode.problem.closure]
     judge = Judge(problem.told, problem.turns, problem.priors, is_good if hold else None)
@@ -135,6 +138,8 @@ def estimate_poses(
         changed = np.abs(after.chance - places.chance).max(initial=0.0)
         is_at_rest = solved.moved < _STEP_CONVERGED and changed < _CHANCE_CONVERGED
         number += 1
+        if until is not None and number > held and _is_like(after, until.solved.places):
+            break
         if number == most or (
             number > held and is_at_rest and np.abs(noise - state.noise.logarithms).max() < _NOISE_CONVERGED
         ):
@@ -147,6 +152,10 @@ def estimate_poses(
     judge = replace(judge, told=replace(judge.told, rotation_variance=used))
     in_order = judge(solved.predictions, solved.maps, solved.places.chance, solved.scale, in_order=True)
     return PoseMode(problem, solved, translation_cost(problem, solved, in_order))
+
+
+def _is_like(places: Places, others: Places) -> bool:
+    return bool((np.abs(places.right - others.right) < _OTHERWISE).all())
 
 
 def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge) -> Solved:
@@ -202,11 +211,10 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
 
 
 def likeliest_level(problem: PoseProblem) -> float:
-    """The level of noise under which closures are likeliest, each by itself, before any of them pulls.
+    """The level of shifts' noise under which closures are likeliest, each by itself, before any of them pulls.
 
-    Where odometry begins too badly, what errs by anything has room for every false closure, and they keep it so; where
-    it begins too well, true regions are held to be wrong. What odometry alone tells of closures is no more than a
-    guess; which level it was the end tells.
+    Odometry that errs by anything has room for every false closure, and they keep it so; taken for better than it is,
+    it holds true regions to be wrong. What it tells of closures by itself is a guess at which; −log p decides.
     """
     told: list[float] = []
     judge = Judge(problem.told, problem.turns, problem.priors)

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rotavg_ros.solver.slam.poses.closures import Told
+from rotavg_ros.solver.slam.poses.closures import GOOD, Told
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 
-# Classes of good closures come first.
-GOOD = 2
 # Squared widths of what repeats differ by, in those of two good closures.
 _KERNELS = np.array([1.0, 16.0, 256.0])
 # No share is less than this, or nearer to one.

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import expit
 
 from rotavg_ros.solver.slam.poses.closures import (
+    GOOD,
     Places,
     Predictions,
     Scale,
@@ -21,7 +22,7 @@ from rotavg_ros.solver.slam.poses.closures import (
     log_from_behind,
 )
 from rotavg_ros.solver.slam.poses.map_turns import MapTurns
-from rotavg_ros.solver.slam.poses.neighbours import GOOD, Repeats, repeats_of, wrong_share
+from rotavg_ros.solver.slam.poses.neighbours import Repeats, repeats_of, wrong_share
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 
 # Classes of wrong places of their own; one more repeats another's.

@@ -111,7 +111,7 @@ def _begun(problem: PoseProblem) -> list[PoseMode]:
     usual, level = estimate_poses(problem), likeliest_level(problem)
     if level == USUAL:
         return [usual]
-    other = estimate_poses(problem, level=level)
+    other = estimate_poses(problem, level=level, until=usual)
     return [usual] if other.is_like(usual) else [usual, other]
 
 

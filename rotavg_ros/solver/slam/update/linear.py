@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from rotavg_ros.solver.slam.poses.estimate import PoseMode
-from rotavg_ros.solver.slam.poses.neighbours import GOOD
 from rotavg_ros.solver.slam.poses.rows import PoseNoise
 from rotavg_ros.solver.slam.posterior.mode import Mode
 
@@ -106,7 +105,7 @@ class Linear:
         length = np.where(segment >= 0, solved.way.length[np.maximum(segment, 0)], 0.0)
         passed = np.where(segment >= 0, solved.way.passed / np.maximum(length, np.finfo(np.float64).tiny), 0.0)
         between = drawn.fraction * (1 - drawn.fraction) * drawn.length * noise.turn
-        good = float(solved.places.chance[:GOOD].sum())
+        good = float(solved.places.right.sum())
         return cls(
             len(drawn.segment_of_edge),
             drawn.above,
