@@ -254,7 +254,7 @@ def _with_closures(
 
     places = estimate.places
     if places is not None and laid.position is not None:
-        weight = np.array([1 / linear.noise.closure_turn, 1 / float(linear.noise.of_closures(np.zeros(())))])
+        weight = np.array([1 / linear.noise.closure_turn, 1 / linear.noise.of_closures(0.0)])
         places = replace(
             places,
             position=torch.from_numpy(laid.position),

@@ -71,7 +71,7 @@ class PoseNoise:
         """From ``(6,)``."""
         return cls(*np.exp(logarithms).tolist())
 
-    def of_closures(self, square_length: np.ndarray) -> np.ndarray:
+    def of_closures(self, square_length: np.ndarray | float) -> np.ndarray:
         """m² per component, of good closures' translations of this squared length, m²; all that they err by."""
         return np.asarray(self.closure + self.common + self.relative * square_length)
 
