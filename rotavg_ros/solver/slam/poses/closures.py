@@ -13,6 +13,8 @@ from rotavg_ros.solver.slam.posterior.densities import log_half_turn
 
 # Classes of good closures come first.
 GOOD = 2
+# Two judge a closure's place otherwise if its chances to be right differ by this.
+_OTHERWISE = 0.5
 # In which errors are longer than a limit: in a plane, too, where that is a little too often.
 _DIMENSIONS = 3
 
@@ -102,6 +104,10 @@ class Places:
     def right(self) -> np.ndarray:
         """``(C,)`` probability that a closure joins the right places by the right rotation."""
         return np.asarray(self.chance[:GOOD].sum(axis=0))
+
+    def is_like(self, other: Places) -> bool:
+        """Whether the same closures join right places."""
+        return bool((np.abs(self.right - other.right) < _OTHERWISE).all())
 
     @property
     def rotation_good(self) -> np.ndarray:

@@ -42,8 +42,6 @@ _LEAST_RATIO, _LARGEST_RATIO = -2.0, 0.6
 _SHARE, _LEAST_SHARE = 0.5, 0.1
 # At rest: a step's root mean square in standard errors; chances of classes; logarithms of variances.
 _STEP_CONVERGED, _CHANCE_CONVERGED, _NOISE_CONVERGED = 0.05, 0.1, 0.1
-# Two judge a closure's place otherwise if its chances to be right differ by this.
-_OTHERWISE = 0.5
 # No two places are nearer than so many typical steps.
 _LEAST_EXTENT = 3.0
 
@@ -66,10 +64,6 @@ class PoseMode:
     def state(self) -> PoseState:
         """Where the key nodes are, and the noise."""
         return self.solved.state
-
-    def is_like(self, other: PoseMode) -> bool:
-        """Whether the same closures join right places."""
-        return _is_like(self.solved.places, other.solved.places)
 
 
 @dataclass(frozen=True)
@@ -138,7 +132,7 @@ def estimate_poses(
         changed = np.abs(after.chance - places.chance).max(initial=0.0)
         is_at_rest = solved.moved < _STEP_CONVERGED and changed < _CHANCE_CONVERGED
         number += 1
-        if until is not None and number > held and _is_like(after, until.solved.places):
+        if until is not None and number > held and after.is_like(until.solved.places):
             break
         if number == most or (
             number > held and is_at_rest and np.abs(noise - state.noise.logarithms).max() < _NOISE_CONVERGED
@@ -152,10 +146,6 @@ def estimate_poses(
     judge = replace(judge, told=replace(judge.told, rotation_variance=used))
     in_order = judge(solved.predictions, solved.maps, solved.places.chance, solved.scale, in_order=True)
     return PoseMode(problem, solved, translation_cost(problem, solved, in_order))
-
-
-def _is_like(places: Places, others: Places) -> bool:
-    return bool((np.abs(places.right - others.right) < _OTHERWISE).all())
 
 
 def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge) -> Solved:

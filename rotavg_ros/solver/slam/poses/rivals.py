@@ -112,7 +112,7 @@ def _begun(problem: PoseProblem) -> list[PoseMode]:
     if level == USUAL:
         return [usual]
     other = estimate_poses(problem, level=level, until=usual)
-    return [usual] if other.is_like(usual) else [usual, other]
+    return [usual] if other.solved.places.is_like(usual.solved.places) else [usual, other]
 
 
 def settling(pose: PoseMode, least: float = np.inf) -> Rival:

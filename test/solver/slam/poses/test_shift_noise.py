@@ -19,31 +19,53 @@ from rotavg_ros.solver.slam.poses.estimate import USUAL, likeliest_level
 from .test_poses import HILLS, graph_of, pose_mode, simulated
 
 
-def exact_odometry(seed: int, step_m: float) -> DrawnPoses:
-    """A city in space, half a metre a step, and two fifths of the closures in runs that join parallel corridors."""
-    run = simulated(seed, **HILLS, world=World.CITY, closures_per_keyframe=0.25, keyframe_distance_m=0.5)
+def with_false_runs(seed: int, noise: Noise, share: float, **options: object) -> DrawnPoses:
+    """A run in space; this share of the closures lies in runs that join parallel corridors."""
+    run = simulated(seed, **options)
     poses = Poses(Rotation.from_quat(run.world_from_body).inv().as_quat(), run.position, run.planar)
     rng = np.random.default_rng(seed)
-    drawn = redrawn(run.graph, poses, Noise(0.8, step_m, 0.6, 0.01), rng)
-    return false_places.with_share(drawn, 0.4, false_places.parallel_corridors_in_runs, rng)
+    drawn = redrawn(run.graph, poses, noise, rng)
+    return false_places.with_share(drawn, share, false_places.parallel_corridors_in_runs, rng)
 
 
-@pytest.mark.parametrize("step_m", [0.0005, 0.05])
-def test_false_runs_are_found_however_well_odometry_tells_lengths(step_m: float) -> None:
-    """Were exact odometry taken for a usual one, all runs could join what they claim to."""
-    for seed in range(2):
-        drawn = exact_odometry(seed, step_m)
-        answer = solve(drawn.graph)
-        flagged = (answer.outlier_score > 0.5).numpy()
-        assert (flagged == drawn.is_wrong)[drawn.is_closure].mean() > 0.97
-        assert answer.position is not None
-        off = position_errors(answer.position.numpy(), drawn.poses.position)
-        assert np.sqrt((off**2).mean()) < 0.3
+def city(seed: int, step_m: float) -> DrawnPoses:
+    """Half a metre a step."""
+    streets = HILLS | {"world": World.CITY, "closures_per_keyframe": 0.25, "keyframe_distance_m": 0.5}
+    return with_false_runs(seed, Noise(0.8, step_m, 0.6, 0.01), 0.4, **streets)
+
+
+def torus(seed: int) -> DrawnPoses:
+    """Odometry errs by a hundredth of a step, where a twentieth is usual, and closures by an eighth of one."""
+    flights = {"world": World.TORUS, "dimensions": 3, "num_keyframes": 335, "laps": 4.0, "closures_per_keyframe": 0.3}
+    lengths = {"keyframe_distance_m": 1.77, "closure_radius_m": 5.0}
+    return with_false_runs(seed, Noise(0.37, 0.017, 2.0, 0.23), 0.26, **flights, **lengths)
+
+
+def right_verdicts(drawn: DrawnPoses) -> float:
+    """Share of the closures that are flagged if they are false, and only then."""
+    flagged = (solve(drawn.graph).outlier_score > 0.5).numpy()
+    return float((flagged == drawn.is_wrong)[drawn.is_closure].mean())
+
+
+def test_a_map_does_not_crumple_while_places_are_sorted_out() -> None:
+    """Odometry of 10 % a step: were its variance free from the first solves on, it would make room for all runs."""
+    drawn = city(0, 0.05)
+    answer = solve(drawn.graph)
+    assert answer.position is not None
+    off = position_errors(answer.position.numpy(), drawn.poses.position)
+    assert np.sqrt((off**2).mean()) < 0.3
+    assert right_verdicts(drawn) > 0.97
+
+
+@pytest.mark.parametrize("seed", [1, 5])
+def test_false_runs_are_found_from_the_noise_that_odometry_tells(seed: int) -> None:
+    """From the usual noise alone a tenth of the closures and more is judged wrongly."""
+    assert right_verdicts(torus(seed)) > 0.97
 
 
 @torch.no_grad()
 def test_the_noise_to_begin_with_is_what_odometry_tells() -> None:
-    levels = [likeliest_level(pose_mode(exact_odometry(0, step_m).graph).problem) for step_m in (0.0005, 0.05)]
+    levels = [likeliest_level(pose_mode(city(0, step_m).graph).problem) for step_m in (0.0005, 0.05)]
     assert levels[0] < USUAL == levels[1]
 
 
