@@ -111,9 +111,10 @@ def test_there_is_an_answer_without_any_part(name: str) -> None:
     assert bool(((solution.outlier_score >= 0) & (solution.outlier_score <= 1)).all())
 
 
-def test_a_slip_is_predicted_by_what_its_witnesses_tell_together() -> None:
-    """Each by itself is told of by the odometry alone, which has drifted."""
-    case = drawn("lone slip: 20 witnesses, one pair of places", 1)
+@pytest.mark.parametrize(("places", "seed"), [("one pair of places", 1), ("three pairs of places", 7)])
+def test_a_slip_is_predicted_by_what_its_witnesses_tell_together(places: str, seed: int) -> None:
+    """Each by itself is told of by the odometry alone, which has drifted; the second slip is nearly half a turn."""
+    case = drawn(f"lone slip: 20 witnesses, {places}", seed)
     with torch.no_grad():
         found = search(case.graph, Networks("cpu").load(SlamCleanNet), bootstrap)
     grouped = next(mode for mode in found.modes if len(mode.slipped) == 0 and mode.is_false.sum() >= 15)

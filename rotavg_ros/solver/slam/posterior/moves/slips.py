@@ -103,21 +103,32 @@ def propose_slips(mode: Mode) -> Iterator[Proposal]:
     for _, closure, place, freed, lost in sorted(found, key=lambda slip: -slip[0])[: mode.problem.limits.slips]:
         edge, turn = int(witnesses.segment[place]), witnesses.turned[:, [closure]]
         # Together they gain less than one by one: false closures that repeat a turn are cheap.
-        after = _log_labelled(mode, mode.is_false & ~freed) + _log_turned(mode, np.flatnonzero(freed))
+        after = _log_labelled(mode, mode.is_false & ~freed)
+        after += _log_turned(mode, np.flatnonzero(freed), turn, witnesses.turned[:, freed])
         after += float(log_slip_odds(mode.problem, mode.problem.graph.own_steps[[edge]], len(mode.slipped))[0])
         predicted = before - after + float(witnesses.gain[lost].sum())
         # A slip turns a part of the map, so it is tried where it would be a rival only.
         yield Proposal("slip", predicted, partial(_with_slip, mode, edge, turn), mode.problem.limits.rival)
 
 
-def _log_turned(mode: Mode, members: np.ndarray) -> float:
-    """Log density of false closures if they are good and one slip turned all of them."""
+def _log_turned(mode: Mode, members: np.ndarray, turn: np.ndarray, turned: np.ndarray) -> float:
+    """Log density of K false closures if they are good and one slip turned all of them by about ``turn``.
+
+    What is left without the turn is small: between rotations by nearly half a turn the differences of vectors are up to
+    π/2 times as long as those that noise makes.
+
+    Args:
+        members: ``(K,)`` closures.
+        turn: ``(4, 1)``.
+        turned: ``(4, K)`` their residuals, from older to newer end.
+    """
     problem, k = mode.problem, mode.problem.components
-    rows, sign = problem.closure[members], problem.sign[members]
-    residual = mode.evaluation.residual[rows]
+    rows, sign, slip = problem.closure[members], problem.sign[members], np.radians(problem.priors.slip_deg)
+    residual = quaternion_rows.log(quaternion_rows.multiply(quaternion_rows.inverse(turn), turned)).T
     total = mode.covariance_of(members) + np.diag(variances(problem, mode.state.noise)[rows])
-    total += np.radians(problem.priors.slip_deg) ** 2 * np.outer(sign, sign)
+    total = total * np.outer(sign, sign) + slip**2
     square = float((residual * np.linalg.solve(total, residual)).sum())
+    square += float((quaternion_rows.log(turn) ** 2).sum()) / slip**2
     log_det = float(np.linalg.slogdet(total)[1])
     return float(-square / 2 - k / 2 * (log_det + len(rows) * np.log(2 * np.pi)))
 
