@@ -85,9 +85,18 @@ class TwoLabels:
             excess += np.maximum(np.abs(flow, out=flow) - room, 0).sum(axis=0)
         return np.asarray(np.minimum(excess, self.gain))
 
-    def best_set(self, network: FlowNetwork, question: int = 0) -> np.ndarray:
-        """``(N,)`` bool, the nodes to turn; ``network`` is the graph's."""
-        return network.minimum_cut(self.to_target[:, question], self.to_source[:, question], self.supply[:, question])
+    def best_set(self, network: FlowNetwork, system: FactorisedLaplacian, question: int = 0) -> np.ndarray:
+        """``(N,)`` bool, the nodes to turn; ``network`` is the graph's, ``system`` as in :meth:`gain_bounds`.
+
+        What the electrical flow carries within what edges have room for is taken off first. All sets still differ in
+        cost by as much (capacities are another way of writing the same cost), and little is left for the maximum flow.
+        """
+        forwards, backwards = self.to_target[:, question], self.to_source[:, question]
+        potential = system.solve(self.supply[:, [question]])[:, 0]
+        flow = np.clip(system.weight * (potential[self.source] - potential[self.target]), -backwards, forwards)
+        supply = self.supply[:, question] - np.bincount(self.source, flow, self.num_nodes)
+        supply += np.bincount(self.target, flow, self.num_nodes)
+        return network.minimum_cut(forwards - flow, backwards + flow, supply)
 
 
 class FlowNetwork:

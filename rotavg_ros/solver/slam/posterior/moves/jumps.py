@@ -80,7 +80,7 @@ class _Jumps:
                 if bound <= hopeless[edge] + _MIN_GAIN:
                     continue
             hopeless[edge] = bound
-            moved = torch.from_numpy(np.flatnonzero(question.best_set(self._network, column)))
+            moved = torch.from_numpy(np.flatnonzero(question.best_set(self._network, system, column)))
             if len(moved) in (0, cost.graph.num_nodes):
                 continue
             tried = correction.clone()
