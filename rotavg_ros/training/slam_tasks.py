@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rotavg_ros.datasets.simulation.few_witnesses import slip_with_few_witnesses
+from rotavg_ros.datasets.simulation.scarce_evidence import several_robots, slip_with_few_witnesses
 from rotavg_ros.datasets.simulation.slam_simulation import random_slam_config, simulate_slam_graph
 from rotavg_ros.datasets.simulation.stress.family import RobotFamily
 from rotavg_ros.metrics.calibration import expected_calibration_error
@@ -17,8 +17,9 @@ from rotavg_ros.solver.learning.closures import ClosureFeatures, SlamCleanNet, c
 from rotavg_ros.solver.neurora.message_passing import DirectedEdges
 from rotavg_ros.training.config import TrainingConfig
 
-# So many of the wide family's runs have a slip that few closures tell of; others' are told of by all that span them.
-_FEW_WITNESSES = 0.2
+# Of the wide family's runs so many have a slip that few closures tell of (others' are told of by all that span them),
+# and so many are of several robots.
+_FEW_WITNESSES, _SEVERAL_ROBOTS = 0.2, 0.15
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,8 @@ def sample_run(
         run = simulate_slam_graph(random_slam_config(rng, keyframes), rng)
         if rng.random() < _FEW_WITNESSES:
             run = slip_with_few_witnesses(run, rng)
+        if rng.random() < _SEVERAL_ROBOTS:
+            run = several_robots(run, rng)
         graph, is_false = run.graph, run.closure_is_false
     else:
         drawn = family.drawn(keyframes, rng)

@@ -29,8 +29,11 @@ _MAX_SOLVES = 28
 _MAX_UPDATE_SOLVES = 6
 # A step turns nothing by more than this, rad.
 _MAX_TURN = 0.3
-# Variances change by no more than this factor from solve to solve; most of them stay while places are sorted out.
+# Variances change by no more than this factor from solve to solve; most stay while places are sorted out, for so
+# many solves at most.
 _SLOWEST, _HELD = 16.0, 8
+# After so many it is told whether places come out as those of other poses.
+_ALIKE_AFTER = 4
 # Which variances do not: those of closures' shifts by themselves.
 _FREE = np.array([False, False, False, True, True, False])
 # Variances of shifts to begin with, in those that are believed beforehand.
@@ -132,7 +135,9 @@ def estimate_poses(
         changed = np.abs(after.chance - places.chance).max(initial=0.0)
         is_at_rest = solved.moved < _STEP_CONVERGED and changed < _CHANCE_CONVERGED
         number += 1
-        if until is not None and number > held and after.is_like(until.solved.places):
+        if is_at_rest:
+            held = min(held, number)
+        if until is not None and number >= _ALIKE_AFTER and after.is_like(until.solved.places):
             break
         if number == most or (
             number > held and is_at_rest and np.abs(noise - state.noise.logarithms).max() < _NOISE_CONVERGED
