@@ -53,7 +53,8 @@ def closure_features(
         (
             np.clip(judge_by_chain(noise, squared_angle, path_steps) / _LOG_ODDS_SCALE, -3, 1.5),
             np.where(finite, np.arcsinh(np.sqrt(squared_angle / variance)), 0.0),
-            np.sqrt(np.minimum(squared_angle, np.pi**2)),
+            # Between chains that closures alone join it depends on which of these the chains were drawn together by.
+            np.where(finite, np.sqrt(np.minimum(squared_angle, np.pi**2)), 0.0),
             np.where(finite, np.log10(1e-3 + drift / noise.closure_variance), 3.0),
             np.full(count, np.log10(np.sqrt(noise.closure_variance)) + 1.5),
             np.full(count, noise.prior_log_odds / 2),

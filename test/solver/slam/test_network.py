@@ -6,6 +6,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from rotavg_ros.datasets.simulation.scarce_evidence import several_robots
+from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.solver.algebra.spanning_forest import minimum_spanning_forest
 from rotavg_ros.solver.networks import NETWORKS
 from rotavg_ros.solver.neurora.network_store import load_network
@@ -40,3 +42,17 @@ def test_neighbours_disagree_by_scipys_angle() -> None:
     )
     angle = (forward[pairs.first].inv() * forward[pairs.second]).magnitude()
     np.testing.assert_allclose(np.sqrt(pairs.squared_angle), angle, rtol=1e-9, atol=3e-8)
+
+
+def test_between_robots_nothing_depends_on_the_closure_that_draws_them_together() -> None:
+    """The residuals of all others between two chains are told from that one, whether it is good or false."""
+    run = simulate_slam_graph(
+        SlamSimulationConfig(num_keyframes=120, closures_per_keyframe=0.3), np.random.default_rng(0)
+    )
+    prepared = prepare(several_robots(run, np.random.default_rng(0)).graph)
+    is_between = ~np.isfinite(prepared.path_steps)
+    assert is_between.sum() > 2
+    other = np.where(is_between, 1.0 + prepared.squared_angle, prepared.squared_angle)
+    for squared_angle in (prepared.squared_angle, other):
+        features = closure_features(prepared.noise, squared_angle, prepared.path_steps, prepared.pairs).closures
+        assert features[torch.from_numpy(is_between)].unique(dim=0).shape[0] == 1

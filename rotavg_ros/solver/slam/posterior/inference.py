@@ -12,7 +12,7 @@ from rotavg_ros.solver.slam.posterior.em import polish, settle, step
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.moves import noise, slips
 from rotavg_ros.solver.slam.posterior.moves.flips import flipped
-from rotavg_ros.solver.slam.posterior.moves.starts import starts, turned_parts
+from rotavg_ros.solver.slam.posterior.moves.starts import starts, turned_further, turned_parts
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import with_noise
 from rotavg_ros.solver.slam.posterior.state import State
@@ -59,6 +59,17 @@ class Search:
         self.move_on()
         if may_cut and self._seems_slipped(self.modes[0]):  # as moves have found since
             self._begun("minimum cuts", turned_parts(self.problem, prepared, correction))
+            self.move_on()
+        if "minimum-cuts" not in self.problem.without:
+            self._cut_further(prepared)
+
+    def _cut_further(self, prepared: Prepared) -> None:
+        """Minimum cuts from the best mode, as long as what they find is better."""
+        least = np.inf
+        while self.modes[0].cost < least - _GAIN and len(self.modes[0].slipped) > 0:
+            best = self.modes[0]
+            least = best.cost
+            self._begun("minimum cuts", turned_further(self.problem, prepared, best.state))
             self.move_on()
 
     def _begun(self, name: str, state: State) -> Mode:

@@ -111,6 +111,13 @@ def test_there_is_an_answer_without_any_part(name: str) -> None:
     assert bool(((solution.outlier_score >= 0) & (solution.outlier_score <= 1)).all())
 
 
+def test_two_stretches_that_slips_turned_alike_are_turned_back_together() -> None:
+    """Closures join them to each other, so neither goes back alone."""
+    kind = "building: locatable slips, 30 % random"
+    case, solution = drawn(kind, 9), solved(kind, 9)
+    assert error_deg(case.graph, solution, case.body_from_world) < 1.0
+
+
 @pytest.mark.parametrize(("places", "seed"), [("one pair of places", 1), ("three pairs of places", 7)])
 def test_a_slip_is_predicted_by_what_its_witnesses_tell_together(places: str, seed: int) -> None:
     """Each by itself is told of by the odometry alone, which has drifted; the second slip is nearly half a turn."""

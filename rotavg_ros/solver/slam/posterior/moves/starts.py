@@ -75,6 +75,16 @@ def turned_parts(problem: Problem, prepared: Prepared, tree: Tensor) -> State:
     return _labelled(problem, at(problem, found, np.ones(0), noise_of(problem, near)))
 
 
+def turned_further(problem: Problem, prepared: Prepared, state: State) -> State:
+    """Other parts turned than a state has: what two pairs of slips turned alike, no single one turns back."""
+    noise = NoiseModel(
+        problem.components, state.noise.step_variance, state.noise.closure_variance, prepared.noise.outlier_share
+    )
+    correction = torch.from_numpy(np.ascontiguousarray(state.correction.T))
+    found = _turned_parts(problem, prepared, correction, noise, anneal=False)
+    return _labelled(problem, at(problem, found, np.ones(0), state.noise))
+
+
 def noise_of(problem: Problem, model: NoiseModel) -> Noise:
     """θ to begin with."""
     return Noise(model.step_variance, model.closure_variance, EXPONENTS[0], COMMON_SHARES[1], RUN_STEPS[0])
@@ -153,7 +163,9 @@ def _robust(problem: Problem, state: State) -> State:
     return _labelled(problem, state)
 
 
-def _turned_parts(problem: Problem, prepared: Prepared, correction: Tensor, model: NoiseModel) -> Tensor:
+def _turned_parts(
+    problem: Problem, prepared: Prepared, correction: Tensor, model: NoiseModel, *, anneal: bool = True
+) -> Tensor:
     """Parts turned by minimum cuts under a truncated cost, first with cheap slips; corrections ``(K, 4)``."""
     graph, pairs = problem.graph, prepared.pairs
     is_agreed = agree(pairs, model)
@@ -161,7 +173,7 @@ def _turned_parts(problem: Problem, prepared: Prepared, correction: Tensor, mode
         no_slip = no_slip_log_odds(graph.own_steps, problem.components, probability)
         prior = np.where(graph.is_odometry, no_slip, model.prior_log_odds + problem.log_odds)
         cost = TruncatedCost.create(graph, model, prior)
-        if number == 0:
+        if number == 0 and anneal:
             correction = cost.anneal(correction)
         correction = jump_to_optimum(cost, correction, pairs, is_agreed)
     return correction
