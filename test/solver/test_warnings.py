@@ -243,7 +243,7 @@ def test_warnings_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(warnings, "of_whole_solve", lambda *_: ())
     monkeypatch.setattr(warnings, "mostly_flagged", lambda *_: ())
     silent = solve(inverted)
-    assert warned.warnings and not silent.warnings
+    assert set(warned.warnings) > set(silent.warnings)
     assert torch.equal(warned.body_from_world, silent.body_from_world)
     assert torch.equal(warned.outlier_score, silent.outlier_score)
 
