@@ -19,7 +19,7 @@ _ROBOTS = (2, 6)
 
 
 def slip_with_few_witnesses(run: SimulatedRun, rng: np.random.Generator) -> SimulatedRun:
-    """A step is off by 5–170°; of the closures across it 2 to 30 good ones are left, and as large a part of the false.
+    """A step is off by 5–170°; of good closures across at most 2 to 30 are left, and such a part of the false.
 
     The good ones join one to three pairs of places (those nearest to as many of them), or are any. Nothing happens
     where no good closure lies across. Dead reckoning stays as it was.

@@ -52,15 +52,15 @@ class Search:
             begun.append(self._begun(name, state))
             if sum(mode.is_like(self.modes[0].state) for mode in begun) >= self.problem.limits.alike:
                 break
-        can_cut = may_cut = "minimum-cuts" not in self.problem.without and len(prepared.pairs.first) > 0
-        if may_cut and self._seems_slipped(self.modes[0]):
-            may_cut = False
+        may_cut = "minimum-cuts" not in self.problem.without and len(prepared.pairs.first) > 0
+        from_tree = may_cut and self._seems_slipped(self.modes[0])
+        if from_tree:
             self._begun("minimum cuts", turned_parts(self.problem, prepared, correction))
         self.move_on()
-        if may_cut and self._seems_slipped(self.modes[0]):  # as moves have found since
+        if may_cut and not from_tree and self._seems_slipped(self.modes[0]):  # as moves have found since
             self._begun("minimum cuts", turned_parts(self.problem, prepared, correction))
             self.move_on()
-        if can_cut:
+        if may_cut:
             self._cut_further(prepared)
 
     def _cut_further(self, prepared: Prepared) -> None:
