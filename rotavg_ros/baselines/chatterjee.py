@@ -25,8 +25,8 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.baselines.start import start_orientations, usable_edges
-from rotavg_ros.solver.algebra.laplacian import LaplacianSystem
 from rotavg_ros.solver.algebra.residuals import edge_residual
+from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem
 from rotavg_ros.view_graph import ViewGraph
 
 # Residuals below this count as this, so that edges that happen to fit exactly do not freeze the solution: in radians,

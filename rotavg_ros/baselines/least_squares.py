@@ -9,8 +9,8 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.laplacian import LaplacianSystem
 from rotavg_ros.solver.algebra.residuals import edge_residual
+from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem
 from rotavg_ros.view_graph import ViewGraph
 
 _MAX_STEPS = 100

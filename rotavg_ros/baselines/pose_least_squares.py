@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from rotavg_ros.baselines.least_squares import least_squares
-from rotavg_ros.solver.algebra.laplacian import LaplacianSystem
+from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem
 from rotavg_ros.view_graph import ViewGraph
 
 FloatArray = NDArray[np.float64]

@@ -15,8 +15,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.solver.algebra.laplacian import LaplacianPattern
 from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed, typical_length
+from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianPattern
 
 # A closure is worth as much as this many typical steps of odometry in a row.
 _CLOSURE_STEPS = 30.0

@@ -13,7 +13,7 @@ import pytest
 from rotavg_ros.online import free_memory
 from rotavg_ros.online.estimator import OnlineEstimator
 from rotavg_ros.online.measurements import EdgeMeasurement, KeyframeReference
-from rotavg_ros.solver.algebra import sparse_factor
+from rotavg_ros.solver.algebra.sparse import sparse_factor
 
 MEGABYTE = 1_000_000
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from rotavg_ros.solver.algebra.laplacian import FactorisedLaplacian
+from rotavg_ros.solver.algebra.sparse.laplacian import FactorisedLaplacian
 
 # scipy's maximum flow counts in integers.
 _UNIT = 1000.0

@@ -11,7 +11,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 
 # Entries of a sparse matrix to one unit, which is about a millisecond with all that is done around a factorisation.
-_ENTRIES = 500.0
+ENTRIES = 500.0
 
 
 class Abandoned(Exception):  # noqa: N818 - it is no error: whoever catches it has asked for it
@@ -89,12 +89,12 @@ def resting(rest: Callable[[float], None]) -> Iterator[None]:
         _rests.reset(token)
 
 
-def spend(entries: int) -> None:
-    """Call it once before a factorisation of a matrix of so many entries."""
-    count(entries / _ENTRIES)
+def spend(units: float) -> None:
+    """Call it once before a factorisation, or a part of one, of so many units."""
+    count(units)
     rest = _rests.get()
     if rest is not None:
-        rest(entries / _ENTRIES)
+        rest(units)
 
 
 def rest() -> None:

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rotavg_ros.solver.algebra.conjugate_gradients import Stop, conjugate_gradients
-from rotavg_ros.solver.algebra.laplacian import LaplacianSystem
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
+from rotavg_ros.solver.algebra.sparse.conjugate_gradients import Stop, conjugate_gradients
+from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem
 from rotavg_ros.solver.running.threads import for_each, threads_on
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape
 from rotavg_ros.view_graph import ViewGraph

@@ -2,8 +2,8 @@
 
 The least-squares covariance σ² L⁻¹ of the edges that are believed: each counts by the probability that it is no
 outlier, and σ² is what residuals say of the noise, divided by the edges that check others. Random samples of that
-covariance tell its diagonal (:meth:`~rotavg_ros.solver.algebra.laplacian.FactorisedLaplacian.samples`). Noise is taken
-to be round. A factorisation takes too long where a graph is well knit.
+covariance tell its diagonal (:meth:`~rotavg_ros.solver.algebra.sparse.laplacian.FactorisedLaplacian.samples`). Noise
+is taken to be round. A factorisation takes too long where a graph is well knit.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rotavg_ros.solver.algebra.laplacian import LaplacianSystem
 from rotavg_ros.solver.algebra.probes import probe_signs
+from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.view_graph import ViewGraph
 

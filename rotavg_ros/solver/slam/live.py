@@ -25,7 +25,8 @@ from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.poses.solve import has_places, poses_of_labels, poses_of_update
 from rotavg_ros.solver.slam.solve import whole
-from rotavg_ros.solver.slam.update.conditioned import Columns, Conditioned, LaidOn, conditioned
+from rotavg_ros.solver.slam.update.columns import Columns
+from rotavg_ros.solver.slam.update.conditioned import Conditioned, LaidOn, conditioned
 from rotavg_ros.solver.slam.update.linear import Linear
 from rotavg_ros.solver.slam.update.memory import SlamMemory, with_poses
 from rotavg_ros.view_graph import ViewGraph
@@ -208,7 +209,7 @@ def _laid_on(graph: ViewGraph, known: SlamMemory, ration: float) -> Estimate | N
         None if places is None else places.position.numpy(),
         variance,
     )
-    columns = known.columns or Columns.none(linear)
+    columns = known.columns or Columns.none()
     most = min(_most_columns(linear, ration), _MOST - len(columns.edge))
     told = conditioned(linear, laid, growth, closure, columns, most)
     memory = replace(known, columns=told.columns)

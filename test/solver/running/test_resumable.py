@@ -18,7 +18,7 @@ from rotavg_ros.solver.running.work import Abandoned, abandonable, metered, rest
 
 def counting(number: int, seen: list[int]) -> int:
     for each in range(number):
-        spend(500)  # one unit
+        spend(1)
         seen.append(each)
     return number
 
@@ -67,7 +67,7 @@ def test_where_it_only_rests_it_is_left_too() -> None:
     seen: list[int] = []
 
     def solve() -> None:
-        spend(5000)
+        spend(10)
         for each in range(3):
             rest()
             seen.append(each)
@@ -81,7 +81,7 @@ def test_where_it_only_rests_it_is_left_too() -> None:
 
 def test_its_error_is_raised_where_it_is_waited_for() -> None:
     def fails() -> None:
-        spend(500)
+        spend(1)
         raise ValueError("no such graph")
 
     solve = Resumable(fails)
@@ -94,7 +94,7 @@ def test_its_error_is_raised_where_it_is_waited_for() -> None:
 def test_it_is_abandoned_with_the_solve_around_it() -> None:
     def runs_for_ever() -> None:
         while True:
-            spend(500)
+            spend(1)
             stop_if_abandoned()
 
     solve, asked = Resumable(runs_for_ever), 0
@@ -126,7 +126,7 @@ def test_torch_has_its_threads_between_turns_and_no_gradients_inside() -> None:
 
     def solve() -> None:
         for _ in range(3):
-            spend(500)
+            spend(1)
             inside.append((torch.get_num_threads(), torch.is_grad_enabled()))
 
     resumable = Resumable(solve)
@@ -142,8 +142,8 @@ def test_torch_has_its_threads_between_turns_and_no_gradients_inside() -> None:
 class Slow:
     @cached_property
     def value(self) -> int:
-        spend(500)
-        spend(500)
+        spend(1)
+        spend(1)
         return 1
 
 
@@ -165,7 +165,7 @@ def _holding(held: list[weakref.ref[_Large]]) -> None:
     large = _Large()
     held.append(weakref.ref(large))
     while True:
-        spend(500)
+        spend(1)
         stop_if_abandoned()
 
 

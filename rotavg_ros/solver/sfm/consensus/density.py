@@ -21,7 +21,7 @@ import numpy as np
 from scipy.special import expit, log_expit
 
 from rotavg_ros.solver.algebra import quaternion_rows
-from rotavg_ros.solver.algebra.laplacian import LaplacianPattern
+from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianPattern
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.sfm.priors import ConsensusPriors
 

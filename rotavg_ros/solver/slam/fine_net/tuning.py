@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.fine_net.evidence import Evidence
 from rotavg_ros.solver.slam.fine_net.features import fine_features
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
@@ -76,8 +77,11 @@ def fine_tuned(mode: Mode, network: SlamFineNet, passes: int = PASSES) -> Mode:
 @torch.inference_mode()
 def applied(network: SlamFineNet, before: Tuned) -> Tuned:
     """After FineNet once more: its variances take the place of the noise's tails."""
+    rest()
     evidence = Evidence.of(before.problem, before.state)
-    log_noise = network(fine_features(evidence)).double()
+    features = fine_features(evidence)
+    rest()
+    log_noise = network(features).double()
     used = torch.from_numpy(1 / evidence.weight)
     edges = told(evidence)
     variance = used * (believed(evidence, edges, used, log_noise) * log_noise).exp()

@@ -10,18 +10,17 @@ from __future__ import annotations
 from copy import copy
 
 import numpy as np
-from scipy.sparse import coo_array, csc_array, csr_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from rotavg_ros.solver.algebra.laplacian import solve_in_parts
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
-from rotavg_ros.solver.algebra.sparse_factor import SparseFactor
+from rotavg_ros.solver.algebra.sparse.multifrontal import Cholesky, Elimination
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.running.work import rest, spend, stop_if_abandoned
 
 _NUM_PROBES, _SEED = 48, 0
-# SuperLU merges no columns of unlike pattern: blocks are dense as they are, and merging fills in, on a sphere sixfold.
-_RELAX, _PANEL = 1, 4
+# What a solve of the samples costs, in what the factor does.
+_SOLVED = 0.5
 # Rows that tell each of their blocks less than this share of what all tell it are nothing; so many of them are worth a
 # pattern without them.
 _NEXT_TO_NOTHING, _WORTH_LEAVING_OUT = 1e-8, 200
@@ -76,19 +75,17 @@ class BlockEquations:
         """
         stop_if_abandoned()
         pattern = self._pattern_of(jacobian)
-        spend(pattern.matrix.nnz)
-        matrix = pattern.matrix
+        rest()
         rows = jacobian if pattern.is_whole else jacobian[pattern.kept]
         blocks = np.matmul(rows.transpose(0, 2, 1), rows).ravel().take(pattern.used)
-        values = np.bincount(pattern.slot, blocks, matrix.nnz)
-        values[pattern.diagonal] += np.finfo(np.float64).tiny
-        values[pattern.diagonal[pattern.rank[self.roots]]] += root_weight
+        entries = np.bincount(pattern.slot, blocks, pattern.elimination.num_entries)
+        entries[pattern.diagonal] += np.finfo(np.float64).tiny
+        entries[pattern.diagonal[self.roots]] += root_weight
         grounding = len(self.roots) * np.log(root_weight).sum()
         if loose_weight is not None:
-            values[pattern.diagonal[pattern.rank[self.loose]]] += loose_weight
+            entries[pattern.diagonal[self.loose]] += loose_weight
             grounding += len(self.loose) * np.log(loose_weight).sum()
-        matrix.data = values
-        factor = SparseFactor(matrix, is_ordered=True, relax=_RELAX, panel=_PANEL)
+        factor = Cholesky(pattern.elimination, entries)
         return BlockFactor(self, pattern, pattern.rows(jacobian), factor, float(grounding))
 
     def _pattern_of(self, jacobian: np.ndarray) -> _Pattern:
@@ -121,7 +118,7 @@ class BlockEquations:
 
 
 class _Pattern:
-    """Where in compressed rows J's numbers stand and in compressed columns H's, blocks in the order of elimination.
+    """Where in compressed rows J's numbers stand, and in the fronts of H's factor its own.
 
     What a row has of no block stands beyond all columns of J.
 
@@ -132,45 +129,35 @@ class _Pattern:
     Attributes:
         kept: those rows.
         is_whole: whether they are all.
+        elimination: of H.
         rank: ``(B,)`` where each block stands in the order of elimination.
-        matrix: H, of which ``data`` is to be set.
-        used, slot: which entries of the products of rows make H, and where in its ``data`` they belong.
-        diagonal: ``(B, d)`` likewise, of the block at each rank.
+        used, slot: which entries of the products of rows make H, and where they belong.
+        diagonal: ``(B, d)`` likewise, of each block.
     """
 
     def __init__(self, equations: BlockEquations, counts: np.ndarray) -> None:
         self.kept, self.is_whole, self._counts = np.flatnonzero(counts), bool(counts.all()), counts
         d, num_blocks, nowhere = equations.size, equations.num_blocks, equations.num_blocks
-        self.rank = _elimination_order(equations.block[self.kept], num_blocks)
+        blocks = equations.block[self.kept]
+        first, second = (ends.ravel() for ends in np.broadcast_arrays(blocks[:, :, None], blocks[:, None, :]))
+        pair = np.flatnonzero((first < nowhere) & (second < nowhere))
+        self.elimination = Elimination(first[pair], second[pair], num_blocks, d)
+        self.rank = self.elimination.rank
+        rest()
+        # Half of what is symmetric.
+        pair = pair[self.rank[first[pair]] <= self.rank[second[pair]]]
+        self.slot = self.elimination.places(self.rank[first[pair]], self.rank[second[pair]]).ravel()
+        inside = np.arange(d)
+        row, one, other = pair // 9, pair // 3 % 3, pair % 3
+        product = ((row * 3 + one)[:, None] * d + inside) * 3 + other[:, None]
+        self.used = (product[:, :, None] * d + inside).ravel()
+        self.diagonal = self.elimination.places(self.rank, self.rank)[:, inside, inside]
         block = np.append(self.rank, nowhere)[equations.block]
-        columns = (block[:, :, None] * d + np.arange(d)).reshape(len(block), 1, 3 * d)
+        columns = (block[:, :, None] * d + inside).reshape(len(block), 1, 3 * d)
         entries = np.broadcast_to(columns, (len(block), d, 3 * d)).ravel().astype(np.int32)
         begins = np.arange(0, len(entries) + 1, 3 * d, dtype=np.int32)
         shape = len(block) * d, (num_blocks + 1) * d
         self._rows: csr_array = csr_array((np.ones(len(entries)), entries, begins), shape=shape)
-        block = block[self.kept]
-        row, column = np.broadcast_arrays(block[:, :, None], block[:, None, :])
-        is_used = ((row < num_blocks) & (column < num_blocks)).ravel()
-        key = (column * num_blocks + row).ravel()[is_used]
-        occupied, slot = np.unique(np.concatenate((key, np.arange(num_blocks) * (num_blocks + 1))), return_inverse=True)
-        count = np.bincount(occupied // num_blocks, minlength=num_blocks)
-        before = np.append(0, np.cumsum(count))
-        within = np.arange(len(occupied)) - before[occupied // num_blocks]
-        # Of a block the first number, and from one of its columns to the next as many as the blocks there have.
-        start, stride = d * (d * before[occupied // num_blocks] + within), d * count[occupied // num_blocks]
-        inside = np.arange(d)
-        place = start[:, None, None] + stride[:, None, None] * inside + inside[:, None]
-        self.used = np.flatnonzero(
-            np.broadcast_to(is_used.reshape(-1, 3, 1, 3, 1), (len(block), 3, d, 3, d)).reshape(-1)
-        )
-        slots = np.zeros((len(is_used), d, d), dtype=np.int64)
-        slots[is_used] = place[slot[: len(key)]]
-        self.slot = slots.reshape(-1, 3, 3, d, d).transpose(0, 1, 3, 2, 4).ravel()[self.used]
-        self.diagonal = place[slot[len(key) :]][:, inside, inside]
-        rows = np.empty(d * d * len(occupied), dtype=np.int32)
-        rows[place] = ((occupied % num_blocks) * d)[:, None, None] + inside[:, None]
-        first = np.append(0, np.cumsum(np.repeat(d * count, d))).astype(np.int32)
-        self.matrix: csc_array = csc_array((np.ones(len(rows)), rows, first), shape=(num_blocks * d, num_blocks * d))
 
     def covers(self, counts: np.ndarray) -> bool:
         """Whether it has all of these rows and few others."""
@@ -185,30 +172,15 @@ class _Pattern:
         return rows
 
 
-def _elimination_order(block: np.ndarray, num_blocks: int) -> np.ndarray:
-    """``(blocks,)`` where each stands in the order of minimum degree of the blocks' graph."""
-    row, column = (ends.ravel() for ends in np.broadcast_arrays(block[:, :, None], block[:, None, :]))
-    is_used = (row < num_blocks) & (column < num_blocks) & (row != column)
-    row, column = row[is_used], column[is_used]
-    # Any positive definite matrix of the pattern will do.
-    degree = np.bincount(row, minlength=num_blocks)
-    diagonal = np.arange(num_blocks)
-    values = np.concatenate((np.full(len(row), -1.0), degree + 1.0))
-    shape = num_blocks, num_blocks
-    graph: csc_array = csc_array(
-        (values, (np.concatenate((row, diagonal)), np.concatenate((column, diagonal)))), shape=shape
-    )
-    return SparseFactor(graph, is_ordered=False, relax=_RELAX, panel=_PANEL).rank
-
-
 class BlockFactor:
     """H for one choice of J and W, here in the order of elimination."""
 
     def __init__(
-        self, system: BlockEquations, pattern: _Pattern, rows: csr_array, factor: SparseFactor, grounding: float
+        self, system: BlockEquations, pattern: _Pattern, rows: csr_array, factor: Cholesky, grounding: float
     ) -> None:
         self._system, self._rank, self._rows = system, pattern.rank, rows
         self._factor, self._grounding = factor, grounding
+        self._drawn: np.ndarray | None = None
 
     @property
     def log_det(self) -> float:
@@ -221,26 +193,32 @@ class BlockFactor:
         return self._factor.num_entries
 
     def fit(self, whitened: np.ndarray) -> np.ndarray:
-        """Unknowns ``(blocks, d, n)`` that explain whitened rows ``(E + R, d, n)`` best."""
-        return self._by_block(self._fit(whitened))
+        """Unknowns ``(blocks, d, n)`` that explain whitened rows ``(E + R, d, n)`` best; samples come with them."""
+        count = whitened.shape[2]
+        ordered: np.ndarray = self._fit(np.concatenate((whitened, self._system.probes), axis=2))
+        self._drawn = ordered[:, count:]
+        return self._by_block(ordered[:, :count])
 
     def _fit(self, whitened: np.ndarray) -> np.ndarray:
         """The same in the order of elimination, ``(blocks d, n)``."""
-        stop_if_abandoned()
-        rest()
-        right = self._rows.T @ whitened.reshape(-1, whitened.shape[2])
-        return solve_in_parts(self._factor, right[: -self._system.size])
+        spend(_SOLVED * self._factor.elimination.units)
+        right: np.ndarray = self._rows.T @ whitened.reshape(-1, whitened.shape[2])
+        return self._factor.solve(right[: -self._system.size])
 
     def _by_block(self, ordered: np.ndarray) -> np.ndarray:
         """``(blocks, d, n)``, in which block v stood at its rank."""
         system = self._system
-        return ordered.reshape(system.num_blocks, system.size, -1).take(self._rank, axis=0)
+        return np.asarray(ordered.reshape(system.num_blocks, system.size, -1).take(self._rank, axis=0))
 
-    def solve(self, columns: np.ndarray) -> np.ndarray:
-        """H⁻¹ of columns ``(blocks, d, n)``."""
+    def begun(self, columns: np.ndarray) -> np.ndarray:
+        """L⁻¹ of columns ``(blocks, d, n)``, ``(blocks d, n)``: H⁻¹ = L⁻ᵀ L⁻¹."""
         ordered = np.empty_like(columns)
         ordered[self._rank] = columns
-        return self._by_block(solve_in_parts(self._factor, ordered.reshape(-1, columns.shape[2])))
+        return self._factor.begun(ordered.reshape(len(columns) * self._system.size, -1))
+
+    def ended(self, half: np.ndarray) -> np.ndarray:
+        """L⁻ᵀ of what was :meth:`begun` ``(blocks d, n)``, ``(blocks, d, n)``."""
+        return self._by_block(self._factor.ended(half))
 
     def predicted(self, unknowns: np.ndarray) -> np.ndarray:
         """Whitened rows ``(E + R, d, n)`` of unknowns ``(blocks, d, n)``."""
@@ -253,9 +231,11 @@ class BlockFactor:
         padded = np.concatenate((ordered, np.zeros((d, count))))
         return np.asarray((self._rows @ padded).reshape(-1, d, count))
 
-    @cached_property
+    @property
     def _samples(self) -> np.ndarray:
-        return self._fit(self._system.probes)
+        if self._drawn is None:
+            self._drawn = self._fit(self._system.probes)
+        return self._drawn
 
     @property
     def samples(self) -> np.ndarray:

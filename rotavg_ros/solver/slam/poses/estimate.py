@@ -14,7 +14,7 @@ import numpy as np
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.small_matrices import inverse
-from rotavg_ros.solver.running.work import rest
+from rotavg_ros.solver.running.work import rest, spend
 from rotavg_ros.solver.slam.poses.block_system import BlockFactor
 from rotavg_ros.solver.slam.poses.closures import Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.evidence import translation_cost
@@ -24,6 +24,8 @@ from rotavg_ros.solver.slam.poses.places import Judge
 from rotavg_ros.solver.slam.poses.rows import ANYHOW, PoseNoise, PoseProblem, PoseState
 from rotavg_ros.solver.slam.poses.solved import Solved
 
+# Units of work for each row, of each third of what is done beside the factorisation.
+_ROW = 0.006
 _MAX_SOLVES = 28
 # An update goes no further: the next one goes on from there.
 _MAX_UPDATE_SOLVES = 6
@@ -129,9 +131,11 @@ def estimate_poses(
     number, held, most = 0, *((_HELD, _MAX_SOLVES) if start is None else (0, start.solves))
     while True:
         solved = _solve(problem, state, places, judge)
+        rest()
         chance, sorted_by = _settling(solved.places.chance, places.chance, sorted_by)
         after, pace = pace.towards(replace(solved.places, chance=chance), places, is_new & (number == 0))
         noise = likeliest_noise(problem, solved).logarithms
+        rest()
         changed = np.abs(after.chance - places.chance).max(initial=0.0)
         is_at_rest = solved.moved < _STEP_CONVERGED and changed < _CHANCE_CONVERGED
         number += 1
@@ -161,6 +165,7 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     rotation_variance = problem.rotation_variance(state.noise)
     rotation_weight = 1 / rotation_variance
     rotation_weight[closure] = places.rotation_weight
+    rest()
     root = problem.whitening(covariance, rotation_weight, places.weight, state)
     jacobian = np.matmul(root, problem.jacobian(way))
     factor = problem.equations.factorise(jacobian, problem.root_weight(rotation_weight, state))
@@ -184,10 +189,12 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     scale = _scale(problem, state)
     # Wherever a closure's source is, and however it is turned.
     anywhere = scale.extent + (problem.lengths[problem.closures] ** 2).sum(axis=1)
+    spend(_ROW * len(jacobian))
     predictions = _left_out(factor, root, left, closure).within(k, ANYHOW, anywhere)
     judge = replace(judge, told=replace(judge.told, rotation_variance=rotation_variance[closure]))
-    rest()
+    spend(_ROW * len(jacobian))
     maps = MapTurns.of(problem, state.position, predictions, scale.good)
+    spend(_ROW * len(jacobian))
     judged = judge(predictions, maps, places.chance, scale)
     return Solved(
         state,
@@ -247,9 +254,9 @@ def _scale(problem: PoseProblem, state: PoseState) -> Scale:
 def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.ndarray) -> Predictions:
     """What all else says of some rows, whose ``root`` is diagonal, by what is left of them and their leverages."""
     sigma = 1 / np.diagonal(root[rows], axis1=1, axis2=2)
-    rest = inverse(factor.redundancy[rows])
-    mean = sigma * np.matmul(rest, left[rows])[:, :, 0]
-    covariance = sigma[:, :, None] * np.matmul(rest, factor.leverage[rows]) * sigma[:, None, :]
+    others = inverse(factor.redundancy[rows])
+    mean = sigma * np.matmul(others, left[rows])[:, :, 0]
+    covariance = sigma[:, :, None] * np.matmul(others, factor.leverage[rows]) * sigma[:, None, :]
     return Predictions(mean, (covariance + covariance.transpose(0, 2, 1)) / 2)
 
 

@@ -12,6 +12,7 @@ from scipy.sparse import csr_array
 from scipy.special import expit
 
 from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.poses.closures import Predictions, Told
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 
@@ -102,9 +103,11 @@ class MapTurns:
         shape = count, count
         alike = csr_array((same * chance[between.others], (between.rows, between.others)), shape=shape)
         alike = alike + csr_array((chance[tells], (tells, tells)), shape=shape)
+        rest()
         each = self._differences(*_pairs(np.arange(count), tells, told.detected, in_order=in_order))
         if len(each.rows) == 0:
             return np.zeros(count), np.zeros(count)
+        rest()
         pooled = each.pooled(alike)
         weight = chance[each.others] * np.exp(-pooled.turn_square(self) / 2)
         density = weight * np.exp(pooled.log_kernel(self))

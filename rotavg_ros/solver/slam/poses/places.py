@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import expit
 
+from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.poses.closures import (
     GOOD,
     Places,
@@ -72,11 +73,13 @@ class Judge:
         total = spread + variance[:, :, None]
         log_shift = -(along**2 / total + np.log(2 * np.pi * total)).sum(axis=2) / 2
         shift = told.sign[:, None] * predictions.mean[:, k:]
+        rest()
         repeats = repeats_of(shift, before, told, scale.closure, in_order)
         log_shift[-1] = 0.0
         share = wrong_share(before, told, self.priors)
         log_wrong, log_right = self._by_itself(predictions, scale)
         wrong = before[-1] * expit(log_wrong - log_right)
+        rest()
         turned = maps.repeats(wrong, np.logaddexp(log_wrong, log_right), told, in_order=in_order)
         log_false = told.false_odds + np.where(known, self._log_unrelated(predictions, scale, repeats, turned), 0.0)
         log_behind = log_from_behind(predictions, seen_alike, k) + self._log_behind(predictions, scale, repeats)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.posterior.em import step
 from rotavg_ros.solver.slam.posterior.left_out import leave_one_out, scores
@@ -169,6 +170,7 @@ def of_mode(mode: Mode) -> Published:
     problem, state, left_out = mode.problem, mode.state, mode.left_out
     is_decided, decided = np.isinf(problem.log_odds) | problem.graph.is_odometry, state.is_good
     for number in range(_ROUNDS):
+        rest()
         score, trust = scores(problem, state, left_out)
         if number > 0:  # closures that answer each other would swing from round to round
             trust = (trust + state.trusted) / 2

@@ -11,11 +11,11 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from rotavg_ros.solver.algebra.laplacian import root_stiffness, solve_in_parts
 from rotavg_ros.solver.algebra.probes import likeliest_leverage, probe_signs
-from rotavg_ros.solver.algebra.sparse_factor import SparseFactor
+from rotavg_ros.solver.algebra.sparse.laplacian import root_stiffness, solve_in_parts
+from rotavg_ros.solver.algebra.sparse.sparse_factor import SparseFactor
 from rotavg_ros.solver.running.cached import cached_property
-from rotavg_ros.solver.running.work import rest, spend, stop_if_abandoned
+from rotavg_ros.solver.running.work import ENTRIES, rest, spend, stop_if_abandoned
 
 _NUM_PROBES = 48
 # Rows that weigh less than this share of the heaviest one are nothing; so many of them are worth a pattern without
@@ -76,7 +76,7 @@ class NormalEquations:
         """With weights ``(E + R,)``, rad⁻²."""
         stop_if_abandoned()
         pattern = self._pattern(weight)
-        spend(pattern.num_entries)
+        spend(pattern.num_entries / ENTRIES)
         stiffness = root_stiffness(weight)
         factor, rank = pattern.factorise(weight, stiffness)
         return Factorised(self, weight, factor, rank, len(self.roots) * np.log(stiffness))

@@ -23,6 +23,7 @@ from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.poses.memory import ACROSS, WALK
 from rotavg_ros.solver.slam.posterior.densities import log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
+from rotavg_ros.solver.slam.update.columns import Columns
 from rotavg_ros.solver.slam.update.linear import Linear
 from rotavg_ros.view_graph import ViewGraph
 
@@ -34,24 +35,6 @@ _ROUNDS = 3
 _NOTHING = 1e-6
 # Both variances are estimates: what closures tell leaves so much of them at least.
 _SUREST = 0.02
-
-
-@dataclass(frozen=True)
-class Columns:
-    """H⁻¹ Aᵀ of new closures, which stays as it is until the next solve.
-
-    Attributes:
-        edge: ``(n,)`` edges of the view-graph.
-        value: ``(K + R, d, n d)``.
-    """
-
-    edge: np.ndarray
-    value: np.ndarray
-
-    @classmethod
-    def none(cls, linear: Linear) -> Columns:
-        """Of no closures."""
-        return cls(np.empty(0, dtype=np.int64), np.empty((linear.num_blocks, linear.size, 0)))
 
 
 @dataclass(frozen=True)
@@ -102,20 +85,21 @@ def conditioned(
     """
     system = _System.of(linear, laid, growth, edge)
     known = len(columns.edge)
-    values = [columns.value]
     for first in range(known, min(known + most, len(edge)), _AT_ONCE):
         some = slice(first, min(first + _AT_ONCE, known + most))
         count_units(linear.column_work * linear.size * len(edge[some]))
         rest()
-        values.append(linear.solve(system.columns(some)))
-    columns = Columns(edge[: known + most], np.concatenate(values, axis=2))
+        columns = columns.and_of(linear, edge[some], system.columns(some))
     count = len(columns.edge)
-    covariance = system.covariance(columns.value, count)
+    covariance = system.covariance(columns.covariance, count)
     accepted = np.zeros(count, dtype=bool)
     for _ in range(_ROUNDS):
-        mean, left_out = _left_out(covariance, system.residual[:count], accepted)
+        given = accepted
+        mean, left_out = _left_out(covariance, system.residual[:count], given)
         odds, rotation_odds = system.log_odds(mean, left_out, slice(count))
         accepted = odds > 0
+        if (accepted == given).all():
+            break
     apart = system.log_odds(system.residual[count:], system.independent(slice(count, None)), slice(count, None))
     score = expit(-np.append(odds, apart[0]))
     rotation_score = expit(-np.append(rotation_odds, apart[1]))
@@ -255,11 +239,10 @@ class _System:
         crossing = np.cross(turns.T[None], shifts.T[:, None]).reshape(-1, 3).T
         return np.asarray((vector @ crossing).reshape(len(vector), shifts.shape[1], turns.shape[1]))
 
-    def covariance(self, value: np.ndarray, count: int) -> np.ndarray:
-        """``(n, d, n, d)`` S of the first closures, by their columns."""
+    def covariance(self, by_columns: np.ndarray, count: int) -> np.ndarray:
+        """``(n, d, n, d)`` S of the first closures, by A H⁻¹ Aᵀ ``(n d, n d)``."""
         d, (k, m) = self.linear.size, self._widths
-        rows: np.ndarray = self._rows(slice(count)) @ value.reshape(-1, count * d)
-        between = np.asarray((rows + rows.T) / 2).reshape(count, d, count, d)
+        between: np.ndarray = by_columns.reshape(count, d, count, d).copy()
         walked = self._walked(np.stack((self.target[:count], self.source[:count])), np.array([1.0, -1.0]), count)
         component = np.repeat([0, 1], (k, m))
         inside = np.arange(count)
@@ -330,7 +313,7 @@ class _System:
         laid = replace(self.laid, variance=self._surer(columns, precision, accepted))
         pull = np.zeros((count, d, q))
         pull[accepted] = (precision @ self.residual[:count][accepted].reshape(-1, q)).reshape(-1, d, q)
-        step = (columns.value.reshape(-1, count * d) @ pull.reshape(-1, q)).reshape(-1, d, q)
+        step = columns.moves(linear, pull.reshape(-1, q))
         new = np.arange(linear.num_nodes, len(self.anchor))
         walked = self._walked(new[None], np.ones(1), count)
         turn = self._at_nodes(0, step[:, :k])
@@ -357,9 +340,11 @@ class _System:
         """
         linear, d, (k, m), count = self.linear, self.linear.size, self._widths, len(accepted)
         new = np.arange(linear.num_nodes, len(self.anchor))
-        value = columns.value.reshape(-1, d, count * d)
+        anchor = self.anchor[new]
+        above, below = columns.at(linear, np.stack((linear.above[anchor], linear.below[anchor])))
+        share = linear.share[:, anchor][:, :, None, None]
         walked = self._walked(new[None], np.ones(1), count)
-        told = [self._at_nodes(kind, value, new) for kind in (0, 1)]
+        told = [(1 - share[kind]) * above + share[kind] * below for kind in (0, 1)]
         both = np.concatenate((told[0][:, :k], told[1][:, k:]), axis=1).reshape(len(new), d, count, d)
         if m:
             lever = self._crossed(self.way[new])
@@ -375,9 +360,9 @@ class _System:
                 variance[kind, new] = np.maximum(before - part.mean(axis=1), _SUREST * before)
         return variance
 
-    def _at_nodes(self, kind: int, step: np.ndarray, nodes: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """``(N', …)`` of unknowns ``(K + R, …)``, at the nodes that all nodes, or some, move with."""
-        linear, anchor = self.linear, self.anchor[nodes]
+    def _at_nodes(self, kind: int, step: np.ndarray) -> np.ndarray:
+        """``(N', …)`` of unknowns ``(K + R, …)``, at the nodes that all nodes move with."""
+        linear, anchor = self.linear, self.anchor
         share = linear.share[kind][anchor][:, None, None]
         return np.asarray((1 - share) * step[linear.above[anchor]] + share * step[linear.below[anchor]])
 

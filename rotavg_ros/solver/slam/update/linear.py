@@ -37,8 +37,10 @@ class Linear:
         noise: how far odometry and closures err; 0 metres by rotations alone.
         good, false: how many closures are.
         extent: m² per component, of the map.
-        solve: H⁻¹ of columns ``(K + R, d, n)``.
-        column_work: units that one of these costs.
+        begun: two halves ``((K + R) d, n)`` of what H⁻¹ is of columns ``(K + R, d, n)``: products of the first with
+            the second are products of columns with H⁻¹ between them.
+        ended: H⁻¹ of columns ``(K + R, d, q)``, by the second half.
+        column_work: units that one column costs.
     """
 
     num_edges: int
@@ -54,7 +56,8 @@ class Linear:
     good: int
     false: int
     extent: float
-    solve: Callable[[np.ndarray], np.ndarray]
+    begun: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    ended: Callable[[np.ndarray], np.ndarray]
     column_work: float
 
     @property
@@ -74,8 +77,11 @@ class Linear:
         drawn = problem.drawn(noise)
         between = drawn.fraction * (1 - drawn.fraction) * drawn.length * noise.step_variance
 
-        def solve(columns: np.ndarray) -> np.ndarray:
-            return np.asarray(factorised.solve(columns[:, 0]))[:, None]
+        def begun(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return columns[:, 0], factorised.solve(columns[:, 0])
+
+        def ended(solved: np.ndarray) -> np.ndarray:
+            return solved[:, None]
 
         is_good = mode.state.is_good[problem.closure]
         return cls(
@@ -92,7 +98,8 @@ class Linear:
             int(is_good.sum()),
             int((~is_good).sum()),
             1.0,
-            solve,
+            begun,
+            ended,
             factorised.num_entries / _ENTRIES,
         )
 
@@ -106,6 +113,11 @@ class Linear:
         passed = np.where(segment >= 0, solved.way.passed / np.maximum(length, np.finfo(np.float64).tiny), 0.0)
         between = drawn.fraction * (1 - drawn.fraction) * drawn.length * noise.turn
         good = float(solved.places.right.sum())
+
+        def begun(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            half = solved.factor.begun(columns)
+            return half, half
+
         return cls(
             len(drawn.segment_of_edge),
             drawn.above,
@@ -120,6 +132,7 @@ class Linear:
             round(good),
             solved.places.chance.shape[1] - round(good),
             solved.scale.extent,
-            solved.factor.solve,
+            begun,
+            solved.factor.ended,
             solved.factor.num_entries / _ENTRIES,
         )

@@ -32,7 +32,7 @@ from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.solve import Drawn
 from rotavg_ros.solver.slam.posterior.state import Noise, Others, State
 from rotavg_ros.solver.slam.stages import outlier_scores
-from rotavg_ros.solver.slam.update.conditioned import Columns
+from rotavg_ros.solver.slam.update.columns import Columns
 from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over, thinned_out
 from rotavg_ros.view_graph import ViewGraph
 

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rotavg_ros import EdgeKind, ViewGraph, rotations
-from rotavg_ros.solver.algebra.laplacian import LaplacianSystem
 from rotavg_ros.solver.algebra.residuals import edge_residual
 from rotavg_ros.solver.algebra.spanning_forest import minimum_spanning_forest
+from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth, OdometryPaths
 from test.solver.graphs import measured, random_truth, slam_edges, small_noise

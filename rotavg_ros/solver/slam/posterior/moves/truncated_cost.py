@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
-from rotavg_ros.solver.algebra.laplacian import LaplacianPattern
+from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianPattern
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.noise.model import NoiseModel

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import cho_solve
 from scipy.sparse import csc_array, csr_array
 
-from rotavg_ros.solver.algebra.sparse_factor import SparseFactor
+from rotavg_ros.solver.algebra.sparse.sparse_factor import SparseFactor
 from rotavg_ros.solver.running.work import stop_if_abandoned
 
 # How much stiffer than its own edges a root is tied to zero.

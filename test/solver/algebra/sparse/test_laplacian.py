@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_array
 
-from rotavg_ros.solver.algebra import laplacian
-from rotavg_ros.solver.algebra.laplacian import LaplacianPattern, LaplacianSystem
 from rotavg_ros.solver.algebra.probes import likeliest_leverage, probe_signs
-from rotavg_ros.solver.algebra.sparse_factor import SparseFactor
+from rotavg_ros.solver.algebra.sparse import laplacian
+from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianPattern, LaplacianSystem
+from rotavg_ros.solver.algebra.sparse.sparse_factor import SparseFactor
 
 
 def random_graph(num_nodes: int, num_edges: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_array, eye_array, random_array
 
-from rotavg_ros.solver.algebra.sparse_factor import SparseFactor
+from rotavg_ros.solver.algebra.sparse.sparse_factor import SparseFactor
 
 
 def _matrix(size: int, density: float) -> csc_array:
@@ -85,7 +85,7 @@ _SCRIPT = """
 import os, threading
 import numpy as np
 from scipy.sparse import csc_array, eye_array
-from rotavg_ros.solver.algebra.sparse_factor import SparseFactor
+from rotavg_ros.solver.algebra.sparse.sparse_factor import SparseFactor
 
 factor = SparseFactor(csc_array(2.0 * eye_array(5)), is_ordered=True)
 child = os.fork()

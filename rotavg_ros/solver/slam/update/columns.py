@@ -1,0 +1,97 @@
+"""What new closures would move: columns H⁻¹ Aᵀ, which stay as they are until the next solve.
+
+With H = L Lᵀ (:mod:`~rotavg_ros.solver.algebra.sparse.multifrontal`) only half of each is worked out, L⁻¹ Aᵀ, which has
+numbers in what is eliminated after a closure's ends and nowhere else. Halves tell what closures have in common,
+and what all of them together move takes one more solve, however many they are. By rotations alone both halves are
+worked out at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rotavg_ros.solver.slam.update.linear import Linear
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Some rows of ``(K + R) d``, the others nothing.
+
+    Attributes:
+        index: ``(s,)`` which.
+        value: ``(s, m)``.
+    """
+
+    index: np.ndarray
+    value: np.ndarray
+
+    @classmethod
+    def of(cls, columns: np.ndarray) -> _Rows:
+        """Of ``((K + R) d, m)``."""
+        index = np.flatnonzero(columns.any(axis=1))
+        return cls(index, columns[index])
+
+    def with_each(self, columns: np.ndarray) -> np.ndarray:
+        """``(m, n)`` products with ``((K + R) d, n)``."""
+        return np.asarray(self.value.T @ columns[self.index])
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Of n new closures, d rows each.
+
+    Attributes:
+        edge: ``(n,)`` edges of the view-graph.
+        left, half: as they came; the product of one's left with the other's half is what two have in common.
+        covariance: ``(n d, n d)`` A H⁻¹ Aᵀ.
+    """
+
+    edge: np.ndarray
+    left: tuple[_Rows, ...]
+    half: tuple[_Rows, ...]
+    covariance: np.ndarray
+
+    @classmethod
+    def none(cls) -> Columns:
+        """Of no closures."""
+        return cls(np.empty(0, dtype=np.int64), (), (), np.empty((0, 0)))
+
+    def and_of(self, linear: Linear, edge: np.ndarray, right: np.ndarray) -> Columns:
+        """With more closures.
+
+        Args:
+            linear: that all columns are of.
+            edge: ``(m,)``.
+            right: ``(K + R, d, m d)`` Aᵀ.
+        """
+        left, half = linear.begun(right)
+        rows = _Rows.of(left)
+        between = self._with_all(self.left, half)
+        own = rows.with_each(half)
+        covariance = np.block([[self.covariance, between], [between.T, (own + own.T) / 2]])
+        return Columns(np.append(self.edge, edge), (*self.left, rows), (*self.half, _Rows.of(half)), covariance)
+
+    def moves(self, linear: Linear, pull: np.ndarray) -> np.ndarray:
+        """``(K + R, d, q)`` what moves where so much pulls at each row, ``(n d, q)``."""
+        total = np.zeros((linear.num_blocks * linear.size, pull.shape[1]))
+        first = 0
+        for half in self.half:
+            count = half.value.shape[1]
+            total[half.index] += half.value @ pull[first : first + count]
+            first += count
+        return linear.ended(total)
+
+    def at(self, linear: Linear, blocks: np.ndarray) -> np.ndarray:
+        """``(…, d, n d)`` of some blocks, the same ones rather than many."""
+        d = linear.size
+        which, place = np.unique(blocks, return_inverse=True)
+        units = np.zeros((linear.num_blocks, d, len(which), d))
+        units[which, :, np.arange(len(which))] = np.eye(d)
+        left, _ = linear.begun(units.reshape(linear.num_blocks, d, -1))
+        return np.asarray(self._with_all(self.half, left).T.reshape(len(which), d, len(self.covariance))[place])
+
+    def _with_all(self, parts: tuple[_Rows, ...], columns: np.ndarray) -> np.ndarray:
+        """``(n d, m)`` products of some ``parts`` with ``((K + R) d, m)``."""
+        return np.concatenate([np.empty((0, columns.shape[1])), *(part.with_each(columns) for part in parts)])
