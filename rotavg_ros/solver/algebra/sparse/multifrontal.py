@@ -142,13 +142,12 @@ class Elimination:
         tie = np.searchsorted(self._ties, first * self.num_blocks + second)
         return np.asarray(tie[:, None, None] * self.size**2 + np.arange(self.size**2).reshape(self.size, self.size))
 
-    def own_part(self, number: int, entries: np.ndarray) -> np.ndarray:
+    def own_part(self, number: int, entries: np.ndarray) -> torch.Tensor:
         """``(p, p + r)`` of all entries those of a front's p pivots, against these and its rows."""
         of_front = slice(self._of_front[number], self._of_front[number + 1])
-        shape = self.fronts[number].shape
-        part = np.zeros(shape[0] * shape[1])
-        part[self._place[of_front]] = entries[of_front]
-        return part.reshape(shape)
+        part = _zeros(*self.fronts[number].shape)
+        part.numpy().reshape(-1)[self._place[of_front]] = entries[of_front]
+        return part
 
     def asked(self, columns: np.ndarray) -> list[int]:
         """Fronts, from below, in which columns ``(B d, k)`` have numbers, and all above these."""
@@ -176,21 +175,20 @@ class Cholesky:
         self.elimination = elimination
         self._upper: list[torch.Tensor] = []
         self._beside: list[torch.Tensor] = []
-        given: list[list[tuple[_Front, np.ndarray]]] = [[] for _ in elimination.fronts]
+        given: list[list[tuple[_Front, torch.Tensor]]] = [[] for _ in elimination.fronts]
         for number, front in enumerate(elimination.fronts):
             stop_if_abandoned()
             spend(front.seconds / _UNIT_S)
-            part = elimination.own_part(number, entries)
-            num_pivots, num_rows = len(part), len(front.rows)
-            left = np.zeros((num_rows, num_rows))
+            own = elimination.own_part(number, entries)
+            num_pivots, num_rows = len(own), len(front.rows)
+            left = _zeros(num_rows, num_rows)
             for below, rest_of_it in given[number]:
-                _add(rest_of_it, below, part, left)
+                _add(rest_of_it.numpy(), below, own.numpy(), left.numpy())
             given[number] = []
-            own = torch.from_numpy(part)
             lower = _lower_root(own[:, :num_pivots].T)
             beside = torch.linalg.solve_triangular(lower, own[:, num_pivots:], upper=False)
             if num_rows:
-                torch.from_numpy(left).addmm_(beside.T, beside, alpha=-1.0)
+                left.addmm_(beside.T, beside, alpha=-1.0)
                 given[front.above].append((front, left))
             self._upper.append(lower.T)
             self._beside.append(beside)
@@ -211,7 +209,7 @@ class Cholesky:
 
     def begun(self, right_hand_side: np.ndarray) -> np.ndarray:
         """L⁻¹ of columns ``(B d, k)``, the matrix being L Lᵀ; where they have numbers and in fronts above those."""
-        solution = torch.from_numpy(np.array(right_hand_side))
+        solution = torch.tensor(right_hand_side)
         for number in self.elimination.asked(right_hand_side):
             rest()
             front, beside = self.elimination.fronts[number], self._beside[number]
@@ -222,7 +220,7 @@ class Cholesky:
 
     def ended(self, half: np.ndarray) -> np.ndarray:
         """L⁻ᵀ of columns ``(B d, k)``."""
-        solution = torch.from_numpy(np.array(half))
+        solution = torch.tensor(half)
         fronts = self.elimination.fronts
         owns = torch.split(solution, [front.end - front.begin for front in fronts])
         for front, own, upper, beside in reversed(list(zip(fronts, owns, self._upper, self._beside, strict=True))):
@@ -230,6 +228,11 @@ class Cholesky:
             told = torch.addmm(own, beside, solution.index_select(0, front.later), alpha=-1.0)
             own.copy_(torch.linalg.solve_triangular(upper, told, upper=True))
         return np.asarray(solution.numpy())
+
+
+def _zeros(rows: int, columns: int) -> torch.Tensor:
+    """In memory of torch's own, whose products come out alike to the last bit wherever that lies."""
+    return torch.zeros(rows, columns, dtype=torch.float64)
 
 
 def _add(given: np.ndarray, below: _Front, part: np.ndarray, left: np.ndarray) -> None:

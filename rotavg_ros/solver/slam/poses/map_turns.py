@@ -12,6 +12,7 @@ from scipy.sparse import csr_array
 from scipy.special import expit
 
 from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.poses.closures import Predictions, Told
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
@@ -164,44 +165,40 @@ class _Differences:
         Args:
             alike: ``(C, C)`` chances that two are off by the same turn, those of the second being so at all.
         """
-
-        def over_all(values: np.ndarray) -> np.ndarray:
-            of_row = csr_array((values, (self.rows, self.others)), shape=alike.shape)
-            return np.asarray((of_row @ alike.T)[self.rows, self.others]).reshape(-1)
-
-        weight = 1 / self.shift_variance
-        total = over_all(weight)
-        turn, shift = (
-            np.stack([over_all(weight * column) / total for column in values.T], axis=1)
-            for values in (self.turn, self.shift)
-        )
-        return _Differences(
-            self.rows, self.others, turn, shift, over_all(weight**2 * self.turn_variance) / total**2, 1 / total
-        )
+        weight, k = 1 / self.shift_variance, self.turn.shape[1]
+        each = (weight, *(weight * self.turn.T), *(weight * self.shift.T), weight**2 * self.turn_variance)
+        # One product for all of them, which stand below each other.
+        count, below = len(alike.indptr) - 1, np.arange(len(each))[:, None]
+        rows, others = (below * count + self.rows).ravel(), np.tile(self.others, len(each))
+        of_rows = csr_array((np.concatenate(each), (rows, others)), shape=(len(each) * count, count))
+        over_all = np.asarray((of_rows @ alike.T)[rows, others]).reshape(len(each), -1)
+        total, variance = over_all[0], over_all[-1]
+        turn, shift = np.split((over_all[1:-1] / total).T, [k], axis=1)
+        return _Differences(self.rows, self.others, turn, shift, variance / total**2, 1 / total)
 
     def turn_square(self, maps: MapTurns) -> np.ndarray:
         """``(P,)`` squares of what turns differ by, in standard deviations."""
-        return np.asarray((self.turn * self._whitened(maps)[0]).sum(axis=1))
+        return np.asarray((self._whitened(maps, self.turn[:, :, None]) ** 2).sum(axis=(1, 2)))
 
     def log_kernel(self, maps: MapTurns) -> np.ndarray:
         """``(P,)`` nats, densities of shifts given by what turns differ, each a mean of several widths."""
         m, k = self.shift.shape[1], self.turn.shape[1]
         own = maps.covariance[self.rows]
-        whitened, of_turns = self._whitened(maps)
-        across = own[:, k:, :k]
-        off = self.shift - (across @ whitened[:, :, None])[:, :, 0]
-        left = own[:, k:, k:] - across @ np.linalg.solve(of_turns, across.transpose(0, 2, 1))
-        left = left + self.shift_variance[:, None, None] * np.eye(m)
-        square = (off * np.linalg.solve(left, off[:, :, None])[:, :, 0]).sum(axis=1)
-        height = np.linalg.slogdet(2 * np.pi * left)[1] + m * np.log(_KERNELS[:, None])
-        each = -(square / _KERNELS[:, None] + height) / 2
+        whitened = self._whitened(maps, np.concatenate((self.turn[:, :, None], own[:, :k, k:]), axis=2))
+        across = whitened[:, :, 1:].transpose(0, 2, 1)
+        off = self.shift[:, :, None] - np.matmul(across, whitened[:, :, :1])
+        left = own[:, k:, k:] - np.matmul(across, whitened[:, :, 1:]) + self.shift_variance[:, None, None] * np.eye(m)
+        root = inverse_root(left)
+        square = (np.matmul(root, off) ** 2).sum(axis=(1, 2))
+        log_det = m * np.log(2 * np.pi) - 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+        each = -(square / _KERNELS[:, None] + log_det + m * np.log(_KERNELS[:, None])) / 2
         return np.asarray(np.logaddexp.reduce(each, axis=0) - np.log(len(_KERNELS)))
 
-    def _whitened(self, maps: MapTurns) -> tuple[np.ndarray, np.ndarray]:
-        """``(P, k)`` and ``(P, k, k)`` rad²: what turns differ by, over its variance; and that."""
+    def _whitened(self, maps: MapTurns, turns: np.ndarray) -> np.ndarray:
+        """``(P, k, n)`` of what goes with turns ``(P, k, n)``, in standard deviations of what these differ by."""
         k = self.turn.shape[1]
         of_turns = maps.covariance[self.rows, :k, :k] + self.turn_variance[:, None, None] * np.eye(k)
-        return np.linalg.solve(of_turns, self.turn[:, :, None])[:, :, 0], of_turns
+        return np.asarray(np.matmul(inverse_root(of_turns), turns))
 
 
 def _with_own(covariance: np.ndarray, sigma: np.ndarray) -> np.ndarray:
