@@ -23,7 +23,8 @@ from rotavg_ros.solver.running.work import rest, spend, stop_if_abandoned
 # What a front takes besides its arithmetic, seconds; numbers multiplied and moved a second, on one core of 2020. They
 # decide on merging and are what work is counted in; no answer depends on them.
 _FRONT_S, _PRODUCTS_PER_S, _MOVES_PER_S = 3.6e-5, 2.5e10, 6.7e8
-_UNIT_S = 1e-3
+# Seconds to a unit: as long as one takes of a solve by rotations alone, with all that is done around it.
+_UNIT_S = 5e-4
 # What is tied to nothing by itself, beside ties of one: enough for any order of elimination, too little to let fill
 # that lies far apart vanish.
 _SLIGHTLY = 1e-6

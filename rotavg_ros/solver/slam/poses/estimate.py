@@ -25,7 +25,7 @@ from rotavg_ros.solver.slam.poses.rows import ANYHOW, PoseNoise, PoseProblem, Po
 from rotavg_ros.solver.slam.poses.solved import Solved
 
 # Units of work for each row, of each third of what is done beside the factorisation.
-_ROW = 0.006
+_ROW = 0.012
 _MAX_SOLVES = 28
 # An update goes no further: the next one goes on from there.
 _MAX_UPDATE_SOLVES = 6
