@@ -66,7 +66,8 @@ class Columns:
             edge: ``(m,)``.
             right: ``(K + R, d, m d)`` Aᵀ.
         """
-        left, half = linear.begun(right)
+        left = linear.left(right)
+        half = linear.half(left)
         rows = _Rows.of(left)
         between = self._with_all(self.left, half)
         own = rows.with_each(half)
@@ -89,7 +90,7 @@ class Columns:
         which, place = np.unique(blocks, return_inverse=True)
         units = np.zeros((linear.num_blocks, d, len(which), d))
         units[which, :, np.arange(len(which))] = np.eye(d)
-        left, _ = linear.begun(units.reshape(linear.num_blocks, d, -1))
+        left = linear.left(units.reshape(linear.num_blocks, d, -1))
         return np.asarray(self._with_all(self.half, left).T.reshape(len(which), d, len(self.covariance))[place])
 
     def _with_all(self, parts: tuple[_Rows, ...], columns: np.ndarray) -> np.ndarray:

@@ -38,9 +38,10 @@ class Linear:
         noise: how far odometry and closures err; 0 metres by rotations alone.
         good, false: how many closures are.
         extent: m² per component, of the map.
-        begun: two halves ``((K + R) d, n)`` of what H⁻¹ is of columns ``(K + R, d, n)``: products of the first with
-            the second are products of columns with H⁻¹ between them.
-        ended: H⁻¹ of columns ``(K + R, d, q)``, by the second half.
+        left: of columns ``(K + R, d, n)``, ``((K + R) d, n)``, and …
+        half: of what is left of them, ``((K + R) d, n)``: products of the one with the other are products of columns
+            with H⁻¹ between them.
+        ended: H⁻¹ of columns ``(K + R, d, n)``, by their halves.
         column_work: units that one column costs.
     """
 
@@ -57,7 +58,8 @@ class Linear:
     good: int
     false: int
     extent: float
-    begun: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    left: Callable[[np.ndarray], np.ndarray]
+    half: Callable[[np.ndarray], np.ndarray]
     ended: Callable[[np.ndarray], np.ndarray]
     column_work: float
 
@@ -78,8 +80,8 @@ class Linear:
         drawn = problem.drawn(noise)
         between = drawn.fraction * (1 - drawn.fraction) * drawn.length * noise.step_variance
 
-        def begun(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return columns[:, 0], factorised.solve(columns[:, 0])
+        def left(columns: np.ndarray) -> np.ndarray:
+            return columns[:, 0]
 
         def ended(solved: np.ndarray) -> np.ndarray:
             return solved[:, None]
@@ -99,7 +101,8 @@ class Linear:
             int(is_good.sum()),
             int((~is_good).sum()),
             1.0,
-            begun,
+            left,
+            factorised.solve,
             ended,
             factorised.num_entries / _ENTRIES,
         )
@@ -115,9 +118,8 @@ class Linear:
         between = drawn.fraction * (1 - drawn.fraction) * drawn.length * noise.turn
         good = float(solved.places.right.sum())
 
-        def begun(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            half = solved.factor.begun(columns)
-            return half, half
+        def half(begun: np.ndarray) -> np.ndarray:
+            return begun
 
         return cls(
             len(drawn.segment_of_edge),
@@ -133,7 +135,8 @@ class Linear:
             round(good),
             solved.places.chance.shape[1] - round(good),
             solved.scale.extent,
-            begun,
+            solved.factor.begun,
+            half,
             solved.factor.ended,
             _PASSED * solved.factor.num_entries / _ENTRIES,
         )

@@ -16,13 +16,16 @@ def _linear(information: np.ndarray, is_half: bool) -> Linear:
     root = np.linalg.cholesky(information)
     flat = _BLOCKS * _SIZE
 
-    def begun(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def left(columns: np.ndarray) -> np.ndarray:
         right = columns.reshape(flat, -1)
         if not is_half:
-            return right, np.linalg.solve(information, right)
-        half = np.linalg.solve(root, right)
-        half[np.abs(half) < 1e-12] = 0.0
-        return half, half
+            return right
+        begun = np.linalg.solve(root, right)
+        begun[np.abs(begun) < 1e-12] = 0.0
+        return begun
+
+    def half(begun: np.ndarray) -> np.ndarray:
+        return begun if is_half else np.linalg.solve(information, begun)
 
     def ended(half: np.ndarray) -> np.ndarray:
         return (np.linalg.solve(root.T, half) if is_half else half).reshape(_BLOCKS, _SIZE, -1)
@@ -30,7 +33,23 @@ def _linear(information: np.ndarray, is_half: bool) -> Linear:
     nothing, nowhere = np.zeros((2, _BLOCKS)), np.arange(_BLOCKS)
     noise, axes = PoseNoise(*np.ones(6)), np.eye(3)
     return Linear(
-        0, nowhere, nowhere, nothing, nothing, _BLOCKS, 1, axes[:, 2:], axes[:, :2], noise, 0, 0, 1.0, begun, ended, 1.0
+        0,
+        nowhere,
+        nowhere,
+        nothing,
+        nothing,
+        _BLOCKS,
+        1,
+        axes[:, 2:],
+        axes[:, :2],
+        noise,
+        0,
+        0,
+        1.0,
+        left,
+        half,
+        ended,
+        1.0,
     )
 
 
