@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rotavg_ros.solver.algebra.products import product
 from rotavg_ros.solver.slam.update.linear import Linear
 
 
@@ -35,7 +36,7 @@ class _Rows:
 
     def with_each(self, columns: np.ndarray) -> np.ndarray:
         """``(m, n)`` products with ``((K + R) d, n)``."""
-        return np.asarray(self.value.T @ columns[self.index])
+        return product(self.value.T, columns[self.index])
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class Columns:
         first = 0
         for half in self.half:
             count = half.value.shape[1]
-            total[half.index] += half.value @ pull[first : first + count]
+            total[half.index] += product(half.value, pull[first : first + count])
             first += count
         return linear.ended(total)
 

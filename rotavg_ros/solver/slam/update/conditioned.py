@@ -16,6 +16,7 @@ from scipy.sparse import csr_array
 from scipy.special import expit
 
 from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.products import inverse_of, product
 from rotavg_ros.solver.algebra.small_matrices import inverse
 from rotavg_ros.solver.running.work import count as count_units
 from rotavg_ros.solver.running.work import rest
@@ -120,10 +121,11 @@ def _left_out(covariance: np.ndarray, residual: np.ndarray, given: np.ndarray) -
     if not given.any():
         return residual, own
     among = covariance[given][:, :, given].reshape(-1, given.sum() * size)
-    precision = np.linalg.inv((among + among.T) / 2)
-    pulled = (precision @ residual[given].reshape(len(precision), -1)).reshape(-1, size, residual.shape[2])
-    gain = covariance[:, :, given].reshape(count * size, -1) @ precision
-    mean = residual - (gain @ residual[given].reshape(len(precision), -1)).reshape(residual.shape)
+    precision = inverse_of((among + among.T) / 2)
+    off = residual[given].reshape(len(precision), -1)
+    pulled = product(precision, off).reshape(-1, size, residual.shape[2])
+    gain = product(covariance[:, :, given].reshape(count * size, -1), precision)
+    mean = residual - product(gain, off).reshape(residual.shape)
     taken = np.einsum("iak,ibk->iab", gain.reshape(count, size, -1), covariance[:, :, given].reshape(count, size, -1))
     left = own - taken
     among_given = np.arange(given.sum())
@@ -309,10 +311,10 @@ class _System:
         linear, d, k, count = self.linear, self.linear.size, self._widths[0], len(accepted)
         q = self.residual.shape[2]
         among = covariance[accepted][:, :, accepted].reshape(-1, accepted.sum() * d)
-        precision = np.linalg.inv((among + among.T) / 2)
+        precision = inverse_of((among + among.T) / 2)
         laid = replace(self.laid, variance=self._surer(columns, precision, accepted))
         pull = np.zeros((count, d, q))
-        pull[accepted] = (precision @ self.residual[:count][accepted].reshape(-1, q)).reshape(-1, d, q)
+        pull[accepted] = product(precision, self.residual[:count][accepted].reshape(-1, q)).reshape(-1, d, q)
         step = columns.moves(linear, pull.reshape(-1, q))
         new = np.arange(linear.num_nodes, len(self.anchor))
         walked = self._walked(new[None], np.ones(1), count)
@@ -352,7 +354,7 @@ class _System:
         for axis, kind in enumerate(np.repeat([0, 1], (k, m))):
             both[:, axis, :, axis] += walked[kind]
         pulled = both[:, :, accepted].reshape(len(new), d, len(precision))
-        fallen = ((pulled @ precision) * pulled).sum(axis=2)
+        fallen = (product(pulled, precision) * pulled).sum(axis=2)
         variance: np.ndarray = self.laid.variance.copy()
         for kind, part in enumerate((fallen[:, :k], fallen[:, k:])):
             if part.shape[1]:

@@ -1,0 +1,24 @@
+"""Products and inverses of large dense matrices, on the thread that asks for them.
+
+NumPy's go to OpenBLAS, which spreads them over the cores and waits busily: beside other work each takes time slices of
+some milliseconds. Torch's obey its number of threads, which is one within a solve.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+
+def product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """``left @ right``, of matrices or of many of them."""
+    return np.asarray(torch.matmul(torch.from_numpy(left), torch.from_numpy(right)).numpy())
+
+
+def inverse_of(matrix: np.ndarray) -> np.ndarray:
+    """Of ``(n, n)``.
+
+    Raises:
+        torch.linalg.LinAlgError: it has none.
+    """
+    return np.asarray(torch.linalg.inv(torch.from_numpy(matrix)).numpy())
