@@ -36,8 +36,9 @@ _INLIER_SQUARE = {1: 6.63, 3: 11.34}
 # Annealing has ended once the loss is as sharp as this.
 _SHARP = 1e3
 # Steps of this many prior standard deviations above (below) the median are tried, closures of half one below it. In
-# this order two starts soonest agree on what is likeliest.
-_STEP_LEVELS, _CLOSURE_LEVEL = (1.0, -1.0, 0.0, 2.0), -0.5
+# this order starts soonest agree on what is likeliest; odometry that is good and one that is far worse than anybody's
+# first, since those between end alike where nearly all closures are held false.
+_STEP_LEVELS, _CLOSURE_LEVEL = (1.0, 4.0, -1.0, 0.0, 2.0), -0.5
 # ρ(r) = |r|^½ beyond a standard deviation: weights are (1 + r²/σ²)^-¾.
 _ROBUST_POWER = -0.75
 # Chances of a slip per step under which parts are turned, first as dear as none.
