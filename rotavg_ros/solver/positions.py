@@ -83,7 +83,7 @@ def fit_positions(
     step = Rotation.from_quat(world_from_body[source]).apply(edges.translation) if len(source) else np.empty((0, 3))
     counts = is_odometry if is_odometry.any() else np.ones(len(source), dtype=bool)
     typical = typical_length(step, steps, counts)
-    weight = np.where(is_odometry, typical / lengths_passed(step, steps, counts), edges.trust / _CLOSURE_STEPS)
+    weight = np.where(is_odometry, typical / lengths_passed(step, steps, typical), edges.trust / _CLOSURE_STEPS)
 
     pattern = LaplacianPattern(num_nodes, source, target, roots)
 

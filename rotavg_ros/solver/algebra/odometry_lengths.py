@@ -24,9 +24,12 @@ def typical_length(
     return float(np.median(moving)) if len(moving) else 1.0
 
 
-def lengths_passed(
-    translation: NDArray[np.float64], steps: NDArray[np.float64], is_odometry: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """``(M,)`` metres that each edge's variance goes with; arguments as of :func:`typical_length`."""
-    shortest = _SHORTEST_STEP * typical_length(translation, steps, is_odometry)
-    return np.asarray(np.maximum(np.linalg.norm(translation, axis=1), shortest * steps))
+def lengths_passed(translation: NDArray[np.float64], steps: NDArray[np.float64], typical: float) -> NDArray[np.float64]:
+    """``(M,)`` metres that each edge's variance goes with.
+
+    Args:
+        translation: ``(M, 3)`` metres.
+        steps: ``(M,)`` odometry steps that each edge stands for.
+        typical: :func:`typical_length` of the graph's odometry.
+    """
+    return np.asarray(np.maximum(np.linalg.norm(translation, axis=1), _SHORTEST_STEP * typical * steps))

@@ -192,11 +192,15 @@ def _laid_on(graph: ViewGraph, known: SlamMemory, ration: float) -> Estimate | N
     edges = np.arange(graph.num_edges)
     waits = (edges >= known.graph.num_edges) & ~graph.is_odometry.numpy()
     kept, closure = np.flatnonzero(~waits), np.flatnonzero(waits)
+    growth = _growth(graph, known, known.graph)
+    if growth is None:
+        return None
     if len(closure) == 0:
-        return known.along_odometry(graph)
-    estimate = known.along_odometry(graph.select_edges(torch.from_numpy(kept)))
+        return known.along_odometry(graph, growth)
+    estimate = known.along_odometry(graph.select_edges(torch.from_numpy(kept)), growth.among(kept))
     linear = _linear(known)
-    growth = _growth(graph, known, linear)
+    if linear.num_nodes != known.graph.num_nodes:
+        growth = _growth(graph, known, linear)
     if estimate is None or growth is None:
         return None
     places = estimate.places

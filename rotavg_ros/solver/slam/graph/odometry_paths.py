@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -107,6 +107,10 @@ class Growth:
         )
         turn = compose_orientations(forest, local)[len(root) :]
         return cls(edge, parent, root[follow(above)[len(root) :]], turn, forest)
+
+    def among(self, kept: np.ndarray) -> Growth:
+        """The same in a graph of the edges ``kept`` ``(M',)`` alone, ascending, its own among these."""
+        return replace(self, edge=np.searchsorted(kept, self.edge))
 
     def along(self, value: np.ndarray) -> np.ndarray:
         """Sums of edges' values ``(n,)`` from the anchors on."""

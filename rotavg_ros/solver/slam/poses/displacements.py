@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed
+from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed, typical_length
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.view_graph import ViewGraph
 
@@ -74,7 +74,8 @@ class DrawnSteps:
         self._measured_at = np.where(self._is_forward, of_parent, of_node)[:, None]
         self._source, self._translation = graph.source, torch.from_numpy(translation)
         self._outside = drawn.view_graph_edge
-        length = lengths_passed(translation, graph.steps.numpy(), graph.is_odometry.numpy())
+        typical = typical_length(translation, graph.steps.numpy(), graph.is_odometry.numpy())
+        length = lengths_passed(translation, graph.steps.numpy(), typical)
         passed = self._so_far(length[self._edge, None])
         self._passed = self._at_nodes(passed)[:, 0]
         self._length = np.concatenate((self._whole(length[self._edge, None])[:, 0], length[self._outside]))

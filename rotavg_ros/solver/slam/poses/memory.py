@@ -63,9 +63,12 @@ class PoseMemory:
 
     def start_alone(self, graph: ViewGraph) -> torch.Tensor | None:
         """``(N, 4)`` where rotations alone go on in a graph that has grown; None where new nodes hang otherwise."""
-        new = np.arange(self.num_edges, graph.num_edges)
-        growth = Growth.of(graph, new[graph.is_odometry[new].numpy()], self.num_nodes)
+        growth = self._growth(graph)
         return None if growth is None else _laid_on(self.alone, growth)
+
+    def _growth(self, graph: ViewGraph) -> Growth | None:
+        new = np.arange(self.num_edges, graph.num_edges)
+        return Growth.of(graph, new[graph.is_odometry[new].numpy()], self.num_nodes)
 
     def start(self, graph: ViewGraph, problem: PoseProblem) -> PoseStart | None:
         """Where the joint solve of a graph that has grown from this one begins; None: from nothing.
@@ -75,11 +78,12 @@ class PoseMemory:
             problem: the same.
         """
         drawn, closures = problem.drawn, problem.closures
-        grown = self._grown(graph)
+        growth = self._growth(graph)
+        grown = None if growth is None else self._grown(graph, growth)
         is_merged = not np.array_equal(drawn.nodes[drawn.roots], self.roots)
         if grown is None or is_merged:
             return None
-        orientation, position, _ = grown
+        orientation, position = grown
         correction = drawn.corrections(orientation).numpy().T
         common = np.zeros((problem.num_runs, 6))
         state = PoseState(np.ascontiguousarray(correction), position[drawn.nodes], common, self.noise)
@@ -87,23 +91,26 @@ class PoseMemory:
         column[self.edge] = np.arange(len(self.edge))
         return PoseStart(state, column[closures], self.places)
 
-    def extended(self, graph: ViewGraph) -> PoseMemory | None:
-        """With odometry alone, on which each new node hangs by one edge; None if something else is new."""
+    def extended(self, graph: ViewGraph, growth: Growth) -> PoseMemory | None:
+        """With odometry alone, on which new nodes hang; None where it has no translations."""
         new = np.arange(self.num_edges, graph.num_edges)
-        grown = self._grown(graph) if bool(graph.is_odometry[new].all()) else None
+        grown = self._grown(graph, growth)
         if grown is None:
             return None
-        orientation, position, growth = grown
+        orientation, position = grown
         poses, noise = self.poses, self.noise
-        steps, length = graph.steps.numpy(), _lengths_passed(graph)
+        assert graph.translation is not None
+        steps = graph.steps.numpy()
+        step = np.nan_to_num(graph.translation[new].numpy())
+        passed = lengths_passed(step, steps[new], self.pose.problem.typical)
         # Beyond its anchor a node's way turns with the anchor's heading, and with its own steps'.
         way = np.linalg.norm(position[self.num_nodes :] - position[growth.anchor], axis=1)
         turned = noise.turn * growth.along(steps[growth.edge])
         lever = (poses.variance[growth.anchor] + turned / WALK) * way**2 * ACROSS
-        shifted = lever + noise.way * growth.along(length[growth.edge])
+        shifted = lever + noise.way * growth.along(passed[growth.edge - self.num_edges])
         variance = np.append(poses.variance, poses.variance[growth.anchor] + turned)
         position_variance = np.append(poses.position_variance, poses.position_variance[growth.anchor] + shifted)
-        precision = np.stack((1 / (noise.turn * steps[new]), 1 / (noise.way * length[new])), axis=1)
+        precision = np.stack((1 / (noise.turn * steps[new]), 1 / (noise.way * passed)), axis=1)
         nothing = np.zeros(len(new))
         alone = _laid_on(self.alone, growth)
         grown_poses = replace(
@@ -118,12 +125,9 @@ class PoseMemory:
         )
         return replace(self, poses=grown_poses, alone=alone)
 
-    def _grown(self, graph: ViewGraph) -> tuple[torch.Tensor, np.ndarray, Growth] | None:
-        """Poses of all nodes, ``(N, 4)`` body_from_world and ``(N, 3)``; None where new ones hang otherwise."""
-        new = np.arange(self.num_edges, graph.num_edges)
-        odometry = new[graph.is_odometry[new].numpy()]
-        growth = Growth.of(graph, odometry, self.num_nodes)
-        if growth is None or graph.translation is None:
+    def _grown(self, graph: ViewGraph, growth: Growth) -> tuple[torch.Tensor, np.ndarray] | None:
+        """Poses of all nodes, ``(N, 4)`` body_from_world and ``(N, 3)``; None without translations."""
+        if graph.translation is None:
             return None
         orientation = _laid_on(torch.from_numpy(np.ascontiguousarray(self.poses.body_from_world)), growth)
         edge = torch.from_numpy(growth.edge)
@@ -132,19 +136,13 @@ class PoseMemory:
         step = np.where((source.numpy() == growth.parent)[:, None], step, -step)
         way = np.stack([growth.along(column) for column in step.T], axis=1)
         position = np.concatenate((self.poses.position, self.poses.position[growth.anchor] + way))
-        return orientation, position, growth
+        return orientation, position
 
 
 def _laid_on(orientation: torch.Tensor, growth: Growth) -> torch.Tensor:
     """Orientations of known nodes, and of new ones along the odometry from them."""
     anchor = torch.from_numpy(growth.anchor)
     return torch.cat((orientation, rotations.normalize(rotations.multiply(growth.turn, orientation[anchor]))))
-
-
-def _lengths_passed(graph: ViewGraph) -> np.ndarray:
-    assert graph.translation is not None
-    translation = np.nan_to_num(graph.translation.numpy())
-    return np.asarray(lengths_passed(translation, graph.steps.numpy(), graph.is_odometry.numpy()))
 
 
 # A walk's heading errs along its way by a third of the variance at its end; of a lever's two or three components one

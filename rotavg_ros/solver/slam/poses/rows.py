@@ -136,7 +136,7 @@ class PoseProblem:
     @cached_property
     def lengths_passed(self) -> np.ndarray:
         """``(M,)`` metres that each edge's variance goes with."""
-        return lengths_passed(self.lengths, self.graph.steps.numpy(), self.graph.is_odometry.numpy())
+        return lengths_passed(self.lengths, self.graph.steps.numpy(), self.typical)
 
     @cached_property
     def bases(self) -> tuple[np.ndarray, np.ndarray]:

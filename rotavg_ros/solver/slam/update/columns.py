@@ -8,7 +8,7 @@ worked out at once.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,17 +47,22 @@ class Columns:
         edge: ``(n,)`` edges of the view-graph.
         left, half: as they came; the product of one's left with the other's half is what two have in common.
         covariance: ``(n d, n d)`` A H⁻¹ Aᵀ.
+        anchors: ``(b,)`` blocks, ascending, that new nodes hang on.
+        units: ``((K + R) d, b d)`` what is left of columns that are one in these.
     """
 
     edge: np.ndarray
     left: tuple[_Rows, ...]
     half: tuple[_Rows, ...]
     covariance: np.ndarray
+    anchors: np.ndarray
+    units: np.ndarray
 
     @classmethod
     def none(cls) -> Columns:
         """Of no closures."""
-        return cls(np.empty(0, dtype=np.int64), (), (), np.empty((0, 0)))
+        nothing = np.empty(0, dtype=np.int64)
+        return cls(nothing, (), (), np.empty((0, 0)), nothing, np.empty((0, 0)))
 
     def and_of(self, linear: Linear, edge: np.ndarray, right: np.ndarray) -> Columns:
         """With more closures.
@@ -73,7 +78,19 @@ class Columns:
         between = self._with_all(self.left, half)
         own = rows.with_each(half)
         covariance = np.block([[self.covariance, between], [between.T, (own + own.T) / 2]])
-        return Columns(np.append(self.edge, edge), (*self.left, rows), (*self.half, _Rows.of(half)), covariance)
+        halves = (*self.half, _Rows.of(half))
+        return replace(
+            self, edge=np.append(self.edge, edge), left=(*self.left, rows), half=halves, covariance=covariance
+        )
+
+    def with_anchors(self, linear: Linear, blocks: np.ndarray) -> Columns:
+        """That know of some blocks, the same ones rather than many, what closures have in common with them."""
+        if np.isin(blocks, self.anchors).all():
+            return self
+        d, anchors = linear.size, np.unique(blocks)
+        units = np.zeros((linear.num_blocks, d, len(anchors), d))
+        units[anchors, :, np.arange(len(anchors))] = np.eye(d)
+        return replace(self, anchors=anchors, units=linear.left(units.reshape(linear.num_blocks, d, -1)))
 
     def moves(self, linear: Linear, pull: np.ndarray) -> np.ndarray:
         """``(K + R, d, q)`` what moves where so much pulls at each row, ``(n d, q)``."""
@@ -85,14 +102,11 @@ class Columns:
             first += count
         return linear.ended(total)
 
-    def at(self, linear: Linear, blocks: np.ndarray) -> np.ndarray:
-        """``(…, d, n d)`` of some blocks, the same ones rather than many."""
-        d = linear.size
-        which, place = np.unique(blocks, return_inverse=True)
-        units = np.zeros((linear.num_blocks, d, len(which), d))
-        units[which, :, np.arange(len(which))] = np.eye(d)
-        left = linear.left(units.reshape(linear.num_blocks, d, -1))
-        return np.asarray(self._with_all(self.half, left).T.reshape(len(which), d, len(self.covariance))[place])
+    def at(self, blocks: np.ndarray) -> np.ndarray:
+        """``(…, d, n d)`` of blocks, which :meth:`with_anchors` was told of."""
+        count, told = len(self.anchors), self._with_all(self.half, self.units).T
+        told = told.reshape(count, len(told) // max(count, 1), len(self.covariance))
+        return np.asarray(told[np.searchsorted(self.anchors, blocks)])
 
     def _with_all(self, parts: tuple[_Rows, ...], columns: np.ndarray) -> np.ndarray:
         """``(n d, m)`` products of some ``parts`` with ``((K + R) d, m)``."""

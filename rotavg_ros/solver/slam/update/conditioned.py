@@ -91,6 +91,7 @@ def conditioned(
         count_units(linear.column_work * linear.size * len(edge[some]))
         rest()
         columns = columns.and_of(linear, edge[some], system.columns(some))
+    columns = columns.with_anchors(linear, system.anchors)
     count = len(columns.edge)
     covariance = system.covariance(columns.covariance, count)
     accepted = np.zeros(count, dtype=bool)
@@ -170,8 +171,8 @@ class _System:
         steps = growth.along(graph.steps.numpy()[growth.edge])
         length = np.zeros(len(growth.edge))
         if laid.position is not None and graph.translation is not None:
-            step_lengths = torch.linalg.vector_norm(graph.translation, dim=1).nan_to_num().numpy()
-            length = growth.along(step_lengths[growth.edge])
+            step = graph.translation[torch.from_numpy(growth.edge)]
+            length = growth.along(torch.linalg.vector_norm(step, dim=1).nan_to_num().numpy())
         turned = noise.turn * steps
         lever = turned / WALK * (way[linear.num_nodes :] ** 2).sum(axis=1) * ACROSS
         along = np.zeros((2, len(anchor)))
@@ -204,6 +205,12 @@ class _System:
         """Components of turns and of shifts in a row."""
         turns, shifts = self.linear.turns, self.linear.shifts
         return (1, 0) if turns is None or shifts is None else (turns.shape[1], shifts.shape[1])
+
+    @property
+    def anchors(self) -> np.ndarray:
+        """``(2, n)`` blocks that new nodes lie between."""
+        anchor = self.anchor[self.linear.num_nodes :]
+        return np.stack((self.linear.above[anchor], self.linear.below[anchor]))
 
     def columns(self, which: slice) -> np.ndarray:
         """``(K + R, d, n d)`` Aᵀ of some closures."""
@@ -342,8 +349,10 @@ class _System:
         """
         linear, d, (k, m), count = self.linear, self.linear.size, self._widths, len(accepted)
         new = np.arange(linear.num_nodes, len(self.anchor))
+        if len(new) == 0:
+            return self.laid.variance
         anchor = self.anchor[new]
-        above, below = columns.at(linear, np.stack((linear.above[anchor], linear.below[anchor])))
+        above, below = columns.at(self.anchors)
         share = linear.share[:, anchor][:, :, None, None]
         walked = self._walked(new[None], np.ones(1), count)
         told = [(1 - share[kind]) * above + share[kind] * below for kind in (0, 1)]

@@ -205,19 +205,17 @@ class SlamMemory:
         )
         return SearchedOn(replace(estimate, memory=memory), fine)
 
-    def along_odometry(self, graph: ViewGraph) -> Estimate | None:
-        """The answer if each new node hangs on an older one by one edge of odometry, and nothing else is new.
+    def along_odometry(self, graph: ViewGraph, new: Growth) -> Estimate | None:
+        """The answer with odometry alone, on which new nodes hang; None where that has lost its translations.
 
         Variances grow by the steps passed, whatever odometry does in turns.
+
+        Args:
+            graph: grown from this one, by odometry alone.
+            new: its new nodes.
         """
         edge = np.arange(self.graph.num_edges, graph.num_edges)
-        if not bool(graph.is_odometry[edge].all()):
-            return None
-        unbiased = self.unbiased(graph)
-        new = Growth.of(unbiased, edge, self.graph.num_nodes)
-        if new is None:
-            return None
-        poses = None if self.poses is None else self.poses.extended(unbiased)
+        poses = None if self.poses is None else self.poses.extended(self.unbiased(graph), new)
         if poses is None and self.poses is not None:
             return None
         steps = graph.steps.numpy()

@@ -120,6 +120,8 @@ def test_nodes_that_hang_on_a_graph_by_odometry_lie_as_in_the_grown_one(seed: in
     orientation = rotations.multiply(growth.turn, paths.orientation[growth.anchor])
     assert float(rotations.angle_between(orientation, paths.orientation[40:]).max()) < 1e-7
     np.testing.assert_allclose(paths.depth[growth.anchor] + growth.along(np.ones(20)), paths.depth[40:])
+    kept = np.append(np.arange(0, 39, 2), np.arange(39, 59))
+    np.testing.assert_array_equal(kept[growth.among(kept).edge], growth.edge)
 
 
 def test_nodes_that_hang_otherwise_do_not_grow() -> None:

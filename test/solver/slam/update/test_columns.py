@@ -84,11 +84,16 @@ def test_they_tell_what_the_inverse_does(is_half: bool) -> None:
     )
     blocks = np.array([[3, 7, 3], [0, 7, 11]])
     expected = (inverse @ flat).reshape(_BLOCKS, _SIZE, -1)[blocks]
-    np.testing.assert_allclose(columns.at(linear, blocks), expected, atol=1e-12)
+    known = columns.with_anchors(linear, blocks)
+    np.testing.assert_allclose(known.at(blocks), expected, atol=1e-12)
+    assert known.with_anchors(linear, blocks[:, 1:]) is known
+    np.testing.assert_allclose(known.at(blocks[:, 1:]), expected[:, 1:], atol=1e-12)
+    some = Columns.none().with_anchors(linear, blocks).and_of(linear, np.arange(5), right)
+    np.testing.assert_allclose(some.at(blocks), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("is_half", [False, True])
 def test_of_no_closures_nothing_moves(is_half: bool) -> None:
     linear = _linear(_information(np.random.default_rng(1)), is_half)
     assert not Columns.none().moves(linear, np.empty((0, 1))).any()
-    assert Columns.none().at(linear, np.array([2, 5])).shape == (2, _SIZE, 0)
+    assert Columns.none().with_anchors(linear, np.array([2, 5])).at(np.array([2, 5])).shape == (2, _SIZE, 0)
