@@ -13,17 +13,19 @@ import torch
 from rotavg_ros import rotations
 from rotavg_ros.view_graph import ViewGraph
 
-# Decimals to which the quaternions of one measurement agree, in whichever direction it is written.
-_DECIMALS = 9
+# What a measurement differs by from its copy in the other direction where a file gives six digits of both: products of
+# the quaternion's components, and metres and a share of the translation's length. Independent ones differ by more.
+_ROTATION, _SHIFT, _SHARE_OF_LENGTH = 1e-5, 5e-6, 1e-5
+# Edges between the same nodes are sorted along a direction in which different measurements hardly ever fall together.
+_DIRECTION = np.sqrt(np.arange(2.0, 15.0))
 
 
 def first_of_each(graph: ViewGraph) -> tuple[np.ndarray, np.ndarray] | None:
     """The edges that say something new, and which of these says the same as each edge.
 
     Two edges say the same if they are of one kind and label, between the same nodes, and measure the same
-    rotation and translation.
-    Independent measurements of a pair of nodes differ, be it by little. One without a translation differs from one
-    with.
+    rotation and translation, to rounding: exporters that write every edge both ways compute one from the other and give
+    six digits of each. One without a translation differs from one with.
 
     Returns:
         ``(U,)`` edges, ascending, and ``(M,)`` numbers in 0 … U-1; None if there are no repetitions.
@@ -36,15 +38,27 @@ def first_of_each(graph: ViewGraph) -> tuple[np.ndarray, np.ndarray] | None:
         return None
     chosen = graph.select_edges(torch.from_numpy(parallel))
     forwards = (chosen.source < chosen.target)[:, None]
-    measured = torch.where(forwards, chosen.target_from_source, rotations.inverse(chosen.target_from_source))
-    said = np.column_stack((pair[parallel], chosen.kind, chosen.label, chosen.steps, measured.numpy().round(_DECIMALS)))
+    rotation = torch.where(forwards, chosen.target_from_source, rotations.inverse(chosen.target_from_source)).numpy()
+    row, column = np.triu_indices(4)
+    rotation = rotation[:, row] * rotation[:, column]  # of q and -q the same
+    shift = np.zeros((len(parallel), 3))
+    has_shift: np.ndarray = np.zeros(len(parallel), dtype=bool)
     if chosen.translation is not None:
         turned = -rotations.rotate(chosen.target_from_source, chosen.translation)
-        shift = torch.where(forwards, chosen.translation, turned)
-        said = np.column_stack((said, shift.nan_to_num().numpy().round(_DECIMALS)))
-    _, first, number = np.unique(said, axis=0, return_index=True, return_inverse=True)
+        shift = torch.where(forwards, chosen.translation, turned).numpy()
+        has_shift = np.asarray(~np.isnan(shift).any(axis=1))
+        shift = np.where(has_shift[:, None], shift, 0.0)
+    exact = (pair[parallel], chosen.kind.numpy(), chosen.label.numpy(), chosen.steps.numpy(), has_shift)
+    order = np.lexsort((np.column_stack((rotation, shift)) @ _DIRECTION, *exact))
+    reach = _SHIFT + _SHARE_OF_LENGTH * np.linalg.norm(shift, axis=1)[order[1:]]
+    again = np.abs(np.diff(rotation[order], axis=0)).max(axis=1) <= _ROTATION
+    again &= np.linalg.norm(np.diff(shift[order], axis=0), axis=1) <= reach
+    for values in exact:
+        again &= values[order[1:]] == values[order[:-1]]
+    begins = np.flatnonzero(np.concatenate(([True], ~again)))
+    first = np.minimum.reduceat(order, begins)
     says_as = np.arange(graph.num_edges)
-    says_as[parallel] = parallel[first[number.reshape(-1)]]
+    says_as[parallel[order]] = parallel[np.repeat(first, np.diff(begins, append=len(order)))]
     is_first = says_as == np.arange(graph.num_edges)
     if is_first.all():
         return None

@@ -46,7 +46,7 @@ def test_measurements_that_differ_are_all_kept() -> None:
     graph = _noisy_graph(20, 10, 0)
     twice = torch.arange(graph.num_edges).repeat(2)
     again = graph.select_edges(twice)
-    turn = rotations.exp(torch.tensor([[0.0, 0.0, 1e-6]], dtype=torch.float64))
+    turn = rotations.exp(torch.tensor([[0.0, 0.0, 1e-4]], dtype=torch.float64))
     measurement = again.target_from_source.clone()
     measurement[graph.num_edges :] = rotations.multiply(measurement[graph.num_edges :], turn)
     assert first_of_each(replace(again, target_from_source=measurement)) is None
@@ -56,3 +56,43 @@ def test_measurements_that_differ_are_all_kept() -> None:
     first, says_as = first_of_each(again) or (None, None)
     np.testing.assert_array_equal(first, np.arange(graph.num_edges))
     np.testing.assert_array_equal(says_as, twice)
+
+
+@pytest.mark.parametrize("digits", [6, 7, 9])
+def test_both_ways_with_the_digits_of_a_file(digits: int) -> None:
+    """Every edge again in the other direction, computed before rounding: each once, half turns among them."""
+    graph = _noisy_graph(60, 30, 0)
+    half_turn = rotations.exp(torch.tensor([[0.0, 0.0, torch.pi]], dtype=torch.float64))
+    measurement = graph.target_from_source.clone()
+    measurement[-1] = half_turn
+    rng = np.random.default_rng(0)
+    translation = torch.from_numpy(
+        rng.normal(size=(graph.num_edges, 3)) * 10.0 ** rng.integers(-2, 3, (graph.num_edges, 1))
+    )
+    graph = replace(graph, target_from_source=measurement, translation=translation)
+    back = -rotations.rotate(graph.target_from_source, translation)
+    every = torch.arange(graph.num_edges)
+    twice = replace(_turned(graph.select_edges(every.repeat(2)), every), translation=torch.cat((back, translation)))
+    rounded = replace(
+        twice,
+        target_from_source=_with_digits(twice.target_from_source, digits),
+        translation=_with_digits(twice.translation, digits),
+    )
+    first, says_as = first_of_each(rounded) or (None, None)
+    np.testing.assert_array_equal(first, every)
+    np.testing.assert_array_equal(says_as, every.repeat(2))
+
+
+def _with_digits(values: torch.Tensor | None, digits: int) -> torch.Tensor:
+    assert values is not None
+    return torch.tensor(
+        [[float(f"{value:.{digits}g}") for value in row] for row in values.tolist()], dtype=torch.float64
+    )
+
+
+def test_no_translation_is_not_one_of_zero() -> None:
+    graph = _noisy_graph(20, 10, 0)
+    again = graph.select_edges(torch.arange(graph.num_edges).repeat(2))
+    translation = torch.zeros(again.num_edges, 3, dtype=torch.float64)
+    translation[graph.num_edges :] = torch.nan
+    assert first_of_each(replace(again, translation=translation)) is None
