@@ -24,6 +24,8 @@ FALSE_CLOSURE_DEG, FALSE_CLOSURE_M = 10.0, 2.0
 # A quaternion whose norm is farther than this from one is refused rather than normalised, and so is a matrix R of whose
 # R Rᵀ an entry is farther than this from the identity's.
 UNIT_NORM_TOLERANCE = 1e-3
+# No robot drives farther between two keyframes, in whatever unit; the squares of far longer ways overflow.
+MAX_TRANSLATION = 1e9
 # scipy's graph routines count nodes in 32 bits.
 _MAX_NODES = 2**31 - 1
 # Nodes without an edge that the largest index alone may imply: more are ids taken for indices, or `num_nodes` says that
@@ -111,7 +113,7 @@ class ViewGraph:
             label: :class:`EdgeLabel` codes; default: automatic.
             steps: default: 1.
             translation: ``(M, 3)`` metres, position of the target in the source's frame, the same whichever way the
-                rotation is given; default: none is known. Rows that are not finite count as unknown.
+                rotation is given; default: none is known. Rows that are not finite or longer than 10⁹ count as unknown.
 
         Raises:
             ViewGraphError: none or both of the two rotations, arrays that are not numbers or whose shapes do not fit,
@@ -214,11 +216,16 @@ def view_graph_of(holder: ViewGraph | HoldsViewGraph) -> ViewGraph:
 
 
 def _translations(values: ArrayLike, num_edges: int) -> Tensor:
-    """``(M, 3)`` metres; rows that are not finite become NaN."""
+    """``(M, 3)`` metres; rows that are not finite or too long to be true become NaN."""
     places = _as_tensor("translation", values, torch.float64)
     if places.shape != (num_edges, 3):
         raise ViewGraphError(f"translation has shape {tuple(places.shape)}; it must be ({num_edges}, 3), metres")
-    return torch.where(torch.isfinite(places).all(dim=1, keepdim=True), places, torch.nan)
+    return where_possible(places)
+
+
+def where_possible(translation: Tensor) -> Tensor:
+    """``(M, 3)``; rows with an entry that is not finite or above :data:`MAX_TRANSLATION` become NaN."""
+    return torch.where((translation.abs() <= MAX_TRANSLATION).all(dim=1, keepdim=True), translation, torch.nan)
 
 
 def _quaternions(target_from_source: ArrayLike | None, source_from_target: ArrayLike | None, num_edges: int) -> Tensor:

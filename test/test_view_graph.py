@@ -164,3 +164,10 @@ def test_select_edges() -> None:
     graph = ViewGraph.create([0, 1, 2], [1, 2, 3], [_UNIT] * 3, kind=[0, 1, 0], precision=[1, 2, 3])
     chosen = graph.select_edges(graph.is_odometry)
     assert chosen.num_nodes == 4 and chosen.source.tolist() == [0, 2] and chosen.precision.tolist() == [1, 3]
+
+
+def test_translations_that_cannot_be_are_unknown() -> None:
+    translation = [[1.0, 2.0, 3.0], [1e300, 0.0, 0.0], [0.0, np.inf, 0.0]]
+    graph = ViewGraph.create([0, 1, 2], [1, 2, 3], [[0.0, 0.0, 0.0, 1.0]] * 3, translation=translation)
+    assert graph.translation is not None
+    assert graph.translation.isfinite().all(dim=1).tolist() == [True, False, False]

@@ -1,7 +1,8 @@
 """g2o pose graphs and their TORO and iSAM dialects.
 
 An edge line stores the pose of the target in the source frame, so its rotation is the inverse of
-``target_from_source``. Edges between consecutive ids, in either direction, are odometry.
+``target_from_source``. Edges between consecutive ids, in either direction, are odometry; of keyframes that are numbered
+with gaps, those between neighbours.
 """
 
 from __future__ import annotations
@@ -14,12 +15,20 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, writing
+from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, joins_consecutive, writing
 from rotavg_ros.datasets.files.pose_graph_rows import ANGULAR_DIAGONAL, lay_out
-from rotavg_ros.datasets.files.text_rows import Row, parse_rows, read_blocks, shown, unit_quaternions, write_rows
+from rotavg_ros.datasets.files.text_rows import (
+    Row,
+    parse_rows,
+    read_blocks,
+    refuse,
+    shown,
+    unit_quaternions,
+    write_rows,
+)
 from rotavg_ros.datasets.planar import quaternion_of_heading
 from rotavg_ros.rotations import inverse
-from rotavg_ros.view_graph import EdgeKind
+from rotavg_ros.view_graph import MAX_TRANSLATION, EdgeKind
 
 # Where the entries of a planar information matrix, in the order xx xy xθ yy yθ θθ, are in the 21 of a spatial one.
 _PLANAR_ENTRIES = (0, 1, 5, 6, 10, 20)
@@ -97,7 +106,7 @@ def read(path: Path) -> GraphFile:
         every = every.select(~self_edge)
         if not len(every.line):
             raise GraphFileError.at(path, None, "every edge joins a pose with itself; there is nothing to solve")
-    consecutive = np.abs(every.ids[:, 0] - every.ids[:, 1]) == 1
+    consecutive = joins_consecutive(every.ids[:, 0], every.ids[:, 1])
     return GraphFile.from_ids(
         every.ids[:, 0],
         every.ids[:, 1],
@@ -144,6 +153,8 @@ def _parse_edges(path: Path, tag: EdgeTag, lines: list[int], rows: list[Row]) ->
         source_from_target = unit_quaternions(path, lines, rotation)
     else:
         source_from_target = Rotation.from_euler("xyz", rotation).as_quat()
+    too_long = (np.abs(translation) > MAX_TRANSLATION).any(axis=1)
+    refuse(path, lines, too_long, f"a translation of more than {MAX_TRANSLATION:g} m; remove the line")
     with np.errstate(over="ignore"):  # absurdly large entries become inf, which counts as unknown
         information = np.zeros((len(rows), 21))
         information[:, tag.information] = _squared(stated) if tag.is_square_root else stated

@@ -20,10 +20,13 @@ import numpy as np
 import torch
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import ViewGraph, where_possible
 
 # Ids are non-negative so that they fit the unsigned 64-bit ids of the messages and of gtsam's keys.
 MAX_NODE_ID = np.iinfo(np.int64).max
+
+# Keyframes of fewer ids, or that joined by less than this share, may as well be cameras.
+_MIN_CHAIN, _CHAIN_SHARE = 10, 0.9
 
 _GZIP = b"\x1f\x8b"
 
@@ -73,14 +76,13 @@ class GraphFile:
         """The graph has the translations, too: a solver sees nothing else."""
         if self.edge_translation is not None:
             translation = torch.as_tensor(self.edge_translation, dtype=torch.float64)
-            translation = torch.where(translation.isfinite().all(dim=1, keepdim=True), translation, torch.nan)
-            object.__setattr__(self, "graph", replace(self.graph, translation=translation))
+            object.__setattr__(self, "graph", replace(self.graph, translation=where_possible(translation)))
 
     @property
     def consecutive(self) -> np.ndarray:
-        """``(M,)`` bool: the edge joins two consecutive ids, which makes it odometry in formats without kinds."""
+        """``(M,)`` bool: what formats without kinds take for odometry, see :func:`joins_consecutive`."""
         source, target = (self.node_ids[end.cpu().numpy()] for end in (self.graph.source, self.graph.target))
-        return np.asarray(np.abs(source - target) == 1)
+        return joins_consecutive(source, target)
 
     @property
     def extras(self) -> list[str]:
@@ -138,6 +140,26 @@ class GraphFile:
             edge_information=edge_information,
             skipped=dict(skipped or {}),
         )
+
+
+def joins_consecutive(source_ids: np.ndarray, target_ids: np.ndarray) -> np.ndarray:
+    """``(M,)`` bool: which edges are odometry where nothing but ids tells.
+
+    Those between consecutive ids; or, where a front end numbers frames and keeps some (0, 5, 10 …), those between ids
+    that follow each other among those that occur. It does if these edges join nearly all such ids, and most of them do
+    not differ by one.
+
+    Args:
+        source_ids, target_ids: ``(M,)`` int64.
+    """
+    consecutive = np.abs(source_ids - target_ids) == 1
+    ids, index = np.unique(np.concatenate((source_ids, target_ids)), return_inverse=True)
+    ends = index.reshape(2, -1)
+    is_next = np.abs(ends[0] - ends[1]) == 1
+    joined = np.unique(ends[:, is_next].min(axis=0))
+    num_by_one = int((np.diff(ids)[joined] == 1).sum())
+    is_chain = len(ids) >= _MIN_CHAIN and len(joined) >= _CHAIN_SHARE * (len(ids) - 1)
+    return np.asarray(is_next if is_chain and 2 * num_by_one < len(joined) else consecutive)
 
 
 @contextmanager

@@ -18,7 +18,7 @@ import numpy as np
 
 from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, reading, writing
 from rotavg_ros.datasets.files.text_rows import refuse, unit_quaternions
-from rotavg_ros.view_graph import EdgeKind
+from rotavg_ros.view_graph import MAX_TRANSLATION, EdgeKind
 
 _SHAPES: dict[str, tuple[int, ...]] = {  # of one row
     "source": (),
@@ -56,6 +56,9 @@ def read(path: Path) -> GraphFile:
             raise GraphFileError.at(path, None, what)
     refuse(path, None, (source < 0) | (target < 0), "a negative id; ids must be integers from 0")
     quaternions = unit_quaternions(path, None, arrays["target_from_source"])
+    if "edge_translation" in arrays:
+        too_long = (np.abs(arrays["edge_translation"]) > MAX_TRANSLATION).any(axis=1)
+        refuse(path, None, too_long, f"a translation of more than {MAX_TRANSLATION:g} m; write NaN where it is unknown")
     kind = arrays.get("kind", np.full(num_edges, EdgeKind.LOOP_CLOSURE, dtype=np.int64))
     refuse(path, None, ~np.isin(kind, list(EdgeKind)), "an unknown kind; 0 is odometry, 1 a loop closure")
     proper = source != target

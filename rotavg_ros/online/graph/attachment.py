@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from rotavg_ros.online import quaternion
@@ -10,6 +9,7 @@ from rotavg_ros.online.graph.growing_view_graph import GrowingViewGraph
 from rotavg_ros.online.measurements import EdgeMeasurement, KeyframeReference, RejectedInputError, RejectReason
 from rotavg_ros.online.odometry.track import OdometryTrack
 from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion, Vector, difference
+from rotavg_ros.view_graph import MAX_TRANSLATION
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ def _translation(
     edge: EdgeMeasurement, target_from_source: Quaternion, source: Attachment, target: Attachment
 ) -> Vector:
     """``p_ks_kt = p_ks_s + R_ks_s (p_s_t + R_s_t R_t_kt (-p_kt_t))``, pose by pose along ks → s → t → kt."""
-    if edge.translation is None or not all(map(math.isfinite, edge.translation)):
+    if edge.translation is None or not all(abs(component) <= MAX_TRANSLATION for component in edge.translation):
         return UNKNOWN_VECTOR
     to_keyframe = quaternion.rotate(quaternion.inverse(target.keyframe_from_body), target.position)
     step = difference(edge.translation, quaternion.rotate(quaternion.inverse(target_from_source), to_keyframe))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from itertools import pairwise
 from pathlib import Path
 
 import gtsam
@@ -75,6 +76,37 @@ def test_consecutive_ids_are_odometry_in_either_direction(tmp_path: Path) -> Non
     assert list(zip(graph_file.node_ids[graph.source], graph_file.node_ids[graph.target], strict=True)) == pairs
 
 
+def _chain_and_loop(ids: list[int]) -> str:
+    pairs = [*pairwise(ids), (ids[-1], ids[0]), (ids[7], ids[2])]
+    return "\n".join(SE2.format(*pair, 0, 1) for pair in pairs)
+
+
+@pytest.mark.parametrize(
+    "ids",
+    [
+        list(range(0, 60, 5)),
+        [0, 3, 4, 9, 12, 15, 21, 22, 30, 34, 39, 41],
+        [(97 << 56) + 10 * k for k in range(6)] + [(98 << 56) + 10 * k for k in range(6)],
+    ],
+)
+def test_keyframes_with_gaps_between_their_ids_have_odometry(tmp_path: Path, ids: list[int]) -> None:
+    graph_file = read_text(tmp_path, _chain_and_loop(ids))
+    assert graph_file.graph.is_odometry.tolist() == [True] * 11 + [False] * 2
+    assert graph_file.consecutive.tolist() == graph_file.graph.is_odometry.tolist()
+
+
+def test_a_closure_between_two_blocks_of_ids_is_no_odometry(tmp_path: Path) -> None:
+    ids = [*range(10), *range(100, 110)]
+    graph_file = read_text(tmp_path, _chain_and_loop(ids))
+    assert graph_file.graph.is_odometry.tolist() == [True] * 9 + [False] + [True] * 9 + [False] * 2
+
+
+def test_cameras_with_gaps_between_their_ids_have_none(tmp_path: Path) -> None:
+    pairs = [(5 * i, 5 * j) for i in range(12) for j in range(i) if (i + j) % 3]
+    graph_file = read_text(tmp_path, "\n".join(SE2.format(*pair, 0, 1) for pair in pairs))
+    assert not graph_file.graph.is_odometry.any()
+
+
 def test_skipped_and_kept(tmp_path: Path) -> None:
     text = f"""# a comment
 
@@ -123,6 +155,7 @@ GOOD = SE2.format(0, 1, 0.1, 1)
         (SE3.format(1, 2, "0 0 0 0"), "quaternion of length 0"),
         (SE3.format(1, 2, "0 0 0 1.01"), "quaternion of length 1.01"),
         (SE3.format(1, 2, "0 0 0 1e200"), "quaternion of length"),
+        ("EDGE_SE2 1 2 1e300 0 0.1 1 0 0 1 0 1", "a translation of more than 1e+09 m"),
         ("EDGE_SE2 1 2 0.1 0.2", "4 numbers where 11 belong"),
         ("VERTEX_SE2 1 2", "2 numbers where 4 belong"),
         ("VERTEX_SE2 one 0 0 0", "'one' is not an integer id"),

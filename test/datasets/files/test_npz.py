@@ -93,6 +93,7 @@ def test_rgbd_scene(shared_data: Path) -> None:
         ({"precision": np.array([1, None], dtype=object)}, "not a readable npz archive"),
         ({"body_from_world_gt": [IDENTITY]}, "1 rows for 3 nodes"),
         ({"body_from_world_gt": [[2.0, 0, 0, 0]] * 3}, "not of unit length"),
+        ({"edge_translation": [[0, 0, 0], [0, -1e10, 0]]}, "edge 1 (from 0) has a translation of more than 1e+09 m"),
         ({"planar": True, "target_from_source": [[0.6, 0, 0, 0.8]] * 2}, "declared planar"),
     ],
 )

@@ -69,7 +69,7 @@ def test_odometry_edges_carry_its_steps(drive) -> None:
     assert np.isnan(estimator_after(drive, with_positions=False).snapshot().translation).all()
 
 
-@pytest.mark.parametrize("translation", [None, (math.nan, 0.0, 0.0), (0.0, math.inf, 0.0)])
+@pytest.mark.parametrize("translation", [None, (math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.0, -1e300)])
 def test_a_closure_without_a_usable_translation_still_counts(drive, translation) -> None:
     estimator = estimator_after(drive)
     edge = measured(drive, 30, 2)
