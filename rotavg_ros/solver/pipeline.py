@@ -116,6 +116,7 @@ def solve(
     score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, estimate.outlier_score.cpu())
     score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
     places = estimate.places
+    rotation_score = None if places is None else places.rotation_score
     return Solution(
         _root_at_identity(estimate.body_from_world.cpu(), job.component),
         score,
@@ -126,10 +127,10 @@ def solve(
         profile,
         where,
         estimate.memory,
-        (*estimate.warnings, *warnings.stating_nothing(graph), *warnings.mostly_flagged(graph, score)),
+        (*estimate.warnings, *warnings.stating_nothing(graph), *warnings.mostly_flagged(graph, score, rotation_score)),
         None if places is None else _root_at_origin(places.position, estimate.body_from_world, job.component),
         None if places is None else places.variance.sqrt(),
-        None if places is None else places.rotation_score,
+        rotation_score,
         None if places is None else places.precision,
         math.sqrt(estimate.step_variance),
         meter.spent,

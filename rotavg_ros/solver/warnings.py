@@ -59,17 +59,27 @@ _NO_ROTATION, _SOME_ROTATION, _SHARE_OF_NOTHING = 1e-9, 0.01, 0.05
 _FEW_BELIEVED, _FAR = 10, math.radians(30.0)
 
 
-def mostly_flagged(graph: ViewGraph, outlier_score: Tensor) -> tuple[str, ...]:
+def mostly_flagged(graph: ViewGraph, outlier_score: Tensor, rotation_score: Tensor | None = None) -> tuple[str, ...]:
     """More than half of the loop closures (of a graph without odometry: of the edges) flagged, labelled ones apart.
 
     Args:
         graph: on the CPU, M edges.
         outlier_score: ``(M,)``.
+        rotation_score: ``(M,)`` likewise, of the rotations alone; None: places are not judged.
     """
     judged = ~graph.is_odometry & (graph.label == EdgeLabel.AUTOMATIC)
-    closures, flagged = int(judged.sum()), int((judged & (outlier_score > _FLAGGED)).sum())
+    is_flagged = judged & (outlier_score > _FLAGGED)
+    closures, flagged = int(judged.sum()), int(is_flagged.sum())
     if closures < _MIN_CLOSURES or 2 * flagged <= closures:
         return ()
+    by_place = 0 if rotation_score is None else int((is_flagged & (rotation_score <= _FLAGGED)).sum())
+    if 2 * by_place > flagged:
+        return (
+            f"{flagged} of {closures} loop closures are flagged as false, {by_place} of them for their places alone; "
+            "translations may not be in metres or not in the frame of their edge's source, then mend them or set "
+            "translation_scale to none; the odometry's position may have jumped somewhere, then leave that edge out; "
+            "or the front end may match wrong places",
+        )
     what = "loop closures" if bool(graph.is_odometry.any()) else "edges"
     return (
         f"{flagged} of {closures} {what} are flagged as false; the front end may match wrong places, or all of them "

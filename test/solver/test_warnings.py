@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from rotavg_ros import EdgeKind, EdgeLabel, ViewGraph, rotations, solve, solve_batch
@@ -196,6 +197,30 @@ def test_most_closures_flagged() -> None:
     assert warnings.mostly_flagged(replace(graph, label=label), score) == ()  # 2 of 3 that nobody has judged
     (text,) = warnings.mostly_flagged(graph.select_edges(torch.arange(5, 9)), score[5:])
     assert text.startswith("3 of 4 edges are flagged")
+
+
+def test_places_in_millimetres() -> None:
+    """Three laps of 40 steps of 1 m, every closure of a right rotation: in millimetres all places are off by metres."""
+    rng, lap = np.random.default_rng(0), 40
+    heading = 2 * np.pi / lap * np.arange(3 * lap)
+    position = lap / (2 * np.pi) * np.stack((np.cos(heading), np.sin(heading), 0 * heading), axis=1)
+    orientation = Rotation.from_rotvec(np.outer(heading, [0, 0, 1]))
+    closures = np.arange(0, 2 * lap, 4)
+    source = np.concatenate((np.arange(3 * lap - 1), closures))
+    target = np.concatenate((np.arange(1, 3 * lap), closures + lap))
+    turn = Rotation.from_rotvec(np.outer(rng.normal(0, 0.005, len(source)), [0, 0, 1]))
+    relative = (orientation[source].inv() * orientation[target] * turn).as_quat()
+    shift = orientation[source].inv().apply(position[target] - position[source])
+    shift[:, :2] += rng.normal(0, 0.03, (len(source), 2))
+    kind = np.repeat([EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE], [3 * lap - 1, len(closures)])
+
+    def warned(unit: float) -> tuple[str, ...]:
+        graph = ViewGraph.create(source, target, source_from_target=relative, kind=kind, translation=unit * shift)
+        return solve(graph).warnings
+
+    assert warned(1.0) == ()
+    (text,) = warned(1000.0)
+    assert "for their places alone; translations may not be in metres" in text and "translation_scale" in text
 
 
 def test_few_closures_that_turn_the_answer() -> None:
