@@ -120,7 +120,8 @@ def _told(summary: dict[str, Any], output: Path) -> str:
     if summary["interrupted"] and summary["damage"] is None:
         lines.append(f"interrupted after {summary['duration_s']:.1f} s of the bag; what is done is written")
     if not summary["loop_closures"]:
-        lines.append("no loop closures in this bag: orientations are the odometry's, and nothing could be corrected")
+        which = "no loop closure of this bag could be used" if summary["waiting"] else "no loop closures in this bag"
+        lines.append(f"{which}: orientations are the odometry's, and nothing could be corrected")
     refused = ", ".join(f"{count} × {reason}" for reason, count in summary["rejected"].items())
     if refused:
         lines.append(f"refused: {refused}")

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from rotavg_ros.bags.reader import BagReader, BagReadError
 from rotavg_ros.errors import UserError
-from rotavg_ros.inputs import OdometryRecord
+from rotavg_ros.inputs import ODOMETRY_CONVERTERS, OdometryRecord
 from rotavg_ros.online import Answer, OnlineEstimator
+from rotavg_ros.online.content import Counts
 from rotavg_ros.online.measurements import OWN_EDGE_ID
+from rotavg_ros.replay import left_waiting
 from rotavg_ros.replay.feed import Feed
 from rotavg_ros.replay.frames import BagFrames
 from rotavg_ros.replay.pace import Pace
@@ -55,7 +57,7 @@ class Outcome:
         failures: ticks whose solve failed; the last one did not.
         interrupted: before the end.
         damage: what of the bag could not be read; None: nothing.
-        warnings: about how the bag was read, a line each.
+        warnings: about how the bag was read, and edges that were not used, a line each.
         wall_seconds: that it took.
     """
 
@@ -133,7 +135,8 @@ def replay(
     if answer is None and damage is not None:
         raise BagReadError(damage)
     if answer is None:
-        raise ReplayError(f"{bag.path}: {_why_nothing(plan, estimator.counts().rejected)}")
+        raise ReplayError(f"{bag.path}: {_why_nothing(plan, estimator.counts())}")
+    waiting = left_waiting.told(estimator.counts(), plan.parameters.robots)
     return Outcome(
         estimator,
         answer,
@@ -144,7 +147,7 @@ def replay(
         loop.failures,
         interrupted,
         damage,
-        tuple(frames.warnings),
+        tuple(frames.warnings) if waiting is None else (*frames.warnings, waiting),
         time.perf_counter() - started,
     )
 
@@ -256,8 +259,22 @@ def _wait_until(moment: float, stop: Callable[[], bool]) -> None:
         time.sleep(min(left, _NAP_S))
 
 
-def _why_nothing(plan: Plan, rejected: dict[str, int]) -> str:
+def _why_nothing(plan: Plan, counts: Counts) -> str:
     topics = ", ".join(source.topic for source in (*plan.odometry, *plan.edges))
-    refused = ", ".join(f"{count} × {reason}" for reason, count in rejected.items() if count)
-    why = f"refused: {refused}" if refused else "none of their messages lies in the replayed part"
-    return f"no keyframe could be made from {topics}; {why}"
+    refused = ", ".join(f"{count} × {reason}" for reason, count in counts.rejected.items() if count)
+    waiting = None if plan.odometry else _without_odometry(plan, counts)
+    waiting = waiting or left_waiting.told(counts, plan.parameters.robots)
+    why = [f"refused: {refused}"] if refused else []
+    why += [waiting] if waiting else []
+    why = why or ["none of their messages lies in the replayed part"]
+    return f"no keyframe could be made from {topics}; {'; '.join(why)}"
+
+
+def _without_odometry(plan: Plan, counts: Counts) -> str | None:
+    """What closures by stamp lack in a bag of which no topic is odometry."""
+    if not counts.pending:
+        return None
+    unfit = [use for use in plan.topics if use.type_name in ODOMETRY_CONVERTERS and use.why_not]
+    why_not = "".join(f"; {use.topic}: {use.why_not}" for use in unfit)
+    edges = "1 edge names" if counts.pending == 1 else f"{counts.pending} edges name"
+    return f"{edges} moments, and no topic was taken for odometry{why_not}"

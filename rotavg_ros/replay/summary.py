@@ -39,6 +39,7 @@ def summarize(record: RunRecord, bag: Path, outcome: Outcome) -> dict[str, Any]:
         "components": answer.num_components,
         "warnings": [*outcome.warnings, *answer.warnings],
         "robots": {robot.robot: _robot(robot, answer.component[robot.nodes]) for robot in record.robots},
+        "waiting": outcome.estimator.counts().pending,
         "rejected": {reason: count for reason, count in record.rejected.items() if count},
         "topics": {use.topic: use.used_as for use in record.topics if use.used_as},
         "ticks": len(record.ticks),

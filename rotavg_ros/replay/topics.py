@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -18,6 +19,9 @@ _TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _TRUTH_NAME = re.compile(r"ground.?truth|(^|[/_])(gt|truth|mocap|vicon|optitrack)([/_]|$)", re.IGNORECASE)
 # Into so many messages of edges is looked for the kind of graph they make.
 _FIRST_EDGES = 100
+# Into so many of odometry for an orientation: a filter that has yet to find its own writes zeros or NaN.
+_FIRST_POSES = 100
+_NO_ORIENTATION = f"none of its first {_FIRST_POSES} messages states an orientation"
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,7 @@ def find_candidates(bag: BagReader) -> Candidates:
         candidate = Candidate(topic, type_name, messages)
         if type_name in ODOMETRY_CONVERTERS:
             if messages and not _states_orientation(bag, candidate):
-                why_not[topic] = "its first message states no orientation"
+                why_not[topic] = _NO_ORIENTATION
             elif messages:
                 poses.append(candidate)
         elif type_name in EDGE_CONVERTERS and messages:
@@ -102,12 +106,11 @@ def _as_reference(candidate: Candidate) -> tuple[bool, bool, int, str]:
 
 
 def _states_orientation(bag: BagReader, candidate: Candidate) -> bool:
-    for _, _, message in islice(bag.decoded([candidate.topic]), 1):
-        try:
+    for _, _, message in islice(bag.decoded([candidate.topic]), _FIRST_POSES):
+        with suppress(RejectedInputError):
             checked_rotation(ODOMETRY_CONVERTERS[candidate.type_name](message, IDENTITY).world_from_body)
-        except RejectedInputError:
-            return False
-    return True
+            return True
+    return False
 
 
 def _has_odometry_edges(bag: BagReader, candidate: Candidate) -> bool:
