@@ -122,11 +122,26 @@ def of_whole_solve(graph: ViewGraph, body_from_world: Tensor, outlier_score: Ten
     if not bool(graph.is_odometry.any()):
         return ()
     odometry = _Odometry.of(graph)
-    found = [_mistaken_convention(odometry, graph.select_edges(closures.nonzero()[:, 0]))]
+    found = [_mistaken_convention(odometry, graph.select_edges(closures.nonzero()[:, 0])), _gaps_of_places(graph)]
     believed = int((closures & (outlier_score <= _FLAGGED)).sum())
     if 0 < believed < _FEW_BELIEVED and bool((graph.components() == odometry.component).all()):
         found.append(_far_from_odometry(odometry, body_from_world, believed))
     return tuple(text for text in found if text is not None)
+
+
+def _gaps_of_places(graph: ViewGraph) -> str | None:
+    """Translations of some odometry are unknown, for which those of all are of no use."""
+    if graph.translation is None:
+        return None
+    known, odometry = graph.translation.isfinite().all(dim=1), graph.is_odometry
+    num_known, num_odometry = int((known & odometry).sum()), int(odometry.sum())
+    if not 0 < num_known < num_odometry or not bool((known & ~odometry).any()):
+        return None
+    return (
+        f"{num_odometry - num_known} of {num_odometry} odometry edges have no translation, so closures are judged by "
+        "their rotations alone, and one that joins wrong places may be believed; odometry of every robot must state "
+        "its position throughout"
+    )
 
 
 def _far_from_odometry(odometry: _Odometry, body_from_world: Tensor, believed: int) -> str | None:

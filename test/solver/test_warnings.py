@@ -199,7 +199,7 @@ def test_most_closures_flagged() -> None:
     assert text.startswith("3 of 4 edges are flagged")
 
 
-def test_places_in_millimetres() -> None:
+def test_places_in_millimetres_and_places_that_are_missing() -> None:
     """Three laps of 40 steps of 1 m, every closure of a right rotation: in millimetres all places are off by metres."""
     rng, lap = np.random.default_rng(0), 40
     heading = 2 * np.pi / lap * np.arange(3 * lap)
@@ -221,6 +221,13 @@ def test_places_in_millimetres() -> None:
     assert warned(1.0) == ()
     (text,) = warned(1000.0)
     assert "for their places alone; translations may not be in metres" in text and "translation_scale" in text
+    shift[7] = np.nan
+    (text,) = warned(1.0)
+    assert text.startswith("1 of 119 odometry edges have no translation, so closures are judged by their rotations")
+    shift[kind == EdgeKind.LOOP_CLOSURE] = np.nan
+    assert warned(1.0) == ()
+    shift[:] = np.nan
+    assert warned(1.0) == ()
 
 
 def test_few_closures_that_turn_the_answer() -> None:

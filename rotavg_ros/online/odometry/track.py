@@ -43,6 +43,7 @@ class OdometryTrack:
         self._before_latest: OdometrySample | None = None
         self._begins_time_line = False
         self._is_restored = False
+        self._without_position_since: int | None = None
 
     def set_limits(self, bounds: OdometryBounds, limits: ContinuityLimits) -> None:
         """Change what applies from now on."""
@@ -74,9 +75,11 @@ class OdometryTrack:
         if self.latest is not None and stamp_ns <= self.latest.stamp_ns and not self._begins_time_line:
             repeated = stamp_ns == self.latest.stamp_ns
             raise RejectedInputError(RejectReason.REPEATED_STAMP if repeated else RejectReason.OUT_OF_ORDER_ODOMETRY)
+        has_lost_position = False
         if position is not None:
             x, y, z = position
-            position = (x, y, z) if math.isfinite(x + y + z) else None
+            has_lost_position = not math.isfinite(x + y + z)
+            position = None if has_lost_position else (x, y, z)
         sample = OdometrySample(stamp_ns, rotation, position)
         if self._begins_time_line:
             self._continuity.forget()
@@ -86,8 +89,17 @@ class OdometryTrack:
             self._begin_chain()
         self._begins_time_line = self._is_restored = False
         self._before_latest, self.latest = self.latest, sample
+        self._note_position(has_lost_position)
         self.samples.append(sample, self.chain, self.time_line)
         return sample
+
+    def _note_position(self, has_lost_position: bool) -> None:
+        """Since when positions are lost, while the last keyframe has one or there is none yet."""
+        assert self.latest is not None
+        if not has_lost_position or (self.last_keyframe is not None and self.last_keyframe.position is None):
+            self._without_position_since = None
+        elif self._without_position_since is None:
+            self._without_position_since = self.latest.stamp_ns
 
     def _begins_anew(self, sample: OdometrySample, latest: OdometrySample) -> bool:
         if self._is_restored:
@@ -97,12 +109,23 @@ class OdometryTrack:
     def _begin_chain(self) -> None:
         self.chain += 1
         self.latest = self.last_keyframe = None
+        self._without_position_since = None
 
     def reached(self, policy: KeyframePolicy) -> bool:
-        """Whether the latest message is far enough from the last keyframe to become one."""
+        """Whether the latest message is far enough from the last keyframe to become one.
+
+        One whose position is lost (NaN) waits for those with one, no longer than odometry may pause: the edge between
+        keyframes of which one has no position has no translation, and without translations of all odometry the
+        solver judges no places.
+        """
         sample, keyframe = self.latest, self.last_keyframe
-        if sample is None or keyframe is None:
-            return sample is not None
+        if sample is None:
+            return False
+        since = self._without_position_since
+        if since is not None and sample.stamp_ns - since <= self.samples.bounds.max_gap_ns:
+            return False
+        if keyframe is None:
+            return True
         distance = 0.0
         if sample.position is not None and keyframe.position is not None:
             distance = math.dist(sample.position, keyframe.position)

@@ -50,6 +50,35 @@ def test_distance_counts_only_with_positions():
         assert not track.reached(policy)
 
 
+def _keyframes(positions: list) -> list[int]:
+    """Stamps of those chosen of messages 10 ns apart that turn by 6° each; every 10° makes one."""
+    track, chosen = OdometryTrack(BOUNDS), []
+    for index, position in enumerate(positions):
+        track.add(10 * index, yaw(6.0 * index), position)
+        if track.reached(KeyframePolicy(math.radians(10), 0, 0)):
+            track.mark_keyframe()
+            chosen.append(10 * index)
+    return chosen
+
+
+HERE, LOST = (1.0, 2.0, 3.0), (math.nan, math.nan, math.nan)
+
+
+@pytest.mark.parametrize(
+    ("positions", "expected"),
+    [
+        ([HERE] * 8, [0, 20, 40, 60]),
+        ([None] * 8, [0, 20, 40, 60]),  # odometry that has none
+        ([LOST] * 3 + [HERE] * 5, [30, 50, 70]),
+        ([HERE, HERE, LOST, HERE, LOST, LOST, HERE, HERE], [0, 30, 60]),
+        ([LOST] * 16, [110, 130, 150]),  # no longer than odometry may pause
+        ([HERE] + [LOST] * 14, [0, 120, 140]),
+    ],
+)
+def test_a_message_whose_position_is_lost_waits_for_one_that_has_it(positions: list, expected: list[int]) -> None:
+    assert _keyframes(positions) == expected
+
+
 @pytest.mark.parametrize(
     ("stamp", "rotation", "reason"),
     [
