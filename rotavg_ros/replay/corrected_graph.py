@@ -13,6 +13,8 @@ from rotavg_ros.replay.record import RunRecord
 
 # Rotations in a plane have no roll and pitch, and steps no height, beyond rounding.
 _PLANAR_TOLERANCE = 1e-9
+# A robot's own numbers that are farther apart are only counted; so many robots do not have that numbers run out.
+_MOST_BETWEEN = 1 << 40
 
 
 def write_graph_of_run(path: Path, record: RunRecord) -> None:
@@ -50,7 +52,23 @@ def write_graph_of_run(path: Path, record: RunRecord) -> None:
 
 
 def keyframe_ids(answer: Answer) -> np.ndarray:
-    """``(N,)`` int64: the keyframes' own numbers, or places in the answer where those are too large or not unique."""
+    """``(N,)`` int64: the only robot's own numbers; of several robots, or of too large numbers, they count from 0.
+
+    One robot's follow another's, with one left out between them, and differ as their own do: what joins consecutive
+    ones is odometry to readers that know no kinds of edges.
+    """
     ids = answer.keyframe_id
-    usable = len(answer.robots) <= 1 and bool((ids <= np.iinfo(np.int64).max).all())
-    return ids.astype(np.int64) if usable else np.arange(len(ids))
+    largest = np.iinfo(np.int64).max
+    if len(answer.robots) <= 1 and bool((ids <= largest).all()):
+        return ids.astype(np.int64)
+    numbers, begin = np.empty(len(ids), dtype=np.int64), 0
+    for robot in range(len(answer.robots)):
+        nodes = answer.keyframe_robot == robot
+        if not nodes.any():
+            continue
+        own = ids[nodes] - ids[nodes].min()
+        if own.max() > _MOST_BETWEEN:
+            own = np.argsort(np.argsort(own))
+        numbers[nodes] = begin + own.astype(np.int64)
+        begin += int(own.max()) + 2
+    return numbers

@@ -16,6 +16,7 @@ from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION
 from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_message
 from rotavg_ros.bags.writer import BagWriter
 from rotavg_ros.cli.main import main
+from rotavg_ros.datasets.files.formats import read_graph
 
 COUNT = 30
 STAMPS = 10**9 + 100_000_000 * np.arange(COUNT)
@@ -61,3 +62,18 @@ def test_two_robots_share_one_world(bag: Path, tmp_path: Path) -> None:
         topics_written = {channel.topic for _, channel, _ in make_reader(file).iter_messages()}
     assert {"/red/orientation", "/blue/orientation", "/red/corrected_path", "/blue/corrected_path"} <= topics_written
     assert (output / "report.html").exists()
+
+
+def test_each_robots_odometry_is_that_of_the_graph(bag: Path, tmp_path: Path) -> None:
+    """Formats without kinds take edges between consecutive ids for odometry: each robot's own steps, and no closure."""
+    topics = ["--odometry", "/red/odom", "--odometry", "/blue/odom"]
+    assert main(["replay", str(bag), "--output", str(tmp_path / "out"), "--no-report", *topics]) == 0
+    graph_file = read_graph(tmp_path / "out" / "graph.g2o")
+    source, target = (graph_file.node_ids[end] for end in (graph_file.graph.source, graph_file.graph.target))
+    is_odometry = graph_file.graph.is_odometry.numpy()
+    assert np.count_nonzero(is_odometry) == 2 * (COUNT - 1)
+    assert list(zip(source[~is_odometry], target[~is_odometry], strict=True)) == [(COUNT - 1, 2 * COUNT)]
+    with (tmp_path / "out" / "orientations.csv").open() as file:
+        ids = [int(row["id"]) for row in csv.DictReader(file)]
+    assert ids == [*range(COUNT), *range(COUNT + 1, 2 * COUNT + 1)]
+    assert ids == graph_file.node_ids.tolist()
