@@ -6,6 +6,7 @@ target_from_source.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -63,10 +64,10 @@ def precision_of_information(information: Sequence[float]) -> float:
 def precision_of_covariance(covariance: Sequence[float]) -> float:
     """Rad⁻²: the inverse of the mean variance of the rotation in a 6 × 6 covariance matrix; 0 unknown.
 
-    A variance of zero is what senders write who know none. A negative sum stays negative, to be refused.
+    A variance of zero, or NaN, is what senders write who know none. A negative sum stays negative, to be refused.
     """
     total = sum(float(covariance[index]) for index in _ROTATION_DIAGONAL)
-    return 3 / total if total else 0.0
+    return 3 / total if total and not math.isnan(total) else 0.0
 
 
 def edge_id_of(source_id: int, target_id: int, kind: int) -> int:

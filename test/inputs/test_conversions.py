@@ -362,6 +362,7 @@ def test_precision_agrees_with_the_spread_of_rotation_vectors() -> None:
     assert precision_of_covariance(covariance.ravel()) == pytest.approx(deviation**-2, rel=0.03)
     assert precision_of_information(information.ravel()) == pytest.approx(deviation**-2, rel=0.03)
     assert precision_of_covariance(np.zeros(36)) == precision_of_information(np.zeros(36)) == 0.0
+    assert precision_of_covariance(np.full(36, np.nan)) == 0.0  # from a sender who knows none
     assert precision_of_covariance(-covariance.ravel()) < 0  # refused later, as bad_precision
 
 

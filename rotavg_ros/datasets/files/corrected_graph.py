@@ -10,10 +10,7 @@ import torch
 
 from rotavg_ros.datasets.files import g2o
 from rotavg_ros.datasets.files.graph_file import GraphFile
-from rotavg_ros.datasets.files.pose_graph_rows import ANGULAR_DIAGONAL, POSITION_DIAGONAL
-
-# Of a position that is not known: as good as none, but the matrix can still be inverted.
-_NO_INFORMATION = 1e-9
+from rotavg_ros.datasets.files.pose_graph_rows import ANGULAR_DIAGONAL, NO_INFORMATION, POSITION_DIAGONAL
 
 
 def write_corrected_graph(
@@ -52,11 +49,11 @@ def write_corrected_graph(
     typical = np.nanmedian(precision) if np.isfinite(precision).any() else 1.0
     typical = typical / graph.steps.cpu().numpy()
     defaults[:, ANGULAR_DIAGONAL] = np.where(np.isnan(precision), typical, precision)[:, None]
-    defaults[:, POSITION_DIAGONAL] = np.where(known, 1.0, _NO_INFORMATION)[:, None]
+    defaults[:, POSITION_DIAGONAL] = np.where(known, 1.0, NO_INFORMATION)[:, None]
     chosen = replace(
         graph_file,
         graph=graph,
-        edge_translation=np.nan_to_num(translation),
+        edge_translation=translation,
         edge_information=np.where(unstated, defaults, information),
     )
     g2o.write(path, chosen, world_from_body * [-1.0, -1.0, -1.0, 1.0], position)
@@ -66,5 +63,5 @@ def _isotropic(precision: np.ndarray) -> np.ndarray:
     """``(M, 21)`` information of edges that err alike in every direction."""
     information = np.zeros((len(precision), 21))
     information[:, ANGULAR_DIAGONAL] = precision[:, [0]]
-    information[:, POSITION_DIAGONAL] = np.maximum(precision[:, [1]], _NO_INFORMATION)
+    information[:, POSITION_DIAGONAL] = np.maximum(precision[:, [1]], NO_INFORMATION)
     return information

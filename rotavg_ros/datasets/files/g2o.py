@@ -16,7 +16,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, joins_consecutive, writing
-from rotavg_ros.datasets.files.pose_graph_rows import ANGULAR_DIAGONAL, lay_out
+from rotavg_ros.datasets.files.pose_graph_rows import ANGULAR_DIAGONAL, lay_out, without_position
 from rotavg_ros.datasets.files.text_rows import (
     Row,
     parse_rows,
@@ -159,6 +159,7 @@ def _parse_edges(path: Path, tag: EdgeTag, lines: list[int], rows: list[Row]) ->
         information = np.zeros((len(rows), 21))
         information[:, tag.information] = _squared(stated) if tag.is_square_root else stated
         precision = information[:, 20] if tag.planar else information[:, ANGULAR_DIAGONAL].mean(axis=1)
+    translation[without_position(translation, information)] = np.nan
     return _Edges(np.array(lines), ids, source_from_target, translation, information, precision)
 
 

@@ -59,6 +59,7 @@ def write(path: Path, graph_file: GraphFile) -> None:
     translation = graph_file.edge_translation
     if translation is None:
         translation = np.zeros((graph.num_edges, 3))
+    translation = np.where(np.isfinite(translation).all(axis=1, keepdims=True), translation, 0.0)
     with writing(path) as temporary, temporary.open("w", encoding="ascii") as file:
         write_rows(file, f"%d %d{' %.15g' * 12}\n", [*ends, matrix, translation])
 
@@ -71,5 +72,7 @@ def not_stored(graph_file: GraphFile) -> list[str]:
         "which edges are odometry": bool(graph.is_odometry.any()),
         "precisions": not bool(graph.precision.isnan().all()),
         "nodes without an edge": len(joined) < graph.num_nodes,
+        "which translations are unknown (written as 0)": graph.translation is not None
+        and not bool(graph.translation.isfinite().all()),
     }
     return [name for name, is_lost in lost.items() if is_lost] + graph_file.extras

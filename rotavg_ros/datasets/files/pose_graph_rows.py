@@ -14,6 +14,8 @@ from rotavg_ros.rotations import inverse
 # Where the diagonal of a 6 × 6 matrix over x, y, z and the rotation is in the 21 of its upper triangle, row by row.
 POSITION_DIAGONAL = [0, 6, 11]
 ANGULAR_DIAGONAL = [15, 18, 20]
+# Of a position that is not known, m⁻²: as good as none, but the matrix can still be inverted.
+NO_INFORMATION = 1e-9
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,13 @@ def lay_out(
     translation = graph_file.edge_translation
     if translation is None:
         translation = np.zeros((graph.num_edges, 3))
+    is_known = np.isfinite(translation).all(axis=1, keepdims=True)
+    translation = np.asarray(np.where(is_known, translation, 0.0))
+    information = _information(graph_file)
+    nothing = np.zeros(information.shape[1])
+    nothing[POSITION_DIAGONAL] = NO_INFORMATION
+    nothing[min(ANGULAR_DIAGONAL) :] = np.nan  # what is stated of the rotation stays
+    information = np.asarray(np.where(is_known | np.isnan(nothing), information, nothing))
     chained, world_from_body = chain_poses(graph, translation, body_from_world)
     return PoseGraphRows(
         ids,
@@ -63,8 +72,20 @@ def lay_out(
         (ids[graph.source.cpu().numpy()], ids[graph.target.cpu().numpy()]),
         translation,
         inverse(graph.target_from_source).cpu().numpy(),
-        _information(graph_file),
+        information,
     )
+
+
+def without_position(translation: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """``(M,)`` bool, edges as they are written whose translation is not known.
+
+    Args:
+        translation: ``(M, 3)`` metres.
+        information: ``(M, 21)``.
+    """
+    stated = information[:, POSITION_DIAGONAL].max(axis=1, initial=0.0)
+    is_nothing = (stated > 0) & (stated < 2 * NO_INFORMATION)  # iSAM writes roots
+    return np.asarray(is_nothing & (translation == 0).all(axis=1))
 
 
 def _information(graph_file: GraphFile) -> np.ndarray:

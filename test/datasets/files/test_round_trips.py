@@ -279,3 +279,24 @@ def test_a_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("suffix", [".g2o", ".toro", ".isam", ".npz", ".txt"])
+def test_translations_that_are_not_known(tmp_path: Path, suffix: str) -> None:
+    """They are read back as what they are; 1DSfM, which has no word for them, says that it has none."""
+    angle = np.array([0.1, 0.2, 0.3, 0.6])
+    quaternions = np.stack((0 * angle, 0 * angle, -np.sin(angle / 2), np.cos(angle / 2)), axis=1)
+    translation = np.array([[1.0, 0.0, 0.0], [np.nan] * 3, [0.0, 0.0, 0.0], [np.nan] * 3])
+    graph_file = GraphFile.from_ids(
+        np.array([0, 1, 2, 0]), np.array([1, 2, 3, 3]), quaternions, planar=True, edge_translation=translation
+    )
+    path = tmp_path / f"graph{suffix}"
+    write_graph(path, graph_file)
+    again = read_graph(path)
+    assert again.edge_translation is not None
+    if suffix == ".txt":
+        np.testing.assert_array_equal(again.edge_translation, np.nan_to_num(translation))
+        assert "which translations are unknown (written as 0)" in not_stored(path, graph_file)
+    else:
+        np.testing.assert_allclose(again.edge_translation, translation, atol=1e-12)
+        assert not any("translations" in what for what in not_stored(path, graph_file))
