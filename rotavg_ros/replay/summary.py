@@ -35,6 +35,7 @@ def summarize(record: RunRecord, bag: Path, outcome: Outcome) -> dict[str, Any]:
         "keyframes": len(answer.keyframe_id),
         "edges": len(answer.outlier),
         "loop_closures": int(closures.sum()),
+        "flagged_closures": int((answer.outlier & closures).sum()),
         "outliers": int(answer.outlier.sum()),
         "components": answer.num_components,
         "warnings": [*outcome.warnings, *answer.warnings],

@@ -93,6 +93,7 @@ def test_tables_are_like_those_of_solve(run: SimulatedRun, replayed: Path) -> No
     assert summary["edges"] == len(edges["source"])
     assert summary["outliers"] == edges["outlier"].sum()
     assert summary["loop_closures"] == int((~run.graph.is_odometry).sum())
+    assert summary["flagged_closures"] == summary["outliers"]  # no odometry slips
     assert abs(summary["outliers"] - run.closure_is_false.sum()) <= 2
     assert sorted(summary["files"]) == sorted(path.name for path in replayed.iterdir())
     assert {"report.html", "trajectory.png", "run.mcap"} <= set(summary["files"])

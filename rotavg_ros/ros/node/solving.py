@@ -124,7 +124,7 @@ class Solving:
         state_file = self._own_state_file(to_write=False)
         self._estimator.load(state_file)
         self._forget_answer()
-        return f"loaded {state_file}"
+        return f"loaded {self._estimator.counts().keyframes} keyframes from {state_file}"
 
     def tick_quietly(self) -> None:
         """As :meth:`tick`; what goes wrong is logged."""

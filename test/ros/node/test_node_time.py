@@ -59,7 +59,8 @@ def test_what_reset_and_load_discard_is_kept_beside_the_state_file(live_node, tm
     live_node.turn(0, 10)
     live_node.wait_for_silence()
     np.savez(path, **np.load(tmp_path / "state.npz.bak-0001"))
-    assert live_node.call("load").success
+    loaded = live_node.call("load")
+    assert loaded.success and "loaded 30 keyframes" in loaded.message, loaded.message
     assert len(np.load(told(3))["keyframe_id"]) == 10
     live_node.spin_until(lambda: live_node.status["keyframes"] == "30")
 

@@ -83,7 +83,7 @@ class Elimination:
 
     def __init__(self, first: np.ndarray, second: np.ndarray, num_blocks: int, size: int) -> None:
         self.num_blocks, self.size = num_blocks, size
-        factor = SparseFactor(_ties(first, second, num_blocks), is_ordered=False)
+        factor = SparseFactor(_tied_matrix(first, second, num_blocks), is_ordered=False)
         begin, row = factor.lower_pattern
         rest()
         supernodes = _Supernodes.of(begin, row, size)
@@ -263,7 +263,7 @@ def _lower_root(matrix: torch.Tensor) -> torch.Tensor:
     return lower
 
 
-def _ties(first: np.ndarray, second: np.ndarray, num_blocks: int) -> csc_array:
+def _tied_matrix(first: np.ndarray, second: np.ndarray, num_blocks: int) -> csc_array:
     """A positive definite matrix of the pattern, of which no fill vanishes: a Laplacian and next to nothing."""
     is_tie = first != second
     first, second = first[is_tie], second[is_tie]
