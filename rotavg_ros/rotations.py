@@ -81,6 +81,12 @@ def rotate(a: Tensor, vector: Tensor) -> Tensor:
     return turned
 
 
+def turn_form(a: Tensor, form: Tensor) -> Tensor:
+    """Quadratic forms ``(..., 3, 3)`` of vectors that are turned by the rotations ``a``: ``A X Aᵀ``."""
+    matrix = to_matrix(a)
+    return matrix @ form @ matrix.mT
+
+
 def to_matrix(a: Tensor) -> Tensor:
     """Unit quaternions ``(..., 4)`` to rotation matrices ``(..., 3, 3)``."""
     return torch.stack(

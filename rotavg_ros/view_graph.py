@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.rotations import from_matrix, inverse
+from rotavg_ros.rotations import canonical, from_matrix, inverse, rotate, turn_form
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 
@@ -31,6 +31,8 @@ _MAX_NODES = 2**31 - 1
 # Nodes without an edge that the largest index alone may imply: more are ids taken for indices, or `num_nodes` says that
 # they are meant. One costs a solve 1.5–2.3 kB and 20 µs (measured), these together 0.2 GB and 2 s.
 _MAX_IMPLIED_LONE_NODES = 100_000
+# An information matrix whose least eigenvalue is a smaller share of its largest is singular, but for rounding.
+_LEAST_EIGENVALUE = 1e-12
 
 
 class EdgeKind(IntEnum):
@@ -68,6 +70,9 @@ class ViewGraph:
             for edges that several were drawn together into; of loop closures without meaning.
         translation: ``(M, 3)`` float64, position of the target in the source's frame, metres; NaN where unknown. None
             where no edge has one.
+        information: ``(M, 3, 3)`` float64 rad⁻², symmetric positive definite: inverse covariance of the rotation vector
+            e in ``target_from_source = exp(e) R_target R_source⁻¹``, an error in the target's frame; NaN where unknown.
+            None where no edge has one. Only the SfM profile reads it.
     """
 
     num_nodes: int
@@ -79,6 +84,7 @@ class ViewGraph:
     label: Tensor
     steps: Tensor
     translation: Tensor | None = None
+    information: Tensor | None = None
 
     @classmethod
     def create(
@@ -94,6 +100,7 @@ class ViewGraph:
         label: ArrayLike | None = None,
         steps: ArrayLike | None = None,
         translation: ArrayLike | None = None,
+        information: ArrayLike | None = None,
     ) -> ViewGraph:
         """Check the arrays and bring them into the graph's types.
 
@@ -109,11 +116,15 @@ class ViewGraph:
                 edge or a gtsam BetweenFactor states.
             num_nodes: default: the largest index that occurs plus one.
             kind: :class:`EdgeKind` codes; default: every edge is a loop closure (an SfM view-graph).
-            precision: rad⁻²; default: unknown. Values that are not positive and finite count as unknown.
+            precision: rad⁻². Values that are not positive and finite count as unknown; these, and the default, are one
+                over the mean variance that ``information`` implies, where there is one.
             label: :class:`EdgeLabel` codes; default: automatic.
             steps: default: 1.
             translation: ``(M, 3)`` metres, position of the target in the source's frame, the same whichever way the
                 rotation is given; default: none is known. Rows that are not finite or longer than 10⁹ count as unknown.
+            information: ``(M, 3, 3)`` rad⁻², of the error in the target's frame, the same whichever way the rotation is
+                given; default: none is known. Matrices that are not finite and positive definite count as unknown; of
+                others the symmetric part counts.
 
         Raises:
             ViewGraphError: none or both of the two rotations, arrays that are not numbers or whose shapes do not fit,
@@ -137,7 +148,10 @@ class ViewGraph:
         _refuse(~(torch.isfinite(steps) & (steps > 0)), "{:g} steps; they must be positive and finite", steps)
         precision = torch.where(torch.isfinite(precision) & (precision > 0), precision, torch.nan)
         places = None if translation is None else _translations(translation, num_edges)
-        return cls(num_nodes, source, target, quaternions, kind, precision, label, steps, places)
+        matrices = None if information is None else _informations(information, num_edges)
+        if matrices is not None:
+            precision = torch.where(precision.isnan(), mean_precision(matrices), precision)
+        return cls(num_nodes, source, target, quaternions, kind, precision, label, steps, places, matrices)
 
     @property
     def num_edges(self) -> int:
@@ -161,6 +175,25 @@ class ViewGraph:
     def select_edges(self, edges: Tensor) -> ViewGraph:
         """The graph of all nodes and the edges chosen by a mask or by indices, in that order."""
         return replace(self, **{name: column[edges] for name, column in self._columns.items()})
+
+    def reverse_edges(self, edges: Tensor) -> ViewGraph:
+        """The same graph, some edges of which are stated from the target to the source.
+
+        Args:
+            edges: ``(M,)`` mask.
+        """
+        turned: dict[str, Any] = {}
+        if self.translation is not None:
+            seen = -rotate(self.target_from_source, self.translation)
+            turned["translation"] = torch.where(edges[:, None], seen, self.translation)
+        if self.information is not None:
+            seen = turn_form(inverse(self.target_from_source), self.information)
+            turned["information"] = torch.where(edges[:, None, None], seen, self.information)
+        stated = torch.where(edges[:, None], canonical(inverse(self.target_from_source)), self.target_from_source)
+        source, target = (
+            torch.where(edges, one, other) for one, other in ((self.target, self.source), (self.source, self.target))
+        )
+        return replace(self, source=source, target=target, target_from_source=stated, **turned)
 
     @property
     def _columns(self) -> dict[str, Any]:
@@ -226,6 +259,31 @@ def _translations(values: ArrayLike, num_edges: int) -> Tensor:
 def where_possible(translation: Tensor) -> Tensor:
     """``(M, 3)``; rows with an entry that is not finite or above :data:`MAX_TRANSLATION` become NaN."""
     return torch.where((translation.abs() <= MAX_TRANSLATION).all(dim=1, keepdim=True), translation, torch.nan)
+
+
+def mean_precision(information: Tensor) -> Tensor:
+    """One over the mean variance of the axes, ``(M,)`` rad⁻², of ``(M, 3, 3)``; NaN where unknown."""
+    is_known = information.isfinite().all(dim=2).all(dim=1)
+    unit = torch.eye(3, dtype=information.dtype, device=information.device)
+    inverses = torch.linalg.inv_ex(torch.where(is_known[:, None, None], information, unit)).inverse
+    return torch.where(is_known, 3 / inverses.diagonal(dim1=1, dim2=2).sum(dim=1), torch.nan)
+
+
+def _informations(values: ArrayLike, num_edges: int) -> Tensor:
+    """``(M, 3, 3)`` rad⁻², symmetric; what is not finite and positive definite becomes NaN."""
+    matrices = _as_tensor("information", values, torch.float64)
+    if matrices.shape != (num_edges, 3, 3):
+        raise ViewGraphError(
+            f"information has shape {tuple(matrices.shape)}; it must be ({num_edges}, 3, 3), in the target's frame"
+        )
+    matrices = (matrices + matrices.mT) / 2
+    scale = matrices.abs().amax(dim=(1, 2)) if num_edges else matrices.new_empty(0)
+    is_finite = torch.isfinite(scale) & (scale > 0)
+    unit = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
+    scaled = torch.where(is_finite[:, None, None], matrices / scale[:, None, None], unit)
+    eigenvalue = torch.linalg.eigvalsh(scaled)
+    is_known = is_finite & (eigenvalue[:, 0] > _LEAST_EIGENVALUE * eigenvalue[:, 2])
+    return torch.where(is_known[:, None, None], matrices, torch.nan)
 
 
 def _quaternions(target_from_source: ArrayLike | None, source_from_target: ArrayLike | None, num_edges: int) -> Tensor:

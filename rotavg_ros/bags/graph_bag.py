@@ -29,5 +29,5 @@ def write_graph(path: str | Path, graph_file: GraphFile) -> None:
 
 def not_stored(path: str | Path, graph_file: GraphFile) -> list[str]:
     """What of this graph a bag has no room for, in words."""
-    lost = graph_file.edge_information is not None
+    lost = graph_file.edge_information is not None or graph_file.graph.information is not None
     return ["information matrices beyond the rotation's precision"] if lost else []

@@ -61,13 +61,22 @@ def solve_batch(
 
 def _union(graphs: Sequence[ViewGraph]) -> ViewGraph:
     """All graphs side by side, but for translations, which the SfM profile does not read."""
-    names = [f.name for f in fields(ViewGraph) if f.name not in {"num_nodes", "translation"}]
+    names = [f.name for f in fields(ViewGraph) if f.name not in {"num_nodes", "translation", "information"}]
     columns = {name: [getattr(graph, name) for graph in graphs] for name in names}
+    if any(graph.information is not None for graph in graphs):
+        columns["information"] = [_information_of(graph) for graph in graphs]
     starts = _starts([graph.num_nodes for graph in graphs])
     for end in ("source", "target"):
         columns[end] = [column + start for column, start in zip(columns[end], starts, strict=False)]
     joined = {name: torch.cat([column.cpu() for column in parts]) for name, parts in columns.items()}
     return ViewGraph(num_nodes=starts[-1], **joined)
+
+
+def _information_of(graph: ViewGraph) -> torch.Tensor:
+    """``(M, 3, 3)``, NaN where there is none."""
+    if graph.information is not None:
+        return graph.information
+    return torch.full((graph.num_edges, 3, 3), torch.nan, dtype=torch.float64, device=graph.device)
 
 
 def _split(joint: Solution, graphs: Sequence[ViewGraph]) -> list[Solution]:

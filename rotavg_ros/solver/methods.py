@@ -51,6 +51,7 @@ NETWORK_METHODS = {
     "neurora-without-both": Method(SfmStages(clean=False, fine_tunings=0), SlamStages(clean=False)),
     "neurora-round": Method(sfm=SfmStages(shaped=False)),
     "neurora-equal-precisions": Method(sfm=SfmStages(stated=False)),
+    "neurora-scalar-precisions": Method(sfm=SfmStages(stated_shapes=False)),
     "neurora-without-consensus": Method(sfm=SfmStages(consensus=False)),
 }
 # Others' methods, to compare with.

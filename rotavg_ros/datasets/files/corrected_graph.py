@@ -10,7 +10,12 @@ import torch
 
 from rotavg_ros.datasets.files import g2o
 from rotavg_ros.datasets.files.graph_file import GraphFile
-from rotavg_ros.datasets.files.pose_graph_rows import ANGULAR_DIAGONAL, NO_INFORMATION, POSITION_DIAGONAL
+from rotavg_ros.datasets.files.pose_graph_rows import (
+    ANGULAR_DIAGONAL,
+    NO_INFORMATION,
+    POSITION_DIAGONAL,
+    rotation_information,
+)
 
 
 def write_corrected_graph(
@@ -44,11 +49,10 @@ def write_corrected_graph(
     information = np.zeros((len(kept), 21)) if stated is None else stated[kept]
     unstated = ~np.any(information, axis=1, keepdims=True)
     known = np.isfinite(translation).all(axis=1)
-    defaults = np.zeros_like(information)
     precision = graph.precision.cpu().numpy()
     typical = np.nanmedian(precision) if np.isfinite(precision).any() else 1.0
     typical = typical / graph.steps.cpu().numpy()
-    defaults[:, ANGULAR_DIAGONAL] = np.where(np.isnan(precision), typical, precision)[:, None]
+    defaults = rotation_information(graph, np.where(np.isnan(precision), typical, precision))
     defaults[:, POSITION_DIAGONAL] = np.where(known, 1.0, NO_INFORMATION)[:, None]
     chosen = replace(
         graph_file,

@@ -16,7 +16,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, joins_consecutive, writing
-from rotavg_ros.datasets.files.pose_graph_rows import ANGULAR_DIAGONAL, lay_out, without_position
+from rotavg_ros.datasets.files.pose_graph_rows import ANGULAR_DIAGONAL, lay_out, rotation_of, without_position
 from rotavg_ros.datasets.files.text_rows import (
     Row,
     parse_rows,
@@ -69,7 +69,8 @@ def read(path: Path) -> GraphFile:
     """Read a pose graph of EDGE_SE2, EDGE_SE3:QUAT, TORO's EDGE2 and EDGE3 and iSAM's ODOMETRY edges.
 
     Landmarks, priors, parameters and self-edges are skipped and counted. Precision is Iθθ, or the mean of the
-    three angular diagonal entries.
+    three angular diagonal entries; information is the 3 × 3 block, of spatial edges that are not equally exact about
+    all axes.
 
     Raises:
         GraphFileError: naming the line that is at fault.
@@ -107,6 +108,7 @@ def read(path: Path) -> GraphFile:
         if not len(every.line):
             raise GraphFileError.at(path, None, "every edge joins a pose with itself; there is nothing to solve")
     consecutive = joins_consecutive(every.ids[:, 0], every.ids[:, 1])
+    planar = all(EDGE_TAGS[tag].planar for tag in edge_tags)
     return GraphFile.from_ids(
         every.ids[:, 0],
         every.ids[:, 1],
@@ -114,9 +116,10 @@ def read(path: Path) -> GraphFile:
         lone_ids=np.concatenate(lone_ids) if lone_ids else None,
         kind=np.where(consecutive, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE),
         precision=every.precision,
-        planar=all(EDGE_TAGS[tag].planar for tag in edge_tags),
+        planar=planar,
         edge_translation=every.translation,
         edge_information=every.information,
+        information=None if planar else rotation_of(every.information),
         skipped=dict(skipped),
     )
 

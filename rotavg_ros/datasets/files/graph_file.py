@@ -53,7 +53,8 @@ class GraphFile:
         planar: every rotation is about z (an SE(2) graph).
         edge_translation: ``(M, 3)`` position of the target in the source frame, metres (SfM: of unknown scale).
         edge_information: ``(M, 21)`` upper triangle, row by row, of the 6 × 6 information matrix of x, y, z and the
-            rotation, as stated by formats that have one. Planar edges have zeros for z, roll and pitch.
+            rotation, as stated by formats that have one. Planar edges have zeros for z, roll and pitch. What solvers
+            read of it is the graph's ``information``.
         body_from_world_gt: ``(N, 4)`` xyzw ground truth; NaN rows where unknown.
         stamps_ns: ``(N,)`` int64 nanoseconds.
         position_gt: ``(N, 3)`` ground truth in the world frame, metres; NaN rows where unknown.
@@ -107,6 +108,7 @@ class GraphFile:
         planar: bool = False,
         edge_translation: np.ndarray | None = None,
         edge_information: np.ndarray | None = None,
+        information: np.ndarray | None = None,
         steps: np.ndarray | None = None,
         skipped: dict[str, int] | None = None,
     ) -> GraphFile:
@@ -131,6 +133,7 @@ class GraphFile:
             kind=kind,
             precision=precision,
             steps=steps,
+            information=information,
         )
         return cls(
             graph,

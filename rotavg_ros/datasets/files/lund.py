@@ -3,6 +3,9 @@
 Of N cameras: ``Rgt`` ``(3N, 3)``, the stacked true R_i; ``Rrel`` ``(3N, 3N)``, whose 3 × 3 block (i, j), i < j, is the
 measured ``R_j R_iᵀ`` or zero where there is none; optionally ``H`` ``(3N, 3N)``, whose blocks are the Hessians of the
 two-view problems in the rotation, of unknown scale. Ids are 0 … N-1, and no edge is odometry.
+
+The files do not say in whose frame a Hessian is. The Sphinx's errors do: by Student's t with one degree of freedom they
+are 990 nats likelier with Hessians in the frame of camera j, the target, than in that of i.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ _ORTHOGONALITY_TOLERANCE = 1e-3
 
 
 def read(path: Path) -> GraphFile:
-    """Read a Lund file; a Hessian becomes the rotation part of the edge's information, and its precision.
+    """Read a Lund file; a Hessian becomes the rotation part of the edge's information.
 
     Raises:
         GraphFileError: naming the array that is at fault.
@@ -44,9 +47,9 @@ def read(path: Path) -> GraphFile:
         source,
         target,
         _quaternions(path, "Rrel", relative[source, target]),
-        precision=None if hessian is None else _precision(hessian),
         lone_ids=np.arange(num_nodes),
         edge_information=None if hessian is None else _information(hessian),
+        information=hessian,
     )
     return replace(graph_file, body_from_world_gt=_quaternions(path, "Rgt", truth.reshape(-1, 3, 3)))
 
@@ -90,10 +93,3 @@ def _information(hessian: np.ndarray) -> np.ndarray:
     """``(M, 21)``: zeros for the translation, and the upper triangle of the Hessian for the rotation."""
     row, column = np.triu_indices(3)
     return np.concatenate((np.zeros((len(hessian), 15)), hessian[:, row, column]), axis=1)
-
-
-def _precision(hessian: np.ndarray) -> np.ndarray:
-    """``(M,)`` one over the mean variance that the Hessians imply; NaN where one is not positive definite."""
-    values = np.linalg.eigvalsh((hessian + hessian.transpose(0, 2, 1)) / 2)
-    is_definite = values[:, 0] > 0
-    return np.where(is_definite, 3 / (1 / np.where(values > 0, values, 1.0)).sum(axis=1), np.nan)

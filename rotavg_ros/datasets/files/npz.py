@@ -1,10 +1,11 @@
 """View-graphs as npz archives of plain arrays.
 
 Required: ``source``, ``target`` ``(M,)`` integer ids and ``target_from_source`` ``(M, 4)`` xyzw.
-Optional: ``kind`` ``(M,)`` (0 odometry, 1 loop closure), ``precision`` ``(M,)`` rad⁻², ``edge_translation`` ``(M, 3)``,
-``edge_information`` ``(M, 21)``, ``node_ids`` ``(N,)`` (names nodes without an edge too), ``planar``; and per node,
-ascending by id: ``body_from_world_gt`` ``(N, 4)`` with NaN where unknown, ``stamps_ns`` ``(N,)``, ``position_gt``
-``(N, 3)``. Other arrays are ignored.
+Optional: ``kind`` ``(M,)`` (0 odometry, 1 loop closure), ``precision`` ``(M,)`` rad⁻², ``information`` ``(M, 3, 3)``
+rad⁻² of the rotation's error in the target's frame, ``edge_translation`` ``(M, 3)``, ``edge_information`` ``(M, 21)``,
+``node_ids`` ``(N,)`` (names nodes without an edge too), ``planar``; and per node, ascending by id:
+``body_from_world_gt`` ``(N, 4)`` with NaN where unknown, ``stamps_ns`` ``(N,)``, ``position_gt`` ``(N, 3)``. Other
+arrays are ignored.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {  # of one row
     "target_from_source": (4,),
     "kind": (),
     "precision": (),
+    "information": (3, 3),
     "edge_translation": (3,),
     "edge_information": (21,),
     "node_ids": (),
@@ -50,7 +52,7 @@ def read(path: Path) -> GraphFile:
     arrays, planar = _load(path)
     source, target = arrays["source"], arrays["target"]
     num_edges = len(source)
-    for name in ("target", "target_from_source", "kind", "precision", *_EDGE_EXTRAS):
+    for name in ("target", "target_from_source", "kind", "precision", "information", *_EDGE_EXTRAS):
         if name in arrays and len(arrays[name]) != num_edges:
             what = f"{name} has {len(arrays[name])} rows, source has {num_edges}; they must agree"
             raise GraphFileError.at(path, None, what)
@@ -74,6 +76,7 @@ def read(path: Path) -> GraphFile:
         lone_ids=np.concatenate((source[~proper], arrays.get("node_ids", source[:0]))),
         kind=kind[proper],
         precision=arrays["precision"][proper] if "precision" in arrays else None,
+        information=arrays["information"][proper] if "information" in arrays else None,
         planar=turns_about_z if planar is None else planar,
         **{name: arrays[name][proper] for name in _EDGE_EXTRAS if name in arrays},
         skipped={} if proper.all() else {"self-edge": int((~proper).sum())},
@@ -98,6 +101,8 @@ def write(path: Path, graph_file: GraphFile) -> None:
         "node_ids": ids,
         "planar": np.array(graph_file.planar),
     }
+    if graph.information is not None:
+        arrays["information"] = graph.information.cpu().numpy()
     for name in (*_EDGE_EXTRAS, *_PER_NODE):
         values = getattr(graph_file, name)
         if values is not None:

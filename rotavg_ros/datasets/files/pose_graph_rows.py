@@ -10,12 +10,15 @@ from rotavg_ros.datasets.dead_reckoning import chain_poses
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.planar import heading_of_quaternion
 from rotavg_ros.rotations import inverse
+from rotavg_ros.view_graph import ViewGraph
 
 # Where the diagonal of a 6 × 6 matrix over x, y, z and the rotation is in the 21 of its upper triangle, row by row.
 POSITION_DIAGONAL = [0, 6, 11]
 ANGULAR_DIAGONAL = [15, 18, 20]
 # Of a position that is not known, m⁻²: as good as none, but the matrix can still be inverted.
 NO_INFORMATION = 1e-9
+# Where the nine entries of a rotation's 3 × 3 block, row by row, are among these.
+_ANGULAR_BLOCK = [15, 16, 17, 16, 18, 19, 17, 19, 20]
 
 
 @dataclass(frozen=True)
@@ -88,12 +91,37 @@ def without_position(translation: np.ndarray, information: np.ndarray) -> np.nda
     return np.asarray(is_nothing & (translation == 0).all(axis=1))
 
 
-def _information(graph_file: GraphFile) -> np.ndarray:
-    """``(M, 21)`` as stated; where nothing is, 1 for positions and the edge's precision for rotations."""
-    precision = np.nan_to_num(graph_file.graph.precision.cpu().numpy(), nan=1.0)
+def rotation_of(information: np.ndarray) -> np.ndarray | None:
+    """A graph's information ``(M, 3, 3)`` of its edges' rotations, from the upper triangles ``(M, 21)`` of 6 × 6.
+
+    An edge of g2o states the target's pose in the source's frame, with an error on its right side, Z exp(ξ): an
+    error in the target's frame, as a graph has it. g2o takes x, y, z of a quaternion for ξ, half a rotation vector, so
+    that its own files state four times the information; GTSAM and Ceres write them without that factor. The scale is
+    left as stated, as that of precisions is: all edges have the same, and solves do not depend on it.
+
+    None where every edge is equally exact about all axes, which its precision says already.
+    """
+    block = information[:, _ANGULAR_BLOCK].reshape(-1, 3, 3)
+    is_round = (block == block[:, :1, :1] * np.eye(3)).all()
+    return None if is_round else block
+
+
+def rotation_information(graph: ViewGraph, precision: np.ndarray) -> np.ndarray:
+    """``(M, 21)``, zero but for the rotation: the graph's information where known, else ``precision`` ``(M,)``."""
+    blocks = precision[:, None, None] * np.eye(3)
+    if graph.information is not None:
+        stated = graph.information.cpu().numpy()
+        blocks = np.where(np.isfinite(stated), stated, blocks)
     information = np.zeros((len(precision), 21))
+    information[:, _ANGULAR_BLOCK] = blocks.reshape(-1, 9)
+    return information
+
+
+def _information(graph_file: GraphFile) -> np.ndarray:
+    """``(M, 21)`` as stated; where nothing is, 1 for positions and what the graph has for rotations."""
+    precision = np.nan_to_num(graph_file.graph.precision.cpu().numpy(), nan=1.0)
+    information = rotation_information(graph_file.graph, precision)
     information[:, POSITION_DIAGONAL] = 1
-    information[:, ANGULAR_DIAGONAL] = precision[:, None]
     stated = graph_file.edge_information
     if stated is None:
         return information

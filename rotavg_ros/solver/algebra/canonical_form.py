@@ -3,7 +3,7 @@
 Names of the nodes, order and direction of the edges, copies of an edge and the choice of the cameras' axes say nothing
 about the orientations. Here they are chosen anew, by what was measured alone:
 
-- Of edges that state the same rotation between the same nodes, one is kept.
+- Of edges that state the same rotation between the same nodes, one is kept, with the best that is stated of them.
 - Nodes are sorted by a weighted number of walks, k_v = Σ_u (½ + w_uv) k_u, a few times over, begun with k = 1. w_uv is
   the cosine of half an edge's angle, which none of those choices changes.
 - Edges run from the earlier node to the later one and are sorted by both.
@@ -25,7 +25,7 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.medians import median_by_group
 from rotavg_ros.solver.algebra.sorted_edges import sorted_by_node
-from rotavg_ros.view_graph import EdgeKind, ViewGraph
+from rotavg_ros.view_graph import EdgeKind, ViewGraph, mean_precision
 
 # So often walks grow by an edge: enough to tell apart what only distant edges tell apart, little beside a solve.
 _WALK_LENGTH = 4
@@ -40,7 +40,8 @@ class CanonicalForm:
     """A view-graph of N nodes, M edges and C components in canonical form, and how to get back.
 
     Attributes:
-        graph: in canonical form, with K ≤ M edges, without translations; of copies the highest precision is kept.
+        graph: in canonical form, with K ≤ M edges, without translations; of copies the highest precision is kept, and
+            the information of the highest mean precision.
         component: ``(N,)`` of its nodes.
         node: ``(N,)`` which of the given graph's nodes each is.
         edge: ``(M,)`` which of its edges stands for each of the given graph's.
@@ -128,7 +129,14 @@ def _form(graph: ViewGraph, component: Tensor, own_axes: bool) -> tuple[Canonica
     )
     if bool(graph.precision.isfinite().any()):
         precision = graph.precision.index_select(0, order)
-    canonical = ViewGraph(graph.num_nodes, low, high, rows.t().contiguous(), kind, precision, label, steps)
+    information = None
+    if graph.information is not None:
+        information = _seen_from_the_higher(graph, is_reversed=source > target).index_select(0, order)
+        of_edge = axes[component.index_select(0, low)]
+        information = of_edge @ information @ of_edge.mT
+    canonical = ViewGraph(
+        graph.num_nodes, low, high, rows.t().contiguous(), kind, precision, label, steps, information=information
+    )
     edge = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
     has_parallels = bool(((low[1:] == low[:-1]) & (high[1:] == high[:-1])).any())
     return CanonicalForm(canonical, component, node, edge, rotations.from_matrix(axes)), has_parallels
@@ -152,7 +160,9 @@ def _without_copies(graph: ViewGraph) -> tuple[Tensor, Tensor]:
 
 
 def _stating_the_highest(graph: ViewGraph, kept: Tensor, copy_of: Tensor) -> ViewGraph:
-    """The graph whose ``kept`` edges state the highest precision that any of their copies does."""
+    """The graph whose ``kept`` edges state the best that any of their copies does."""
+    if graph.information is not None:
+        graph = replace(graph, information=_best_information(graph, kept, copy_of))
     if not bool(graph.precision.isfinite().any()):
         return graph
     stated = graph.precision.nan_to_num(nan=0.0)
@@ -160,6 +170,32 @@ def _stating_the_highest(graph: ViewGraph, kept: Tensor, copy_of: Tensor) -> Vie
     precision = graph.precision.clone()
     precision[kept] = torch.where(highest > 0, highest, torch.nan)
     return replace(graph, precision=precision)
+
+
+def _seen_from_the_higher(graph: ViewGraph, is_reversed: Tensor) -> Tensor:
+    """Information ``(M, 3, 3)`` in the frame of the target; in the source's of edges that are to be reversed."""
+    assert graph.information is not None
+    seen = rotations.turn_form(rotations.inverse(graph.target_from_source), graph.information)
+    return torch.where(is_reversed[:, None, None], seen, graph.information)
+
+
+def _best_information(graph: ViewGraph, kept: Tensor, copy_of: Tensor) -> Tensor:
+    """Information ``(M, 3, 3)`` whose ``kept`` rows are those of the copies of the highest mean precision.
+
+    Copies of the same mean precision that differ are averaged, so that their order does not matter.
+    """
+    is_reversed = graph.source > graph.target
+    information = _seen_from_the_higher(graph, is_reversed)
+    stated = mean_precision(information).nan_to_num(nan=0.0)
+    highest = stated.new_zeros(len(kept)).scatter_reduce(0, copy_of, stated, "amax")
+    is_best = (stated >= (1 - _SAME) * highest[copy_of]) & (stated > 0)
+    best, place = information[is_best], copy_of[is_best]
+    count = torch.bincount(place, minlength=len(kept))
+    mean = best.new_zeros(len(kept), 3, 3).index_add_(0, place, best) / count[:, None, None]  # NaN where none is
+    chosen = information.clone()
+    chosen[kept] = mean
+    as_stated = rotations.turn_form(graph.target_from_source, chosen)
+    return torch.where(is_reversed[:, None, None], as_stated, chosen)
 
 
 def _nodes_in_order(graph: ViewGraph, component: Tensor) -> Tensor:

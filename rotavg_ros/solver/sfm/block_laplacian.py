@@ -10,6 +10,7 @@ sparse matrices of scalars. A has in row v and column u what belongs to v's own 
 from __future__ import annotations
 
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -54,56 +55,47 @@ class Arrivals:
 
     def matrices(self, weights: SplitWeights) -> list[Tensor]:
         """A and Aᵀ ``(N, N)``."""
-        edges, size = self._edges, (self.num_nodes, self.num_nodes)
         at_source = weights.total * weights.source_share
         # An edge arrives at its target, reversed at its source.
         by_end = torch.cat((weights.total - at_source, at_source))
         own = by_end.index_select(0, self._arrives)
         others = by_end.index_select(0, self._leaves)
+        return [self._matrix(values) for values in (own, others)]
+
+    def symmetric(self, value: Tensor) -> Tensor:
+        """The matrix ``(N, N)`` that has the value of each edge, ``(M,)``, for both its ends."""
+        return self._matrix(value.index_select(0, self._edges.edge))
+
+    def _matrix(self, values: Tensor) -> Tensor:
+        """``(N, N)``, given what arrives."""
+        edges, size = self._edges, (self.num_nodes, self.num_nodes)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
-            return [
-                torch.sparse_csr_tensor(edges.first, edges.source, values, size, check_invariants=False)
-                for values in (own, others)
-            ]
+            return torch.sparse_csr_tensor(edges.first, edges.source, values, size, check_invariants=False)
 
 
-class BlockLaplacian:
-    """``L`` of a graph, in the weights' precision. Vectors have their components in rows, ``(3, N)``.
+class Laplacian(ABC):
+    """``L`` of a graph. Vectors have their components in rows, ``(3, N)``.
 
     Args:
-        arrivals: the graph's.
-        weights: of the edges.
-        shape: S.
+        diagonal: ``(3, 3, N)`` the blocks on its diagonal.
         component: ``(N,)``; each of the C components is solved by itself.
 
     Attributes:
-        weight_sum: ``(N,)`` the weights of each node's edges, added up.
+        weight_sum: ``(N,)`` the scalar weights of each node's edges, added up.
     """
 
-    def __init__(self, arrivals: Arrivals, weights: SplitWeights, shape: NoiseShape, component: Tensor) -> None:
-        self._own, self._others = arrivals.matrices(weights)
-        self._threads = threads_on(component.device) if len(weights.total) > _WORTH_WORKERS else 1
+    def __init__(self, diagonal: Tensor, weight_sum: Tensor, component: Tensor) -> None:
         self._components = _Components(component, int(component.max()) + 1)
-        self._information = shape.information.to(weights.total).contiguous()
-        one = weights.total.new_ones(1, arrivals.num_nodes)
-        arriving = _arriving(self._others, torch.cat((self._information.flatten(0, 1), one)))
-        own = _arriving(self._own, one)[0]
-        self._diagonal = arriving[:9].view_as(self._information) + own * self._information
-        self.weight_sum = own + arriving[9]
+        self._diagonal, self.weight_sum = diagonal, weight_sum
 
+    @abstractmethod
     def product(self, x: Tensor) -> Tensor:
         """``L x`` ``(3, N)``."""
-        parts = [x] * 2
 
-        def one_part(number: int) -> None:
-            if number == 0:
-                parts[0] = _apply(self._information, _arriving(self._own, x))
-            else:
-                parts[1] = _arriving(self._others, _apply(self._information, x))
-
-        for_each(one_part, (0, 1), self._threads)
-        return _apply(self._diagonal, x).sub_(parts[0]).sub_(parts[1])
+    def at_nodes(self, x: Tensor) -> Tensor:
+        """``D x`` ``(3, N)``: the diagonal's blocks alone."""
+        return _apply(self._diagonal, x)
 
     def diagonal_solve(self) -> Preconditioner:
         """A preconditioner for well-knit graphs: what solves by the blocks on the diagonal alone."""
@@ -127,6 +119,40 @@ class BlockLaplacian:
         """
         stop = Stop(tolerance, relative_tolerance, _MAX_ITERATIONS)
         return conjugate_gradients(self.product, precondition, force, self._components, stop)
+
+
+class BlockLaplacian(Laplacian):
+    """``L`` of a graph, in the weights' precision.
+
+    Args:
+        arrivals: the graph's.
+        weights: of the edges.
+        shape: S.
+        component: ``(N,)``; each of the C components is solved by itself.
+    """
+
+    def __init__(self, arrivals: Arrivals, weights: SplitWeights, shape: NoiseShape, component: Tensor) -> None:
+        self._own, self._others = arrivals.matrices(weights)
+        self._threads = threads_on(component.device) if len(weights.total) > _WORTH_WORKERS else 1
+        self._information = shape.information.to(weights.total).contiguous()
+        one = weights.total.new_ones(1, arrivals.num_nodes)
+        others = arriving(self._others, torch.cat((self._information.flatten(0, 1), one)))
+        own = arriving(self._own, one)[0]
+        diagonal = others[:9].view_as(self._information) + own * self._information
+        super().__init__(diagonal, own + others[9], component)
+
+    def product(self, x: Tensor) -> Tensor:
+        """``L x`` ``(3, N)``."""
+        parts = [x] * 2
+
+        def one_part(number: int) -> None:
+            if number == 0:
+                parts[0] = _apply(self._information, arriving(self._own, x))
+            else:
+                parts[1] = arriving(self._others, _apply(self._information, x))
+
+        for_each(one_part, (0, 1), self._threads)
+        return self.at_nodes(x).sub_(parts[0]).sub_(parts[1])
 
 
 class _Components:
@@ -154,16 +180,18 @@ class _Components:
         return x.new_zeros(self._count).scatter_reduce(0, self._component, x.abs().amax(dim=0), "amax")
 
 
-def factorised(graph: ViewGraph, weight: Tensor, shape: NoiseShape, roots: Tensor) -> Preconditioner:
-    """A preconditioner for graphs that are not well knit: the same Laplacian with round weights, factorised."""
-    # Cameras of a component share their noise's shape, which turning does not make larger.
-    trace = shape.information.diagonal().sum(dim=1)[graph.source]
+def factorised(graph: ViewGraph, weight: Tensor, roots: Tensor) -> Preconditioner:
+    """A preconditioner for graphs that are not well knit: the same Laplacian with round weights, factorised.
+
+    Args:
+        weight: ``(M,)`` mean of the diagonal of each edge's weight.
+    """
     ends = graph.source.cpu().numpy(), graph.target.cpu().numpy()
-    system = LaplacianSystem(graph.num_nodes, *ends, (weight * trace / 3).cpu().numpy(), roots.cpu().numpy())
+    system = LaplacianSystem(graph.num_nodes, *ends, weight.cpu().numpy(), roots.cpu().numpy())
     return lambda x: torch.from_numpy(system.solve(x.t().cpu().double().numpy())).t().to(x)
 
 
-def _arriving(matrix: Tensor, rows: Tensor) -> Tensor:
+def arriving(matrix: Tensor, rows: Tensor) -> Tensor:
     """``matrix @ rowsᵀ``, components in rows again, ``(k, N)``; sparse products want them side by side."""
     return (matrix @ rows.t().contiguous()).t().contiguous()
 

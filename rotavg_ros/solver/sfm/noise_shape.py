@@ -17,6 +17,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.sfm.priors import NoiseShapePriors
+from rotavg_ros.solver.sfm.symmetric_rows import turned
 
 
 class ResidualSample(NamedTuple):
@@ -86,12 +87,11 @@ class ShapeEstimator:
 
     def _placed(self, covariance: Tensor, matrix: Tensor) -> NoiseShape:
         """Covariance in the cameras' frames → information in the world's, given body_from_world ``(3, 3, N)``."""
-        supported = _as_far_as_supported(covariance, self._redundancy, self._priors)
+        supported = as_far_as_supported(covariance, self._redundancy, self._priors)
         information = torch.linalg.inv_ex(supported).inverse.permute(1, 2, 0)
         if len(supported) > 1:
             information = information[:, :, self._component]
-        turned = (information[:, :, None] * matrix).sum(dim=1)
-        return NoiseShape((matrix[:, :, None] * turned[:, None]).sum(dim=0), covariance)
+        return NoiseShape(turned(information, matrix), covariance)
 
 
 def share_of_first(first_square: Tensor, second_square: Tensor) -> Tensor:
@@ -154,7 +154,7 @@ def scatter(
     return covariance
 
 
-def _as_far_as_supported(covariance: Tensor, redundancy: Tensor, priors: NoiseShapePriors) -> Tensor:
+def as_far_as_supported(covariance: Tensor, redundancy: Tensor, priors: NoiseShapePriors) -> Tensor:
     """The covariances ``(G, 3, 3)``, rounder the fewer residuals ``(G,)`` speak for them, and not too flat."""
     unit = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
     mean_variance = covariance.diagonal(dim1=1, dim2=2).mean(dim=1)

@@ -19,6 +19,7 @@ class SfmStages:
         weighted: refinement begins by weighing the edges by CleanNet's scores.
         shaped: the refinement estimates the noise's shape; otherwise noise is taken to be round.
         stated: precisions that edges state are believed as far as residuals bear them out; otherwise not at all.
+        stated_shapes: and so is the information that they state, about which axes they are exact.
         consensus: after the refinement another answer is looked for where edges that it rejects agree with each other.
         as_written: of :data:`PAPER_PARTS`, those that run as the paper's text has them, not as this package does.
     """
@@ -29,5 +30,6 @@ class SfmStages:
     weighted: bool = True
     shaped: bool = True
     stated: bool = True
+    stated_shapes: bool = True
     consensus: bool = True
     as_written: frozenset[str] = frozenset()

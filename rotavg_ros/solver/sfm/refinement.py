@@ -17,6 +17,9 @@ happens to fit is not exact. With r the residual, p the edge's prior weight and 
 since the fourth root is concave and its tangents bound it (majorise and minimise). A step towards the bound's minimum
 lowers the bound up to twice its length.
 
+Where edges state about which axes they are exact, and are believed (``stated_shape.py``), T r takes the place of r in
+shaped steps, with a matrix T for each edge.
+
 A step's length λ is in standard errors of the answer: λ² = xᵀ L x / (φ N), of N nodes. It depends neither on the frames
 of world and cameras nor on the noise's size.
 """
@@ -32,6 +35,7 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.solver.sfm.step import Measure, Problem, Structure, l1_weight, l_half_weight
+from rotavg_ros.solver.sfm.symmetric_rows import distinct_entries, turned
 from rotavg_ros.view_graph import ViewGraph
 
 PRIORS = RefinementPriors()
@@ -40,15 +44,22 @@ ROUND = replace(PRIORS, shape=replace(PRIORS.shape, least_ratio=1.0))
 
 
 class EdgeWeights(NamedTuple):
-    """Prior weights ``(M,)`` in [0, 1], multiplied to the robust ones.
+    """What is known of M edges before their residuals are.
 
     Attributes:
-        shaped: in shaped steps.
-        coarse: in coarse steps. CleanNet's scores belong here alone: after these, residuals know more.
+        shaped: ``(M,)`` positive, multiplied to the robust weights in shaped steps.
+        coarse: ``(M,)`` the same in coarse steps. CleanNet's scores belong here alone: after these, residuals know
+            more.
+        unit: ``(3, 3, M)`` T, symmetric, in the targets' frames: residuals r count as T r in shaped steps; None: T = 1.
     """
 
     shaped: Tensor
     coarse: Tensor
+    unit: Tensor | None = None
+
+    def times(self, shaped: Tensor, coarse: Tensor) -> EdgeWeights:
+        """With factors ``(M,)`` to both weights."""
+        return self._replace(shaped=self.shaped * shaped, coarse=self.coarse * coarse)
 
 
 def refine(
@@ -65,7 +76,7 @@ def refine(
     Args:
         body_from_world: ``(N, 4)`` start.
         structure: default: computed.
-        weights: default: ones.
+        weights: default: ones, and no units.
 
     Returns:
         ``(N, 4)`` float64 orientations.
@@ -74,11 +85,13 @@ def refine(
     if weights is None:
         ones = torch.ones_like(graph.precision)
         weights = EdgeWeights(ones, ones)
-    shaped_prior, coarse_prior = (weight.float().clamp(min=priors.least_prior) for weight in weights)
+    shaped_prior, coarse_prior = (
+        weight.float().clamp(min=priors.least_prior) for weight in (weights.shaped, weights.coarse)
+    )
     problem = Problem(graph, structure, priors)
     coarse_steps = min(priors.max_coarse_steps, max_steps - priors.least_shaped_steps)
     orientations, taken = _coarse(problem, body_from_world.double(), coarse_prior, coarse_steps)
-    return _shaped(problem, orientations, shaped_prior, max_steps - taken)
+    return _shaped(problem, orientations, weights._replace(shaped=shaped_prior), max_steps - taken)
 
 
 def _coarse(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: int) -> tuple[Tensor, int]:
@@ -96,9 +109,9 @@ def _coarse(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: in
     return orientations, max(max_steps, 0)
 
 
-def _shaped(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: int) -> Tensor:
+def _shaped(problem: Problem, orientations: Tensor, weights: EdgeWeights, max_steps: int) -> Tensor:
     """ℓ½ steps that know the noise's shape and size, until they have converged."""
-    priors = problem.priors
+    priors, prior = problem.priors, weights.shaped
     noise = problem.round
     variance = problem.variance_of_means()
     dispersion = torch.ones_like(problem.roots, dtype=orientations.dtype)
@@ -106,15 +119,16 @@ def _shaped(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: in
     is_open = torch.ones_like(problem.roots, dtype=torch.bool)
     is_held = torch.zeros_like(is_open)
     for _ in range(max_steps):
+        unit = None if weights.unit is None else _in_world(weights.unit, orientations, problem.graph.target)
         if step is not None and bool(is_held.all()):
             carried = problem.shapes.carried(noise, orientations)
-            measure = Measure(carried, variance, l_half_weight, dtype, step.weights.source_share)
+            measure = Measure(carried, variance, l_half_weight, dtype, step.source_share, unit)
         else:
-            sample = problem.sample(orientations)
+            sample = problem.sample(orientations, unit)
             is_noisy = problem.is_well_knit and bool((problem.typical(sample) > priors.coarse_noise).all())
             dtype = torch.float32 if is_noisy else torch.float64
             noise = problem.shapes.estimate(sample, orientations, noise, is_held)
-            measure = Measure(noise, variance, l_half_weight, dtype)
+            measure = Measure(noise, variance, l_half_weight, dtype, unit=unit)
             pooled = problem.pooled(orientations, measure, prior)
             dispersion = torch.where(is_held, dispersion, problem.dispersion(sample, measure, pooled))
         step = problem.step(orientations, measure, problem.pooled(orientations, measure, prior), is_open)
@@ -128,6 +142,12 @@ def _shaped(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: in
         if not bool(is_open.any()):
             break
     return orientations
+
+
+def _in_world(unit: Tensor, orientations: Tensor, target: Tensor) -> Tensor:
+    """Matrices ``(3, 3, M)`` in the targets' frames → entries ``(6, M)`` in the world's."""
+    matrix = rotations.to_matrix(orientations).permute(1, 2, 0).contiguous()
+    return distinct_entries(turned(unit, matrix.index_select(2, target)))
 
 
 def _turned(orientations: Tensor, turn: Tensor) -> Tensor:

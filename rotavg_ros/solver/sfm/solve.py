@@ -24,7 +24,8 @@ from rotavg_ros.solver.sfm.consensus.search import CONSENSUS, consensus
 from rotavg_ros.solver.sfm.options import SfmStages
 from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
 from rotavg_ros.solver.sfm.series import EdgesInSeries
-from rotavg_ros.solver.sfm.stated_precision import Residuals, relative_variance
+from rotavg_ros.solver.sfm.stated_precision import Residuals, relative_variance, stated_sizes
+from rotavg_ros.solver.sfm.stated_shape import FramedResiduals, believed_units
 from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.solver.sfm.uncertainty import References, variances
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
@@ -77,17 +78,18 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
                 refine, graph, max_steps=steps, structure=structure, priors=PRIORS if stages.shaped else ROUND
             )
             orientations = refinement(orientations, weights=weights)
-            ratio = _relative_variance(graph, orientations, structure) if stages.stated else None
-            if ratio is not None:
-                weights = EdgeWeights(weights.shaped * ratio**-0.25, weights.coarse * ratio**-0.5)
-                orientations = refinement(orientations, weights=weights)
+            if stages.stated:
+                as_stated = _as_stated(weights, graph, orientations, structure, stages)
+                if as_stated is not None:
+                    weights = as_stated
+                    orientations = refinement(orientations, weights=weights)
         if stages.consensus:
             with watch.stage("consensus"):
                 other = consensus(graph, orientations, component, CONSENSUS)
                 if other is not None:
                     warnings = other.warnings
                 if other is not None and other.body_from_world is not None and other.weight is not None:
-                    weights = EdgeWeights(weights.shaped * other.weight, weights.coarse * other.weight)
+                    weights = weights.times(other.weight, other.weight)
                     orientations = refinement(other.body_from_world, weights=weights)
     score, variance = cleaned.outlier_probability.double(), torch.full((graph.num_nodes,), torch.nan)
     by_residuals = stages.fine_tunings > 0 and not ("cleannet" in stages.as_written and stages.clean)
@@ -106,13 +108,31 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     return Estimate(form.orientations(orientations), score, variance, warnings=warnings)
 
 
-def _relative_variance(graph: ViewGraph, orientations: Tensor, structure: Structure) -> Tensor | None:
-    """Of every edge's noise as far as precisions are stated and residuals bear them out, ``(M,)``; None: no such."""
-    if not bool(graph.precision.isfinite().any()):
+def _as_stated(
+    weights: EdgeWeights, graph: ViewGraph, orientations: Tensor, structure: Structure, stages: SfmStages
+) -> EdgeWeights | None:
+    """With what edges state of their noise, as far as residuals at the orientations bear it out; None: nothing is."""
+    information = graph.information if stages.stated_shapes else None
+    precision = stated_sizes(graph)
+    if not bool(precision.isfinite().any()):
         return None
-    angle = EdgeResiduals(graph, orientations.float()).angles()
-    residuals = Residuals(angle, structure.component[graph.source], structure.redundancy(graph))
-    return relative_variance(graph.precision, residuals)
+    residuals = EdgeResiduals(graph, orientations.float())
+    component, redundancy = structure.component[graph.source], structure.redundancy(graph)
+    ratio = relative_variance(precision, Residuals(residuals.angles(), component, redundancy))
+    unit = None
+    if information is not None:
+        vector = EdgeResiduals(graph, orientations.double()).vectors(slice(0, graph.num_edges)).t()
+        at_source, at_target = (rotations.to_matrix(orientations.double())[end] for end in (graph.source, graph.target))
+        vector = (at_target @ vector[:, :, None]).squeeze(2)
+        if ratio is not None:
+            vector = vector * ratio.rsqrt()[:, None]
+        framed = FramedResiduals(vector, at_source @ at_target.mT, component, redundancy)
+        unit = believed_units(information, framed, (PRIORS if stages.shaped else ROUND).shape)
+    if ratio is not None:
+        weights = weights.times(ratio**-0.25, ratio**-0.5)
+    elif unit is None:
+        return None
+    return weights._replace(unit=unit)
 
 
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:

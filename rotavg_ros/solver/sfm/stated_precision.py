@@ -24,6 +24,7 @@ from torch import Tensor
 from rotavg_ros.solver.algebra.canonical_form import evenly_spread
 from rotavg_ros.solver.algebra.medians import median_by_group
 from rotavg_ros.solver.sfm.priors import PrecisionPriors
+from rotavg_ros.view_graph import ViewGraph, mean_precision
 
 PRECISION_PRIORS = PrecisionPriors()
 # Fixed-point steps to the likeliest scale; what is left after so many is below 1 %.
@@ -42,6 +43,14 @@ class Residuals(NamedTuple):
     angle: Tensor
     component: Tensor
     redundancy: Tensor
+
+
+def stated_sizes(graph: ViewGraph) -> Tensor:
+    """One over the mean variance that each edge states, ``(M,)`` rad⁻² of any scale; NaN: nothing is stated."""
+    if graph.information is None:
+        return graph.precision
+    size = mean_precision(graph.information)
+    return torch.where(size.isfinite(), size, graph.precision)
 
 
 def relative_variance(
@@ -94,9 +103,19 @@ def _exponents(log_ratio: Tensor, is_known: Tensor, residuals: Residuals, priors
         -1.5 * (scale[:, group].log() + exponent[:, None] * log_ratio) - 2 * (scaled / scale[:, group]).log1p()
     )
     worth = residuals.redundancy.clamp(min=0) / edges.clamp(min=1)
-    prior = torch.full_like(exponent, (1 - priors.worthless) / (len(exponent) - 1))
-    prior[0] = priors.worthless
-    posterior = torch.softmax(worth * log_likelihood + prior.log()[:, None], dim=0)
+    mean_exponent = posterior_mean(exponent, worth * log_likelihood, priors)
     mean = sums(log_ratio[None]) / number
     spread = (sums(log_ratio[None] ** 2) / number - mean**2).clamp(min=0).sqrt()[0]
-    return torch.where(spread < priors.least_spread, 0.0, exponent @ posterior)
+    return torch.where(spread < priors.least_spread, 0.0, mean_exponent)
+
+
+def posterior_mean(exponent: Tensor, log_likelihood: Tensor, priors: PrecisionPriors) -> Tensor:
+    """Mean of an exponent, ``(C,)``, of which 0 is likely beforehand.
+
+    Args:
+        exponent: ``(K,)`` from 0 to 1.
+        log_likelihood: ``(K, C)`` of each.
+    """
+    prior = torch.full_like(exponent, (1 - priors.worthless) / (len(exponent) - 1))
+    prior[0] = priors.worthless
+    return exponent @ torch.softmax(log_likelihood + prior.log()[:, None], dim=0)

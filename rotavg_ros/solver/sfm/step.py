@@ -14,10 +14,12 @@ from rotavg_ros.solver.algebra.relaxed_forest import relaxed_forest
 from rotavg_ros.solver.algebra.residuals import SLICE_EDGES, EdgeResiduals, measured_rows
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.running.threads import for_each, slices, stretches
-from rotavg_ros.solver.sfm.block_laplacian import Arrivals, BlockLaplacian, SplitWeights, factorised
+from rotavg_ros.solver.sfm.block_laplacian import Arrivals, BlockLaplacian, Laplacian, SplitWeights, factorised
+from rotavg_ros.solver.sfm.edge_laplacian import EdgeLaplacian, MatrixWeights
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape, ResidualSample, ShapeEstimator, share_of_first
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.solver.sfm.series import EdgesInSeries
+from rotavg_ros.solver.sfm.symmetric_rows import distinct_entries, full, times, turned
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -64,6 +66,8 @@ class Measure(NamedTuple):
         weigh: expected squared residuals → robust weights.
         dtype: how exactly residuals and systems are computed.
         source_share: ``(M,)`` probability of each edge that its noise is in its source's frame; None: as residuals say.
+        unit: ``(6, M)`` entries of T in the world's frame: residuals r count as T r (``stated_shape.py``), and the
+            noise's shape is that of T r; None: T = 1.
     """
 
     shape: NoiseShape
@@ -71,13 +75,18 @@ class Measure(NamedTuple):
     weigh: Callable[[Tensor], Tensor]
     dtype: torch.dtype
     source_share: Tensor | None = None
+    unit: Tensor | None = None
+
+    def in_units(self, vector: Tensor, edges: slice | Tensor) -> Tensor:
+        """``T r`` of some edges, whose residuals are ``(3, k)``; or ``T`` times what pulls at them."""
+        return vector if self.unit is None else times(self.unit[:, edges].to(vector), vector)
 
     def rows(self, dtype: torch.dtype) -> Tensor:
         """What nodes say of their edges, ``(k, N)``: variance and, unless noise is round, six entries of the shape."""
         variance = self.variance[None]
         if self.shape.covariance is None:
             return variance.to(dtype)
-        return torch.cat((variance, _distinct_entries(self.shape.information))).to(dtype)
+        return torch.cat((variance, distinct_entries(self.shape.information))).to(dtype)
 
 
 class Expected(NamedTuple):
@@ -95,6 +104,14 @@ class Expected(NamedTuple):
     variance: Tensor
     source_share: Tensor
 
+    @staticmethod
+    def information(at_source: Tensor, at_target: Tensor, source_share: Tensor) -> Tensor:
+        """Ω ``(3, 3, k)``, given :meth:`Measure.rows` of both ends and the share."""
+        if len(at_source) == 1:
+            unit = torch.eye(3, dtype=at_source.dtype, device=at_source.device)
+            return unit[:, :, None].expand(3, 3, len(source_share))
+        return full(torch.lerp(at_target[1:], at_source[1:], source_share))
+
     @classmethod
     def of(cls, vector: Tensor, at_source: Tensor, at_target: Tensor, source_share: Tensor | None = None) -> Expected:
         """Of residuals, given :meth:`Measure.rows` of both ends; the share, where it is held."""
@@ -102,7 +119,7 @@ class Expected(NamedTuple):
         if len(at_source) == 1:  # noise is round: Ω = 1
             square = _dot(vector, vector)
             return cls(vector, square, variance, torch.full_like(square, 0.5))
-        pulls = [_times(end[1:], vector) for end in (at_source, at_target)]
+        pulls = [times(end[1:], vector) for end in (at_source, at_target)]
         squares = [_dot(vector, pull) for pull in pulls]
         share = share_of_first(*squares) if source_share is None else source_share
         square = torch.lerp(squares[1], squares[0], share)
@@ -116,13 +133,27 @@ class Step(NamedTuple):
         turn: ``(3, N)`` radians, world's frame.
         weight: ``(N,)`` of all edges of each node.
         decrement: ``(C,)`` xᵀ L x.
-        weights: the edges' robust weights.
+        source_share: ``(M,)`` probability of each edge that its noise is in its source's frame.
     """
 
     turn: Tensor
     weight: Tensor
     decrement: Tensor
+    source_share: Tensor
+
+
+class Pull(NamedTuple):
+    """What edges do at some orientations.
+
+    Attributes:
+        weights: the edges' robust weights.
+        matrix: ``(6, M)`` entries of their weights with noise's shape, where edges have units of their own.
+        force: ``(3, N)`` weighted residuals that pull at each node, summed.
+    """
+
     weights: SplitWeights
+    matrix: Tensor | None
+    force: Tensor
 
 
 class Problem:
@@ -164,9 +195,11 @@ class Problem:
         """Variances ``(N,)`` of nodes whose edges all weigh one: three axes of unit variance each over the degree."""
         return 3 / self.degree.clamp(min=1).double()
 
-    def sample(self, orientations: Tensor) -> ResidualSample:
-        """Residuals of some edges."""
+    def sample(self, orientations: Tensor, unit: Tensor | None = None) -> ResidualSample:
+        """Residuals of some edges, in their :attr:`Measure.unit`."""
         vector = EdgeResiduals(self._some, orientations).vectors(slice(0, self._some.num_edges))
+        if unit is not None:
+            vector = times(unit[:, self._chosen], vector)
         return ResidualSample(vector, self._some.source, self._some.target)
 
     def typical(self, sample: ResidualSample) -> Tensor:
@@ -185,6 +218,7 @@ class Problem:
             return prior
         rows = measure.rows(torch.float64)
         vector = EdgeResiduals(graph, orientations).vectors(slice(0, graph.num_edges))
+        vector = measure.in_units(vector, series.edge)
         own = Expected.of(vector, *(rows.index_select(1, end) for end in (graph.source, graph.target)))
         together = series.sums(own.square)[series.group]
         weights = (measure.weigh(square + own.variance) for square in (series.blame * together, own.square))
@@ -193,7 +227,7 @@ class Problem:
         return pooled
 
     def dispersion(self, sample: ResidualSample, measure: Measure, prior: Tensor) -> Tensor:
-        """φ of each component, ``(C,)``, as some residuals have it."""
+        """φ of each component, ``(C,)``, as some residuals, in their units, have it."""
         rows = measure.rows(torch.float64)
         ends = (rows.index_select(1, end) for end in (sample.source, sample.target))
         expected = Expected.of(sample.vector, *ends)
@@ -206,28 +240,37 @@ class Problem:
 
     def step(self, orientations: Tensor, measure: Measure, prior: Tensor, is_open: Tensor) -> Step:
         """The least-squares step of the components ``(C,)`` that are open; the others' is zero."""
-        weights, force = self._weights_and_forces(orientations, measure, prior)
+        weights, matrix, force = self._pull(orientations, measure, prior)
         force *= is_open[self.component]
-        system = BlockLaplacian(self.arrivals, weights, measure.shape, self.component)
+        system: Laplacian
+        if matrix is None:
+            system = BlockLaplacian(self.arrivals, weights, measure.shape, self.component)
+        else:
+            system = EdgeLaplacian(self.arrivals, MatrixWeights(matrix, weights.total), self.component)
         tolerances = self.priors.least_angle, self.priors.step_tolerance
         turn, is_solved = force, False
         if self.is_well_knit:
             turn, is_solved = system.solve(force, system.diagonal_solve(), *tolerances)
             self.is_well_knit = is_solved
         if not is_solved:
-            approximate = factorised(self.graph, weights.total, measure.shape, self.roots)
+            if matrix is None:
+                # Cameras of a component share their noise's shape, which turning does not make larger.
+                trace = measure.shape.information.diagonal().sum(dim=1)[self.graph.source]
+                approximate = factorised(self.graph, weights.total * trace / 3, self.roots)
+            else:
+                approximate = factorised(self.graph, matrix[[0, 3, 5]].mean(dim=0), self.roots)
             turn, _ = system.solve(force, approximate, *tolerances)
         decrement = (force * turn).sum(dim=0).double()
         turn = (turn - turn[:, self.roots[self.component]]).double()
-        return Step(turn, system.weight_sum.double(), self.sum(decrement), weights)
+        return Step(turn, system.weight_sum.double(), self.sum(decrement), weights.source_share)
 
-    def _weights_and_forces(self, orientations: Tensor, measure: Measure, prior: Tensor) -> tuple[SplitWeights, Tensor]:
-        """The edges' robust weights, and the weighted residuals that pull at each node, summed ``(3, N)``."""
+    def _pull(self, orientations: Tensor, measure: Measure, prior: Tensor) -> Pull:
         graph, dtype = self.graph, measure.dtype
         measured = self._measured if dtype == self._measured.dtype else None
         residuals = EdgeResiduals(graph, orientations.to(dtype), measured)
         rows, prior = measure.rows(dtype), prior.to(dtype)
         weights = SplitWeights(torch.empty_like(prior), torch.empty_like(prior))
+        matrix = None if measure.unit is None else prior.new_empty(6, graph.num_edges)
         parts = stretches(slices(graph.num_edges, SLICE_EDGES, graph.device))
         # Components in rows: adding columns up by node is a dozen times as fast as adding up rows.
         forces = [rows.new_zeros(3, graph.num_nodes) for _ in parts]
@@ -237,15 +280,20 @@ class Problem:
                 source, target = graph.source[edges], graph.target[edges]
                 at_source, at_target = rows.index_select(1, source), rows.index_select(1, target)
                 held = None if measure.source_share is None else measure.source_share[edges].to(dtype)
-                expected = Expected.of(residuals.vectors(edges), at_source, at_target, held)
+                vector = measure.in_units(residuals.vectors(edges), edges)
+                expected = Expected.of(vector, at_source, at_target, held)
                 robust = measure.weigh(expected.square + expected.variance).mul_(prior[edges])
                 weights.total[edges], weights.source_share[edges] = robust, expected.source_share
-                pull = expected.pull.mul_(robust)
+                pull = measure.in_units(expected.pull.mul_(robust), edges)
+                if matrix is not None and measure.unit is not None:
+                    information = Expected.information(at_source, at_target, expected.source_share)
+                    in_world = turned(information, full(measure.unit[:, edges].to(dtype)))
+                    matrix[:, edges] = robust * distinct_entries(in_world)
                 forces[part].index_add_(1, target, pull)
                 forces[part].index_add_(1, source, pull.neg_())  # with alpha = -1 it takes six times as long
 
         for_each(walk, range(len(parts)))
-        return weights, torch.stack(forces).sum(dim=0)
+        return Pull(weights, matrix, torch.stack(forces).sum(dim=0))
 
 
 def l1_weight(squared_residual: Tensor) -> Tensor:
@@ -259,22 +307,6 @@ def l_half_weight(squared_residual: Tensor) -> Tensor:
     Two roots take a fifth of the time of a power.
     """
     return (squared_residual * squared_residual.sqrt()).rsqrt_()
-
-
-def _distinct_entries(matrices: Tensor) -> Tensor:
-    """Symmetric matrices ``(3, 3, N)`` → their entries xx, xy, xz, yy, yz, zz in rows, ``(6, N)``."""
-    return matrices.flatten(0, 1)[[0, 1, 2, 4, 5, 8]]
-
-
-def _times(entries: Tensor, vector: Tensor) -> Tensor:
-    """Products ``(3, k)`` of symmetric matrices, given by :func:`_distinct_entries`, and vectors ``(3, k)``."""
-    xx, xy, xz, yy, yz, zz = entries
-    x, y, z = vector
-    product = torch.empty_like(vector)
-    torch.mul(xx, x, out=product[0]).addcmul_(xy, y).addcmul_(xz, z)
-    torch.mul(xy, x, out=product[1]).addcmul_(yy, y).addcmul_(yz, z)
-    torch.mul(xz, x, out=product[2]).addcmul_(yz, y).addcmul_(zz, z)
-    return product
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:

@@ -72,7 +72,8 @@ def test_block_systems_are_numpys_least_squares(is_factorised: bool) -> None:
     np.testing.assert_allclose(system.product(x), force, atol=1e-9)
 
     roots = _roots(graph)
-    precondition = factorised(graph, weight, shape, roots) if is_factorised else system.diagonal_solve()
+    mean_weight = weight * shape.information.diagonal().sum(dim=1)[graph.source] / 3
+    precondition = factorised(graph, mean_weight, roots) if is_factorised else system.diagonal_solve()
     found, is_solved = system.solve(torch.from_numpy(force), precondition, 1e-12, 0.0)
     assert is_solved
     root = roots[graph.components()]

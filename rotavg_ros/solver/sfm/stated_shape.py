@@ -1,0 +1,138 @@
+"""About which axes each edge states to be exact, and how far that is believed: as far as residuals bear it out.
+
+A stated information has a size, one over the mean variance, and a shape, its covariance Σ_e scaled to a mean variance
+of one. :mod:`rotavg_ros.solver.sfm.stated_precision` has the size. An edge's noise is assumed to have the shape
+
+    Σ_e^β, scaled to a mean variance of one,     0 ≤ β ≤ 1,
+
+in the target's frame. T_e is its inverse square root. T_e r has the same shape C for all edges, in the cameras' frames,
+which is estimated for each β as the refinement does it (:mod:`rotavg_ros.solver.sfm.noise_shape`). So stated shapes are
+believed for what they know of single edges, not for what all edges have in common. The density of residuals is
+Student's t with one degree of freedom, in either end's frame with probability one half:
+
+    log p_e = log det T_e − ½ log det C + log Σ_k ½ (1 + y_kᵀ C⁻¹ y_k)⁻²,     y_k = R_k T_e r_e / √ρ_e
+
+β is the mean over its posterior. Beforehand it is 0 with a high probability.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rotavg_ros.solver.algebra.canonical_form import evenly_spread
+from rotavg_ros.solver.sfm.noise_shape import as_far_as_supported, scatter
+from rotavg_ros.solver.sfm.priors import NoiseShapePriors, PrecisionPriors
+from rotavg_ros.solver.sfm.stated_precision import PRECISION_PRIORS, posterior_mean
+
+
+class FramedResiduals(NamedTuple):
+    """Of M edges in C components.
+
+    Attributes:
+        vector: ``(M, 3)`` rotation vectors in the targets' frames, rad, in units of √ρ.
+        source_from_target: ``(M, 3, 3)`` takes them to the sources' frames.
+        component: ``(M,)`` of every edge.
+        redundancy: ``(C,)`` edges of each component beyond a spanning tree.
+    """
+
+    vector: Tensor
+    source_from_target: Tensor
+    component: Tensor
+    redundancy: Tensor
+
+    def select(self, edges: Tensor) -> FramedResiduals:
+        """Some of the edges, by their indices."""
+        vector, turn, component = (column[edges] for column in self[:3])
+        return FramedResiduals(vector, turn, component, self.redundancy)
+
+
+class _Shapes(NamedTuple):
+    """Of M edges: axes ``(M, 3, 3)`` in columns, and logarithms of their variances ``(M, 3)``."""
+
+    axes: Tensor
+    log_variance: Tensor
+
+    @classmethod
+    def of(cls, information: Tensor, is_known: Tensor, least_ratio: float) -> _Shapes:
+        """Of information ``(M, 3, 3)``; round where it is not known."""
+        unit = torch.eye(3, dtype=information.dtype, device=information.device)
+        value, axes = torch.linalg.eigh(torch.where(is_known[:, None, None], information, unit))
+        # The first axis is the least exact one.
+        log_variance = -(value / value[:, :1]).log()
+        return cls(axes, log_variance.clamp(min=2 * torch.tensor(least_ratio).log().item()))
+
+    def inverse_deviation(self, exponent: Tensor) -> Tensor:
+        """One over the standard deviations along the axes ``(M, 3)``, given β ``(M,)`` or for all."""
+        variance = (exponent[..., None] * self.log_variance).exp()
+        return (variance / variance.mean(dim=1, keepdim=True)).rsqrt()
+
+    def units(self, inverse_deviation: Tensor) -> Tensor:
+        """T ``(M, 3, 3)``."""
+        return (self.axes * inverse_deviation[:, None]) @ self.axes.mT
+
+
+def believed_units(
+    information: Tensor,
+    residuals: FramedResiduals,
+    shape: NoiseShapePriors,
+    priors: PrecisionPriors = PRECISION_PRIORS,
+) -> Tensor | None:
+    """T of every edge, in its target's frame, ``(3, 3, M)``; None where all are one.
+
+    Args:
+        information: ``(M, 3, 3)`` in the targets' frames, of any scale; NaN where unknown, which counts as round.
+        shape: how the common shape is estimated; no axis is believed to be more exact than its ``least_ratio``.
+    """
+    is_known = information.isfinite().all(dim=2).all(dim=1)
+    if not bool(is_known.any()):
+        return None
+    shapes = _Shapes.of(information, is_known, shape.least_ratio)
+    known = is_known.nonzero().squeeze(1)
+    chosen = known[evenly_spread(residuals.component[known], len(residuals.redundancy), priors.max_sample)]
+    sampled = _Shapes(shapes.axes[chosen], shapes.log_variance[chosen])
+    edges = torch.bincount(residuals.component, minlength=len(residuals.redundancy)).clamp(min=1)
+    worth = residuals.redundancy.clamp(min=0) / edges
+    exponent = _exponents(sampled, residuals.select(chosen), worth, shape, priors)
+    exponent = torch.where(exponent < priors.least_exponent, 0.0, exponent)
+    if not bool((exponent > 0).any()):
+        return None
+    return shapes.units(shapes.inverse_deviation(exponent[residuals.component])).permute(1, 2, 0).contiguous()
+
+
+def _exponents(
+    shapes: _Shapes, residuals: FramedResiduals, worth: Tensor, shape: NoiseShapePriors, priors: PrecisionPriors
+) -> Tensor:
+    """Mean of β over its posterior, ``(C,)``; 0 where stated shapes are round.
+
+    Args:
+        worth: ``(C,)`` how much a residual counts.
+    """
+    group, count = residuals.component, len(residuals.redundancy)
+    number = torch.bincount(group, minlength=count).clamp(min=1)
+    exponent = torch.linspace(0.0, 1.0, priors.num_exponents, dtype=torch.float64, device=group.device)
+
+    def sums(value: Tensor) -> Tensor:
+        return value.new_zeros(count).index_add_(0, group, value)
+
+    log_likelihood = torch.stack([sums(_log_likelihood(shapes, residuals, beta, shape)) for beta in exponent])
+    mean_exponent = posterior_mean(exponent, worth * log_likelihood, priors)
+    spread = (sums(shapes.log_variance.var(dim=1, correction=0)) / number).sqrt()
+    return torch.where(spread < priors.least_spread, 0.0, mean_exponent)
+
+
+def _log_likelihood(shapes: _Shapes, residuals: FramedResiduals, exponent: Tensor, shape: NoiseShapePriors) -> Tensor:
+    """The logarithm of p_e for one β, ``(M,)``, up to a constant."""
+    inverse_deviation = shapes.inverse_deviation(exponent)
+    at_target = shapes.units(inverse_deviation) @ residuals.vector[:, :, None]
+    ends = (residuals.source_from_target @ at_target, at_target)
+    vectors = tuple(end.squeeze(2).t().contiguous() for end in ends)
+    group, redundancy = residuals.component, residuals.redundancy
+    covariance = scatter((vectors[0], vectors[1]), group, len(redundancy), priors=shape)
+    covariance = as_far_as_supported(covariance, redundancy, shape)
+    inverse = torch.linalg.inv_ex(covariance).inverse.permute(1, 2, 0)[:, :, group]
+    squares = [((inverse * vector).sum(dim=1) * vector).sum(dim=0) for vector in vectors]
+    at_either = torch.logsumexp(torch.stack([-2 * square.log1p() for square in squares]), dim=0)
+    return inverse_deviation.log().sum(dim=1) - torch.logdet(covariance)[group] / 2 + at_either
