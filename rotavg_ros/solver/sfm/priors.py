@@ -46,6 +46,8 @@ class PrecisionPriors:
             variance at most.
         max_log_ratio: logarithm of the factor by which an edge is believed to be better or worse than typical ones.
         max_sample: edges that tell α.
+        least_residual: of the typical residual; shorter ones are of edges that the answer meets. Normal noise in three
+            dimensions is as short once in a million edges.
         least_angle: rad; residuals count as at least this, numerical.
     """
 
@@ -55,6 +57,7 @@ class PrecisionPriors:
     least_spread: float = 0.2
     max_log_ratio: float = float(np.log(100.0))
     max_sample: int = 8_000
+    least_residual: float = 0.01
     least_angle: float = float(np.radians(1e-4))
 
 

@@ -74,15 +74,21 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             allowed = (graph.label != EdgeLabel.REJECTED).double()
             coarse = 1 - cleaned.outlier_probability if stages.weighted else torch.ones_like(allowed)
             weights = EdgeWeights(allowed, allowed * coarse)
-            refinement = partial(
-                refine, graph, max_steps=steps, structure=structure, priors=PRIORS if stages.shaped else ROUND
-            )
+            priors = PRIORS if stages.shaped else ROUND
+            refinement = partial(refine, graph, max_steps=steps, structure=structure, priors=priors)
             orientations = refinement(orientations, weights=weights)
-            if stages.stated:
-                as_stated = _as_stated(weights, graph, orientations, structure, stages)
-                if as_stated is not None:
-                    weights = as_stated
-                    orientations = refinement(orientations, weights=weights)
+            believe = partial(_as_stated, weights, graph, structure=structure, stages=stages)
+            believed = believe(orientations) if stages.stated else None
+            if believed is not None:
+                weights = believed
+                orientations = refinement(orientations, weights=weights)
+            if believed is not None and believed.unit is not None:
+                # Residuals of an answer that knows shapes tell more of them. Coarse steps, which know none, would leave
+                # it.
+                again = believe(orientations)
+                weights = believed if again is None else again
+                shaped_only = replace(priors, max_coarse_steps=0)
+                orientations = refinement(orientations, weights=weights, priors=shaped_only)
         if stages.consensus:
             with watch.stage("consensus"):
                 other = consensus(graph, orientations, component, CONSENSUS)

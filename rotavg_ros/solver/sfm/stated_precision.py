@@ -8,7 +8,8 @@ noise is assumed to have the variance of a typical edge's times
 α is the mean over its posterior. Beforehand it is 0 with a high probability, so that nothing is believed unless the
 residuals speak for it. Their density is Student's t with one degree of freedom in three dimensions and the scale
 s √ρ_e, which outliers do not swamp; s is the likeliest for each α. The residuals are those of an answer that took all
-edges to be alike.
+edges to be alike. Where there are few edges, the cost |r|^½ has answers that meet as many edges exactly as there are
+nodes. Their residuals say nothing of their noise and are left out.
 
 In the refinement an edge's residual then counts in units of √ρ_e. For the costs |r| and |r|^½ that is a weight of
 ρ^(−1/2) and ρ^(−1/4).
@@ -74,6 +75,12 @@ def relative_variance(
     return (exponent[group] * log_ratio).exp() if bool((exponent > 0).any()) else None
 
 
+def is_telling(residuals: Residuals, priors: PrecisionPriors) -> Tensor:
+    """Which edges the answer does not meet, ``(M,)`` bool: their residuals are no vanishing share of typical ones."""
+    typical = median_by_group(residuals.angle, residuals.component, len(residuals.redundancy))
+    return residuals.angle >= priors.least_residual * typical[residuals.component]
+
+
 def _exponents(log_ratio: Tensor, is_known: Tensor, residuals: Residuals, priors: PrecisionPriors) -> Tensor:
     """Mean of α over its posterior, ``(C,)``; 0 where stated precisions hardly differ.
 
@@ -83,7 +90,7 @@ def _exponents(log_ratio: Tensor, is_known: Tensor, residuals: Residuals, priors
     """
     count = len(residuals.redundancy)
     edges = torch.bincount(residuals.component, minlength=count)
-    known = is_known.nonzero().squeeze(1)
+    known = (is_known & is_telling(residuals, priors)).nonzero().squeeze(1)
     chosen = known[evenly_spread(residuals.component[known], count, priors.max_sample)]
     log_ratio, group = log_ratio[chosen], residuals.component[chosen]
     number = torch.bincount(group, minlength=count).clamp(min=1)
