@@ -85,12 +85,10 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "series": set(),
         "stated_precision": {"priors"},
         "stated_shape": {"noise_shape", "priors", "stated_precision"},
+        "stated_noise": {"priors", "refinement", "stated_precision", "stated_shape", "step"},
         "uncertainty": {"priors"},
         "consensus": {"priors"},
-        "solve": {
-            *("consensus", "options", "refinement", "series", "stated_precision", "stated_shape"),
-            *("step", "uncertainty"),
-        },
+        "solve": {"consensus", "options", "refinement", "series", "stated_noise", "step", "uncertainty"},
     },
     "solver/slam": {
         "": set(),

@@ -171,3 +171,48 @@ def test_translations_that_cannot_be_are_unknown() -> None:
     graph = ViewGraph.create([0, 1, 2], [1, 2, 3], [[0.0, 0.0, 0.0, 1.0]] * 3, translation=translation)
     assert graph.translation is not None
     assert graph.translation.isfinite().all(dim=1).tolist() == [True, False, False]
+
+
+def test_information_that_is_no_information_is_unknown() -> None:
+    """Not finite, not positive definite, or singular but for rounding; of others the symmetric part counts."""
+    skew = [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    stated = np.array([np.diag([1.0, 2.0, 4.0]) + skew, np.diag([1, 1, -1]), np.full((3, 3), np.inf), np.ones((3, 3))])
+    precision = [7.0, 5.0, np.nan, np.nan]
+    graph = ViewGraph.create([0] * 4, [1] * 4, [_UNIT] * 4, information=stated, precision=precision)
+    assert graph.information is not None
+    assert graph.information[0].tolist() == np.diag([1.0, 2.0, 4.0]).tolist()
+    assert bool(graph.information[1:].isnan().all())
+    np.testing.assert_array_equal(graph.precision.numpy(), precision)
+    implied = ViewGraph.create([0] * 4, [1] * 4, [_UNIT] * 4, information=stated).precision
+    np.testing.assert_allclose(implied.numpy(), [3 / (1 + 1 / 2 + 1 / 4), np.nan, np.nan, np.nan])
+    with pytest.raises(ViewGraphError, match=r"information has shape \(4, 6\); it must be \(1, 3, 3\)"):
+        ViewGraph.create([0], [1], [_UNIT], information=np.ones((4, 6)))
+
+
+@given(st.integers(0, 2**16))
+def test_reversed_edges_state_the_same(seed: int) -> None:
+    """Twice reversed is as it was; a small error's squared length in units of information is the same either way."""
+    rng = np.random.default_rng(seed)
+    error = Rotation.from_rotvec(1e-5 * rng.standard_normal((6, 3)))
+    true = Rotation.random(6, random_state=seed)
+    factors = rng.standard_normal((6, 3, 3))
+    information = factors @ factors.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    place = rng.standard_normal((6, 3))
+    measured = (error * true).as_quat()
+    graph = ViewGraph.create([0] * 6, [1] * 6, measured, information=information, translation=place)
+    some = torch.from_numpy(rng.random(6) < 0.5)
+    other = graph.reverse_edges(some)
+    again = other.reverse_edges(some)
+    for name in ("source", "target", "target_from_source", "information", "translation"):
+        torch.testing.assert_close(getattr(again, name), getattr(graph, name))
+    reversed_ones = some.numpy()
+    stated = Rotation.from_quat(other.target_from_source.numpy())
+    wanted = Rotation.from_quat(np.where(reversed_ones[:, None], true.inv().as_quat(), true.as_quat()))
+    noise = (stated * wanted.inv()).as_rotvec()
+    assert other.information is not None and other.translation is not None
+    lengths = np.einsum("mi,mij,mj->m", noise, other.information.numpy(), noise)
+    expected = np.einsum("mi,mij,mj->m", error.as_rotvec(), information, error.as_rotvec())
+    np.testing.assert_allclose(lengths, expected, rtol=1e-3)
+    # The two bodies' places in each other's frames belong to one segment.
+    np.testing.assert_allclose(np.linalg.norm(other.translation.numpy(), axis=1), np.linalg.norm(place, axis=1))
+    assert other.source.tolist() == reversed_ones.astype(int).tolist()

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
-from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.estimate import Estimate, Run
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.fine_net import FineNet
@@ -24,8 +23,7 @@ from rotavg_ros.solver.sfm.consensus.search import CONSENSUS, consensus
 from rotavg_ros.solver.sfm.options import SfmStages
 from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
 from rotavg_ros.solver.sfm.series import EdgesInSeries
-from rotavg_ros.solver.sfm.stated_precision import Residuals, relative_variance, stated_sizes
-from rotavg_ros.solver.sfm.stated_shape import FramedResiduals, believed_units
+from rotavg_ros.solver.sfm.stated_noise import StatedNoise
 from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.solver.sfm.uncertainty import References, variances
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
@@ -77,18 +75,9 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             priors = PRIORS if stages.shaped else ROUND
             refinement = partial(refine, graph, max_steps=steps, structure=structure, priors=priors)
             orientations = refinement(orientations, weights=weights)
-            believe = partial(_as_stated, weights, graph, structure=structure, stages=stages)
-            believed = believe(orientations) if stages.stated else None
-            if believed is not None:
-                weights = believed
-                orientations = refinement(orientations, weights=weights)
-            if believed is not None and believed.unit is not None:
-                # Residuals of an answer that knows shapes tell more of them. Coarse steps, which know none, would leave
-                # it.
-                again = believe(orientations)
-                weights = believed if again is None else again
-                shaped_only = replace(priors, max_coarse_steps=0)
-                orientations = refinement(orientations, weights=weights, priors=shaped_only)
+            if stages.stated:
+                noise = StatedNoise.of(graph, structure, priors, stages.stated_shapes)
+                orientations, weights = noise.refined(orientations, weights, refinement)
         if stages.consensus:
             with watch.stage("consensus"):
                 other = consensus(graph, orientations, component, CONSENSUS)
@@ -112,33 +101,6 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             variance = variance if stated is None else form.of_nodes(stated)
     score = score.index_select(0, form.edge)
     return Estimate(form.orientations(orientations), score, variance, warnings=warnings)
-
-
-def _as_stated(
-    weights: EdgeWeights, graph: ViewGraph, orientations: Tensor, structure: Structure, stages: SfmStages
-) -> EdgeWeights | None:
-    """With what edges state of their noise, as far as residuals at the orientations bear it out; None: nothing is."""
-    information = graph.information if stages.stated_shapes else None
-    precision = stated_sizes(graph)
-    if not bool(precision.isfinite().any()):
-        return None
-    residuals = EdgeResiduals(graph, orientations.float())
-    component, redundancy = structure.component[graph.source], structure.redundancy(graph)
-    ratio = relative_variance(precision, Residuals(residuals.angles(), component, redundancy))
-    unit = None
-    if information is not None:
-        vector = EdgeResiduals(graph, orientations.double()).vectors(slice(0, graph.num_edges)).t()
-        at_source, at_target = (rotations.to_matrix(orientations.double())[end] for end in (graph.source, graph.target))
-        vector = (at_target @ vector[:, :, None]).squeeze(2)
-        if ratio is not None:
-            vector = vector * ratio.rsqrt()[:, None]
-        framed = FramedResiduals(vector, at_source @ at_target.mT, component, redundancy)
-        unit = believed_units(information, framed, (PRIORS if stages.shaped else ROUND).shape)
-    if ratio is not None:
-        weights = weights.times(ratio**-0.25, ratio**-0.5)
-    elif unit is None:
-        return None
-    return weights._replace(unit=unit)
 
 
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:

@@ -92,7 +92,7 @@ def believed_units(
     shape: NoiseShapePriors,
     priors: PrecisionPriors = PRECISION_PRIORS,
 ) -> Tensor | None:
-    """T of every edge, in its target's frame, ``(3, 3, M)``; None where all are one.
+    """T of every edge, in its target's frame, ``(3, 3, M)``, one where β is 0; None where it is 0 everywhere.
 
     Args:
         information: ``(M, 3, 3)`` in the targets' frames, of any scale; NaN where unknown, which counts as round.
@@ -111,7 +111,10 @@ def believed_units(
     exponent = torch.where(exponent < priors.least_exponent, 0.0, exponent)
     if not bool((exponent > 0).any()):
         return None
-    return shapes.units(shapes.inverse_deviation(exponent[residuals.component])).permute(1, 2, 0).contiguous()
+    of_edge = exponent[residuals.component]
+    units = shapes.units(shapes.inverse_deviation(of_edge))
+    unit = torch.eye(3, dtype=units.dtype, device=units.device)
+    return torch.where((of_edge > 0)[:, None, None], units, unit).permute(1, 2, 0).contiguous()
 
 
 def _exponents(

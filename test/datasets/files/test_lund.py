@@ -46,6 +46,9 @@ def test_edges_agree_with_the_truth(tmp_path: Path) -> None:
     assert float(true_edge_noise(graph, truth).max()) < 1e-7
     assert graph_file.edge_information is not None
     np.testing.assert_array_equal(graph_file.edge_information[:, 15:], [[1, 0, 0, 2, 0, 3]] * 3)
+    assert graph.information is not None
+    np.testing.assert_array_equal(graph.information.numpy(), [np.diag([1.0, 2.0, 3.0])] * 3)
+    np.testing.assert_allclose(graph.precision.numpy(), 3 / (1 + 1 / 2 + 1 / 3))
 
 
 def test_hessians_are_optional(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from rotavg_ros import rotations
 from rotavg_ros.datasets.files import g2o
@@ -300,3 +301,55 @@ def test_translations_that_are_not_known(tmp_path: Path, suffix: str) -> None:
     else:
         np.testing.assert_allclose(again.edge_translation, translation, atol=1e-12)
         assert not any("translations" in what for what in not_stored(path, graph_file))
+
+
+def _with_information(rng: np.random.Generator) -> GraphFile:
+    """Of a chain: one edge states it, one does not."""
+    factors = rng.standard_normal((2, 3, 3))
+    information = factors @ factors.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    information[1] = np.nan
+    return GraphFile.from_ids(
+        np.array([3, 4]),
+        np.array([4, 5]),
+        Rotation.random(2, rng).as_quat(),
+        precision=np.array([np.nan, 2.0]),
+        information=information,
+        edge_translation=rng.standard_normal((2, 3)),
+    )
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".g2o", ".toro"])
+def test_information_is_kept(suffix: str) -> None:
+    graph_file = _with_information(np.random.default_rng(0))
+    read, expected = through(suffix, graph_file).graph.information, graph_file.graph.information
+    assert read is not None and expected is not None
+    torch.testing.assert_close(read[0], expected[0], rtol=1e-12, atol=1e-12)
+    # Pose-graph files have no word for an unknown one.
+    unknown = torch.full((3, 3), torch.nan) if suffix == ".npz" else 2 * torch.eye(3)
+    torch.testing.assert_close(read[1], unknown.double(), equal_nan=True)
+    assert (
+        through(suffix, replace(graph_file, graph=replace(graph_file.graph, information=None))).graph.information
+        is None
+    )
+
+
+def test_gtsam_has_information_in_the_same_frame() -> None:
+    """Its error of a g2o edge, in units of the information that it reads, is ours."""
+    rng = np.random.default_rng(1)
+    graph_file = _with_information(rng)
+    graph = graph_file.graph
+    assert graph.information is not None
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "graph.g2o"
+        write_graph(path, graph_file)
+        factors, _ = gtsam.readG2o(str(path), True)
+    true = Rotation.random(2, rng)  # world_from_body of both ends of the first edge
+    pose = gtsam.Values()
+    place = graph_file.edge_translation
+    assert place is not None
+    for key, orientation, position in ((3, true[0], np.zeros(3)), (4, true[1], true[0].apply(place[0]))):
+        pose.insert(key, gtsam.Pose3(gtsam.Rot3(orientation.as_matrix()), position))
+    error = Rotation.from_quat(graph.target_from_source[0].numpy()) * (true[1].inv() * true[0]).inv()
+    vector = error.as_rotvec()
+    expected = vector @ graph.information[0].numpy() @ vector / 2
+    assert factors.at(0).error(pose) == pytest.approx(expected, rel=1e-6)

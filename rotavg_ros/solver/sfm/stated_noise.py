@@ -1,0 +1,121 @@
+"""Refinement that believes what edges state of their noise, size and shape, as far as residuals bear it out.
+
+1. The residuals of an answer that took all edges to be alike tell the two exponents, α
+   (:mod:`rotavg_ros.solver.sfm.stated_precision`) and β (:mod:`rotavg_ros.solver.sfm.stated_shape`).
+2. Components in which one is not 0 are refined anew.
+3. Where β is not 0, both are estimated once more, from the residuals of the new answer, whose own errors are smaller
+   and hide less of the noise, and shaped steps go on from there. Coarse steps, which know no shapes, would leave it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.residuals import EdgeResiduals
+from rotavg_ros.solver.sfm.priors import RefinementPriors
+from rotavg_ros.solver.sfm.refinement import EdgeWeights
+from rotavg_ros.solver.sfm.stated_precision import Residuals, relative_variance, stated_sizes
+from rotavg_ros.solver.sfm.stated_shape import FramedResiduals, believed_units
+from rotavg_ros.solver.sfm.step import Structure
+from rotavg_ros.view_graph import ViewGraph
+
+
+class StatedNoise(NamedTuple):
+    """What edges of a graph state of their noise (M edges, C components).
+
+    Attributes:
+        size: ``(M,)`` rad⁻² of any scale, NaN where unknown.
+        information: ``(M, 3, 3)`` in the targets' frames, NaN where unknown; None: sizes alone are believed.
+        priors: of the refinement.
+    """
+
+    graph: ViewGraph
+    structure: Structure
+    size: Tensor
+    information: Tensor | None
+    priors: RefinementPriors
+
+    @classmethod
+    def of(cls, graph: ViewGraph, structure: Structure, priors: RefinementPriors, with_shapes: bool) -> StatedNoise:
+        """What there is.
+
+        Args:
+            with_shapes: axes are believed, too.
+        """
+        return cls(graph, structure, stated_sizes(graph), graph.information if with_shapes else None, priors)
+
+    def refined(
+        self, orientations: Tensor, weights: EdgeWeights, refine: Callable[..., Tensor]
+    ) -> tuple[Tensor, EdgeWeights]:
+        """The orientations ``(N, 4)`` refined anew where statements are believed, and the edges' weights there.
+
+        Args:
+            refine: :func:`rotavg_ros.solver.sfm.refinement.refine` of this graph.
+            weights: without statements.
+        """
+        if not bool(self.size.isfinite().any()):
+            return orientations, weights
+        ratio, unit = self._believed(orientations)
+        if ratio is None and unit is None:
+            return orientations, weights
+        chosen = _weighed(weights, ratio, unit)
+        is_believed = self._components(ratio, unit)[self.structure.component][:, None]
+        orientations = torch.where(is_believed, refine(orientations, weights=chosen), orientations)
+        if unit is None:
+            return orientations, chosen
+        has_shapes = self._components(None, unit)
+        is_again = has_shapes[self.structure.component[self.graph.source]]
+        ratio_again, unit_again = self._believed(orientations)
+        ratio = torch.where(is_again, _or_ones(ratio_again, self.size), _or_ones(ratio, self.size))
+        unit = unit if unit_again is None else torch.where(is_again, unit_again, unit)
+        chosen = _weighed(weights, ratio, unit)
+        shaped_only = replace(self.priors, max_coarse_steps=0)
+        again = refine(orientations, weights=chosen, priors=shaped_only)
+        return torch.where(has_shapes[self.structure.component][:, None], again, orientations), chosen
+
+    def _believed(self, orientations: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        """ρ ``(M,)`` and T ``(3, 3, M)`` as residuals at the orientations bear them out; None: of no edge."""
+        graph, structure = self.graph, self.structure
+        component, redundancy = structure.component[graph.source], structure.redundancy(graph)
+        angle = EdgeResiduals(graph, orientations.float()).angles()
+        ratio = relative_variance(self.size, Residuals(angle, component, redundancy))
+        if self.information is None:
+            return ratio, None
+        orientations = orientations.double()
+        vector = EdgeResiduals(graph, orientations).vectors(slice(0, graph.num_edges)).t()
+        matrix = rotations.to_matrix(orientations)
+        at_source, at_target = matrix[graph.source], matrix[graph.target]
+        vector = (at_target @ vector[:, :, None]).squeeze(2)
+        if ratio is not None:
+            vector = vector * ratio.rsqrt()[:, None]
+        framed = FramedResiduals(vector, at_source @ at_target.mT, component, redundancy)
+        return ratio, believed_units(self.information, framed, self.priors.shape)
+
+    def _components(self, ratio: Tensor | None, unit: Tensor | None) -> Tensor:
+        """In which components something is believed, ``(C,)`` bool."""
+        of_edge = torch.zeros_like(self.size, dtype=torch.bool)
+        if ratio is not None:
+            of_edge |= ratio != 1
+        if unit is not None:
+            identity = torch.eye(3, dtype=unit.dtype, device=unit.device)[:, :, None]
+            of_edge |= (unit != identity).flatten(0, 1).any(dim=0)
+        believed = torch.zeros_like(self.structure.roots, dtype=torch.bool)
+        believed[self.structure.component[self.graph.source[of_edge]]] = True
+        return believed
+
+
+def _weighed(weights: EdgeWeights, ratio: Tensor | None, unit: Tensor | None) -> EdgeWeights:
+    """Weights that believe ρ, in whose roots residuals count in the costs |r|^½ and |r|, and T."""
+    if ratio is not None:
+        weights = weights.times(ratio**-0.25, ratio**-0.5)
+    return weights._replace(unit=unit)
+
+
+def _or_ones(ratio: Tensor | None, like: Tensor) -> Tensor:
+    return torch.ones_like(like) if ratio is None else ratio
