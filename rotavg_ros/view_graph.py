@@ -265,7 +265,9 @@ def mean_precision(information: Tensor) -> Tensor:
     """One over the mean variance of the axes, ``(M,)`` rad⁻², of ``(M, 3, 3)``; NaN where unknown."""
     is_known = information.isfinite().all(dim=2).all(dim=1)
     unit = torch.eye(3, dtype=information.dtype, device=information.device)
-    inverses = torch.linalg.inv_ex(torch.where(is_known[:, None, None], information, unit)).inverse
+    information = torch.where(is_known[:, None, None], information, unit)
+    is_known &= torch.linalg.cholesky_ex(information).info == 0  # else not positive definite
+    inverses = torch.linalg.inv_ex(information).inverse
     return torch.where(is_known, 3 / inverses.diagonal(dim1=1, dim2=2).sum(dim=1), torch.nan)
 
 

@@ -50,6 +50,25 @@ def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> Non
     assert len(traffic.waits) <= waits
 
 
+def test_information_goes_along() -> None:
+    graph = _graph()
+    rng = np.random.default_rng(1)
+    factors = torch.from_numpy(rng.standard_normal((graph.num_edges, 3, 3)))
+    information = factors @ factors.mT + 0.05 * torch.eye(3)
+    error = torch.linalg.cholesky(torch.linalg.inv(information)) @ torch.from_numpy(
+        0.02 * rng.standard_normal((graph.num_edges, 3, 1))
+    )
+    truth = rotations.random(graph.num_nodes, generator=torch.Generator().manual_seed(0))
+    true = rotations.multiply(truth[graph.target], rotations.inverse(truth[graph.source]))
+    measured = rotations.canonical(rotations.multiply(rotations.exp(error.squeeze(2)), true))
+    graph = replace(graph, target_from_source=measured, information=information)
+    with pretended_gpu():
+        found = solve(graph, device="cuda")
+    assert_same(found, solve(graph, device="cpu"))
+    unstated = solve(replace(graph, information=None), device="cpu")
+    assert float(rotations.angle_between(unstated.body_from_world, found.body_from_world).max()) > 1e-3
+
+
 def test_waits_do_not_grow_with_the_graph() -> None:
     counts = []
     for cameras in (40, 160):

@@ -30,6 +30,7 @@ class StatedNoise(NamedTuple):
     """What edges of a graph state of their noise (M edges, C components).
 
     Attributes:
+        graph, structure: of which; components have answers of their own.
         size: ``(M,)`` rad⁻² of any scale, NaN where unknown.
         information: ``(M, 3, 3)`` in the targets' frames, NaN where unknown; None: sizes alone are believed.
         priors: of the refinement.

@@ -20,6 +20,7 @@ what the likelihood gains at most with the statements of other edges is subtract
 from __future__ import annotations
 
 from dataclasses import replace
+from math import log
 from typing import NamedTuple
 
 import torch
@@ -72,9 +73,9 @@ class _Shapes(NamedTuple):
         """Of information ``(M, 3, 3)``; round where it is not known."""
         unit = torch.eye(3, dtype=information.dtype, device=information.device)
         value, axes = torch.linalg.eigh(torch.where(is_known[:, None, None], information, unit))
-        # The first axis is the least exact one.
-        log_variance = -(value / value[:, :1]).log()
-        return cls(axes, log_variance.clamp(min=2 * torch.tensor(least_ratio).log().item()))
+        # The first axis is the least exact one. What is not positive definite states nothing.
+        share = torch.where(value[:, :1] > 0, value / value[:, :1], 1.0)
+        return cls(axes, -share.log().clamp(max=-2 * log(least_ratio)))
 
     def inverse_deviation(self, exponent: Tensor) -> Tensor:
         """One over the standard deviations along the axes ``(M, 3)``, given β ``(M,)`` or for all."""

@@ -123,7 +123,8 @@ def test_what_states_no_shape_changes_nothing_at_all() -> None:
     expected = _solved(replace(graph, information=None))
     broken = torch.full((graph.num_edges, 3, 3), torch.nan, dtype=torch.float64)
     broken[::3], broken[1::3] = torch.diag(torch.tensor([1.0, 1.0, -1.0])).double(), torch.inf
-    others = [_stating(graph, broken).information, broken * torch.nan]
+    unknown = broken * torch.nan
+    others = [_stating(graph, broken).information, unknown, torch.where(broken == torch.inf, torch.nan, broken)]
     for information in others:
         found = _solved(replace(graph, information=information))
         assert torch.equal(found.body_from_world, expected.body_from_world)
