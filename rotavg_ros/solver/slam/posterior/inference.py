@@ -94,7 +94,7 @@ class Search:
     def _seems_slipped(self, mode: Mode) -> bool:
         if "slips" in self.problem.without:
             return False
-        return len(mode.slipped) > 0 or any(slip.predicted <= slip.slack for slip in slips.propose_slips(mode))
+        return len(mode.slipped) > 0 or slips.may_have_slipped(mode)
 
     def move_on(self) -> None:
         """The search from the modes that are kept."""
@@ -166,6 +166,7 @@ def proposals(mode: Mode) -> Iterator[Proposal]:
     if "settling" not in without:
         # Labels as probabilities come past what stops single flips; what it gives is not known before.
         yield Proposal("settle", 0.0, partial(settle, problem, mode.state), problem.limits.slack)
+        yield from noise.propose_worse_odometry(mode)
     if "slips" not in without:
         yield from slips.propose_slips(mode)
     if not without & {"slips", "shifts"}:

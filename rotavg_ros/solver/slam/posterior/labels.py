@@ -30,7 +30,8 @@ _REPEAT_DEG = 0.05 * 2.0 ** np.arange(9)
 # One width for all, or each as likely for every closure.
 _KERNELS = len(_REPEAT_DEG) + 1
 _GRID = len(_NEAR_SHARES), len(_FAR_SHARES), len(_NEAR_MISS_QUANTILES), _KERNELS
-# Of closures detected at about the same time, one from about the same older place counts for so many others.
+# Of closures that are near, one that was detected at about the same time from about the same older place counts for so
+# many others.
 _IN_RUN = 10.0
 # Predicted to less than this share of the variance of any rotation.
 _TOLD = 0.5
@@ -97,8 +98,8 @@ def false_density(
     """Closures wrong by themselves, or by the same turn of the world as other false ones.
 
     Places that look alike are mistaken for each other again and again. The density of a repeat is a kernel estimate
-    over the false closures detected before (a Pólya urn), those detected shortly before weighing apart from all, and
-    among these most those of the same run.
+    over the false closures detected before (a Pólya urn), those near weighing apart from all: those detected shortly
+    before, most of them those of the same run, and, where there are such, those that join the same places.
 
     Args:
         is_false: ``(C,)`` bool, of the others.
@@ -138,15 +139,23 @@ def _repeats(
         turn: ``(4, C)`` of the world, by which each closure is wrong if it is false.
         is_told: ``(C,)`` bool, whether anything else tells that turn.
     """
-    k = problem.components
+    k, gap = problem.components, problem.priors.run_gap_steps
     other, there = _others(problem, is_false, rows, both_sides)
     there &= is_told[rows, None] & is_told.take(other)
+
+    def apart(mine: np.ndarray, its: np.ndarray) -> np.ndarray:
+        return np.asarray(np.abs(its.take(other) - mine[rows, None]))
+
     older, newer = problem.ends.T
-    between = np.abs(newer.take(other) - newer[rows, None])
-    is_near = there & (between <= problem.priors.run_gap_steps)
-    between += np.abs(older.take(other) - older[rows, None])
-    weights = is_near * np.where(between <= problem.priors.run_gap_steps, _IN_RUN, 1.0), there.astype(np.float64)
-    cosine = np.abs(sum(part.take(other) * part[rows, None] for part in turn))
+    by_older, by_newer = apart(older, older), apart(newer, newer)
+    # A place that was mistaken for another one is so again; from there, the other one for it, by the inverse turn.
+    is_inverse = np.minimum(apart(older, newer), apart(newer, older)) <= gap
+    is_inverse &= (by_older > gap) & (by_newer > gap)
+    is_near = there & (by_newer <= gap)
+    is_near |= there & is_near.any(axis=1, keepdims=True) & (is_inverse | (by_older <= gap))
+    weights = is_near * np.where(by_older + by_newer <= gap, _IN_RUN, 1.0), there.astype(np.float64)
+    *axis, real = (part.take(other) * part[rows, None] for part in turn)
+    cosine = np.abs(real + np.where(is_inverse, -1.0, 1.0) * sum(axis))
     alike = np.nonzero(there & (cosine > np.cos(_FARTHEST * np.radians(_REPEAT_DEG[-1]) / 2)))
     kernel = _kernels((2 * np.arccos(np.minimum(cosine[alike], 1.0))) ** 2, k)
     near, far = _mean_kernels(weights, alike, kernel)

@@ -85,7 +85,11 @@ def test_labels_and_f_stay_and_tails_are_taken_over() -> None:
 
 
 def test_the_answer_is_the_same_in_every_frame() -> None:
-    """The world turned and every body's axes chosen otherwise."""
+    """The world turned and every body's axes chosen otherwise.
+
+    Which of two segments errs in a loop is a tie now and then, and rounding breaks it: less than a fifth of what is
+    published as uncertainty.
+    """
     case = drawn("hills: uneven odometry", 105)
     axes = torch.from_numpy(Rotation.from_euler("xyz", [0.3, -0.8, 2.0]).as_quat(canonical=True))
     relative = case.graph.target_from_source
@@ -94,7 +98,9 @@ def test_the_answer_is_the_same_in_every_frame() -> None:
     one, two = (solve(graph, profile="slam") for graph in (case.graph, turned))
     back = rotations.multiply(rotations.inverse(axes), two.body_from_world)
     errors = orientation_errors(back, one.body_from_world)
-    assert float(np.degrees(errors.numpy().max())) < 0.02
+    usual = one.uncertainty.median()
+    assert float(errors.max() / usual) < 0.2
+    assert float(errors.median() / usual) < 0.01
 
 
 def test_few_edges_are_left_alone() -> None:

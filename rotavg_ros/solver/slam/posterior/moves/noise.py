@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from rotavg_ros.solver.slam.posterior.densities import log_good
-from rotavg_ros.solver.slam.posterior.em import polish
-from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.solver.slam.posterior.em import polish, settle
+from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.objective import log_noise_prior
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import tails, variances, with_noise
@@ -31,6 +32,8 @@ _REACH = 2
 _JOINT = ("run_steps", "common_share")
 # By what a variance changes when other noise is believed, at most and in steps.
 _SCALES = np.exp(np.linspace(-2.0, 1.2, 17))
+# Labels are settled from a variance of odometry's steps so many times as large, too.
+_WORSE_STEPS = 4.0
 # After so many solves F is about what it will be.
 _FIRST_SOLVES = 2
 
@@ -52,6 +55,33 @@ def tuned(mode: Mode) -> Iterator[Mode]:
                 mode = min(mode, found, key=lambda either: either.cost)
     if mode is not begun:
         yield _polished(mode, mode.state.noise)
+
+
+def propose_worse_odometry(mode: Mode) -> Iterator[Proposal]:
+    """Labels settled from odometry that errs twice as much, where that leaves any open.
+
+    Odometry that is held for better than it is makes those closures false that would tell; without these it seems as
+    good as it is held for. No single label leads out of that while noise stays.
+    """
+    problem, noise = mode.problem, mode.state.noise
+    if _opens_labels(mode, _WORSE_STEPS):
+        state = replace(mode.state, noise=replace(noise, step_variance=_WORSE_STEPS * noise.step_variance))
+        yield Proposal("worse odometry", 0.0, partial(settle, problem, state), problem.limits.slack)
+
+
+def _opens_labels(mode: Mode, factor: float) -> bool:
+    """Whether a closure's label, decided now, would be open if what is predicted of it varied so many times as much."""
+    problem, told, closure = mode.problem, mode.left_out, mode.problem.closure
+    noise = mode.state.noise
+    own, tailed = variances(problem, noise)[closure], tails(problem, noise)[closure]
+    square, predicted, ratio = told.square[closure], told.predicted[closure], problem.priors.tail_ratio
+
+    def log_density(predicted: np.ndarray) -> np.ndarray:
+        return log_good(square, own, predicted, problem.components, tailed, ratio)[0]
+
+    side, decided = np.sign(told.log_odds[closure]), problem.limits.slack
+    changed = told.log_odds[closure] + log_density(factor * predicted) - log_density(predicted)
+    return bool(((side * told.log_odds[closure] > decided) & (side * changed < decided)).any())
 
 
 def _predicted(mode: Mode, noise: Noise) -> float:

@@ -85,22 +85,9 @@ class _Witnesses:
 
 def propose_slips(mode: Mode) -> Iterator[Proposal]:
     """Segments where a turn would explain most of the closures that are held false."""
-    if mode.is_false.sum() < 2 or not mode.state.is_good[: mode.problem.graph.num_segments].any():
-        return
     witnesses = _Witnesses.of(mode)
-    left = witnesses.can_tell & mode.is_false
-    disagrees = witnesses.can_tell & ~mode.is_false
-    found = []
-    for closure in np.flatnonzero(left):
-        if left[closure]:
-            agrees = witnesses.agreeing(closure, mode)
-            left &= ~agrees
-            place, freed, lost = witnesses.best_place(agrees, disagrees)
-            gained = float(witnesses.gain[freed].sum() - witnesses.gain[lost].sum() - witnesses.price[place])
-            if freed.sum() >= _LEAST_WITNESSES:
-                found.append((gained, closure, place, freed, lost))
     before = _log_labelled(mode, mode.is_false)
-    for _, closure, place, freed, lost in sorted(found, key=lambda slip: -slip[0])[: mode.problem.limits.slips]:
+    for _, closure, place, freed, lost in _places(mode, witnesses)[: mode.problem.limits.slips]:
         edge, turn = int(witnesses.segment[place]), witnesses.turned[:, [closure]]
         # Together they gain less than one by one: false closures that repeat a turn are cheap.
         after = _log_labelled(mode, mode.is_false & ~freed)
@@ -109,6 +96,35 @@ def propose_slips(mode: Mode) -> Iterator[Proposal]:
         predicted = before - after + float(witnesses.gain[lost].sum())
         # A slip turns a part of the map, so it is tried where it would be a rival only.
         yield Proposal("slip", predicted, partial(_with_slip, mode, edge, turn), mode.problem.limits.rival)
+
+
+def may_have_slipped(mode: Mode) -> bool:
+    """Whether some slip would pay if the closures that it explains did not repeat each other.
+
+    Of several slips none need pay by itself while the closures that tell of the others are held false: those repeat
+    each other and are cheap.
+    """
+    return any(gained > 0 for gained, *_ in _places(mode, _Witnesses.of(mode))) or any(
+        slip.predicted <= slip.slack for slip in propose_slips(mode)
+    )
+
+
+def _places(mode: Mode, witnesses: _Witnesses) -> list[tuple[float, int, int, np.ndarray, np.ndarray]]:
+    """Slips by what each gains, nats, closure by closure: a closure with its turn, the place, whom it frees and loses.
+
+    The most gain first.
+    """
+    left, found = witnesses.can_tell & mode.is_false, []
+    disagrees = witnesses.can_tell & ~mode.is_false
+    for closure in np.flatnonzero(left if len(witnesses.segment) else np.zeros_like(left)):
+        if left[closure]:
+            agrees = witnesses.agreeing(closure, mode)
+            left &= ~agrees
+            place, freed, lost = witnesses.best_place(agrees, disagrees)
+            gained = float(witnesses.gain[freed].sum() - witnesses.gain[lost].sum() - witnesses.price[place])
+            if freed.sum() >= _LEAST_WITNESSES:
+                found.append((gained, int(closure), place, freed, lost))
+    return sorted(found, key=lambda slip: -slip[0])
 
 
 def _log_turned(mode: Mode, members: np.ndarray, turn: np.ndarray, turned: np.ndarray) -> float:
