@@ -133,10 +133,10 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "noise": {"rows", "solved"},
         "evidence": {"closures", "noise", "rows", "solved"},
         "estimate": {"block_system", "closures", "evidence", "map_turns", "noise", "places", "rows", "solved"},
-        "rivals": {"estimate", "rows"},
+        "search": {"closures", "estimate", "rows"},
         "answer": {"estimate", "rows"},
         "memory": {"answer", "closures", "estimate", "rows"},
-        "solve": {"answer", "estimate", "memory", "rivals", "rows"},
+        "solve": {"answer", "estimate", "memory", "rows", "search"},
     },
     "solver/slam/posterior": {
         "": set(),

@@ -19,6 +19,7 @@ from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.files.ground_truth import attach_truth
 from rotavg_ros.datasets.simulation.poses import false_places
 from rotavg_ros.datasets.simulation.poses.drawn import DrawnPoses, Noise, Poses, redrawn
+from rotavg_ros.datasets.simulation.poses.odometry_jumps import with_jumps
 from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.datasets.simulation.stress.conditions import WORLDS
 from rotavg_ros.errors import UserError
@@ -37,12 +38,15 @@ _SHARE = 0.3
 
 AS_RECORDED = cases.AS_RECORDED
 CLEAN = "no false closures"
+# Odometry whose position jumps so often, too.
+JUMPS, _NUM_JUMPS = "2 jumps of position, 30 % random", 2
 CONDITIONS: dict[str, false_places.Add | None] = {
     CLEAN: None,
     "30 % random": false_places.random_places,
     "30 % parallel corridors": false_places.parallel_corridors,
     "30 % parallel corridors in runs": false_places.parallel_corridors_in_runs,
     "30 % symmetric building": false_places.symmetric_building,
+    JUMPS: false_places.random_places,
 }
 
 
@@ -135,6 +139,8 @@ def _drawn(folder: Path, graph: str, condition: str, seed: int) -> Case:
         drawn = redrawn(topology, poses, CLASSIC_NOISE[graph], rng, stated)
     add = CONDITIONS[condition]
     spoiled = drawn if add is None else false_places.with_share(drawn, _SHARE, add, rng)
+    if condition == JUMPS:
+        spoiled = with_jumps(spoiled, _NUM_JUMPS, rng)
     return known_case(CaseKey(graph, condition, seed), spoiled)
 
 

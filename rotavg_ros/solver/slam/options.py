@@ -25,6 +25,7 @@ SWITCHES: dict[str, str] = {
     "robust-start": "no start weighs odometry down as it does closures",
     "minimum-cuts": "no start turns whole parts",
     "translations": "closures are judged by their rotations alone",
+    "jumps": "odometry's position does not jump while its heading stays",
     "relabelling": "rivals are compared by places under the labels that rotations alone gave them",
     "rivals": "the best labelling alone is published",
 }

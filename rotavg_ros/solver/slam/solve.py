@@ -19,6 +19,7 @@ from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.options import SlamStages
+from rotavg_ros.solver.slam.poses.search.jumps import of_jumps
 from rotavg_ros.solver.slam.poses.solve import has_places, median_poses
 from rotavg_ros.solver.slam.posterior.modes import of_slips, publish
 from rotavg_ros.solver.slam.posterior.solve import search
@@ -92,7 +93,8 @@ def _whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     is_divided = bool(published.warnings) if poses is None else poses.poses.is_divided
     # The posterior's warning is of answers that rotations alone do not tell apart.
     told = estimate.warnings if is_divided else ()
-    estimate = replace(estimate, warnings=(*told, *of_slips(mode)))
+    jumps = () if poses is None else of_jumps(poses.pose)
+    estimate = replace(estimate, warnings=(*told, *of_slips(mode), *jumps))
     if stages == SlamStages():
         estimate = replace(estimate, memory=SlamMemory.of(graph, found.bias, mode, estimate, is_divided))
     return estimate if poses is None else with_poses(graph, estimate, poses)

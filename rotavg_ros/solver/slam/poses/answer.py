@@ -10,6 +10,7 @@ from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
 from rotavg_ros.solver.slam.poses.estimate import PoseMode
 from rotavg_ros.solver.slam.posterior.modes import FAR_TURN, LIKELY, median
+from rotavg_ros.solver.slam.stages import outlier_scores
 from rotavg_ros.view_graph import FALSE_CLOSURE_M
 
 
@@ -22,8 +23,8 @@ class Poses:
         position: ``(N, 3)`` metres, in the frame of the odometry's orientations; roots at the origin.
         variance: ``(N,)`` rad² per component, of orientations.
         position_variance: ``(N,)`` m² per component.
-        outlier_probability: ``(M,)`` that a closure is false, in rotation or place; of odometry its label.
-        rotation_probability: ``(M,)`` that its rotation is; of odometry likewise.
+        outlier_probability: ``(M,)`` that a closure is false, in rotation or place; that odometry's position jumped.
+        rotation_probability: ``(M,)`` that a closure's rotation is false; that odometry slipped.
         precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count; 0 of translations that are not known.
         is_divided: whether another labelling is nearly as likely, by which a part of the map is turned.
     """
@@ -80,9 +81,11 @@ def _of_mode(pose: PoseMode) -> Poses:
     shifts = (samples[:, k:] ** 2).mean(axis=(1, 2))
     between = (1 - passed) * shifts[drawn.above] + passed * shifts[drawn.below]
     segment = problem.segment_of_node
-    length = np.where(segment >= 0, pose.solved.way.length[np.maximum(segment, 0)], 0.0)
-    between += passed * (1 - passed) * length * pose.state.noise.way
-    score, rotation = (drawn.edge_values(value) for value in _scores(pose))
+    spread = pose.solved.way.length[: drawn.num_segments] * pose.state.noise.way + problem.jumps
+    between += passed * (1 - passed) * np.where(segment >= 0, spread[np.maximum(segment, 0)], 0.0)
+    score, rotation = (outlier_scores(drawn, probability) for probability in _scores(pose))
+    if problem.jump is not None:
+        score = np.maximum(score, problem.jump > 0)
     return Poses(np.ascontiguousarray(orientation.T), position, variance, between, score, rotation, _precision(pose))
 
 
@@ -96,6 +99,8 @@ def _precision(pose: PoseMode) -> np.ndarray:
     slipped = drawn.edge_values((drawn.is_odometry & ~problem.mode.state.is_good).astype(np.float64))
     slip = np.radians(problem.mode.problem.priors.slip_deg), problem.priors.slip * problem.typical
     variance += (slipped * drawn.share_of_segment)[:, None] * np.square(slip)
+    if problem.jump is not None:
+        variance[:, 1] += problem.jump
     variance[edges, 0] = 1 / pose.solved.rotation_weight[closure]
     variance[edges, 1] = 1 / pose.solved.closure_weight
     known = np.isfinite(problem.translation).all(axis=1)
@@ -103,7 +108,7 @@ def _precision(pose: PoseMode) -> np.ndarray:
 
 
 def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``(4, N)`` and ``(N, 3)`` poses of all nodes, and how far along its segment each lies, ``(N,)`` in metres passed.
+    """``(4, N)`` and ``(N, 3)`` poses of all nodes, and how far along its segment each lies by variance, ``(N,)``.
 
     What a segment's shift is off by bends it: of a Brownian bridge b with z = −∫ d × dε, E[b | z] = σ² G × Cov(z)⁻¹ z,
     G the lever up to there. What is left then goes with the way passed.
@@ -125,13 +130,17 @@ def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray
     way = problem.displacements(orientation)
     position = state.position[drawn.above] + way.way
     passed = np.zeros(len(position))
-    passed[inner] = way.passed[inner] / np.maximum(way.length[segment], np.finfo(np.float64).tiny)
+    behind, whole = way.passed[inner], way.length[segment]
+    if problem.jump is not None:
+        behind = state.noise.way * behind + problem.drawn_steps.up_to_nodes(problem.jump)[inner]
+        whole = state.noise.way * whole + problem.jumps[segment]
+    passed[inner] = behind / np.maximum(whole, np.finfo(np.float64).tiny)
     position[inner] += passed[inner, None] * (ends - way.displacement[segments])[segment]
     return orientation, position, passed
 
 
 def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
-    """``(E,)`` each: probability that an edge is false, and that its rotation is."""
+    """``(E,)`` each: probability that a closure is false, in rotation or place; and that an edge's rotation is."""
     problem, places, mode = pose.problem, pose.solved.places, pose.problem.mode
     predictions = pose.solved.predictions
     closure, k = mode.problem.closure, problem.turns
@@ -147,6 +156,6 @@ def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
     # An outlier errs by too much in rotation or place, whatever it is called.
     turned = np.concatenate((np.broadcast_to(exceeds, (len(places.chance) - 1, len(exceeds))), if_false[None]))
     elsewhere = places.beyond(FALSE_CLOSURE_M) * problem.told.is_known
-    score = rotation.copy()
+    score = np.zeros(len(rotation))
     score[closure] = (places.chance * (1 - (1 - turned) * (1 - elsewhere))).sum(axis=0)
     return score, rotation

@@ -105,6 +105,10 @@ class DrawnSteps:
             self._at_nodes(after),
         )
 
+    def up_to_nodes(self, of_edge: np.ndarray) -> np.ndarray:
+        """``(N,)`` sums of values ``(M,)`` of odometry's edges from the key node above."""
+        return self._at_nodes(self._so_far(of_edge[self._edge, None]))[:, 0]
+
     def _whole(self, value: np.ndarray) -> np.ndarray:
         """``(S, …)`` sums over segments."""
         if not self._num_segments:

@@ -70,6 +70,10 @@ class PoseMode:
         """Where the key nodes are, and the noise."""
         return self.solved.state
 
+    def jumps_like(self, other: PoseMode) -> bool:
+        """Whether odometry's position jumps in the same segments."""
+        return np.array_equal(self.problem.jumps > 0, other.problem.jumps > 0)
+
 
 @dataclass(frozen=True)
 class PoseStart:
@@ -110,6 +114,7 @@ def estimate_poses(
     start: PoseStart | None = None,
     level: float = USUAL,
     until: PoseMode | None = None,
+    sorts: bool = False,
 ) -> PoseMode:
     """Poses of a labelling.
 
@@ -119,6 +124,7 @@ def estimate_poses(
         start: where to begin; default: at what rotations say, no closure's translation believed, …
         level: … with variances of shifts so many times what is believed beforehand.
         until: no further than where these poses' closures join right places, too.
+        sorts: no further than where places are sorted out, most variances as they begin.
     """
     is_good = problem.mode.state.is_good[problem.mode.problem.closure]
     judge = Judge(problem.told, problem.turns, problem.priors, is_good if hold else None)
@@ -141,13 +147,15 @@ def estimate_poses(
         number += 1
         if is_at_rest:
             held = min(held, number)
+        if sorts and (is_at_rest or number == _HELD):
+            break
         if until is not None and number >= _ALIKE_AFTER and after.is_like(until.solved.places):
             break
         if number == most or (
             number > held and is_at_rest and np.abs(noise - state.noise.logarithms).max() < _NOISE_CONVERGED
         ):
             break
-        state, change = _with_noise(solved.state, noise, change, is_held=number <= held)
+        state, change = _with_noise(solved.state, noise, change, is_held=sorts or number <= held)
         places = _following(after, problem, solved.state.noise, state.noise)
     if not hold:
         return PoseMode(problem, solved, math.nan)

@@ -18,6 +18,7 @@ from rotavg_ros.solver.slam.poses.answer import Poses
 from rotavg_ros.solver.slam.poses.closures import Places
 from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart
 from rotavg_ros.solver.slam.poses.rows import PoseNoise, PoseProblem, PoseState
+from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -60,6 +61,14 @@ class PoseMemory:
     def num_edges(self) -> int:
         """M."""
         return len(self.poses.precision)
+
+    def problem(self, graph: ViewGraph, translation: np.ndarray, mode: Mode) -> PoseProblem:
+        """Of a graph that has grown: odometry jumps where it did."""
+        jump, before = None, self.pose.problem.jump
+        if before is not None:
+            jump = np.zeros(graph.num_edges)
+            jump[: len(before)] = before
+        return PoseProblem(graph, translation, mode, jump=jump)
 
     def start_alone(self, graph: ViewGraph) -> torch.Tensor | None:
         """``(N, 4)`` where rotations alone go on in a graph that has grown; None where new nodes hang otherwise."""

@@ -18,7 +18,7 @@ _Prior = tuple[float, float]
 def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     """All variances, each from its part of what is left over (Harville 1977), under their priors."""
     noise, places = solved.state.noise, solved.places
-    k, segments = problem.turns, np.flatnonzero(~problem.slipped)
+    k, segments = problem.turns, np.flatnonzero(~problem.slipped & (problem.jumps == 0))
     redundancy = solved.factor.redundancy[segments]
     half = inverse_root(solved.covariance[segments][:, ::-1, ::-1])[:, ::-1, ::-1].transpose(0, 2, 1)
     pulled = np.matmul(half, solved.left[segments, k:])

@@ -107,12 +107,15 @@ class PoseProblem:
         translation: ``(M, 3)`` position of the target in the source's frame, metres; NaN where unknown, of closures.
         mode: what rotations alone make of it.
         priors: of translations.
+        jump: ``(M,)`` m² per component, variance of the jump of each edge of odometry; 0 where there is none. None:
+            nowhere.
     """
 
     graph: ViewGraph
     translation: np.ndarray
     mode: Mode
     priors: PlacePriors = field(default_factory=PlacePriors)
+    jump: np.ndarray | None = None
 
     @cached_property
     def drawn(self) -> ClosureGraph:
@@ -205,6 +208,35 @@ class PoseProblem:
     def slipped(self) -> np.ndarray:
         """``(S,)`` bool, segments that slipped."""
         return np.asarray(~self.mode.state.is_good[: self.drawn.num_segments])
+
+    @cached_property
+    def jumps(self) -> np.ndarray:
+        """``(S,)`` m² per component, variance of the jump of each segment's shift; 0 where there is none."""
+        of_segment = np.zeros(self.drawn.num_segments)
+        if self.jump is not None:
+            segment = self.drawn.segment_of_edge
+            on_segment = np.flatnonzero(segment >= 0)
+            np.maximum.at(of_segment, segment[on_segment], self.jump[on_segment])
+        return of_segment
+
+    @cached_property
+    def _step_reports(self) -> np.ndarray:
+        """``(M,)`` metres, what one step of each edge may have reported: of several, what is left beside usual ones."""
+        length, steps = np.linalg.norm(self.lengths, axis=1), self.graph.steps.numpy()
+        return np.asarray(np.maximum(length - (steps - 1) * self.typical, length / steps))
+
+    @cached_property
+    def longest_steps(self) -> np.ndarray:
+        """``(S,)`` the edge of each segment that reports the longest step."""
+        segment = self.drawn.segment_of_edge
+        edge = np.flatnonzero(segment >= 0)
+        order = np.lexsort((-self._step_reports[edge], segment[edge]))
+        return np.asarray(edge[order][np.unique(segment[edge][order], return_index=True)[1]])
+
+    @cached_property
+    def could_jump(self) -> np.ndarray:
+        """``(S,)`` m² per component, variance of a jump of each segment: as far as its longest step reports."""
+        return np.asarray(self._step_reports[self.longest_steps] ** 2)
 
     def rotation_variance(self, noise: PoseNoise) -> np.ndarray:
         """``(E,)`` rad², of odometry as labelled and of closures as good ones, tails as the last solve weighed them."""
@@ -351,6 +383,7 @@ class PoseProblem:
         variance = noise.way * np.maximum(way.length, _LEAST_LENGTH * self.typical)
         slipped = drawn.is_odometry & ~self.mode.state.is_good
         variance += np.where(slipped, (self.priors.slip * self.typical) ** 2, 0.0)
+        variance[:num_segments] += self.jumps
         # Odometry beside the chain that is not believed, which nothing hangs on, does not pull.
         variance[num_segments:] = np.where(slipped, variance / _NOTHING, variance)[num_segments:]
         variance[self.mode.problem.closure] = self.own_variance(noise)

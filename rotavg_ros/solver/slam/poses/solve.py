@@ -9,8 +9,8 @@ import numpy as np
 from rotavg_ros.solver.slam.poses.answer import answer
 from rotavg_ros.solver.slam.poses.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.memory import PoseMemory
-from rotavg_ros.solver.slam.poses.rivals import rival_poses
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.search.rivals import rival_poses
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
 
@@ -45,7 +45,7 @@ def median_poses(
 
 def poses_of_update(graph: ViewGraph, mode: Mode, memory: PoseMemory) -> PoseMemory | None:
     """Of a graph without its bias that has grown, with the labels of its rotations; None if all is due."""
-    problem = PoseProblem(graph, _translations(graph), mode)
+    problem = memory.problem(graph, _translations(graph), mode)
     start = memory.start(graph, problem)
     if start is None:
         return None

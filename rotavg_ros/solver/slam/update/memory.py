@@ -153,12 +153,14 @@ class SlamMemory:
     def thinned_to(self, graph: ViewGraph) -> SlamMemory | None:
         """The labels of a graph that has lost keyframes since, for :meth:`updated`; None where that would not do.
 
-        Where odometry slipped is not known any more once edges of it were drawn together.
+        Where odometry slipped, or jumped, is not known any more once edges of it were drawn together.
         """
         odometry = self.graph.is_odometry.numpy()
         if graph.num_nodes >= self.graph.num_nodes:
             return None
         if (self.trusted[odometry] <= _GOOD).any() or first_of_each(graph) is not None:
+            return None
+        if self.poses is not None and self.poses.pose.problem.jump is not None:
             return None
         trusted = thinned_out(self.trusted, self.graph, graph, _NEW)
         if trusted is None:
@@ -261,13 +263,13 @@ def estimate_of(published: Published, noise: Noise) -> Estimate:
 def with_poses(graph: ViewGraph, estimate: Estimate, memory: PoseMemory) -> Estimate:
     """The estimate of rotations alone, with orientations, positions and closures' scores by translations as well.
 
-    Whether odometry slipped is told by rotations.
+    Whether odometry slipped is told by rotations, whether its position jumped by translations.
     """
     poses, goes_on = memory.poses, estimate.memory
-    by_both = (poses.outlier_probability, poses.rotation_probability)
-    score, rotation_score = (
-        torch.where(graph.is_odometry, estimate.outlier_score, torch.from_numpy(probability)) for probability in by_both
-    )
+    slipped, is_odometry = estimate.outlier_score, graph.is_odometry
+    by_both, rotation = (torch.from_numpy(each) for each in (poses.outlier_probability, poses.rotation_probability))
+    score = torch.where(is_odometry, slipped + by_both - slipped * by_both, by_both)
+    rotation_score = torch.where(is_odometry, slipped, rotation)
     places = Places(
         torch.from_numpy(poses.position),
         torch.from_numpy(poses.position_variance),

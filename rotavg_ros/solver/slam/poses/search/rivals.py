@@ -13,6 +13,7 @@ import numpy as np
 
 from rotavg_ros.solver.slam.poses.estimate import USUAL, PoseMode, PoseStart, estimate_poses, likeliest_level
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.search.jumps import likeliest_jump, log_jump_prior, with_jump, without_small_jumps
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
@@ -23,6 +24,8 @@ _MAX_RIVALS, _FARTHEST, _FAR = 5, 20.0, 5.0
 # Labels follow places so many times at most, as long as −log p falls by this, nats, and may come near the least so far.
 _ROUNDS, _LEAST_GAIN, _HOPELESS = 4, 0.1, 20.0
 _GOOD = 0.5
+# Jumps at most; one is tried if −log p is predicted to rise by no more than this, nats.
+_MAX_JUMPS, _SLACK = 8, 1.0
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,11 @@ class Rival:
     @property
     def cost(self) -> float:
         """−log p of rotations and translations, nats."""
-        return self.mode.cost + self.pose.cost
+        return self.mode.cost + self.pose.cost - log_jump_prior(self.pose.problem)
+
+    def is_same(self, other: Rival) -> bool:
+        """Whether both have the same labels."""
+        return self.mode.labels == other.mode.labels and self.pose.jumps_like(other.pose)
 
 
 @dataclass(frozen=True)
@@ -74,18 +81,58 @@ def rival_poses(
         for pose in _begun(PoseProblem(graph, translation, mode)):
             least = min((rival.cost for rival in ended), default=np.inf)
             ended.append(settling(pose, least))
+    ended.extend(_jumping(min(ended, key=lambda rival: rival.cost)))
     rivals: list[Rival] = []
     for rival in sorted(ended, key=lambda rival: rival.cost):
         is_far = rivals and rival.cost > rivals[0].cost + _FAR
-        if not is_far and not any(rival.mode.labels == other.mode.labels for other in rivals):
+        if not is_far and not any(rival.is_same(other) for other in rivals):
             rivals.append(rival)
     cost = np.array([rival.cost for rival in rivals])
     share = np.exp(cost[0] - cost)
     poses: list[PoseMode] = []
     for rival in rivals:
-        problem = PoseProblem(graph, translation, tuned(rival.mode))
+        problem = replace(rival.pose.problem, mode=tuned(rival.mode))
         poses.append(estimate_poses(problem, start=PoseStart.at(rival.pose)))
     return Rivals([rival.mode for rival in rivals], poses, share / share.sum())
+
+
+def _jumping(rival: Rival) -> list[Rival]:
+    """The same labelling with odometry's position jumping, as long as that is likelier, or would be a rival."""
+    before = rival.pose.problem
+    if "jumps" in before.mode.problem.without:
+        return []
+    rivals = [rival]
+    for _ in range(_MAX_JUMPS):
+        jump = likeliest_jump(rivals[-1].pose)
+        if jump is None or jump.gained < -_SLACK:
+            break
+        rivals.append(_settled(*with_jump(rivals[-1].pose, jump)))
+        if rivals[-1].cost > rivals[-2].cost:
+            break
+    if rival.pose.state.noise.way > before.turn_noise.way:
+        # Odometry that jumps seems to err by more everywhere, until nothing seems wrong: they are looked for before.
+        sorted_out = _with_jumps(estimate_poses(before, sorts=True))
+        if sorted_out.problem is not before:
+            rivals.append(_settled(sorted_out.problem, PoseStart.at(sorted_out)))
+    for each in rivals[1:]:
+        if (problem := without_small_jumps(each.pose)) is not None:
+            rivals.append(_settled(problem, PoseStart.at(each.pose)))
+    return rivals[1:]
+
+
+def _settled(problem: PoseProblem, start: PoseStart) -> Rival:
+    return settling(estimate_poses(problem, start=start))
+
+
+def _with_jumps(pose: PoseMode) -> PoseMode:
+    """Poses with all jumps that gain, most variances as they began."""
+    for _ in range(_MAX_JUMPS):
+        jump = likeliest_jump(pose)
+        if jump is None or jump.gained < 0:
+            break
+        problem, start = with_jump(pose, jump)
+        pose = estimate_poses(problem, start=start, sorts=True)
+    return pose
 
 
 def _first(modes: Sequence[Mode]) -> list[Mode]:

@@ -1,0 +1,34 @@
+"""Odometry whose position jumps while its heading does not: wheels that spin, a tracker that was lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from rotavg_ros.datasets.simulation.poses.drawn import DrawnPoses
+
+# How far, in median steps of the odometry; and the share of the path at either end that no closure may judge.
+STEPS = (3.0, 40.0)
+_ENDS = 0.1
+
+
+def with_jumps(drawn: DrawnPoses, count: int, rng: np.random.Generator) -> DrawnPoses:
+    """So many steps of odometry off by any direction's jump, each by itself.
+
+    Raises:
+        ValueError: fewer steps than jumps.
+    """
+    odometry = np.flatnonzero(drawn.graph.is_odometry.numpy())
+    kept = int(_ENDS * len(odometry))
+    steps = rng.choice(odometry[kept : len(odometry) - kept], count, replace=False)
+    assert drawn.graph.translation is not None
+    translation = drawn.graph.translation.clone()
+    typical = float(np.median(np.linalg.norm(translation[odometry].numpy(), axis=1)))
+    direction = rng.normal(size=(count, 3)) * [1, 1, not drawn.poses.planar]
+    length = typical * rng.uniform(*STEPS, count) / np.linalg.norm(direction, axis=1)
+    translation[steps] += torch.from_numpy(direction * length[:, None])
+    is_wrong = drawn.is_wrong.copy()
+    is_wrong[steps] = True
+    return replace(drawn, graph=replace(drawn.graph, translation=translation), is_wrong=is_wrong)

@@ -1,0 +1,129 @@
+"""Odometry whose position jumps while its heading does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros import ViewGraph, rotations, solve
+from rotavg_ros.datasets.simulation.poses.odometry_jumps import STEPS
+from rotavg_ros.evaluation.common.cases import Case
+from rotavg_ros.evaluation.slam import pose_cases
+from rotavg_ros.metrics import orientation_errors
+from rotavg_ros.solver.solution import Solution
+
+from .test_pose_memory import go_on, up_to
+from .test_poses import graph_of, simulated
+
+
+def case_of(kind: str, seed: int) -> Case:
+    (case,) = (one.draw(seed) for one in pose_cases.kinds(Path, [kind]) if one.name == kind)
+    assert case is not None
+    return case
+
+
+def errors_of(case: Case, solution: Solution) -> tuple[float, float]:
+    """Mean of orientations, degrees, and of positions, metres, the first keyframe's pose given."""
+    assert case.poses is not None and solution.position is not None
+    turned = np.degrees(orientation_errors(solution.body_from_world, case.truth).numpy().mean())
+    frame = rotations.multiply(rotations.inverse(case.truth[0]), solution.body_from_world[0])
+    placed = rotations.rotate(frame.expand(len(case.truth), 4), solution.position - solution.position[0])
+    return float(turned), float((placed - (case.poses.position - case.poses.position[0])).norm(dim=1).mean())
+
+
+def warned_of_jumps(solution: Solution) -> list[str]:
+    return [warning for warning in solution.warnings if "held to have jumped" in warning]
+
+
+def jumped(graph: ViewGraph, step: int, shift: tuple[float, float, float]) -> ViewGraph:
+    """With one step of odometry off by so much."""
+    assert graph.translation is not None
+    translation = graph.translation.clone()
+    edge = int(torch.nonzero(graph.is_odometry & (graph.target == step))[0])
+    translation[edge] += torch.tensor(shift, dtype=torch.float64)
+    return replace(graph, translation=translation)
+
+
+# In the first building the second jump takes the first one back, and in the first hills they are ten steps apart:
+# neither pays by itself.
+@pytest.mark.parametrize(("world", "seed"), [("building", 5), ("building", 8), ("hills", 3), ("hills", 7)])
+def test_closures_across_a_jump_are_right(world: str, seed: int) -> None:
+    case = case_of(f"{world}: {pose_cases.JUMPS}", seed)
+    solution = solve(case.graph)
+    is_flagged = solution.outlier_score.numpy() > 0.5
+    is_closure, is_wrong = case.is_closure.numpy(), ~case.is_inlier.numpy()
+    assert (is_flagged == is_wrong)[is_closure].mean() > 0.98
+    turned, placed = errors_of(case, solution)
+    assert turned < 1.5 and placed < 0.3
+    (warning,) = warned_of_jumps(solution)
+    assert "2 times" in warning
+    np.testing.assert_array_equal(is_flagged[~is_closure], is_wrong[~is_closure])
+    rotation = solution.rotation_score
+    assert rotation is not None and float(rotation[case.graph.is_odometry].max()) < 0.05
+
+
+def test_without_jumps_they_are_flagged() -> None:
+    case = case_of(f"building: {pose_cases.JUMPS}", 5)
+    solution = solve(case.graph, method="neurora~jumps")
+    is_good = (case.is_closure & case.is_inlier).numpy()
+    assert (solution.outlier_score.numpy() > 0.5)[is_good].mean() > 0.2
+    assert not warned_of_jumps(solution)
+
+
+@pytest.mark.parametrize("condition", ["30 % parallel corridors in runs", "30 % symmetric building", "30 % random"])
+@pytest.mark.parametrize("seed", [5, 6])
+def test_false_closures_that_agree_are_no_jump(condition: str, seed: int) -> None:
+    case = case_of(f"building: {condition}", seed)
+    solution = solve(case.graph)
+    assert not warned_of_jumps(solution)
+    assert float(solution.outlier_score[case.graph.is_odometry].max()) < 0.05
+
+
+def test_a_jump_is_one_however_its_step_is_written() -> None:
+    """From the newer end to the older one, and in other units of length."""
+    case = case_of(f"building: {pose_cases.JUMPS}", 6)
+    graph = case.graph
+    assert graph.translation is not None
+    back = rotations.inverse(graph.target_from_source)
+    reversed_step = -rotations.rotate(graph.target_from_source, graph.translation)
+    is_odometry = graph.is_odometry
+    turned_round = replace(
+        graph,
+        source=torch.where(is_odometry, graph.target, graph.source),
+        target=torch.where(is_odometry, graph.source, graph.target),
+        target_from_source=torch.where(is_odometry[:, None], back, graph.target_from_source),
+        translation=torch.where(is_odometry[:, None], reversed_step, graph.translation),
+    )
+    before, after = solve(graph), solve(turned_round)
+    assert (before.outlier_score > 0.5).eq(after.outlier_score > 0.5)[~is_odometry].all()
+    assert len(warned_of_jumps(after)) == 1
+    assert before.position is not None and after.position is not None
+    assert float((before.position - after.position).norm(dim=1).max()) < 0.1
+
+
+def test_a_jump_is_remembered_while_the_graph_grows() -> None:
+    graph = jumped(graph_of(simulated(2, num_keyframes=400, laps=3.0, closures_per_keyframe=0.3)), 120, (7.0, 4.0, 0.0))
+    answer = solve(up_to(graph, 300))
+    assert len(warned_of_jumps(answer)) == 1
+    for nodes in range(302, 331, 4):
+        answer = go_on(up_to(graph, nodes), answer)
+        assert "refine" not in answer.stage_seconds
+    whole = solve(up_to(graph, nodes))
+    assert answer.position is not None and whole.position is not None
+    assert float((answer.position - whole.position).norm(dim=1).max()) < 0.5
+    assert float((answer.outlier_score > 0.5).double().mean()) < 0.02
+
+
+def test_jumps_are_as_far_as_they_say() -> None:
+    case = case_of(f"building: {pose_cases.JUMPS}", 7)
+    assert case.graph.translation is not None
+    odometry = ~case.is_closure.numpy()
+    length = case.graph.translation.norm(dim=1).numpy()[odometry]
+    far = ~case.is_inlier.numpy()[odometry]
+    assert far.sum() == 2
+    typical = np.median(length)
+    assert (length[far] > (STEPS[0] - 2) * typical).all() and (length[far] < (STEPS[1] + 2) * typical).all()
