@@ -6,23 +6,31 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from rotavg_ros.datasets.simulation.poses.drawn import DrawnPoses
+from rotavg_ros.datasets.simulation.poses.drawn import DrawnPoses, IndexArray
 
 # How far, in median steps of the odometry; and the share of the path at either end that no closure may judge.
 STEPS = (3.0, 40.0)
 _ENDS = 0.1
+_TRIES = 400
 
 
 def with_jumps(drawn: DrawnPoses, count: int, rng: np.random.Generator) -> DrawnPoses:
-    """So many steps of odometry off by any direction's jump, each by itself.
+    """So many steps of odometry off by any direction's jump, each by itself; good closures hold all together without.
 
     Raises:
-        ValueError: fewer steps than jumps.
+        ValueError: fewer steps than jumps, or hardly any that closures hold together without.
     """
     odometry = np.flatnonzero(drawn.graph.is_odometry.numpy())
     kept = int(_ENDS * len(odometry))
-    steps = rng.choice(odometry[kept : len(odometry) - kept], count, replace=False)
+    for _ in range(_TRIES):
+        steps = rng.choice(odometry[kept : len(odometry) - kept], count, replace=False)
+        if _holds_without(drawn, steps):
+            break
+    else:
+        raise ValueError("hardly a step of the odometry that closures hold together without")
     assert drawn.graph.translation is not None
     translation = drawn.graph.translation.clone()
     typical = float(np.median(np.linalg.norm(translation[odometry].numpy(), axis=1)))
@@ -32,3 +40,11 @@ def with_jumps(drawn: DrawnPoses, count: int, rng: np.random.Generator) -> Drawn
     is_wrong = drawn.is_wrong.copy()
     is_wrong[steps] = True
     return replace(drawn, graph=replace(drawn.graph, translation=translation), is_wrong=is_wrong)
+
+
+def _holds_without(drawn: DrawnPoses, steps: IndexArray) -> bool:
+    used = ~drawn.is_wrong
+    used[steps] = False
+    ends = drawn.graph.source.numpy()[used], drawn.graph.target.numpy()[used]
+    links = coo_array((np.ones(len(ends[0])), ends), shape=(drawn.graph.num_nodes,) * 2)
+    return bool(connected_components(links, directed=False)[0] == 1)
