@@ -115,14 +115,16 @@ class Solving:
         return "paused: inputs are kept, nothing is solved" if paused else "running"
 
     def save(self) -> str:
-        state_file = self._own_state_file()
+        state_file, content = self._own_state_file(), self._content()
         self._estimator.save(state_file)
+        self._saved = content
         self._health.saved()
         return f"saved to {state_file}"
 
     def load(self) -> str:
         state_file = self._own_state_file(to_write=False)
         self._estimator.load(state_file)
+        self._saved = self._content()
         self._forget_answer()
         return f"loaded {self._estimator.counts().keyframes} keyframes from {state_file}"
 
@@ -142,11 +144,17 @@ class Solving:
             return
         try:
             self.save()
-            self._saved = content
         except Exception as error:
             if str(error) != self._health.save_failure:
                 self._node.get_logger().error(str(error))
             self._health.saved(failure=str(error))
+
+    def tell_what_is_lost(self) -> None:
+        """At the end, where nothing saves by itself: that keyframes were not saved, if any were not."""
+        keyframes = self._estimator.counts().keyframes
+        if keyframes > 0 and self._content() != self._saved:
+            how = "set autosave_period_s" if self._state_file is not None else "set state_file and autosave_period_s"
+            self._node.get_logger().warning(f"{keyframes} keyframes are lost that were not saved; {how} to keep them")
 
     def back_up_quietly(self, discarded: Discarded) -> None:
         """Keep what was forgotten or replaced beside the state file; the diagnostics tell of it, or why it failed."""

@@ -235,3 +235,17 @@ def test_parameters_change_live_all_or_none(live_node) -> None:
         assert not result.successful and reason in result.reason
     (descriptor,) = live_node.call("describe_parameters", DescribeParameters, names=["outlier_threshold"]).descriptors
     assert descriptor.description and descriptor.floating_point_range[0].to_value == 1.0
+
+
+def test_keyframes_that_nobody_saved_are_told_of_at_the_end(live_node, tmp_path) -> None:
+    live_node.start(*EVERY_MESSAGE, f"state_file:={tmp_path / 'state.npz'}")
+    feed(live_node, 0, 10)
+    live_node.wait_for_silence()
+    assert live_node.call("save").success
+    assert live_node.stop(signal.SIGTERM) == 0
+    assert "lost" not in live_node.process.output
+    live_node.start(*EVERY_MESSAGE)
+    feed(live_node, 0, 10)
+    live_node.wait_for_silence()
+    assert live_node.stop(signal.SIGTERM) == 0
+    assert "10 keyframes are lost that were not saved; set state_file and autosave_period_s" in live_node.process.output
