@@ -33,7 +33,7 @@ _MAX_UPDATE_SOLVES = 6
 _MAX_TURN = 0.3
 # Variances change by no more than this factor from solve to solve; most stay while places are sorted out, for so
 # many solves at most.
-_SLOWEST, _HELD = 16.0, 8
+_SLOWEST, HELD = 16.0, 8
 # After so many it is told whether places come out as those of other poses.
 _ALIKE_AFTER = 4
 # Which variances do not: those of closures' shifts by themselves.
@@ -114,7 +114,7 @@ def estimate_poses(
     start: PoseStart | None = None,
     level: float = USUAL,
     until: PoseMode | None = None,
-    sorts: bool = False,
+    held_for: int | None = None,
 ) -> PoseMode:
     """Poses of a labelling.
 
@@ -124,7 +124,7 @@ def estimate_poses(
         start: where to begin; default: at what rotations say, no closure's translation believed, …
         level: … with variances of shifts so many times what is believed beforehand.
         until: no further than where these poses' closures join right places, too.
-        sorts: no further than where places are sorted out, most variances as they begin.
+        held_for: so many solves at most, with most variances as they begin, or until places rest.
     """
     is_good = problem.mode.state.is_good[problem.mode.problem.closure]
     judge = Judge(problem.told, problem.turns, problem.priors, is_good if hold else None)
@@ -134,7 +134,7 @@ def estimate_poses(
         places, is_new = start.over(places), start.column < 0
     change, sorted_by = np.zeros(len(state.noise.logarithms)), np.zeros_like(places.chance)
     pace = Pace(np.full((2, len(is_good)), _SHARE), np.zeros((2, len(is_good))))
-    number, held, most = 0, *((_HELD, _MAX_SOLVES) if start is None else (0, start.solves))
+    number, held, most = 0, *((HELD, _MAX_SOLVES) if start is None else (0, start.solves))
     while True:
         solved = _solve(problem, state, places, judge)
         rest()
@@ -147,7 +147,7 @@ def estimate_poses(
         number += 1
         if is_at_rest:
             held = min(held, number)
-        if sorts and (is_at_rest or number == _HELD):
+        if held_for is not None and (is_at_rest or number == held_for):
             break
         if until is not None and number >= _ALIKE_AFTER and after.is_like(until.solved.places):
             break
@@ -155,7 +155,7 @@ def estimate_poses(
             number > held and is_at_rest and np.abs(noise - state.noise.logarithms).max() < _NOISE_CONVERGED
         ):
             break
-        state, change = _with_noise(solved.state, noise, change, is_held=sorts or number <= held)
+        state, change = _with_noise(solved.state, noise, change, is_held=held_for is not None or number <= held)
         places = _following(after, problem, solved.state.noise, state.noise)
     if not hold:
         return PoseMode(problem, solved, math.nan)

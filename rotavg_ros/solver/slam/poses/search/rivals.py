@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rotavg_ros.solver.slam.poses.estimate import USUAL, PoseMode, PoseStart, estimate_poses, likeliest_level
+from rotavg_ros.solver.slam.poses.estimate import HELD, USUAL, PoseMode, PoseStart, estimate_poses, likeliest_level
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.search.jumps import likeliest_jump, log_jump_prior, with_jump, without_small_jumps
 from rotavg_ros.solver.slam.posterior.em import polish
@@ -101,6 +101,22 @@ def _jumping(rival: Rival) -> list[Rival]:
     before = rival.pose.problem
     if "jumps" in before.mode.problem.without:
         return []
+    begun = [rival]
+    # With a jump what is right may be given up, or odometry seems to err by more everywhere until nothing seems wrong:
+    # they are looked for before closures pull, and before variances grow.
+    has_grown = rival.pose.state.noise.way > before.turn_noise.way
+    for solves in (1, HELD) if has_grown else (1,):
+        jumped = _with_jumps(estimate_poses(before, held_for=solves))
+        if jumped.problem is not before and not any(jumped.jumps_like(other.pose) for other in begun):
+            begun.append(_settled(jumped.problem, PoseStart.at(jumped)))
+    found = [likelier for start in begun for likelier in _jumping_further(start)]
+    for each in (*begun[1:], *found):
+        if (problem := without_small_jumps(each.pose)) is not None:
+            found.append(_settled(problem, PoseStart.at(each.pose)))
+    return [*begun[1:], *found]
+
+
+def _jumping_further(rival: Rival) -> list[Rival]:
     rivals = [rival]
     for _ in range(_MAX_JUMPS):
         jump = likeliest_jump(rivals[-1].pose)
@@ -109,14 +125,6 @@ def _jumping(rival: Rival) -> list[Rival]:
         rivals.append(_settled(*with_jump(rivals[-1].pose, jump)))
         if rivals[-1].cost > rivals[-2].cost:
             break
-    if rival.pose.state.noise.way > before.turn_noise.way:
-        # Odometry that jumps seems to err by more everywhere, until nothing seems wrong: they are looked for before.
-        sorted_out = _with_jumps(estimate_poses(before, sorts=True))
-        if sorted_out.problem is not before:
-            rivals.append(_settled(sorted_out.problem, PoseStart.at(sorted_out)))
-    for each in rivals[1:]:
-        if (problem := without_small_jumps(each.pose)) is not None:
-            rivals.append(_settled(problem, PoseStart.at(each.pose)))
     return rivals[1:]
 
 
@@ -131,7 +139,7 @@ def _with_jumps(pose: PoseMode) -> PoseMode:
         if jump is None or jump.gained < 0:
             break
         problem, start = with_jump(pose, jump)
-        pose = estimate_poses(problem, start=start, sorts=True)
+        pose = estimate_poses(problem, start=start, held_for=HELD)
     return pose
 
 
