@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.poses.closures import given_turn
 from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
@@ -204,6 +205,7 @@ class _Witnesses:
 
     def place(self, speaker: int) -> tuple[int, int, float]:
         """Where a jump gains most that makes right what one closure and all that agree say; and what it gains."""
+        rest()
         change = self._changed(speaker)
         across = np.zeros(len(self.segment) + 1)
         np.add.at(across, self.first, change)
@@ -218,6 +220,7 @@ class _Witnesses:
         Closures into it say one shift, and those out of it the opposite one. With A and B sums over closures by where
         both ends are, all begins and ends are looked at at once.
         """
+        rest()
         count = len(self.segment)
         bins = np.minimum(np.arange(count + 1) * _ENDS // max(count, _ENDS), _ENDS)
         older, newer = bins[self.first], bins[self.last]
