@@ -236,7 +236,7 @@ class PoseProblem:
     @cached_property
     def could_jump(self) -> np.ndarray:
         """``(S,)`` m² per component, variance of a jump of each segment: as far as its longest step reports."""
-        return np.asarray(self._step_reports[self.longest_steps] ** 2)
+        return np.asarray(np.maximum(self._step_reports[self.longest_steps], _LEAST_LENGTH * self.typical) ** 2)
 
     def rotation_variance(self, noise: PoseNoise) -> np.ndarray:
         """``(E,)`` rad², of odometry as labelled and of closures as good ones, tails as the last solve weighed them."""

@@ -250,9 +250,9 @@ class _Witnesses:
         The first that speaks tells how far it is, and gains nothing.
         """
         square, known = float((self.shift[speaker] ** 2).sum()), float(self.spread[speaker])
-        total = self.variance + known
-        width = self.shift.shape[1] * np.log(total / known) / 2
-        return np.asarray(np.where(self.price > 0, self.price + square / (2 * total) + width, 0.0))
+        width = self.shift.shape[1] * np.log1p(self.variance / known) / 2
+        off = square / (2 * np.maximum(self.variance, np.finfo(np.float64).tiny))
+        return np.asarray(np.where(self.price > 0, self.price + off + width, 0.0))
 
     def _changed(self, speaker: int, sign: float = 1.0) -> np.ndarray:
         """``(C,)`` nats, what closures gain by the jump that one speaks of, those that lie across it."""
