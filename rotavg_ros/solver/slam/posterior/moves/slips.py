@@ -86,8 +86,9 @@ class _Witnesses:
 def propose_slips(mode: Mode) -> Iterator[Proposal]:
     """Segments where a turn would explain most of the closures that are held false."""
     witnesses = _Witnesses.of(mode)
-    before = _log_labelled(mode, mode.is_false)
-    for _, closure, place, freed, lost in _places(mode, witnesses)[: mode.problem.limits.slips]:
+    places = _places(mode, witnesses)[: mode.problem.limits.slips]
+    before = _log_labelled(mode, mode.is_false) if places else 0.0
+    for _, closure, place, freed, lost in places:
         edge, turn = int(witnesses.segment[place]), witnesses.turned[:, [closure]]
         # Together they gain less than one by one: false closures that repeat a turn are cheap.
         after = _log_labelled(mode, mode.is_false & ~freed)
