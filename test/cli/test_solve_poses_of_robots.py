@@ -89,7 +89,8 @@ def test_a_real_robot(shared_data: Path, tmp_path: Path, threshold: str, metres:
     assert np.degrees((off.mean().inv() * off).magnitude().mean()) < degrees
     vertices, found = least_squares(tmp_path / "graph.g2o", from_odometry=False)
     assert rms(vertices, truth.position_gt) < metres
-    assert rms(found, truth.position_gt) <= 1.1 * rms(vertices, truth.position_gt)
+    # Of 0.000 two closures in the file are about as likely false as right.
+    assert rms(found, truth.position_gt) <= 1.15 * rms(vertices, truth.position_gt)
 
     wrong, right = _places(truth, known)
     flagged = np.array([row["outlier"] == "1" for row in _rows(tmp_path / "edges.csv")])

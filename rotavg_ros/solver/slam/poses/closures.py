@@ -17,6 +17,8 @@ GOOD = 2
 _OTHERWISE = 0.5
 # In which errors are longer than a limit: in a plane, too, where that is a little too often.
 _DIMENSIONS = 3
+# Closures detected before (and after) one that it is compared with.
+_WINDOW = 48
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,24 @@ class Told:
     sign: np.ndarray
     detection: np.ndarray
     detected: np.ndarray
+
+    def detected_near(self, rows: np.ndarray, tells: np.ndarray, *, in_order: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Some closures with those that were detected not long before, or after, among others; never with themselves.
+
+        Args:
+            rows: the closures.
+            tells: the others, in the order of their detection.
+            in_order: those before alone.
+
+        Returns:
+            ``(P,)`` each of ``rows`` and of ``tells``.
+        """
+        first = np.searchsorted(self.detected[tells], self.detected[rows])
+        place = first[:, None] + np.arange(-_WINDOW, 0)
+        if not in_order:
+            place = np.concatenate((place, (first + np.isin(rows, tells))[:, None] + np.arange(_WINDOW)), axis=1)
+        which, columns = np.nonzero((place >= 0) & (place < len(tells)))
+        return rows[which], tells[place[which, columns]]
 
 
 @dataclass(frozen=True)
@@ -148,11 +168,13 @@ class GivenTurn:
 
     Attributes:
         log_turn: ``(C,)`` nats, of the turn.
+        square: ``(C,)`` of the turn in standard deviations.
         along: ``(C, m)`` metres, mean.
         spread: ``(C, m)`` m², variance.
     """
 
     log_turn: np.ndarray
+    square: np.ndarray
     along: np.ndarray
     spread: np.ndarray
 
@@ -165,10 +187,15 @@ def given_turn(predictions: Predictions, variance: np.ndarray, turns: int) -> Gi
     whitened, across = np.matmul(root, mean[:, :k, None]), np.matmul(root, covariance[:, :k, k:])
     explained = across.transpose(0, 2, 1)
     log_turn = np.log(np.diagonal(root, axis1=1, axis2=2) / np.sqrt(2 * np.pi)).sum(axis=1)
-    log_turn -= (whitened[:, :, 0] ** 2).sum(axis=1) / 2
+    square = (whitened[:, :, 0] ** 2).sum(axis=1)
     given = mean[:, k:] - np.matmul(explained, whitened)[:, :, 0]
     spread, axes = np.linalg.eigh(covariance[:, k:, k:] - np.matmul(explained, across))
-    return GivenTurn(log_turn, np.matmul(axes.transpose(0, 2, 1), given[:, :, None])[:, :, 0], np.maximum(spread, 0.0))
+    return GivenTurn(
+        log_turn - square / 2,
+        square,
+        np.matmul(axes.transpose(0, 2, 1), given[:, :, None])[:, :, 0],
+        np.maximum(spread, 0.0),
+    )
 
 
 def along_axes(predictions: Predictions, turns: int) -> tuple[np.ndarray, np.ndarray]:

@@ -38,8 +38,10 @@ _SLOWEST, HELD = 16.0, 8
 _ALIKE_AFTER = 4
 # Which variances do not: those of closures' shifts by themselves.
 _FREE = np.array([False, False, False, True, True, False])
-# Variances of shifts to begin with, in those that are believed beforehand.
-USUAL, _LEVELS = 1.0, (1.0, 1 / 16, 1 / 256)
+# Variances of shifts to begin with, of odometry and of closures, in those that are believed beforehand.
+Level = tuple[float, float]
+USUAL: Level = (1.0, 1.0)
+_LEVELS: tuple[Level, ...] = (USUAL, (1 / 16, 1 / 16), (1 / 256, 1 / 256), (1.0, 1 / 256), (1.0, 1 / 4096))
 # A variance whose change is a constant multiple of the one before is set to where that leads; of these at most. The
 # multiple of one that swings is negative.
 _LEAST_RATIO, _LARGEST_RATIO = -2.0, 0.6
@@ -112,7 +114,7 @@ def estimate_poses(
     *,
     hold: bool = False,
     start: PoseStart | None = None,
-    level: float = USUAL,
+    level: Level = USUAL,
     until: PoseMode | None = None,
     held_for: int | None = None,
 ) -> PoseMode:
@@ -220,7 +222,7 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     )
 
 
-def likeliest_level(problem: PoseProblem) -> float:
+def likeliest_level(problem: PoseProblem) -> Level:
     """The level of shifts' noise under which closures are likeliest, each by itself, before any of them pulls.
 
     Odometry that errs by anything has room for every false closure, and they keep it so; taken for better than it is,
@@ -235,14 +237,14 @@ def likeliest_level(problem: PoseProblem) -> float:
     return _LEVELS[int(np.argmax(told))]
 
 
-def _begin(problem: PoseProblem, level: float) -> PoseState:
+def _begin(problem: PoseProblem, level: Level) -> PoseState:
     """Orientations by rotations alone, positions along odometry."""
     mode = problem.mode
     common = np.zeros((problem.num_runs, 6))
     if problem.turns_share:
         common[:, :3] = mode.state.common
     nowhere = np.zeros((problem.drawn.num_nodes, 3))
-    state = PoseState(mode.state.correction, nowhere, common, problem.turn_noise.of_shifts_times(level))
+    state = PoseState(mode.state.correction, nowhere, common, problem.turn_noise.of_shifts_times(*level))
     return replace(state, position=problem.along_odometry(problem.displacements(problem.orientations(state))))
 
 

@@ -17,8 +17,6 @@ from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.poses.closures import Predictions, Told
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 
-# False closures before (and after) one that it is compared with.
-_WINDOW = 48
 # Squared widths of what two differ by, in its variance, which is known only about.
 _KERNELS = np.array([1.0, 16.0])
 # Turns alike up to so many standard deviations; whoever is elsewhere with less than this chance tells nobody anything.
@@ -99,13 +97,13 @@ class MapTurns:
         count = len(self.shift)
         chance = elsewhere * told.is_known
         tells = told.detection[chance[told.detection] > _LEAST_CHANCE]
-        between = self._differences(*_pairs(tells, tells, told.detected, in_order=False))
+        between = self._differences(*told.detected_near(tells, tells, in_order=False))
         same = expit(between.log_kernel(self) - log_alone[between.rows])
         shape = count, count
         alike = csr_array((same * chance[between.others], (between.rows, between.others)), shape=shape)
         alike = alike + csr_array((chance[tells], (tells, tells)), shape=shape)
         rest()
-        each = self._differences(*_pairs(np.arange(count), tells, told.detected, in_order=in_order))
+        each = self._differences(*told.detected_near(np.arange(count), tells, in_order=in_order))
         if len(each.rows) == 0:
             return np.zeros(count), np.zeros(count)
         rest()
@@ -206,18 +204,6 @@ def _with_own(covariance: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     scale = sigma[:, :, None] * sigma[:, None, :]
     spread, axes = np.linalg.eigh(covariance / scale)
     return np.asarray(scale * ((axes * (1 + np.maximum(spread, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)))
-
-
-def _pairs(
-    rows: np.ndarray, tells: np.ndarray, detected: np.ndarray, *, in_order: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Some closures with those that were detected not long before, or after, among others; never with themselves."""
-    first = np.searchsorted(detected[tells], detected[rows])
-    place = first[:, None] + np.arange(-_WINDOW, 0)
-    if not in_order:
-        place = np.concatenate((place, (first + np.isin(rows, tells))[:, None] + np.arange(_WINDOW)), axis=1)
-    which, columns = np.nonzero((place >= 0) & (place < len(tells)))
-    return rows[which], tells[place[which, columns]]
 
 
 def _rotated(turn: np.ndarray, vector: np.ndarray) -> np.ndarray:

@@ -11,42 +11,72 @@ from rotavg_ros.solver.slam.poses.priors import PlacePriors
 
 # Squared widths of what repeats differ by, in those of two good closures.
 _KERNELS = np.array([1.0, 16.0, 256.0])
-# No share is less than this, or nearer to one.
-_SHARE = 0.01
+# No share is less than this, or nearer to one; whoever is wrong with less than this chance tells nobody anything.
+_SHARE = _LEAST_CHANCE = 0.01
 
 
 @dataclass(frozen=True)
 class Repeats:
-    """Of C closures, by the ones before and after.
+    """Of C closures, what others say of the wrong places that each may join.
 
     Attributes:
-        chance: ``(C,)`` that such a one joins wrong places.
-        alike, turned: ``(C,)`` densities of each one's shift if it is such a one's, where that is seen nearly at the
-            right angle, and where not; times the chances of these.
+        chance: ``(C,)`` that one before or after joins wrong places.
+        alike: ``(C,)`` density of each one's turn and shift if it joins the places of such a one, seen nearly at the
+            right angle, …
+        turned: … and of its shift, given the turn, where not; each times the chances of these.
+        has_elsewhere: ``(C,)`` how surely there is one anywhere that joins wrong places at nearly the right angle; …
+        elsewhere: ``(C,)`` … and the density of turn and shift by these.
     """
 
     chance: np.ndarray
     alike: np.ndarray
     turned: np.ndarray
+    has_elsewhere: np.ndarray
+    elsewhere: np.ndarray
 
 
-def repeats_of(mean: np.ndarray, before: np.ndarray, told: Told, closure_variance: float, in_order: bool) -> Repeats:
-    """By the closures that follow each other, if both join the same wrong place.
+@dataclass(frozen=True)
+class Errors:
+    """By what C closures are off from what all else says, from their older to their newer ends.
+
+    Attributes:
+        turn, shift: ``(C, k)`` rad and ``(C, m)`` metres.
+        turn_variance: ``(C,)`` rad² per component, of good ones.
+        shift_variance: m² per component, of a good one.
+    """
+
+    turn: np.ndarray
+    shift: np.ndarray
+    turn_variance: np.ndarray
+    shift_variance: float
+
+    def turned_alike(self, rows: np.ndarray, others: np.ndarray) -> np.ndarray:
+        """``(P,)`` densities of turns, if they are those of others."""
+        variance = self.turn_variance[rows] + self.turn_variance[others]
+        return _mean_kernel(self.turn[rows] - self.turn[others], variance)
+
+    def shifted_alike(self, rows: np.ndarray, others: np.ndarray, sign: int = 1) -> np.ndarray:
+        """``(P,)`` densities of shifts, if they are ``sign`` times those of others."""
+        variance = np.full(len(rows), 2 * self.shift_variance)
+        return _mean_kernel(self.shift[rows] - sign * self.shift[others], variance)
+
+
+def repeats_of(errors: Errors, before: np.ndarray, told: Told, *, in_order: bool) -> Repeats:
+    """By the closures that follow each other, if both join the same wrong places; and by all wrong ones.
+
+    A front end goes on finding a wrong place once it has, and finds it again on the next lap, or from there the other
+    one. So a false closure costs once what makes its places alike: how they are turned, and where they are.
 
     Args:
-        mean: ``(C, m)`` metres, what each is off by, from its older to its newer end.
+        errors: of all closures.
         before: ``(J + 1, C)`` chances of classes.
         told: which follows which.
-        closure_variance: m² per component, of good closures: of the difference of two, twice that.
-        in_order: of the one before alone.
+        in_order: of those before alone.
     """
     later = np.flatnonzero((told.follows >= 0) & told.is_known & told.is_known[told.follows])
     earlier = told.follows[later]
-    square = ((mean[later] - mean[earlier]) ** 2).sum(axis=1)
-    variance = 2 * closure_variance * _KERNELS[:, None]
-    density = np.exp(-square / (2 * variance)) / (2 * np.pi * variance) ** (mean.shape[1] / 2)
-    density = density.mean(axis=0)
-    count = len(mean)
+    shifted = errors.shifted_alike(later, earlier)
+    count = len(told.follows)
     ends = [(later, earlier)] if in_order else [(later, earlier), (earlier, later)]
     neighbours = np.maximum(sum(np.bincount(end, minlength=count) for end, _ in ends), 1)
 
@@ -54,8 +84,31 @@ def repeats_of(mean: np.ndarray, before: np.ndarray, told: Told, closure_varianc
         return np.asarray(sum(np.bincount(end, each * weight[other], count) for end, other in ends) / neighbours)
 
     alike, turned = before[GOOD:-1].sum(axis=0), before[-1]
-    ones = np.ones(len(later))
-    return Repeats(mean_over(alike + turned, ones), mean_over(alike, density), mean_over(turned, density))
+    return Repeats(
+        mean_over(alike + turned, np.ones(len(later))),
+        mean_over(alike, errors.turned_alike(later, earlier) * shifted),
+        mean_over(turned, shifted),
+        *_elsewhere(errors, alike * told.is_known, told, in_order=in_order),
+    )
+
+
+def _elsewhere(errors: Errors, wrong: np.ndarray, told: Told, *, in_order: bool) -> tuple[np.ndarray, np.ndarray]:
+    """``has_elsewhere`` and ``elsewhere`` of :class:`Repeats`, by the chances ``(C,)`` to join wrong places."""
+    count = len(wrong)
+    tells = told.detection[wrong[told.detection] > _LEAST_CHANCE]
+    rows, others = told.detected_near(np.flatnonzero(told.is_known), tells, in_order=in_order)
+    # A place that was mistaken for another one is so again, or from there the other one for it.
+    shifted = (errors.shifted_alike(rows, others) + errors.shifted_alike(rows, others, -1)) / 2
+    density = np.bincount(rows, wrong[others] * errors.turned_alike(rows, others) * shifted, count)
+    total = np.bincount(rows, wrong[others], count)
+    return np.minimum(total, 1.0), density / np.maximum(total, 1.0)
+
+
+def _mean_kernel(apart: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """``(P,)`` densities of differences ``(P, n)``, ``variance`` ``(P,)`` per component; means of several widths."""
+    wide = variance * _KERNELS[:, None]
+    density = np.exp(-(apart**2).sum(axis=1) / (2 * wide)) / (2 * np.pi * wide) ** (apart.shape[1] / 2)
+    return np.asarray(density.mean(axis=0))
 
 
 def wrong_share(before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndarray:

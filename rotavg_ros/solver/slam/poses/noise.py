@@ -47,7 +47,9 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     noise = PoseNoise.of(np.log(logarithms))
     # Runs that join wrong places have more than that in common, and would make room for themselves.
     most = problem.priors.most_common
-    return replace(noise, common=min(noise.common, most / (1 - most) * noise.closure))
+    farthest = problem.priors.largest_step**2 * problem.typical
+    common = min(noise.common, most / (1 - most) * noise.closure)
+    return replace(noise, common=common, way=min(noise.way, farthest))
 
 
 def log_noise_prior(problem: PoseProblem, noise: PoseNoise) -> float:

@@ -23,12 +23,14 @@ from rotavg_ros.solver.slam.poses.closures import (
     log_from_behind,
 )
 from rotavg_ros.solver.slam.poses.map_turns import MapTurns
-from rotavg_ros.solver.slam.poses.neighbours import Repeats, repeats_of, wrong_share
+from rotavg_ros.solver.slam.poses.neighbours import Errors, Repeats, repeats_of, wrong_share
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 
 # Classes of wrong places of their own; one more repeats another's.
 _WRONG = 6
 _ELSEWHERE = _WRONG + 1
+# Nobody calls a place alike that is seen turned by more standard deviations than this.
+_FARTHEST = 3.0
 # What pulls least, of a good closure's weight: nothing, but the system stays solvable.
 _NOTHING = 1e-8
 _LOG_NOTHING = -1e6
@@ -72,10 +74,12 @@ class Judge:
         variance = self._variances(scale)
         total = spread + variance[:, :, None]
         log_shift = -(along**2 / total + np.log(2 * np.pi * total)).sum(axis=2) / 2
-        shift = told.sign[:, None] * predictions.mean[:, k:]
         rest()
-        repeats = repeats_of(shift, before, told, scale.closure, in_order)
-        log_shift[-1] = 0.0
+        turn, shift = np.split(told.sign[:, None] * predictions.mean, [k], axis=1)
+        errors = Errors(turn, shift, told.rotation_variance, scale.closure)
+        repeats = repeats_of(errors, before, told, in_order=in_order)
+        # Turn and shift are those of the one that is repeated, which is seen nearly at the right angle.
+        log_turn[-1], log_shift[-1] = -np.maximum(elsewhere.square - _FARTHEST**2, 0.0) / 2, 0.0
         share = wrong_share(before, told, self.priors)
         log_wrong, log_right = self._by_itself(predictions, scale)
         wrong = before[-1] * expit(log_wrong - log_right)
@@ -180,6 +184,10 @@ class Judge:
         priors = self.priors
         right, wrong = np.log1p(-share), np.log(share)
         log_alone, log_repeat = self._log_repeats(repeats.alike, repeats)
+        with np.errstate(divide="ignore"):
+            log_elsewhere = np.maximum(np.log(priors.elsewhere * repeats.elsewhere), _LOG_NOTHING)
+        log_repeat = np.logaddexp(log_repeat, log_alone + log_elsewhere)
+        log_alone = log_alone + np.log1p(-priors.elsewhere * repeats.has_elsewhere)
         by_itself = wrong + log_alone + np.log1p(-priors.from_behind) - np.log(_WRONG)
         return np.stack(
             (
@@ -191,7 +199,7 @@ class Judge:
         )
 
     def _log_repeats(self, density: np.ndarray, repeats: Repeats) -> tuple[np.ndarray, np.ndarray]:
-        """``(C,)`` nats each: that a wrong place is no neighbour's; and that it is, with the density of its shift."""
+        """``(C,)`` nats each: that a wrong place is no neighbour's; and that it is, with the density given by it."""
         share = self.priors.repeats
         with np.errstate(divide="ignore"):
             return np.log1p(-share * repeats.chance), np.maximum(np.log(share * density), _LOG_NOTHING)

@@ -13,7 +13,8 @@ class PlacePriors:
         step: median of the standard deviation of where one typical step of odometry ends, per component; its variance
             grows with the way passed.
         step_spread: standard deviation of its logarithm: small, since odometry that may err by anything makes room for
-            every false closure.
+            every false closure; …
+        largest_step: … and what it is at most, where everything is at one place.
         closure: median of the standard deviation of a good closure's translation, …
         closure_spread: … and that of its logarithm.
         relative: median of what a good closure's translation errs by, of its own length, …
@@ -27,8 +28,8 @@ class PlacePriors:
         turned_deg: standard deviation of how much another place that looks alike is seen turned.
         from_behind: share of places that look alike that do so from the other side, half a turn off.
         turned_in_place: share of false rotations at the right place: symmetric rooms, registrations that flip.
-        elsewhere: share of false rotations that are seen as others far from them, by the same turn of the map, where
-            others are turned alike.
+        elsewhere: share of wrong places that are off as others far from them are, by the same turn of the map or the
+            same shift, where there are such.
         wrong_place: closures of a plausible rotation that join wrong places: a priori that many in as many as are
             counted beforehand, …
         counted: … in all; what all tell counts for one closure within a run.
@@ -39,6 +40,7 @@ class PlacePriors:
 
     step: float = 0.05
     step_spread: float = 0.7
+    largest_step: float = 0.3
     closure: float = 1.0
     closure_spread: float = 1.0
     relative: float = 0.05

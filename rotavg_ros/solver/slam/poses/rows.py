@@ -75,10 +75,10 @@ class PoseNoise:
         """m² per component, of good closures' translations of this squared length, m²; all that they err by."""
         return np.asarray(self.closure + self.common + self.relative * square_length)
 
-    def of_shifts_times(self, factor: float) -> PoseNoise:
-        """With all variances of shifts this factor times as large, but for what goes with their length."""
-        shifts = {name: factor * getattr(self, name) for name in ("way", "closure", "common")}
-        return replace(self, **shifts)
+    def of_shifts_times(self, of_odometry: float, of_closures: float) -> PoseNoise:
+        """With variances of shifts so many times as large, but for what goes with their length."""
+        closure, common = of_closures * self.closure, of_closures * self.common
+        return replace(self, way=of_odometry * self.way, closure=closure, common=common)
 
 
 @dataclass(frozen=True)

@@ -177,21 +177,28 @@ def settling(pose: PoseMode, least: float = np.inf) -> Rival:
         pose: of the labelling to begin with.
         least: −log p of another one, nats; of one that is far from it no more is asked.
     """
-    begun, best = pose.problem, None
+    begun, first, best = pose.problem, pose, None
     for _ in range(_ROUNDS):
         mode = relabelled(pose)
         if best is not None and mode.labels == best.mode.labels:
             break
-        problem = replace(begun, mode=mode)
-        rival = Rival(mode, estimate_poses(problem, hold=True, start=PoseStart.at(pose)))
+        rival = _held(replace(begun, mode=mode), pose)
         if best is not None and rival.cost > best.cost - _LEAST_GAIN:
             break
         best = rival
         if best.cost > least + _HOPELESS:
             break
-        pose = estimate_poses(problem, start=PoseStart.at(rival.pose))
+        pose = estimate_poses(rival.pose.problem, start=PoseStart.at(rival.pose))
     assert best is not None
+    if best.mode.labels != begun.mode.labels and best.cost < least + _HOPELESS:
+        # Closures that hold each other to be right, or wrong, may be less likely so all together.
+        best = min(best, _held(begun, first), key=lambda rival: rival.cost)
     return best
+
+
+def _held(problem: PoseProblem, pose: PoseMode) -> Rival:
+    """A labelling as it is, from other poses."""
+    return Rival(problem.mode, estimate_poses(problem, hold=True, start=PoseStart.at(pose)))
 
 
 def relabelled(pose: PoseMode) -> Mode:
