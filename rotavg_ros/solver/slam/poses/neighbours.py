@@ -50,10 +50,10 @@ class Errors:
     turn_variance: np.ndarray
     shift_variance: float
 
-    def turned_alike(self, rows: np.ndarray, others: np.ndarray) -> np.ndarray:
-        """``(P,)`` densities of turns, if they are those of others."""
+    def turned_alike(self, rows: np.ndarray, others: np.ndarray, sign: int = 1) -> np.ndarray:
+        """``(P,)`` densities of turns, if they are ``sign`` times those of others."""
         variance = self.turn_variance[rows] + self.turn_variance[others]
-        return _mean_kernel(self.turn[rows] - self.turn[others], variance)
+        return _mean_kernel(self.turn[rows] - sign * self.turn[others], variance)
 
     def shifted_alike(self, rows: np.ndarray, others: np.ndarray, sign: int = 1) -> np.ndarray:
         """``(P,)`` densities of shifts, if they are ``sign`` times those of others."""
@@ -98,8 +98,8 @@ def _elsewhere(errors: Errors, wrong: np.ndarray, told: Told, *, in_order: bool)
     tells = told.detection[wrong[told.detection] > _LEAST_CHANCE]
     rows, others = told.detected_near(np.flatnonzero(told.is_known), tells, in_order=in_order)
     # A place that was mistaken for another one is so again, or from there the other one for it.
-    shifted = (errors.shifted_alike(rows, others) + errors.shifted_alike(rows, others, -1)) / 2
-    density = np.bincount(rows, wrong[others] * errors.turned_alike(rows, others) * shifted, count)
+    moved = sum(errors.turned_alike(rows, others, sign) * errors.shifted_alike(rows, others, sign) for sign in (1, -1))
+    density = np.bincount(rows, wrong[others] * moved / 2, count)
     total = np.bincount(rows, wrong[others], count)
     return np.minimum(total, 1.0), density / np.maximum(total, 1.0)
 

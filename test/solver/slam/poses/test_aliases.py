@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -93,4 +93,6 @@ def test_a_repeat_has_the_turn_of_the_other_as_well_as_its_shift() -> None:
     rows, others = np.array([1, 2, 3]), np.zeros(3, dtype=np.int64)
     alike, otherwise, back = errors.turned_alike(rows, others) * errors.shifted_alike(rows, others)
     assert alike > 1e5 * otherwise and alike > 1e5 * back
-    np.testing.assert_allclose(errors.shifted_alike(rows, others, -1)[2], errors.shifted_alike(rows, others)[0])
+    inverse = replace(errors, turn=errors.turn * np.array([[1], [1], [1], [-1]]))
+    there_and_back = inverse.turned_alike(rows, others, -1) * inverse.shifted_alike(rows, others, -1)
+    np.testing.assert_allclose(there_and_back[2], alike)
