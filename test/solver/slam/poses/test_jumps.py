@@ -143,3 +143,23 @@ def test_jumps_are_as_far_as_they_say() -> None:
     assert far.sum() == 2
     typical = np.median(length)
     assert (length[far] > (STEPS[0] - 2) * typical).all() and (length[far] < (STEPS[1] + 2) * typical).all()
+
+
+@torch.no_grad()
+def test_no_step_jumps_farther_than_it_reports() -> None:
+    """A hundred closures agree on a jump of five metres at steps of half a metre: they are wrong, all together."""
+    run = simulated(3)
+    graph = graph_of(run)
+    assert graph.translation is not None
+    later = torch.maximum(graph.source, graph.target) > graph.num_nodes // 2
+    earlier = torch.minimum(graph.source, graph.target) < graph.num_nodes // 2
+    across = ~graph.is_odometry & later & earlier
+    world = torch.from_numpy(run.world_from_body)[graph.source[across]]
+    elsewhere = torch.tensor([5.0, 0.0, 0.0], dtype=torch.float64).expand(int(across.sum()), 3)
+    # The newer end, wherever the closure begins.
+    sign = torch.where(graph.target > graph.source, 1.0, -1.0)[across, None]
+    translation = graph.translation.clone()
+    translation[across] += sign * rotations.rotate(rotations.inverse(world), elsewhere)
+    solution = solve(replace(graph, translation=translation))
+    assert across.sum() > 20
+    assert not warned_of_jumps(solution)

@@ -28,6 +28,8 @@ _WRONG = 0.5
 _LOOKED_AT, _STRETCHES, _ENDS = 48, 4, 1000
 # Positions that differ by less, in steps, are the same.
 _SAME_PLACE = 1e-9
+# A step that jumped says so: it is off by no more than so many times what it reports.
+_AS_FAR = 2.0
 # No chance is less.
 _LEAST = 1e-12
 
@@ -100,17 +102,29 @@ def with_jump(pose: PoseMode, jump: Jump) -> tuple[PoseProblem, PoseStart]:
     return replace(problem, jump=variance), replace(PoseStart.at(pose), state=state, places=begun)
 
 
-def without_small_jumps(pose: PoseMode) -> PoseProblem | None:
-    """The problem without the jumps that closures need not see; None if there are none."""
+def without_odd_jumps(pose: PoseMode) -> PoseProblem | None:
+    """The problem without the jumps that closures need not see, or that no step reports; None if there are none."""
     problem, scale = pose.problem, pose.solved.scale
     jumped = np.flatnonzero(problem.jumps)
     least = problem.priors.least_wrong**2 * problem.shifts * min(scale.closure, scale.extent)
-    small = jumped[(_jumped_by(pose, jumped) ** 2).sum(axis=1) < least]
-    if len(small) == 0 or problem.jump is None:
+    is_small = (_jumped_by(pose, jumped) ** 2).sum(axis=1) < least
+    odd = jumped[is_small | _is_too_far(pose, jumped)]
+    if len(odd) == 0 or problem.jump is None:
         return None
-    is_small = np.isin(problem.drawn.segment_of_edge, small)
-    left = np.where(is_small, 0.0, problem.jump)
+    is_odd = np.isin(problem.drawn.segment_of_edge, odd)
+    left = np.where(is_odd, 0.0, problem.jump)
     return replace(problem, jump=left if left.any() else None)
+
+
+def jumps_too_far(pose: PoseMode) -> bool:
+    """Whether any jump is one that no step reports."""
+    return bool(_is_too_far(pose, np.flatnonzero(pose.problem.jumps)).any())
+
+
+def _is_too_far(pose: PoseMode, segments: np.ndarray) -> np.ndarray:
+    """``(n,)`` bool."""
+    square = (_jumped_by(pose, segments) ** 2).sum(axis=1)
+    return np.asarray(square > _AS_FAR**2 * pose.problem.could_jump[segments])
 
 
 def _after(problem: PoseProblem, segment: int) -> np.ndarray:
@@ -252,6 +266,9 @@ class _Witnesses:
         square, known = float((self.shift[speaker] ** 2).sum()), float(self.spread[speaker])
         width = self.shift.shape[1] * np.log1p(self.variance / known) / 2
         off = square / (2 * np.maximum(self.variance, np.finfo(np.float64).tiny))
+        # As far as that is known.
+        least = max(np.sqrt(square) - _AGREE * np.sqrt(self.shift.shape[1] * known), 0.0)
+        off[least**2 > _AS_FAR**2 * self.variance] = np.inf
         return np.asarray(np.where(self.price > 0, self.price + off + width, 0.0))
 
     def _changed(self, speaker: int, sign: float = 1.0) -> np.ndarray:

@@ -13,7 +13,13 @@ import numpy as np
 
 from rotavg_ros.solver.slam.poses.estimate import HELD, USUAL, PoseMode, PoseStart, estimate_poses, likeliest_level
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
-from rotavg_ros.solver.slam.poses.search.jumps import likeliest_jump, log_jump_prior, with_jump, without_small_jumps
+from rotavg_ros.solver.slam.poses.search.jumps import (
+    jumps_too_far,
+    likeliest_jump,
+    log_jump_prior,
+    with_jump,
+    without_odd_jumps,
+)
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
@@ -111,9 +117,9 @@ def _jumping(rival: Rival) -> list[Rival]:
             begun.append(_settled(jumped.problem, PoseStart.at(jumped)))
     found = [likelier for start in begun for likelier in _jumping_further(start)]
     for each in (*begun[1:], *found):
-        if (problem := without_small_jumps(each.pose)) is not None:
+        if (problem := without_odd_jumps(each.pose)) is not None:
             found.append(_settled(problem, PoseStart.at(each.pose)))
-    return [*begun[1:], *found]
+    return [jumped for jumped in (*begun[1:], *found) if not jumps_too_far(jumped.pose)]
 
 
 def _jumping_further(rival: Rival) -> list[Rival]:
