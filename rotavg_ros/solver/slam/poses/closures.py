@@ -17,6 +17,10 @@ GOOD = 2
 _OTHERWISE = 0.5
 # In which errors are longer than a limit: in a plane, too, where that is a little too often.
 _DIMENSIONS = 3
+# Predicted to less than this share of what is known of anything.
+_TOLD = 0.5
+# rad² per component of a turn about which nothing is known.
+ANYHOW = np.pi**2 / 3
 # Closures detected before (and after) one that it is compared with.
 _WINDOW = 48
 
@@ -50,6 +54,17 @@ class Predictions:
         share[:, turns:] = (shift / (spread[:, turns:].mean(axis=1) + shift))[:, None]
         root = np.sqrt(share)
         return Predictions(share * self.mean, root[:, :, None] * self.covariance * root[:, None, :])
+
+    def tell(self, turns: int, extent: float) -> np.ndarray:
+        """``(C,)`` bool, whether turns and shifts are predicted to less than half the variance of any at all.
+
+        Args:
+            turns: k.
+            extent: m² per component, of places on the map.
+        """
+        spread = np.diagonal(self.covariance, axis1=1, axis2=2)
+        turn, shift = spread[:, :turns].mean(axis=1), spread[:, turns:].mean(axis=1)
+        return np.asarray((turn < _TOLD * ANYHOW) & (shift < _TOLD * extent))
 
 
 @dataclass(frozen=True)

@@ -43,12 +43,14 @@ class Errors:
         turn, shift: ``(C, k)`` rad and ``(C, m)`` metres.
         turn_variance: ``(C,)`` rad² per component, of good ones.
         shift_variance: m² per component, of a good one.
+        is_told: ``(C,)`` bool, whether all else says anything of it: if not, nobody knows by what it is off.
     """
 
     turn: np.ndarray
     shift: np.ndarray
     turn_variance: np.ndarray
     shift_variance: float
+    is_told: np.ndarray
 
     def turned_alike(self, rows: np.ndarray, others: np.ndarray, sign: int = 1) -> np.ndarray:
         """``(P,)`` densities of turns, if they are ``sign`` times those of others."""
@@ -73,7 +75,8 @@ def repeats_of(errors: Errors, before: np.ndarray, told: Told, *, in_order: bool
         told: which follows which.
         in_order: of those before alone.
     """
-    later = np.flatnonzero((told.follows >= 0) & told.is_known & told.is_known[told.follows])
+    can_tell = told.is_known & errors.is_told
+    later = np.flatnonzero((told.follows >= 0) & can_tell & can_tell[told.follows])
     earlier = told.follows[later]
     shifted = errors.shifted_alike(later, earlier)
     count = len(told.follows)
@@ -88,7 +91,7 @@ def repeats_of(errors: Errors, before: np.ndarray, told: Told, *, in_order: bool
         mean_over(alike + turned, np.ones(len(later))),
         mean_over(alike, errors.turned_alike(later, earlier) * shifted),
         mean_over(turned, shifted),
-        *_elsewhere(errors, alike * told.is_known, told, in_order=in_order),
+        *_elsewhere(errors, alike * can_tell, told, in_order=in_order),
     )
 
 
@@ -96,7 +99,7 @@ def _elsewhere(errors: Errors, wrong: np.ndarray, told: Told, *, in_order: bool)
     """``has_elsewhere`` and ``elsewhere`` of :class:`Repeats`, by the chances ``(C,)`` to join wrong places."""
     count = len(wrong)
     tells = told.detection[wrong[told.detection] > _LEAST_CHANCE]
-    rows, others = told.detected_near(np.flatnonzero(told.is_known), tells, in_order=in_order)
+    rows, others = told.detected_near(np.flatnonzero(told.is_known & errors.is_told), tells, in_order=in_order)
     # A place that was mistaken for another one is so again, or from there the other one for it.
     moved = sum(errors.turned_alike(rows, others, sign) * errors.shifted_alike(rows, others, sign) for sign in (1, -1))
     density = np.bincount(rows, wrong[others] * moved / 2, count)

@@ -76,7 +76,7 @@ class Judge:
         log_shift = -(along**2 / total + np.log(2 * np.pi * total)).sum(axis=2) / 2
         rest()
         turn, shift = np.split(told.sign[:, None] * predictions.mean, [k], axis=1)
-        errors = Errors(turn, shift, told.rotation_variance, scale.closure)
+        errors = Errors(turn, shift, told.rotation_variance, scale.closure, predictions.tell(k, scale.extent))
         repeats = repeats_of(errors, before, told, in_order=in_order)
         # Turn and shift are those of the one that is repeated, which is seen nearly at the right angle.
         log_turn[-1], log_shift[-1] = -np.maximum(elsewhere.square - _FARTHEST**2, 0.0) / 2, 0.0

@@ -15,7 +15,7 @@ from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.poses.block_system import BlockEquations
-from rotavg_ros.solver.slam.poses.closures import Told
+from rotavg_ros.solver.slam.poses.closures import ANYHOW, Told
 from rotavg_ros.solver.slam.poses.displacements import Displacements, DrawnSteps
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 from rotavg_ros.solver.slam.posterior.densities import log_false, log_good
@@ -27,8 +27,6 @@ from rotavg_ros.view_graph import ViewGraph
 
 # Shifts off the plane of motion by less than this share of the longest are none.
 _PLANAR = 1e-6
-# rad² per component of a turn about which nothing is known.
-ANYHOW = np.pi**2 / 3
 # A segment in which nothing moves errs by this share of a typical step at least.
 _LEAST_LENGTH = 1e-3
 # The share of an error that is not shared; the system stays solvable.

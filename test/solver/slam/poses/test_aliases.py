@@ -89,6 +89,7 @@ def test_a_repeat_has_the_turn_of_the_other_as_well_as_its_shift() -> None:
         np.array([shift, shift, shift, -shift]),
         np.full(4, np.radians(0.1) ** 2),
         0.02**2,
+        np.ones(4, dtype=bool),
     )
     rows, others = np.array([1, 2, 3]), np.zeros(3, dtype=np.int64)
     alike, otherwise, back = errors.turned_alike(rows, others) * errors.shifted_alike(rows, others)
