@@ -1,28 +1,8 @@
-"""Random signs that tell every edge's leverage from a few right-hand sides (see ``FactorisedLaplacian.samples``)."""
+"""Random signs that tell variances from a few right-hand sides (see ``FactorisedLaplacian.samples``)."""
 
 from __future__ import annotations
 
 import numpy as np
-
-
-def likeliest_leverage(square: np.ndarray, product: np.ndarray) -> np.ndarray:
-    """Leverages ``(E,)`` in (0, 1], the effective resistance of each edge times its weight.
-
-    A sample's difference over an edge, times the root of its weight, is ``x = l s + rest``: the edge's own sign s
-    enters it by the leverage l, and what all other edges add has the variance ``l (1 - l)``. The mean square alone
-    leaves an error of l of 20 % (48 probes), which for an edge that nearly alone ties a part of the graph is many times
-    1 - l. The likelihood of both moments has one maximum, the root of a cubic that falls from 0 to 1.
-
-    Args:
-        square: ``(E,)`` means of x².
-        product: ``(E,)`` means of x s.
-    """
-    # 2 l³ - 2 (1 + b) l² + (1 + 2 a) l - a = 0 in the form t³ + p t + q = 0, where p ≥ 0: Cardano's only real root.
-    centre = (1 + product) / 3
-    p = np.maximum(0.5 + square - 3 * centre**2, np.finfo(np.float64).tiny)
-    q = centre * (0.5 + square - 2 * centre**2) - square / 2
-    root = -np.copysign(np.cbrt(np.abs(q) / 2 + np.sqrt((q / 2) ** 2 + (p / 3) ** 3)), q)
-    return np.asarray(np.clip(centre + root - p / (3 * root), np.finfo(np.float64).tiny, 1.0))
 
 
 def probe_signs(first: np.ndarray, second: np.ndarray, num_probes: int) -> np.ndarray:

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.sparse import coo_array, csc_array
 
-from rotavg_ros.solver.algebra.sparse.sparse_factor import SparseFactor
+from rotavg_ros.solver.algebra.sparse.sparse_factor import SparseFactor, tied_matrix
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.running.work import rest, spend, stop_if_abandoned
 
@@ -25,9 +24,6 @@ from rotavg_ros.solver.running.work import rest, spend, stop_if_abandoned
 _FRONT_S, _PRODUCTS_PER_S, _MOVES_PER_S = 3.6e-5, 2.5e10, 6.7e8
 # Seconds to a unit: as long as one takes of a solve by rotations alone, with all that is done around it.
 _UNIT_S = 5e-4
-# What is tied to nothing by itself, beside ties of one: enough for any order of elimination, too little to let fill
-# that lies far apart vanish.
-_SLIGHTLY = 1e-6
 # Where rounding leaves a front without a pivot, so much of its largest diagonal is added, and ever more, up to that.
 _LIFT, _MORE, _NO_ROUNDING = 1e-15, 16.0, 1.0
 
@@ -83,7 +79,7 @@ class Elimination:
 
     def __init__(self, first: np.ndarray, second: np.ndarray, num_blocks: int, size: int) -> None:
         self.num_blocks, self.size = num_blocks, size
-        factor = SparseFactor(_tied_matrix(first, second, num_blocks), is_ordered=False)
+        factor = SparseFactor(tied_matrix(first, second, num_blocks), is_ordered=False)
         begin, row = factor.lower_pattern
         rest()
         supernodes = _Supernodes.of(begin, row, size)
@@ -261,18 +257,6 @@ def _lower_root(matrix: torch.Tensor) -> torch.Tensor:
         lower, info = torch.linalg.cholesky_ex(matrix)
         lift *= _MORE
     return lower
-
-
-def _tied_matrix(first: np.ndarray, second: np.ndarray, num_blocks: int) -> csc_array:
-    """A positive definite matrix of the pattern, of which no fill vanishes: a Laplacian and next to nothing."""
-    is_tie = first != second
-    first, second = first[is_tie], second[is_tie]
-    row, column = np.concatenate((first, second)), np.concatenate((second, first))
-    degree = np.bincount(row, minlength=num_blocks)
-    diagonal = np.arange(num_blocks)
-    values = np.concatenate((np.full(len(row), -1.0), degree + _SLIGHTLY))
-    ends = np.concatenate((row, diagonal)), np.concatenate((column, diagonal))
-    return csc_array(coo_array((values, ends), shape=(num_blocks, num_blocks)))
 
 
 def _singly(blocks: np.ndarray, size: int) -> np.ndarray:

@@ -22,8 +22,34 @@ from functools import partial
 from queue import SimpleQueue
 
 import numpy as np
-from scipy.sparse import csc_array
+from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import SuperLU, splu
+
+# What is tied to nothing by itself, beside ties of one: enough for any order of elimination, too little to let fill
+# that lies far apart vanish.
+_SLIGHTLY = 1e-6
+
+
+def tied_matrix(first: np.ndarray, second: np.ndarray, size: int) -> csc_array:
+    """A positive definite matrix of the pattern, of which no fill vanishes: a Laplacian and next to nothing.
+
+    Args:
+        first, second: ``(n,)`` unknowns that are tied, in any order and as often as it comes.
+        size: unknowns.
+    """
+    is_tie = first != second
+    first, second = first[is_tie], second[is_tie]
+    row, column = np.concatenate((first, second)), np.concatenate((second, first))
+    degree = np.bincount(row, minlength=size)
+    diagonal = np.arange(size)
+    values = np.concatenate((np.full(len(row), -1.0), degree + _SLIGHTLY))
+    ends = np.concatenate((row, diagonal)), np.concatenate((column, diagonal))
+    return csc_array(coo_array((values, ends), shape=(size, size)))
+
+
+def order_of_little_fill(first: np.ndarray, second: np.ndarray, size: int) -> np.ndarray:
+    """``(N,)`` where each unknown stands in an order of elimination of minimum degree, for such ties."""
+    return SparseFactor(tied_matrix(first, second, size), is_ordered=False).rank
 
 
 class SparseFactor:

@@ -70,7 +70,8 @@ def fine_tuned(mode: Mode, network: SlamFineNet, passes: int = PASSES) -> Mode:
     for _ in range(passes):
         tuned = applied(network, tuned)
     residual = residuals(tuned.problem, tuned.state)
-    evaluation = Evaluation(mode.evaluation.terms, residual, tuned.factorised.weight, tuned.factorised)
+    solved = tuned.factorised
+    evaluation = Evaluation(mode.evaluation.terms, residual, solved.weight, solved, tuned.state.others)
     return replace(mode, problem=tuned.problem, state=tuned.state, evaluation=evaluation)
 
 
@@ -90,7 +91,7 @@ def applied(network: SlamFineNet, before: Tuned) -> Tuned:
     problem = before.problem.with_relative(variance.numpy() / usual)
     state = replace(before.state, noise=_scaled(before.state.noise, *scale.exp().tolist()))
     for _ in range(_SOLVES):
-        state, _, factorised = step(problem, state)
+        state, _, _, factorised = step(problem, state)
     return Tuned(problem, state, factorised)
 
 

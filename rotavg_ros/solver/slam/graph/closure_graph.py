@@ -95,15 +95,21 @@ class ClosureGraph:
         orientation = torch.from_numpy(quaternion_rows.multiply(odometry, spread).T.copy())
         return rotations.normalize(orientation)
 
-    def variance(self, samples: np.ndarray, step_variance: float) -> np.ndarray:
-        """Variance of all nodes ``(N,)`` from samples of the key nodes' errors ``(K, k)``; rad².
+    def variance(self, own: np.ndarray, apart: np.ndarray, step_variance: float) -> np.ndarray:
+        """Variance of all nodes ``(N,)``, rad².
 
         Inside a segment the error is interpolated, plus that of a random walk that is tied down at both ends.
+
+        Args:
+            own: ``(K,)`` rad², of the key nodes' errors.
+            apart: ``(S,)`` rad², of the difference between those at both ends of each segment.
+            step_variance: rad², of one step of odometry.
         """
-        fraction = self.fraction[:, None]
-        interpolated = (1 - fraction) * samples[self.above] + fraction * samples[self.below]
-        bridge = self.fraction * (1 - self.fraction) * self.length * step_variance
-        return np.asarray((interpolated**2).mean(axis=1) + bridge)
+        across = np.zeros(self.num_nodes)
+        across[self.target[: self.num_segments]] = apart
+        rest = self.fraction * (1 - self.fraction)
+        of_ends = (1 - self.fraction) * own[self.above] + self.fraction * own[self.below]
+        return np.asarray(of_ends + rest * (self.length * step_variance - across[self.below]))
 
     def corrections(self, body_from_world: Tensor) -> Tensor:
         """Orientations of all nodes ``(N, 4)`` → corrections of the key nodes ``(K, 4)`` that are nearest to them."""

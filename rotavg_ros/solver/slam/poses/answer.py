@@ -77,7 +77,10 @@ def _of_mode(pose: PoseMode) -> Poses:
     orientation, position, passed = _within_segments(pose)
     samples = pose.solved.factor.samples[: drawn.num_nodes]
     turns = np.moveaxis(samples[:, :k], 1, 2).reshape(drawn.num_nodes, -1)
-    variance = drawn.variance(turns, pose.state.noise.turn)
+    ends = (key_nodes[: drawn.num_segments] for key_nodes in (drawn.source, drawn.target))
+    source, target = (turns[key_nodes] for key_nodes in ends)
+    own, apart = (turns**2).mean(axis=1), ((target - source) ** 2).mean(axis=1)
+    variance = drawn.variance(own, apart, pose.state.noise.turn)
     shifts = (samples[:, k:] ** 2).mean(axis=(1, 2))
     between = (1 - passed) * shifts[drawn.above] + passed * shifts[drawn.below]
     segment = problem.segment_of_node

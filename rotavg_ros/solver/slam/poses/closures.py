@@ -9,6 +9,7 @@ import numpy as np
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.noise.exceedance import exceedance
+from rotavg_ros.solver.slam.noise.repeats import Near, places_near
 from rotavg_ros.solver.slam.posterior.densities import log_half_turn
 
 # Classes of good closures come first.
@@ -92,23 +93,16 @@ class Told:
     detection: np.ndarray
     detected: np.ndarray
 
-    def detected_near(self, rows: np.ndarray, tells: np.ndarray, *, in_order: bool) -> tuple[np.ndarray, np.ndarray]:
+    def detected_near(self, rows: np.ndarray, tells: np.ndarray, *, in_order: bool) -> Near:
         """Some closures with those that were detected not long before, or after, among others; never with themselves.
 
         Args:
-            rows: the closures.
+            rows: ``(n,)`` the closures.
             tells: the others, in the order of their detection.
             in_order: those before alone.
-
-        Returns:
-            ``(P,)`` each of ``rows`` and of ``tells``.
         """
-        first = np.searchsorted(self.detected[tells], self.detected[rows])
-        place = first[:, None] + np.arange(-_WINDOW, 0)
-        if not in_order:
-            place = np.concatenate((place, (first + np.isin(rows, tells))[:, None] + np.arange(_WINDOW)), axis=1)
-        which, columns = np.nonzero((place >= 0) & (place < len(tells)))
-        return rows[which], tells[place[which, columns]]
+        is_one = None if in_order else np.isin(rows, tells)
+        return Near(rows, tells, places_near(self.detected[tells], self.detected[rows], is_one, _WINDOW))
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,9 @@ from rotavg_ros.solver.slam.poses.closures import (
     given_turn,
     log_from_behind,
 )
-from rotavg_ros.solver.slam.poses.map_turns import MapTurns
-from rotavg_ros.solver.slam.poses.neighbours import Errors, Repeats, repeats_of, wrong_share
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
+from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
+from rotavg_ros.solver.slam.poses.repeats.neighbours import Errors, Repeats, repeats_of, wrong_share
 
 # Classes of wrong places of their own; one more repeats another's.
 _WRONG = 6

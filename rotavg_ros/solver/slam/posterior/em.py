@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import expit
@@ -26,8 +27,6 @@ from rotavg_ros.solver.slam.posterior.system import Factorised
 # Residuals say nothing of noise or labels while orientations still turn by more than this; but not for ever.
 _SETTLED_TURN = np.radians(3.0)
 _MAX_UNSETTLED = 5
-# Noise is estimated anew until that lowers F by less than this, nats.
-_NOISE_CONVERGED = 0.1
 _PROBABILITY_CONVERGED = 0.02
 # Noise that comes nearer by a constant factor from solve to solve, by this at most, is set to where that leads.
 _SLOWEST = 0.85
@@ -36,15 +35,38 @@ _SLOWEST = 0.85
 _NEWTON_STEPS, _NEWTON_CONVERGED, _FARTHEST = 20, 1e-9, 5.0
 
 
-def step(problem: Problem, state: State) -> tuple[State, float, Factorised]:
-    """One Gauss–Newton step on the corrections; also its largest component, rad, and the factor."""
+class Step(NamedTuple):
+    """One Gauss–Newton step on the corrections.
+
+    Attributes:
+        state: after it.
+        turned: largest component, rad.
+        gained: nats, by how much −log p of the residuals falls, ½ δᵀ H δ.
+        factorised: H.
+    """
+
+    state: State
+    turned: float
+    gained: float
+    factorised: Factorised
+
+
+def step(problem: Problem, state: State, *, all_rows: bool = True) -> Step:
+    """One Gauss–Newton step, and what it tells of each edge from all others.
+
+    Args:
+        problem: the graph.
+        state: before.
+        all_rows: it tells of edges that weigh nothing, too.
+    """
     residual, variance = residuals(problem, state), variances(problem, state.noise)
     own = variance[: len(problem.graph.source)]
     if_good = weights_if_good(state, own, sites(problem, state, residual, variance))
     factorised = problem.system(state.noise).factorise(weights(problem, state, if_good, variance))
-    turn = factorised.fit(residual)
-    state = with_others(moved(state, turn), factorised, if_good, own, problem.components)
-    return state, float(np.abs(turn).max(initial=0.0)), factorised
+    slope = factorised.gradient(residual)
+    turn = factorised.solve(slope)
+    state = with_others(moved(state, turn), factorised, if_good, own, problem.components, all_rows=all_rows)
+    return Step(state, float(np.abs(turn).max(initial=0.0)), float((slope * turn).sum()) / 2, factorised)
 
 
 def polish(
@@ -59,22 +81,21 @@ def polish(
         hold_noise: leave the noise as it is.
     """
     enough = problem.limits.polish_solves if solves is None else solves
-    last = np.zeros(2)
-    turned, at_rest = np.inf, 0.0
+    last, gained = np.zeros(2), np.inf
     for number in range(problem.limits.polish_solves):
-        if number >= enough and turned < at_rest:
+        if number >= enough and gained < problem.limits.rival:
             break
-        state, turned, factorised = step(problem, state)
-        at_rest = float(np.sqrt(state.noise.step_variance))
-        is_settled = turned < problem.limits.converged * at_rest
+        state, turned, gained, factorised = step(problem, state, all_rows=False)
+        is_settled = gained < problem.limits.converged
         if not hold_noise and turned < _SETTLED_TURN:
             before = state.noise
             noise, last = _extrapolated(before, estimate_noise(problem, state, factorised), last)
             state = replace(state, noise=noise)
-            is_settled &= _gained(problem, before, noise) < _NOISE_CONVERGED
+            is_settled &= _gained(problem, before, noise) < problem.limits.converged
         if is_settled:
             break
-    return state, evaluate(problem, state, is_moving=turned > at_rest)
+    evaluation = evaluate(problem, state, is_moving=gained > problem.limits.rival)
+    return replace(state, others=evaluation.others), evaluation
 
 
 def _extrapolated(before: Noise, after: Noise, last: np.ndarray) -> tuple[Noise, np.ndarray]:
@@ -87,7 +108,7 @@ def _extrapolated(before: Noise, after: Noise, last: np.ndarray) -> tuple[Noise,
     """
     change = np.log([after.step_variance / before.step_variance, after.closure_variance / before.closure_variance])
     ratio = float(change @ last) / max(float(last @ last), np.finfo(np.float64).tiny)
-    if not ratio < _SLOWEST:
+    if not last.any() or not ratio < _SLOWEST:
         return after, change
     # Where it swings the ratio is negative, and that leads to between the last two.
     step, closure = np.exp(change * ratio / (1 - ratio)).tolist()
@@ -108,7 +129,7 @@ def settle(problem: Problem, state: State, solves: int | None = None) -> State:
     closure = problem.closure
     told = problem.log_odds[closure]
     for number in range(problem.limits.settling_solves if solves is None else solves):
-        state, turned, factorised = step(problem, state)
+        state, turned, gained, factorised = step(problem, state)
         if turned > _SETTLED_TURN and number < _MAX_UNSETTLED:
             continue
         left_out = leave_one_out(problem, state, factorised)
@@ -117,8 +138,7 @@ def settle(problem: Problem, state: State, solves: int | None = None) -> State:
         changed = float(np.abs(trusted - state.trusted).max(initial=0.0))
         state = replace(state, trusted=trusted)
         state = replace(state, noise=estimate_noise(problem, state, factorised))
-        is_settled = turned < problem.limits.converged * np.sqrt(state.noise.step_variance)
-        if changed < _PROBABILITY_CONVERGED and is_settled:
+        if changed < _PROBABILITY_CONVERGED and gained < problem.limits.converged:
             break
     return replace(state, trusted=state.is_good.astype(np.float64))
 
@@ -131,7 +151,7 @@ def estimate_noise(problem: Problem, state: State, factorised: Factorised) -> No
     site = sites(problem, state, residual, variance)
     common = variance[num_edges:]
     # A run's prior is a row like others, and has no tails.
-    of_runs = 1 - np.minimum(factorised.resistance[num_edges:] / common, 1.0)
+    of_runs = 1 - np.minimum(factorised.resistance_of_kept[num_edges:] / common, 1.0)
     redundancy = k * np.concatenate((state.trusted * site.shrinkage, of_runs))
     square = np.concatenate((state.trusted * site.misfit, (residual[num_edges:] ** 2).sum(axis=1) / common))
     is_step = np.concatenate((problem.graph.is_odometry, np.zeros(len(common), dtype=bool)))

@@ -76,7 +76,7 @@ class Search:
         """The mode of a start, under such noise as the best one has; the first one tells what noise that is."""
         if self.modes:
             best = self.modes[0]
-            state = step(self.problem, with_noise(self.problem, state, best.state.noise))[0]
+            state = step(self.problem, with_noise(self.problem, state, best.state.noise)).state
             if best.is_turned_like(state):  # and labels follow from orientations
                 return best
             mode = self.flipped(self.polished(state, name))

@@ -10,35 +10,25 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.sparse import csr_array
 from scipy.special import betaln
 
 from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.slam.noise.repeats import KERNELS, Closures, Near, places_near, repeats
 from rotavg_ros.solver.slam.posterior.densities import anyhow, log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 
 # Nodes of the sums that stand for integrals over rates: the share of false closures and the probability that a label is
-# its predecessor's; the shares of false closures that repeat a near one's turn and any one's; of those that repeat none
-# but are near misses; and what repeats differ by, as a kernel's width.
+# its predecessor's; the shares of false closures that repeat a near one's turn and any one's; and of those that repeat
+# none but are near misses.
 _SHARES = np.array([0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98])
 _STAY = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 0.97])
 _NEAR_SHARES = np.array([0.05, 0.5, 0.95])
 _FAR_SHARES = np.array([0.01, 0.05, 0.2, 0.5])
 _NEAR_MISS_QUANTILES = np.array([1.0, 3.0, 5.0]) / 6
-_REPEAT_DEG = 0.05 * 2.0 ** np.arange(9)
-# One width for all, or each as likely for every closure.
-_KERNELS = len(_REPEAT_DEG) + 1
-_GRID = len(_NEAR_SHARES), len(_FAR_SHARES), len(_NEAR_MISS_QUANTILES), _KERNELS
-# Of closures that are near, one that was detected at about the same time from about the same older place counts for so
-# many others.
-_IN_RUN = 10.0
+_GRID = len(_NEAR_SHARES), len(_FAR_SHARES), len(_NEAR_MISS_QUANTILES), KERNELS
 # Predicted to less than this share of the variance of any rotation.
 _TOLD = 0.5
-# A kernel ends at so many widths, where it is 4e-6 of its height.
-_FARTHEST = 5.0
-# So many closures and those that each is compared with stay in a core's cache.
-_ROWS_AT_ONCE = 1000
 # The least density that counts.
 _LEAST = 1e-300
 
@@ -97,9 +87,8 @@ def false_density(
 ) -> FalseDensity:
     """Closures wrong by themselves, or by the same turn of the world as other false ones.
 
-    Places that look alike are mistaken for each other again and again. The density of a repeat is a kernel estimate
-    over the false closures detected before (a Pólya urn), those near weighing apart from all: those detected shortly
-    before, most of them those of the same run, and, where there are such, those that join the same places.
+    The density of a repeat is a kernel estimate over the false closures detected before (a Pólya urn), those near
+    weighing apart from all (:mod:`~rotavg_ros.solver.slam.noise.repeats`).
 
     Args:
         is_false: ``(C,)`` bool, of the others.
@@ -113,92 +102,17 @@ def false_density(
     near_misses = _near_miss_shares(problem.priors)[:, None]
     alone = np.exp(log_false(square, k, problem.priors, near_misses, predicted[rows]))
     if count == 0 or not is_false.any() or "repeats" in problem.without:
-        nothing, none = np.zeros((_KERNELS, count)), np.zeros(count, dtype=bool)
+        nothing, none = np.zeros((KERNELS, count)), np.zeros(count, dtype=bool)
         return FalseDensity(alone, nothing, nothing, none, none)
-    turn = quaternion_rows.exp((residual * problem.sign[:, None]).T)
+    older, newer = problem.ends.T
+    turn = np.ascontiguousarray(quaternion_rows.exp((residual * problem.sign[:, None]).T).T)
     # Of a closure that nothing else predicts it is not known by what turn it is wrong.
     is_told = predicted < _TOLD * anyhow(k)
-    parts = [
-        _repeats(problem, is_false, turn, is_told, rows[start : start + _ROWS_AT_ONCE], both_sides)
-        for start in range(0, count, _ROWS_AT_ONCE)
-    ]
-    return FalseDensity(alone, *(np.concatenate(values, axis=-1) for values in zip(*parts, strict=True)))
-
-
-def _repeats(
-    problem: Problem,
-    is_false: np.ndarray,
-    turn: np.ndarray,
-    is_told: np.ndarray,
-    rows: np.ndarray,
-    both_sides: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """``near``, ``far``, ``has_near`` and ``has_far`` of :class:`FalseDensity`.
-
-    Args:
-        turn: ``(4, C)`` of the world, by which each closure is wrong if it is false.
-        is_told: ``(C,)`` bool, whether anything else tells that turn.
-    """
-    k, gap = problem.components, problem.priors.run_gap_steps
-    other, there = _others(problem, is_false, rows, both_sides)
-    there &= is_told[rows, None] & is_told.take(other)
-
-    def apart(mine: np.ndarray, its: np.ndarray) -> np.ndarray:
-        return np.asarray(np.abs(its.take(other) - mine[rows, None]))
-
-    older, newer = problem.ends.T
-    by_older, by_newer = apart(older, older), apart(newer, newer)
-    # A place that was mistaken for another one is so again; from there, the other one for it, by the inverse turn.
-    is_inverse = np.minimum(apart(older, newer), apart(newer, older)) <= gap
-    is_inverse &= (by_older > gap) & (by_newer > gap)
-    is_near = there & (by_newer <= gap)
-    is_near |= there & is_near.any(axis=1, keepdims=True) & (is_inverse | (by_older <= gap))
-    weights = is_near * np.where(by_older + by_newer <= gap, _IN_RUN, 1.0), there.astype(np.float64)
-    *axis, real = (part.take(other) * part[rows, None] for part in turn)
-    cosine = np.abs(real + np.where(is_inverse, -1.0, 1.0) * sum(axis))
-    alike = np.nonzero(there & (cosine > np.cos(_FARTHEST * np.radians(_REPEAT_DEG[-1]) / 2)))
-    kernel = _kernels((2 * np.arccos(np.minimum(cosine[alike], 1.0))) ** 2, k)
-    near, far = _mean_kernels(weights, alike, kernel)
-    return near, far, np.asarray(is_near.any(axis=1)), np.asarray(there.any(axis=1))
-
-
-def _others(
-    problem: Problem, is_false: np.ndarray, rows: np.ndarray, both_sides: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """``(n, W)`` false closures detected not long before (or after) each of n, and whether there is such a one."""
-    false, when = problem.detection[is_false[problem.detection]], problem.detected
-    window = min(problem.limits.window, len(false))
-    earlier = np.searchsorted(when[false], when[rows])
-    place = earlier[:, None] + np.arange(-window, 0)
-    if both_sides:
-        place = np.concatenate((place, (earlier + is_false[rows])[:, None] + np.arange(window)), axis=1)
-    return false.take(place, mode="clip"), (place >= 0) & (place < len(false))
-
-
-def _kernels(square: np.ndarray, components: int) -> np.ndarray:
-    """``(m, S − 1)`` normal densities of squared angles, rad², of all widths."""
-    width = np.radians(_REPEAT_DEG)
-    kernel = np.empty((len(width), len(square)))
-    np.exp(-square / (2 * width[-1] ** 2), out=kernel[-1])
-    for number in range(len(width) - 2, -1, -1):  # half as wide: to the fourth power
-        np.square(np.square(kernel[number + 1]), out=kernel[number])
-    return np.asarray(np.ascontiguousarray(kernel.T) * (2 * np.pi * width**2) ** (-components / 2))
-
-
-def _mean_kernels(
-    weights: tuple[np.ndarray, ...], alike: tuple[np.ndarray, ...], kernel: np.ndarray
-) -> list[np.ndarray]:
-    """``(S, n)`` for each of the weights ``(n, W)``: means over the others of each; of all widths alike at the end."""
-    count, places = len(weights[0]), len(kernel)
-    end = np.searchsorted(alike[0], np.arange(count), side="right")
-    ends = np.concatenate(([0], *(end + number * places for number in range(len(weights)))))
-    columns = np.tile(np.arange(places), len(weights))
-    spread = csr_array(
-        (np.concatenate([weight[alike] for weight in weights]), columns, ends), shape=(len(weights) * count, places)
-    )
-    total = np.maximum(np.concatenate([weight.sum(axis=1) for weight in weights]), 1.0)
-    mean = (spread @ kernel).T / total
-    return np.split(np.concatenate((mean, mean.mean(axis=0, keepdims=True))), len(weights), axis=1)
+    false = problem.detection[is_false[problem.detection]]
+    is_one = is_false[rows] if both_sides else None
+    between = places_near(problem.detected[false], problem.detected[rows], is_one, problem.limits.window)
+    closures, near = Closures(older, newer, turn, is_told), Near(rows, false, between)
+    return FalseDensity(alone, *repeats(closures, near, problem.priors.run_gap_steps, k))
 
 
 def _near_miss_shares(priors: SlamPriors) -> np.ndarray:

@@ -176,10 +176,10 @@ def of_mode(mode: Mode) -> Published:
             trust = (trust + state.trusted) / 2
         trusted = np.where(trust < _SURELY_FALSE, 0.0, trust)
         trusted = np.where(is_decided, decided, trusted).astype(np.float64)
-        state, _, factorised = step(problem, replace(state, trusted=trusted))
+        state, _, _, factorised = step(problem, replace(state, trusted=trusted))
         if number < _ROUNDS - 1:
             left_out = leave_one_out(problem, state, factorised)
-    samples = factorised.samples[: problem.graph.num_nodes]
     graph = problem.drawn(state.noise)
-    variance = graph.variance(samples, state.noise.step_variance)
+    apart = factorised.resistance[: graph.num_segments]
+    variance = graph.variance(factorised.variance[: graph.num_nodes], apart, state.noise.step_variance)
     return Published(graph, state.correction, score, variance, 0, (1.0,))

@@ -29,6 +29,7 @@ from rotavg_ros.solver.slam.posterior.state import (
     TAIL_SHARES,
     TURN_SHARES,
     Noise,
+    Others,
     State,
 )
 from rotavg_ros.solver.slam.posterior.system import Factorised
@@ -46,6 +47,7 @@ class Evaluation:
         residual: ``(E + R, 3)`` rad, of all rows.
         weight: ``(E + R,)`` rad⁻².
         factorised: H.
+        others: what all other edges say of each.
         is_moving: whether corrections were not at their optimum yet, where F says nothing: it may come out as anything.
     """
 
@@ -53,6 +55,7 @@ class Evaluation:
     residual: np.ndarray
     weight: np.ndarray
     factorised: Factorised
+    others: Others
     is_moving: bool = False
 
     @property
@@ -102,7 +105,7 @@ def evaluate(problem: Problem, state: State, *, is_moving: bool = False) -> Eval
     if problem.bias is not None:
         information, _ = problem.bias.information(graph.source, state, residual, factorised, priors)
         terms["bias"] = problem.bias.cost(information, priors)
-    return Evaluation(terms, residual, weight, factorised, is_moving)
+    return Evaluation(terms, residual, weight, factorised, told.others, is_moving)
 
 
 def log_noise_prior(noise: Noise, priors: SlamPriors) -> float:

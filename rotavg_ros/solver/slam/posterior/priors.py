@@ -70,7 +70,7 @@ class SearchLimits:
         polish_solves: sparse solves at most to bring a labelling to its optimum.
         trial_solves: the same while other noise is tried, or flips of single labels.
         settling_solves: the same while labels are probabilities.
-        converged: such a part of a step's standard deviation is no movement.
+        converged: what lowers F by less than so many nats, a step or other noise, is no movement.
         flip_rounds: batches of single flips.
         annealing_factor: by how much the loss of graduated non-convexity is sharpened from solve to solve.
         robust_solves: of the ℓ½ start.
@@ -86,7 +86,7 @@ class SearchLimits:
     polish_solves: int = 20
     trial_solves: int = 5
     settling_solves: int = 8
-    converged: float = 0.1
+    converged: float = 0.03
     flip_rounds: int = 8
     annealing_factor: float = 1.6
     robust_solves: int = 12

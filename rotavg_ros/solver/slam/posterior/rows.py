@@ -90,7 +90,15 @@ def weights_if_good(state: State, own: np.ndarray, site: Sites) -> np.ndarray:
     return np.asarray(np.sqrt(state.others.relative / own * site.weight))
 
 
-def with_others(state: State, factorised: Factorised, if_good: np.ndarray, own: np.ndarray, components: int) -> State:
+def with_others(
+    state: State,
+    factorised: Factorised,
+    if_good: np.ndarray,
+    own: np.ndarray,
+    components: int,
+    *,
+    all_rows: bool = True,
+) -> State:
     """The state after a solve, with what that tells of each edge from all others.
 
     That is taken together with what holds of any edge: its residual is a rotation. So of one that alone holds two parts
@@ -102,12 +110,18 @@ def with_others(state: State, factorised: Factorised, if_good: np.ndarray, own: 
         if_good: ``(E,)`` rad⁻², what edges weighed in it as good ones.
         own: ``(E,)`` rad², their variances.
         components: k.
+        all_rows: of those that weigh nothing, too; else what was told of these stays.
     """
-    resistance = factorised.resistance[: len(own)]
+    resistance = (factorised.resistance if all_rows else factorised.resistance_of_kept)[: len(own)]
     rest = np.maximum(1 - factorised.weight[: len(own)] * resistance, _LEAST_REST)
     predicted = resistance / rest
     limited = 1 + predicted / anyhow(components)
-    return replace(state, others=Others(rest * limited, predicted / limited, if_good * own))
+    rest, predicted = rest * limited, predicted / limited
+    if not all_rows:
+        stays = np.isnan(resistance)
+        rest = np.where(stays, state.others.rest, rest)
+        predicted = np.where(stays, state.others.predicted, predicted)
+    return replace(state, others=Others(rest, predicted, if_good * own))
 
 
 def weights(problem: Problem, state: State, good: np.ndarray, variance: np.ndarray) -> np.ndarray:

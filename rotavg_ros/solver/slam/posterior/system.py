@@ -7,20 +7,22 @@ what everything else predicts of a row.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from scipy.sparse import coo_array, csc_array, csr_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from rotavg_ros.solver.algebra.probes import likeliest_leverage, probe_signs
-from rotavg_ros.solver.algebra.sparse.laplacian import root_stiffness, solve_in_parts
-from rotavg_ros.solver.algebra.sparse.sparse_factor import SparseFactor
+from rotavg_ros.solver.algebra.sparse.laplacian import root_stiffness
+from rotavg_ros.solver.algebra.sparse.ldl import LDL, RowPattern
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.running.work import ENTRIES, rest, spend, stop_if_abandoned
 
-_NUM_PROBES = 48
-# Rows that weigh less than this share of the heaviest one are nothing; so many of them are worth a pattern without
-# them, of which some are kept.
-_NO_WEIGHT, _WORTH_LEAVING_OUT, _MAX_PARTS = 1e-9, 200, 8
+# Rows that weigh less than this share of the heaviest one are nothing.
+_NO_WEIGHT = 1e-9
+# So many patterns of rows are kept. One whose rows are others than another's by this share at most is eliminated in the
+# same order.
+_MAX_PATTERNS, _SAME_ORDER = 8, 0.02
 _MAX_LEVERAGE = 1 - 1e-6
 
 
@@ -64,35 +66,41 @@ class NormalEquations:
         rows = np.repeat(np.arange(len(column)), 3)
         self.rows: csr_array = csr_array((value.ravel(), (rows, column.ravel())), shape=(len(column), self.size))
         self._transposed = self.rows.T.tocsr()
-        self._whole = _Pattern(self, np.arange(len(column)))
-        self._parts: dict[bytes, _Pattern] = {}
-        self.probes = probe_signs(
-            np.concatenate((source, num_nodes + np.arange(self.num_runs))),
-            np.concatenate((target, 2 * num_nodes + self.num_runs + np.arange(self.num_runs))),
-            _NUM_PROBES,
-        ).astype(np.float64)
+        self._whole = np.ones(len(column), dtype=bool)
+        self._patterns: dict[bytes, _Pattern] = {}
+        self._ordered: list[_Pattern] = []
 
     def factorise(self, weight: np.ndarray) -> Factorised:
         """With weights ``(E + R,)``, rad⁻²."""
         stop_if_abandoned()
         pattern = self._pattern(weight)
-        spend(pattern.num_entries / ENTRIES)
+        spend(pattern.rows.num_entries / ENTRIES)
         stiffness = root_stiffness(weight)
-        factor, rank = pattern.factorise(weight, stiffness)
-        return Factorised(self, weight, factor, rank, len(self.roots) * np.log(stiffness))
+        extra = np.zeros(self.size)
+        extra[self.roots] = stiffness
+        factor = pattern.rows.factorise(weight[pattern.counts], extra)
+        return Factorised(self, weight, pattern, factor, len(self.roots) * np.log(stiffness))
 
     def _pattern(self, weight: np.ndarray) -> _Pattern:
         """Of the rows that weigh anything: others fill the factor of a graph with many false closures for nothing."""
-        counts = weight > _NO_WEIGHT * weight.max()
-        if len(weight) - counts.sum() < _WORTH_LEAVING_OUT:
-            return self._whole
+        counts = weight > _NO_WEIGHT * weight.max(initial=0.0)
         key = np.packbits(counts).tobytes()
-        if key not in self._parts:
-            if len(self._parts) == _MAX_PARTS:
-                del self._parts[next(iter(self._parts))]
+        if key not in self._patterns:
+            if len(self._patterns) == _MAX_PATTERNS:
+                del self._patterns[next(iter(self._patterns))]
             # Where nothing else holds a part together, next to nothing does.
-            self._parts[key] = _Pattern(self, np.flatnonzero(counts)) if self._is_held(counts) else self._whole
-        return self._parts[key]
+            self._patterns[key] = self._laid_out(counts if self._is_held(counts) else self._whole)
+        return self._patterns[key]
+
+    def _laid_out(self, counts: np.ndarray) -> _Pattern:
+        """The pattern of some rows, in the order of one that has about the same, if there is such."""
+        limit = _SAME_ORDER * len(counts)
+        alike = next((other for other in self._ordered if np.count_nonzero(other.counts != counts) <= limit), None)
+        rank = None if alike is None else alike.rows.rank
+        pattern = _Pattern(counts, RowPattern(self.column[counts], self.value[counts], self.size, rank))
+        if alike is None:
+            self._ordered = [pattern, *self._ordered[: _MAX_PATTERNS - 1]]
+        return pattern
 
     def _is_held(self, counts: np.ndarray) -> bool:
         """Whether some rows alone tie every unknown to a root."""
@@ -102,66 +110,31 @@ class NormalEquations:
         return bool(connected_components(links, directed=False)[0] == len(self.roots))
 
 
-class _Pattern:
-    """Where the entries of H stand that some of the rows make, in an order of elimination with little fill."""
+class _Pattern(NamedTuple):
+    """Of some of the rows.
 
-    def __init__(self, system: NormalEquations, rows: np.ndarray) -> None:
-        # Not the system itself, which holds this: both would stay until the garbage collector comes round to them.
-        self._rows, self._num_rows, self._size, self._roots = rows, len(system.column), system.size, system.roots
-        self._column, self._value = system.column[rows], system.value[rows]
-        self._rank = np.arange(system.size)
-        self._is_ordered = False
-        self._lay_out()
+    Attributes:
+        counts: ``(E + R,)`` bool, which.
+        rows: where H's and its factor's entries stand.
+    """
 
-    def _lay_out(self) -> None:
-        size = self._size
-        column, value = self._rank[self._column], self._value
-        first, second = np.repeat(column, 3, axis=1), np.tile(column, 3)
-        keys = np.concatenate(((second * size + first).ravel(), self._rank * (size + 1)))
-        occupied, slot = np.unique(keys, return_inverse=True)
-        slot, diagonal = np.split(slot, [first.size])
-        self._root_slot = diagonal[self._roots]
-        product = (np.repeat(value, 3, axis=1) * np.tile(value, 3)).ravel()
-        row = np.repeat(self._rows, 9)
-        # Entries of H as a linear map of the weights.
-        self._entries: csr_array = csr_array((product, (slot, row)), shape=(len(occupied), self._num_rows))
-        first_of_column = np.searchsorted(occupied, np.arange(size + 1) * size)
-        self._matrix: csc_array = csc_array(
-            (np.ones(len(occupied)), (occupied % size).astype(np.int32), first_of_column.astype(np.int32)),
-            shape=(size, size),
-        )
-
-    @property
-    def num_entries(self) -> int:
-        """Of H."""
-        return int(self._matrix.nnz)
-
-    def factorise(self, weight: np.ndarray, stiffness: float) -> tuple[SparseFactor, np.ndarray]:
-        """H's factor, and where each unknown stands in it.
-
-        Args:
-            weight: ``(E + R,)`` rad⁻².
-            stiffness: rad⁻², what ties roots down.
-        """
-        values = self._entries @ weight
-        values[self._root_slot] += stiffness
-        self._matrix.data = values
-        factor = SparseFactor(self._matrix, is_ordered=self._is_ordered)
-        rank = self._rank
-        if not self._is_ordered:
-            self._rank, self._is_ordered = factor.rank, True
-            self._lay_out()
-        return factor, rank
+    counts: np.ndarray
+    rows: RowPattern
 
 
 class Factorised:
-    """H for one choice of weights."""
+    """H for one choice of weights.
+
+    Attributes:
+        system: its pattern.
+        weight: ``(E + R,)`` rad⁻².
+    """
 
     def __init__(
-        self, system: NormalEquations, weight: np.ndarray, factor: SparseFactor, rank: np.ndarray, grounding: float
+        self, system: NormalEquations, weight: np.ndarray, pattern: _Pattern, factor: LDL, grounding: float
     ) -> None:
         self.system, self.weight = system, weight
-        self._factor, self._rank, self._node, self._grounding = factor, rank, np.argsort(rank), grounding
+        self._counts, self._factor, self._grounding = pattern.counts, factor, grounding
 
     @property
     def log_det(self) -> float:
@@ -171,33 +144,44 @@ class Factorised:
     @property
     def num_entries(self) -> int:
         """Of the factor."""
-        return self._factor.num_entries
+        return self._factor.pattern.num_factor_entries
 
     def solve(self, right_hand_side: np.ndarray) -> np.ndarray:
         """``H⁻¹ b`` for ``(K + R, k)`` columns."""
         stop_if_abandoned()
         rest()
-        return solve_in_parts(self._factor, right_hand_side.take(self._node, axis=0)).take(self._rank, axis=0)
+        return self._factor.solve(right_hand_side)
 
     def fit(self, difference: np.ndarray) -> np.ndarray:
         """Unknowns ``(K + R, k)`` that explain ``(E + R, k)`` best."""
-        return self.solve(self.system._transposed @ (self.weight[:, None] * difference))
+        return self.solve(self.gradient(difference))
 
-    @cached_property
-    def samples(self) -> np.ndarray:
-        """Unknowns ``(K + R, 48)`` whose second moments are H⁻¹."""
-        return self.fit(self.system.probes / np.sqrt(self.weight)[:, None])
+    def gradient(self, difference: np.ndarray) -> np.ndarray:
+        """``Jᵀ W r`` ``(K + R, k)`` of ``(E + R, k)`` residuals."""
+        return np.asarray(self.system._transposed @ (self.weight[:, None] * difference))
+
+    @property
+    def variance(self) -> np.ndarray:
+        """``(K + R,)`` rad², of every unknown."""
+        return self._factor.variance
 
     @cached_property
     def resistance(self) -> np.ndarray:
-        """``(E + R,)`` rad², variance of what the fit says of every row, estimated by samples."""
-        scaled = np.sqrt(self.weight)[:, None] * (self.system.rows @ self.samples)
-        probes = self.system.probes
-        leverage = likeliest_leverage((scaled**2).mean(axis=1), (scaled * probes).mean(axis=1))
-        return np.asarray(np.minimum(leverage, _MAX_LEVERAGE) / self.weight)
+        """``(E + R,)`` rad², variance of what the fit says of every row."""
+        variance, left_out = self.resistance_of_kept.copy(), ~self._counts
+        far = self._factor.variance_of(self.system.column[left_out], self.system.value[left_out])
+        variance[left_out] = np.minimum(far, _MAX_LEVERAGE / self.weight[left_out])
+        return np.asarray(variance)
+
+    @cached_property
+    def resistance_of_kept(self) -> np.ndarray:
+        """The same, but NaN of rows that weigh nothing, which takes less time."""
+        variance = np.full(len(self.weight), np.nan)
+        variance[self._counts] = np.minimum(self._factor.row_variance, _MAX_LEVERAGE / self.weight[self._counts])
+        return variance
 
     def covariance(self, rows: np.ndarray) -> np.ndarray:
-        """``(n, n)`` rad², exact, of what the fit says of some rows."""
+        """``(n, n)`` rad², of what the fit says of some rows."""
         chosen = self.system.rows[rows]
         columns = np.zeros((self.system.size, len(rows)))
         np.add.at(columns, (self.system.column[rows], np.arange(len(rows))[:, None]), self.system.value[rows])

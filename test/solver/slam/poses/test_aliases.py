@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros import ViewGraph, solve
 from rotavg_ros.datasets.simulation.plane_paths import FloatArray
 from rotavg_ros.metrics.positions import position_errors
-from rotavg_ros.solver.slam.poses.neighbours import Errors
+from rotavg_ros.solver.slam.poses.repeats.neighbours import Errors
 
 # Metres between aisles, keyframes along each, and how many there are.
 _SPACING, _LENGTH, _AISLES = 4.0, 30, 6

@@ -255,7 +255,7 @@ def test_there_are_few_numbers() -> None:
 # numerical floors.
 STRUCTURAL = {
     "densities": {"_QUARTER_TURN"},
-    "em": {"_SETTLED_TURN", "_MAX_UNSETTLED", "_NOISE_CONVERGED", "_SLOWEST", "_PROBABILITY_CONVERGED"}
+    "em": {"_SETTLED_TURN", "_MAX_UNSETTLED", "_SLOWEST", "_PROBABILITY_CONVERGED"}
     | {"_NEWTON_STEPS", "_NEWTON_CONVERGED", "_FARTHEST"},
     "inference": {"_GAIN", "_BEAM"},
     "labels": {
@@ -263,12 +263,7 @@ STRUCTURAL = {
         "_STAY",
         "_NEAR_SHARES",
         "_FAR_SHARES",
-        "_REPEAT_DEG",
-        "_KERNELS",
-        "_IN_RUN",
         "_TOLD",
-        "_FARTHEST",
-        "_ROWS_AT_ONCE",
         "_LEAST",
         "_GRID",
         "_NEAR_MISS_QUANTILES",
@@ -292,7 +287,7 @@ STRUCTURAL = {
     "rows": {"_NOTHING", "_MAX_TURN", "_LEAST_REST"},
     "solve": {"Begin", "_BIAS_ROUNDS", "_LEAST_GAIN"},
     "state": {"EXPONENTS", "COMMON_SHARES", "RUN_STEPS", "TURN_SHARES", "TAIL_SHARES"},
-    "system": {"_NUM_PROBES", "_MAX_LEVERAGE", "_NO_WEIGHT", "_WORTH_LEAVING_OUT", "_MAX_PARTS"},
+    "system": {"_MAX_LEVERAGE", "_NO_WEIGHT", "_MAX_PATTERNS", "_SAME_ORDER"},
 }
 
 

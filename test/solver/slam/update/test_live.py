@@ -160,7 +160,7 @@ def test_in_silence_the_answer_becomes_that_of_a_solve_from_scratch() -> None:
     graph = until(case.graph, 500)
     solution, ticks = go_on(graph, solve(until(case.graph, 480), profile="slam")), 0
     while not (solution := go_on(graph, solution, anew=True)).is_anew:
-        advance(solution.memory, 100.0)
+        advance(solution.memory, 30.0)
         ticks += 1
     assert ticks > 2
     cold = solve(graph, profile="slam")

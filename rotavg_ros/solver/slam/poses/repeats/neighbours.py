@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from rotavg_ros.solver.algebra.compiled import compiled
+from rotavg_ros.solver.slam.noise.repeats import Near
 from rotavg_ros.solver.slam.poses.closures import GOOD, Told
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 
-# Squared widths of what repeats differ by, in those of two good closures.
-_KERNELS = np.array([1.0, 16.0, 256.0])
+# Squared widths of what repeats differ by, in those of two good closures: so many, each a sixteenth of the one before.
+_BROADEST, _WIDTHS = 256.0, 3
 # No share is less than this, or nearer to one; whoever is wrong with less than this chance tells nobody anything.
 _SHARE = _LEAST_CHANCE = 0.01
 
@@ -55,12 +58,12 @@ class Errors:
     def turned_alike(self, rows: np.ndarray, others: np.ndarray, sign: int = 1) -> np.ndarray:
         """``(P,)`` densities of turns, if they are ``sign`` times those of others."""
         variance = self.turn_variance[rows] + self.turn_variance[others]
-        return _mean_kernel(self.turn[rows] - sign * self.turn[others], variance)
+        return _mean_kernels(self.turn[rows] - sign * self.turn[others], variance)
 
     def shifted_alike(self, rows: np.ndarray, others: np.ndarray, sign: int = 1) -> np.ndarray:
         """``(P,)`` densities of shifts, if they are ``sign`` times those of others."""
         variance = np.full(len(rows), 2 * self.shift_variance)
-        return _mean_kernel(self.shift[rows] - sign * self.shift[others], variance)
+        return _mean_kernels(self.shift[rows] - sign * self.shift[others], variance)
 
 
 def repeats_of(errors: Errors, before: np.ndarray, told: Told, *, in_order: bool) -> Repeats:
@@ -97,21 +100,77 @@ def repeats_of(errors: Errors, before: np.ndarray, told: Told, *, in_order: bool
 
 def _elsewhere(errors: Errors, wrong: np.ndarray, told: Told, *, in_order: bool) -> tuple[np.ndarray, np.ndarray]:
     """``has_elsewhere`` and ``elsewhere`` of :class:`Repeats`, by the chances ``(C,)`` to join wrong places."""
-    count = len(wrong)
     tells = told.detection[wrong[told.detection] > _LEAST_CHANCE]
-    rows, others = told.detected_near(np.flatnonzero(told.is_known & errors.is_told), tells, in_order=in_order)
-    # A place that was mistaken for another one is so again, or from there the other one for it.
-    moved = sum(errors.turned_alike(rows, others, sign) * errors.shifted_alike(rows, others, sign) for sign in (1, -1))
-    density = np.bincount(rows, wrong[others] * moved / 2, count)
-    total = np.bincount(rows, wrong[others], count)
+    rows = np.flatnonzero(told.is_known & errors.is_told)
+    near = told.detected_near(rows, tells, in_order=in_order)
+    off = np.concatenate((errors.turn, errors.shift), axis=1)
+    variance = errors.turn_variance, errors.shift_variance
+    density, total = _moved_alike(off, errors.turn.shape[1], *variance, wrong, near)
     return np.minimum(total, 1.0), density / np.maximum(total, 1.0)
 
 
-def _mean_kernel(apart: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """``(P,)`` densities of differences ``(P, n)``, ``variance`` ``(P,)`` per component; means of several widths."""
-    wide = variance * _KERNELS[:, None]
-    density = np.exp(-(apart**2).sum(axis=1) / (2 * wide)) / (2 * np.pi * wide) ** (apart.shape[1] / 2)
-    return np.asarray(density.mean(axis=0))
+@compiled
+def _moved_alike(
+    off: np.ndarray, turns: int, turn_variance: np.ndarray, shift_variance: float, wrong: np.ndarray, near: Near
+) -> tuple[np.ndarray, np.ndarray]:
+    """``(C,)`` densities of turns and shifts like those of others near, or their opposites; and how many these are.
+
+    A place that was mistaken for another one is so again, or from there the other one for it.
+
+    Args:
+        off: ``(C, k + m)`` turns and shifts.
+        turns: k.
+        turn_variance: ``(C,)`` rad² per component, of good closures' turns.
+        shift_variance: m² per component.
+        wrong: ``(C,)`` chances to join wrong places.
+        near: which to compare with which.
+    """
+    rows, others, between = near
+    shifts = off.shape[1] - turns
+    density, total = np.zeros(len(wrong)), np.zeros(len(wrong))
+    for n in range(len(rows)):
+        row = rows[n]
+        for side in range(2):
+            for place in range(between[n, 2 * side], between[n, 2 * side + 1]):
+                other = others[place]
+                moved = 0.0
+                for sign in (1, -1):
+                    of_turn, of_shift = 0.0, 0.0
+                    for d in range(turns):
+                        of_turn += (off[row, d] - sign * off[other, d]) ** 2
+                    for d in range(turns, off.shape[1]):
+                        of_shift += (off[row, d] - sign * off[other, d]) ** 2
+                    shifted = _mean_kernel(of_shift, 2 * shift_variance, shifts)
+                    if shifted > 0:
+                        moved += shifted * _mean_kernel(of_turn, turn_variance[row] + turn_variance[other], turns)
+                density[row] += wrong[other] * moved / 2
+                total[row] += wrong[other]
+    return density, total
+
+
+@compiled
+def _mean_kernel(square: float, variance: float, components: int) -> float:
+    """Density of a difference of so many components, ``variance`` in each; mean of several widths."""
+    half = components / 2
+    kernel, total = math.exp(-square / (2 * _BROADEST * variance)), 0.0
+    width = _BROADEST
+    for _ in range(_WIDTHS):
+        total += kernel / width**half
+        # A sixteenth as wide: to the sixteenth power.
+        for _ in range(4):
+            kernel *= kernel
+        width /= 16.0
+    density: float = total / _WIDTHS / (2 * math.pi * variance) ** half
+    return density
+
+
+@compiled
+def _mean_kernels(apart: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """``(P,)`` densities of differences ``(P, n)``, ``variance`` ``(P,)`` per component."""
+    density = np.empty(len(apart))
+    for p in range(len(apart)):
+        density[p] = _mean_kernel((apart[p] ** 2).sum(), variance[p], apart.shape[1])
+    return density
 
 
 def wrong_share(before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndarray:

@@ -1,0 +1,228 @@
+"""The sums over pairs of closures behind :meth:`~rotavg_ros.solver.slam.poses.repeats.map_turns.MapTurns.repeats`.
+
+Of two closures that are turned alike, one's turn and shift differ from what the other's turn of the map would have by
+something of which the variance is known (the lever of the other's turn included). The density of such a difference is a
+normal one of turns, and a mean of two widths of shifts given the turn.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from rotavg_ros.solver.algebra.compiled import compiled
+from rotavg_ros.solver.slam.noise.repeats import Near
+
+# Squared width, besides one, of what two differ by, in its variance, which is known only about.
+_BROADER = 16.0
+# Turns alike up to so many standard deviations.
+_FARTHEST = 4.0
+# What is less likely the same turn than this adds nothing.
+_NEGLIGIBLE = 1e-8
+# So small a squared sine counts as this; no density is less than the other.
+_TINY, _LEAST = 1e-30, 1e-300
+
+
+# Where in a row of a closure its shift, its place and its covariance begin, after its turn.
+_SHIFT, _PLACE, _COVARIANCE = 4, 7, 10
+
+
+class Axes(NamedTuple):
+    """``(3, k)`` of turns and ``(3, m)`` of shifts."""
+
+    turns: np.ndarray
+    shifts: np.ndarray
+
+
+def closure_rows(turn: np.ndarray, shift: np.ndarray, place: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """``(C, 10 + d²)`` of closures, what is read together beside each other.
+
+    Args:
+        turn: ``(4, C)`` unit quaternions.
+        shift, place: ``(C, 3)`` metres.
+        covariance: ``(C, d, d)`` of turns and shifts.
+    """
+    return np.concatenate((turn.T, shift, place, covariance.reshape(len(shift), -1)), axis=1)
+
+
+@compiled
+def repeated_density(
+    turned: np.ndarray, axes: Axes, chance: np.ndarray, log_alone: np.ndarray, among: Near, of_all: Near
+) -> tuple[np.ndarray, np.ndarray]:
+    """``(C,)`` how surely others are turned alike, and the density of each shift by these.
+
+    Each of those others stands for all that seem to be off by the turn by which it is, weighed by precision.
+
+    Args:
+        turned: the closures as :func:`closure_rows`.
+        axes: of turns and shifts.
+        chance: ``(C,)`` that each joins places that are turned and wrong.
+        log_alone: ``(C,)`` nats, density of its shift if no other has to do with it.
+        among: closures that tell of others, with each other.
+        of_all: all closures, with these.
+    """
+    count, k = len(chance), axes.turns.shape[1]
+    size = k + axes.shifts.shape[1]
+    tells, near, nearby = among.rows, among.between, of_all.between
+    most = 1
+    for t in range(len(tells)):
+        most = max(most, 1 + near[t, 1] - near[t, 0] + near[t, 3] - near[t, 2])
+    # Of each that tells, which are off by the same turn, and how likely they are so.
+    number = np.ones(len(tells), np.int64)
+    alike, how = np.empty((len(tells), most), np.int64), np.empty((len(tells), most))
+    difference, root = np.empty(size), np.empty((size + 1, size))
+    for t in range(len(tells)):
+        row = tells[t]
+        alike[t, 0], how[t, 0] = row, chance[row]
+        for side in range(2):
+            for place in range(near[t, 2 * side], near[t, 2 * side + 1]):
+                other = tells[place]
+                of_turn, of_shift = _difference(turned, axes, row, other, difference)
+                if of_turn < 0:
+                    continue
+                _, same = _densities(turned, row, difference, (of_turn, of_shift), k, root)
+                likely = same / max(same + math.exp(log_alone[row]), _LEAST)
+                if likely > _NEGLIGIBLE:
+                    alike[t, number[t]], how[t, number[t]] = other, likely * chance[other]
+                    number[t] += 1
+    surely, density = np.zeros(count), np.zeros(count)
+    most = 1
+    for c in range(count):
+        most = max(most, nearby[c, 1] - nearby[c, 0] + nearby[c, 3] - nearby[c, 2])
+    listed, apart, variance = np.empty(most, np.int64), np.empty((most, size)), np.empty((most, 2))
+    slot = np.full(count, -1, np.int64)
+    for c in range(count):
+        found = 0
+        for side in range(2):
+            for place in range(nearby[c, 2 * side], nearby[c, 2 * side + 1]):
+                of_turn, of_shift = _difference(turned, axes, c, tells[place], difference)
+                if of_turn >= 0:
+                    listed[found], slot[tells[place]] = place, found
+                    apart[found] = difference
+                    variance[found, 0], variance[found, 1] = of_turn, of_shift
+                    found += 1
+        for n in range(found):
+            # The mean over all that are like this one.
+            t = listed[n]
+            total, of_turn = 0.0, 0.0
+            difference[:] = 0.0
+            for entry in range(number[t]):
+                at = slot[alike[t, entry]]
+                if at >= 0:
+                    weight = how[t, entry] / variance[at, 1]
+                    total += weight
+                    of_turn += weight / variance[at, 1] * variance[at, 0]
+                    for d in range(size):
+                        difference[d] += weight * apart[at, d]
+            for d in range(size):
+                difference[d] /= total
+            square, same = _densities(turned, c, difference, (of_turn / total**2, 1 / total), k, root)
+            weight = chance[tells[t]] * math.exp(-square / 2)
+            surely[c] += weight
+            density[c] += weight * same
+        for n in range(found):
+            slot[tells[listed[n]]] = -1
+        density[c] /= max(surely[c], 1.0)
+        surely[c] = min(surely[c], 1.0)
+    return surely, density
+
+
+@compiled
+def _difference(turned: np.ndarray, axes: Axes, row: int, other: int, difference: np.ndarray) -> tuple[float, float]:
+    """Between one closure and what the turn of another would have it be.
+
+    Args:
+        turned: closures.
+        axes: of turns and shifts.
+        row, other: which.
+        difference: ``(k + m,)`` rad and metres, to be filled.
+
+    Returns:
+        Variances per component of what the other says, rad² and m²; negative if their turns are not the same.
+    """
+    turns, shifts = axes
+    k, m = turns.shape[1], shifts.shape[1]
+    size = k + m
+    own, of_turn = 0.0, 0.0
+    for d in range(k):
+        own += turned[row, _COVARIANCE + d * size + d]
+        of_turn += turned[other, _COVARIANCE + d * size + d]
+    # a ∘ b⁻¹ as a rotation vector.
+    a0, a1, a2, a3 = turned[row, 0], turned[row, 1], turned[row, 2], turned[row, 3]
+    b0, b1, b2, b3 = turned[other, 0], turned[other, 1], turned[other, 2], turned[other, 3]
+    x = -a3 * b0 + a0 * b3 - a1 * b2 + a2 * b1
+    y = -a3 * b1 + a1 * b3 - a2 * b0 + a0 * b2
+    z = -a3 * b2 + a2 * b3 - a0 * b1 + a1 * b0
+    w = a3 * b3 + a0 * b0 + a1 * b1 + a2 * b2
+    sine = math.sqrt(max(x * x + y * y + z * z, _TINY))
+    angle = 2 * math.atan2(sine, abs(w))
+    if not angle**2 < _FARTHEST**2 * (own + of_turn):
+        return -1.0, -1.0
+    scale = angle / sine * (1.0 if w >= 0 else -1.0)
+    for d in range(k):
+        difference[d] = scale * (x * turns[0, d] + y * turns[1, d] + z * turns[2, d])
+    # The other's turn of the way from its place to this one's.
+    arm0 = turned[row, _PLACE] - turned[other, _PLACE]
+    arm1 = turned[row, _PLACE + 1] - turned[other, _PLACE + 1]
+    arm2 = turned[row, _PLACE + 2] - turned[other, _PLACE + 2]
+    c0, c1, c2 = b1 * arm2 - b2 * arm1, b2 * arm0 - b0 * arm2, b0 * arm1 - b1 * arm0
+    t0 = arm0 + 2 * (b3 * c0 + b1 * c2 - b2 * c1)
+    t1 = arm1 + 2 * (b3 * c1 + b2 * c0 - b0 * c2)
+    t2 = arm2 + 2 * (b3 * c2 + b0 * c1 - b1 * c0)
+    off0 = turned[row, _SHIFT] - turned[other, _SHIFT] - t0 + arm0
+    off1 = turned[row, _SHIFT + 1] - turned[other, _SHIFT + 1] - t1 + arm1
+    off2 = turned[row, _SHIFT + 2] - turned[other, _SHIFT + 2] - t2 + arm2
+    of_shift = 0.0
+    for e in range(m):
+        s0, s1, s2 = shifts[0, e], shifts[1, e], shifts[2, e]
+        difference[k + e] = off0 * s0 + off1 * s1 + off2 * s2
+        # sᵀ (t ×) = (s × t)ᵀ: by what the other's turn moves it along this axis.
+        l0, l1, l2 = s1 * t2 - s2 * t1, s2 * t0 - s0 * t2, s0 * t1 - s1 * t0
+        of_shift += turned[other, _COVARIANCE + (k + e) * size + k + e]
+        for d in range(k):
+            lever = l0 * turns[0, d] + l1 * turns[1, d] + l2 * turns[2, d]
+            of_shift -= 2 * lever * turned[other, _COVARIANCE + d * size + k + e]
+            for f in range(k):
+                another = l0 * turns[0, f] + l1 * turns[1, f] + l2 * turns[2, f]
+                of_shift += lever * another * turned[other, _COVARIANCE + d * size + f]
+    return of_turn / k, of_shift / m
+
+
+@compiled
+def _densities(
+    turned: np.ndarray, row: int, difference: np.ndarray, variance: tuple[float, float], k: int, root: np.ndarray
+) -> tuple[float, float]:
+    """Squares of what turns differ by, in standard deviations; and the density of what shifts differ by, given that.
+
+    Args:
+        turned, row: one of the closures.
+        difference: ``(k + m,)`` to what another says.
+        variance: rad² and m² per component, of what another says.
+        k: components of turns.
+        root: ``(k + m + 1, k + m)`` room for Cholesky's factor, and what is left of the difference.
+    """
+    size = len(difference)
+    m = size - k
+    square, squares, volume = 0.0, 0.0, (2 * math.pi) ** (m / 2)
+    for i in range(size):
+        value = difference[i]
+        for j in range(i):
+            entry = turned[row, _COVARIANCE + i * size + j]
+            for n in range(j):
+                entry -= root[i, n] * root[j, n]
+            root[i, j] = entry / root[j, j]
+            value -= root[i, j] * root[size, j]
+        pivot = turned[row, _COVARIANCE + i * size + i] + (variance[0] if i < k else variance[1])
+        for n in range(i):
+            pivot -= root[i, n] * root[i, n]
+        root[i, i] = math.sqrt(pivot)
+        root[size, i] = value / root[i, i]
+        if i < k:
+            square += root[size, i] * root[size, i]
+        else:
+            squares += root[size, i] * root[size, i]
+            volume *= root[i, i]
+    both = math.exp(-squares / 2) + math.exp(-squares / (2 * _BROADER)) / _BROADER ** (m / 2)
+    return square, both / (2 * volume)

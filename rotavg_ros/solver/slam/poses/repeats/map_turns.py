@@ -1,0 +1,121 @@
+"""Closures that are false by the same turn of the map: a symmetric building seen as if it were turned about its middle.
+
+Such closures agree as one turn about one point, wherever they were seen, and not as one shift.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.running.work import rest
+from rotavg_ros.solver.slam.poses.closures import Predictions, Told
+from rotavg_ros.solver.slam.poses.repeats.map_turn_densities import Axes, closure_rows, repeated_density
+from rotavg_ros.solver.slam.poses.rows import PoseProblem
+
+# Whoever is elsewhere with less than this chance tells nobody anything.
+_LEAST_CHANCE = 0.01
+
+
+@dataclass(frozen=True)
+class MapTurns:
+    """By what turn of the map each of C closures is false, if it is, seen from its older end; world frame.
+
+    Attributes:
+        turn: ``(4, C)`` unit quaternions.
+        shift: ``(C, 3)`` metres, by what the turned map has the newer end elsewhere, …
+        place: ``(C, 3)`` … from where it is.
+        covariance: ``(C, k + m, k + m)`` of turns and shifts, the closures' own noise included.
+        bases: ``(3, k)`` axes of turns and ``(3, m)`` of shifts.
+    """
+
+    turn: np.ndarray
+    shift: np.ndarray
+    place: np.ndarray
+    covariance: np.ndarray
+    bases: tuple[np.ndarray, np.ndarray]
+
+    @classmethod
+    def of(
+        cls, problem: PoseProblem, position: np.ndarray, predictions: Predictions, closure_variance: np.ndarray
+    ) -> MapTurns:
+        """By what closures are off from what all else says.
+
+        Args:
+            problem: the graph.
+            position: ``(K, 3)`` metres, of the key nodes.
+            predictions: what all else says.
+            closure_variance: ``(C,)`` m² per component, of good closures.
+        """
+        closure, (turns, shifts), drawn = problem.mode.problem.closure, problem.bases, problem.drawn
+        k, m = turns.shape[1], shifts.shape[1]
+        is_forward = problem.told.sign > 0
+        source, target = position[drawn.source[closure]], position[drawn.target[closure]]
+        # A correction turns bodies from the world, the map the other way.
+        forward = quaternion_rows.exp(-turns @ predictions.mean[:, :k].T)
+        shift = predictions.mean[:, k:] @ shifts.T
+        # Where the newer end is the source: the inverse, F⁻¹ x = Fᵀ (x − target − ε) + target.
+        inverse = quaternion_rows.inverse(forward)
+        seen = _rotated(inverse, source - target - shift)
+        change = np.zeros((len(closure), k + m, k + m))
+        change[:, :k, :k], change[:, k:, k:] = -np.eye(k), np.eye(m)
+        back = np.stack([_rotated(inverse, np.broadcast_to(axis, source.shape)) for axis in np.eye(3)], axis=2)
+        is_back = ~is_forward
+        change[is_back, :k, :k] = (turns.T @ back @ turns)[is_back]
+        change[is_back, k:, :k] = -(shifts.T @ _crossed(seen) @ back @ turns)[is_back]
+        change[is_back, k:, k:] = -(shifts.T @ back @ shifts)[is_back]
+        own = np.repeat(np.stack((problem.told.rotation_variance, closure_variance), axis=1), (k, m), axis=1)
+        covariance = _with_own(predictions.covariance, np.sqrt(own))
+        return cls(
+            np.where(is_forward, forward, inverse),
+            np.where(is_forward[:, None], shift, seen + target - source),
+            np.where(is_forward[:, None], target, source),
+            change @ covariance @ change.transpose(0, 2, 1),
+            problem.bases,
+        )
+
+    def repeats(
+        self, elsewhere: np.ndarray, log_alone: np.ndarray, told: Told, *, in_order: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """``(C,)`` each: how surely there is one that is turned alike, up to 1; and the density of the shift by these.
+
+        The density is of shifts given the turn, which is counted with the rotations. It is a kernel estimate over other
+        closures, each of which stands for all that seem to be off by the turn by which it is (weighed by precision).
+
+        Args:
+            elsewhere: ``(C,)`` chance that each joins places that are turned and wrong.
+            log_alone: ``(C,)`` nats, density of its shift if no other has to do with it.
+            told: whose translations are known, and the order of detection.
+            in_order: given those before alone.
+        """
+        chance = elsewhere * told.is_known
+        tells = told.detection[chance[told.detection] > _LEAST_CHANCE]
+        rest()
+        among, of_all = (
+            told.detected_near(rows, tells, in_order=alone)
+            for rows, alone in ((tells, False), (np.arange(len(chance)), in_order))
+        )
+        turned = closure_rows(self.turn, self.shift, self.place, self.covariance)
+        axes = Axes(*(np.ascontiguousarray(basis) for basis in self.bases))
+        return repeated_density(turned, axes, chance, log_alone, among, of_all)
+
+
+def _with_own(covariance: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """``(C, d, d)`` covariances from samples, of which none may be negative, with closures' own noise ``(C, d)``."""
+    scale = sigma[:, :, None] * sigma[:, None, :]
+    spread, axes = np.linalg.eigh(covariance / scale)
+    return np.asarray(scale * ((axes * (1 + np.maximum(spread, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)))
+
+
+def _rotated(turn: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """``(n, 3)`` vectors turned by quaternions ``(4, n)``."""
+    axis = turn[:3].T
+    across = 2 * np.cross(axis, vector)
+    return np.asarray(vector + turn[3][:, None] * across + np.cross(axis, across))
+
+
+def _crossed(vector: np.ndarray) -> np.ndarray:
+    """``(n, 3, 3)`` of v ×."""
+    return np.asarray(np.cross(vector[:, None, :], np.eye(3)).transpose(0, 2, 1))

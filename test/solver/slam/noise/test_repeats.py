@@ -1,0 +1,59 @@
+"""Densities of turns like those of other false closures, against sums that are written out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.solver.slam.noise.repeats import KERNELS, REPEAT_DEG, Closures, Near, places_near, repeats
+
+GAP, WINDOW = 30.0, 6
+
+
+@given(st.integers(0, 10_000), st.integers(1, 25), st.booleans(), st.sampled_from([1, 3]))
+def test_densities_are_means_over_those_near_and_over_all(
+    seed: int, count: int, both_sides: bool, components: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    # Few places, so that many are near each other, or the other way round.
+    older, newer = rng.integers(0, 4, count) * 20.0, 500 + rng.integers(0, 4, count) * 20.0
+    swapped = rng.random(count) < 0.3
+    older, newer = np.where(swapped, newer, older), np.where(swapped, older, newer)
+    turn = Rotation.from_rotvec(0.1 * rng.normal(size=(count, 3)) * ([0, 0, 1] if components == 1 else 1))
+    is_told, false = rng.random(count) < 0.9, np.flatnonzero(rng.random(count) < 0.7)
+    rows = np.arange(count)
+    between = places_near(false, rows, np.isin(rows, false) if both_sides else None, WINDOW)
+    found = repeats(Closures(older, newer, turn.as_quat(), is_told), Near(rows, false, between), GAP, components)
+
+    width = np.radians(REPEAT_DEG)
+    for row in rows:
+        before = [other for other in false if other < row][-WINDOW:]
+        after = [other for other in false if other > row][:WINDOW] if both_sides else []
+        others = [other for other in before + after if is_told[other]] if is_told[row] else []
+        follows = any(abs(newer[other] - newer[row]) <= GAP for other in others)
+        near, far, weight_near = np.zeros(KERNELS - 1), np.zeros(KERNELS - 1), 0.0
+        for other in others:
+            apart = np.abs([older[other] - older[row], newer[other] - newer[row]])
+            crossed = min(abs(newer[other] - older[row]), abs(older[other] - newer[row]))
+            back = crossed <= GAP and bool((apart > GAP).all())
+            is_near = apart[1] <= GAP or (follows and (back or apart[0] <= GAP))
+            weight = (10.0 if apart.sum() <= GAP else 1.0) * is_near
+            angle = (turn[row] * turn[other] if back else turn[row] * turn[other].inv()).magnitude()
+            kernel = np.exp(-(angle**2) / (2 * width**2)) / (2 * np.pi * width**2) ** (components / 2)
+            near, far, weight_near = near + weight * kernel, far + kernel, weight_near + weight
+        assert found.has_far[row] == bool(others) and found.has_near[row] == (weight_near > 0)
+        for density, total, number in ((found.near, near, weight_near), (found.far, far, len(others))):
+            expected = total / max(number, 1.0)
+            # Kernels end at five widths of the broadest.
+            np.testing.assert_allclose(density[:-1, row], expected, rtol=1e-6, atol=1e-5 * width[-1] ** -components)
+            assert density[-1, row] == pytest.approx(density[:-1, row].mean())
+
+
+def test_nobody_is_near_itself() -> None:
+    when, rows = np.array([2, 5, 9]), np.array([2, 4, 5, 10])
+    near = places_near(when, rows, np.isin(rows, when), 2)
+    assert near.tolist() == [[0, 0, 1, 3], [0, 1, 1, 3], [0, 1, 2, 3], [1, 3, 3, 3]]
+    assert places_near(when, rows, None, 2)[:, 2:].tolist() == [[3, 3]] * 4
