@@ -6,9 +6,12 @@ half as long as one of torch's. The conventions are those of ``rotations.py``; t
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from rotavg_ros.hamilton import hamilton_product
+from rotavg_ros.solver.algebra.compiled import compiled
 
 # So small a squared sine or angle counts as this, which makes angle / sine what it is in the limit instead of 0/0.
 _MIN_SQUARE = 1e-30
@@ -58,3 +61,29 @@ def residual(correction: np.ndarray, measured: np.ndarray, source: np.ndarray, t
     at_target = correction.take(target, axis=1)
     np.negative(at_target[:3], out=at_target[:3])
     return multiply(at_target, multiply(measured, correction.take(source, axis=1)))
+
+
+@compiled
+def residual_vectors(
+    correction: np.ndarray, measured: np.ndarray, source: np.ndarray, target: np.ndarray
+) -> np.ndarray:
+    """``(E, 3)`` rad, of any length at most π: what :func:`log` makes of :func:`residual`, edge by edge."""
+    vectors = np.empty((len(source), 3))
+    for e in range(len(source)):
+        u, v = source[e], target[e]
+        ax, ay, az, aw = measured[0, e], measured[1, e], measured[2, e], measured[3, e]
+        bx, by, bz, bw = correction[0, u], correction[1, u], correction[2, u], correction[3, u]
+        mx = aw * bx + ax * bw + ay * bz - az * by
+        my = aw * by - ax * bz + ay * bw + az * bx
+        mz = aw * bz + ax * by - ay * bx + az * bw
+        mw = aw * bw - ax * bx - ay * by - az * bz
+        cx, cy, cz, cw = -correction[0, v], -correction[1, v], -correction[2, v], correction[3, v]
+        x = cw * mx + cx * mw + cy * mz - cz * my
+        y = cw * my - cx * mz + cy * mw + cz * mx
+        z = cw * mz + cx * my - cy * mx + cz * mw
+        w = cw * mw - cx * mx - cy * my - cz * mz
+        sine = math.sqrt(max(x * x + y * y + z * z, _MIN_SQUARE))
+        # The sign of w makes the vector the same for a quaternion and its negative.
+        scale = 2 * math.atan2(sine, abs(w)) / sine * (1.0 if w >= 0 else -1.0)
+        vectors[e, 0], vectors[e, 1], vectors[e, 2] = scale * x, scale * y, scale * z
+    return vectors

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -14,13 +15,14 @@ from rotavg_ros.solver.estimate import Estimate, Run
 from rotavg_ros.solver.running.work import metered
 from rotavg_ros.solver.slam import stages as slam_stages
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
-from rotavg_ros.solver.slam.fine_net.tuning import all_fine_tuned, fine_tuned
+from rotavg_ros.solver.slam.fine_net.tuning import fine_tuned
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.poses.search.jumps import of_jumps
 from rotavg_ros.solver.slam.poses.solve import has_places, median_poses
+from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.modes import of_slips, publish
 from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.preparation import Prepared, prepare
@@ -81,14 +83,12 @@ def whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
 def _whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     with run.watch.stage("refine"):
         found = search(graph, _clean_net(stages, run), partial(_begin, stages, run), stages.without)
-        fine_net = None if "fine-net" in stages.without else run.networks.load(SlamFineNet)
-        tuned = found.modes if fine_net is None else all_fine_tuned(found.modes, fine_net)
-        published = publish(found.drawn.problem, tuned)
+        tune = _tuning(stages, run)
+        published = publish(found.drawn.problem, found.modes, tune)
     with run.watch.stage("expand"):
-        estimate, mode, poses = estimate_of(published, tuned[0].state.noise), found.modes[published.chosen], None
+        estimate, mode, poses = estimate_of(published), found.modes[published.chosen], None
     if "translations" not in stages.without and has_places(graph):
         with run.watch.stage("poses"):
-            tune = (lambda mode: mode) if fine_net is None else partial(fine_tuned, network=fine_net)
             poses, mode = median_poses(_unbiased(graph, found.bias), found.modes, tune)
     is_divided = bool(published.warnings) if poses is None else poses.poses.is_divided
     # The posterior's warning is of answers that rotations alone do not tell apart.
@@ -102,6 +102,13 @@ def _whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
 
 def _clean_net(stages: SlamStages, run: Run) -> SlamCleanNet | None:
     return run.networks.load(SlamCleanNet) if stages.clean and "cleannet" not in stages.without else None
+
+
+def _tuning(stages: SlamStages, run: Run) -> Callable[[Mode], Mode]:
+    """A labelling with the noise of each edge as FineNet has it, or as it is."""
+    if "fine-net" in stages.without:
+        return lambda mode: mode
+    return partial(fine_tuned, network=run.networks.load(SlamFineNet))
 
 
 def _begin(stages: SlamStages, run: Run, prepared: Prepared, cleaned: slam_stages.CleanedClosures) -> Tensor:

@@ -34,3 +34,6 @@ def test_residuals_are_what_edges_disagree_by() -> None:
     expected = (nodes[target].inv() * measured * nodes[source]).as_rotvec()
     residual = quaternion_rows.residual(nodes.as_quat().T, measured.as_quat().T, source, target)
     np.testing.assert_allclose(quaternion_rows.log(residual).T, expected, atol=1e-12)
+    for sign in (1, -1):
+        vectors = quaternion_rows.residual_vectors(nodes.as_quat().T, sign * measured.as_quat().T, source, target)
+        np.testing.assert_allclose(vectors, expected, atol=1e-12)

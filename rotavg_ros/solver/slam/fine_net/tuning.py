@@ -47,12 +47,6 @@ class Tuned:
     factorised: Factorised
 
 
-def all_fine_tuned(modes: list[Mode], network: SlamFineNet) -> list[Mode]:
-    """The modes (the best first), rivals of the best fine-tuned; what is published is made of these."""
-    farthest = modes[0].cost + modes[0].problem.limits.rival
-    return [fine_tuned(mode, network) if mode.cost <= farthest else mode for mode in modes]
-
-
 def fine_tuned(mode: Mode, network: SlamFineNet, passes: int = PASSES) -> Mode:
     """The mode's labels, orientations and noise under variances that FineNet predicts.
 

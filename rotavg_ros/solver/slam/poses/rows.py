@@ -342,7 +342,7 @@ class PoseProblem:
         """``(E + R, k + m)`` measured less predicted."""
         drawn, (turns, shifts) = self.drawn, self.bases
         measured = self.mode.problem.measured
-        turn = quaternion_rows.log(quaternion_rows.residual(state.correction, measured, drawn.source, drawn.target)).T
+        turn = quaternion_rows.residual_vectors(state.correction, measured, drawn.source, drawn.target)
         shift = way.displacement - (state.position[drawn.target] - state.position[drawn.source])
         both = np.concatenate((turn, shift), axis=1)
         shared = np.flatnonzero(self.run >= 0)

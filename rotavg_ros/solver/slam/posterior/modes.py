@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from rotavg_ros.solver.slam.posterior.em import step
 from rotavg_ros.solver.slam.posterior.left_out import leave_one_out, scores
 from rotavg_ros.solver.slam.posterior.mode import OTHER_NOISE, Mode
 from rotavg_ros.solver.slam.posterior.problem import Problem
+from rotavg_ros.solver.slam.posterior.state import Noise
 
 # No labelling counts that is less likely by so many nats, and no other noise of the same labels.
 _FAR, _FAR_NOISE = 5.0, 2.0
@@ -36,6 +38,7 @@ class Published:
         correction: ``(4, K)``.
         outlier_probability: ``(E,)``.
         variance: ``(N,)`` rad², of the view-graph's nodes.
+        noise: of the likeliest labelling.
         chosen: number of the mode whose orientations these are, the median.
         rivals: probabilities of the labellings that were averaged, the best first.
         warnings: where rivals are likely and differ.
@@ -45,6 +48,7 @@ class Published:
     correction: np.ndarray
     outlier_probability: np.ndarray
     variance: np.ndarray
+    noise: Noise
     chosen: int
     rivals: tuple[float, ...]
     warnings: tuple[str, ...] = ()
@@ -55,10 +59,16 @@ class Published:
         return self.graph.orientations(torch.from_numpy(np.ascontiguousarray(self.correction.T)))
 
 
-def publish(problem: Problem, modes: list[Mode]) -> Published:
-    """Of distinct modes (the best first), by exp(−F): the average of their scores, the orientations of their median."""
+def publish(problem: Problem, modes: list[Mode], tuned: Callable[[Mode], Mode] = lambda mode: mode) -> Published:
+    """Of distinct modes, by exp(−F): the average of their scores, the orientations of their median.
+
+    Args:
+        problem: the graph.
+        modes: the best first.
+        tuned: a mode with the noise of each edge as FineNet has it; labellings stay as likely as they are.
+    """
     rivals, share = (modes[:1], np.ones(1)) if "rivals" in problem.without else distinct(problem, modes)
-    answers = [of_mode(mode) for mode in rivals]
+    answers = [of_mode(tuned(mode)) for mode in rivals]
     middle = median([answer.correction for answer in answers], share)
     chosen = answers[middle]
     turns = [
@@ -76,7 +86,8 @@ def publish(problem: Problem, modes: list[Mode]) -> Published:
     number = next(number for number, mode in enumerate(modes) if mode is rivals[middle])
     # Shares add up to one but for rounding.
     score = np.clip(score, 0.0, 1.0)
-    return Published(graph, chosen.correction, score, variance, number, tuple(share.tolist()), warnings)
+    noise = answers[0].noise
+    return Published(graph, chosen.correction, score, variance, noise, number, tuple(share.tolist()), warnings)
 
 
 def median(corrections: list[np.ndarray], share: np.ndarray) -> int:
@@ -182,4 +193,4 @@ def of_mode(mode: Mode) -> Published:
     graph = problem.drawn(state.noise)
     apart = factorised.resistance[: graph.num_segments]
     variance = graph.variance(factorised.variance[: graph.num_nodes], apart, state.noise.step_variance)
-    return Published(graph, state.correction, score, variance, 0, (1.0,))
+    return Published(graph, state.correction, score, variance, state.noise, 0, (1.0,))

@@ -44,8 +44,7 @@ def tails(problem: Problem, noise: Noise) -> np.ndarray:
 def residuals(problem: Problem, state: State) -> np.ndarray:
     """``(E + R, 3)`` rad, of all rows."""
     graph, system = problem.graph, problem.system(state.noise)
-    turned = quaternion_rows.residual(state.correction, problem.measured, graph.source, graph.target)
-    vectors = quaternion_rows.log(turned).T
+    vectors = quaternion_rows.residual_vectors(state.correction, problem.measured, graph.source, graph.target)
     edges = np.flatnonzero(system.shared)
     vectors[edges] -= system.sign[edges, None] * state.common[system.run[edges]]
     return np.concatenate((vectors, -state.common))

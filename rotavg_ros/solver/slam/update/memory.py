@@ -194,7 +194,7 @@ class SlamMemory:
         if self.poses is None:  # else places have a say in it
             mode = search.flipped(mode)
         fine = fine_tuned(mode, networks[1], passes=1)
-        estimate = estimate_of(publish(problem, [fine]), fine.state.noise)
+        estimate = estimate_of(publish(problem, [fine]))
         memory = replace(
             self,
             graph=graph,
@@ -249,14 +249,14 @@ class SlamMemory:
         return graph if self.bias is None else without_bias(graph, self.bias)
 
 
-def estimate_of(published: Published, noise: Noise) -> Estimate:
-    """The posterior's answer on the view-graph's nodes and edges; ``noise`` is of the likeliest labelling."""
+def estimate_of(published: Published) -> Estimate:
+    """The posterior's answer on the view-graph's nodes and edges."""
     return Estimate(
         published.body_from_world,
         torch.from_numpy(outlier_scores(published.graph, published.outlier_probability)),
         torch.from_numpy(published.variance),
         warnings=published.warnings,
-        step_variance=noise.step_variance,
+        step_variance=published.noise.step_variance,
     )
 
 
