@@ -8,10 +8,12 @@ barrier, and on a machine that does anything else besides, each barrier waits fo
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import copy_context
+from operator import itemgetter
 from typing import TypeVar
 
 import torch
@@ -119,22 +121,45 @@ def num_workers() -> int:
 def for_each(work: Callable[[Item], None], items: Sequence[Item], threads: int | None = None) -> None:
     """Call ``work`` for every item, on several threads; what one raises is raised here. Never nested.
 
+    The calling thread works, too: it need not wait until another one is awake.
+
     Args:
         threads: at most so many; default: all workers.
     """
-    if min(len(items), _crew.size if threads is None else min(threads, _crew.size)) <= 1:
+    threads = min(len(items), _crew.size if threads is None else min(threads, _crew.size))
+    if threads <= 1:
         for item in items:
             stop_if_abandoned()
             work(item)
         return
-    context = copy_context()
+    waiting = deque(enumerate(items))
+    failures: list[tuple[int, BaseException]] = []
 
-    @torch.no_grad()  # gradients are switched off by thread, so every worker needs it said
-    def in_context(item: Item) -> None:
-        context.copy().run(work, item)
+    def take_turns() -> None:
+        while waiting:
+            try:
+                number, item = waiting.popleft()
+            except IndexError:  # another thread has just taken the last one
+                return
+            try:
+                stop_if_abandoned()
+                work(item)
+            except BaseException as error:  # raised below, in the calling thread
+                failures.append((number, error))
+                waiting.clear()
 
-    for _ in _crew.pool().map(in_context, items):
-        stop_if_abandoned()
+    in_context = torch.no_grad()(take_turns)  # gradients are switched off by thread, so every worker needs it said
+    pool, context = _crew.pool(), copy_context()
+    helpers = [pool.submit(context.copy().run, in_context) for _ in range(threads - 1)]
+    take_turns()
+    for helper in helpers:
+        if not helper.cancel():
+            helper.result()
+    if failures:
+        try:
+            raise min(failures, key=itemgetter(0))[1]
+        finally:
+            failures.clear()  # an error holds this frame, which would hold the error
 
 
 def threads_on(device: torch.device) -> int | None:
