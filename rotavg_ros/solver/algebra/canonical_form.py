@@ -17,14 +17,18 @@ Where the data are the same for several nodes or axes, any of them is taken, sin
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.medians import median_by_group
+from rotavg_ros.solver.algebra.residuals import SLICE_EDGES
 from rotavg_ros.solver.algebra.sorted_edges import sorted_by_node
+from rotavg_ros.solver.running.threads import for_each, slices, threads_on
 from rotavg_ros.view_graph import EdgeKind, ViewGraph, mean_precision
 
 # So often walks grow by an edge: enough to tell apart what only distant edges tell apart, little beside a solve.
@@ -33,6 +37,8 @@ _WALK_LENGTH = 4
 _MOST_EDGES = 1 << 15
 # Quaternions are the same if no entry differs by more: far below any measurement, far above rounding.
 _SAME = 1e-9
+# With fewer edges a sum takes less time than waking another worker.
+_WORTH_WORKERS = 50_000
 
 
 @dataclass(frozen=True)
@@ -105,41 +111,91 @@ def _form(graph: ViewGraph, component: Tensor, own_axes: bool) -> tuple[Canonica
     node = _nodes_in_order(graph, component)
     rank = torch.empty_like(node)
     rank[node] = torch.arange(len(node), device=node.device)
-    source, target = (rank.index_select(0, end) for end in (graph.source, graph.target))
-    low, high = torch.minimum(source, target), torch.maximum(source, target)
-    _, by_high = sorted_by_node(high.int(), graph.num_nodes)
-    _, by_low = sorted_by_node(low.int().index_select(0, by_high), graph.num_nodes)
-    order = by_high.index_select(0, by_low).long()
-    is_forward = (source < target).index_select(0, order)
-    low, high, label = (column.index_select(0, order) for column in (low, high, graph.label))
     component = component[node]
-    # Components in rows: picking numbers one by one takes a quarter of the time of picking rows of four.
-    rows = torch.stack([row.index_select(0, order) for row in graph.target_from_source.t().contiguous()])
-    rows[:3] *= torch.where(is_forward, 1.0, -1.0)
+    stated = _StatedEdges.of(graph, rank)
+    low, order = stated.in_order(graph.num_nodes)
+    count = int(component.max()) + 1 if len(component) else 0
     if own_axes:
-        axes = _axes(low, high, rows, component)
-        rows = torch.cat((_in_axes(axes, rows[:3], component, low), rows[3:]))
+        some = evenly_spread(component.index_select(0, low) if count > 1 else low, count, _MOST_EDGES)
+        chosen = order.index_select(0, some)
+        higher, rows = stated.higher(chosen), stated.upwards(chosen).t().contiguous()
+        axes = _axes(low.index_select(0, some), higher, rows, component)
     else:
-        count = int(component.max()) + 1 if len(component) else 0
-        axes = torch.eye(3, dtype=rows.dtype, device=rows.device).expand(count, 3, 3)
+        axes = torch.eye(3, dtype=graph.target_from_source.dtype, device=graph.device).expand(count, 3, 3)
+    high, edge, measured = torch.empty_like(low), torch.empty_like(low), torch.empty_like(graph.target_from_source)
+    place = torch.arange(len(low), device=low.device)
+
+    def write(part: slice) -> None:
+        chosen = order[part]
+        high[part] = stated.higher(chosen)
+        edge.index_copy_(0, chosen.long(), place[part])
+        upwards = stated.upwards(chosen)
+        measured[part] = _turned(upwards, axes, component, low[part]) if own_axes else upwards
+
+    for_each(write, slices(len(low), SLICE_EDGES, low.device))
     # One number each, seen M times: at millions of edges columns that nobody reads take room.
     kind, precision, steps = (
         torch.full_like(column[:1], value).expand(len(column))
         for column, value in ((graph.kind, EdgeKind.LOOP_CLOSURE), (graph.precision, torch.nan), (graph.steps, 1.0))
     )
+    label = graph.label[:1].expand(len(low))
+    if bool((graph.label != label).any()):
+        label = graph.label.index_select(0, order)
     if bool(graph.precision.isfinite().any()):
         precision = graph.precision.index_select(0, order)
     information = None
     if graph.information is not None:
-        information = _seen_from_the_higher(graph, is_reversed=source > target).index_select(0, order)
+        is_reversed = stated.source > stated.target
+        information = _seen_from_the_higher(graph, is_reversed).index_select(0, order)
         of_edge = axes[component.index_select(0, low)]
         information = of_edge @ information @ of_edge.mT
-    canonical = ViewGraph(
-        graph.num_nodes, low, high, rows.t().contiguous(), kind, precision, label, steps, information=information
-    )
-    edge = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
+    canonical = ViewGraph(graph.num_nodes, low, high, measured, kind, precision, label, steps, information=information)
     has_parallels = bool(((low[1:] == low[:-1]) & (high[1:] == high[:-1])).any())
     return CanonicalForm(canonical, component, node, edge, rotations.from_matrix(axes)), has_parallels
+
+
+class _StatedEdges(NamedTuple):
+    """Edges as they are stated, between nodes by their rank.
+
+    Attributes:
+        source, target: ``(M,)`` int32.
+        target_from_source: ``(M, 4)``.
+    """
+
+    source: Tensor
+    target: Tensor
+    target_from_source: Tensor
+
+    @classmethod
+    def of(cls, graph: ViewGraph, rank: Tensor) -> _StatedEdges:
+        """Given the ``rank`` ``(N,)`` of every node."""
+        source, target = (torch.empty_like(end, dtype=torch.int32) for end in (graph.source, graph.target))
+        short = rank.int()
+
+        def write(part: slice) -> None:
+            for ranks, end in ((source, graph.source), (target, graph.target)):
+                ranks[part] = short.index_select(0, end[part])
+
+        for_each(write, slices(len(source), SLICE_EDGES, source.device))
+        return cls(source, target, graph.target_from_source)
+
+    def in_order(self, num_nodes: int) -> tuple[Tensor, Tensor]:
+        """By the lower end, then by the higher one: the lower end of each ``(M,)`` int64, and which it is, int32."""
+        _, by_high = sorted_by_node(torch.maximum(self.source, self.target), num_nodes)
+        low = torch.minimum(self.source, self.target).index_select(0, by_high)
+        first, by_low = sorted_by_node(low, num_nodes)
+        nodes = torch.arange(num_nodes, device=low.device)
+        return nodes.repeat_interleave(first.diff(), output_size=len(low)), by_high.index_select(0, by_low)
+
+    def higher(self, edges: Tensor) -> Tensor:
+        """The higher end of some edges ``(k,)``."""
+        return torch.maximum(self.source.index_select(0, edges), self.target.index_select(0, edges))
+
+    def upwards(self, edges: Tensor) -> Tensor:
+        """What some edges ``(k,)`` measure from the lower to the higher end, ``(k, 4)``."""
+        is_reversed = self.source.index_select(0, edges) > self.target.index_select(0, edges)
+        signs = self.target_from_source.new_tensor([[1.0, 1.0, 1.0, 1.0], [-1.0, -1.0, -1.0, 1.0]])
+        return signs.index_select(0, is_reversed.int()).mul_(self.target_from_source.index_select(0, edges))
 
 
 def _without_copies(graph: ViewGraph) -> tuple[Tensor, Tensor]:
@@ -203,30 +259,36 @@ def _nodes_in_order(graph: ViewGraph, component: Tensor) -> Tensor:
     weight = 0.5 + graph.target_from_source[:, 3]
     walks = torch.ones(graph.num_nodes, dtype=weight.dtype, device=weight.device)
     for _ in range(_WALK_LENGTH):
-        walks = _collected(graph, *(weight * walks.index_select(0, end) for end in (graph.source, graph.target)))
+        walks = _collected((graph.source, graph.target), weight, walks)
     by_walks = walks.argsort(stable=True)
     return by_walks[component[by_walks].argsort(stable=True)]
 
 
-def _collected(graph: ViewGraph, at_target: Tensor, at_source: Tensor) -> Tensor:
-    """Sums ``(N,)`` of what edges ``(M,)`` bring to their ends."""
-    collected = at_target.new_zeros(graph.num_nodes)
-    return collected.index_add_(0, graph.target, at_target).index_add_(0, graph.source, at_source)
+def _collected(ends: Sequence[Tensor], weight: Tensor, value: Tensor) -> Tensor:
+    """Sums ``(N,)`` over each node's edges: ``weight`` ``(M,)`` times ``value`` ``(N,)`` of the other end.
+
+    Args:
+        ends: both ends of the edges, ``(M,)``.
+    """
+    sums = [torch.zeros_like(value) for _ in ends]
+
+    def collect(number: int) -> None:
+        sums[number].index_add_(0, ends[number], weight * value.index_select(0, ends[1 - number]))
+
+    for_each(collect, range(2), threads_on(value.device) if len(weight) > _WORTH_WORKERS else 1)
+    return sums[0] + sums[1]
 
 
 def _axes(source: Tensor, target: Tensor, rows: Tensor, component: Tensor) -> Tensor:
     """Canonical axes ``(C, 3, 3)`` of the cameras of each component, an axis a row.
 
     Args:
-        source, target: ``(M,)`` of edges in canonical order.
+        source, target: ``(M,)`` of edges, from lower to higher nodes.
         rows: ``(4, M)`` their measurements.
         component: ``(N,)`` of every node.
     """
     count = int(component.max()) + 1 if len(component) else 0
     of_edge = component.index_select(0, source)
-    some = evenly_spread(of_edge, count, _MOST_EDGES)
-    source, target, of_edge = (column.index_select(0, some) for column in (source, target, of_edge))
-    rows = torch.stack([row.index_select(0, some) for row in rows])
     main = torch.linalg.eigh(_moments(rows[:3], of_edge, count)).eigenvectors
     # The main axis last: then what turns about it have left lies in the plane of the first two coordinates.
     first, second, along = _in_axes(main.mT, rows[:3], component, source)
@@ -277,3 +339,13 @@ def _in_axes(axes: Tensor, vectors: Tensor, component: Tensor, source: Tensor) -
     if len(axes) == 1:
         return axes[0] @ vectors
     return (axes.permute(1, 2, 0)[:, :, component[source]] * vectors).sum(dim=1)
+
+
+def _turned(measured: Tensor, axes: Tensor, component: Tensor, source: Tensor) -> Tensor:
+    """Quaternions ``(M, 4)`` of edges, given their sources, as the axes ``(C, 3, 3)`` of their components have them."""
+    if len(axes) == 1:
+        turn = torch.eye(4, dtype=axes.dtype, device=axes.device)
+        turn[:3, :3] = axes[0].t()
+        return torch.matmul(measured, turn)
+    rows = measured.t().contiguous()
+    return torch.cat((_in_axes(axes, rows[:3], component, source), rows[3:])).t()

@@ -10,7 +10,11 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from rotavg_ros.solver.running.threads import for_each, slices
 from rotavg_ros.view_graph import ViewGraph
+
+# Rows that a thread writes before it takes others.
+_SLICE_EDGES = 1 << 16
 
 
 class Tile(NamedTuple):
@@ -39,10 +43,17 @@ class SortedEdges:
     @classmethod
     def of(cls, graph: ViewGraph) -> SortedEdges:
         num_edges = graph.num_edges
-        first, order = sorted_by_node(torch.cat((graph.target, graph.source)).int(), graph.num_nodes)
-        source = torch.cat((graph.source, graph.target)).int().index_select(0, order)
-        is_reversed = order >= num_edges
-        return cls(first, source, order - num_edges * is_reversed.int(), is_reversed)
+        first, order = sorted_by_node(torch.cat((graph.target.int(), graph.source.int())), graph.num_nodes)
+        begins = torch.cat((graph.source.int(), graph.target.int()))
+        source, is_reversed = torch.empty_like(order), torch.empty_like(order, dtype=torch.bool)
+
+        def write(part: slice) -> None:
+            torch.index_select(begins, 0, order[part], out=source[part])
+            torch.ge(order[part], num_edges, out=is_reversed[part])
+            order[part] %= num_edges
+
+        for_each(write, slices(len(order), _SLICE_EDGES, order.device))
+        return cls(first, source, order, is_reversed)
 
     @property
     def num_nodes(self) -> int:
@@ -67,8 +78,15 @@ class SortedEdges:
         chosen = kept.index_select(0, self.edge)
         first = torch.cat((chosen.new_zeros(1, dtype=torch.int32), chosen.cumsum(0, dtype=torch.int32)))[self.first]
         rows = chosen.nonzero().squeeze(1)
-        columns = (column.index_select(0, rows) for column in (self.source, self.edge, self.is_reversed))
-        return SortedEdges(first, *columns)
+        columns = (self.source, self.edge, self.is_reversed)
+        selected = tuple(column.new_empty(len(rows)) for column in columns)
+
+        def write(part: slice) -> None:
+            for column, into in zip(columns, selected, strict=True):
+                torch.index_select(column, 0, rows[part], out=into[part])
+
+        for_each(write, slices(len(rows), _SLICE_EDGES, rows.device))
+        return SortedEdges(first, *selected)
 
     def tiles(self, num_edges: int) -> list[Tile]:
         """All nodes in order, cut into tiles of about ``num_edges`` edges; a node's edges are never split."""

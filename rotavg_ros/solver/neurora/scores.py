@@ -28,18 +28,22 @@ def residual_probability(angle: Tensor, uncertainty: Tensor, outlier_angle: floa
 
 
 def residual_and_uncertainty(
-    graph: ViewGraph, body_from_world: Tensor, component: Tensor | None = None
+    graph: ViewGraph, body_from_world: Tensor, component: Tensor | None = None, angle: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Residual angle of every edge and, up to a constant, the error of the orientations at its ends.
 
     A node's error falls with the root of its number of edges d: median residual · √(1/d_source + 1/d_target), the
     median of each ``component`` ``(N,)`` for itself; default: of all edges.
 
+    Args:
+        angle: ``(M,)`` rad, what is known of the residuals; default: computed.
+
     Returns:
         Both ``(M,)`` float32 radians.
     """
-    angle = EdgeResiduals(graph, body_from_world.float()).angles()
-    share = 1 / torch.bincount(torch.cat((graph.source, graph.target)), minlength=graph.num_nodes).float()
+    angle = EdgeResiduals(graph, body_from_world.float()).angles() if angle is None else angle
+    degree = torch.bincount(graph.source, minlength=graph.num_nodes)
+    share = 1 / degree.add_(torch.bincount(graph.target, minlength=graph.num_nodes)).float()
     spread = share.index_select(0, graph.source).add_(share.index_select(0, graph.target)).sqrt_()
     median = angle.median()
     if component is not None and bool((component > 0).any()):

@@ -23,9 +23,9 @@ def clean(network: CleanNet, graph: ViewGraph) -> Cleaned:
     device = next(network.parameters()).device
     edges = SortedEdges.of(graph)
     with torch.no_grad():
-        result = clean_edges(network, graph.target_from_source.float().to(device), edges.to(device))
+        result = clean_edges(network, graph.target_from_source.to(device), edges.to(device))
         probability = torch.sigmoid(result.outlier_logit).to(graph.device)
-    rectified = replace(graph, target_from_source=result.target_from_source.to(graph.device).double())
+    rectified = replace(graph, target_from_source=result.target_from_source.to(graph.device))
     return Cleaned(rectified, graph, probability, edges)
 
 

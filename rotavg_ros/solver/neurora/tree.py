@@ -15,6 +15,7 @@ from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.algebra.spanning_forest import compose, shortest_path_forest
 from rotavg_ros.solver.neurora.cleaned import Cleaned
 from rotavg_ros.solver.neurora.numbers import NUMBERS
+from rotavg_ros.solver.running.threads import for_each, threads_on
 
 # So many edges tell which of two trees fits better.
 _MISFIT_SAMPLE = 16_384
@@ -95,6 +96,13 @@ def _misfits(cleaned: Cleaned, candidates: Sequence[Tensor], component: Tensor) 
     sample = cleaned.is_inlier.nonzero().squeeze(1)
     sample = sample[:: 1 + len(sample) // _MISFIT_SAMPLE]
     edges = cleaned.measured.select_edges(sample)
-    angles = [EdgeResiduals(edges, body_from_world.float()).angles() for body_from_world in candidates]
-    count = int(component.max()) + 1
-    return [median_by_group(angle, component[edges.source], count) for angle in angles]
+    count, of_edge = int(component.max()) + 1, component[edges.source]
+    misfits = [of_edge.new_empty(0, dtype=torch.float32) for _ in candidates]
+
+    def compare(number: int) -> None:
+        residual = EdgeResiduals(edges, candidates[number].float()).quaternions(slice(0, edges.num_edges))
+        angle = 2 * torch.atan2((residual[:3] * residual[:3]).sum(dim=0).sqrt(), residual[3])
+        misfits[number] = median_by_group(angle, of_edge, count)
+
+    for_each(compare, range(len(candidates)), threads_on(component.device))
+    return misfits

@@ -18,10 +18,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from rotavg_ros.solver.algebra.residuals import SLICE_EDGES
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.algebra.sparse.conjugate_gradients import Stop, conjugate_gradients
 from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem
-from rotavg_ros.solver.running.threads import for_each, threads_on
+from rotavg_ros.solver.running.threads import for_each, slices, threads_on
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape
 from rotavg_ros.view_graph import ViewGraph
 
@@ -53,14 +54,25 @@ class Arrivals:
         self._arrives = edges.edge + num_edges * edges.is_reversed.int()
         self._leaves = edges.edge + num_edges * (~edges.is_reversed).int()
 
-    def matrices(self, weights: SplitWeights) -> list[Tensor]:
-        """A and Aᵀ ``(N, N)``."""
-        at_source = weights.total * weights.source_share
-        # An edge arrives at its target, reversed at its source.
-        by_end = torch.cat((weights.total - at_source, at_source))
-        own = by_end.index_select(0, self._arrives)
-        others = by_end.index_select(0, self._leaves)
-        return [self._matrix(values) for values in (own, others)]
+    def by_end(self, weights: SplitWeights) -> Tensor:
+        """What belongs to either end's matrix, first of all edges' targets, then of their sources, ``(2M,)``."""
+        num_edges = len(weights.total)
+        by_end = weights.total.new_empty(2, num_edges)
+
+        def write(edges: slice) -> None:
+            torch.mul(weights.total[edges], weights.source_share[edges], out=by_end[1, edges])
+            torch.sub(weights.total[edges], by_end[1, edges], out=by_end[0, edges])
+
+        for_each(write, slices(num_edges, SLICE_EDGES, by_end.device))
+        return by_end.view(-1)
+
+    def own(self, by_end: Tensor) -> Tensor:
+        """A ``(N, N)``, of what :meth:`by_end` gives. An edge arrives at its target, reversed at its source."""
+        return self._matrix(by_end.index_select(0, self._arrives))
+
+    def others(self, by_end: Tensor) -> Tensor:
+        """Aᵀ ``(N, N)``."""
+        return self._matrix(by_end.index_select(0, self._leaves))
 
     def symmetric(self, value: Tensor) -> Tensor:
         """The matrix ``(N, N)`` that has the value of each edge, ``(M,)``, for both its ends."""
@@ -132,14 +144,24 @@ class BlockLaplacian(Laplacian):
     """
 
     def __init__(self, arrivals: Arrivals, weights: SplitWeights, shape: NoiseShape, component: Tensor) -> None:
-        self._own, self._others = arrivals.matrices(weights)
         self._threads = threads_on(component.device) if len(weights.total) > _WORTH_WORKERS else 1
         self._information = shape.information.to(weights.total).contiguous()
         one = weights.total.new_ones(1, arrivals.num_nodes)
-        others = arriving(self._others, torch.cat((self._information.flatten(0, 1), one)))
-        own = arriving(self._own, one)[0]
-        diagonal = others[:9].view_as(self._information) + own * self._information
-        super().__init__(diagonal, own + others[9], component)
+        upper, lower = torch.triu_indices(3, 3, device=one.device)  # a symmetric matrix has six entries of its own
+        rows = one, torch.cat((self._information[upper, lower], one))
+        matrices, sums = [one, one], [one, one]
+        by_end = arrivals.by_end(weights)
+
+        def one_part(number: int) -> None:
+            matrices[number] = (arrivals.own, arrivals.others)[number](by_end)
+            sums[number] = arriving(matrices[number], rows[number])
+
+        for_each(one_part, (1, 0), self._threads)  # the longer part first
+        self._own, self._others = matrices
+        own, others = sums[0][0], sums[1]
+        of_others = torch.empty_like(self._information)
+        of_others[upper, lower] = of_others[lower, upper] = others[:6]
+        super().__init__(of_others + own * self._information, own + others[6], component)
 
     def product(self, x: Tensor) -> Tensor:
         """``L x`` ``(3, N)``."""

@@ -16,7 +16,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from rotavg_ros.solver.algebra.residuals import SLICE_EDGES
 from rotavg_ros.solver.neurora.scores import residual_probability
+from rotavg_ros.solver.running.threads import for_each, slices, stretches
 from rotavg_ros.view_graph import ViewGraph
 
 # SplitMix64's constants, as signed numbers.
@@ -52,10 +54,19 @@ class EdgesInSeries(NamedTuple):
         in_forest = torch.zeros(graph.num_edges, dtype=torch.bool, device=graph.device)
         in_forest[parent_edge[is_child]] = True
         others = (~in_forest).nonzero().squeeze(1)
-        flow = _hashed(others)
-        excess = torch.zeros(graph.num_nodes, dtype=torch.int64, device=graph.device)
-        excess.index_add_(0, graph.source.index_select(0, others), flow)
-        excess.index_add_(0, graph.target.index_select(0, others), -flow)
+        flow = torch.empty_like(others)
+        parts = stretches(slices(len(others), SLICE_EDGES, graph.device))
+        excesses = [others.new_zeros(graph.num_nodes) for _ in (*parts, None)]
+
+        def flow_along(number: int) -> None:
+            for part in parts[number]:
+                edge, hashed = others[part], _hashed(others[part])
+                flow[part] = hashed
+                excesses[number].index_add_(0, graph.source.index_select(0, edge), hashed)
+                excesses[number].index_add_(0, graph.target.index_select(0, edge), -hashed)
+
+        for_each(flow_along, range(len(parts)))
+        excess = torch.stack(excesses).sum(dim=0)
         forest_flow = _subtree_sums(excess, parent)[is_child].abs()
 
         seen = torch.zeros(_TABLE, dtype=torch.bool, device=graph.device)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
+from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.estimate import Estimate, Run
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.fine_net import FineNet
@@ -64,6 +65,7 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             else:
                 orientations = fine_tune(networks.load(FineNet), cleaned, orientations, component)
     warnings: tuple[str, ...] = ()
+    residual: Tensor | None = None
     steps = run.refinement_steps
     if steps is None:
         steps = PRIORS.max_steps if stages.refine else 0
@@ -80,18 +82,20 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
                 orientations, weights = noise.refined(orientations, weights, refinement)
         if stages.consensus:
             with watch.stage("consensus"):
-                other = consensus(graph, orientations, component, CONSENSUS)
+                residual = EdgeResiduals(graph, orientations.float()).angles()
+                other = consensus(graph, orientations, component, CONSENSUS, residual)
                 if other is not None:
                     warnings = other.warnings
                 if other is not None and other.body_from_world is not None and other.weight is not None:
                     weights = weights.times(other.weight, other.weight)
                     orientations = refinement(other.body_from_world, weights=weights)
+                    residual = None
     score, variance = cleaned.outlier_probability.double(), torch.full((graph.num_nodes,), torch.nan)
     by_residuals = stages.fine_tunings > 0 and not ("cleannet" in stages.as_written and stages.clean)
     if steps > 0 or by_residuals:
         # Before, there is but a tree; now a residual is the noise but for the orientations' error. The paper's CleanNet
         # has the last word in any case.
-        angle, spread = residual_and_uncertainty(graph, orientations, component)
+        angle, spread = residual_and_uncertainty(graph, orientations, component, residual)
         score = residual_probability(angle, spread, NUMBERS.outlier_angle)
         series = structure.series
         score[series.edge] = series.score(angle[series.edge], spread[series.edge], NUMBERS.outlier_angle)

@@ -26,10 +26,10 @@ from rotavg_ros.solver.running.threads import for_each, slices
 
 
 def clean_edges(network: CleanNet, target_from_source: Tensor, edges: SortedEdges) -> CleanEdges:
-    """What CleanNet says of the measurements ``(M, 4)`` float32; ``edges`` are all of the graph's."""
-    num_edges = len(target_from_source)
+    """What CleanNet says of the measurements ``(M, 4)``, in its own precision; ``edges`` are all of the graph's."""
+    num_edges, like = len(target_from_source), network.noise_head.weight
     # Rows: predicted noise (4), outlier logit (1). Columns: as the edges are sorted.
-    opinion = target_from_source.new_empty(5, 2 * num_edges)
+    opinion = like.new_empty(5, 2 * num_edges)
     # The heads are linear in the message, and that is linear in the activation.
     last = cast(MessagePassingLayer, network.network.layers[-1]).message_output
     head = torch.cat((network.noise_head.weight, network.outlier_head.weight))
@@ -46,13 +46,12 @@ def clean_edges(network: CleanNet, target_from_source: Tensor, edges: SortedEdge
             0, row, torch.arange(tile.edges.start, tile.edges.stop, dtype=torch.int32, device=row.device)
         )
 
-    no_states = target_from_source.new_zeros(edges.num_nodes, 0)
-    visit_activations(network.network, no_states, target_from_source, edges, collect)
-    clean = torch.empty_like(target_from_source)
-    logit = target_from_source.new_empty(num_edges)
+    no_states = like.new_zeros(edges.num_nodes, 0)
+    visit_activations(network.network, no_states, target_from_source.to(like.dtype), edges, collect)
+    clean, logit = like.new_empty(num_edges, 4), like.new_empty(num_edges)
 
     def decide(part: slice) -> None:
-        measured = target_from_source[part].t().contiguous()
+        measured = target_from_source[part].to(like.dtype).t().contiguous()
         forward, backward = (opinion.index_select(1, direction[part]) for direction in column.view(2, -1))
         # clean_net.correct, multiplied out: R̃ (1 + (f + R̃⁻¹ b⁻¹ R̃) / 2) = R̃ + (R̃ f + b⁻¹ R̃) / 2.
         inverse_backward = torch.cat((-backward[:3], backward[3:4]))
@@ -73,8 +72,23 @@ def fine_tuned(network: FineNet, cleaned: Cleaned, body_from_world: Tensor, comp
     Args:
         component: ``(N,)`` connected components.
     """
-    measured, edges = cleaned.measured, cleaned.edges.select(cleaned.is_inlier)
-    outlier_logit = cleaned.outlier_probability.logit()
+    edges = cleaned.edges.select(cleaned.is_inlier)
+    scale = torch.empty_like(body_from_world[:1, :1])
+
+    def features() -> Tensor:
+        nonlocal scale
+        scale, of_edges = _scale_and_features(cleaned, body_from_world, component)
+        return of_edges
+
+    # Nobody but the network's first layer holds the features, which take as much room as the measurements.
+    states = node_features(body_from_world, edges.degree[:, None])
+    states = node_states(network.network, states, features(), edges)
+    return network.correct(body_from_world, states, scale)
+
+
+def _scale_and_features(cleaned: Cleaned, body_from_world: Tensor, component: Tensor) -> tuple[Tensor, Tensor]:
+    """What residuals are in units of, as :func:`typical_size` gives it, and the edges' features ``(M, …)``."""
+    measured, is_inlier = cleaned.measured, cleaned.is_inlier
     num_edges = measured.num_edges
     residuals = [EdgeResiduals(graph, body_from_world) for graph in (measured, cleaned.graph)]
     raw, clean = (body_from_world.new_empty(3, num_edges) for _ in residuals)
@@ -85,17 +99,17 @@ def fine_tuned(network: FineNet, cleaned: Cleaned, body_from_world: Tensor, comp
 
     parts = slices(num_edges, SLICE_EDGES, raw.device)
     for_each(compare, parts)
-    used = edges.edge[~edges.is_reversed]
+    used = is_inlier.nonzero().squeeze(1)
     scale = typical_size(raw.index_select(1, used), measured.source.index_select(0, used), component)
     features = raw.new_empty(num_edges, ODD_FEATURES + EVEN_FEATURES)
 
     def write(part: slice) -> None:
         unit = scale[measured.source[part], 0] if len(scale) > 1 else scale[0]
-        features[part] = edge_features(raw[:, part], clean[:, part], outlier_logit[part], unit).t()
+        logit = cleaned.outlier_probability[part].logit()
+        features[part] = edge_features(raw[:, part], clean[:, part], logit, unit).t()
 
     for_each(write, parts)
-    states = node_features(body_from_world, edges.degree[:, None])
-    return network.correct(body_from_world, node_states(network.network, states, features, edges), scale)
+    return scale, features
 
 
 def typical_size(vectors: Tensor, node: Tensor, group_of_node: Tensor) -> Tensor:

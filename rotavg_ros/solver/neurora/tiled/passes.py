@@ -1,9 +1,8 @@
 """Message passing for solves: the formula of ``message_passing.py`` in tiles that fit a core's cache.
 
 Node states are projected before they are gathered. Directed edges are sorted by target and walked in tiles; what an
-edge remembers lies beside its features in one buffer and is overwritten in place, so that a layer is one matrix
-product per tile, and no copy of all edges is made. A tile has all edges of its nodes, so means are complete and workers
-never meet within a layer.
+edge remembers is overwritten in place, so that no copy of all edges is made. A tile has all edges of its nodes, so
+means are complete and workers never meet within a layer.
 """
 
 from __future__ import annotations
@@ -55,7 +54,9 @@ def node_states(network: MessagePassingNetwork, nodes: Tensor, features: Tensor,
             change their sign where an edge is reversed.
         edges: over which messages run.
     """
-    with _walk(network, features, edges) as walk:
+    walking = _walk(network, features, edges)
+    del features
+    with walking as walk:
         for layer in range(len(network.layers)):
             nodes = walk.layer(layer, nodes)
     return nodes
@@ -66,7 +67,9 @@ def visit_activations(
 ) -> None:
     """Show the last layer's activations to ``visit``, tile by tile and on several threads; else as above."""
     last = len(network.layers) - 1
-    with _walk(network, features, edges) as walk:
+    walking = _walk(network, features, edges)
+    del features
+    with walking as walk:
         for layer in range(last):
             nodes = walk.layer(layer, nodes)
         walk.layer(last, nodes, visit)
@@ -75,15 +78,33 @@ def visit_activations(
 @contextmanager
 def _walk(network: MessagePassingNetwork, features: Tensor, edges: SortedEdges) -> Iterator[_Walk]:
     layers = [cast(MessagePassingLayer, layer) for layer in network.layers]
-    with scratch(len(edges.source), layers[0].message_output.in_features + features.shape[1], features) as state:
-        yield _Walk(layers, network.odd_width, features, edges, state)
+    num_edges, hidden, width = len(edges.source), layers[0].message_output.in_features, features.shape[1]
+    with scratch(num_edges, hidden + width, features) as memory:
+        flat, end = memory.view(-1), num_edges * hidden
+        state = _State(flat[:end].view(num_edges, hidden), flat[end:].view(num_edges, width))
+        walk = _Walk(layers, network.odd_width, features, edges, state)
+        del features  # what the caller does not hold, either, makes room for activations
+        yield walk
+
+
+class _State(NamedTuple):
+    """What is known of E directed edges; apart from each other, since contiguous rows are copied faster.
+
+    Attributes:
+        activation: ``(E, hidden)`` of the layer before.
+        features: ``(E, edge_width)``, with the signs of their directions.
+    """
+
+    activation: Tensor
+    features: Tensor
 
 
 class _Walk:
     """One pass of a network over one graph.
 
     Args:
-        state: ``(E, hidden + edge_width)`` working memory: the activation of the layer before, then the features.
+        features: ``(M, edge_width)``; they are read here and no more.
+        state: working memory.
     """
 
     def __init__(
@@ -92,15 +113,12 @@ class _Walk:
         odd_width: int,
         features: Tensor,
         edges: SortedEdges,
-        state: Tensor,
+        state: _State,
     ) -> None:
-        self.layers, self.features, self.edges, self.state = layers, features, edges, state
+        self.layers, self.edges, self.state = layers, edges, state
+        self.hidden, self.width = state.activation.shape[1], features.shape[1]
         # Whether layers see what the one before has left of an edge.
-        self.remembers = layers[-1].edge_projection.in_features > features.shape[1]
-        # Of the features of edges as given, and of edges reversed.
-        self.signs = features.new_ones(2, features.shape[1])
-        self.signs[1, :odd_width] = -1
-        self.hidden = layers[0].message_output.in_features
+        self.remembers = layers[-1].edge_projection.in_features > self.width
         on_cpu = features.device.type == "cpu"
         num_edges = len(edges.source)
         tuning = current_tuning()
@@ -111,18 +129,34 @@ class _Walk:
         longest = max((tile.edges.stop - tile.edges.start for tile in tiles), default=0)
         self.pair_offsets = torch.arange(0, 2 * longest + 1, 2, dtype=torch.int32, device=features.device)
         self.row_numbers = torch.arange(longest, dtype=torch.int32, device=features.device)
-        # Rows of the two projections of the node states, one upon the other, that every edge adds up.
-        self.ends = torch.stack((edges.target(), edges.source + edges.num_nodes), dim=1)
         self.is_connected = (edges.degree > 0)[:, None]
+        # Rows of the two projections of the node states, one upon the other, that every edge adds up.
+        self.ends = edges.source.new_empty(num_edges, 2)
+        # Of the features of edges as given, and of edges reversed: a row of signs for every edge, since torch is slow
+        # at spreading one sign over a few columns.
+        signs = features.new_ones(2, self.width)
+        signs[1, :odd_width] = -1
+        nodes, degree = torch.arange(edges.num_nodes, dtype=torch.int32, device=features.device), edges.degree
+
+        def begin(tiles: Sequence[Tile]) -> None:
+            for tile in tiles:
+                of_edge = signs.index_select(0, edges.is_reversed[tile.edges].int())
+                of_edge.mul_(features.index_select(0, edges.edge[tile.edges]))
+                state.features[tile.edges] = of_edge
+                count = tile.edges.stop - tile.edges.start
+                target = nodes[tile.nodes].repeat_interleave(degree[tile.nodes], output_size=count)
+                torch.stack((target, edges.source[tile.edges] + edges.num_nodes), dim=1, out=self.ends[tile.edges])
+
+        for_each(begin, self.stretches, self.threads)
 
     def layer(self, index: int, nodes: Tensor, visit: Visit | None = None) -> Tensor:
         """One layer; returns the new node states, or ``nodes`` where ``visit`` takes the activations instead."""
         layer = self.layers[index]
-        is_first, is_last = index == 0, index == len(self.layers) - 1
+        is_last = index == len(self.layers) - 1
         # The specification has features before activations.
-        width = self.features.shape[1]
         projection = layer.edge_projection
-        weight = torch.cat((projection.weight[:, width:], projection.weight[:, :width]), dim=1).t().contiguous()
+        weight = projection.weight.t().contiguous()
+        of_features, of_activation = weight[: self.width], weight[self.width :]
         projected = None
         if layer.node_width:
             at_target = torch.addmm(projection.bias, nodes, layer.target_projection.weight.t())
@@ -133,21 +167,20 @@ class _Walk:
         def walk(tiles: Sequence[Tile]) -> None:
             for tile in tiles:
                 stop_if_abandoned()
-                state = self.state[tile.edges]
-                if is_first:
-                    self._write_features(tile, state)
-                inputs = state if self.remembers and not is_first else state[:, self.hidden :]
+                before, features = self.state.activation[tile.edges], self.state.features[tile.edges]
                 if projected is None:
-                    activation = torch.addmm(projection.bias, inputs, weight)
+                    activation = torch.addmm(projection.bias, features, of_features)
                 else:
-                    activation = self._gather_sum(tile, projected).addmm_(inputs, weight)
-                activation.relu_()
+                    activation = self._gather_sum(tile, projected).addmm_(features, of_features)
+                if len(of_activation):
+                    activation.addmm_(before, of_activation)
+                if self.remembers and not is_last:
+                    activation = torch.clamp_min(activation, 0, out=before)  # ReLU, and where it is remembered
+                else:
+                    activation.relu_()
                 if visit is not None:
                     visit(tile, activation)
-                    continue
-                if self.remembers and not is_last:
-                    state[:, : self.hidden] = activation
-                if len(state):
+                elif len(activation):
                     mean[tile.nodes] = self._mean_by_node(tile, activation)
             if visit is None:
                 rows = slice(tiles[0].nodes.start, tiles[-1].nodes.stop)
@@ -155,11 +188,6 @@ class _Walk:
 
         for_each(walk, self.stretches, self.threads)
         return nodes if visit is not None else updated
-
-    def _write_features(self, tile: Tile, state: Tensor) -> None:
-        # A row of signs for every edge, since torch is slow at spreading one sign over a few columns.
-        signs = self.signs.index_select(0, self.edges.is_reversed[tile.edges].int())
-        state[:, self.hidden :] = signs.mul_(self.features.index_select(0, self.edges.edge[tile.edges]))
 
     def _gather_sum(self, tile: Tile, projected: Tensor) -> Tensor:
         """Sum of the projections of both ends, ``(edges of the tile, hidden)``."""

@@ -52,7 +52,11 @@ class Consensus(NamedTuple):
 
 
 def consensus(
-    graph: ViewGraph, body_from_world: Tensor, component: Tensor, priors: ConsensusPriors
+    graph: ViewGraph,
+    body_from_world: Tensor,
+    component: Tensor,
+    priors: ConsensusPriors,
+    angle: Tensor | None = None,
 ) -> Consensus | None:
     """Another answer, in those components where one is likelier; None if edges contradict it nowhere.
 
@@ -60,13 +64,16 @@ def consensus(
         graph: N nodes, M edges, which run from lower to higher nodes.
         body_from_world: ``(N, 4)`` the first answer.
         component: ``(N,)`` of every node.
+        angle: ``(M,)`` rad, residuals of the first answer; default: computed.
     """
-    is_judged = graph.label != EdgeLabel.REJECTED
-    judged = graph if bool(is_judged.all()) else graph.select_edges(is_judged.nonzero()[:, 0])
-    is_off = EdgeResiduals(judged, body_from_world.float()).angles() > NUMBERS.outlier_angle
+    angle = EdgeResiduals(graph, body_from_world.float()).angles() if angle is None else angle
+    is_judged, is_off = graph.label != EdgeLabel.REJECTED, angle > NUMBERS.outlier_angle
+    judged = graph
+    if not bool(is_judged.all()):
+        judged, is_off = graph.select_edges(is_judged.nonzero()[:, 0]), is_off[is_judged]
     count = int(component.max()) + 1
-    contradicting = Triangles.of(judged, count * priors.glance).contradicting(
-        is_off, component[judged.source], count, priors.closing[0]
+    contradicting = Triangles.of(judged, count * priors.glance, is_off).contradicting(
+        is_off, component.index_select(0, judged.source), count, priors.closing[0]
     )
     numbers = (contradicting > priors.contradicting).nonzero()[:, 0].tolist()
     if not numbers:

@@ -8,7 +8,11 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver.running.threads import for_each, slices
 from rotavg_ros.view_graph import ViewGraph
+
+# Paths that a thread looks at before it takes others.
+_SLICE_PATHS = 8192
 
 
 @dataclass(frozen=True)
@@ -24,12 +28,13 @@ class Triangles:
     angle: Tensor
 
     @classmethod
-    def of(cls, graph: ViewGraph, most: int) -> Triangles:
+    def of(cls, graph: ViewGraph, most: int, among: Tensor | None = None) -> Triangles:
         """Of a graph whose edges run from lower to higher nodes.
 
         Args:
             graph: M edges.
             most: triangles at most; so many paths of two edges are looked at, evenly spread over all.
+            among: ``(M,)`` bool: triangles that have one of these edges alone; default: all.
         """
         key, source, target, order = graph.source * graph.num_nodes + graph.target, graph.source, graph.target, None
         if not bool((key[1:] >= key[:-1]).all()):  # a canonical form is sorted, and copies of a large one cost memory
@@ -41,15 +46,25 @@ class Triangles:
         up_to = count.cumsum(0)
         paths = int(up_to[-1]) if graph.num_edges else 0
         path = torch.arange(0, paths, max(1, -(-paths // most)), device=graph.device)
-        one = torch.searchsorted(up_to, path, right=True)
-        two = first[target[one]] + path - (up_to - count)[one]
-        wanted = source[one] * graph.num_nodes + target[two]
-        three = torch.searchsorted(key, wanted).clamp(max=max(graph.num_edges - 1, 0))
-        edge = torch.stack((one, two, three))[:, key[three] == wanted]
-        edge = edge if order is None else order[edge]
-        measured = [graph.target_from_source[each].double() for each in edge]
-        passed = rotations.multiply(measured[1], measured[0])
-        return cls(edge, rotations.angle_between(passed, measured[2]))
+        parts = slices(len(path), _SLICE_PATHS, path.device)
+        found = [(path.new_empty(3, 0), path.new_empty(0, dtype=torch.float64)) for _ in parts]
+
+        def look(number: int) -> None:
+            along = path[parts[number]]
+            one = torch.searchsorted(up_to, along, right=True)
+            two = first[target[one]] + along - (up_to[one] - count[one])
+            wanted = source[one] * graph.num_nodes + target[two]
+            three = torch.searchsorted(key, wanted).clamp(max=max(graph.num_edges - 1, 0))
+            edge = torch.stack((one, two, three))[:, key[three] == wanted]
+            edge = edge if order is None else order[edge]
+            edge = edge if among is None else edge[:, among[edge].any(dim=0)]
+            measured = [graph.target_from_source[each].double() for each in edge]
+            passed = rotations.multiply(measured[1], measured[0])
+            found[number] = edge, rotations.angle_between(passed, measured[2])
+
+        for_each(look, range(len(parts)))
+        edges, angles = zip(*found, strict=True) if found else ((path.new_empty(3, 0),), (path.new_empty(0).double(),))
+        return cls(torch.cat(edges, dim=1), torch.cat(angles))
 
     def votes(self, closing: float, num_edges: int) -> Tensor:
         """``(M,)`` how many triangles of each edge close, to within about ``closing`` rad."""
