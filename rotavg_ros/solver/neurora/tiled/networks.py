@@ -21,7 +21,7 @@ from rotavg_ros.solver.neurora.fine_net import (
 )
 from rotavg_ros.solver.neurora.message_passing import MessagePassingLayer
 from rotavg_ros.solver.neurora.numbers import NUMBERS
-from rotavg_ros.solver.neurora.tiled.passes import node_states, visit_activations
+from rotavg_ros.solver.neurora.tiled.passes import visit_activations, walk_over
 from rotavg_ros.solver.running.threads import for_each, slices
 
 
@@ -36,19 +36,20 @@ def clean_edges(network: CleanNet, target_from_source: Tensor, edges: SortedEdge
     bias = head @ last.bias + torch.cat((network.noise_head.bias, network.outlier_head.bias))
     weight = head @ last.weight
 
-    # In which column they are of an edge as it was given, then of the same edge reversed.
-    column = edges.edge.new_empty(2 * num_edges)
-
     def collect(tile: Tile, activation: Tensor) -> None:
         opinion[:, tile.edges] = torch.addmm(bias[:, None], weight, activation.t())
-        row = edges.edge[tile.edges] + num_edges * edges.is_reversed[tile.edges]
-        column.index_copy_(
-            0, row, torch.arange(tile.edges.start, tile.edges.stop, dtype=torch.int32, device=row.device)
-        )
 
     no_states = like.new_zeros(edges.num_nodes, 0)
     visit_activations(network.network, no_states, target_from_source.to(like.dtype), edges, collect)
+    # In which column they are of an edge as it was given, then of the same edge reversed.
+    column = edges.edge.new_empty(2 * num_edges)
     clean, logit = like.new_empty(num_edges, 4), like.new_empty(num_edges)
+
+    def find(part: slice) -> None:
+        row = edges.edge[part] + num_edges * edges.is_reversed[part]
+        column.index_copy_(0, row, torch.arange(part.start, part.stop, dtype=torch.int32, device=row.device))
+
+    for_each(find, slices(2 * num_edges, SLICE_EDGES, column.device))
 
     def decide(part: slice) -> None:
         measured = target_from_source[part].to(like.dtype).t().contiguous()
@@ -72,17 +73,12 @@ def fine_tuned(network: FineNet, cleaned: Cleaned, body_from_world: Tensor, comp
     Args:
         component: ``(N,)`` connected components.
     """
+    scale, features = _scale_and_features(cleaned, body_from_world, component)
     edges = cleaned.edges.select(cleaned.is_inlier)
-    scale = torch.empty_like(body_from_world[:1, :1])
-
-    def features() -> Tensor:
-        nonlocal scale
-        scale, of_edges = _scale_and_features(cleaned, body_from_world, component)
-        return of_edges
-
-    # Nobody but the network's first layer holds the features, which take as much room as the measurements.
     states = node_features(body_from_world, edges.degree[:, None])
-    states = node_states(network.network, states, features(), edges)
+    with walk_over(network.network, features, edges) as walk:
+        del features, edges  # they make room for activations
+        states = walk.node_states(states)
     return network.correct(body_from_world, states, scale)
 
 

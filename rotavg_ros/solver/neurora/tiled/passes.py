@@ -54,12 +54,8 @@ def node_states(network: MessagePassingNetwork, nodes: Tensor, features: Tensor,
             change their sign where an edge is reversed.
         edges: over which messages run.
     """
-    walking = _walk(network, features, edges)
-    del features
-    with walking as walk:
-        for layer in range(len(network.layers)):
-            nodes = walk.layer(layer, nodes)
-    return nodes
+    with walk_over(network, features, edges) as walk:
+        return walk.node_states(nodes)
 
 
 def visit_activations(
@@ -67,7 +63,7 @@ def visit_activations(
 ) -> None:
     """Show the last layer's activations to ``visit``, tile by tile and on several threads; else as above."""
     last = len(network.layers) - 1
-    walking = _walk(network, features, edges)
+    walking = walk_over(network, features, edges)
     del features
     with walking as walk:
         for layer in range(last):
@@ -76,14 +72,15 @@ def visit_activations(
 
 
 @contextmanager
-def _walk(network: MessagePassingNetwork, features: Tensor, edges: SortedEdges) -> Iterator[_Walk]:
+def walk_over(network: MessagePassingNetwork, features: Tensor, edges: SortedEdges) -> Iterator[Walk]:
+    """A pass of a network, as :func:`node_states` has it. Features and edges are read before, and not held inside."""
     layers = [cast(MessagePassingLayer, layer) for layer in network.layers]
     num_edges, hidden, width = len(edges.source), layers[0].message_output.in_features, features.shape[1]
     with scratch(num_edges, hidden + width, features) as memory:
         flat, end = memory.view(-1), num_edges * hidden
         state = _State(flat[:end].view(num_edges, hidden), flat[end:].view(num_edges, width))
-        walk = _Walk(layers, network.odd_width, features, edges, state)
-        del features  # what the caller does not hold, either, makes room for activations
+        walk = Walk(layers, network.odd_width, features, edges, state)
+        del features, edges  # what the caller does not hold, either, makes room for activations
         yield walk
 
 
@@ -99,11 +96,11 @@ class _State(NamedTuple):
     features: Tensor
 
 
-class _Walk:
+class Walk:
     """One pass of a network over one graph.
 
     Args:
-        features: ``(M, edge_width)``; they are read here and no more.
+        features: ``(M, edge_width)``; they and the edges are read here and no more.
         state: working memory.
     """
 
@@ -115,7 +112,7 @@ class _Walk:
         edges: SortedEdges,
         state: _State,
     ) -> None:
-        self.layers, self.edges, self.state = layers, edges, state
+        self.layers, self.first, self.state = layers, edges.first, state
         self.hidden, self.width = state.activation.shape[1], features.shape[1]
         # Whether layers see what the one before has left of an edge.
         self.remembers = layers[-1].edge_projection.in_features > self.width
@@ -148,6 +145,12 @@ class _Walk:
                 torch.stack((target, edges.source[tile.edges] + edges.num_nodes), dim=1, out=self.ends[tile.edges])
 
         for_each(begin, self.stretches, self.threads)
+
+    def node_states(self, nodes: Tensor) -> Tensor:
+        """The last node states ``(N, hidden)``, of initial ones ``(N, node_width)``."""
+        for layer in range(len(self.layers)):
+            nodes = self.layer(layer, nodes)
+        return nodes
 
     def layer(self, index: int, nodes: Tensor, visit: Visit | None = None) -> Tensor:
         """One layer; returns the new node states, or ``nodes`` where ``visit`` takes the activations instead."""
@@ -195,7 +198,7 @@ class _Walk:
         return _bags(projected, ends, self.pair_offsets[: len(ends) // 2 + 1], "sum")
 
     def _mean_by_node(self, tile: Tile, activation: Tensor) -> Tensor:
-        first = self.edges.first[tile.nodes.start : tile.nodes.stop + 1]
+        first = self.first[tile.nodes.start : tile.nodes.stop + 1]
         return _bags(activation, self.row_numbers[: len(activation)], first - tile.edges.start, "mean")
 
 
