@@ -16,7 +16,7 @@ from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
 from rotavg_ros.solver.methods import DEFAULT_METHOD, DEVICES, METHODS, PROFILES, is_method, method_named
 from rotavg_ros.solver.neurora.network_store import Networks
 from rotavg_ros.solver.neurora.numbers import NUMBERS
-from rotavg_ros.solver.running.threads import workers
+from rotavg_ros.solver.running.threads import for_each, workers
 from rotavg_ros.solver.running.work import metered
 from rotavg_ros.solver.sfm.solve import solve_sfm
 from rotavg_ros.solver.slam.live import advance as advance_slam
@@ -29,6 +29,8 @@ from rotavg_ros.view_graph import EdgeKind, EdgeLabel, HoldsViewGraph, ViewGraph
 
 # The noise that makes an edge an outlier, in radians.
 _OUTLIER_ANGLE = {"sfm": NUMBERS.outlier_angle, "slam": exceedance.OUTLIER_ANGLE}
+# With fewer edges two looks at them take less time than waking another worker.
+_WORTH_WORKERS = 50_000
 
 
 @torch.no_grad()
@@ -99,6 +101,15 @@ def solve(
         devices.choose(device) if profile == "sfm" and all(method_named(name) is not None for name in names) else "cpu"
     )
     graph = graph.to("cpu")
+    stating_nothing: list[tuple[str, ...]] = []
+
+    def look(number: int) -> None:
+        if number == 0:
+            graph.components()  # the graph remembers them
+        else:
+            stating_nothing.append(warnings.stating_nothing(graph))
+
+    for_each(look, (0, 1), None if graph.num_edges > _WORTH_WORKERS else 1)
     job = _Job(graph, graph.components(), names, profile)
     steps = refinement_steps
     goes_on_from = _memory_of(names, memory) if steps is None and warm_start is not None else None
@@ -127,7 +138,7 @@ def solve(
         profile,
         where,
         estimate.memory,
-        (*estimate.warnings, *warnings.stating_nothing(graph), *warnings.mostly_flagged(graph, score, rotation_score)),
+        (*estimate.warnings, *stating_nothing[0], *warnings.mostly_flagged(graph, score, rotation_score)),
         None if places is None else _root_at_origin(places.position, estimate.body_from_world, job.component),
         None if places is None else places.variance.sqrt(),
         rotation_score,

@@ -292,7 +292,7 @@ def _axes(source: Tensor, target: Tensor, rows: Tensor, component: Tensor) -> Te
     main = torch.linalg.eigh(_moments(rows[:3], of_edge, count)).eigenvectors
     # The main axis last: then what turns about it have left lies in the plane of the first two coordinates.
     first, second, along = _in_axes(main.mT, rows[:3], component, source)
-    length = torch.hypot(along, rows[3]).clamp(min=_SAME)
+    length = (along * along + rows[3] * rows[3]).sqrt().clamp(min=_SAME)  # hypot takes ten times as long
     along, cosine = along / length, rows[3] / length
     before = torch.stack((cosine * first - along * second, cosine * second + along * first))
     after = torch.stack((cosine * first + along * second, cosine * second - along * first))

@@ -19,6 +19,8 @@ from rotavg_ros.solver.running.threads import for_each, threads_on
 
 # So many edges tell which of two trees fits better.
 _MISFIT_SAMPLE = 16_384
+# With fewer a look at them takes less time than waking another worker.
+_WORTH_WORKERS = 8_192
 
 
 class Bootstrapped(NamedTuple):
@@ -49,7 +51,8 @@ def bootstrap(cleaned: Cleaned, component: Tensor | None = None) -> Bootstrapped
     """
     component = cleaned.graph.components() if component is None else component
     degree = cleaned.edges.degree
-    fewest = torch.minimum(degree[cleaned.graph.source], degree[cleaned.graph.target])
+    ends = cleaned.graph.source, cleaned.graph.target
+    fewest = torch.minimum(*(degree.float().index_select(0, end) for end in ends))
     cost = NUMBERS.edge_cost + NUMBERS.outlier_cost * cleaned.outlier_probability + NUMBERS.fringe_cost / fewest
     parent, parent_edge, roots = _cheapest_forest(cleaned, cost, hubs(cleaned.edges, component), component)
     rectified, raw = (compose(parent, parent_edge, graph) for graph in (cleaned.graph, cleaned.measured))
@@ -104,5 +107,6 @@ def _misfits(cleaned: Cleaned, candidates: Sequence[Tensor], component: Tensor) 
         angle = 2 * torch.atan2((residual[:3] * residual[:3]).sum(dim=0).sqrt(), residual[3])
         misfits[number] = median_by_group(angle, of_edge, count)
 
-    for_each(compare, range(len(candidates)), threads_on(component.device))
+    threads = threads_on(component.device) if edges.num_edges > _WORTH_WORKERS else 1
+    for_each(compare, range(len(candidates)), threads)
     return misfits

@@ -52,8 +52,10 @@ class Structure:
 
     def redundancy(self, graph: ViewGraph) -> Tensor:
         """How many edges each component has beyond a spanning tree, ``(C,)``."""
-        members = (self.component.index_select(0, graph.source), self.component)
-        edges, nodes = (torch.bincount(member, minlength=len(self.roots)) for member in members)
+        nodes = torch.bincount(self.component, minlength=len(self.roots))
+        if len(self.roots) == 1:
+            return graph.num_edges - nodes + 1
+        edges = torch.bincount(self.component.index_select(0, graph.source), minlength=len(self.roots))
         return edges - nodes + 1
 
 

@@ -28,40 +28,44 @@ from rotavg_ros.solver.running.threads import for_each, slices
 def clean_edges(network: CleanNet, target_from_source: Tensor, edges: SortedEdges) -> CleanEdges:
     """What CleanNet says of the measurements ``(M, 4)``, in its own precision; ``edges`` are all of the graph's."""
     num_edges, like = len(target_from_source), network.noise_head.weight
-    # Rows: predicted noise (4), outlier logit (1). Columns: as the edges are sorted.
-    opinion = like.new_empty(5, 2 * num_edges)
+    # As the edges are sorted.
+    directed_logit = like.new_empty(2 * num_edges)
     # The heads are linear in the message, and that is linear in the activation.
     last = cast(MessagePassingLayer, network.network.layers[-1]).message_output
     head = torch.cat((network.noise_head.weight, network.outlier_head.weight))
     bias = head @ last.bias + torch.cat((network.noise_head.bias, network.outlier_head.bias))
     weight = head @ last.weight
 
-    def collect(tile: Tile, activation: Tensor) -> None:
-        opinion[:, tile.edges] = torch.addmm(bias[:, None], weight, activation.t())
+    def collect(tile: Tile, activation: Tensor, noise: Tensor) -> None:
+        opinion = torch.addmm(bias[:, None], weight, activation.t())
+        noise.copy_(opinion[:4].t())
+        directed_logit[tile.edges] = opinion[4]
 
     no_states = like.new_zeros(edges.num_nodes, 0)
-    visit_activations(network.network, no_states, target_from_source.to(like.dtype), edges, collect)
-    # In which column they are of an edge as it was given, then of the same edge reversed.
-    column = edges.edge.new_empty(2 * num_edges)
+    # Predicted noise takes the place of measurements, whose four numbers it has.
+    noise = visit_activations(network.network, no_states, target_from_source.to(like.dtype), edges, collect)
+    # In which row the opinion is of an edge as it was given, then of the same edge reversed.
+    place = edges.edge.new_empty(2 * num_edges)
     clean, logit = like.new_empty(num_edges, 4), like.new_empty(num_edges)
 
     def find(part: slice) -> None:
         row = edges.edge[part] + num_edges * edges.is_reversed[part]
-        column.index_copy_(0, row, torch.arange(part.start, part.stop, dtype=torch.int32, device=row.device))
+        place.index_copy_(0, row, torch.arange(part.start, part.stop, dtype=torch.int32, device=row.device))
 
-    for_each(find, slices(2 * num_edges, SLICE_EDGES, column.device))
+    for_each(find, slices(2 * num_edges, SLICE_EDGES, place.device))
 
     def decide(part: slice) -> None:
         measured = target_from_source[part].to(like.dtype).t().contiguous()
-        forward, backward = (opinion.index_select(1, direction[part]) for direction in column.view(2, -1))
+        rows = [direction[part] for direction in place.view(2, -1)]
+        forward, backward = (noise.index_select(0, row).t().contiguous() for row in rows)
         # clean_net.correct, multiplied out: R̃ (1 + (f + R̃⁻¹ b⁻¹ R̃) / 2) = R̃ + (R̃ f + b⁻¹ R̃) / 2.
         inverse_backward = torch.cat((-backward[:3], backward[3:4]))
-        change = multiply_rows(measured, forward[:4]) + multiply_rows(inverse_backward, measured)
+        change = multiply_rows(measured, forward) + multiply_rows(inverse_backward, measured)
         corrected = torch.add(measured, change, alpha=0.5)
         # Unit length and w ≥ 0; torch's normalize takes twenty times as long over rows.
         scale = (corrected * corrected).sum(dim=0).rsqrt_().mul_(1 - 2 * (corrected[3] < 0).to(corrected))
         clean[part] = (corrected * scale).t()
-        logit[part] = (forward[4] + backward[4]) / 2
+        logit[part] = (directed_logit.index_select(0, rows[0]) + directed_logit.index_select(0, rows[1])) / 2
 
     for_each(decide, slices(num_edges, SLICE_EDGES, logit.device))
     return CleanEdges(clean, logit)

@@ -30,8 +30,9 @@ class Tuning(NamedTuple):
 
 _tuning = Tuning(tile_edges=8192, threads=1 << 10)
 
-# Gets a tile and the last layer's activations of its edges, ``(edges of the tile, hidden)``.
-Visit = Callable[[Tile, Tensor], None]
+# Gets a tile, the last layer's activations of its edges, ``(edges of the tile, hidden)``, and where to write as many
+# numbers of each edge as it has features.
+Visit = Callable[[Tile, Tensor, Tensor], None]
 
 
 def current_tuning() -> Tuning:
@@ -60,8 +61,12 @@ def node_states(network: MessagePassingNetwork, nodes: Tensor, features: Tensor,
 
 def visit_activations(
     network: MessagePassingNetwork, nodes: Tensor, features: Tensor, edges: SortedEdges, visit: Visit
-) -> None:
-    """Show the last layer's activations to ``visit``, tile by tile and on several threads; else as above."""
+) -> Tensor:
+    """Show the last layer's activations to ``visit``, tile by tile and on several threads; else as above.
+
+    Returns:
+        ``(E, edge_width)`` what it has written, in the place of the features, as the edges are sorted.
+    """
     last = len(network.layers) - 1
     walking = walk_over(network, features, edges)
     del features
@@ -69,16 +74,16 @@ def visit_activations(
         for layer in range(last):
             nodes = walk.layer(layer, nodes)
         walk.layer(last, nodes, visit)
+        return walk.state.features
 
 
 @contextmanager
 def walk_over(network: MessagePassingNetwork, features: Tensor, edges: SortedEdges) -> Iterator[Walk]:
     """A pass of a network, as :func:`node_states` has it. Features and edges are read before, and not held inside."""
     layers = [cast(MessagePassingLayer, layer) for layer in network.layers]
-    num_edges, hidden, width = len(edges.source), layers[0].message_output.in_features, features.shape[1]
-    with scratch(num_edges, hidden + width, features) as memory:
-        flat, end = memory.view(-1), num_edges * hidden
-        state = _State(flat[:end].view(num_edges, hidden), flat[end:].view(num_edges, width))
+    num_edges = len(edges.source)
+    with scratch(num_edges, layers[0].message_output.in_features, features) as activation:
+        state = _State(activation, features.new_empty(num_edges, features.shape[1]))
         walk = Walk(layers, network.odd_width, features, edges, state)
         del features, edges  # what the caller does not hold, either, makes room for activations
         yield walk
@@ -138,8 +143,8 @@ class Walk:
         def begin(tiles: Sequence[Tile]) -> None:
             for tile in tiles:
                 of_edge = signs.index_select(0, edges.is_reversed[tile.edges].int())
-                of_edge.mul_(features.index_select(0, edges.edge[tile.edges]))
-                state.features[tile.edges] = of_edge
+                stated = features.index_select(0, edges.edge[tile.edges])
+                torch.mul(stated, of_edge, out=state.features[tile.edges])
                 count = tile.edges.stop - tile.edges.start
                 target = nodes[tile.nodes].repeat_interleave(degree[tile.nodes], output_size=count)
                 torch.stack((target, edges.source[tile.edges] + edges.num_nodes), dim=1, out=self.ends[tile.edges])
@@ -182,7 +187,7 @@ class Walk:
                 else:
                     activation.relu_()
                 if visit is not None:
-                    visit(tile, activation)
+                    visit(tile, activation, features)
                 elif len(activation):
                     mean[tile.nodes] = self._mean_by_node(tile, activation)
             if visit is None:
