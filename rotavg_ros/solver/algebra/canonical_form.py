@@ -50,7 +50,7 @@ class CanonicalForm:
             the information of the highest mean precision.
         component: ``(N,)`` of its nodes.
         node: ``(N,)`` which of the given graph's nodes each is.
-        edge: ``(M,)`` which of its edges stands for each of the given graph's.
+        edge: ``(M,)`` int32, which of its edges stands for each of the given graph's.
         canonical_from_body: ``(C, 4)`` the canonical axes of each component's cameras.
     """
 
@@ -122,8 +122,8 @@ def _form(graph: ViewGraph, component: Tensor, own_axes: bool) -> tuple[Canonica
         axes = _axes(low.index_select(0, some), higher, rows, component)
     else:
         axes = torch.eye(3, dtype=graph.target_from_source.dtype, device=graph.device).expand(count, 3, 3)
-    high, edge, measured = torch.empty_like(low), torch.empty_like(low), torch.empty_like(graph.target_from_source)
-    place = torch.arange(len(low), device=low.device)
+    high, edge, measured = torch.empty_like(low), torch.empty_like(order), torch.empty_like(graph.target_from_source)
+    place = torch.arange(len(low), dtype=order.dtype, device=low.device)
 
     def write(part: slice) -> None:
         chosen = order[part]
