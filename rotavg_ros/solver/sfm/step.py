@@ -121,9 +121,12 @@ class Expected(NamedTuple):
         if len(at_source) == 1:  # noise is round: Ω = 1
             square = _dot(vector, vector)
             return cls(vector, square, variance, torch.full_like(square, 0.5))
+        if source_share is not None:
+            pull = times(torch.lerp(at_target[1:], at_source[1:], source_share), vector)
+            return cls(pull, _dot(vector, pull), variance, source_share)
         pulls = [times(end[1:], vector) for end in (at_source, at_target)]
         squares = [_dot(vector, pull) for pull in pulls]
-        share = share_of_first(*squares) if source_share is None else source_share
+        share = share_of_first(*squares)
         square = torch.lerp(squares[1], squares[0], share)
         return cls(torch.lerp(pulls[1], pulls[0], share), square, variance, share)
 
@@ -271,7 +274,8 @@ class Problem:
         measured = self._measured if dtype == self._measured.dtype else None
         residuals = EdgeResiduals(graph, orientations.to(dtype), measured)
         rows, prior = measure.rows(dtype), prior.to(dtype)
-        weights = SplitWeights(torch.empty_like(prior), torch.empty_like(prior))
+        held = None if measure.source_share is None else measure.source_share.to(dtype)
+        weights = SplitWeights(torch.empty_like(prior), torch.empty_like(prior) if held is None else held)
         matrix = None if measure.unit is None else prior.new_empty(6, graph.num_edges)
         parts = stretches(slices(graph.num_edges, SLICE_EDGES, graph.device))
         # Components in rows: adding columns up by node is a dozen times as fast as adding up rows.
@@ -281,11 +285,12 @@ class Problem:
             for edges in parts[part]:
                 source, target = graph.source[edges], graph.target[edges]
                 at_source, at_target = rows.index_select(1, source), rows.index_select(1, target)
-                held = None if measure.source_share is None else measure.source_share[edges].to(dtype)
                 vector = measure.in_units(residuals.vectors(edges), edges)
-                expected = Expected.of(vector, at_source, at_target, held)
+                expected = Expected.of(vector, at_source, at_target, None if held is None else held[edges])
                 robust = measure.weigh(expected.square + expected.variance).mul_(prior[edges])
-                weights.total[edges], weights.source_share[edges] = robust, expected.source_share
+                weights.total[edges] = robust
+                if held is None:
+                    weights.source_share[edges] = expected.source_share
                 pull = measure.in_units(expected.pull.mul_(robust), edges)
                 if matrix is not None and measure.unit is not None:
                     information = Expected.information(at_source, at_target, expected.source_share)
