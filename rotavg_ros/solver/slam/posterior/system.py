@@ -20,9 +20,9 @@ from rotavg_ros.solver.running.work import ENTRIES, rest, spend, stop_if_abandon
 
 # Rows that weigh less than this share of the heaviest one are nothing.
 _NO_WEIGHT = 1e-9
-# So many patterns of rows are kept. One whose rows are others than another's by this share at most is eliminated in the
-# same order.
-_MAX_PATTERNS, _SAME_ORDER = 8, 0.02
+# So many patterns of rows are kept. One that lacks no more than this share of another's rows, and has so many more at
+# most, is eliminated in the same order: what is lacking fills nothing in, what is more may fill in much.
+_MAX_PATTERNS, _LACKING, _MORE = 8, 0.02, 3
 _MAX_LEVERAGE = 1 - 1e-6
 
 
@@ -94,8 +94,7 @@ class NormalEquations:
 
     def _laid_out(self, counts: np.ndarray) -> _Pattern:
         """The pattern of some rows, in the order of one that has about the same, if there is such."""
-        limit = _SAME_ORDER * len(counts)
-        alike = next((other for other in self._ordered if np.count_nonzero(other.counts != counts) <= limit), None)
+        alike = next((other for other in self._ordered if _is_eliminated_alike(counts, other.counts)), None)
         rank = None if alike is None else alike.rows.rank
         pattern = _Pattern(counts, RowPattern(self.column[counts], self.value[counts], self.size, rank))
         if alike is None:
@@ -120,6 +119,12 @@ class _Pattern(NamedTuple):
 
     counts: np.ndarray
     rows: RowPattern
+
+
+def _is_eliminated_alike(counts: np.ndarray, others: np.ndarray) -> bool:
+    """Whether some rows ``(E + R,)`` bool have little fill in the order of elimination of others."""
+    more, lacking = np.count_nonzero(counts & ~others), np.count_nonzero(others & ~counts)
+    return more <= _MORE and lacking <= _LACKING * len(counts)
 
 
 class Factorised:

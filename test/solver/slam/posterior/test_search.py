@@ -287,7 +287,7 @@ STRUCTURAL = {
     "rows": {"_NOTHING", "_MAX_TURN", "_LEAST_REST"},
     "solve": {"Begin", "_BIAS_ROUNDS", "_LEAST_GAIN"},
     "state": {"EXPONENTS", "COMMON_SHARES", "RUN_STEPS", "TURN_SHARES", "TAIL_SHARES"},
-    "system": {"_MAX_LEVERAGE", "_NO_WEIGHT", "_MAX_PATTERNS", "_SAME_ORDER"},
+    "system": {"_MAX_LEVERAGE", "_NO_WEIGHT", "_MAX_PATTERNS", "_LACKING", "_MORE"},
 }
 
 
