@@ -20,6 +20,7 @@ SWITCHES: dict[str, str] = {
     "turns": "odometry errs alike however far it turns",
     "settling": "labels are flipped as they are, never gone on from as probabilities",
     "shifts": "a slip, once found, stays in its segment",
+    "splits": "what lies between a slip and another place is not turned by itself",
     "mending": "a slip, once found, is not taken back together with what it explains",
     "annealing": "no start anneals the closures",
     "robust-start": "no start weighs odometry down as it does closures",

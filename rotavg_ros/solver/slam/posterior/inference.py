@@ -12,6 +12,7 @@ from rotavg_ros.solver.slam.posterior.em import polish, settle, step
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.moves import noise, slips
 from rotavg_ros.solver.slam.posterior.moves.flips import flipped
+from rotavg_ros.solver.slam.posterior.moves.splits import propose_splits
 from rotavg_ros.solver.slam.posterior.moves.starts import starts, turned_further, turned_parts
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import with_noise
@@ -173,3 +174,5 @@ def proposals(mode: Mode) -> Iterator[Proposal]:
         yield from slips.propose_shifts(mode)
     if not without & {"slips", "mending"}:
         yield from slips.propose_mending(mode)
+    if not without & {"slips", "splits"}:
+        yield from propose_splits(mode)

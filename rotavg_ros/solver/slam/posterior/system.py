@@ -124,7 +124,7 @@ class _Pattern(NamedTuple):
 def _is_eliminated_alike(counts: np.ndarray, others: np.ndarray) -> bool:
     """Whether some rows ``(E + R,)`` bool have little fill in the order of elimination of others."""
     more, lacking = np.count_nonzero(counts & ~others), np.count_nonzero(others & ~counts)
-    return more <= _MORE and lacking <= _LACKING * len(counts)
+    return bool(more <= _MORE and lacking <= _LACKING * len(counts))
 
 
 class Factorised:

@@ -275,7 +275,7 @@ STRUCTURAL = {
     "mode": {"OTHER_NOISE", "_SAME", "_MAX_DENSE"},
     "moves/jumps": {"_MAX_ROUNDS", "_MAX_CANDIDATES", "_MIN_GAIN", "_MIN_CARRIED"},
     "moves/noise": {"_GRIDS", "_REACH", "_JOINT", "_SCALES", "_MIN_SPREAD", "_FIRST_SOLVES", "_WORSE_STEPS"},
-    "moves/slips": {"_LEAST_WITNESSES", "_AGREE", "_AGREE_ANGLE", "_OPTIMISM", "_SETTLING", "_SAME_PLACE"},
+    "moves/slips": {"LEAST_WITNESSES", "_AGREE", "_AGREE_ANGLE", "OPTIMISM", "SETTLING", "SAME_PLACE"},
     "moves/starts": {"_INLIER_SQUARE", "_SHARP", "_STEP_LEVELS", "_CLOSURE_LEVEL", "_ROBUST_POWER"}
     | {"_ANNEALED_SLIPS", "_LEAST_WEIGHT", "_SAME_TURN"},
     # A cost by which a start is found; F alone decides what becomes of it.

@@ -17,19 +17,19 @@ from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.rows import variances
 from rotavg_ros.solver.slam.posterior.state import State
 
-_SETTLING = 4
+SETTLING = 4
 # What relabelling and bending may gain beyond what residuals tell of a part that is turned back, nats.
-_OPTIMISM = 10.0
+OPTIMISM = 10.0
 # A turn explains a closure that is off by it to so many standard deviations, or to this angle, rad.
 _AGREE, _AGREE_ANGLE = 3.0, np.radians(2.0)
 # One false closure costs less than a slip.
-_LEAST_WITNESSES = 2
+LEAST_WITNESSES = 2
 # Positions that differ by less, in steps, are the same.
-_SAME_PLACE = 1e-9
+SAME_PLACE = 1e-9
 
 
 @dataclass(frozen=True)
-class _Witnesses:
+class Witnesses:
     """What closures say of slips (C closures, S sound segments in the order of the path).
 
     Attributes:
@@ -50,7 +50,7 @@ class _Witnesses:
     price: np.ndarray
 
     @classmethod
-    def of(cls, mode: Mode) -> _Witnesses:
+    def of(cls, mode: Mode) -> Witnesses:
         problem, state, graph, closure = mode.problem, mode.state, mode.problem.graph, mode.problem.closure
         turned = quaternion_rows.residual(state.correction, problem.measured, graph.source, graph.target)[:, closure]
         turned = np.where(problem.sign > 0, turned, quaternion_rows.inverse(turned))
@@ -59,17 +59,17 @@ class _Witnesses:
         segment = np.flatnonzero(state.is_good[: graph.num_segments])
         start = np.minimum(graph.position[graph.source[segment]], graph.position[graph.target[segment]])
         order = np.argsort(start, kind="stable")
-        first, last = np.searchsorted(start[order], problem.ends.T - _SAME_PLACE)
+        first, last = np.searchsorted(start[order], problem.ends.T - SAME_PLACE)
         square = (mode.evaluation.residual[closure] ** 2).sum(axis=1)
         alone = log_false(square, problem.components, problem.priors)
         gain = np.maximum(mode.left_out.if_good[closure] - alone, 0.0)
         segment = segment[order]
         return cls(turned, can_tell, first, last, gain, segment, mode.left_out.log_odds[segment])
 
-    def agreeing(self, closure: np.integer, mode: Mode) -> np.ndarray:
-        """``(C,)`` bool, false closures that one turn explains together with this one."""
+    def agreeing(self, turn: np.ndarray, mode: Mode) -> np.ndarray:
+        """``(C,)`` bool, false closures that are off by about a turn ``(4,)``."""
         tolerance = 2 * _AGREE**2 * mode.problem.components * mode.state.noise.closure_variance + _AGREE_ANGLE**2
-        difference = 2 * np.arccos(np.minimum(np.abs(self.turned[:, closure] @ self.turned), 1.0))
+        difference = 2 * np.arccos(np.minimum(np.abs(turn @ self.turned), 1.0))
         return np.asarray((difference**2 < tolerance) & self.can_tell & mode.is_false)
 
     def best_place(self, agrees: np.ndarray, disagrees: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
@@ -85,16 +85,16 @@ class _Witnesses:
 
 def propose_slips(mode: Mode) -> Iterator[Proposal]:
     """Segments where a turn would explain most of the closures that are held false."""
-    witnesses = _Witnesses.of(mode)
+    witnesses = Witnesses.of(mode)
     places = _places(mode, witnesses)[: mode.problem.limits.slips]
     before = _log_labelled(mode, mode.is_false) if places else 0.0
     for _, closure, place, freed, lost in places:
         edge, turn = int(witnesses.segment[place]), witnesses.turned[:, [closure]]
         # Together they gain less than one by one: false closures that repeat a turn are cheap.
-        after = _log_labelled(mode, mode.is_false & ~freed)
-        after += _log_turned(mode, np.flatnonzero(freed), turn, witnesses.turned[:, freed])
-        after += float(log_slip_odds(mode.problem, mode.problem.graph.own_steps[[edge]], len(mode.slipped))[0])
-        predicted = before - after + float(witnesses.gain[lost].sum())
+        labelled = _log_labelled(mode, mode.is_false & ~freed)
+        labelled += _log_turned(mode, np.flatnonzero(freed), turn, witnesses.turned[:, freed])
+        labelled += float(log_slip_odds(mode.problem, mode.problem.graph.own_steps[[edge]], len(mode.slipped))[0])
+        predicted = before - labelled + float(witnesses.gain[lost].sum())
         # A slip turns a part of the map, so it is tried where it would be a rival only.
         yield Proposal("slip", predicted, partial(_with_slip, mode, edge, turn), mode.problem.limits.rival)
 
@@ -105,12 +105,12 @@ def may_have_slipped(mode: Mode) -> bool:
     Of several slips none need pay by itself while the closures that tell of the others are held false: those repeat
     each other and are cheap.
     """
-    return any(gained > 0 for gained, *_ in _places(mode, _Witnesses.of(mode))) or any(
+    return any(gained > 0 for gained, *_ in _places(mode, Witnesses.of(mode))) or any(
         slip.predicted <= slip.slack for slip in propose_slips(mode)
     )
 
 
-def _places(mode: Mode, witnesses: _Witnesses) -> list[tuple[float, int, int, np.ndarray, np.ndarray]]:
+def _places(mode: Mode, witnesses: Witnesses) -> list[tuple[float, int, int, np.ndarray, np.ndarray]]:
     """Slips by what each gains, nats, closure by closure: a closure with its turn, the place, whom it frees and loses.
 
     The most gain first.
@@ -119,11 +119,11 @@ def _places(mode: Mode, witnesses: _Witnesses) -> list[tuple[float, int, int, np
     disagrees = witnesses.can_tell & ~mode.is_false
     for closure in np.flatnonzero(left if len(witnesses.segment) else np.zeros_like(left)):
         if left[closure]:
-            agrees = witnesses.agreeing(closure, mode)
+            agrees = witnesses.agreeing(witnesses.turned[:, closure], mode)
             left &= ~agrees
             place, freed, lost = witnesses.best_place(agrees, disagrees)
             gained = float(witnesses.gain[freed].sum() - witnesses.gain[lost].sum() - witnesses.price[place])
-            if freed.sum() >= _LEAST_WITNESSES:
+            if freed.sum() >= LEAST_WITNESSES:
                 found.append((gained, int(closure), place, freed, lost))
     return sorted(found, key=lambda slip: -slip[0])
 
@@ -168,10 +168,10 @@ def propose_mending(mode: Mode) -> Iterator[Proposal]:
         for name, end in (("mend and reject", None), ("turn a part back", following)):
             if end is not None or name == "mend and reject":
                 state = _mended(mode, int(edge), end)
-                predicted = rough_cost(mode.problem, state) - before - _OPTIMISM
-                yield Proposal(name, predicted, partial(settle, mode.problem, state, _SETTLING), slack)
+                predicted = rough_cost(mode.problem, state) - before - OPTIMISM
+                yield Proposal(name, predicted, partial(settle, mode.problem, state, SETTLING), slack)
         bends = -float(mode.left_out.log_odds[edge])
-        yield Proposal("mend and bend", bends - _OPTIMISM, partial(_bent, mode, int(edge)), slack)
+        yield Proposal("mend and bend", bends - OPTIMISM, partial(_bent, mode, int(edge)), slack)
 
 
 def propose_shifts(mode: Mode) -> Iterator[Proposal]:
@@ -190,10 +190,10 @@ def propose_shifts(mode: Mode) -> Iterator[Proposal]:
             if other >= 0 and mode.state.is_good[other] and chain[other] == chain[edge]:
                 state = _shifted(mode, int(edge), other, is_later=place > at)
                 predicted = rough_cost(mode.problem, state) - before
-                yield Proposal("shift", predicted, partial(settle, mode.problem, state, _SETTLING), limits.rival)
+                yield Proposal("shift", predicted, partial(settle, mode.problem, state, SETTLING), limits.rival)
 
 
-def _after(mode: Mode, edge: int) -> np.ndarray:
+def after(mode: Mode, edge: int) -> np.ndarray:
     """``(K,)`` bool, all that follows a segment along its chain."""
     graph = mode.problem.graph
     chain = graph.paths.chain[graph.nodes]
@@ -201,7 +201,7 @@ def _after(mode: Mode, edge: int) -> np.ndarray:
     return np.asarray((chain == chain[graph.source[edge]]) & (graph.position >= end))
 
 
-def _turned(mode: Mode, nodes: np.ndarray, turn: np.ndarray) -> State:
+def turned_by(mode: Mode, nodes: np.ndarray, turn: np.ndarray) -> State:
     """Nodes turned by ``turn`` ``(4, 1)``."""
     correction = mode.state.correction.copy()
     correction[:, nodes] = quaternion_rows.multiply(correction[:, nodes], turn)
@@ -209,12 +209,12 @@ def _turned(mode: Mode, nodes: np.ndarray, turn: np.ndarray) -> State:
 
 
 def _with_slip(mode: Mode, edge: int, turn: np.ndarray) -> State:
-    state = _turned(mode, _after(mode, edge), turn)
+    state = turned_by(mode, after(mode, edge), turn)
     trusted = relabelled(mode.problem, state)
     odometry = mode.problem.graph.is_odometry
     trusted[odometry] = mode.state.trusted[odometry]
     trusted[edge] = 0.0
-    return settle(mode.problem, replace(state, trusted=trusted), _SETTLING)
+    return settle(mode.problem, replace(state, trusted=trusted), SETTLING)
 
 
 def _turn_of(mode: Mode, edge: int) -> np.ndarray:
@@ -228,11 +228,11 @@ def _turn_of(mode: Mode, edge: int) -> np.ndarray:
 
 
 def _shifted(mode: Mode, edge: int, other: int, *, is_later: bool) -> State:
-    turn, after = _turn_of(mode, edge), _after(mode, edge)
+    turn, follows = _turn_of(mode, edge), after(mode, edge)
     if is_later:
-        state = _turned(mode, after & ~_after(mode, other), turn)
+        state = turned_by(mode, follows & ~after(mode, other), turn)
     else:
-        state = _turned(mode, _after(mode, other) & ~after, quaternion_rows.inverse(turn))
+        state = turned_by(mode, after(mode, other) & ~follows, quaternion_rows.inverse(turn))
     trusted = relabelled(mode.problem, state)
     odometry = mode.problem.graph.is_odometry
     trusted[odometry] = mode.state.trusted[odometry]
@@ -241,10 +241,10 @@ def _shifted(mode: Mode, edge: int, other: int, *, is_later: bool) -> State:
 
 
 def _mended(mode: Mode, edge: int, following: int | None) -> State:
-    graph, turn, nodes = mode.problem.graph, _turn_of(mode, edge), _after(mode, edge)
+    graph, turn, nodes = mode.problem.graph, _turn_of(mode, edge), after(mode, edge)
     if following is not None:
-        nodes &= ~_after(mode, following)
-    state = _turned(mode, nodes, turn)
+        nodes &= ~after(mode, following)
+    state = turned_by(mode, nodes, turn)
     trusted = relabelled(mode.problem, state)
     odometry = graph.is_odometry
     kept = mode.state.trusted[odometry]
@@ -256,4 +256,4 @@ def _mended(mode: Mode, edge: int, following: int | None) -> State:
 def _bent(mode: Mode, edge: int) -> State:
     trusted = mode.state.trusted.copy()
     trusted[edge] = 1.0
-    return settle(mode.problem, replace(mode.state, trusted=trusted), _SETTLING)
+    return settle(mode.problem, replace(mode.state, trusted=trusted), SETTLING)

@@ -1,0 +1,114 @@
+"""Turn what lies between a slip and another place: a slip that was two, or that is elsewhere by many segments.
+
+What lies beyond both is right as it is. So no turn of all that follows a place explains the closures from between, and
+no slip that is tried by itself gains by them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.slam.posterior.em import settle
+from rotavg_ros.solver.slam.posterior.left_out import relabelled, rough_cost
+from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
+from rotavg_ros.solver.slam.posterior.moves.slips import (
+    LEAST_WITNESSES,
+    OPTIMISM,
+    SAME_PLACE,
+    SETTLING,
+    Witnesses,
+    after,
+    turned_by,
+)
+from rotavg_ros.solver.slam.posterior.state import State
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What lies between a slip and a sound segment before or after it.
+
+    Attributes:
+        gained: nats, closure by closure, less what a slip of that segment costs.
+        slip, segment: edges.
+        turn: ``(4, 1)``.
+    """
+
+    gained: float
+    slip: int
+    segment: int
+    turn: np.ndarray
+
+
+def propose_splits(mode: Mode) -> Iterator[Proposal]:
+    """Parts beside slips that one turn puts right, those that gain most closure by closure."""
+    slipped = mode.slipped[mode.slipped < mode.problem.graph.num_segments]
+    if len(slipped) == 0 or mode.is_false.sum() < LEAST_WITNESSES:
+        return
+    limits, witnesses, before = mode.problem.limits, Witnesses.of(mode), rough_cost(mode.problem, mode.state)
+    parts = [part for slip in slipped[: limits.slips] for part in _parts(mode, witnesses, int(slip))]
+    for part in sorted(parts, key=lambda part: -part.gained)[: limits.slips]:
+        state = _split(mode, part)
+        predicted = rough_cost(mode.problem, state) - before - OPTIMISM
+        yield Proposal("split", predicted, partial(settle, mode.problem, state, SETTLING), limits.slack)
+
+
+def _parts(mode: Mode, witnesses: Witnesses, slip: int) -> Iterator[_Part]:
+    """The best part beside a slip for each turn by which false closures are off, or for its inverse."""
+    graph, ends, segment = mode.problem.graph, mode.problem.ends, witnesses.segment
+    chain = graph.paths.chain[graph.nodes[graph.source]]
+    end = max(graph.position[graph.source[slip]], graph.position[graph.target[slip]]) - SAME_PLACE
+    start = np.minimum(graph.position[graph.source], graph.position[graph.target])[segment]
+    is_later, (older_later, newer_later) = start >= end, (ends >= end).T
+    there = witnesses.can_tell & (chain[mode.problem.closure] == chain[slip])
+    good = np.where(there & ~mode.is_false, witnesses.gain, 0.0)
+    left = there & mode.is_false
+    for number in np.flatnonzero(left):
+        if not left[number]:
+            continue
+        turn = witnesses.turned[:, [number]]
+        inverse = quaternion_rows.inverse(turn)
+        off, back = (there & witnesses.agreeing(each[:, 0], mode) for each in (turn, inverse))
+        left &= ~(off | back)
+        # In the part is the newer end, turned by what the closure is off, or the older one, turned by the inverse.
+        for by, newer, older in ((turn, off, back), (inverse, back, off)):
+            newer_gains, older_gains = (np.where(freed, witnesses.gain, 0.0) - good for freed in (newer, older))
+            later = _over(witnesses, newer_gains * (newer_later & ~older_later), None, witnesses.last)
+            later += _over(witnesses, older_gains * older_later, witnesses.first, witnesses.last)
+            earlier = _over(witnesses, newer_gains * ~newer_later, witnesses.first, witnesses.last)
+            earlier -= _over(witnesses, older_gains * (newer_later & ~older_later), None, witnesses.first)
+            earlier += float((older_gains * (newer_later & ~older_later)).sum())
+            gained = np.where(is_later, later, earlier) - witnesses.price
+            gained[chain[segment] != chain[slip]] = -np.inf
+            if len(gained) and gained.max() > -np.inf and (newer | older).sum() >= LEAST_WITNESSES:
+                best = int(gained.argmax())
+                yield _Part(float(gained[best]), slip, int(segment[best]), by)
+
+
+def _over(witnesses: Witnesses, change: np.ndarray, begin: np.ndarray | None, end: np.ndarray) -> np.ndarray:
+    """``(S,)`` sums of what closures ``(C,)`` change over segments from ``begin`` to before ``end``.
+
+    Without ``begin`` over those from ``end`` on.
+    """
+    total = np.zeros(len(witnesses.segment) + 1)
+    if begin is None:
+        np.add.at(total, end, change)
+    else:
+        np.add.at(total, begin, change)
+        np.add.at(total, end, -change)
+    return np.cumsum(total)[:-1]
+
+
+def _split(mode: Mode, part: _Part) -> State:
+    """The part turned, its segment slipped; the slip may be none any more."""
+    graph, follows = mode.problem.graph, after(mode, part.slip)
+    state = turned_by(mode, follows ^ after(mode, part.segment), part.turn)
+    trusted = relabelled(mode.problem, state)
+    odometry = graph.is_odometry
+    trusted[odometry] = np.maximum(mode.state.trusted[odometry], trusted[odometry])
+    trusted[part.segment] = 0.0
+    return replace(state, trusted=trusted)
