@@ -1,8 +1,8 @@
 """How dense other false closures lie about the turn of each: kernel estimates over those detected before, or all.
 
-Places that look alike are mistaken for each other again and again. Those near a closure weigh apart from all: those
-detected shortly before, most of them those of the same run, and, where there are such, those that join the same places.
-A place that was mistaken for another one is so again; from there, the other one for it, by the inverse turn.
+Places that look alike are mistaken for each other again and again. Those of a closure's run weigh apart from those that
+were detected shortly before, and these from all: a run that begins repeats nobody, whatever the last one did. Within a
+run a place that was mistaken for another one is so again; from there, the other one for it, by the inverse turn.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from rotavg_ros.solver.algebra.compiled import compiled
 REPEAT_DEG = 0.05 * 2.0 ** np.arange(9)
 # One width for all, or each as likely for every closure.
 KERNELS = len(REPEAT_DEG) + 1
-# Of closures that are near, one that was detected at about the same time from about the same older place counts for so
-# many others.
+# One of the same run counts for so many that join the same places at other times.
 _IN_RUN = 10.0
+# Of a run, of those shortly before, of all.
+_WHOSE = 3
 # A kernel ends at so many widths, where it is 4e-6 of its height.
 _FARTHEST = 5.0
 
@@ -57,14 +58,18 @@ class Repeats(NamedTuple):
     """Of n closures.
 
     Attributes:
-        near, far: ``(S, n)`` for each kernel, densities of turns like those of near and of any false closures.
-        has_near, has_far: ``(n,)`` bool, whether there are such.
+        density: ``(3, S, n)`` for each kernel, of turns like those of its run and of the same places, of false closures
+            detected shortly before, and of any.
+        has_any: ``(3, n)`` bool, whether there are such.
     """
 
-    near: np.ndarray
-    far: np.ndarray
-    has_near: np.ndarray
-    has_far: np.ndarray
+    density: np.ndarray
+    has_any: np.ndarray
+
+    @classmethod
+    def none(cls, count: int) -> Repeats:
+        """Of n closures that are compared with nobody."""
+        return cls(np.zeros((_WHOSE, KERNELS, count)), np.zeros((_WHOSE, count), dtype=np.bool_))
 
 
 def repeats(closures: Closures, near: Near, gap: float, components: int) -> Repeats:
@@ -115,26 +120,24 @@ def places_near(when: np.ndarray, asked: np.ndarray, is_one: np.ndarray | None, 
 
 
 @compiled
-def _repeats(
-    closures: Closures, compared: Near, gap: float, kernels: _Kernels
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _repeats(closures: Closures, compared: Near, gap: float, kernels: _Kernels) -> tuple[np.ndarray, np.ndarray]:
     older, newer, turn, is_told = closures
     rows, false, between = compared
     height, least_cosine = kernels.height, kernels.least_cosine
-    count, broadest = len(rows), -0.5 / kernels.broadest**2
-    near, far = np.zeros((len(height) + 1, count)), np.zeros((len(height) + 1, count))
-    has_near, has_far = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
-    for n in range(count):
+    widths, broadest = len(height), -0.5 / kernels.broadest**2
+    density, total = np.zeros((_WHOSE, widths + 1, len(rows))), np.zeros((_WHOSE, len(rows)))
+    weight = np.empty(_WHOSE)
+    for n in range(len(rows)):
         c = rows[n]
         if not is_told[c]:
             continue
-        # Whether one was detected shortly before.
+        # Whether it is of a run.
         follows = False
         for side in range(2):
             for place in range(between[n, 2 * side], between[n, 2 * side + 1]):
                 other = false[place]
-                follows |= is_told[other] and abs(newer[other] - newer[c]) <= gap
-        near_total, far_total = 0.0, 0.0
+                apart = abs(older[other] - older[c]) + abs(newer[other] - newer[c])
+                follows |= is_told[other] and apart <= gap
         for side in range(2):
             for place in range(between[n, 2 * side], between[n, 2 * side + 1]):
                 other = false[place]
@@ -143,24 +146,24 @@ def _repeats(
                 by_older, by_newer = abs(older[other] - older[c]), abs(newer[other] - newer[c])
                 crossed = min(abs(newer[other] - older[c]), abs(older[other] - newer[c]))
                 is_inverse = crossed <= gap and by_older > gap and by_newer > gap
-                is_near = by_newer <= gap or (follows and (is_inverse or by_older <= gap))
-                weight = (_IN_RUN if by_older + by_newer <= gap else 1.0) if is_near else 0.0
-                near_total += weight
-                far_total += 1.0
+                is_of_run = by_older + by_newer <= gap
+                is_of_places = follows and not is_of_run and (is_inverse or by_older <= gap)
+                weight[0] = _IN_RUN if is_of_run else (1.0 if is_of_places else 0.0)
+                weight[1] = 1.0 if by_newer <= gap and not is_of_run else 0.0
+                weight[2] = 1.0
+                total[:, n] += weight
                 axis = turn[other, 0] * turn[c, 0] + turn[other, 1] * turn[c, 1] + turn[other, 2] * turn[c, 2]
                 real = turn[other, 3] * turn[c, 3]
                 cosine = abs(real - axis if is_inverse else real + axis)
                 if cosine <= least_cosine:
                     continue
                 kernel = np.exp(broadest * (2 * np.arccos(min(cosine, 1.0))) ** 2)
-                for s in range(len(height) - 1, -1, -1):
-                    near[s, n] += weight * kernel
-                    far[s, n] += kernel
+                for s in range(widths - 1, -1, -1):
+                    for whose in range(_WHOSE):
+                        density[whose, s, n] += weight[whose] * kernel
                     kernel = (kernel * kernel) ** 2  # half as wide: to the fourth power
-        has_near[n], has_far[n] = near_total > 0, far_total > 0
-        for s in range(len(height)):
-            near[s, n] *= height[s] / max(near_total, 1.0)
-            far[s, n] *= height[s] / max(far_total, 1.0)
-            near[-1, n] += near[s, n] / len(height)
-            far[-1, n] += far[s, n] / len(height)
-    return near, far, has_near, has_far
+        for whose in range(_WHOSE):
+            for s in range(widths):
+                density[whose, s, n] *= height[s] / max(total[whose, n], 1.0)
+                density[whose, widths, n] += density[whose, s, n] / widths
+    return density, total > 0

@@ -13,24 +13,26 @@ import numpy as np
 from scipy.special import betaln
 
 from rotavg_ros.solver.algebra import quaternion_rows
-from rotavg_ros.solver.slam.noise.repeats import KERNELS, Closures, Near, places_near, repeats
+from rotavg_ros.solver.algebra.compiled import compiled
+from rotavg_ros.solver.slam.noise.repeats import KERNELS, Closures, Near, Repeats, places_near, repeats
 from rotavg_ros.solver.slam.posterior.densities import anyhow, log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 
 # Nodes of the sums that stand for integrals over rates: the share of false closures and the probability that a label is
-# its predecessor's; the shares of false closures that repeat a near one's turn and any one's; and of those that repeat
-# none but are near misses.
+# its predecessor's; the shares of false closures that repeat their run's turn, that of one shortly before and any
+# one's; and of those that repeat none but are near misses.
 _SHARES = np.array([0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98])
 _STAY = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 0.97])
+_RUN_SHARES = np.array([0.05, 0.5, 0.95])
 _NEAR_SHARES = np.array([0.05, 0.5, 0.95])
 _FAR_SHARES = np.array([0.01, 0.05, 0.2, 0.5])
 _NEAR_MISS_QUANTILES = np.array([1.0, 3.0, 5.0]) / 6
-_GRID = len(_NEAR_SHARES), len(_FAR_SHARES), len(_NEAR_MISS_QUANTILES), KERNELS
+_GRID = len(_RUN_SHARES), len(_NEAR_SHARES), len(_FAR_SHARES), len(_NEAR_MISS_QUANTILES), KERNELS
 # Predicted to less than this share of the variance of any rotation.
 _TOLD = 0.5
-# The least density that counts.
-_LEAST = 1e-300
+# The least density that counts; a product is turned into its logarithm beyond these.
+_LEAST, _SMALL, _LARGE = 1e-100, 1e-100, 1e100
 
 
 @dataclass(frozen=True)
@@ -39,42 +41,71 @@ class FalseDensity:
 
     Attributes:
         alone: ``(M, n)`` wrong by themselves, for each share of near misses.
-        near, far: ``(S, n)`` for each kernel, repeats of near and of any false closures.
-        has_near, has_far: ``(n,)`` bool, whether there are such.
+        repeats: by the turns of others, of which some may be there.
     """
 
     alone: np.ndarray
-    near: np.ndarray
-    far: np.ndarray
-    has_near: np.ndarray
-    has_far: np.ndarray
+    repeats: Repeats
 
-    @property
-    def mixed(self) -> np.ndarray:
-        """``(G, n)`` (1 − c) ((1 − g) alone + g far) + c near, over the grid of c, g, near misses and the width."""
-        far_share = _FAR_SHARES[:, None, None, None] * self.has_far
-        near_share = _NEAR_SHARES[:, None, None, None, None] * self.has_near
-        any_one = (1 - far_share) * self.alone[:, None] + far_share * self.far
-        both = (1 - near_share) * any_one + near_share * self.near
-        return np.asarray(np.maximum(both, _LEAST).reshape(math.prod(_GRID), self.alone.shape[1]))
+    def log_sums(self) -> np.ndarray:
+        """``(G,)`` logarithms of all closures together, at each point of the grid of rates.
+
+        Each is (1 − c) ((1 − d) ((1 − g) alone + g of any) + d of those before) + c of its run, where there are such.
+        """
+        return _log_sums(self.alone, *self.repeats, (_RUN_SHARES, _NEAR_SHARES, _FAR_SHARES))
 
     def mean(self, log_rates: np.ndarray) -> np.ndarray:
-        """``(n,)`` what ``mixed`` is in the mean over the grid, whose points have these logarithms ``(G,)``.
+        """``(n,)`` the same of each in the mean over the grid, whose points have these logarithms ``(G,)``.
 
-        It is linear in all three, so what each counts for is summed over the grid beforehand.
+        It is linear in all four, so what each counts for is summed over the grid beforehand.
         """
         rates = np.exp(log_rates).reshape(_GRID)
-        c, g = _NEAR_SHARES[:, None, None, None], _FAR_SHARES[:, None, None]
+        shares = np.ix_(_RUN_SHARES, _NEAR_SHARES, _FAR_SHARES)
+        c, d, g = (share[..., None, None] for share in shares)
         mean = np.zeros(self.alone.shape[1])
-        for has_near, has_far in np.ndindex(2, 2):
-            rows = np.flatnonzero((self.has_near == bool(has_near)) & (self.has_far == bool(has_far)))
-            of_far = rates * (1 - has_near * c)
-            mean[rows] = (of_far * (1 - has_far * g)).sum(axis=(0, 1, 3)) @ self.alone[:, rows]
-            if has_far:
-                mean[rows] += (of_far * g).sum(axis=(0, 1, 2)) @ self.far[:, rows]
-            if has_near:
-                mean[rows] += (rates * c).sum(axis=(0, 1, 2)) @ self.near[:, rows]
+        has_any = self.repeats.has_any
+        for has in np.ndindex(2, 2, 2):
+            rows = np.flatnonzero((has_any == np.array(has, dtype=bool)[:, None]).all(axis=0))
+            if len(rows) == 0:
+                continue
+            of_run, before, of_any = c * has[0], (1 - c * has[0]) * d * has[1], (1 - c * has[0]) * (1 - d * has[1])
+            alone = (rates * of_any * (1 - g * has[2])).sum(axis=(0, 1, 2, 4))
+            mean[rows] = alone @ self.alone[:, rows]
+            for share, density in zip((of_run, before, of_any * g * has[2]), self.repeats.density, strict=True):
+                mean[rows] += (rates * share).sum(axis=(0, 1, 2, 3)) @ density[:, rows]
         return np.asarray(np.maximum(mean, _LEAST))
+
+
+@compiled
+def _log_sums(
+    alone: np.ndarray,
+    density: np.ndarray,
+    has_any: np.ndarray,
+    shares: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """Products of what :meth:`FalseDensity.log_sums` says of each closure, logarithms taken where they get small."""
+    of_run, before, of_any = shares
+    size = len(of_run) * len(before) * len(of_any) * len(alone) * density.shape[1]
+    product, total = np.ones(size), np.zeros(size)
+    for n in range(alone.shape[1]):
+        at = 0
+        for c in of_run:
+            for d in before:
+                for g in of_any:
+                    run = c if has_any[0, n] else 0.0
+                    near = (1 - run) * (d if has_any[1, n] else 0.0)
+                    rest = 1 - run - near
+                    far = rest * (g if has_any[2, n] else 0.0)
+                    for m in range(len(alone)):
+                        by_itself = (rest - far) * alone[m, n]
+                        for s in range(density.shape[1]):
+                            each = by_itself + far * density[2, s, n] + near * density[1, s, n] + run * density[0, s, n]
+                            product[at] *= max(each, _LEAST)
+                            if not _SMALL < product[at] < _LARGE:
+                                total[at] += math.log(product[at])
+                                product[at] = 1.0
+                            at += 1
+    return total + np.log(product)
 
 
 def false_density(
@@ -102,8 +133,7 @@ def false_density(
     near_misses = _near_miss_shares(problem.priors)[:, None]
     alone = np.exp(log_false(square, k, problem.priors, near_misses, predicted[rows]))
     if count == 0 or not is_false.any() or "repeats" in problem.without:
-        nothing, none = np.zeros((KERNELS, count)), np.zeros(count, dtype=bool)
-        return FalseDensity(alone, nothing, nothing, none, none)
+        return FalseDensity(alone, Repeats.none(count))
     older, newer = problem.ends.T
     turn = np.ascontiguousarray(quaternion_rows.exp((residual * problem.sign[:, None]).T).T)
     # Of a closure that nothing else predicts it is not known by what turn it is wrong.
@@ -112,7 +142,7 @@ def false_density(
     is_one = is_false[rows] if both_sides else None
     between = places_near(problem.detected[false], problem.detected[rows], is_one, problem.limits.window)
     closures, near = Closures(older, newer, turn, is_told), Near(rows, false, between)
-    return FalseDensity(alone, *repeats(closures, near, problem.priors.run_gap_steps, k))
+    return FalseDensity(alone, repeats(closures, near, problem.priors.run_gap_steps, k))
 
 
 def _near_miss_shares(priors: SlamPriors) -> np.ndarray:
@@ -131,13 +161,13 @@ def _log_repeat_prior(priors: SlamPriors) -> np.ndarray:
 
 def repeat_rates(problem: Problem, density: FalseDensity) -> np.ndarray:
     """``(G,)`` log posterior of the grid's points, given false closures."""
-    rates = np.log(density.mixed).sum(axis=1) + _log_repeat_prior(problem.priors)
+    rates = density.log_sums() + _log_repeat_prior(problem.priors)
     return np.asarray(rates - np.logaddexp.reduce(rates))
 
 
 def log_false_set(problem: Problem, density: FalseDensity) -> float:
     """Of all false closures together, rates and width integrated."""
-    return float(np.logaddexp.reduce(np.log(density.mixed).sum(axis=1) + _log_repeat_prior(problem.priors)))
+    return float(np.logaddexp.reduce(density.log_sums() + _log_repeat_prior(problem.priors)))
 
 
 def _log_transitions() -> tuple[np.ndarray, np.ndarray]:
