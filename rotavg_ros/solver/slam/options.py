@@ -19,6 +19,7 @@ SWITCHES: dict[str, str] = {
     "bias": "no gyroscope has a bias",
     "turns": "odometry errs alike however far it turns",
     "settling": "labels are flipped as they are, never gone on from as probabilities",
+    "rejected-runs": "good closures of a run that hold each other good are rejected one by one alone",
     "shifts": "a slip, once found, stays in its segment",
     "splits": "what lies between a slip and another place is not turned by itself",
     "mending": "a slip, once found, is not taken back together with what it explains",

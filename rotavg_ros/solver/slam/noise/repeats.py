@@ -126,11 +126,12 @@ def _repeats(closures: Closures, compared: Near, gap: float, kernels: _Kernels) 
     height, least_cosine = kernels.height, kernels.least_cosine
     widths, broadest = len(height), -0.5 / kernels.broadest**2
     density, total = np.zeros((_WHOSE, widths + 1, len(rows))), np.zeros((_WHOSE, len(rows)))
-    weight = np.empty(_WHOSE)
+    weight, of_one, summed = np.empty(_WHOSE), np.empty(widths), np.empty((_WHOSE, widths))
     for n in range(len(rows)):
         c = rows[n]
         if not is_told[c]:
             continue
+        summed[:] = 0.0
         # Whether it is of a run.
         follows = False
         for side in range(2):
@@ -151,7 +152,8 @@ def _repeats(closures: Closures, compared: Near, gap: float, kernels: _Kernels) 
                 weight[0] = _IN_RUN if is_of_run else (1.0 if is_of_places else 0.0)
                 weight[1] = 1.0 if by_newer <= gap and not is_of_run else 0.0
                 weight[2] = 1.0
-                total[:, n] += weight
+                for whose in range(_WHOSE):
+                    total[whose, n] += weight[whose]
                 axis = turn[other, 0] * turn[c, 0] + turn[other, 1] * turn[c, 1] + turn[other, 2] * turn[c, 2]
                 real = turn[other, 3] * turn[c, 3]
                 cosine = abs(real - axis if is_inverse else real + axis)
@@ -159,11 +161,14 @@ def _repeats(closures: Closures, compared: Near, gap: float, kernels: _Kernels) 
                     continue
                 kernel = np.exp(broadest * (2 * np.arccos(min(cosine, 1.0))) ** 2)
                 for s in range(widths - 1, -1, -1):
-                    for whose in range(_WHOSE):
-                        density[whose, s, n] += weight[whose] * kernel
+                    of_one[s] = kernel
                     kernel = (kernel * kernel) ** 2  # half as wide: to the fourth power
+                for whose in range(_WHOSE):
+                    if weight[whose] > 0:
+                        for s in range(widths):
+                            summed[whose, s] += weight[whose] * of_one[s]
         for whose in range(_WHOSE):
             for s in range(widths):
-                density[whose, s, n] *= height[s] / max(total[whose, n], 1.0)
+                density[whose, s, n] = summed[whose, s] * height[s] / max(total[whose, n], 1.0)
                 density[whose, widths, n] += density[whose, s, n] / widths
     return density, total > 0

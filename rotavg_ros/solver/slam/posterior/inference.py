@@ -12,6 +12,7 @@ from rotavg_ros.solver.slam.posterior.em import polish, settle, step
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.moves import noise, slips
 from rotavg_ros.solver.slam.posterior.moves.flips import flipped
+from rotavg_ros.solver.slam.posterior.moves.runs import propose_rejected_runs
 from rotavg_ros.solver.slam.posterior.moves.splits import propose_splits
 from rotavg_ros.solver.slam.posterior.moves.starts import starts, turned_further, turned_parts
 from rotavg_ros.solver.slam.posterior.problem import Problem
@@ -168,6 +169,8 @@ def proposals(mode: Mode) -> Iterator[Proposal]:
         # Labels as probabilities come past what stops single flips; what it gives is not known before.
         yield Proposal("settle", 0.0, partial(settle, problem, mode.state), problem.limits.slack)
         yield from noise.propose_worse_odometry(mode)
+    if "rejected-runs" not in without:
+        yield from propose_rejected_runs(mode)
     if "slips" not in without:
         yield from slips.propose_slips(mode)
     if not without & {"slips", "shifts"}:

@@ -87,11 +87,11 @@ def propose_slips(mode: Mode) -> Iterator[Proposal]:
     """Segments where a turn would explain most of the closures that are held false."""
     witnesses = Witnesses.of(mode)
     places = _places(mode, witnesses)[: mode.problem.limits.slips]
-    before = _log_labelled(mode, mode.is_false) if places else 0.0
+    before = log_labelled(mode, mode.is_false) if places else 0.0
     for _, closure, place, freed, lost in places:
         edge, turn = int(witnesses.segment[place]), witnesses.turned[:, [closure]]
         # Together they gain less than one by one: false closures that repeat a turn are cheap.
-        labelled = _log_labelled(mode, mode.is_false & ~freed)
+        labelled = log_labelled(mode, mode.is_false & ~freed)
         labelled += _log_turned(mode, np.flatnonzero(freed), turn, witnesses.turned[:, freed])
         labelled += float(log_slip_odds(mode.problem, mode.problem.graph.own_steps[[edge]], len(mode.slipped))[0])
         predicted = before - labelled + float(witnesses.gain[lost].sum())
@@ -150,10 +150,16 @@ def _log_turned(mode: Mode, members: np.ndarray, turn: np.ndarray, turned: np.nd
     return float(-square / 2 - k / 2 * (log_det + len(rows) * np.log(2 * np.pi)))
 
 
-def _log_labelled(mode: Mode, is_false: np.ndarray) -> float:
-    """Log density of false closures and of all labels, residuals as they are."""
+def log_labelled(mode: Mode, is_false: np.ndarray, residual: np.ndarray | None = None) -> float:
+    """Log density of false closures and of all labels.
+
+    Args:
+        mode: at its optimum.
+        is_false: ``(C,)`` bool, labels.
+        residual: ``(C, 3)`` rad; default: as they are.
+    """
     problem = mode.problem
-    residual = mode.evaluation.residual[problem.closure]
+    residual = mode.evaluation.residual[problem.closure] if residual is None else residual
     predicted = mode.state.others.predicted[problem.closure]
     density = false_density(problem, is_false, residual, predicted, np.flatnonzero(is_false))
     return log_false_set(problem, density) + log_label_prior(problem, is_false)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,49 +45,70 @@ class _Part:
     turn: np.ndarray
 
 
+class _Group(NamedTuple):
+    """False closures that agree.
+
+    Attributes:
+        turn, inverse: ``(4, 1)`` by which the first of them is off, and back.
+        off, back: ``(C,)`` bool, which of all are off by the one and by the other.
+    """
+
+    turn: np.ndarray
+    inverse: np.ndarray
+    off: np.ndarray
+    back: np.ndarray
+
+
 def propose_splits(mode: Mode) -> Iterator[Proposal]:
     """Parts beside slips that one turn puts right, those that gain most closure by closure."""
     slipped = mode.slipped[mode.slipped < mode.problem.graph.num_segments]
     if len(slipped) == 0 or mode.is_false.sum() < LEAST_WITNESSES:
         return
     limits, witnesses, before = mode.problem.limits, Witnesses.of(mode), rough_cost(mode.problem, mode.state)
-    parts = [part for slip in slipped[: limits.slips] for part in _parts(mode, witnesses, int(slip))]
+    groups = list(_groups(mode, witnesses))
+    parts = [part for slip in slipped[: limits.slips] for part in _parts(mode, witnesses, groups, int(slip))]
     for part in sorted(parts, key=lambda part: -part.gained)[: limits.slips]:
         state = _split(mode, part)
         predicted = rough_cost(mode.problem, state) - before - OPTIMISM
         yield Proposal("split", predicted, partial(settle, mode.problem, state, SETTLING), limits.slack)
 
 
-def _parts(mode: Mode, witnesses: Witnesses, slip: int) -> Iterator[_Part]:
-    """The best part beside a slip for each turn by which false closures are off, or for its inverse."""
+def _groups(mode: Mode, witnesses: Witnesses) -> Iterator[_Group]:
+    """Of closures that are held false, those that one turn or its inverse explains."""
+    left = witnesses.can_tell & mode.is_false
+    for number in np.flatnonzero(left):
+        if left[number]:
+            turn = witnesses.turned[:, [number]]
+            inverse = quaternion_rows.inverse(turn)
+            off, back = (witnesses.agreeing(each[:, 0], mode) for each in (turn, inverse))
+            left &= ~(off | back)
+            if (off | back).sum() >= LEAST_WITNESSES:
+                yield _Group(turn, inverse, off, back)
+
+
+def _parts(mode: Mode, witnesses: Witnesses, groups: list[_Group], slip: int) -> Iterator[_Part]:
+    """The best part beside a slip for the turn of each group, and for its inverse."""
     graph, ends, segment = mode.problem.graph, mode.problem.ends, witnesses.segment
     chain = graph.paths.chain[graph.nodes[graph.source]]
     end = max(graph.position[graph.source[slip]], graph.position[graph.target[slip]]) - SAME_PLACE
     start = np.minimum(graph.position[graph.source], graph.position[graph.target])[segment]
     is_later, (older_later, newer_later) = start >= end, (ends >= end).T
+    across = newer_later & ~older_later
     there = witnesses.can_tell & (chain[mode.problem.closure] == chain[slip])
     good = np.where(there & ~mode.is_false, witnesses.gain, 0.0)
-    left = there & mode.is_false
-    for number in np.flatnonzero(left):
-        if not left[number]:
-            continue
-        turn = witnesses.turned[:, [number]]
-        inverse = quaternion_rows.inverse(turn)
-        off, back = (there & witnesses.agreeing(each[:, 0], mode) for each in (turn, inverse))
-        left &= ~(off | back)
+    is_elsewhere = chain[segment] != chain[slip]
+    for group in groups if len(segment) and not is_elsewhere.all() else ():
         # In the part is the newer end, turned by what the closure is off, or the older one, turned by the inverse.
-        for by, newer, older in ((turn, off, back), (inverse, back, off)):
-            newer_gains, older_gains = (np.where(freed, witnesses.gain, 0.0) - good for freed in (newer, older))
-            later = _over(witnesses, newer_gains * (newer_later & ~older_later), None, witnesses.last)
+        for turn, newer, older in ((group.turn, group.off, group.back), (group.inverse, group.back, group.off)):
+            newer_gains, older_gains = (np.where(there & freed, witnesses.gain, 0.0) - good for freed in (newer, older))
+            later = _over(witnesses, newer_gains * across, None, witnesses.last)
             later += _over(witnesses, older_gains * older_later, witnesses.first, witnesses.last)
             earlier = _over(witnesses, newer_gains * ~newer_later, witnesses.first, witnesses.last)
-            earlier -= _over(witnesses, older_gains * (newer_later & ~older_later), None, witnesses.first)
-            earlier += float((older_gains * (newer_later & ~older_later)).sum())
+            earlier += (older_gains * across).sum() - _over(witnesses, older_gains * across, None, witnesses.first)
             gained = np.where(is_later, later, earlier) - witnesses.price
-            gained[chain[segment] != chain[slip]] = -np.inf
-            if len(gained) and gained.max() > -np.inf and (newer | older).sum() >= LEAST_WITNESSES:
-                best = int(gained.argmax())
-                yield _Part(float(gained[best]), slip, int(segment[best]), by)
+            gained[is_elsewhere] = -np.inf
+            best = int(gained.argmax())
+            yield _Part(float(gained[best]), slip, int(segment[best]), turn)
 
 
 def _over(witnesses: Witnesses, change: np.ndarray, begin: np.ndarray | None, end: np.ndarray) -> np.ndarray:

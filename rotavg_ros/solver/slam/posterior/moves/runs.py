@@ -1,0 +1,80 @@
+"""Reject a whole run: good closures that hold each other good, whatever all else says of each.
+
+Of K closures of a run with residuals r, variances V (diagonal) and covariance R of what the fit says of them, all else
+says N(0, S) of their discrepancies y without them:
+
+    y = V (V − R)⁻¹ r,    S = V (V − R)⁻¹ V.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from rotavg_ros.solver.slam.posterior.em import settle
+from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
+from rotavg_ros.solver.slam.posterior.moves.slips import SETTLING, log_labelled
+from rotavg_ros.solver.slam.posterior.rows import variances
+from rotavg_ros.solver.slam.posterior.state import State
+
+# A run has so many good closures at least.
+_LEAST_MEMBERS = 2
+
+
+def propose_rejected_runs(mode: Mode) -> Iterator[Proposal]:
+    """Runs of good closures that pull against all else most."""
+    problem, limits = mode.problem, mode.problem.limits
+    runs = _runs(mode)[: limits.slips]
+    if not runs:
+        return
+    residual = mode.evaluation.residual[problem.closure]
+    before = log_labelled(mode, mode.is_false, residual)
+    for members in runs:
+        if (found := _without(mode, members)) is None:
+            continue
+        log_density, off = found
+        is_false, discrepancy = mode.is_false.copy(), residual.copy()
+        is_false[members], discrepancy[members] = True, off
+        predicted = before + log_density - log_labelled(mode, is_false, discrepancy)
+        yield Proposal("reject a run", predicted, partial(_rejected, mode, members), limits.slack)
+
+
+def _runs(mode: Mode) -> list[np.ndarray]:
+    """Members ``(K,)`` of each, those first that are off alike by most standard deviations."""
+    problem, is_good = mode.problem, ~mode.is_false & ~np.isinf(mode.problem.log_odds[mode.problem.closure])
+    own = variances(problem, mode.state.noise)[problem.closure]
+    off = mode.evaluation.residual[problem.closure] * (problem.sign * is_good)[:, None]
+    total = np.stack([np.bincount(problem.run, column) for column in off.T], axis=1)
+    square = (total**2).sum(axis=1) / np.maximum(np.bincount(problem.run, own * is_good), np.finfo(np.float64).tiny)
+    order = np.argsort(-square, kind="stable")
+    chosen = order[np.bincount(problem.run, is_good)[order] >= _LEAST_MEMBERS]
+    return [np.flatnonzero(is_good & (problem.run == run)) for run in chosen[: problem.limits.slips]]
+
+
+def _without(mode: Mode, members: np.ndarray) -> tuple[float, np.ndarray] | None:
+    """Log density of members by all other edges, and their discrepancies ``(K, 3)``; None if nothing tells of some."""
+    problem, k = mode.problem, mode.problem.components
+    rows, sign = problem.closure[members], problem.sign[members, None]
+    own = variances(problem, mode.state.noise)[rows]
+    left = np.diag(own) - mode.covariance_of(members) * sign * sign.T
+    try:
+        log_det_left = 2 * float(np.log(np.diagonal(np.linalg.cholesky(left))).sum())
+    except np.linalg.LinAlgError:
+        return None
+    residual = mode.evaluation.residual[rows] * sign
+    solved = np.linalg.solve(left, residual)
+    off = own[:, None] * solved
+    if not (np.abs(off) < np.pi).all():
+        return None
+    log_det = 2 * float(np.log(own).sum()) - log_det_left
+    log_density = -float((residual * solved).sum()) / 2 - k / 2 * (log_det + len(rows) * np.log(2 * np.pi))
+    return log_density, off * sign
+
+
+def _rejected(mode: Mode, members: np.ndarray) -> State:
+    trusted = mode.state.trusted.copy()
+    trusted[mode.problem.closure[members]] = 0.0
+    return settle(mode.problem, replace(mode.state, trusted=trusted), SETTLING)
