@@ -17,8 +17,6 @@ from rotavg_ros.solver.algebra.compiled import compiled
 REPEAT_DEG = 0.05 * 2.0 ** np.arange(9)
 # One width for all, or each as likely for every closure.
 KERNELS = len(REPEAT_DEG) + 1
-# One of the same run counts for so many that join the same places at other times.
-_IN_RUN = 10.0
 # Of a run, of those shortly before, of all.
 _WHOSE = 3
 # A kernel ends at so many widths, where it is 4e-6 of its height.
@@ -58,8 +56,8 @@ class Repeats(NamedTuple):
     """Of n closures.
 
     Attributes:
-        density: ``(3, S, n)`` for each kernel, of turns like those of its run and of the same places, of false closures
-            detected shortly before, and of any.
+        density: ``(3, S, n)`` for each kernel, of turns like those of its run, of false closures detected shortly before
+            or of the same places, and of any.
         has_any: ``(3, n)`` bool, whether there are such.
     """
 
@@ -132,13 +130,12 @@ def _repeats(closures: Closures, compared: Near, gap: float, kernels: _Kernels) 
         if not is_told[c]:
             continue
         summed[:] = 0.0
-        # Whether it is of a run.
+        # Whether one was detected shortly before.
         follows = False
         for side in range(2):
             for place in range(between[n, 2 * side], between[n, 2 * side + 1]):
                 other = false[place]
-                apart = abs(older[other] - older[c]) + abs(newer[other] - newer[c])
-                follows |= is_told[other] and apart <= gap
+                follows |= is_told[other] and abs(newer[other] - newer[c]) <= gap
         for side in range(2):
             for place in range(between[n, 2 * side], between[n, 2 * side + 1]):
                 other = false[place]
@@ -148,9 +145,9 @@ def _repeats(closures: Closures, compared: Near, gap: float, kernels: _Kernels) 
                 crossed = min(abs(newer[other] - older[c]), abs(older[other] - newer[c]))
                 is_inverse = crossed <= gap and by_older > gap and by_newer > gap
                 is_of_run = by_older + by_newer <= gap
-                is_of_places = follows and not is_of_run and (is_inverse or by_older <= gap)
-                weight[0] = _IN_RUN if is_of_run else (1.0 if is_of_places else 0.0)
-                weight[1] = 1.0 if by_newer <= gap and not is_of_run else 0.0
+                is_of_places = follows and (is_inverse or by_older <= gap)
+                weight[0] = 1.0 if is_of_run else 0.0
+                weight[1] = 1.0 if (by_newer <= gap or is_of_places) and not is_of_run else 0.0
                 weight[2] = 1.0
                 for whose in range(_WHOSE):
                     total[whose, n] += weight[whose]

@@ -14,7 +14,7 @@ GAP, WINDOW = 30.0, 6
 
 
 @given(st.integers(0, 10_000), st.integers(1, 25), st.booleans(), st.sampled_from([1, 3]))
-def test_densities_are_means_over_those_near_and_over_all(
+def test_densities_are_means_over_a_run_those_before_and_all(
     seed: int, count: int, both_sides: bool, components: int
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -34,19 +34,19 @@ def test_densities_are_means_over_those_near_and_over_all(
         after = [other for other in false if other > row][:WINDOW] if both_sides else []
         others = [other for other in before + after if is_told[other]] if is_told[row] else []
         follows = any(abs(newer[other] - newer[row]) <= GAP for other in others)
-        near, far, weight_near = np.zeros(KERNELS - 1), np.zeros(KERNELS - 1), 0.0
-        for other in others:
+        kernels, weights = np.zeros((len(others), KERNELS - 1)), np.zeros((3, len(others)))
+        for number, other in enumerate(others):
             apart = np.abs([older[other] - older[row], newer[other] - newer[row]])
             crossed = min(abs(newer[other] - older[row]), abs(older[other] - newer[row]))
             back = crossed <= GAP and bool((apart > GAP).all())
-            is_near = apart[1] <= GAP or (follows and (back or apart[0] <= GAP))
-            weight = (10.0 if apart.sum() <= GAP else 1.0) * is_near
             angle = (turn[row] * turn[other] if back else turn[row] * turn[other].inv()).magnitude()
-            kernel = np.exp(-(angle**2) / (2 * width**2)) / (2 * np.pi * width**2) ** (components / 2)
-            near, far, weight_near = near + weight * kernel, far + kernel, weight_near + weight
-        assert found.has_far[row] == bool(others) and found.has_near[row] == (weight_near > 0)
-        for density, total, number in ((found.near, near, weight_near), (found.far, far, len(others))):
-            expected = total / max(number, 1.0)
+            kernels[number] = np.exp(-(angle**2) / (2 * width**2)) / (2 * np.pi * width**2) ** (components / 2)
+            of_run = apart.sum() <= GAP
+            of_places = follows and (back or apart[0] <= GAP)
+            weights[:, number] = of_run, not of_run and (apart[1] <= GAP or of_places), 1.0
+        np.testing.assert_array_equal(found.has_any[:, row], weights.sum(axis=1) > 0)
+        for density, weight in zip(found.density, weights, strict=True):
+            expected = weight @ kernels / max(weight.sum(), 1.0)
             # Kernels end at five widths of the broadest.
             np.testing.assert_allclose(density[:-1, row], expected, rtol=1e-6, atol=1e-5 * width[-1] ** -components)
             assert density[-1, row] == pytest.approx(density[:-1, row].mean())

@@ -17,6 +17,7 @@ from scipy.stats import multivariate_normal
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.running.work import metered
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
+from rotavg_ros.solver.slam.noise.repeats import Repeats
 from rotavg_ros.solver.slam.posterior.bias import Bias
 from rotavg_ros.solver.slam.posterior.densities import Sites, log_false, log_good, log_normal
 from rotavg_ros.solver.slam.posterior.em import polish, step
@@ -398,7 +399,7 @@ def test_priors_are_normalised() -> None:
     for turn in turns:
         residual = np.zeros((len(problem.closure), 3))
         residual[second, 2] = turn
-        densities.append(false_density(problem, is_false, residual, exact, second).mixed[:, 0])
+        densities.append(np.exp(false_density(problem, is_false, residual, exact, second).log_sums()))
     np.testing.assert_allclose(np.trapezoid(densities, turns, axis=0), 1.0, atol=0.02)
     chain = _problem(ViewGraph.create(np.arange(6), np.arange(1, 7), _yaw(np.zeros(6)), kind=[0] * 6))
     # Every node an end of closures would make six segments of one step; here their prior is asked for as if.
@@ -415,7 +416,7 @@ def test_priors_are_normalised() -> None:
         ("common-errors", lambda problem: problem.system(_NOISE).num_runs == 0),
         ("turns", lambda problem: not problem.turns_vary),
         ("slips", lambda problem: bool(np.isposinf(problem.log_odds[problem.graph.is_odometry]).all())),
-        ("repeats", lambda problem: not (_repeated(problem).near.any() or _repeated(problem).far.any())),
+        ("repeats", lambda problem: not _repeated(problem).repeats.density.any()),
         ("label-runs", lambda problem: _stickiness(problem) == pytest.approx(0.0, abs=1e-9)),
     ],
 )
@@ -425,16 +426,30 @@ def test_a_term_is_there_until_it_is_switched_off(name: str, is_off: Callable[[P
     assert is_off(_problem(graph, SlamPriors(), without={name}))
 
 
-def test_the_mean_over_rates_is_that_of_the_mixture() -> None:
+def _drawn_density(count: int) -> tuple[FalseDensity, np.ndarray]:
+    """A density, and what it makes of each closure ``(G, n)`` at each point of the grid of rates."""
     rng = np.random.default_rng(0)
-    count = 40
-    has_near, has_far = rng.random((2, count)) < 0.5
-    density = FalseDensity(
-        rng.random((3, count)), rng.random((10, count)) * has_near, rng.random((10, count)) * has_far, has_near, has_far
-    )
-    rates = rng.normal(size=len(density.mixed))
+    has_any = rng.random((3, count)) < 0.5
+    alone, of_others = rng.random((3, count)), rng.random((3, 10, count)) * has_any[:, None] * 1e-3
+    c, d = (np.array([0.05, 0.5, 0.95])[:, None] * has for has in has_any[:2])
+    g = np.array([0.01, 0.05, 0.2, 0.5])[:, None] * has_any[2]
+    run, before, far = c[:, None, None, None, None], d[:, None, None, None], g[:, None, None]
+    any_one = (1 - far) * alone[:, None] + far * of_others[2]
+    mixed = (1 - run) * ((1 - before) * any_one + before * of_others[1]) + run * of_others[0]
+    return FalseDensity(alone, Repeats(of_others, has_any)), mixed.reshape(-1, count)
+
+
+def test_the_mean_over_rates_is_that_of_the_mixture() -> None:
+    density, mixed = _drawn_density(40)
+    rates = np.random.default_rng(1).normal(size=len(mixed))
     rates -= logsumexp(rates)
-    np.testing.assert_allclose(density.mean(rates), np.exp(rates) @ density.mixed, rtol=1e-12)
+    np.testing.assert_allclose(density.mean(rates), np.exp(rates) @ mixed, rtol=1e-12)
+
+
+def test_all_false_closures_together_are_the_product_of_all() -> None:
+    """However many there are: the product of 3000 densities is below the least number."""
+    density, mixed = _drawn_density(3000)
+    np.testing.assert_allclose(density.log_sums(), np.log(mixed).sum(axis=1), rtol=1e-9)
 
 
 def _repeated(problem: Problem) -> FalseDensity:

@@ -261,10 +261,13 @@ STRUCTURAL = {
     "labels": {
         "_SHARES",
         "_STAY",
+        "_RUN_SHARES",
         "_NEAR_SHARES",
         "_FAR_SHARES",
         "_TOLD",
         "_LEAST",
+        "_SMALL",
+        "_LARGE",
         "_GRID",
         "_NEAR_MISS_QUANTILES",
     }
@@ -275,6 +278,7 @@ STRUCTURAL = {
     "mode": {"OTHER_NOISE", "_SAME", "_MAX_DENSE"},
     "moves/jumps": {"_MAX_ROUNDS", "_MAX_CANDIDATES", "_MIN_GAIN", "_MIN_CARRIED"},
     "moves/noise": {"_GRIDS", "_REACH", "_JOINT", "_SCALES", "_MIN_SPREAD", "_FIRST_SOLVES", "_WORSE_STEPS"},
+    "moves/runs": {"_LEAST_MEMBERS"},
     "moves/slips": {"LEAST_WITNESSES", "_AGREE", "_AGREE_ANGLE", "OPTIMISM", "SETTLING", "SAME_PLACE"},
     "moves/starts": {"_INLIER_SQUARE", "_SHARP", "_STEP_LEVELS", "_CLOSURE_LEVEL", "_ROBUST_POWER"}
     | {"_ANNEALED_SLIPS", "_LEAST_WEIGHT", "_SAME_TURN"},
