@@ -11,6 +11,7 @@ SWITCHES: dict[str, str] = {
     "fine-net": "all edges of a kind err as the noise's densities have it, whatever their neighbours say",
     "tails": "good edges are Gaussian",
     "near-misses": "false closures are uniform over all rotations",
+    "vertical": "false closures of a robot that stays upright are wrong by any turn, not by one about the vertical",
     "repeats": "every false closure is wrong by itself",
     "label-runs": "closures that follow each other have independent labels",
     "common-errors": "every closure errs by itself",

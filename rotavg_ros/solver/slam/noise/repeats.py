@@ -56,8 +56,8 @@ class Repeats(NamedTuple):
     """Of n closures.
 
     Attributes:
-        density: ``(3, S, n)`` for each kernel, of turns like those of its run, of false closures detected shortly before
-            or of the same places, and of any.
+        density: ``(3, S, n)`` for each kernel, of turns like those of its run, of false closures that were detected
+            shortly before or join the same places, and of any.
         has_any: ``(3, n)`` bool, whether there are such.
     """
 

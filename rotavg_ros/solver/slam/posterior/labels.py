@@ -14,6 +14,7 @@ from scipy.special import betaln
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.compiled import compiled
+from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
 from rotavg_ros.solver.slam.noise.repeats import KERNELS, Closures, Near, Repeats, places_near, repeats
 from rotavg_ros.solver.slam.posterior.densities import anyhow, log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
@@ -28,11 +29,17 @@ _RUN_SHARES = np.array([0.05, 0.5, 0.95])
 _NEAR_SHARES = np.array([0.05, 0.5, 0.95])
 _FAR_SHARES = np.array([0.01, 0.05, 0.2, 0.5])
 _NEAR_MISS_QUANTILES = np.array([1.0, 3.0, 5.0]) / 6
-_GRID = len(_RUN_SHARES), len(_NEAR_SHARES), len(_FAR_SHARES), len(_NEAR_MISS_QUANTILES), KERNELS
+# Of false closures of a robot that stays upright, that are wrong by a turn about the vertical if any are.
+_ABOUT_VERTICAL = 0.9
 # Predicted to less than this share of the variance of any rotation.
 _TOLD = 0.5
 # The least density that counts; a product is turned into its logarithm beyond these.
 _LEAST, _SMALL, _LARGE = 1e-100, 1e-100, 1e100
+
+
+def _grid(kinds: int) -> tuple[int, ...]:
+    """Of rates, for so many densities of false closures that are wrong by themselves."""
+    return len(_RUN_SHARES), len(_NEAR_SHARES), len(_FAR_SHARES), kinds, KERNELS
 
 
 @dataclass(frozen=True)
@@ -40,7 +47,8 @@ class FalseDensity:
     """Of n closures if they are false, none of them as a logarithm.
 
     Attributes:
-        alone: ``(M, n)`` wrong by themselves, for each share of near misses.
+        alone: ``(M, n)`` wrong by themselves, for each share of near misses; and again where most turns are about the
+            vertical, if the robot knows one.
         repeats: by the turns of others, of which some may be there.
     """
 
@@ -59,7 +67,7 @@ class FalseDensity:
 
         It is linear in all four, so what each counts for is summed over the grid beforehand.
         """
-        rates = np.exp(log_rates).reshape(_GRID)
+        rates = np.exp(log_rates).reshape(_grid(len(self.alone)))
         shares = np.ix_(_RUN_SHARES, _NEAR_SHARES, _FAR_SHARES)
         c, d, g = (share[..., None, None] for share in shares)
         mean = np.zeros(self.alone.shape[1])
@@ -132,6 +140,10 @@ def false_density(
     square = (residual[rows] ** 2).sum(axis=1)
     near_misses = _near_miss_shares(problem.priors)[:, None]
     alone = np.exp(log_false(square, k, problem.priors, near_misses, predicted[rows]))
+    if problem.vertical is not None:
+        uniform = (1 - near_misses) * np.exp(log_uniform_density(np.sqrt(square), k))
+        ratio = problem.vertical.density_ratio(residual[rows], predicted[rows])
+        alone = np.concatenate((alone, alone + _ABOUT_VERTICAL * uniform * (ratio - 1)))
     if count == 0 or not is_false.any() or "repeats" in problem.without:
         return FalseDensity(alone, Repeats.none(count))
     older, newer = problem.ends.T
@@ -152,22 +164,23 @@ def _near_miss_shares(priors: SlamPriors) -> np.ndarray:
 
 
 @cache
-def _log_repeat_prior(priors: SlamPriors) -> np.ndarray:
+def _log_repeat_prior(priors: SlamPriors, kinds: int) -> np.ndarray:
     """``(G,)`` of the grid's points: Beta(1, count) on the share that repeats a turn elsewhere, all else as likely."""
     far = (priors.elsewhere_count - 1) * np.log1p(-_FAR_SHARES) + np.log(np.gradient(_FAR_SHARES))
-    grid = np.broadcast_to(far[:, None, None], _GRID).ravel()
+    grid = np.broadcast_to(far[:, None, None], _grid(kinds)).ravel()
     return np.asarray(grid - np.logaddexp.reduce(grid))
 
 
 def repeat_rates(problem: Problem, density: FalseDensity) -> np.ndarray:
     """``(G,)`` log posterior of the grid's points, given false closures."""
-    rates = density.log_sums() + _log_repeat_prior(problem.priors)
+    rates = density.log_sums() + _log_repeat_prior(problem.priors, len(density.alone))
     return np.asarray(rates - np.logaddexp.reduce(rates))
 
 
 def log_false_set(problem: Problem, density: FalseDensity) -> float:
     """Of all false closures together, rates and width integrated."""
-    return float(np.logaddexp.reduce(density.log_sums() + _log_repeat_prior(problem.priors)))
+    log_prior = _log_repeat_prior(problem.priors, len(density.alone))
+    return float(np.logaddexp.reduce(density.log_sums() + log_prior))
 
 
 def _log_transitions() -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs, closure_ends
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
+from rotavg_ros.solver.slam.noise.vertical import Vertical
 from rotavg_ros.solver.slam.posterior.bias import Bias
 from rotavg_ros.solver.slam.posterior.priors import SearchLimits, SlamPriors
 from rotavg_ros.solver.slam.posterior.state import RUN_STEPS, Noise
@@ -142,6 +143,13 @@ class Problem:
         ratio = np.where(is_known, logarithm, 0.0) - np.median(logarithm[is_known])
         is_sane = is_known & (np.abs(ratio) <= np.log(self.priors.largest_stated_ratio))
         return np.where(is_sane, np.maximum(ratio, np.log(self.priors.least_stated_ratio)), 0.0)
+
+    @cached_property
+    def vertical(self) -> Vertical | None:
+        """That the robot knows, where rotations have three components; None if none, or several robots differ in it."""
+        if self.components == 1 or "vertical" in self.without:
+            return None
+        return Vertical.of(self.graph.odometry_orientation)
 
     @cached_property
     def run(self) -> np.ndarray:

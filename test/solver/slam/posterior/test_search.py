@@ -268,7 +268,7 @@ STRUCTURAL = {
         "_LEAST",
         "_SMALL",
         "_LARGE",
-        "_GRID",
+        "_ABOUT_VERTICAL",
         "_NEAR_MISS_QUANTILES",
     }
     | {"_LOG_FIRST", "_LOG_FOLLOWS", "_LOG_STEPS"},
