@@ -1,0 +1,106 @@
+"""Moves for what no single flip, slip or shift leads out of: two slips taken for one, and runs that hold each other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros import EdgeKind, ViewGraph
+from rotavg_ros.solver.slam.posterior.inference import Search
+from rotavg_ros.solver.slam.posterior.left_out import relabelled
+from rotavg_ros.solver.slam.posterior.mode import Mode
+from rotavg_ros.solver.slam.posterior.moves.runs import propose_rejected_runs
+from rotavg_ros.solver.slam.posterior.moves.splits import propose_splits
+from rotavg_ros.solver.slam.posterior.moves.starts import at, noise_of
+from rotavg_ros.solver.slam.posterior.solve import Drawn
+from test.solver.graphs import as_quaternions, measured, random_truth, small_noise
+
+LAP, LAPS = 40, 4
+FIRST, SECOND = 60, 70
+
+
+def laps(
+    slips: dict[int, float], is_false: np.ndarray | None = None, off_deg: float = 0.0
+) -> tuple[ViewGraph, Rotation]:
+    """Laps in the plane, every other place seen again on all later ones; some closures off by one turn of the world."""
+    truth = random_truth(LAP * LAPS, 0, planar=True)
+    first, second = np.triu_indices(LAPS, 1)
+    place = np.arange(0, LAP, 2)[:, None]
+    closures = np.stack(((place + LAP * first).ravel(), (place + LAP * second).ravel()), axis=1)
+    source = np.concatenate((np.arange(LAP * LAPS - 1), closures[:, 0]))
+    target = np.concatenate((np.arange(1, LAP * LAPS), closures[:, 1]))
+    vector = small_noise(
+        len(source), np.repeat([0.1, 0.5], [LAP * LAPS - 1, len(closures)]), 0, planar=True
+    ).as_rotvec()
+    for step, angle in slips.items():
+        vector[step, 2] += np.radians(angle)
+    if is_false is not None:
+        vector[LAP * LAPS - 1 :][is_false, 2] += np.radians(off_deg)
+    kind = np.repeat([EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE], [LAP * LAPS - 1, len(closures)])
+    return measured(truth, source, target, Rotation.from_rotvec(vector), kind=kind), truth
+
+
+def mode_at(drawn: Drawn, body_from_world: Rotation, slipped: list[int]) -> Mode:
+    """The labelling that orientations speak for, odometry slipping after some nodes alone."""
+    graph, problem = drawn.problem.graph, drawn.problem
+    correction = drawn.prepared.closure_graph.corrections(as_quaternions(body_from_world))
+    state = at(problem, correction, np.ones(len(graph.source)), noise_of(problem, drawn.prepared.noise))
+    trusted = relabelled(problem, state)
+    start = np.minimum(graph.nodes[graph.source], graph.nodes[graph.target])[: graph.num_segments]
+    trusted[: graph.num_segments] = 1.0
+    for after in slipped:
+        # The segment that the step lies in is the last that starts before it.
+        trusted[int(np.argmax(np.where(start <= after, start, -1)))] = 0.0
+    return Search(problem).polished(replace(state, trusted=trusted), "begun")
+
+
+@pytest.mark.parametrize(("taken", "other"), [(FIRST, SECOND), (SECOND, FIRST)])
+def test_one_slip_that_was_two_is_split(taken: int, other: int) -> None:
+    """What lies between is turned by the one; the closures from there are held false, and agree."""
+    graph, truth = laps({FIRST: 45.0, SECOND: 77.0})
+    drawn = Drawn.of(graph, None)
+    right = mode_at(drawn, truth, [FIRST, SECOND])
+    between = slice(FIRST + 1, SECOND + 1)
+    turned = truth.as_quat()
+    angle = 77.0 if other == SECOND else 45.0
+    candidates = []
+    for sign in (1, -1):
+        moved = turned.copy()
+        moved[between] = (truth[between] * Rotation.from_rotvec([0, 0, np.radians(sign * angle)])).as_quat()
+        candidates.append(mode_at(drawn, Rotation.from_quat(moved), [taken]))
+    merged = min(candidates, key=lambda mode: mode.cost)
+    assert merged.cost > right.cost + 20
+    best = min(propose_splits(merged), key=lambda proposal: proposal.predicted)
+    assert best.predicted < -5
+    found = Search(drawn.problem).polished(best.make(), best.name)
+    assert found.cost < right.cost + 3
+    assert len(found.slipped) == 2
+
+
+def test_a_run_that_holds_itself_good_is_rejected_as_one() -> None:
+    """Each is what the others predict; no single flip lowers F."""
+    count = LAP // 2 * len(np.triu_indices(LAPS, 1)[0])
+    closures = np.arange(count)
+    # The last lap's closures with the first one, at eight places.
+    is_run = np.isin(closures // 6, np.arange(6, 14)) & (closures % 6 == 2)
+    graph, truth = laps({}, is_run, 4.0)
+    drawn = Drawn.of(graph, None)
+    begun = mode_at(drawn, truth, [])
+    problem = drawn.problem
+    trusted = begun.state.trusted.copy()
+    trusted[problem.closure] = 1.0
+    held = Search(problem).polished(replace(begun.state, trusted=trusted), "held")
+    best = min(propose_rejected_runs(held), key=lambda proposal: proposal.predicted)
+    found = Search(problem).polished(best.make(), best.name)
+    assert best.predicted < -5
+    assert found.cost - held.cost < best.predicted + 5
+
+
+def test_nothing_is_proposed_where_nothing_slipped_and_nothing_is_false() -> None:
+    graph, truth = laps({})
+    mode = mode_at(Drawn.of(graph, None), truth, [])
+    assert not list(propose_splits(mode))
+    assert all(proposal.predicted > 0 for proposal in propose_rejected_runs(mode))
