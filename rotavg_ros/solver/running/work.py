@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 
-# Entries of a sparse matrix to one unit, which is about a millisecond with all that is done around a factorisation.
+# Entries on one side of a sparse matrix to one unit, which is half a millisecond with all that is done around a
+# factorisation.
 ENTRIES = 500.0
 
 

@@ -1,0 +1,49 @@
+"""Functions that numba compiles when they are called, and not before."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+
+from rotavg_ros.solver.algebra.compiled import compiled
+
+
+@compiled
+def squared(value: float) -> float:
+    """Its square."""
+    return value * value
+
+
+@compiled
+def sum_of_squares(values: np.ndarray) -> float:
+    total = 0.0
+    for value in values:
+        total += squared(value)
+    return total
+
+
+def test_one_may_call_another() -> None:
+    assert sum_of_squares(np.array([1.0, 2.0, 3.0])) == 14.0
+    assert squared(3.0) == 9.0
+    assert squared.__doc__ == "Its square."
+
+
+def test_what_cannot_be_kept_is_compiled_all_the_same() -> None:
+    """Without a file there is no folder beside it, as where neither folder can be written to."""
+    names: dict[str, Any] = {}
+    exec("def twice(value):\n    return 2 * value\n", names)  # noqa: S102
+    assert compiled(names["twice"])(3) == 6
+
+
+def test_a_photo_collection_is_solved_without_numba() -> None:
+    code = (
+        "import sys\n"
+        "from rotavg_ros import ViewGraph, solve\n"
+        "solve(ViewGraph.create([0, 1, 2], [1, 2, 0], [[0, 0, 0, 1]] * 3))\n"
+        "assert 'rotavg_ros.solver.slam.solve' in sys.modules\n"
+        "assert 'numba' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
