@@ -116,7 +116,7 @@ def test_wheel_contains_every_file_of_the_package_and_the_ros_files(tmp_path: Pa
     subprocess.run([*command, "--wheel-dir", tmp_path, source], check=True)
     (wheel,) = tmp_path.glob("*.whl")
     contents = set(zipfile.ZipFile(wheel).namelist())
-    files = (path for path in (ROOT / "rotavg_ros").rglob("*.*") if path.suffix != ".pyc")
+    files = (path for path in (ROOT / "rotavg_ros").rglob("*.*") if path.parent.name != "__pycache__")
     missing = {path.relative_to(ROOT).as_posix() for path in files} - contents
     assert missing == set()
     installed = {name.partition(".data/data/")[2] for name in contents}
