@@ -8,6 +8,7 @@ numbers. Whoever calls none of them does not load numba, which takes a quarter o
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import update_wrapper
 from typing import Any, Generic, TypeVar, cast
 
@@ -42,9 +43,31 @@ class _Compiled(Generic[Function]):
                 called = function.__globals__.get(name)
                 if isinstance(called, _Compiled):
                     function.__globals__[name] = called.dispatcher
-            try:
-                made = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-            except RuntimeError:  # neither folder can be written to: it is compiled in every process
-                made = numba.njit(nogil=True, error_model="numpy")(function)
+            made: Any = numba.njit(nogil=True, error_model="numpy")(function)
+            with suppress(RuntimeError):  # neither folder can be written to: it is compiled in every process
+                made._cache = _kept(function)
             self._dispatcher = cast(Function, made)
         return self._dispatcher
+
+
+def _kept(function: Callable[..., object]) -> object:
+    """Numba's cache, but what a power cut or a full disk left of it stops no solve: it is compiled again."""
+    from numba.core import caching
+
+    numbas: Any = caching.FunctionCache  # without types
+
+    class Kept(numbas):  # type: ignore[misc]
+        def load_overload(self, sig: Any, target_context: Any) -> Any:
+            try:
+                return super().load_overload(sig, target_context)
+            except Exception:  # a pickle cut short, or of zeros, may raise anything
+                with suppress(OSError):
+                    self.flush()
+                return None
+
+        def save_overload(self, sig: Any, data: Any) -> None:
+            with suppress(OSError):
+                super().save_overload(sig, data)
+
+    kept: Any = Kept
+    return cast(object, kept(function))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from rotavg_ros.solver.algebra.compiled import compiled
 
@@ -47,3 +50,30 @@ def test_a_photo_collection_is_solved_without_numba() -> None:
         "assert 'numba' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+@pytest.mark.parametrize("left", [b"", bytes(200)])
+def test_what_a_power_cut_left_of_machine_code_is_made_again(suffix: str, left: bytes, tmp_path: Path) -> None:
+    (tmp_path / "module.py").write_text(
+        "from rotavg_ros.solver.algebra.compiled import compiled\n"
+        "@compiled\n"
+        "def inner(value):\n    return value + 1\n"
+        "@compiled\n"
+        "def outer(value):\n    return 2 * inner(value)\n"
+    )
+    code = "from module import outer; print(outer(2)); print(sum(outer.dispatcher.stats.cache_hits.values()))"
+    path = os.pathsep.join((str(tmp_path), *filter(None, sys.path)))
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": path}
+
+    def answers() -> list[str]:
+        command = [sys.executable, "-c", code]
+        return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.split()
+
+    assert answers() == ["6", "0"]
+    kept = list((tmp_path / "cache").rglob(f"*.{suffix}"))
+    assert len(kept) == 2
+    for each in kept:
+        each.write_bytes(left)
+    assert answers() == ["6", "0"]
+    assert answers() == ["6", "1"]
