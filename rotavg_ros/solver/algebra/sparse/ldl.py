@@ -68,9 +68,9 @@ class RowPattern:
         self.size = size
         self.column, self.value = rank[column].astype(np.int32), np.ascontiguousarray(value)
         begin, row, self._slot = _lay_out(self.column, self.value, size)
-        above, counts = _elimination_tree(begin, row)
+        above, counts = elimination_tree(begin, row)
         factor_begin = np.append(0, np.cumsum(counts))
-        self.shape = _Shape(begin, row, above, factor_begin, _factor_rows(begin, row, above, factor_begin))
+        self.shape = _Shape(begin, row, above, factor_begin, factor_rows(begin, row, above, factor_begin))
 
     @property
     def num_entries(self) -> int:
@@ -207,8 +207,12 @@ def _weighted(
 
 
 @compiled
-def _elimination_tree(begin: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What each unknown is eliminated into, and how many entries each column of L has."""
+def elimination_tree(begin: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What each unknown is eliminated into, and how many entries each column of L has below its diagonal.
+
+    Args:
+        begin, row: of the matrix's upper triangle by columns, in the order of elimination.
+    """
     size = len(begin) - 1
     above, seen = np.full(size, _NOWHERE, np.int32), np.empty(size, np.int32)
     count = np.zeros(size, np.int64)
@@ -226,7 +230,7 @@ def _elimination_tree(begin: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, n
 
 
 @compiled
-def _factor_rows(begin: np.ndarray, row: np.ndarray, above: np.ndarray, factor_begin: np.ndarray) -> np.ndarray:
+def factor_rows(begin: np.ndarray, row: np.ndarray, above: np.ndarray, factor_begin: np.ndarray) -> np.ndarray:
     """Rows of L's entries, ascending in each column."""
     size = len(above)
     factor_row, free = np.empty(factor_begin[-1], np.int32), factor_begin[:-1].copy()

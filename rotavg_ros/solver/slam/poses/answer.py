@@ -75,13 +75,10 @@ def _of_mode(pose: PoseMode) -> Poses:
     """One labelling's answer."""
     problem, drawn, k = pose.problem, pose.problem.drawn, pose.problem.turns
     orientation, position, passed = _within_segments(pose)
-    samples = pose.solved.factor.samples[: drawn.num_nodes]
-    turns = np.moveaxis(samples[:, :k], 1, 2).reshape(drawn.num_nodes, -1)
-    ends = (key_nodes[: drawn.num_segments] for key_nodes in (drawn.source, drawn.target))
-    source, target = (turns[key_nodes] for key_nodes in ends)
-    own, apart = (turns**2).mean(axis=1), ((target - source) ** 2).mean(axis=1)
+    of_nodes = pose.solved.factor.variance[: drawn.num_nodes]
+    own, shifts = of_nodes[:, :k].mean(axis=1), of_nodes[:, k:].mean(axis=1)
+    apart = np.trace(_apart(pose)[:, :k, :k], axis1=1, axis2=2) / k
     variance = drawn.variance(own, apart, pose.state.noise.turn)
-    shifts = (samples[:, k:] ** 2).mean(axis=(1, 2))
     between = (1 - passed) * shifts[drawn.above] + passed * shifts[drawn.below]
     segment = problem.segment_of_node
     spread = pose.solved.way.length[: drawn.num_segments] * pose.state.noise.way + problem.jumps
@@ -90,6 +87,14 @@ def _of_mode(pose: PoseMode) -> Poses:
     if problem.jump is not None:
         score = np.maximum(score, problem.jump > 0)
     return Poses(np.ascontiguousarray(orientation.T), position, variance, between, score, rotation, _precision(pose))
+
+
+def _apart(pose: PoseMode) -> np.ndarray:
+    """``(S, d, d)`` covariance of what each segment's ends differ by."""
+    segments, d = pose.problem.drawn.num_segments, pose.problem.turns + pose.problem.shifts
+    difference = np.concatenate((np.eye(d), -np.eye(d), np.zeros((d, d))), axis=1)
+    rows = np.tile(difference, (segments, 1, 1))
+    return pose.solved.factor.covariance(rows, np.arange(segments))
 
 
 def _precision(pose: PoseMode) -> np.ndarray:

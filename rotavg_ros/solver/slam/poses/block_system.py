@@ -2,33 +2,33 @@
 
 A node's block is its turn (k components) and its shift (m), a run's block what its closures err in common. The three
 blocks of a row are those of its target, its source and its run. H = Jᵀ W J is factorised once for each choice of J
-and W; samples of N(0, H⁻¹) tell what everything else predicts of a row.
+and W; its inverse between a row's blocks tells what everything else predicts of the row. Of rows that weigh nothing
+beside the others H knows nothing; what it says of those is told from samples of N(0, H⁻¹).
 """
 
 from __future__ import annotations
 
-from copy import copy
-
 import numpy as np
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from rotavg_ros.solver.algebra.small_matrices import inverse_root
-from rotavg_ros.solver.algebra.sparse.multifrontal import Cholesky, Elimination
+from rotavg_ros.solver.algebra.small_matrices import inverse
+from rotavg_ros.solver.algebra.sparse.elimination import Elimination
+from rotavg_ros.solver.algebra.sparse.multifrontal import Cholesky
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.running.work import rest, spend, stop_if_abandoned
+from rotavg_ros.solver.slam.poses.block_rows import covariance_of_rows, exceed, gradient, normal_matrix, predicted_rows
 
-_NUM_PROBES, _SEED = 48, 0
-# What a solve of the samples costs, in what the factor does.
-_SOLVED = 0.5
+_NUM_SAMPLES, _SEED = 48, 0
+# What a solve of one column costs, in what the factor does.
+_SOLVED = 0.1
 # Rows that tell each of their blocks less than this share of what all tell it are nothing; so many of them are worth a
 # pattern without them.
 _NEXT_TO_NOTHING, _WORTH_LEAVING_OUT = 1e-8, 200
-# What a row decides itself is no more than all but this: nothing else may tell of it.
-_LEAST = 1e-9
-# What is left of a turn and of a shift has less in common than this share, squared.
-_CORRELATED = 0.9
-_TINY = np.finfo(np.float64).tiny
+# What a row decides itself is no more than all but the first: nothing else may tell of it. But for the second it nearly
+# does.
+_LEAST, _NEARLY = 1e-9, 1e-4
+_NOWHERE = -1
 
 
 class BlockEquations:
@@ -53,14 +53,12 @@ class BlockEquations:
         loose: np.ndarray,
     ) -> None:
         num_runs = int(run.max(initial=-1)) + 1
-        self.turns, self.size, self.num_edges = size[0], sum(size), len(ends)
+        self.size, self.num_edges = sum(size), len(ends)
         self.num_blocks, self.roots, self.loose = num_nodes + num_runs, roots, loose
-        nowhere = self.num_blocks
         source, target = ends.T
-        block = np.stack((target, source, np.where(run >= 0, num_nodes + run, nowhere)), axis=1)
-        of_runs = np.stack((num_nodes + np.arange(num_runs), *[np.full(num_runs, nowhere)] * 2), axis=1)
+        block = np.stack((target, source, np.where(run >= 0, num_nodes + run, _NOWHERE)), axis=1)
+        of_runs = np.stack((num_nodes + np.arange(num_runs), *[np.full(num_runs, _NOWHERE)] * 2), axis=1)
         self.block = np.concatenate((block, of_runs))
-        self.probes = np.random.default_rng(_SEED).standard_normal((len(self.block), self.size, _NUM_PROBES))
         self._pattern: _Pattern | None = None
 
     def factorise(
@@ -76,9 +74,12 @@ class BlockEquations:
         stop_if_abandoned()
         pattern = self._pattern_of(jacobian)
         rest()
-        rows = jacobian if pattern.is_whole else jacobian[pattern.kept]
-        blocks = np.matmul(rows.transpose(0, 2, 1), rows).ravel().take(pattern.used)
-        entries = np.bincount(pattern.slot, blocks, pattern.elimination.num_entries)
+        entries = normal_matrix(
+            np.ascontiguousarray(jacobian[pattern.kept]),
+            pattern.place[pattern.kept],
+            pattern.slot,
+            pattern.elimination.num_entries,
+        )
         entries[pattern.diagonal] += np.finfo(np.float64).tiny
         entries[pattern.diagonal[self.roots]] += root_weight
         grounding = len(self.roots) * np.log(root_weight).sum()
@@ -86,7 +87,7 @@ class BlockEquations:
             entries[pattern.diagonal[self.loose]] += loose_weight
             grounding += len(self.loose) * np.log(loose_weight).sum()
         factor = Cholesky(pattern.elimination, entries)
-        return BlockFactor(self, pattern, pattern.rows(jacobian), factor, float(grounding))
+        return BlockFactor(pattern, np.ascontiguousarray(jacobian), factor, float(grounding))
 
     def _pattern_of(self, jacobian: np.ndarray) -> _Pattern:
         """Of the rows that tell anything: others fill the factor of a graph with many false closures for nothing."""
@@ -103,9 +104,10 @@ class BlockEquations:
         """
         d, num_blocks = self.size, self.num_blocks
         told = (jacobian**2).sum(axis=1).reshape(-1, 3, d).max(axis=2)
-        of_block = np.bincount(self.block.ravel(), told.ravel(), num_blocks + 1)
+        block = np.where(self.block >= 0, self.block, num_blocks)
+        of_block = np.bincount(block.ravel(), told.ravel(), num_blocks + 1)
         of_block[num_blocks] = np.inf
-        counts: np.ndarray = (told > _NEXT_TO_NOTHING * of_block[self.block]).any(axis=1)
+        counts: np.ndarray = (told > _NEXT_TO_NOTHING * of_block[block]).any(axis=1)
         is_worth = len(counts) - counts.sum() >= _WORTH_LEAVING_OUT
         everything = np.ones_like(counts)
         return counts if is_worth and self._num_parts(counts) == self._num_parts(everything) else everything
@@ -118,69 +120,50 @@ class BlockEquations:
 
 
 class _Pattern:
-    """Where in compressed rows J's numbers stand, and in the fronts of H's factor its own.
-
-    What a row has of no block stands beyond all columns of J.
+    """Where rows' products stand in H, in the order of elimination.
 
     Args:
         equations: of B blocks and rows with blocks ``(E + R, 3)``.
         counts: ``(E + R,)`` bool, rows that H is made of.
 
     Attributes:
-        kept: those rows.
-        is_whole: whether they are all.
+        counts, kept: those rows, as they were given and as numbers.
         elimination: of H.
-        rank: ``(B,)`` where each block stands in the order of elimination.
-        used, slot: which entries of the products of rows make H, and where they belong.
-        diagonal: ``(B, d)`` likewise, of each block.
+        place: ``(E + R, 3)`` where the blocks of each row stand in the order of elimination, or -1.
+        slot: ``(rows kept, 3, 3)`` where H's numbers of each pair of a row's blocks begin, the same in either order.
+        diagonal: ``(B, d)`` entries.
     """
 
     def __init__(self, equations: BlockEquations, counts: np.ndarray) -> None:
-        self.kept, self.is_whole, self._counts = np.flatnonzero(counts), bool(counts.all()), counts
-        d, num_blocks, nowhere = equations.size, equations.num_blocks, equations.num_blocks
+        self.counts, self.kept = counts, np.flatnonzero(counts)
+        d, num_blocks = equations.size, equations.num_blocks
         blocks = equations.block[self.kept]
         first, second = (ends.ravel() for ends in np.broadcast_arrays(blocks[:, :, None], blocks[:, None, :]))
-        pair = np.flatnonzero((first < nowhere) & (second < nowhere))
-        self.elimination = Elimination(first[pair], second[pair], num_blocks, d)
+        pair = np.flatnonzero((first >= 0) & (second >= 0))
+        first, second = first[pair], second[pair]
+        self.elimination = Elimination(first, second, num_blocks, d)
         self.rank = self.elimination.rank
         rest()
-        # Half of what is symmetric.
-        pair = pair[self.rank[first[pair]] <= self.rank[second[pair]]]
-        self.slot = self.elimination.places(self.rank[first[pair]], self.rank[second[pair]]).ravel()
-        inside = np.arange(d)
-        row, one, other = pair // 9, pair // 3 % 3, pair % 3
-        product = ((row * 3 + one)[:, None] * d + inside) * 3 + other[:, None]
-        self.used = (product[:, :, None] * d + inside).ravel()
-        self.diagonal = self.elimination.places(self.rank, self.rank)[:, inside, inside]
-        block = np.append(self.rank, nowhere)[equations.block]
-        columns = (block[:, :, None] * d + inside).reshape(len(block), 1, 3 * d)
-        entries = np.broadcast_to(columns, (len(block), d, 3 * d)).ravel().astype(np.int32)
-        begins = np.arange(0, len(entries) + 1, 3 * d, dtype=np.int32)
-        shape = len(block) * d, (num_blocks + 1) * d
-        self._rows: csr_array = csr_array((np.ones(len(entries)), entries, begins), shape=shape)
+        lower = np.minimum(self.rank[first], self.rank[second])
+        upper = np.maximum(self.rank[first], self.rank[second])
+        slot = np.full(9 * len(blocks), _NOWHERE)
+        slot[pair] = self.elimination.corners(lower, upper)
+        self.slot = slot.reshape(-1, 3, 3)
+        self.diagonal = self.elimination.corners(self.rank, self.rank)[:, None] + np.arange(d) * (d + 1)
+        self.place = np.where(equations.block >= 0, self.rank[equations.block], _NOWHERE)
 
     def covers(self, counts: np.ndarray) -> bool:
         """Whether it has all of these rows and few others."""
-        missing, needless = counts & ~self._counts, self._counts & ~counts
+        missing, needless = counts & ~self.counts, self.counts & ~counts
         return not missing.any() and int(needless.sum()) < _WORTH_LEAVING_OUT
-
-    def rows(self, jacobian: np.ndarray) -> csr_array:
-        """W^½ J, ``((E + R) d, (B + 1) d)``, columns in the order of elimination and those of no block."""
-        # SciPy's constructors check each time what stays as it is.
-        rows = copy(self._rows)
-        rows.data = jacobian.ravel()
-        return rows
 
 
 class BlockFactor:
-    """H for one choice of J and W, here in the order of elimination."""
+    """H for one choice of J and W."""
 
-    def __init__(
-        self, system: BlockEquations, pattern: _Pattern, rows: csr_array, factor: Cholesky, grounding: float
-    ) -> None:
-        self._system, self._rank, self._rows = system, pattern.rank, rows
+    def __init__(self, pattern: _Pattern, jacobian: np.ndarray, factor: Cholesky, grounding: float) -> None:
+        self._pattern, self._jacobian = pattern, jacobian
         self._factor, self._grounding = factor, grounding
-        self._drawn: np.ndarray | None = None
 
     @property
     def log_det(self) -> float:
@@ -193,99 +176,111 @@ class BlockFactor:
         return self._factor.num_entries
 
     def fit(self, whitened: np.ndarray) -> np.ndarray:
-        """Unknowns ``(blocks, d, n)`` that explain whitened rows ``(E + R, d, n)`` best; samples come with them."""
-        count = whitened.shape[2]
-        ordered: np.ndarray = self._fit(np.concatenate((whitened, self._system.probes), axis=2))
-        self._drawn = ordered[:, count:]
-        return self._by_block(ordered[:, :count])
-
-    def _fit(self, whitened: np.ndarray) -> np.ndarray:
-        """The same in the order of elimination, ``(blocks d, n)``."""
-        spend(_SOLVED * self._factor.elimination.units)
-        right: np.ndarray = self._rows.T @ whitened.reshape(-1, whitened.shape[2])
-        return self._factor.solve(right[: -self._system.size])
+        """Unknowns ``(blocks, d, n)`` that explain whitened rows ``(E + R, d, n)`` best."""
+        place, elimination = self._pattern.place, self._factor.elimination
+        spend(_SOLVED * whitened.shape[2] * elimination.units)
+        right = gradient(self._jacobian, place, np.ascontiguousarray(whitened), elimination.num_blocks)
+        return self._by_block(self._factor.solve(right.reshape(-1, whitened.shape[2])))
 
     def _by_block(self, ordered: np.ndarray) -> np.ndarray:
         """``(blocks, d, n)``, in which block v stood at its rank."""
-        system = self._system
-        return np.asarray(ordered.reshape(system.num_blocks, system.size, -1).take(self._rank, axis=0))
+        elimination = self._factor.elimination
+        by_place = ordered.reshape(elimination.num_blocks, elimination.size, -1)
+        return np.asarray(by_place.take(elimination.rank, axis=0))
 
     def begun(self, columns: np.ndarray) -> np.ndarray:
-        """L⁻¹ of columns ``(blocks, d, n)``, ``(blocks d, n)``: H⁻¹ = L⁻ᵀ L⁻¹."""
+        """U⁻ᵀ of columns ``(blocks, d, n)``, ``(blocks d, n)``: H⁻¹ = U⁻¹ U⁻ᵀ."""
         ordered = np.empty_like(columns)
-        ordered[self._rank] = columns
-        return self._factor.begun(ordered.reshape(len(columns) * self._system.size, -1))
+        ordered[self._pattern.rank] = columns
+        return self._factor.begun(ordered.reshape(-1, columns.shape[2]))
 
     def ended(self, half: np.ndarray) -> np.ndarray:
-        """L⁻ᵀ of what was :meth:`begun` ``(blocks d, n)``, ``(blocks, d, n)``."""
+        """U⁻¹ of what was :meth:`begun` ``(blocks d, n)``, ``(blocks, d, n)``."""
         return self._by_block(self._factor.ended(half))
 
     def predicted(self, unknowns: np.ndarray) -> np.ndarray:
         """Whitened rows ``(E + R, d, n)`` of unknowns ``(blocks, d, n)``."""
         ordered = np.empty_like(unknowns)
-        ordered[self._rank] = unknowns
-        return self._predicted(ordered.reshape(-1, unknowns.shape[2]))
-
-    def _predicted(self, ordered: np.ndarray) -> np.ndarray:
-        d, count = self._system.size, ordered.shape[1]
-        padded = np.concatenate((ordered, np.zeros((d, count))))
-        return np.asarray((self._rows @ padded).reshape(-1, d, count))
+        ordered[self._pattern.rank] = unknowns
+        return predicted_rows(self._jacobian, self._pattern.place, ordered)
 
     @property
-    def _samples(self) -> np.ndarray:
-        if self._drawn is None:
-            self._drawn = self._fit(self._system.probes)
-        return self._drawn
-
-    @property
-    def samples(self) -> np.ndarray:
-        """Unknowns ``(blocks, d, 48)`` drawn from N(0, H⁻¹)."""
-        return self._by_block(self._samples)
+    def variance(self) -> np.ndarray:
+        """``(blocks, d)`` diagonal of H⁻¹."""
+        return self._factor.inverse[self._pattern.diagonal]
 
     @cached_property
-    def leverage(self) -> np.ndarray:
-        """``(E + R, d, d)`` Λ, what of a whitened row its own measurement decides.
+    def _samples(self) -> np.ndarray:
+        """``(blocks, d, 48)`` drawn from N(0, H⁻¹), in the order of elimination."""
+        elimination = self._factor.elimination
+        shape = elimination.num_blocks, elimination.size, _NUM_SAMPLES
+        spend(_SOLVED * _NUM_SAMPLES * elimination.units / 2)
+        drawn = np.random.default_rng(_SEED).standard_normal(shape)
+        return self._factor.ended(drawn.reshape(-1, _NUM_SAMPLES)).reshape(shape)
 
-        Of a row's own probe z ~ N(0, I) the fit takes up y, and y ~ N(0, Λ), z − y ~ N(0, I − Λ) are independent. Of
-        turns and of shifts by themselves their moments A and B make L⁻¹ A L⁻ᵀ with L Lᵀ = A + B (a matrix-variate
-        beta), near which Λ is, at both ends.
-        """
+    def covariance(self, jacobian: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """``(n, d, d)`` of J x, x ~ N(0, H⁻¹), J ``(n, d, 3 d)`` of the blocks of rows ``(n,)``."""
+        pattern, found = self._pattern, np.empty((len(row), *jacobian.shape[1:2] * 2))
+        number = np.cumsum(pattern.counts) - 1
+        is_kept = pattern.counts[row]
+        slot = pattern.slot[number[row[is_kept]]]
+        place = pattern.place[row]
+        found[is_kept] = covariance_of_rows(jacobian[is_kept], place[is_kept], slot, self._factor.inverse)
+        if not is_kept.all():
+            drawn = predicted_rows(jacobian[~is_kept], place[~is_kept], self._samples)
+            found[~is_kept] = np.matmul(drawn, drawn.transpose(0, 2, 1)) / _NUM_SAMPLES
+        return found
+
+    def covariance_between(self, jacobian: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """``(n d, n d)`` the same of some rows together."""
+        count, d, _ = jacobian.shape
+        elimination = self._factor.elimination
+        # Each block once: rows of a run have some in common.
+        block, number = np.unique(self._pattern.place[row], return_inverse=True)
+        number = number.reshape(count, 3) - (block[0] < 0)
+        block = block[block >= 0]
+        columns = np.zeros((elimination.num_blocks, d, len(block), d))
+        columns[block, :, np.arange(len(block))] = np.eye(d)
+        half = self._factor.begun(columns.reshape(elimination.num_blocks * d, -1))
+        whole = np.zeros((count, d, len(block) + 1, d))
+        for third in range(3):
+            part = jacobian[:, :, third * d : (third + 1) * d]
+            whole[np.arange(count), :, number[:, third]] += part
+        rows = whole[:, :, :-1].reshape(count * d, -1)
+        return np.asarray(rows @ (half.T @ half) @ rows.T)
+
+    @property
+    def leverage(self) -> np.ndarray:
+        """``(E + R, d, d)`` Λ = W^½ J H⁻¹ Jᵀ W^½, what of a whitened row its own measurement decides."""
         return self._shares[0]
 
-    @cached_property
+    @property
     def redundancy(self) -> np.ndarray:
         """``(E + R, d, d)`` I − Λ, positive definite."""
         return self._shares[1]
 
     @cached_property
     def _shares(self) -> tuple[np.ndarray, np.ndarray]:
-        k, d = self._system.turns, self._system.size
-        taken = self._predicted(self._samples)
-        left = self._system.probes - taken
-        moments = [np.matmul(part, part.transpose(0, 2, 1)) / _NUM_PROBES for part in (taken, left)]
-        both = moments[0] + moments[1]
-        # A turn's moments with a shift's are noise where one of the two hardly counts, and it is as slight as that in y
-        # or in z − y by itself, but not in their sum: nothing of the one's leverage may get into the other's.
-        root = np.zeros_like(both)
-        root[:, :k, :k], root[:, k:, k:] = inverse_root(both[:, :k, :k]), inverse_root(both[:, k:, k:])
-        of_taken, of_left = (np.matmul(root, np.matmul(part, root.transpose(0, 2, 1))) for part in moments)
-        of_left += _LEAST * np.eye(d)
-        across = _slighter(of_taken[:, :k, k:], -of_left[:, :k, k:])
-        room = _least_value(of_left[:, :k, :k]) * _least_value(of_left[:, k:, k:])
-        square = (across**2).sum(axis=(1, 2))
-        across *= np.sqrt(np.minimum(_CORRELATED * room / np.maximum(square, _TINY), 1.0))[:, None, None]
-        for share, sign in ((of_taken, 1), (of_left, -1)):
-            share[:, :k, k:] = sign * across
-            share[:, k:, :k] = share[:, :k, k:].transpose(0, 2, 1)
-        return of_taken, of_left
+        unit = np.eye(self._jacobian.shape[1])
+        leverage = self.covariance(self._jacobian, np.arange(len(self._jacobian)))
+        redundancy = unit - leverage
+        # Both are positive but for rounding.
+        low = np.flatnonzero(~(exceed(redundancy, _LEAST) & exceed(leverage, -_LEAST)))
+        value, vector = np.linalg.eigh(redundancy[low])
+        value = np.clip(value, _LEAST, 1.0)[:, None]
+        redundancy[low] = np.matmul(vector * value, vector.transpose(0, 2, 1))
+        leverage[low] = np.matmul(vector * (1 - value), vector.transpose(0, 2, 1))
+        return leverage, redundancy
 
-
-def _slighter(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of two matrices ``(n, k, m)`` each, that of fewer squares."""
-    is_first = (a**2).sum(axis=(1, 2)) <= (b**2).sum(axis=(1, 2))
-    return np.where(is_first[:, None, None], a, b)
-
-
-def _least_value(matrix: np.ndarray) -> np.ndarray:
-    """``(n,)`` no more than the least eigenvalues of ``(n, k, k)``."""
-    return np.asarray(1 / (inverse_root(matrix) ** 2).sum(axis=(1, 2)))
+    def without(self, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of rows ``(n,)``: (I − Λ)⁻¹, and (I − Λ)⁻¹ Λ, what the others say; ``(n, d, d)`` each."""
+        redundancy = self.redundancy[row]
+        others = inverse(redundancy)
+        covariance = np.matmul(others, self.leverage[row])
+        # Of what a row nearly decides itself the product is a small difference of large numbers.
+        low = np.flatnonzero(~exceed(redundancy, _NEARLY))
+        value, vector = np.linalg.eigh(redundancy[low])
+        value = np.clip(value, _LEAST, 1.0)[:, None]
+        others[low] = np.matmul(vector / value, vector.transpose(0, 2, 1))
+        covariance[low] = np.matmul(vector * (1 - value) / value, vector.transpose(0, 2, 1))
+        return others, (covariance + covariance.transpose(0, 2, 1)) / 2

@@ -81,12 +81,13 @@ class Judge:
         # Turn and shift are those of the one that is repeated, which is seen nearly at the right angle.
         log_turn[-1], log_shift[-1] = -np.maximum(elsewhere.square - _FARTHEST**2, 0.0) / 2, 0.0
         share = wrong_share(before, told, self.priors)
-        log_wrong, log_right = self._by_itself(predictions, scale)
+        shifts = along_axes(predictions, k)
+        by_itself = log_wrong, log_right = self._by_itself(shifts, scale)
         wrong = before[-1] * expit(log_wrong - log_right)
         rest()
         turned = maps.repeats(wrong, np.logaddexp(log_wrong, log_right), told, in_order=in_order)
-        log_false = told.false_odds + np.where(known, self._log_unrelated(predictions, scale, repeats, turned), 0.0)
-        log_behind = log_from_behind(predictions, seen_alike, k) + self._log_behind(predictions, scale, repeats)
+        log_false = told.false_odds + np.where(known, self._log_unrelated(by_itself, repeats, turned), 0.0)
+        log_behind = log_from_behind(predictions, seen_alike, k) + self._log_behind(shifts, scale, repeats)
         log_false = np.where(known, np.logaddexp(log_false, log_behind + np.log(share)), log_false)
         log_class = log_shift + self._log_classes(share, repeats)
         # Without a translation nothing tells of a place: a closure whose rotation is right is good.
@@ -116,23 +117,23 @@ class Judge:
             np.append(turn_squares.sum(), (at_good * own * along[good] ** 2 / total[good] ** 2).sum(axis=axes)),
             np.append(turn_freedom.sum(), (at_good * own / total[good]).sum(axis=axes)),
             log_density,
-            *self._errors(predictions, scale, (along, spread, variance)),
+            *self._errors(shifts, scale, (along, spread, variance)),
         )
 
     def _errors(
-        self, predictions: Predictions, scale: Scale, classes: tuple[np.ndarray, np.ndarray, np.ndarray]
+        self, shifts: tuple[np.ndarray, np.ndarray], scale: Scale, classes: tuple[np.ndarray, np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray]:
         """``(J + 1, C)`` metres and m² per component: length of ε's mean, and its variance.
 
         Args:
-            predictions: what all else says.
+            shifts: what all else says of them along axes, ``(C, m)`` means and variances.
             scale: of errors.
             classes: ``(J, C, m)`` means and variances of what is said along axes, ``(J, C)`` variances of ε. A false
                 rotation may be anywhere, whatever its turn says.
         """
         along, spread = (
             np.concatenate((of_classes, anywhere[None]))
-            for of_classes, anywhere in zip(classes[:2], along_axes(predictions, self.turns), strict=True)
+            for of_classes, anywhere in zip(classes[:2], shifts, strict=True)
         )
         variance = np.concatenate((classes[2], np.full((1, along.shape[1]), scale.extent)))[:, :, None]
         total = spread + variance
@@ -204,38 +205,39 @@ class Judge:
         with np.errstate(divide="ignore"):
             return np.log1p(-share * repeats.chance), np.maximum(np.log(share * density), _LOG_NOTHING)
 
-    def _log_anywhere(self, predictions: Predictions, scale: Scale) -> np.ndarray:
+    @staticmethod
+    def _log_anywhere(shifts: tuple[np.ndarray, np.ndarray], scale: Scale) -> np.ndarray:
         """``(C,)`` nats, of shifts that lead anywhere on the map."""
-        along, spread = along_axes(predictions, self.turns)
+        along, spread = shifts
         total = spread + scale.extent
         return np.asarray(-(along**2 / total + np.log(2 * np.pi * total)).sum(axis=1) / 2)
 
-    def _log_behind(self, predictions: Predictions, scale: Scale, repeats: Repeats) -> np.ndarray:
+    def _log_behind(self, shifts: tuple[np.ndarray, np.ndarray], scale: Scale, repeats: Repeats) -> np.ndarray:
         """``(C,)`` nats, of shifts of closures that join wrong places, seen from the other side."""
         log_alone, log_repeat = self._log_repeats(repeats.turned, repeats)
-        log_alone = log_alone + np.log(self.priors.from_behind) + self._log_anywhere(predictions, scale)
+        log_alone = log_alone + np.log(self.priors.from_behind) + self._log_anywhere(shifts, scale)
         return np.asarray(np.logaddexp(log_alone, log_repeat))
 
-    def _by_itself(self, predictions: Predictions, scale: Scale) -> tuple[np.ndarray, np.ndarray]:
+    def _by_itself(self, shifts: tuple[np.ndarray, np.ndarray], scale: Scale) -> tuple[np.ndarray, np.ndarray]:
         """``(C,)`` nats each, of shifts of closures whose rotation is false: at wrong places, and at the right one."""
-        along, spread = along_axes(predictions, self.turns)
+        along, spread = shifts
         right = spread + scale.own[:, None]
         log_right = -(along**2 / right + np.log(2 * np.pi * right)).sum(axis=1) / 2
         share = self.priors.turned_in_place
-        return self._log_anywhere(predictions, scale) + np.log1p(-share), log_right + np.log(share)
+        return self._log_anywhere(shifts, scale) + np.log1p(-share), log_right + np.log(share)
 
     def _log_unrelated(
-        self, predictions: Predictions, scale: Scale, repeats: Repeats, elsewhere: tuple[np.ndarray, np.ndarray]
+        self, by_itself: tuple[np.ndarray, np.ndarray], repeats: Repeats, elsewhere: tuple[np.ndarray, np.ndarray]
     ) -> np.ndarray:
         """``(C,)`` nats, of shifts of closures whose rotation is false: wrong places, or the right one turned.
 
         Args:
-            predictions, scale: of errors.
+            by_itself: nats of shifts at wrong places and at the right one, if no other has to do with them.
             repeats: of those before and after.
             elsewhere: of those anywhere, by the same turn of the map.
         """
         log_alone, log_repeat = self._log_repeats(repeats.turned, repeats)
-        log_by_itself = np.logaddexp(*self._by_itself(predictions, scale))
+        log_by_itself = np.logaddexp(*by_itself)
         chance, density = elsewhere
         share = self.priors.elsewhere
         with np.errstate(divide="ignore"):

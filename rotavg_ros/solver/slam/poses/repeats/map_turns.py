@@ -67,7 +67,7 @@ class MapTurns:
         change[is_back, k:, :k] = -(shifts.T @ _crossed(seen) @ back @ turns)[is_back]
         change[is_back, k:, k:] = -(shifts.T @ back @ shifts)[is_back]
         own = np.repeat(np.stack((problem.told.rotation_variance, closure_variance), axis=1), (k, m), axis=1)
-        covariance = _with_own(predictions.covariance, np.sqrt(own))
+        covariance = predictions.covariance + own[:, :, None] * np.eye(k + m)
         return cls(
             np.where(is_forward, forward, inverse),
             np.where(is_forward[:, None], shift, seen + target - source),
@@ -100,13 +100,6 @@ class MapTurns:
         turned = closure_rows(self.turn, self.shift, self.place, self.covariance)
         axes = Axes(*(np.ascontiguousarray(basis) for basis in self.bases))
         return repeated_density(turned, axes, chance, log_alone, among, of_all)
-
-
-def _with_own(covariance: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """``(C, d, d)`` covariances from samples, of which none may be negative, with closures' own noise ``(C, d)``."""
-    scale = sigma[:, :, None] * sigma[:, None, :]
-    spread, axes = np.linalg.eigh(covariance / scale)
-    return np.asarray(scale * ((axes * (1 + np.maximum(spread, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)))
 
 
 def _rotated(turn: np.ndarray, vector: np.ndarray) -> np.ndarray:

@@ -1,0 +1,248 @@
+"""Loops over small fronts: Cholesky's factor Uᵀ U, its triangles, and those entries of the inverse that fronts hold.
+
+Of a front's matrix, pivots against pivots and rows, only the upper triangle is kept. What is left of its rows waits on
+a stack for the front above; downwards a front finds there what the inverse is between its rows (Takahashi, Fagan and
+Chin 1973; by fronts, Campbell and Davis 1995).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rotavg_ros.solver.algebra.compiled import compiled
+from rotavg_ros.solver.algebra.sparse.elimination import Shape
+
+# Where rounding leaves less than this of a diagonal entry, nothing is known of it but that it is positive.
+_ROUNDING = 1e-15
+
+
+class Room(NamedTuple):
+    """What fronts read and fill.
+
+    Attributes:
+        entries: the matrix's own numbers, or the inverse's in their places.
+        store: the factor's.
+        stack: what waits for the front above or below.
+        work: room for one front.
+    """
+
+    entries: np.ndarray
+    store: np.ndarray
+    stack: np.ndarray
+    work: np.ndarray
+
+
+@compiled
+def gather(shape: Shape, f: int, room: Room, own: np.ndarray, left: np.ndarray, top: int) -> int:
+    """A front's matrix: its own numbers ``own`` ``(p, p + r)`` and what those below leave, also to ``left`` ``(r, r)``.
+
+    Returns:
+        How many numbers still wait on the stack.
+    """
+    flat = own.reshape(-1)
+    flat[:] = 0.0
+    left[:] = 0.0
+    for e in range(shape.entry_begin[f], shape.entry_begin[f + 1]):
+        flat[shape.entry[e]] = room.entries[e]
+    num_pivots = len(own)
+    for at in range(shape.child_begin[f + 1] - 1, shape.child_begin[f] - 1, -1):
+        child = shape.child[at]
+        within = shape.within[shape.row_begin[child] : shape.row_begin[child + 1]]
+        count = len(within)
+        top -= count * count
+        for i in range(count):
+            line = room.stack[top + i * count : top + (i + 1) * count]
+            if within[i] < num_pivots:
+                to = own[within[i]]
+                for j in range(i, count):
+                    to[within[j]] += line[j]
+            else:
+                to = left[within[i] - num_pivots]
+                for j in range(i, count):
+                    to[within[j] - num_pivots] += line[j]
+    return top
+
+
+@compiled
+def _take(to: np.ndarray, of: np.ndarray, row: int, first: int, last: int) -> None:
+    """From ``to``, the end of a line, what pivots ``first`` … ``last`` of ``of`` take at ``row``."""
+    end = of.shape[1]
+    begin, k = end - len(to), first
+    while k + 4 <= last:
+        a, b, c, d = of[k, row], of[k + 1, row], of[k + 2, row], of[k + 3, row]
+        one, two, three, four = of[k, begin:end], of[k + 1, begin:end], of[k + 2, begin:end], of[k + 3, begin:end]
+        for i in range(end - begin):
+            to[i] -= a * one[i] + b * two[i] + c * three[i] + d * four[i]
+        k += 4
+    while k < last:
+        a, one = of[k, row], of[k, begin:end]
+        for i in range(end - begin):
+            to[i] -= a * one[i]
+        k += 1
+
+
+@compiled
+def eliminate(shape: Shape, first: int, last: int, room: Room, top: int) -> int:
+    """Fronts ``first`` … ``last``, the last not included.
+
+    Returns:
+        How many numbers wait on the stack; -1: the matrix is not positive definite.
+    """
+    for f in range(first, last):
+        num_pivots = shape.begin[f + 1] - shape.begin[f]
+        num_rows = shape.row_begin[f + 1] - shape.row_begin[f]
+        width = num_pivots + num_rows
+        own = room.store[shape.store[f] : shape.store[f] + num_pivots * width].reshape(num_pivots, width)
+        left = room.work[: num_rows * num_rows].reshape(num_rows, num_rows)
+        top = gather(shape, f, room, own, left, top)
+        for begin in range(0, num_pivots, 4):
+            end = min(begin + 4, num_pivots)
+            for k in range(begin, end):
+                before = own[k, k]
+                _take(own[k, k:], own, k, begin, k)
+                pivot = own[k, k]
+                if not before > 0.0:
+                    return -1
+                root = np.sqrt(max(pivot, _ROUNDING * before))
+                own[k, k] = root
+                for i in range(k + 1, width):
+                    own[k, i] /= root
+            for k in range(end, num_pivots):
+                _take(own[k, k:], own, k, begin, end)
+            for i in range(num_rows):
+                _take(left[i, i:], own, num_pivots + i, begin, end)
+        room.stack[top : top + num_rows * num_rows] = room.work[: num_rows * num_rows]
+        top += num_rows * num_rows
+    return top
+
+
+@compiled
+def solve_lower(shape: Shape, first: int, last: int, store: np.ndarray, columns: np.ndarray) -> None:
+    """U⁻ᵀ of columns ``(N, n)``, in place, as far as fronts ``first`` … ``last`` go, the last not included."""
+    num_columns = columns.shape[1]
+    for f in range(first, last):
+        start = shape.begin[f]
+        num_pivots, row = shape.begin[f + 1] - start, shape.row[shape.row_begin[f] : shape.row_begin[f + 1]]
+        width = num_pivots + len(row)
+        own = store[shape.store[f] : shape.store[f] + num_pivots * width].reshape(num_pivots, width)
+        value = np.empty(width)
+        for c in range(num_columns):
+            asked = 0
+            while asked < num_pivots and columns[start + asked, c] == 0.0:
+                asked += 1
+            if asked == num_pivots:
+                continue
+            for k in range(num_pivots):
+                value[k] = columns[start + k, c]
+            value[num_pivots:] = 0.0
+            for k in range(asked, num_pivots):
+                value[k] /= own[k, k]
+                factor, line = value[k], own[k]
+                for i in range(k + 1, width):
+                    value[i] -= factor * line[i]
+            for k in range(asked, num_pivots):
+                columns[start + k, c] = value[k]
+            for i in range(len(row)):
+                columns[row[i], c] += value[num_pivots + i]
+
+
+@compiled
+def solve_upper(shape: Shape, first: int, last: int, store: np.ndarray, columns: np.ndarray) -> None:
+    """U⁻¹ of columns ``(N, n)``, in place, as far as fronts ``last`` - 1 … ``first`` go."""
+    num_columns = columns.shape[1]
+    for f in range(last - 1, first - 1, -1):
+        start = shape.begin[f]
+        num_pivots, row = shape.begin[f + 1] - start, shape.row[shape.row_begin[f] : shape.row_begin[f + 1]]
+        width = num_pivots + len(row)
+        own = store[shape.store[f] : shape.store[f] + num_pivots * width].reshape(num_pivots, width)
+        value = np.empty(width)
+        for c in range(num_columns):
+            for i in range(len(row)):
+                value[num_pivots + i] = columns[row[i], c]
+            for k in range(num_pivots - 1, -1, -1):
+                line = own[k]
+                # Four sums at once.
+                a, b, left, right = 0.0, 0.0, 0.0, 0.0
+                i = k + 1
+                while i + 4 <= width:
+                    a += line[i] * value[i]
+                    b += line[i + 1] * value[i + 1]
+                    left += line[i + 2] * value[i + 2]
+                    right += line[i + 3] * value[i + 3]
+                    i += 4
+                while i < width:
+                    a += line[i] * value[i]
+                    i += 1
+                value[k] = (columns[start + k, c] - ((a + b) + (left + right))) / line[k]
+                columns[start + k, c] = value[k]
+
+
+@compiled
+def invert(shape: Shape, first: int, last: int, room: Room, top: int) -> int:
+    """Fronts ``last`` - 1 … ``first``: of the inverse Z what stands where the matrix's own numbers do.
+
+    Where j is a pivot and i > j,  Z_ij = − Σ_k U_jk Z_ki / U_jj,  k > j;  Z_jj = (1 / U_jj − Σ_k U_jk Z_kj) / U_jj.
+
+    Returns:
+        How many numbers wait on the stack.
+    """
+    for f in range(last - 1, first - 1, -1):
+        num_pivots = shape.begin[f + 1] - shape.begin[f]
+        num_rows = shape.row_begin[f + 1] - shape.row_begin[f]
+        width = num_pivots + num_rows
+        own = room.store[shape.store[f] : shape.store[f] + num_pivots * width].reshape(num_pivots, width)
+        found = room.work[: width * width].reshape(width, width)
+        top -= num_rows * num_rows
+        for i in range(num_rows):
+            found[num_pivots + i, num_pivots:] = room.stack[top + i * num_rows : top + (i + 1) * num_rows]
+        for j in range(num_pivots - 1, -1, -1):
+            line, to = own[j], found[j, j + 1 :]
+            to[:] = 0.0
+            k = j + 1
+            while k + 4 <= width:
+                a, b, c, d = line[k], line[k + 1], line[k + 2], line[k + 3]
+                one, two, three, four = (
+                    found[k, j + 1 :],
+                    found[k + 1, j + 1 :],
+                    found[k + 2, j + 1 :],
+                    found[k + 3, j + 1 :],
+                )
+                for i in range(width - j - 1):
+                    to[i] -= a * one[i] + b * two[i] + c * three[i] + d * four[i]
+                k += 4
+            while k < width:
+                a, one = line[k], found[k, j + 1 :]
+                for i in range(width - j - 1):
+                    to[i] -= a * one[i]
+                k += 1
+            own_part = 1.0 / line[j]
+            for i in range(j + 1, width):
+                found[j, i] /= line[j]
+                found[i, j] = found[j, i]
+                own_part -= line[i] * found[j, i]
+            found[j, j] = own_part / line[j]
+        top = hand_down(shape, f, found, room, top)
+    return top
+
+
+@compiled
+def hand_down(shape: Shape, f: int, found: np.ndarray, room: Room, top: int) -> int:
+    """A front's part of Z ``(p + r, p + r)`` to those below, and to where the matrix has numbers.
+
+    Returns:
+        How many numbers wait on the stack.
+    """
+    flat = found.reshape(-1)  # its first rows are those of the pivots
+    for e in range(shape.entry_begin[f], shape.entry_begin[f + 1]):
+        room.entries[e] = flat[shape.entry[e]]
+    for at in range(shape.child_begin[f], shape.child_begin[f + 1]):
+        child = shape.child[at]
+        within = shape.within[shape.row_begin[child] : shape.row_begin[child + 1]]
+        for i in within:
+            line = found[i]
+            for j in within:
+                room.stack[top] = line[j]
+                top += 1
+    return top
