@@ -122,7 +122,8 @@ ROOMS: dict[str, dict[str, set[str]]] = {
     "solver/slam/poses": {
         "": set(),
         "priors": set(),
-        "block_system": set(),
+        "block_rows": set(),
+        "block_system": {"block_rows"},
         "displacements": set(),
         "closures": set(),
         "rows": {"block_system", "closures", "displacements", "priors"},
@@ -132,7 +133,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "noise": {"rows", "solved"},
         "evidence": {"closures", "noise", "rows", "solved"},
         "estimate": {"block_system", "closures", "evidence", "noise", "places", "repeats", "rows", "solved"},
-        "search": {"closures", "estimate", "rows"},
+        "search": {"closures", "estimate", "places", "repeats", "rows"},
         "answer": {"estimate", "rows"},
         "memory": {"answer", "closures", "estimate", "rows"},
         "solve": {"answer", "estimate", "memory", "rows", "search"},

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rotavg_ros.solver.algebra import quaternion_rows
-from rotavg_ros.solver.algebra.small_matrices import inverse
 from rotavg_ros.solver.running.work import rest, spend
 from rotavg_ros.solver.slam.poses.block_system import BlockFactor
 from rotavg_ros.solver.slam.poses.closures import ANYHOW, Places, Predictions, Scale
@@ -97,6 +96,18 @@ class PoseStart:
     def at(cls, pose: PoseMode) -> PoseStart:
         """Of the same labelling."""
         return cls(pose.state, np.arange(len(pose.solved.places.weight)), pose.solved.places, _MAX_SOLVES)
+
+    @classmethod
+    def believing(cls, pose: PoseMode, closures: np.ndarray) -> PoseStart:
+        """Of the same labelling, but that some closures ``(n,)`` are right."""
+        problem, noise, places = pose.problem, pose.state.noise, pose.solved.places
+        chance, weight, rotation = places.chance.copy(), places.weight.copy(), places.rotation_weight.copy()
+        chance[:, closures] = 0.0
+        chance[0, closures] = 1.0
+        weight[closures] = 1 / problem.own_variance(noise)[closures]
+        rotation[closures] = 1 / problem.rotation_variance(noise)[problem.mode.problem.closure[closures]]
+        begun = replace(places, chance=chance, weight=weight, rotation_weight=rotation)
+        return replace(cls.at(pose), places=begun)
 
     def over(self, places: Places) -> Places:
         """These, and others' ``places`` of what is new."""
@@ -264,10 +275,9 @@ def _scale(problem: PoseProblem, state: PoseState) -> Scale:
 def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.ndarray) -> Predictions:
     """What all else says of some rows, whose ``root`` is diagonal, by what is left of them and their leverages."""
     sigma = 1 / np.diagonal(root[rows], axis1=1, axis2=2)
-    others = inverse(factor.redundancy[rows])
+    others, covariance = factor.without(rows)
     mean = sigma * np.matmul(others, left[rows])[:, :, 0]
-    covariance = sigma[:, :, None] * np.matmul(others, factor.leverage[rows]) * sigma[:, None, :]
-    return Predictions(mean, (covariance + covariance.transpose(0, 2, 1)) / 2)
+    return Predictions(mean, sigma[:, :, None] * covariance * sigma[:, None, :])
 
 
 @dataclass(frozen=True)

@@ -175,8 +175,23 @@ def _mean_kernels(apart: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 def wrong_share(before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndarray:
     """``(C,)`` how likely each is to join wrong places, by all others and by its run most (Beta, Bernoulli)."""
-    wrong = before[GOOD:-1].sum(axis=0) * told.is_known
-    any_one = (1 - before[-1]) * told.is_known
-    overall = (wrong.sum() + priors.wrong_place) / (any_one.sum() + priors.counted)
+    wrong, any_one = _wrong_places(before, told)
+    overall = _overall(wrong, any_one, priors)
     in_run, of_run = np.bincount(told.run, wrong)[told.run] - wrong, np.bincount(told.run, any_one)[told.run] - any_one
     return np.asarray(np.clip((overall + in_run) / (1 + of_run), _SHARE, 1 - _SHARE))
+
+
+def log_all_right(before: np.ndarray, told: Told, priors: PlacePriors, count: int) -> float:
+    """Nats, that so many closures of a run all join right places, one after the other, by the same share."""
+    right = 1 - _overall(*_wrong_places(before, told), priors)
+    number = np.arange(count)
+    return float(np.log((right + number) / (1 + number)).sum())
+
+
+def _wrong_places(before: np.ndarray, told: Told) -> tuple[np.ndarray, np.ndarray]:
+    """``(C,)`` each: chance of a wrong place, and of any that a closure can tell of."""
+    return before[GOOD:-1].sum(axis=0) * told.is_known, (1 - before[-1]) * told.is_known
+
+
+def _overall(wrong: np.ndarray, any_one: np.ndarray, priors: PlacePriors) -> float:
+    return float((wrong.sum() + priors.wrong_place) / (any_one.sum() + priors.counted))

@@ -91,15 +91,8 @@ def with_jump(pose: PoseMode, jump: Jump) -> tuple[PoseProblem, PoseStart]:
     variance = np.zeros(problem.graph.num_edges) if problem.jump is None else problem.jump.copy()
     variance[problem.longest_steps[ends]] = problem.could_jump[ends]
     state = replace(state, position=state.position + shifted[:, None] * jump.shift)
-    places, freed = pose.solved.places, np.flatnonzero(jump.freed)
-    closure = problem.mode.problem.closure[freed]
-    chance, weight, rotation = places.chance.copy(), places.weight.copy(), places.rotation_weight.copy()
-    chance[:, freed] = 0.0
-    chance[0, freed] = 1.0
-    weight[freed] = 1 / problem.own_variance(state.noise)[freed]
-    rotation[freed] = 1 / problem.rotation_variance(state.noise)[closure]
-    begun = replace(places, chance=chance, weight=weight, rotation_weight=rotation)
-    return replace(problem, jump=variance), replace(PoseStart.at(pose), state=state, places=begun)
+    start = PoseStart.believing(pose, np.flatnonzero(jump.freed))
+    return replace(problem, jump=variance), replace(start, state=state)
 
 
 def without_odd_jumps(pose: PoseMode) -> PoseProblem | None:

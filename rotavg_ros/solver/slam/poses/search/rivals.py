@@ -20,6 +20,7 @@ from rotavg_ros.solver.slam.poses.search.jumps import (
     with_jump,
     without_odd_jumps,
 )
+from rotavg_ros.solver.slam.poses.search.runs import runs_to_believe
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
@@ -32,6 +33,8 @@ _ROUNDS, _LEAST_GAIN, _HOPELESS = 4, 0.1, 20.0
 _GOOD = 0.5
 # Jumps at most; one is tried if −log p is predicted to rise by no more than this, nats.
 _MAX_JUMPS, _SLACK = 8, 1.0
+# Runs that are believed after all, at most.
+_MAX_RUNS = 8
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,7 @@ def rival_poses(
         for pose in _begun(PoseProblem(graph, translation, mode)):
             least = min((rival.cost for rival in ended), default=np.inf)
             ended.append(settling(pose, least))
+    ended.append(_with_runs(min(ended, key=lambda rival: rival.cost)))
     ended.extend(_jumping(min(ended, key=lambda rival: rival.cost)))
     rivals: list[Rival] = []
     for rival in sorted(ended, key=lambda rival: rival.cost):
@@ -100,6 +104,25 @@ def rival_poses(
         problem = replace(rival.pose.problem, mode=tuned(rival.mode))
         poses.append(estimate_poses(problem, start=PoseStart.at(rival.pose)))
     return Rivals([rival.mode for rival in rivals], poses, share / share.sum())
+
+
+def _with_runs(rival: Rival) -> Rival:
+    """The same labelling with whole runs believed, as long as that is likelier."""
+    if "believed-runs" in rival.mode.problem.without:
+        return rival
+    tried: set[bytes] = set()
+    for _ in range(_MAX_RUNS):
+        for gained, members in runs_to_believe(rival.pose):
+            if gained < -_SLACK or members.tobytes() in tried:
+                continue
+            tried.add(members.tobytes())
+            believed = _settled(rival.pose.problem, PoseStart.believing(rival.pose, members))
+            if believed.cost < rival.cost - _LEAST_GAIN:
+                rival = believed
+                break
+        else:
+            break
+    return rival
 
 
 def _jumping(rival: Rival) -> list[Rival]:

@@ -1,0 +1,104 @@
+"""Believe a whole run: closures that hold each other to join wrong places, though together they may as well be right.
+
+One by one each is told by its neighbours that places are mistaken here. Of the K closures of a run, none of which
+pulls, all else says N(0, S) of their discrepancies y if all are right, S = A H⁻¹ Aᵀ + V, A their rows and V what
+each errs by itself. Where that is likelier than what they are held for, poses are estimated anew with the run believed;
+−log p of both decides, as of any two labellings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rotavg_ros.solver.slam.poses.estimate import PoseMode
+from rotavg_ros.solver.slam.poses.places import Judge
+from rotavg_ros.solver.slam.poses.repeats.neighbours import log_all_right
+
+# So many runs are looked at, those first that are off by the fewest standard deviations; of so many closures at least.
+_LOOKED_AT, _LEAST_MEMBERS = 32, 2
+_WRONG = 0.5
+
+
+def runs_to_believe(pose: PoseMode) -> list[tuple[float, np.ndarray]]:
+    """By how many nats runs are likelier to be right than what they are held for, and their closures, best first."""
+    told, places = pose.problem.told, pose.solved.places
+    could = told.is_known & (told.label == 0) & (places.right < _WRONG)
+    runs = _nearest(pose, could)
+    if not runs:
+        return []
+    judge = Judge(told, pose.problem.turns, pose.problem.priors)
+    in_order = judge(pose.solved.predictions, pose.solved.maps, places.chance, pose.solved.scale, in_order=True)
+    found = [_Run.of(pose, members, in_order.log_density[members]) for members in runs]
+    return sorted(((run.gained, run.members) for run in found if run is not None), key=lambda each: -each[0])
+
+
+def _nearest(pose: PoseMode, could: np.ndarray) -> list[np.ndarray]:
+    """Members of runs that could be right, those first that are off by the fewest standard deviations in common."""
+    told, predictions, k = pose.problem.told, pose.solved.predictions, pose.problem.turns
+    count = np.bincount(told.run, could)
+    off = np.stack([np.bincount(told.run, could * told.sign * column) for column in predictions.mean.T], axis=1)
+    spread = np.diagonal(predictions.covariance, axis1=1, axis2=2)
+    own = np.stack((told.rotation_variance, pose.solved.scale.good), axis=1)
+    total = spread + np.repeat(own, [k, spread.shape[1] - k], axis=1)
+    variance = np.stack([np.bincount(told.run, could * column) for column in total.T], axis=1)
+    # Means of all members, of which each knows about the same.
+    square = (off**2 / np.maximum(count * 1.0, 1.0)[:, None] / np.maximum(variance, np.finfo(np.float64).tiny)).sum(
+        axis=1
+    )
+    order = np.argsort(np.where(count >= _LEAST_MEMBERS, square, np.inf), kind="stable")[:_LOOKED_AT]
+    return [np.flatnonzero(could & (told.run == run)) for run in order if count[run] >= _LEAST_MEMBERS]
+
+
+@dataclass(frozen=True)
+class _Run:
+    """K closures that are likelier to be right together, each given the others, than what they are held for.
+
+    Attributes:
+        members: ``(K,)`` closures.
+        gained: nats, by all of them.
+    """
+
+    members: np.ndarray
+    gained: float
+
+    @classmethod
+    def of(cls, pose: PoseMode, members: np.ndarray, held: np.ndarray) -> _Run | None:
+        """The largest such part of a run, which whoever gains least by being right leaves first; None if there is none.
+
+        Args:
+            pose: that none of them pulls.
+            members: ``(n,)`` closures.
+            held: ``(n,)`` nats, of each as it is held to be.
+        """
+        d = pose.problem.turns + pose.problem.shifts
+        total, off = _discrepancies(pose, members)
+        while len(members) >= _LEAST_MEMBERS:
+            precision = np.linalg.inv(total)
+            pulled = (precision @ off).reshape(-1, d)
+            each = np.arange(len(members))
+            own = precision.reshape(len(members), d, len(members), d)[each, :, each]
+            # N(y_i given the others) of N(0, P⁻¹): P y and P's own blocks tell it.
+            square = (pulled * np.linalg.solve(own, pulled[:, :, None])[:, :, 0]).sum(axis=1)
+            given_others = (np.linalg.slogdet(own)[1] - square - d * np.log(2 * np.pi)) / 2
+            least = int(np.argmin(given_others - held))
+            if given_others[least] >= held[least]:
+                log_density = np.linalg.slogdet(precision)[1] - off @ pulled.ravel() - len(off) * np.log(2 * np.pi)
+                problem, places = pose.problem, pose.solved.places
+                log_right = log_all_right(places.chance, problem.told, problem.priors, len(members))
+                return cls(members, float(log_density / 2 - held.sum()) + log_right)
+            stays = np.repeat(each != least, d)
+            total, off = total[np.ix_(stays, stays)], off[stays]
+            members, held = np.delete(members, least), np.delete(held, least)
+        return None
+
+
+def _discrepancies(pose: PoseMode, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``(K d, K d)`` covariance of a run's discrepancies if its closures are right, and these ``(K d,)``."""
+    problem, solved, k = pose.problem, pose.solved, pose.problem.turns
+    rows, d = problem.mode.problem.closure[members], problem.turns + problem.shifts
+    own = np.repeat(problem.rotation_variance(pose.state.noise)[rows, None], d, axis=1)
+    own[:, k:] = problem.own_variance(pose.state.noise)[members, None]
+    total = solved.factor.covariance_between(problem.jacobian(solved.way)[rows], rows) + np.diag(own.ravel())
+    return total, solved.predictions.mean[members].ravel()
