@@ -13,6 +13,7 @@ SWITCHES: dict[str, str] = {
     "near-misses": "false closures are uniform over all rotations",
     "vertical": "false closures of a robot that stays upright are wrong by any turn, not by one about the vertical",
     "repeats": "every false closure is wrong by itself",
+    "own-repeats": "all runs of false closures repeat their turns as often",
     "label-runs": "closures that follow each other have independent labels",
     "common-errors": "every closure errs by itself",
     "stated-precisions": "all closures are alike, whatever they state",

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.special import betaln
+from scipy.special import betaln, softmax
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.compiled import compiled
@@ -31,10 +31,16 @@ _FAR_SHARES = np.array([0.01, 0.05, 0.2, 0.5])
 _NEAR_MISS_QUANTILES = np.array([1.0, 3.0, 5.0]) / 6
 # Of false closures of a robot that stays upright, that are wrong by a turn about the vertical if any are.
 _ABOUT_VERTICAL = 0.9
+# That each run of false closures repeats turns with shares of its own, beforehand.
+_OWN_SHARES = 0.25
 # Predicted to less than this share of the variance of any rotation.
 _TOLD = 0.5
 # The least density that counts; a product is turned into its logarithm beyond these.
 _LEAST, _SMALL, _LARGE = 1e-100, 1e-100, 1e100
+
+
+# Each of the first two with each of the second.
+_OF_RUN, _BEFORE = (share.reshape(-1, 1) for share in np.meshgrid(_RUN_SHARES, _NEAR_SHARES, indexing="ij"))
 
 
 def _grid(kinds: int) -> tuple[int, ...]:
@@ -42,46 +48,69 @@ def _grid(kinds: int) -> tuple[int, ...]:
     return len(_RUN_SHARES), len(_NEAR_SHARES), len(_FAR_SHARES), kinds, KERNELS
 
 
+def _split(rates: np.ndarray, kinds: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of values ``(G,)`` those where all runs share c and d, ``(9, …)``, and where each run has its own, ``(1, …)``."""
+    others = _grid(kinds)[2:]
+    each = rates.reshape(len(_OF_RUN) + 1, *others)
+    return each[:-1], each[-1:]
+
+
 @dataclass(frozen=True)
 class FalseDensity:
     """Of n closures if they are false, none of them as a logarithm.
+
+    How often they repeat others, c and d, is the same for all runs, or each run has its own: one place is mistaken by
+    one turn as long as it is seen, another one by many. Of the grid's G points those where c and d are shared come
+    first, then those where they are summed over run by run.
 
     Attributes:
         alone: ``(M, n)`` wrong by themselves, for each share of near misses; and again where most turns are about the
             vertical, if the robot knows one.
         repeats: by the turns of others, of which some may be there.
+        run: ``(n,)`` number of the chain that each is one of.
     """
 
     alone: np.ndarray
     repeats: Repeats
+    run: np.ndarray
 
     def log_sums(self) -> np.ndarray:
         """``(G,)`` logarithms of all closures together, at each point of the grid of rates.
 
         Each is (1 − c) ((1 − d) ((1 − g) alone + g of any) + d of those before) + c of its run, where there are such.
         """
-        return _log_sums(self.alone, *self.repeats, (_RUN_SHARES, _NEAR_SHARES, _FAR_SHARES))
+        order = np.argsort(self.run, kind="stable")
+        return _log_sums(self.alone, *self.repeats, self.run, order, (_RUN_SHARES, _NEAR_SHARES, _FAR_SHARES))
 
-    def mean(self, log_rates: np.ndarray) -> np.ndarray:
+    def mean(self, log_rates: np.ndarray, own: np.ndarray) -> np.ndarray:
         """``(n,)`` the same of each in the mean over the grid, whose points have these logarithms ``(G,)``.
 
         It is linear in all four, so what each counts for is summed over the grid beforehand.
+
+        Args:
+            log_rates: ``(G,)``.
+            own: ``(9, n)`` how likely each c and d is for a closure's run, if it has its own.
         """
-        rates = np.exp(log_rates).reshape(_grid(len(self.alone)))
-        shares = np.ix_(_RUN_SHARES, _NEAR_SHARES, _FAR_SHARES)
-        c, d, g = (share[..., None, None] for share in shares)
-        mean = np.zeros(self.alone.shape[1])
-        has_any = self.repeats.has_any
-        for has in np.ndindex(2, 2, 2):
-            rows = np.flatnonzero((has_any == np.array(has, dtype=bool)[:, None]).all(axis=0))
-            if len(rows) == 0:
-                continue
-            of_run, before, of_any = c * has[0], (1 - c * has[0]) * d * has[1], (1 - c * has[0]) * (1 - d * has[1])
-            alone = (rates * of_any * (1 - g * has[2])).sum(axis=(0, 1, 2, 4))
-            mean[rows] = alone @ self.alone[:, rows]
-            for share, density in zip((of_run, before, of_any * g * has[2]), self.repeats.density, strict=True):
-                mean[rows] += (rates * share).sum(axis=(0, 1, 2, 3)) @ density[:, rows]
+        shared, _ = _split(np.exp(log_rates), len(self.alone))
+        mean = self._summed(shared).sum(axis=0) + (self.by_shares(log_rates) * own).sum(axis=0)
         return np.asarray(np.maximum(mean, _LEAST))
+
+    def by_shares(self, log_rates: np.ndarray) -> np.ndarray:
+        """``(9, n)`` of each, for each c and d, in the mean over the points at which runs have their own."""
+        _, own = _split(np.exp(log_rates), len(self.alone))
+        return self._summed(own)
+
+    def _summed(self, rates: np.ndarray) -> np.ndarray:
+        """``(9, n)`` for each c and d, summed over all else by ``rates``, ``(9 or 1, g, M, kernels)``."""
+        of_kernels = rates.sum(axis=(1, 2))
+        has_run, has_near, has_any = self.repeats.has_any
+        of_run, before = of_kernels @ self.repeats.density[0], of_kernels @ self.repeats.density[1]
+        any_one = rates.sum(axis=(1, 3)) @ self.alone
+        repeated = np.tensordot(rates, _FAR_SHARES, (1, 0))
+        far = repeated.sum(axis=1) @ self.repeats.density[2] - repeated.sum(axis=2) @ self.alone
+        run = _OF_RUN * has_run
+        near = (1 - run) * _BEFORE * has_near
+        return np.asarray((1 - run - near) * (any_one + has_any * far) + near * before + run * of_run)
 
 
 @compiled
@@ -89,31 +118,54 @@ def _log_sums(
     alone: np.ndarray,
     density: np.ndarray,
     has_any: np.ndarray,
+    run: np.ndarray,
+    order: np.ndarray,
     shares: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> np.ndarray:
     """Products of what :meth:`FalseDensity.log_sums` says of each closure, logarithms taken where they get small."""
     of_run, before, of_any = shares
-    size = len(of_run) * len(before) * len(of_any) * len(alone) * density.shape[1]
-    product, total = np.ones(size), np.zeros(size)
-    for n in range(alone.shape[1]):
+    ways, inner = len(of_run) * len(before), len(of_any) * len(alone) * density.shape[1]
+    size = ways * inner
+    # Of the run at hand; of all runs, with the same c and d and with their own.
+    product, total, is_small = np.ones(size), np.zeros(size), False
+    products, totals = np.ones(size + inner), np.zeros(size + inner)
+    for place in range(len(order)):
+        n = order[place]
         at = 0
         for c in of_run:
             for d in before:
                 for g in of_any:
-                    run = c if has_any[0, n] else 0.0
-                    near = (1 - run) * (d if has_any[1, n] else 0.0)
-                    rest = 1 - run - near
+                    of_its = c if has_any[0, n] else 0.0
+                    near = (1 - of_its) * (d if has_any[1, n] else 0.0)
+                    rest = 1 - of_its - near
                     far = rest * (g if has_any[2, n] else 0.0)
                     for m in range(len(alone)):
                         by_itself = (rest - far) * alone[m, n]
                         for s in range(density.shape[1]):
-                            each = by_itself + far * density[2, s, n] + near * density[1, s, n] + run * density[0, s, n]
-                            product[at] *= max(each, _LEAST)
+                            each = by_itself + far * density[2, s, n] + near * density[1, s, n]
+                            product[at] *= max(each + of_its * density[0, s, n], _LEAST)
                             if not _SMALL < product[at] < _LARGE:
                                 total[at] += math.log(product[at])
-                                product[at] = 1.0
+                                product[at], is_small = 1.0, True
                             at += 1
-    return total + np.log(product)
+        if place + 1 < len(order) and run[order[place + 1]] == run[n]:
+            continue
+        if is_small:
+            for point in range(inner):
+                log = total[point::inner] + np.log(product[point::inner])
+                largest = log.max()
+                totals[point:size:inner] += log
+                totals[size + point] += largest
+                products[size + point] *= np.exp(log - largest).mean()
+        else:
+            products[:size] *= product
+            products[size:] *= product.reshape(ways, inner).sum(axis=0) / ways
+        product[:], total[:], is_small = 1.0, 0.0, False
+        for at in range(size + inner):
+            if not _SMALL < products[at] < _LARGE:
+                totals[at] += math.log(products[at])
+                products[at] = 1.0
+    return totals + np.log(products)
 
 
 def false_density(
@@ -144,8 +196,9 @@ def false_density(
         uniform = (1 - near_misses) * np.exp(log_uniform_density(np.sqrt(square), k))
         ratio = problem.vertical.density_ratio(residual[rows], predicted[rows])
         alone = np.concatenate((alone, alone + _ABOUT_VERTICAL * uniform * (ratio - 1)))
+    run = problem.run[rows]
     if count == 0 or not is_false.any() or "repeats" in problem.without:
-        return FalseDensity(alone, Repeats.none(count))
+        return FalseDensity(alone, Repeats.none(count), run)
     older, newer = problem.ends.T
     turn = np.ascontiguousarray(quaternion_rows.exp((residual * problem.sign[:, None]).T).T)
     # Of a closure that nothing else predicts it is not known by what turn it is wrong.
@@ -154,7 +207,7 @@ def false_density(
     is_one = is_false[rows] if both_sides else None
     between = places_near(problem.detected[false], problem.detected[rows], is_one, problem.limits.window)
     closures, near = Closures(older, newer, turn, is_told), Near(rows, false, between)
-    return FalseDensity(alone, repeats(closures, near, problem.priors.run_gap_steps, k))
+    return FalseDensity(alone, repeats(closures, near, problem.priors.run_gap_steps, k), run)
 
 
 def _near_miss_shares(priors: SlamPriors) -> np.ndarray:
@@ -164,23 +217,68 @@ def _near_miss_shares(priors: SlamPriors) -> np.ndarray:
 
 
 @cache
-def _log_repeat_prior(priors: SlamPriors, kinds: int) -> np.ndarray:
-    """``(G,)`` of the grid's points: Beta(1, count) on the share that repeats a turn elsewhere, all else as likely."""
+def _log_repeat_prior(priors: SlamPriors, kinds: int, has_own: bool) -> np.ndarray:
+    """``(G,)`` of the grid's points: Beta(1, count) on the share that repeats a turn elsewhere, all else as likely.
+
+    Each run has its own shares with the probability :data:`_OWN_SHARES`, else all have the same.
+    """
     far = (priors.elsewhere_count - 1) * np.log1p(-_FAR_SHARES) + np.log(np.gradient(_FAR_SHARES))
-    grid = np.broadcast_to(far[:, None, None], _grid(kinds)).ravel()
+    shared = np.broadcast_to(far[:, None, None], _grid(kinds)).ravel()
+    own = np.broadcast_to(far[:, None, None], _grid(kinds)[2:]).ravel()
+    log_odds = np.log(_OWN_SHARES / (1 - _OWN_SHARES)) if has_own else -np.inf
+    grid = np.concatenate((shared - np.logaddexp.reduce(shared), own - np.logaddexp.reduce(own) + log_odds))
     return np.asarray(grid - np.logaddexp.reduce(grid))
+
+
+def _log_weighted(problem: Problem, density: FalseDensity) -> np.ndarray:
+    """``(G,)`` prior times density of all false closures, at the grid's points."""
+    has_own = "own-repeats" not in problem.without
+    return np.asarray(density.log_sums() + _log_repeat_prior(problem.priors, len(density.alone), has_own))
 
 
 def repeat_rates(problem: Problem, density: FalseDensity) -> np.ndarray:
     """``(G,)`` log posterior of the grid's points, given false closures."""
-    rates = density.log_sums() + _log_repeat_prior(problem.priors, len(density.alone))
+    rates = _log_weighted(problem, density)
     return np.asarray(rates - np.logaddexp.reduce(rates))
 
 
 def log_false_set(problem: Problem, density: FalseDensity) -> float:
     """Of all false closures together, rates and width integrated."""
-    log_prior = _log_repeat_prior(problem.priors, len(density.alone))
-    return float(np.logaddexp.reduce(density.log_sums() + log_prior))
+    return float(np.logaddexp.reduce(_log_weighted(problem, density)))
+
+
+def if_false(
+    problem: Problem, is_false: np.ndarray, residual: np.ndarray, predicted: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """``(C,)`` densities of each closure if it is false: given all other false ones, and by itself.
+
+    Args:
+        is_false: ``(C,)`` bool.
+        residual: ``(C, 3)`` rad, from source to target.
+        predicted: ``(C,)`` rad², variance of what these are counted from.
+    """
+    rows = np.flatnonzero(is_false)
+    false = false_density(problem, is_false, residual, predicted, rows)
+    each = false_density(problem, is_false, residual, predicted, np.arange(len(is_false)), both_sides=True)
+    rates = repeat_rates(problem, false)
+    own = _own_shares(problem, rows, false.by_shares(rates))
+    return each.mean(rates, own), each.alone.mean(axis=0)
+
+
+def _own_shares(problem: Problem, rows: np.ndarray, by_shares: np.ndarray) -> np.ndarray:
+    """``(9, C)`` how likely each c and d is for each closure's run, given the others that are false.
+
+    Args:
+        problem: the graph.
+        rows: ``(F,)`` closures that are false.
+        by_shares: ``(9, F)`` their densities.
+    """
+    log = np.log(np.maximum(by_shares, _LEAST)).T
+    of_run = np.zeros((int(problem.run.max(initial=-1)) + 1, log.shape[1]))
+    np.add.at(of_run, problem.run[rows], log)
+    own = of_run[problem.run]
+    own[rows] -= log
+    return np.asarray(softmax(own.T, axis=0))
 
 
 def _log_transitions() -> tuple[np.ndarray, np.ndarray]:

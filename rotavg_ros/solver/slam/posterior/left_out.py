@@ -12,11 +12,11 @@ from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
 from rotavg_ros.solver.slam.posterior.densities import log_false, log_good, log_slipped
 from rotavg_ros.solver.slam.posterior.labels import (
     false_density,
+    if_false,
     label_log_odds,
     log_false_set,
     log_label_prior,
     log_slip_odds,
-    repeat_rates,
 )
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import residuals, sites, tails, variances, with_others
@@ -60,11 +60,9 @@ def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> Lef
     # The prior's log-odds, less the density of what an edge is if it is not good.
     odds = problem.log_odds.copy()
     is_false = ~state.is_good[closure]
-    of_closures = residual[closure], told.others.predicted[closure]
-    rates = repeat_rates(problem, false_density(problem, is_false, *of_closures, np.flatnonzero(is_false)))
-    each = false_density(problem, is_false, *of_closures, np.arange(len(closure)), both_sides=True)
+    told_false, alone = if_false(problem, is_false, residual[closure], told.others.predicted[closure])
     label_odds = label_log_odds(problem, is_false)
-    odds[closure] = label_odds - np.log(each.mean(rates))
+    odds[closure] = label_odds - np.log(told_false)
     odometry = np.flatnonzero(graph.is_odometry)
     slips = int((~state.is_good[odometry]).sum())
     odds[odometry] -= log_slip_odds(problem, graph.own_steps[odometry], slips)
@@ -73,7 +71,7 @@ def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> Lef
     if_good = log_good(k * (own + predicted), own, predicted, k, tails(problem, state.noise), priors.tail_ratio)[0]
     log_odds = site.log_density + odds
     unrepeated = log_odds.copy()
-    unrepeated[closure] = site.log_density[closure] + label_odds - np.log(each.alone.mean(axis=0))
+    unrepeated[closure] = site.log_density[closure] + label_odds - np.log(alone)
     return LeftOut(log_odds, square, predicted, if_good, unrepeated)
 
 

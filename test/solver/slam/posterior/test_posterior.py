@@ -25,8 +25,10 @@ from rotavg_ros.solver.slam.posterior.labels import (
     FalseDensity,
     false_density,
     label_log_odds,
+    log_false_set,
     log_label_prior,
     log_slip_prior,
+    repeat_rates,
 )
 from rotavg_ros.solver.slam.posterior.left_out import leave_one_out
 from rotavg_ros.solver.slam.posterior.mode import Mode
@@ -416,6 +418,7 @@ def test_priors_are_normalised() -> None:
         ("common-errors", lambda problem: problem.system(_NOISE).num_runs == 0),
         ("turns", lambda problem: not problem.turns_vary),
         ("slips", lambda problem: bool(np.isposinf(problem.log_odds[problem.graph.is_odometry]).all())),
+        ("own-repeats", lambda problem: not np.isfinite(repeat_rates(problem, _repeated(problem))).all()),
         ("repeats", lambda problem: not _repeated(problem).repeats.density.any()),
         ("label-runs", lambda problem: _stickiness(problem) == pytest.approx(0.0, abs=1e-9)),
     ],
@@ -427,7 +430,7 @@ def test_a_term_is_there_until_it_is_switched_off(name: str, is_off: Callable[[P
 
 
 def _drawn_density(count: int) -> tuple[FalseDensity, np.ndarray]:
-    """A density, and what it makes of each closure ``(G, n)`` at each point of the grid of rates."""
+    """A density, and what it makes of each closure ``(9, P, n)``, for each c and d, at the points of other rates."""
     rng = np.random.default_rng(0)
     has_any = rng.random((3, count)) < 0.5
     alone, of_others = rng.random((3, count)), rng.random((3, 10, count)) * has_any[:, None] * 1e-3
@@ -436,20 +439,56 @@ def _drawn_density(count: int) -> tuple[FalseDensity, np.ndarray]:
     run, before, far = c[:, None, None, None, None], d[:, None, None, None], g[:, None, None]
     any_one = (1 - far) * alone[:, None] + far * of_others[2]
     mixed = (1 - run) * ((1 - before) * any_one + before * of_others[1]) + run * of_others[0]
-    return FalseDensity(alone, Repeats(of_others, has_any)), mixed.reshape(-1, count)
+    number = rng.integers(0, count // 5, count)
+    return FalseDensity(alone, Repeats(of_others, has_any), number), mixed.reshape(9, -1, count)
 
 
 def test_the_mean_over_rates_is_that_of_the_mixture() -> None:
     density, mixed = _drawn_density(40)
-    rates = np.random.default_rng(1).normal(size=len(mixed))
+    rng, (ways, points, count) = np.random.default_rng(1), mixed.shape
+    rates = rng.normal(size=(ways + 1) * points)
     rates -= logsumexp(rates)
-    np.testing.assert_allclose(density.mean(rates), np.exp(rates) @ mixed, rtol=1e-12)
+    own = rng.dirichlet(np.ones(ways), count).T
+    shared, of_own = np.split(np.exp(rates), [ways * points])
+    expected = np.einsum("wp,wpn->n", shared.reshape(ways, points), mixed)
+    expected += np.einsum("p,wn,wpn->n", of_own, own, mixed)
+    np.testing.assert_allclose(density.mean(rates, own), expected, rtol=1e-12)
 
 
-def test_all_false_closures_together_are_the_product_of_all() -> None:
-    """However many there are: the product of 3000 densities is below the least number."""
-    density, mixed = _drawn_density(3000)
-    np.testing.assert_allclose(density.log_sums(), np.log(mixed).sum(axis=1), rtol=1e-9)
+@pytest.mark.parametrize("count", [30, 3000])
+def test_all_false_closures_together_are_the_product_of_all(count: int) -> None:
+    """However many there are: the product of 3000 densities is below the least number, and that of 400 of a run is."""
+    density, mixed = _drawn_density(count)
+    run = np.where(np.arange(count) % 7 == 0, 0, density.run)
+    of_each = np.log(mixed)
+    of_run = np.stack([of_each[..., run == number].sum(axis=-1) for number in np.unique(run)])
+    own = (logsumexp(of_run, axis=1) - np.log(len(mixed))).sum(axis=0)
+    expected = np.concatenate((of_each.sum(axis=-1).ravel(), own))
+    np.testing.assert_allclose(replace(density, run=run).log_sums(), expected, rtol=1e-9)
+
+
+def test_runs_that_repeat_one_turn_are_cheap_though_others_repeat_none() -> None:
+    """Twenty false closures of one run by any turn, six of another one by one turn."""
+    ends = np.concatenate((np.arange(20), 60 + np.arange(6))), np.concatenate((40 + np.arange(20), 130 + np.arange(6)))
+    steps = np.arange(140)
+    graph = ViewGraph.create(
+        np.concatenate((steps, ends[1])),
+        np.concatenate((steps + 1, ends[0])),
+        _yaw(np.zeros(140 + 26)),
+        kind=[0] * 140 + [1] * 26,
+    )
+    cost = {}
+    for without in ((), ("own-repeats",)):
+        problem = _problem(graph, SlamPriors(), without=without)
+        is_scattered = problem.ends[:, 1] < 100
+        turn = np.where(is_scattered, np.random.default_rng(0).uniform(-np.pi, np.pi, 26), 3.0)
+        residual = np.stack((np.zeros(26), np.zeros(26), turn), axis=1)
+        for name, is_false in (("both", np.ones(26, dtype=bool)), ("scattered", is_scattered)):
+            rows = np.flatnonzero(is_false)
+            density = false_density(problem, is_false, residual, np.zeros(26), rows)
+            cost[name, without] = -log_false_set(problem, density)
+    repeating = [cost["both", without] - cost["scattered", without] for without in ((), ("own-repeats",))]
+    assert repeating[0] < repeating[1] - 2.0
 
 
 def _repeated(problem: Problem) -> FalseDensity:

@@ -269,9 +269,10 @@ STRUCTURAL = {
         "_SMALL",
         "_LARGE",
         "_ABOUT_VERTICAL",
+        "_OWN_SHARES",
         "_NEAR_MISS_QUANTILES",
     }
-    | {"_LOG_FIRST", "_LOG_FOLLOWS", "_LOG_STEPS"},
+    | {"_LOG_FIRST", "_LOG_FOLLOWS", "_LOG_STEPS", "_OF_RUN", "_BEFORE"},
     "left_out": {"CERTAIN"},
     "modes": {"_FAR", "_FAR_NOISE", "LIKELY", "FAR_TURN", "FAR_SLIP", "_SURELY_FALSE", "_ROUNDS"},
     "moves/flips": {"_PART", "_DECIDED", "_HOPE", "_LEAST_GAIN"},
