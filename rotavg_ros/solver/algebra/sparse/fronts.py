@@ -66,6 +66,16 @@ def gather(shape: Shape, f: int, room: Room, own: np.ndarray, left: np.ndarray, 
 
 
 @compiled
+def _diagonal(shape: Shape, f: int, entries: np.ndarray, width: int) -> np.ndarray:
+    """``(p,)`` what the matrix itself has on a front's diagonal."""
+    diagonal = np.zeros(shape.begin[f + 1] - shape.begin[f])
+    for e in range(shape.entry_begin[f], shape.entry_begin[f + 1]):
+        if shape.entry[e] % (width + 1) == 0:
+            diagonal[shape.entry[e] // (width + 1)] = entries[e]
+    return diagonal
+
+
+@compiled
 def _take(to: np.ndarray, of: np.ndarray, row: int, first: int, last: int) -> None:
     """From ``to``, the end of a line, what pivots ``first`` … ``last`` of ``of`` take at ``row``."""
     end = of.shape[1]
@@ -97,15 +107,15 @@ def eliminate(shape: Shape, first: int, last: int, room: Room, top: int) -> int:
         own = room.store[shape.store[f] : shape.store[f] + num_pivots * width].reshape(num_pivots, width)
         left = room.work[: num_rows * num_rows].reshape(num_rows, num_rows)
         top = gather(shape, f, room, own, left, top)
+        scale = _diagonal(shape, f, room.entries, width)
         for begin in range(0, num_pivots, 4):
             end = min(begin + 4, num_pivots)
             for k in range(begin, end):
-                before = own[k, k]
                 _take(own[k, k:], own, k, begin, k)
-                pivot = own[k, k]
-                if not before > 0.0:
+                pivot = max(own[k, k], _ROUNDING * scale[k])
+                if not pivot > 0.0:
                     return -1
-                root = np.sqrt(max(pivot, _ROUNDING * before))
+                root = np.sqrt(pivot)
                 own[k, k] = root
                 for i in range(k + 1, width):
                     own[k, i] /= root
