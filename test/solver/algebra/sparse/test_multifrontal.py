@@ -163,6 +163,23 @@ def test_a_front_that_rounding_leaves_no_pivot_is_lifted() -> None:
     assert np.isfinite(_solved(elimination, matrix, np.ones((3, 1, 1)))).all()
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e-9, 1e12])
+def test_a_large_part_that_nothing_holds_is_lifted_as_well(scale: float) -> None:
+    """What earlier pivots leave of the last one may be less than nothing."""
+    blocks = 23
+    first, second = np.triu_indices(blocks, 1)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        weight = scale * np.exp(5 * rng.normal(size=len(first)))
+        matrix = np.zeros((blocks, blocks))
+        np.add.at(matrix, (first, second), -weight)
+        matrix += matrix.T
+        matrix -= np.diag(matrix.sum(axis=1))
+        elimination = Elimination(first, second, blocks, 1)
+        solved = _solved(elimination, matrix.reshape(blocks, 1, blocks, 1), np.ones((blocks, 1, 1)))
+        assert np.isfinite(solved).all()
+
+
 @pytest.mark.parametrize("value", [-1.0, np.nan])
 def test_what_is_not_positive_definite_is_refused(value: float) -> None:
     elimination = Elimination(np.array([0]), np.array([1]), 2, 1)
