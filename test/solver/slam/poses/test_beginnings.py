@@ -7,15 +7,8 @@ from pathlib import Path
 import pytest
 
 from rotavg_ros import solve
-from rotavg_ros.evaluation.common.cases import Case
 from rotavg_ros.evaluation.common.scoring import orientation_errors
 from rotavg_ros.evaluation.slam import cases
-
-
-def mean_deg(case: Case) -> float:
-    solution = solve(case.graph)
-    errors = orientation_errors(solution.body_from_world, case.truth, case.graph.components())
-    return float(errors[errors.isfinite()].rad2deg().mean())
 
 
 # The longest is right by rotations alone.
@@ -25,4 +18,9 @@ def test_no_slip_is_invented_for_corridors_seen_from_behind(shared_data: Path, b
     kind = next(kind for kind in cases.kinds(shared_data, ["B25b_0.000"], []) if kind.name == beginning)
     case = kind.draw(0)
     assert case is not None
-    assert mean_deg(case) < 2.5
+    solution = solve(case.graph)
+    assert solution.rotation_score is not None
+    assert not (solution.rotation_score[case.graph.is_odometry] > 0.5).any()
+    errors = orientation_errors(solution.body_from_world, case.truth, case.graph.components())
+    # Such a slip turns all beyond it by 80 degrees. After 40 % eight closures of 111 are right: 3.5 degrees.
+    assert errors[errors.isfinite()].rad2deg().mean() < (4.0 if beginning == "first 40 %" else 2.5)
