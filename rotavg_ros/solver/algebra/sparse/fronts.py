@@ -35,6 +35,15 @@ class Room(NamedTuple):
 
 
 @compiled
+def _own(shape: Shape, f: int, store: np.ndarray) -> np.ndarray:
+    """``(p, p + r)`` where a front's pivots are kept, against these and its rows."""
+    num_pivots = shape.begin[f + 1] - shape.begin[f]
+    width = num_pivots + shape.row_begin[f + 1] - shape.row_begin[f]
+    kept: np.ndarray = store[shape.store[f] : shape.store[f] + num_pivots * width].reshape(num_pivots, width)
+    return kept
+
+
+@compiled
 def gather(shape: Shape, f: int, room: Room, own: np.ndarray, left: np.ndarray, top: int) -> int:
     """A front's matrix: its own numbers ``own`` ``(p, p + r)`` and what those below leave, also to ``left`` ``(r, r)``.
 
@@ -101,10 +110,9 @@ def eliminate(shape: Shape, first: int, last: int, room: Room, top: int) -> int:
         How many numbers wait on the stack; -1: the matrix is not positive definite.
     """
     for f in range(first, last):
-        num_pivots = shape.begin[f + 1] - shape.begin[f]
-        num_rows = shape.row_begin[f + 1] - shape.row_begin[f]
-        width = num_pivots + num_rows
-        own = room.store[shape.store[f] : shape.store[f] + num_pivots * width].reshape(num_pivots, width)
+        own = _own(shape, f, room.store)
+        num_pivots, width = own.shape
+        num_rows = width - num_pivots
         left = room.work[: num_rows * num_rows].reshape(num_rows, num_rows)
         top = gather(shape, f, room, own, left, top)
         scale = _diagonal(shape, f, room.entries, width)
@@ -133,10 +141,9 @@ def solve_lower(shape: Shape, first: int, last: int, store: np.ndarray, columns:
     """U⁻ᵀ of columns ``(N, n)``, in place, as far as fronts ``first`` … ``last`` go, the last not included."""
     num_columns = columns.shape[1]
     for f in range(first, last):
-        start = shape.begin[f]
-        num_pivots, row = shape.begin[f + 1] - start, shape.row[shape.row_begin[f] : shape.row_begin[f + 1]]
-        width = num_pivots + len(row)
-        own = store[shape.store[f] : shape.store[f] + num_pivots * width].reshape(num_pivots, width)
+        start, row = shape.begin[f], shape.row[shape.row_begin[f] : shape.row_begin[f + 1]]
+        own = _own(shape, f, store)
+        num_pivots, width = own.shape
         value = np.empty(width)
         for c in range(num_columns):
             asked = 0
@@ -163,10 +170,9 @@ def solve_upper(shape: Shape, first: int, last: int, store: np.ndarray, columns:
     """U⁻¹ of columns ``(N, n)``, in place, as far as fronts ``last`` - 1 … ``first`` go."""
     num_columns = columns.shape[1]
     for f in range(last - 1, first - 1, -1):
-        start = shape.begin[f]
-        num_pivots, row = shape.begin[f + 1] - start, shape.row[shape.row_begin[f] : shape.row_begin[f + 1]]
-        width = num_pivots + len(row)
-        own = store[shape.store[f] : shape.store[f] + num_pivots * width].reshape(num_pivots, width)
+        start, row = shape.begin[f], shape.row[shape.row_begin[f] : shape.row_begin[f + 1]]
+        own = _own(shape, f, store)
+        num_pivots, width = own.shape
         value = np.empty(width)
         for c in range(num_columns):
             for i in range(len(row)):
@@ -199,10 +205,9 @@ def invert(shape: Shape, first: int, last: int, room: Room, top: int) -> int:
         How many numbers wait on the stack.
     """
     for f in range(last - 1, first - 1, -1):
-        num_pivots = shape.begin[f + 1] - shape.begin[f]
-        num_rows = shape.row_begin[f + 1] - shape.row_begin[f]
-        width = num_pivots + num_rows
-        own = room.store[shape.store[f] : shape.store[f] + num_pivots * width].reshape(num_pivots, width)
+        own = _own(shape, f, room.store)
+        num_pivots, width = own.shape
+        num_rows = width - num_pivots
         found = room.work[: width * width].reshape(width, width)
         top -= num_rows * num_rows
         for i in range(num_rows):

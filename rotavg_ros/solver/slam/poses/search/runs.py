@@ -12,12 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rotavg_ros.solver.running.work import rest, stop_if_abandoned
 from rotavg_ros.solver.slam.poses.estimate import PoseMode
 from rotavg_ros.solver.slam.poses.places import Judge
 from rotavg_ros.solver.slam.poses.repeats.neighbours import log_all_right
 
-# So many runs are looked at, those first that are off by the fewest standard deviations; of so many closures at least.
-_LOOKED_AT, _LEAST_MEMBERS = 32, 2
+# So many runs are looked at, those first that are off by the fewest standard deviations; of so many closures at least,
+# and so many of longer ones: what these come to tells the others.
+_LOOKED_AT, _LEAST_MEMBERS, _MOST_MEMBERS = 32, 2, 96
 _WRONG = 0.5
 
 
@@ -44,11 +46,11 @@ def _nearest(pose: PoseMode, could: np.ndarray) -> list[np.ndarray]:
     total = spread + np.repeat(own, [k, spread.shape[1] - k], axis=1)
     variance = np.stack([np.bincount(told.run, could * column) for column in total.T], axis=1)
     # Means of all members, of which each knows about the same.
-    square = (off**2 / np.maximum(count * 1.0, 1.0)[:, None] / np.maximum(variance, np.finfo(np.float64).tiny)).sum(
-        axis=1
-    )
+    variance *= np.maximum(count, 1.0)[:, None]
+    square = (off**2 / np.maximum(variance, np.finfo(np.float64).tiny)).sum(axis=1)
     order = np.argsort(np.where(count >= _LEAST_MEMBERS, square, np.inf), kind="stable")[:_LOOKED_AT]
-    return [np.flatnonzero(could & (told.run == run)) for run in order if count[run] >= _LEAST_MEMBERS]
+    members = [np.flatnonzero(could & (told.run == run)) for run in order if count[run] >= _LEAST_MEMBERS]
+    return [each[:_MOST_MEMBERS] for each in members]
 
 
 @dataclass(frozen=True)
@@ -72,10 +74,12 @@ class _Run:
             members: ``(n,)`` closures.
             held: ``(n,)`` nats, of each as it is held to be.
         """
+        stop_if_abandoned()
+        rest()
         d = pose.problem.turns + pose.problem.shifts
         total, off = _discrepancies(pose, members)
+        precision = np.linalg.inv(total)
         while len(members) >= _LEAST_MEMBERS:
-            precision = np.linalg.inv(total)
             pulled = (precision @ off).reshape(-1, d)
             each = np.arange(len(members))
             own = precision.reshape(len(members), d, len(members), d)[each, :, each]
@@ -88,8 +92,11 @@ class _Run:
                 problem, places = pose.problem, pose.solved.places
                 log_right = log_all_right(places.chance, problem.told, problem.priors, len(members))
                 return cls(members, float(log_density / 2 - held.sum()) + log_right)
+            # The inverse of what is left of the covariance, by that of all.
             stays = np.repeat(each != least, d)
-            total, off = total[np.ix_(stays, stays)], off[stays]
+            across = precision[np.ix_(stays, ~stays)]
+            precision = precision[np.ix_(stays, stays)] - across @ np.linalg.solve(own[least], across.T)
+            off = off[stays]
             members, held = np.delete(members, least), np.delete(held, least)
         return None
 
