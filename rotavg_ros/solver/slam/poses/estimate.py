@@ -18,7 +18,7 @@ from rotavg_ros.solver.slam.poses.block_system import BlockFactor
 from rotavg_ros.solver.slam.poses.closures import ANYHOW, Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.evidence import translation_cost
 from rotavg_ros.solver.slam.poses.noise import likeliest_noise, log_noise_prior
-from rotavg_ros.solver.slam.poses.places import Judge
+from rotavg_ros.solver.slam.poses.places.judge import Judge
 from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
 from rotavg_ros.solver.slam.poses.rows import PoseNoise, PoseProblem, PoseState
 from rotavg_ros.solver.slam.poses.solved import Solved

@@ -29,11 +29,12 @@ class PlacePriors:
         from_behind: share of places that look alike that do so from the other side, half a turn off.
         turned_in_place: share of false rotations at the right place: symmetric rooms, registrations that flip.
         elsewhere: share of wrong places that are off as others far from them are, by the same turn of the map or the
-            same shift, where there are such.
+            same shift, where there are such: a priori that many of as many as are counted beforehand.
         wrong_place: closures of a plausible rotation that join wrong places: a priori that many in as many as are
             counted beforehand, …
-        counted: … in all; what all tell counts for one closure within a run.
-        repeats: share of wrong places that repeat the one of the closure before or after, where there is one.
+        counted: … in all, as for the shares of those that repeat others; what all tell counts for one closure within
+            a run.
+        repeats: share of wrong places that repeat the one of the closure before or after, where there is one: likewise.
         least_wrong: a wrong place is off by so many standard deviations of a good closure at least, and by the map's
             extent at most; all scales between are as likely.
     """

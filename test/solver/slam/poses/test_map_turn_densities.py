@@ -60,23 +60,23 @@ def test_each_counts_all_that_are_turned_like_those_near_it(planar: bool, in_ord
 
     def densities(
         one: int, turned: np.ndarray, off: np.ndarray, of_turn: float, of_shift: float
-    ) -> tuple[float, float]:
+    ) -> tuple[float, np.ndarray]:
         total = covariance[one] + np.diag(np.repeat([of_turn, of_shift], [k, m]))
         inverse = np.linalg.inv(total[:k, :k])
         mean, left = total[k:, :k] @ inverse @ turned, total[k:, k:] - total[k:, :k] @ inverse @ total[:k, k:]
         widths = [multivariate_normal(mean, width * left).pdf(off) for width in (1.0, 16.0)]
-        return float(turned @ inverse @ turned), float(np.mean(widths))
+        return float(turned @ inverse @ turned), np.array(widths)
 
     alike = np.zeros((COUNT, COUNT))
     for one in tells:
         alike[one, one] = chance[one]
         for other in near(one, before_alone=False):
             if (found := difference(one, other)) is not None:
-                same = densities(one, *found)[1]
+                same = densities(one, *found)[1].mean()
                 alike[one, other] = chance[other] * same / (same + np.exp(log_alone[one]))
     for one in range(COUNT):
         listed = {other: found for other in near(one, in_order) if (found := difference(one, other)) is not None}
-        weights, total = [], 0.0
+        weights, total = [], np.zeros(2)
         for other in listed:
             weight = np.array([alike[other, third] / listed[third][3] for third in listed])
             turned, off = (sum(w * found[n] for w, found in zip(weight, listed.values(), strict=True)) for n in (0, 1))
@@ -88,4 +88,4 @@ def test_each_counts_all_that_are_turned_like_those_near_it(planar: bool, in_ord
             weights.append(chance[other] * np.exp(-square / 2))
             total += weights[-1] * same
         assert surely[one] == pytest.approx(min(sum(weights), 1.0), rel=1e-4)
-        assert density[one] == pytest.approx(total / max(sum(weights), 1.0), rel=1e-4, abs=1e-12)
+        np.testing.assert_allclose(density[one], total / max(sum(weights), 1.0), rtol=1e-4, atol=1e-12)

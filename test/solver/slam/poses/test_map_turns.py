@@ -66,7 +66,9 @@ def repeats(pose: PoseMode, *, in_order: bool = False) -> tuple[np.ndarray, np.n
     solved, problem = pose.solved, pose.problem
     false = problem.mode.is_false & (np.linalg.norm(solved.maps.shift, axis=1) > _ELSEWHERE_M)
     alone = np.full(len(false), -np.log(2 * np.pi * solved.scale.extent))
-    return solved.maps.repeats(false.astype(np.float64), alone, problem.told, in_order=in_order)
+    anybody = np.ones(len(false), dtype=bool)
+    chance, by_width = solved.maps.repeats(false.astype(np.float64), alone, problem.told, anybody, in_order=in_order)
+    return chance, by_width.mean(axis=1)
 
 
 def test_those_turned_about_the_middle_of_the_map_tell_of_each_other(case_and_pose: tuple[Case, PoseMode]) -> None:
@@ -122,12 +124,19 @@ def test_density_is_one_over_all_places(case_and_pose: tuple[Case, PoseMode]) ->
         detection=np.concatenate((told.detection, np.arange(count, count + draws))),
         detected=np.concatenate((told.detected, np.arange(count, count + draws))),
     )
+    anybody = np.ones(count + draws, dtype=bool)
     chance, density = many.repeats(
-        np.concatenate((false, np.zeros(draws))), np.concatenate((alone, np.zeros(draws))), told, in_order=False
+        np.concatenate((false, np.zeros(draws))),
+        np.concatenate((alone, np.zeros(draws))),
+        told,
+        anybody,
+        in_order=False,
     )
-    total = density[count:].mean() * (2 * reach) ** axes.shape[1]
     assert chance[-1] > 0.5
-    assert total == pytest.approx(chance[-1], rel=0.15)
+    # Of the broader kernels many draws tell, of the narrower ones some do in space.
+    total = density[count:].mean(axis=0) * (2 * reach) ** axes.shape[1]
+    assert total[-1] == pytest.approx(chance[-1], rel=0.1)
+    assert total.mean() == pytest.approx(chance[-1], rel=0.15)
 
 
 def test_whichever_end_a_closure_is_written_from(case_and_pose: tuple[Case, PoseMode]) -> None:

@@ -10,7 +10,7 @@ import torch
 
 from rotavg_ros import ViewGraph, solve
 from rotavg_ros.solver.slam.poses.closures import Scale
-from rotavg_ros.solver.slam.poses.places import Judge
+from rotavg_ros.solver.slam.poses.places.judge import Judge
 from rotavg_ros.solver.slam.poses.repeats.neighbours import wrong_share
 
 from .test_poses import errors, graph_of, pose_mode, simulated

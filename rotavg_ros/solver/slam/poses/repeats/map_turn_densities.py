@@ -2,7 +2,7 @@
 
 Of two closures that are turned alike, one's turn and shift differ from what the other's turn of the map would have by
 something of which the variance is known (the lever of the other's turn included). The density of such a difference is a
-normal one of turns, and a mean of two widths of shifts given the turn.
+normal one of turns, and one of a few widths of shifts given the turn.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ import numpy as np
 from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.slam.noise.repeats import Near
 
-# Squared width, besides one, of what two differ by, in its variance, which is known only about.
+# Squared widths of what two differ by, in its variance, which is known only about: each so many times the one before.
 _BROADER = 16.0
+# So many of closures anywhere, and of those that follow each other.
+WIDTHS, WIDTHS_AFTER = 2, 3
 # Turns alike up to so many standard deviations.
 _FARTHEST = 4.0
 # What is less likely the same turn than this adds nothing.
@@ -51,7 +53,7 @@ def closure_rows(turn: np.ndarray, shift: np.ndarray, place: np.ndarray, covaria
 def repeated_density(
     turned: np.ndarray, axes: Axes, chance: np.ndarray, log_alone: np.ndarray, among: Near, of_all: Near
 ) -> tuple[np.ndarray, np.ndarray]:
-    """``(C,)`` how surely others are turned alike, and the density of each shift by these.
+    """``(C,)`` how surely others are turned alike, and ``(C, W)`` the density of each shift by these, of each width.
 
     Each of those others stands for all that seem to be off by the turn by which it is, weighed by precision.
 
@@ -61,7 +63,7 @@ def repeated_density(
         chance: ``(C,)`` that each joins places that are turned and wrong.
         log_alone: ``(C,)`` nats, density of its shift if no other has to do with it.
         among: closures that tell of others, with each other.
-        of_all: all closures, with these.
+        of_all: those that are asked for, with these.
     """
     count, k = len(chance), axes.turns.shape[1]
     size = k + axes.shifts.shape[1]
@@ -72,7 +74,7 @@ def repeated_density(
     # Of each that tells, which are off by the same turn, and how likely they are so.
     number = np.ones(len(tells), np.int64)
     alike, how = np.empty((len(tells), most), np.int64), np.empty((len(tells), most))
-    difference, root = np.empty(size), np.empty((size + 1, size))
+    difference, root, same = np.empty(size), np.empty((size + 1, size)), np.empty(WIDTHS)
     for t in range(len(tells)):
         row = tells[t]
         alike[t, 0], how[t, 0] = row, chance[row]
@@ -82,21 +84,21 @@ def repeated_density(
                 of_turn, of_shift = _difference(turned, axes, row, other, difference)
                 if of_turn < 0:
                     continue
-                _, same = _densities(turned, row, difference, (of_turn, of_shift), k, root)
-                likely = same / max(same + math.exp(log_alone[row]), _LEAST)
+                _densities(turned, row, difference, (of_turn, of_shift, k), root, same)
+                likely = same.mean() / max(same.mean() + math.exp(log_alone[row]), _LEAST)
                 if likely > _NEGLIGIBLE:
                     alike[t, number[t]], how[t, number[t]] = other, likely * chance[other]
                     number[t] += 1
-    surely, density = np.zeros(count), np.zeros(count)
+    surely, density = np.zeros(count), np.zeros((count, WIDTHS))
     most = 1
-    for c in range(count):
-        most = max(most, nearby[c, 1] - nearby[c, 0] + nearby[c, 3] - nearby[c, 2])
+    for n in range(len(of_all.rows)):
+        most = max(most, nearby[n, 1] - nearby[n, 0] + nearby[n, 3] - nearby[n, 2])
     listed, apart, variance = np.empty(most, np.int64), np.empty((most, size)), np.empty((most, 2))
     slot = np.full(count, -1, np.int64)
-    for c in range(count):
-        found = 0
+    for asked in range(len(of_all.rows)):
+        c, found = of_all.rows[asked], 0
         for side in range(2):
-            for place in range(nearby[c, 2 * side], nearby[c, 2 * side + 1]):
+            for place in range(nearby[asked, 2 * side], nearby[asked, 2 * side + 1]):
                 of_turn, of_shift = _difference(turned, axes, c, tells[place], difference)
                 if of_turn >= 0:
                     listed[found], slot[tells[place]] = place, found
@@ -118,7 +120,7 @@ def repeated_density(
                         difference[d] += weight * apart[at, d]
             for d in range(size):
                 difference[d] /= total
-            square, same = _densities(turned, c, difference, (of_turn / total**2, 1 / total), k, root)
+            square = _densities(turned, c, difference, (of_turn / total**2, 1 / total, k), root, same)
             weight = chance[tells[t]] * math.exp(-square / 2)
             surely[c] += weight
             density[c] += weight * same
@@ -127,6 +129,28 @@ def repeated_density(
         density[c] /= max(surely[c], 1.0)
         surely[c] = min(surely[c], 1.0)
     return surely, density
+
+
+@compiled
+def repeated_after(turned: np.ndarray, axes: Axes, later: np.ndarray, earlier: np.ndarray) -> np.ndarray:
+    """``(2, P, W)`` densities of shifts: of the later of two by the turn of the earlier one, and the other way round.
+
+    Args:
+        turned: closures as :func:`closure_rows`, with the variances of what two near each other do not share.
+        axes: of turns and shifts.
+        later, earlier: ``(P,)`` closures.
+    """
+    k = axes.turns.shape[1]
+    size = k + axes.shifts.shape[1]
+    density = np.zeros((2, len(later), WIDTHS_AFTER))
+    difference, root = np.empty(size), np.empty((size + 1, size))
+    for pair in range(len(later)):
+        for end in range(2):
+            row, other = (later[pair], earlier[pair]) if end == 0 else (earlier[pair], later[pair])
+            of_turn, of_shift = _difference(turned, axes, row, other, difference)
+            if of_turn >= 0:
+                _densities(turned, row, difference, (of_turn, of_shift, k), root, density[end, pair])
+    return density
 
 
 @compiled
@@ -156,6 +180,9 @@ def _difference(turned: np.ndarray, axes: Axes, row: int, other: int, difference
     y = -a3 * b1 + a1 * b3 - a2 * b0 + a0 * b2
     z = -a3 * b2 + a2 * b3 - a0 * b1 + a1 * b0
     w = a3 * b3 + a0 * b0 + a1 * b1 + a2 * b2
+    # cos a ≥ 1 − a²/2: whoever is turned otherwise by far is told without a sine.
+    if abs(w) < 1 - _FARTHEST**2 * (own + of_turn) / 8:
+        return -1.0, -1.0
     sine = math.sqrt(max(x * x + y * y + z * z, _TINY))
     angle = 2 * math.atan2(sine, abs(w))
     if not angle**2 < _FARTHEST**2 * (own + of_turn):
@@ -192,17 +219,23 @@ def _difference(turned: np.ndarray, axes: Axes, row: int, other: int, difference
 
 @compiled
 def _densities(
-    turned: np.ndarray, row: int, difference: np.ndarray, variance: tuple[float, float], k: int, root: np.ndarray
-) -> tuple[float, float]:
-    """Squares of what turns differ by, in standard deviations; and the density of what shifts differ by, given that.
+    turned: np.ndarray,
+    row: int,
+    difference: np.ndarray,
+    said: tuple[float, float, int],
+    root: np.ndarray,
+    same: np.ndarray,
+) -> float:
+    """Squares of what turns differ by, in standard deviations; and densities of what shifts differ by, given that.
 
     Args:
         turned, row: one of the closures.
         difference: ``(k + m,)`` to what another says.
-        variance: rad² and m² per component, of what another says.
-        k: components of turns.
+        said: rad² and m² per component, of what another says; k.
         root: ``(k + m + 1, k + m)`` room for Cholesky's factor, and what is left of the difference.
+        same: ``(W,)`` densities, to be filled, the narrower one first.
     """
+    of_turn, of_shift, k = said
     size = len(difference)
     m = size - k
     square, squares, volume = 0.0, 0.0, (2 * math.pi) ** (m / 2)
@@ -214,7 +247,7 @@ def _densities(
                 entry -= root[i, n] * root[j, n]
             root[i, j] = entry / root[j, j]
             value -= root[i, j] * root[size, j]
-        pivot = turned[row, _COVARIANCE + i * size + i] + (variance[0] if i < k else variance[1])
+        pivot = turned[row, _COVARIANCE + i * size + i] + (of_turn if i < k else of_shift)
         for n in range(i):
             pivot -= root[i, n] * root[i, n]
         root[i, i] = math.sqrt(pivot)
@@ -224,5 +257,8 @@ def _densities(
         else:
             squares += root[size, i] * root[size, i]
             volume *= root[i, i]
-    both = math.exp(-squares / 2) + math.exp(-squares / (2 * _BROADER)) / _BROADER ** (m / 2)
-    return square, both / (2 * volume)
+    for width in range(len(same)):
+        same[width] = math.exp(-squares / 2) / volume
+        squares /= _BROADER
+        volume *= _BROADER ** (m / 2)
+    return square

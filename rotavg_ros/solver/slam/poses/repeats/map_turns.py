@@ -12,7 +12,7 @@ import numpy as np
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.poses.closures import Predictions, Told
-from rotavg_ros.solver.slam.poses.repeats.map_turn_densities import Axes, closure_rows, repeated_density
+from rotavg_ros.solver.slam.poses.repeats.map_turn_densities import Axes, closure_rows, repeated_after, repeated_density
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 
 # Whoever is elsewhere with less than this chance tells nobody anything.
@@ -28,6 +28,7 @@ class MapTurns:
         shift: ``(C, 3)`` metres, by what the turned map has the newer end elsewhere, …
         place: ``(C, 3)`` … from where it is.
         covariance: ``(C, k + m, k + m)`` of turns and shifts, the closures' own noise included.
+        own: ``(C, k + m, k + m)`` of that noise alone.
         bases: ``(3, k)`` axes of turns and ``(3, m)`` of shifts.
     """
 
@@ -35,6 +36,7 @@ class MapTurns:
     shift: np.ndarray
     place: np.ndarray
     covariance: np.ndarray
+    own: np.ndarray
     bases: tuple[np.ndarray, np.ndarray]
 
     @classmethod
@@ -67,27 +69,31 @@ class MapTurns:
         change[is_back, k:, :k] = -(shifts.T @ _crossed(seen) @ back @ turns)[is_back]
         change[is_back, k:, k:] = -(shifts.T @ back @ shifts)[is_back]
         own = np.repeat(np.stack((problem.told.rotation_variance, closure_variance), axis=1), (k, m), axis=1)
-        covariance = predictions.covariance + own[:, :, None] * np.eye(k + m)
+        noise = own[:, :, None] * np.eye(k + m)
+        back_turned = change.transpose(0, 2, 1)
         return cls(
             np.where(is_forward, forward, inverse),
             np.where(is_forward[:, None], shift, seen + target - source),
             np.where(is_forward[:, None], target, source),
-            change @ covariance @ change.transpose(0, 2, 1),
+            change @ (predictions.covariance + noise) @ back_turned,
+            change @ noise @ back_turned,
             problem.bases,
         )
 
     def repeats(
-        self, elsewhere: np.ndarray, log_alone: np.ndarray, told: Told, *, in_order: bool
+        self, elsewhere: np.ndarray, log_alone: np.ndarray, told: Told, asked: np.ndarray, *, in_order: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """``(C,)`` each: how surely there is one that is turned alike, up to 1; and the density of the shift by these.
+        """``(C,)`` how surely there is one that is turned alike, up to 1; ``(C, W)`` densities of shifts by these.
 
-        The density is of shifts given the turn, which is counted with the rotations. It is a kernel estimate over other
-        closures, each of which stands for all that seem to be off by the turn by which it is (weighed by precision).
+        Densities are of shifts given the turn, which is counted with the rotations, and of so many widths. They are
+        kernel estimates over other closures, each of which stands for all that seem to be off by the turn by which it
+        is (weighed by precision).
 
         Args:
             elsewhere: ``(C,)`` chance that each joins places that are turned and wrong.
             log_alone: ``(C,)`` nats, density of its shift if no other has to do with it.
             told: whose translations are known, and the order of detection.
+            asked: ``(C,)`` bool, of which: zeros of the others.
             in_order: given those before alone.
         """
         chance = elsewhere * told.is_known
@@ -95,11 +101,24 @@ class MapTurns:
         rest()
         among, of_all = (
             told.detected_near(rows, tells, in_order=alone)
-            for rows, alone in ((tells, False), (np.arange(len(chance)), in_order))
+            for rows, alone in ((tells, False), (np.flatnonzero(asked), in_order))
         )
         turned = closure_rows(self.turn, self.shift, self.place, self.covariance)
-        axes = Axes(*(np.ascontiguousarray(basis) for basis in self.bases))
-        return repeated_density(turned, axes, chance, log_alone, among, of_all)
+        return repeated_density(turned, self._axes, chance, log_alone, among, of_all)
+
+    def repeats_after(self, later: np.ndarray, earlier: np.ndarray) -> np.ndarray:
+        """``(2, P, W)`` densities of shifts given turns: of the later of two by the earlier one, and the other way.
+
+        What all else says of two that follow each other is off by about the same, and does not count.
+
+        Args:
+            later, earlier: ``(P,)`` closures.
+        """
+        return repeated_after(closure_rows(self.turn, self.shift, self.place, self.own), self._axes, later, earlier)
+
+    @property
+    def _axes(self) -> Axes:
+        return Axes(*(np.ascontiguousarray(basis) for basis in self.bases))
 
 
 def _rotated(turn: np.ndarray, vector: np.ndarray) -> np.ndarray:

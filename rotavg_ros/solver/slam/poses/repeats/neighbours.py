@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from rotavg_ros.solver.algebra.compiled import compiled
-from rotavg_ros.solver.slam.noise.repeats import Near
 from rotavg_ros.solver.slam.poses.closures import GOOD, Told
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
+from rotavg_ros.solver.slam.poses.repeats.exactness import (
+    WIDTHS,
+    Chains,
+    Errors,
+    InTurn,
+    kernels_along,
+    repeated_anywhere,
+    shared_ways,
+)
+from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
 
-# Squared widths of what repeats differ by, in those of two good closures: so many, each a sixteenth of the one before.
-_BROADEST, _WIDTHS = 256.0, 3
 # No share is less than this, or nearer to one; whoever is wrong with less than this chance tells nobody anything.
 _SHARE = _LEAST_CHANCE = 0.01
 
@@ -23,50 +30,32 @@ class Repeats:
     """Of C closures, what others say of the wrong places that each may join.
 
     Attributes:
-        chance: ``(C,)`` that one before or after joins wrong places.
-        alike: ``(C,)`` density of each one's turn and shift if it joins the places of such a one, seen nearly at the
-            right angle, …
-        turned: … and of its shift, given the turn, where not; each times the chances of these.
+        has_alike: ``(C,)`` how surely one before or after joins wrong places, seen nearly at the right angle, …
+        alike: ``(C,)`` … and density of each one's turn and shift if it joins those; times the chances of these.
+        has_turned: ``(C,)`` how surely one before or after joins wrong places by a false rotation, …
+        turned: ``(C, W)`` … and densities of its shift, given the turn, if it joins those; times the chances of these.
         has_elsewhere: ``(C,)`` how surely there is one anywhere that joins wrong places at nearly the right angle; …
-        elsewhere: ``(C,)`` … and the density of turn and shift by these.
+        elsewhere: ``(C, W)`` … and densities of turn and shift by these, times that.
+        number: ``(C,)`` how many of all, it included, are off by about the same.
     """
 
-    chance: np.ndarray
+    has_alike: np.ndarray
     alike: np.ndarray
+    has_turned: np.ndarray
     turned: np.ndarray
     has_elsewhere: np.ndarray
     elsewhere: np.ndarray
+    number: np.ndarray
+
+    @property
+    def has_any(self) -> np.ndarray:
+        """``(C,)`` how surely one before or after joins wrong places."""
+        return np.asarray(self.has_alike + self.has_turned)
 
 
-@dataclass(frozen=True)
-class Errors:
-    """By what C closures are off from what all else says, from their older to their newer ends.
-
-    Attributes:
-        turn, shift: ``(C, k)`` rad and ``(C, m)`` metres.
-        turn_variance: ``(C,)`` rad² per component, of good ones.
-        shift_variance: m² per component, of a good one.
-        is_told: ``(C,)`` bool, whether all else says anything of it: if not, nobody knows by what it is off.
-    """
-
-    turn: np.ndarray
-    shift: np.ndarray
-    turn_variance: np.ndarray
-    shift_variance: float
-    is_told: np.ndarray
-
-    def turned_alike(self, rows: np.ndarray, others: np.ndarray, sign: int = 1) -> np.ndarray:
-        """``(P,)`` densities of turns, if they are ``sign`` times those of others."""
-        variance = self.turn_variance[rows] + self.turn_variance[others]
-        return _mean_kernels(self.turn[rows] - sign * self.turn[others], variance)
-
-    def shifted_alike(self, rows: np.ndarray, others: np.ndarray, sign: int = 1) -> np.ndarray:
-        """``(P,)`` densities of shifts, if they are ``sign`` times those of others."""
-        variance = np.full(len(rows), 2 * self.shift_variance)
-        return _mean_kernels(self.shift[rows] - sign * self.shift[others], variance)
-
-
-def repeats_of(errors: Errors, before: np.ndarray, told: Told, *, in_order: bool) -> Repeats:
+def repeats_of(
+    errors: Errors, maps: MapTurns, before: np.ndarray, told: Told, alone: np.ndarray, *, in_order: bool
+) -> Repeats:
     """By the closures that follow each other, if both join the same wrong places; and by all wrong ones.
 
     A front end goes on finding a wrong place once it has, and finds it again on the next lap, or from there the other
@@ -74,103 +63,90 @@ def repeats_of(errors: Errors, before: np.ndarray, told: Told, *, in_order: bool
 
     Args:
         errors: of all closures.
+        maps: by what turns of the map they are off.
         before: ``(J + 1, C)`` chances of classes.
         told: which follows which.
+        alone: ``(C,)`` density of turn and shift at a wrong place that is seen nearly at the right angle, if no other
+            has to do with it; zero where it is not: none elsewhere is looked for then.
         in_order: of those before alone.
     """
     can_tell = told.is_known & errors.is_told
-    later = np.flatnonzero((told.follows >= 0) & can_tell & can_tell[told.follows])
-    earlier = told.follows[later]
-    shifted = errors.shifted_alike(later, earlier)
-    count = len(told.follows)
-    ends = [(later, earlier)] if in_order else [(later, earlier), (earlier, later)]
-    neighbours = np.maximum(sum(np.bincount(end, minlength=count) for end, _ in ends), 1)
-
-    def mean_over(weight: np.ndarray, each: np.ndarray) -> np.ndarray:
-        return np.asarray(sum(np.bincount(end, each * weight[other], count) for end, other in ends) / neighbours)
-
     alike, turned = before[GOOD:-1].sum(axis=0), before[-1]
+    pairs = _Pairs.of(np.where(can_tell & can_tell[told.follows], told.follows, -1), in_order=in_order)
+    linked = np.zeros(len(alike))
+    linked[pairs.later] = before[-2, pairs.later] * alike[pairs.earlier]
+    in_turn = InTurn(told.detection, told.run, in_order)
+    kinds = (errors.turn, errors.turn_variance), (errors.shift, errors.shift_variance)
+    of_turns, of_shifts = (_Exactness.of(off, variance, pairs, linked, in_turn) for off, variance in kinds)
+    moved = [turn * shift for turn, shift in zip(of_turns.density, of_shifts.density, strict=True)]
+    tells = told.detection[(alike * can_tell)[told.detection] > _LEAST_CHANCE]
+    near = told.detected_near(np.flatnonzero(can_tell & (alone > 0)), tells, in_order=in_order)
+    density, total, number = repeated_anywhere(errors, alone, alike, near)
+    # Of false rotations: off by the same shift, or by the same turn of the map.
+    ways = np.concatenate((np.stack([of_shifts.by_last] * 2), maps.repeats_after(pairs.later, pairs.earlier)), axis=2)
+    certain = np.ones((2, len(pairs.later)))
     return Repeats(
-        mean_over(alike + turned, np.ones(len(later))),
-        mean_over(alike, errors.turned_alike(later, earlier) * shifted),
-        mean_over(turned, shifted),
-        *_elsewhere(errors, alike * can_tell, told, in_order=in_order),
+        pairs.mean_over(alike, certain),
+        pairs.mean_over(alike, moved),
+        pairs.mean_over(turned, certain),
+        np.stack([pairs.mean_over(turned, way) for way in np.moveaxis(ways, 2, 0)], axis=1),
+        np.minimum(total, 1.0),
+        density / np.maximum(total, 1.0)[:, None],
+        1 + number,
     )
 
 
-def _elsewhere(errors: Errors, wrong: np.ndarray, told: Told, *, in_order: bool) -> tuple[np.ndarray, np.ndarray]:
-    """``has_elsewhere`` and ``elsewhere`` of :class:`Repeats`, by the chances ``(C,)`` to join wrong places."""
-    tells = told.detection[wrong[told.detection] > _LEAST_CHANCE]
-    rows = np.flatnonzero(told.is_known & errors.is_told)
-    near = told.detected_near(rows, tells, in_order=in_order)
-    off = np.concatenate((errors.turn, errors.shift), axis=1)
-    variance = errors.turn_variance, errors.shift_variance
-    density, total = _moved_alike(off, errors.turn.shape[1], *variance, wrong, near)
-    return np.minimum(total, 1.0), density / np.maximum(total, 1.0)
+class _Pairs(NamedTuple):
+    """P pairs of closures of which one follows the other.
 
-
-@compiled
-def _moved_alike(
-    off: np.ndarray, turns: int, turn_variance: np.ndarray, shift_variance: float, wrong: np.ndarray, near: Near
-) -> tuple[np.ndarray, np.ndarray]:
-    """``(C,)`` densities of turns and shifts like those of others near, or their opposites; and how many these are.
-
-    A place that was mistaken for another one is so again, or from there the other one for it.
-
-    Args:
-        off: ``(C, k + m)`` turns and shifts.
-        turns: k.
-        turn_variance: ``(C,)`` rad² per component, of good closures' turns.
-        shift_variance: m² per component.
-        wrong: ``(C,)`` chances to join wrong places.
-        near: which to compare with which.
+    Attributes:
+        later, earlier: ``(P,)`` closures.
+        follows: ``(C,)`` the one before each, or -1.
+        ends: which of a pair is told of by which; only the later one if that is told by those before alone.
     """
-    rows, others, between = near
-    shifts = off.shape[1] - turns
-    density, total = np.zeros(len(wrong)), np.zeros(len(wrong))
-    for n in range(len(rows)):
-        row = rows[n]
-        for side in range(2):
-            for place in range(between[n, 2 * side], between[n, 2 * side + 1]):
-                other = others[place]
-                moved = 0.0
-                for sign in (1, -1):
-                    of_turn, of_shift = 0.0, 0.0
-                    for d in range(turns):
-                        of_turn += (off[row, d] - sign * off[other, d]) ** 2
-                    for d in range(turns, off.shape[1]):
-                        of_shift += (off[row, d] - sign * off[other, d]) ** 2
-                    shifted = _mean_kernel(of_shift, 2 * shift_variance, shifts)
-                    if shifted > 0:
-                        moved += shifted * _mean_kernel(of_turn, turn_variance[row] + turn_variance[other], turns)
-                density[row] += wrong[other] * moved / 2
-                total[row] += wrong[other]
-    return density, total
+
+    later: np.ndarray
+    earlier: np.ndarray
+    follows: np.ndarray
+    ends: tuple[tuple[np.ndarray, np.ndarray], ...]
+
+    @classmethod
+    def of(cls, follows: np.ndarray, *, in_order: bool) -> _Pairs:
+        later = np.flatnonzero(follows >= 0)
+        earlier = follows[later]
+        return cls(later, earlier, follows, ((later, earlier), (earlier, later))[: 1 if in_order else 2])
+
+    def mean_over(self, weight: np.ndarray, each: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
+        """``(C,)`` of values of pairs, one ``(P,)`` for each end, the mean over neighbours of these times weights."""
+        count = len(self.follows)
+        neighbours = sum(np.bincount(end, minlength=count) for end, _ in self.ends)
+        summed = (
+            np.bincount(end, of * weight[other], count) for of, (end, other) in zip(each, self.ends, strict=False)
+        )
+        return np.asarray(sum(summed) / np.maximum(neighbours, 1))
 
 
-@compiled
-def _mean_kernel(square: float, variance: float, components: int) -> float:
-    """Density of a difference of so many components, ``variance`` in each; mean of several widths."""
-    half = components / 2
-    kernel, total = math.exp(-square / (2 * _BROADEST * variance)), 0.0
-    width = _BROADEST
-    for _ in range(_WIDTHS):
-        total += kernel / width**half
-        # A sixteenth as wide: to the sixteenth power.
-        for _ in range(4):
-            kernel *= kernel
-        width /= 16.0
-    density: float = total / _WIDTHS / (2 * math.pi * variance) ** half
-    return density
+class _Exactness(NamedTuple):
+    """Of turns, or of shifts, of C closures in P pairs.
 
+    Attributes:
+        density: ``(P,)`` for each end of a pair, if it repeats the other.
+        by_last: ``(P, widths)`` of either end by the other alone.
+    """
 
-@compiled
-def _mean_kernels(apart: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """``(P,)`` densities of differences ``(P, n)``, ``variance`` ``(P,)`` per component."""
-    density = np.empty(len(apart))
-    for p in range(len(apart)):
-        density[p] = _mean_kernel((apart[p] ** 2).sum(), variance[p], apart.shape[1])
-    return density
+    density: list[np.ndarray]
+    by_last: np.ndarray
+
+    @classmethod
+    def of(
+        cls, off: np.ndarray, variance: np.ndarray, pairs: _Pairs, linked: np.ndarray, in_turn: InTurn
+    ) -> _Exactness:
+        kernels = kernels_along(off, variance, Chains(in_turn.order, pairs.follows, linked))
+        beforehand = np.ones(kernels[0].shape[1])
+        likely = shared_ways(kernels[0], beforehand, linked, in_turn)
+        of_ends = zip(kernels, pairs.ends, strict=False)
+        density = [(likely[end] * of[pairs.later]).sum(axis=1) for of, (end, _) in of_ends]
+        return cls(density, kernels[0][pairs.later, :WIDTHS])
 
 
 def wrong_share(before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndarray:
@@ -179,6 +155,18 @@ def wrong_share(before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndarr
     overall = _overall(wrong, any_one, priors)
     in_run, of_run = np.bincount(told.run, wrong)[told.run] - wrong, np.bincount(told.run, any_one)[told.run] - any_one
     return np.asarray(np.clip((overall + in_run) / (1 + of_run), _SHARE, 1 - _SHARE))
+
+
+def log_places(before: np.ndarray, told: Told, priors: PlacePriors) -> float:
+    """Nats, that closures join right and wrong places as they do, each by how common wrong ones are among the others.
+
+    Args:
+        before: ``(J + 1, C)`` chances of classes.
+        told: runs.
+        priors: of places.
+    """
+    share, (wrong, any_one) = wrong_share(before, told, priors), _wrong_places(before, told)
+    return float((wrong * np.log(share) + (any_one - wrong) * np.log1p(-share)).sum())
 
 
 def log_all_right(before: np.ndarray, told: Told, priors: PlacePriors, count: int) -> float:

@@ -15,6 +15,8 @@ import numpy as np
 from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.poses.closures import given_turn
 from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart
+from rotavg_ros.solver.slam.poses.places.judge import Judge
+from rotavg_ros.solver.slam.poses.repeats.neighbours import log_places
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.posterior.labels import log_slip_prior
 
@@ -190,7 +192,10 @@ class _Witnesses:
         can_tell = told.is_known & (_chain(problem, drawn.source) == _chain(problem, drawn.target))[mode.closure]
         is_wrong = (places.right < _WRONG) & can_tell & (told.label == 0)
         # Off by nothing it would be as likely as the first, or more; without its right place it is less by the second.
-        freed, lost = log_here - places.log_density, -np.log(np.maximum(1 - places.right, _LEAST))
+        judge = Judge(told, k, problem.priors)
+        # Closures that agree tell each other of their wrong places: together they are as likely as one after the other.
+        held = judge(solved.predictions, solved.maps, places.chance, solved.scale, in_order=True).log_density
+        freed, lost = log_here - held, -np.log(np.maximum(1 - places.right, _LEAST))
         gain = np.where(can_tell, np.maximum(np.where(is_wrong, freed, lost), 0.0), 0.0)
         start = np.minimum(drawn.position[drawn.source], drawn.position[drawn.target])[: drawn.num_segments]
         order = np.argsort(start, kind="stable")
@@ -277,11 +282,21 @@ class _Witnesses:
         weight = (into.astype(np.float64) - out) / self.spread
         shift = (weight @ self.shift) / max(float(np.abs(weight).sum()), np.finfo(np.float64).tiny)
         back = -1 if end < 0 else int(self.segment[end])
+        # With so many that are right after all, wrong ones are less common among all others as well.
+        told, priors, chance = pose.problem.told, pose.problem.priors, pose.solved.places.chance
+        gained += log_places(_right(chance, freed), told, priors) - log_places(chance, told, priors)
         return Jump(int(self.segment[begin]), back, pose.problem.bases[1] @ shift, gained, freed)
 
     @staticmethod
     def _inside(place: np.ndarray, begin: int, end: int) -> np.ndarray:
         return np.asarray((place > begin) & ((end < 0) | (place <= end)))
+
+
+def _right(chance: np.ndarray, closures: np.ndarray) -> np.ndarray:
+    """``(J + 1, C)`` chances with some closures at right places."""
+    changed = np.where(closures, 0.0, chance)
+    changed[0] += closures
+    return changed
 
 
 def _chain(problem: PoseProblem, nodes: np.ndarray) -> np.ndarray:

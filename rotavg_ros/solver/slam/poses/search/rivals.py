@@ -26,15 +26,16 @@ from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
 
 # So many rival labellings are compared by their translations at most, none that rotations alone make less likely by
-# more nats than the first of these; those that are less likely by no more than the second are published together.
-_MAX_RIVALS, _FARTHEST, _FAR = 5, 20.0, 5.0
+# more nats than the first of these than the likeliest, or the likeliest without slips; those that are less likely by no
+# more than the second are published together.
+_MAX_RIVALS, _FARTHEST, _FAR = 8, 20.0, 5.0
 # Labels follow places so many times at most, as long as −log p falls by this, nats, and may come near the least so far.
 _ROUNDS, _LEAST_GAIN, _HOPELESS = 4, 0.1, 20.0
 _GOOD = 0.5
 # Jumps at most; one is tried if −log p is predicted to rise by no more than this, nats.
-_MAX_JUMPS, _SLACK = 8, 1.0
-# Runs that are believed after all, at most.
-_MAX_RUNS = 8
+_MAX_JUMPS, _SLACK = 8, 8.0
+# Runs that are believed after all, at most, and in so many labellings.
+_MAX_RUNS, _MAX_BELIEVING = 8, 3
 
 
 @dataclass(frozen=True)
@@ -86,17 +87,16 @@ def rival_poses(
         tuned: the same labelling with the noise of each edge as FineNet has it, for its poses.
     """
     ended: list[Rival] = []
-    for mode in _first(modes):
-        for pose in _begun(PoseProblem(graph, translation, mode)):
-            least = min((rival.cost for rival in ended), default=np.inf)
-            ended.append(settling(pose, least))
-    ended.append(_with_runs(min(ended, key=lambda rival: rival.cost)))
+    begun = [estimate_poses(PoseProblem(graph, translation, mode)) for mode in _first(modes)]
+    for pose in begun:
+        ended.append(settling(pose, min((rival.cost for rival in ended), default=np.inf)))
+    least = min(rival.cost for rival in ended)
+    for pose, rival in zip(begun, ended[: len(begun)], strict=True):
+        if rival.cost < least + _HOPELESS and (other := _begun_otherwise(pose)) is not None:
+            ended.append(settling(other, least))
+    ended.extend([_with_runs(rival) for rival in _distinct(ended, _HOPELESS)[:_MAX_BELIEVING]])
     ended.extend(_jumping(min(ended, key=lambda rival: rival.cost)))
-    rivals: list[Rival] = []
-    for rival in sorted(ended, key=lambda rival: rival.cost):
-        is_far = rivals and rival.cost > rivals[0].cost + _FAR
-        if not is_far and not any(rival.is_same(other) for other in rivals):
-            rivals.append(rival)
+    rivals = _distinct(ended, _FAR)
     cost = np.array([rival.cost for rival in rivals])
     share = np.exp(cost[0] - cost)
     poses: list[PoseMode] = []
@@ -104,6 +104,16 @@ def rival_poses(
         problem = replace(rival.pose.problem, mode=tuned(rival.mode))
         poses.append(estimate_poses(problem, start=PoseStart.at(rival.pose)))
     return Rivals([rival.mode for rival in rivals], poses, share / share.sum())
+
+
+def _distinct(ended: Sequence[Rival], farthest: float) -> list[Rival]:
+    """The likeliest of each labelling, but for those that are less likely than the first by more than some nats."""
+    rivals: list[Rival] = []
+    for rival in sorted(ended, key=lambda rival: rival.cost):
+        is_far = rivals and rival.cost > rivals[0].cost + farthest
+        if not is_far and not any(rival.is_same(other) for other in rivals):
+            rivals.append(rival)
+    return rivals
 
 
 def _with_runs(rival: Rival) -> Rival:
@@ -175,28 +185,27 @@ def _with_jumps(pose: PoseMode) -> PoseMode:
 def _first(modes: Sequence[Mode]) -> list[Mode]:
     """Those to begin with, of which none turns everything as another one does.
 
-    Odometry that slipped by rotations alone may have had to jump: places are asked of the likeliest labelling without
-    slips, too, however unlikely rotations alone make it.
+    Odometry that slipped by rotations alone may have had to jump, so places are asked of labellings without slips,
+    however unlikely rotations alone make these: they are counted from the likeliest of their own.
     """
+    unslipped = min((mode.cost for mode in modes if len(mode.slipped) == 0), default=np.inf)
     first: list[Mode] = []
     for mode in modes:
-        if len(first) == _MAX_RIVALS or mode.cost > modes[0].cost + _FARTHEST:
-            break
-        if not any(mode.is_turned_like(other.state) for other in first):
+        best = unslipped if len(mode.slipped) == 0 else modes[0].cost
+        is_far = mode.cost > best + _FARTHEST
+        if not is_far and not any(mode.is_turned_like(other.state) for other in first):
             first.append(mode)
-    unslipped = next((mode for mode in modes if len(mode.slipped) == 0), None)
-    if unslipped is not None and not any(unslipped.is_turned_like(other.state) for other in first):
-        first.append(unslipped)
-    return first
+    last = next((mode for mode in first[_MAX_RIVALS:] if mode.cost == unslipped), None)
+    return first[:_MAX_RIVALS] + ([] if last is None else [last])
 
 
-def _begun(problem: PoseProblem) -> list[PoseMode]:
-    """Poses of a labelling, begun with the noise that is believed beforehand, and with that which odometry tells of."""
-    usual, level = estimate_poses(problem), likeliest_level(problem)
+def _begun_otherwise(usual: PoseMode) -> PoseMode | None:
+    """Poses of the same labelling, begun with the noise that odometry tells of in the place of what is believed."""
+    level = likeliest_level(usual.problem)
     if level == USUAL:
-        return [usual]
-    other = estimate_poses(problem, level=level, until=usual)
-    return [usual] if other.solved.places.is_like(usual.solved.places) else [usual, other]
+        return None
+    other = estimate_poses(usual.problem, level=level, until=usual)
+    return None if other.solved.places.is_like(usual.solved.places) else other
 
 
 def settling(pose: PoseMode, least: float = np.inf) -> Rival:

@@ -14,7 +14,7 @@ import numpy as np
 
 from rotavg_ros.solver.running.work import rest, stop_if_abandoned
 from rotavg_ros.solver.slam.poses.estimate import PoseMode
-from rotavg_ros.solver.slam.poses.places import Judge
+from rotavg_ros.solver.slam.poses.places.judge import Judge
 from rotavg_ros.solver.slam.poses.repeats.neighbours import log_all_right
 
 # So many runs are looked at, those first that are off by the fewest standard deviations; of so many closures at least,

@@ -1,0 +1,95 @@
+"""How much closures pull, given how likely each class of their errors is; and what they tell of their noise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rotavg_ros.solver.slam.poses.closures import GOOD, Places, Scale, Told
+from rotavg_ros.solver.slam.poses.places.classes import BY_ITSELF, CLASSES, Said, log_sum
+from rotavg_ros.solver.slam.poses.priors import PlacePriors
+
+# What pulls least, of a good closure's weight: nothing, but the system stays solvable.
+_NOTHING = 1e-8
+
+
+def pulled(said: Said, told: Told, log_class: np.ndarray, number: np.ndarray) -> Places:
+    """What follows from how likely each class is.
+
+    Args:
+        said: what all else says.
+        told: which translations are known, and runs.
+        log_class: ``(J + 1, C)`` nats, of closures and of their class; that of false rotations last.
+        number: ``(C,)`` how many of all are off by about the same.
+    """
+    known, k = told.is_known, said.turns
+    log_density = log_sum(log_class)
+    chance = np.exp(log_class - log_density)
+    weight = np.where(known, _shift_weight(said, told, log_class, number), 0.0)
+    square = (said.predictions.mean[:, k:] ** 2).sum(axis=1)
+    turn_weight, turn_squares, turn_freedom = _of_turns(said, chance)
+    good = slice(GOOD)
+    at_good, total = chance[good, :, None] * known[:, None], said.total[good]
+    floor = np.stack((said.scale.floor_share, 1 - said.scale.floor_share))[:, None, :, None]
+    own, axes = said.variance[good, :, None] * floor, (1, 2, 3)
+    return Places(
+        chance,
+        np.maximum(weight, _least_weight(square, said.scale)),
+        turn_weight,
+        np.append(turn_squares, (at_good * own * said.along[good] ** 2 / total**2).sum(axis=axes)),
+        np.append(turn_freedom, (at_good * own / total).sum(axis=axes)),
+        log_density,
+        *said.errors(),
+    )
+
+
+def nothing_known(told: Told, priors: PlacePriors, is_good: np.ndarray, square: np.ndarray, scale: Scale) -> Places:
+    """Before any solve: no translation pulls, rotations do as labelled, and as many places are wrong as may be.
+
+    Args:
+        told: what rotations alone say.
+        priors: of places.
+        is_good: ``(C,)`` labels.
+        square: ``(C,)`` m², by what translations are off.
+        scale: of errors.
+    """
+    chance = np.zeros((CLASSES, len(is_good)))
+    wrong = priors.wrong_place / priors.counted
+    chance[0], chance[GOOD], chance[-1] = is_good * (1 - wrong), is_good * wrong, ~is_good
+    turn = np.where(is_good, 1.0, _NOTHING) / told.rotation_variance
+    none = np.zeros_like(chance)
+    zeros = np.zeros(3), np.zeros(3), np.zeros(len(is_good))
+    return Places(chance, _least_weight(square, scale), turn, *zeros, none, none)
+
+
+def _shift_weight(said: Said, told: Told, log_class: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """``(C,)`` m⁻²: the weight of one normal density that pulls as far as all classes do in the mean.
+
+    n closures that all join the same wrong places, those of a run or all that are off alike, say once where these are,
+    and not n times: each of these repeats errs by n times the variance of the class that it would be of by itself.
+    """
+    chance = np.exp(log_class - log_sum(log_class))
+    alone = np.exp(log_class[BY_ITSELF] - log_sum(log_class[BY_ITSELF]))
+    number = np.maximum(np.bincount(told.run, chance[-2])[told.run], number)
+    each = np.concatenate((chance[:-2], chance[-2] * alone))[:, :, None]
+    variance = np.concatenate((said.variance[:-1], number * said.variance[BY_ITSELF]))[:, :, None]
+    total = np.concatenate((said.spread[:-1], said.spread[BY_ITSELF])) + variance
+    pull = (each / total).mean(axis=2).sum(axis=0)
+    shrunk = (each * variance / total).mean(axis=2).sum(axis=0) + chance[-1]
+    return np.asarray(pull / shrunk)
+
+
+def _of_turns(said: Said, chance: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """``(C,)`` rad⁻² of turns likewise; squares and freedom of good closures' for the variance of their noise."""
+    k, (variance, nearly) = said.turns, said.turned
+    right, alike = chance[:GOOD].sum(axis=0), chance[GOOD:-1].sum(axis=0)
+    spread = np.trace(said.predictions.covariance[:, :k, :k], axis1=1, axis2=2) / k
+    pull = right / (variance + spread) + alike / (nearly + spread)
+    shrunk = right / (1 + spread / variance) + alike / (1 + spread / nearly) + chance[-1]
+    square, total = (said.predictions.mean[:, :k] ** 2).sum(axis=1), variance + spread
+    weight = np.maximum(pull / shrunk, _NOTHING / variance)
+    return weight, float((right * square * variance / total**2).sum()), float((right * k * variance / total).sum())
+
+
+def _least_weight(square: np.ndarray, scale: Scale) -> np.ndarray:
+    """``(C,)`` m⁻², of closures that are off by ``square`` m²: however far that is, they pull next to nothing."""
+    return np.asarray(_NOTHING / (scale.closure + square))

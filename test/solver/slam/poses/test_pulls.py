@@ -1,0 +1,95 @@
+"""How much closures pull by their classes: runs that repeat one wrong place say once where it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from rotavg_ros.solver.slam.poses.closures import GOOD, Predictions, Scale, Told
+from rotavg_ros.solver.slam.poses.places.classes import CLASSES, Said
+from rotavg_ros.solver.slam.poses.places.pulls import pulled
+from rotavg_ros.solver.slam.poses.priors import PlacePriors
+
+
+def told(count: int) -> Told:
+    """Closures of one run, each of .01 rad, one after the other."""
+    each = np.arange(count)
+    return Told(
+        rotation_variance=np.full(count, 1e-4),
+        false_odds=np.zeros(count),
+        is_known=np.ones(count, dtype=bool),
+        label=np.zeros(count),
+        run=np.zeros(count, dtype=np.int64),
+        follows=each - 1,
+        sign=np.ones(count),
+        detection=each,
+        detected=each,
+    )
+
+
+def said_of(count: int, off: float) -> Said:
+    """That all are off by some metres along x, which is known to a metre, in a plane of 50 m."""
+    mean = np.tile([0.0, off, 0.0], (count, 1))
+    covariance = np.tile(np.diag([1e-4, 1.0, 1.0]), (count, 1, 1))
+    scale = Scale(np.full(count, 0.01), np.full(count, 0.01), np.ones(count), 2500.0)
+    return Said.of(Predictions(mean, covariance), told(count), 1, scale, PlacePriors())
+
+
+def of_class(number: int, count: int) -> np.ndarray:
+    """``(J + 1, C)`` nats: all of one class, those of wrong places otherwise as likely as each other."""
+    log_class = np.full((CLASSES, count), -40.0)
+    log_class[number] = 0.0
+    return log_class
+
+
+@pytest.mark.parametrize("count", [1, 2, 50])
+def test_a_run_of_repeats_pulls_like_one_of_them(count: int) -> None:
+    said, repeats = said_of(count, 30.0), of_class(CLASSES - 2, count)
+    # Each would be of the broadest class by itself.
+    repeats[CLASSES - 3] = -20.0
+    weight = pulled(said, told(count), repeats, np.ones(count)).weight
+    one = pulled(said_of(1, 30.0), told(1), of_class(CLASSES - 3, 1), np.ones(1)).weight
+    np.testing.assert_allclose(weight.sum(), one[0], rtol=1e-4)
+
+
+def test_repeats_of_other_runs_that_are_off_alike_count_as_well() -> None:
+    repeats = of_class(CLASSES - 2, 2)
+    repeats[CLASSES - 3] = -20.0
+    alone, among_ten = (
+        pulled(said_of(2, 30.0), told(2), repeats.copy(), np.full(2, number)).weight for number in (1.0, 10.0)
+    )
+    np.testing.assert_allclose(alone / among_ten, 5.0, rtol=1e-4)
+
+
+def test_good_ones_pull_by_their_own_variance_each() -> None:
+    weight = pulled(said_of(20, 0.1), told(20), of_class(0, 20), np.ones(20)).weight
+    np.testing.assert_allclose(weight, 1 / 0.01, rtol=1e-6)
+
+
+def test_false_rotations_pull_next_to_nothing() -> None:
+    places = pulled(said_of(3, 30.0), told(3), of_class(CLASSES - 1, 3), np.ones(3))
+    assert (places.weight < 1e-8).all() and (places.rotation_weight < 1e-3).all()
+
+
+def test_densities_given_the_turn_are_those_of_both_together() -> None:
+    """With a turn that is known to have to do with the shift."""
+    said = said_of(1, 0.2)
+    covariance = said.predictions.covariance.copy()
+    covariance[:, 0, 1] = covariance[:, 1, 0] = 0.006
+    mean = np.array([[0.01, 0.2, -0.1]])
+    said = Said.of(Predictions(mean, covariance), told(1), 1, said.scale, PlacePriors())
+    good = covariance[0] + np.diag([1e-4, 0.01, 0.01])
+    both = multivariate_normal(np.zeros(3), good).logpdf(mean[0])
+    np.testing.assert_allclose((said.log_turn + said.log_shift)[0, 0], both)
+    tail = covariance[0] + np.diag([1e-4, 0.16, 0.16])
+    both = multivariate_normal(np.zeros(3), tail).logpdf(mean[0])
+    np.testing.assert_allclose((said.log_turn + said.log_shift)[GOOD - 1, 0], both)
+
+
+def test_what_states_no_translation_does_not_pull() -> None:
+    unknown = replace(told(2), is_known=np.array([True, False]))
+    weight = pulled(said_of(2, 0.1), unknown, of_class(0, 2), np.ones(2)).weight
+    assert weight[0] > 1e6 * weight[1]
