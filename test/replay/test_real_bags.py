@@ -37,7 +37,7 @@ def test_a_recorded_robot(
 
 @pytest.mark.slow
 def test_b25b_from_graph_to_positions(shared_data: Path, tmp_path: Path) -> None:
-    graph = shared_data / "slam" / "b25b" / "B25b_0.000.g2o"
+    graph = shared_data / "slam" / "b25b" / "B25b_0.500.g2o"
     companions = ["--stamps", str(graph.with_name("B25b_timestamps.txt"))]
     companions += ["--truth", str(graph.with_name("ground_truth.csv"))]
     assert main(["convert", str(graph), str(tmp_path / "bag"), *companions]) == 0
