@@ -24,7 +24,7 @@ def pulled(said: Said, told: Told, log_class: np.ndarray, number: np.ndarray) ->
     known, k = told.is_known, said.turns
     log_density = log_sum(log_class)
     chance = np.exp(log_class - log_density)
-    weight = np.where(known, _shift_weight(said, told, log_class, number), 0.0)
+    weight = np.where(known, _shift_weight(said, told, (log_class, chance), number), 0.0)
     square = (said.predictions.mean[:, k:] ** 2).sum(axis=1)
     turn_weight, turn_squares, turn_freedom = _of_turns(said, chance)
     good = slice(GOOD)
@@ -61,13 +61,13 @@ def nothing_known(told: Told, priors: PlacePriors, is_good: np.ndarray, square: 
     return Places(chance, _least_weight(square, scale), turn, *zeros, none, none)
 
 
-def _shift_weight(said: Said, told: Told, log_class: np.ndarray, number: np.ndarray) -> np.ndarray:
+def _shift_weight(said: Said, told: Told, classes: tuple[np.ndarray, np.ndarray], number: np.ndarray) -> np.ndarray:
     """``(C,)`` m⁻²: the weight of one normal density that pulls as far as all classes do in the mean.
 
     n closures that all join the same wrong places, those of a run or all that are off alike, say once where these are,
     and not n times: each of these repeats errs by n times the variance of the class that it would be of by itself.
     """
-    chance = np.exp(log_class - log_sum(log_class))
+    log_class, chance = classes
     alone = np.exp(log_class[BY_ITSELF] - log_sum(log_class[BY_ITSELF]))
     number = np.maximum(np.bincount(told.run, chance[-2])[told.run], number)
     each = np.concatenate((chance[:-2], chance[-2] * alone))[:, :, None]

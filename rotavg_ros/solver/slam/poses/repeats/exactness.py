@@ -163,15 +163,11 @@ def repeated_anywhere(
                 of_turn = errors.turn_variance[row] + errors.turn_variance[other]
                 of_shift = errors.shift_variance[row] + errors.shift_variance[other]
                 for sign in (1, -1):
-                    square = 0.0
-                    for d in range(shifts):
-                        square += (errors.shift[row, d] - sign * errors.shift[other, d]) ** 2
+                    square = _apart(errors.shift[row], errors.shift[other], sign)
                     if square > _FARTHEST**2 * _BROADEST * of_shift:
                         continue
                     _kernels(shifted, square, of_shift, shifts)
-                    square = 0.0
-                    for d in range(turns):
-                        square += (errors.turn[row, d] - sign * errors.turn[other, d]) ** 2
+                    square = _apart(errors.turn[row], errors.turn[other], sign)
                     if square > _FARTHEST**2 * _BROADEST * of_turn:
                         continue
                     _kernels(turned, square, of_turn, turns)
@@ -199,11 +195,18 @@ def _fill(
     own, other, number = noise
     size = len(off)
     for way in range(2):
-        square = 0.0
-        for d in range(size):
-            square += (off[d] - (last[d] if way == 0 else mean[d])) ** 2
+        square = _apart(off, last if way == 0 else mean, 1)
         variance = own + (other if way == 0 else other / number)
         _kernels(kernels[way * WIDTHS : (way + 1) * WIDTHS], square, variance, size)
+
+
+@compiled
+def _apart(off: np.ndarray, other: np.ndarray, sign: int) -> float:
+    """Square of what one is off from another, or from its opposite."""
+    square = 0.0
+    for d in range(len(off)):
+        square += (off[d] - sign * other[d]) ** 2
+    return square
 
 
 @compiled

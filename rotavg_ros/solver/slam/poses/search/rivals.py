@@ -32,8 +32,11 @@ _MAX_RIVALS, _FARTHEST, _FAR = 8, 20.0, 5.0
 # Labels follow places so many times at most, as long as −log p falls by this, nats, and may come near the least so far.
 _ROUNDS, _LEAST_GAIN, _HOPELESS = 4, 0.1, 20.0
 _GOOD = 0.5
-# Jumps at most; one is tried if −log p is predicted to rise by no more than this, nats.
-_MAX_JUMPS, _SLACK = 8, 8.0
+# A jump, or a run that is believed, is tried if −log p is predicted to rise by no more than this, nats: what closures
+# gain is told one by one, and a jump that was predicted to lose 4 gained 62.
+_SLACK = 8.0
+# Jumps at most.
+_MAX_JUMPS = 8
 # Runs that are believed after all, at most, and in so many labellings.
 _MAX_RUNS, _MAX_BELIEVING = 8, 3
 
