@@ -31,6 +31,7 @@ SWITCHES: dict[str, str] = {
     "translations": "closures are judged by their rotations alone",
     "jumps": "odometry's position does not jump while its heading stays",
     "believed-runs": "closures of a run that hold each other to join wrong places are believed one by one alone",
+    "doubted-runs": "closures of a run that bend the map until they fit are doubted one by one alone",
     "relabelling": "rivals are compared by places under the labels that rotations alone gave them",
     "rivals": "the best labelling alone is published",
 }

@@ -15,7 +15,7 @@ import numpy as np
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.running.work import rest, spend
 from rotavg_ros.solver.slam.poses.block_system import BlockFactor
-from rotavg_ros.solver.slam.poses.closures import ANYHOW, Places, Predictions, Scale
+from rotavg_ros.solver.slam.poses.closures import ANYHOW, REPEATS, Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.evidence import translation_cost
 from rotavg_ros.solver.slam.poses.noise import likeliest_noise, log_noise_prior
 from rotavg_ros.solver.slam.poses.places.judge import Judge
@@ -48,6 +48,8 @@ _LEAST_RATIO, _LARGEST_RATIO = -2.0, 0.6
 _SHARE, _LEAST_SHARE = 0.5, 0.1
 # At rest: a step's root mean square in standard errors; chances of classes; logarithms of variances.
 _STEP_CONVERGED, _CHANCE_CONVERGED, _NOISE_CONVERGED = 0.05, 0.1, 0.1
+# What does not pull, in what it would.
+_NOTHING = 1e-6
 # No two places are nearer than so many typical steps.
 _LEAST_EXTENT = 3.0
 
@@ -108,6 +110,16 @@ class PoseStart:
         rotation[closures] = 1 / problem.rotation_variance(noise)[problem.mode.problem.closure[closures]]
         begun = replace(places, chance=chance, weight=weight, rotation_weight=rotation)
         return replace(cls.at(pose), places=begun)
+
+    @classmethod
+    def doubting(cls, pose: PoseMode, closures: np.ndarray) -> PoseStart:
+        """Of the same labelling, but that some closures ``(n,)`` join the same wrong places."""
+        places = pose.solved.places
+        chance, weight = places.chance.copy(), places.weight.copy()
+        chance[:, closures] = 0.0
+        chance[REPEATS, closures] = 1.0
+        weight[closures] *= _NOTHING
+        return replace(cls.at(pose), places=replace(places, chance=chance, weight=weight))
 
     def over(self, places: Places) -> Places:
         """These, and others' ``places`` of what is new."""

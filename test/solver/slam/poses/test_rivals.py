@@ -15,7 +15,8 @@ from rotavg_ros.solver.slam import stages
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.poses.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
-from rotavg_ros.solver.slam.poses.search.rivals import rival_poses, settling
+from rotavg_ros.solver.slam.poses.search.rivals import rival_poses
+from rotavg_ros.solver.slam.poses.search.settling import settling
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.solve import Found, search

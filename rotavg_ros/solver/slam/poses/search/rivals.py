@@ -1,8 +1,4 @@
-"""Rival labellings by rotations and translations together.
-
-A labelling that rotations alone make likeliest need not be so with places: where places speak against a rotation's
-label the label follows, rotations are solved anew, and so on as long as both together become likelier.
-"""
+"""Rival labellings by rotations and translations together: which are begun with, and which are left."""
 
 from __future__ import annotations
 
@@ -13,15 +9,9 @@ import numpy as np
 
 from rotavg_ros.solver.slam.poses.estimate import HELD, USUAL, PoseMode, PoseStart, estimate_poses, likeliest_level
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
-from rotavg_ros.solver.slam.poses.search.jumps import (
-    jumps_too_far,
-    likeliest_jump,
-    log_jump_prior,
-    with_jump,
-    without_odd_jumps,
-)
-from rotavg_ros.solver.slam.poses.search.runs import runs_to_believe
-from rotavg_ros.solver.slam.posterior.em import polish
+from rotavg_ros.solver.slam.poses.search.jumps import jumps_too_far, likeliest_jump, with_jump, without_odd_jumps
+from rotavg_ros.solver.slam.poses.search.runs import with_runs, without_runs
+from rotavg_ros.solver.slam.poses.search.settling import HOPELESS, SLACK, Rival, settled, settling
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
 
@@ -29,38 +19,10 @@ from rotavg_ros.view_graph import ViewGraph
 # more nats than the first of these than the likeliest, or the likeliest without slips; those that are less likely by no
 # more than the second are published together.
 _MAX_RIVALS, _FARTHEST, _FAR = 8, 20.0, 5.0
-# Labels follow places so many times at most, as long as −log p falls by this, nats, and may come near the least so far.
-_ROUNDS, _LEAST_GAIN, _HOPELESS = 4, 0.1, 20.0
-_GOOD = 0.5
-# A jump, or a run that is believed, is tried if −log p is predicted to rise by no more than this, nats: what closures
-# gain is told one by one, and a jump that was predicted to lose 4 gained 62.
-_SLACK = 8.0
+# Whole runs are believed and doubted in so many labellings at most.
+_MAX_BELIEVING = 3
 # Jumps at most.
 _MAX_JUMPS = 8
-# Runs that are believed after all, at most, and in so many labellings.
-_MAX_RUNS, _MAX_BELIEVING = 8, 3
-
-
-@dataclass(frozen=True)
-class Rival:
-    """A labelling of rotations that places leave as it is.
-
-    Attributes:
-        mode: the labelling.
-        pose: its poses, its labels held.
-    """
-
-    mode: Mode
-    pose: PoseMode
-
-    @property
-    def cost(self) -> float:
-        """−log p of rotations and translations, nats."""
-        return self.mode.cost + self.pose.cost - log_jump_prior(self.pose.problem)
-
-    def is_same(self, other: Rival) -> bool:
-        """Whether both have the same labels."""
-        return self.mode.labels == other.mode.labels and self.pose.jumps_like(other.pose)
 
 
 @dataclass(frozen=True)
@@ -95,9 +57,9 @@ def rival_poses(
         ended.append(settling(pose, min((rival.cost for rival in ended), default=np.inf)))
     least = min(rival.cost for rival in ended)
     for pose, rival in zip(begun, ended[: len(begun)], strict=True):
-        if rival.cost < least + _HOPELESS and (other := _begun_otherwise(pose)) is not None:
+        if rival.cost < least + HOPELESS and (other := _begun_otherwise(pose)) is not None:
             ended.append(settling(other, least))
-    ended.extend([_with_runs(rival) for rival in _distinct(ended, _HOPELESS)[:_MAX_BELIEVING]])
+    ended.extend([without_runs(with_runs(rival)) for rival in _distinct(ended, HOPELESS)[:_MAX_BELIEVING]])
     ended.extend(_jumping(min(ended, key=lambda rival: rival.cost)))
     rivals = _distinct(ended, _FAR)
     cost = np.array([rival.cost for rival in rivals])
@@ -119,25 +81,6 @@ def _distinct(ended: Sequence[Rival], farthest: float) -> list[Rival]:
     return rivals
 
 
-def _with_runs(rival: Rival) -> Rival:
-    """The same labelling with whole runs believed, as long as that is likelier."""
-    if "believed-runs" in rival.mode.problem.without:
-        return rival
-    tried: set[bytes] = set()
-    for _ in range(_MAX_RUNS):
-        for gained, members in runs_to_believe(rival.pose):
-            if gained < -_SLACK or members.tobytes() in tried:
-                continue
-            tried.add(members.tobytes())
-            believed = _settled(rival.pose.problem, PoseStart.believing(rival.pose, members))
-            if believed.cost < rival.cost - _LEAST_GAIN:
-                rival = believed
-                break
-        else:
-            break
-    return rival
-
-
 def _jumping(rival: Rival) -> list[Rival]:
     """The same labelling with odometry's position jumping, as long as that is likelier, or would be a rival."""
     before = rival.pose.problem
@@ -150,11 +93,11 @@ def _jumping(rival: Rival) -> list[Rival]:
     for solves in (1, HELD) if has_grown else (1,):
         jumped = _with_jumps(estimate_poses(before, held_for=solves))
         if jumped.problem is not before and not any(jumped.jumps_like(other.pose) for other in begun):
-            begun.append(_settled(jumped.problem, PoseStart.at(jumped)))
+            begun.append(settled(jumped.problem, PoseStart.at(jumped)))
     found = [likelier for start in begun for likelier in _jumping_further(start)]
     for each in (*begun[1:], *found):
         if (problem := without_odd_jumps(each.pose)) is not None:
-            found.append(_settled(problem, PoseStart.at(each.pose)))
+            found.append(settled(problem, PoseStart.at(each.pose)))
     return [jumped for jumped in (*begun[1:], *found) if not jumps_too_far(jumped.pose)]
 
 
@@ -162,16 +105,12 @@ def _jumping_further(rival: Rival) -> list[Rival]:
     rivals = [rival]
     for _ in range(_MAX_JUMPS):
         jump = likeliest_jump(rivals[-1].pose)
-        if jump is None or jump.gained < -_SLACK:
+        if jump is None or jump.gained < -SLACK:
             break
-        rivals.append(_settled(*with_jump(rivals[-1].pose, jump)))
+        rivals.append(settled(*with_jump(rivals[-1].pose, jump)))
         if rivals[-1].cost > rivals[-2].cost:
             break
     return rivals[1:]
-
-
-def _settled(problem: PoseProblem, start: PoseStart) -> Rival:
-    return settling(estimate_poses(problem, start=start))
 
 
 def _with_jumps(pose: PoseMode) -> PoseMode:
@@ -209,50 +148,3 @@ def _begun_otherwise(usual: PoseMode) -> PoseMode | None:
         return None
     other = estimate_poses(usual.problem, level=level, until=usual)
     return None if other.solved.places.is_like(usual.solved.places) else other
-
-
-def settling(pose: PoseMode, least: float = np.inf) -> Rival:
-    """A labelling with labels of rotations as places have them, as long as both together become likelier by it.
-
-    Args:
-        pose: of the labelling to begin with.
-        least: −log p of another one, nats; of one that is far from it no more is asked.
-    """
-    begun, first, best = pose.problem, pose, None
-    for _ in range(_ROUNDS):
-        mode = relabelled(pose)
-        if best is not None and mode.labels == best.mode.labels:
-            break
-        rival = _held(replace(begun, mode=mode), pose)
-        if best is not None and rival.cost > best.cost - _LEAST_GAIN:
-            break
-        best = rival
-        if best.cost > least + _HOPELESS:
-            break
-        pose = estimate_poses(rival.pose.problem, start=PoseStart.at(rival.pose))
-    assert best is not None
-    if best.mode.labels != begun.mode.labels and best.cost < least + _HOPELESS:
-        # Closures that hold each other to be right, or wrong, may be less likely so all together.
-        best = min(best, _held(begun, first), key=lambda rival: rival.cost)
-    return best
-
-
-def _held(problem: PoseProblem, pose: PoseMode) -> Rival:
-    """A labelling as it is, from other poses."""
-    return Rival(problem.mode, estimate_poses(problem, hold=True, start=PoseStart.at(pose)))
-
-
-def relabelled(pose: PoseMode) -> Mode:
-    """The labelling by which closures' rotations are right where places and rotations together say so."""
-    before = pose.problem.mode
-    problem = before.problem
-    closure = problem.closure
-    is_told = np.isinf(problem.log_odds[closure])
-    if "relabelling" in problem.without:
-        return before
-    trusted = before.state.trusted.copy()
-    trusted[closure] = np.where(is_told, trusted[closure], pose.solved.places.rotation_good > _GOOD)
-    if np.array_equal(trusted, before.state.trusted):
-        return before
-    state = replace(before.state, correction=pose.state.correction, trusted=trusted)
-    return Mode(problem, *polish(problem, state), before.origin)

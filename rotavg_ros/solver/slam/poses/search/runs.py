@@ -1,9 +1,13 @@
-"""Believe a whole run: closures that hold each other to join wrong places, though together they may as well be right.
+"""Believe a whole run, or doubt it: closures that hold each other to be wrong, or right, though together they are not.
 
 One by one each is told by its neighbours that places are mistaken here. Of the K closures of a run, none of which
 pulls, all else says N(0, S) of their discrepancies y if all are right, S = A H⁻¹ Aᵀ + V, A their rows and V what
 each errs by itself. Where that is likelier than what they are held for, poses are estimated anew with the run believed;
 −log p of both decides, as of any two labellings.
+
+The other way round closures that join the same wrong places bend the map until they fit, and each is told by the others
+that it is right. What a run has in common is an unknown by itself: where all else says that it is far from nothing, the
+run is held to join wrong places, and poses are estimated anew.
 """
 
 from __future__ import annotations
@@ -11,16 +15,54 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtrc
 
 from rotavg_ros.solver.running.work import rest, stop_if_abandoned
-from rotavg_ros.solver.slam.poses.estimate import PoseMode
+from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart
 from rotavg_ros.solver.slam.poses.places.judge import Judge
 from rotavg_ros.solver.slam.poses.repeats.neighbours import log_all_right
+from rotavg_ros.solver.slam.poses.search.settling import LEAST_GAIN, SLACK, Rival, moved
 
 # So many runs are looked at, those first that are off by the fewest standard deviations; of so many closures at least,
 # and so many of longer ones: what these come to tells the others.
 _LOOKED_AT, _LEAST_MEMBERS, _MOST_MEMBERS = 32, 2, 96
 _WRONG = 0.5
+# Runs are doubted that would be as far off by chance with less than this probability.
+_UNLIKELY = 0.05
+# Runs that are believed, or doubted, at most; the most unlikely are tried, of which one is.
+_MAX_RUNS, _MAX_DOUBTED = 8, 4
+
+
+def with_runs(rival: Rival) -> Rival:
+    """The same labelling with whole runs believed, as long as that is likelier."""
+    if "believed-runs" in rival.mode.problem.without:
+        return rival
+    tried: set[bytes] = set()
+    for _ in range(_MAX_RUNS):
+        for gained, members in runs_to_believe(rival.pose):
+            if gained < -SLACK or members.tobytes() in tried:
+                continue
+            tried.add(members.tobytes())
+            believed = moved(rival, PoseStart.believing(rival.pose, members))
+            if believed.cost < rival.cost - LEAST_GAIN:
+                rival = believed
+                break
+        else:
+            break
+    return rival
+
+
+def without_runs(rival: Rival) -> Rival:
+    """The same labelling with whole runs doubted, as long as that is likelier."""
+    if "doubted-runs" in rival.mode.problem.without:
+        return rival
+    for _ in range(_MAX_RUNS):
+        doubted = [moved(rival, PoseStart.doubting(rival.pose, run)) for run in runs_to_doubt(rival.pose)[:_MAX_DOUBTED]]
+        likeliest = min(doubted, key=lambda each: each.cost, default=rival)
+        if likeliest.cost > rival.cost - LEAST_GAIN:
+            break
+        rival = with_runs(likeliest)
+    return rival
 
 
 def runs_to_believe(pose: PoseMode) -> list[tuple[float, np.ndarray]]:
@@ -34,6 +76,26 @@ def runs_to_believe(pose: PoseMode) -> list[tuple[float, np.ndarray]]:
     in_order = judge(pose.solved.predictions, pose.solved.maps, places.chance, pose.solved.scale, in_order=True)
     found = [_Run.of(pose, members, in_order.log_density[members]) for members in runs]
     return sorted(((run.gained, run.members) for run in found if run is not None), key=lambda each: -each[0])
+
+
+def runs_to_doubt(pose: PoseMode) -> list[np.ndarray]:
+    """Closures of runs that are believed though all else says that they are off alike, the most unlikely first.
+
+    What a run has in common is a row of the system by itself: all other rows say N(μ, P) of it, which is whitened.
+    """
+    problem, solved = pose.problem, pose.solved
+    of_run, run = problem.run[problem.mode.problem.closure], problem.told.run
+    row = len(problem.drawn.source) + np.arange(problem.num_runs)
+    others, covariance = solved.factor.without(row)
+    off = np.matmul(others, solved.left[row])
+    square = (off * np.linalg.solve(covariance + np.eye(off.shape[1]), off)).sum(axis=(1, 2))
+    believed = np.flatnonzero((solved.places.right > _WRONG) & (of_run >= 0) & (problem.told.label == 0))
+    most = np.zeros(run.max(initial=-1) + 1)
+    np.maximum.at(most, run[believed], square[of_run[believed]])
+    by_chance = chdtrc(off.shape[1], most)
+    order = np.argsort(-most, kind="stable")
+    members = [believed[run[believed] == each] for each in order[by_chance[order] < _UNLIKELY]]
+    return [each for each in members if len(each) >= _LEAST_MEMBERS]
 
 
 def _nearest(pose: PoseMode, could: np.ndarray) -> list[np.ndarray]:
