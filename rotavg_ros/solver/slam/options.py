@@ -28,6 +28,7 @@ SWITCHES: dict[str, str] = {
     "annealing": "no start anneals the closures",
     "robust-start": "no start weighs odometry down as it does closures",
     "minimum-cuts": "no start turns whole parts",
+    "tilt": "odometry errs alike about all axes, though gravity may hold those that the robot tilts about",
     "translations": "closures are judged by their rotations alone",
     "jumps": "odometry's position does not jump while its heading stays",
     "believed-runs": "closures of a run that hold each other to join wrong places are believed one by one alone",

@@ -78,7 +78,7 @@ def _of_mode(pose: PoseMode) -> Poses:
     of_nodes = pose.solved.factor.variance[: drawn.num_nodes]
     own, shifts = of_nodes[:, :k].mean(axis=1), of_nodes[:, k:].mean(axis=1)
     apart = np.trace(_apart(pose)[:, :k, :k], axis1=1, axis2=2) / k
-    variance = drawn.variance(own, apart, pose.state.noise.turn)
+    variance = drawn.variance(own, apart, problem.mean_turn(pose.state.noise))
     between = (1 - passed) * shifts[drawn.above] + passed * shifts[drawn.below]
     segment = problem.segment_of_node
     spread = pose.solved.way.length[: drawn.num_segments] * pose.state.noise.way + problem.jumps
@@ -101,7 +101,7 @@ def _precision(pose: PoseMode) -> np.ndarray:
     """``(M, 2)`` rad⁻² and m⁻², with which the view-graph's edges count in the answer."""
     problem, noise, drawn = pose.problem, pose.state.noise, pose.problem.drawn
     graph, closure, edges = problem.graph, problem.mode.problem.closure, problem.closures
-    variance = np.stack((noise.turn * graph.steps.numpy(), noise.way * problem.lengths_passed), axis=1)
+    variance = np.stack((problem.mean_turn(noise) * graph.steps.numpy(), noise.way * problem.lengths_passed), axis=1)
     if (relative := problem.mode.problem.relative) is not None:
         variance[:, 0] *= drawn.edge_values(relative)
     slipped = drawn.edge_values((drawn.is_odometry & ~problem.mode.state.is_good).astype(np.float64))
@@ -109,7 +109,7 @@ def _precision(pose: PoseMode) -> np.ndarray:
     variance += (slipped * drawn.share_of_segment)[:, None] * np.square(slip)
     if problem.jump is not None:
         variance[:, 1] += problem.jump
-    variance[edges, 0] = 1 / pose.solved.rotation_weight[closure]
+    variance[edges, 0] = 1 / pose.solved.rotation_weight[closure, 0]
     variance[edges, 1] = 1 / pose.solved.closure_weight
     known = np.isfinite(problem.translation).all(axis=1)
     return np.asarray(np.stack((1 / variance[:, 0], known / variance[:, 1]), axis=1))
@@ -131,9 +131,10 @@ def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray
     off = (way.displacement[segments] - ends) @ shifts
     pulled = np.linalg.solve(pose.solved.covariance[segments], off[:, :, None])[:, :, 0] @ shifts.T
     bent = np.zeros((3, drawn.paths.forest.parent.shape[0]))
-    turns = problem.bases[0]
-    lever = np.cross(way.lever[inner], pulled[segment])
-    bent[:, inner] = (problem.bridge_variance(state.noise)[segment, None] * lever @ turns @ turns.T).T
+    lever = np.cross(way.lever[inner], pulled[segment]) @ problem.bases[0]
+    about = lever @ problem.about_vertical
+    of_about, of_others = problem.bridge_variance(state.noise)[:, segment, None]
+    bent[:, inner] = ((of_about * about + of_others * (lever - about)) @ problem.bases[0].T).T
     orientation = quaternion_rows.normalize(quaternion_rows.multiply(orientation, quaternion_rows.exp(bent)))
     way = problem.displacements(orientation)
     position = state.position[drawn.above] + way.way

@@ -36,7 +36,7 @@ _SLOWEST, HELD = 16.0, 8
 # After so many it is told whether places come out as those of other poses.
 _ALIKE_AFTER = 4
 # Which variances do not: those of closures' shifts by themselves.
-_FREE = np.array([False, False, False, True, True, False])
+_FREE = np.array([False, False, False, True, True, False, False])
 # Variances of shifts to begin with, of odometry and of closures, in those that are believed beforehand.
 Level = tuple[float, float]
 USUAL: Level = (1.0, 1.0)
@@ -195,9 +195,9 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     closure, k, num_nodes = problem.mode.problem.closure, problem.turns, problem.drawn.num_nodes
     way = problem.displacements(problem.orientations(state))
     residual, covariance = problem.residuals(state, way), problem.shift_covariance(state, way)
-    rotation_variance = problem.rotation_variance(state.noise)
+    rotation_variance = problem.rotation_variances(state.noise)
     rotation_weight = 1 / rotation_variance
-    rotation_weight[closure] = places.rotation_weight
+    rotation_weight[closure] = places.rotation_weight[:, None]
     rest()
     root = problem.whitening(covariance, rotation_weight, places.weight, state)
     jacobian = np.matmul(root, problem.jacobian(way))
@@ -224,7 +224,7 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     anywhere = scale.extent + (problem.lengths[problem.closures] ** 2).sum(axis=1)
     spend(_ROW * len(jacobian))
     predictions = _left_out(factor, root, left, closure).within(k, ANYHOW, anywhere)
-    judge = replace(judge, told=replace(judge.told, rotation_variance=rotation_variance[closure]))
+    judge = replace(judge, told=replace(judge.told, rotation_variance=rotation_variance[closure, 0]))
     spend(_ROW * len(jacobian))
     maps = MapTurns.of(problem, state.position, predictions, scale.good)
     spend(_ROW * len(jacobian))
@@ -346,8 +346,8 @@ def _with_noise(
 
     Args:
         state: before.
-        noise: ``(6,)`` logarithms of variances as estimated.
-        last: ``(6,)`` how they changed before; zero where that is not to be gone on from.
+        noise: ``(7,)`` logarithms of variances as estimated.
+        last: ``(7,)`` how they changed before; zero where that is not to be gone on from.
         is_held: all but closures' shifts stay.
     """
     before = state.noise.logarithms

@@ -33,7 +33,10 @@ def _normal(problem: PoseProblem, solved: Solved) -> float:
     odometry = np.flatnonzero(drawn.is_odometry)
     cost = float((solved.left**2).sum() + _log_det(problem, solved)) / 2
     cost += float(np.linalg.slogdet(solved.covariance[odometry])[1].sum()) / 2
-    cost -= (float(np.log(solved.closure_weight).sum()) * m + float(np.log(solved.rotation_weight).sum()) * k) / 2
+    components = problem.num_about, k - problem.num_about
+    cost -= (
+        float(np.log(solved.closure_weight).sum()) * m + float(np.log(solved.rotation_weight).sum(axis=0) @ components)
+    ) / 2
     cost += m / 2 * problem.num_runs * float(np.log(solved.state.noise.common))
     cost += k / 2 * problem.num_runs * float(np.log(problem.common_turn(solved.state.noise)))
     # Rows less unknowns, per component of a shift; of loose nodes something is known beforehand.
@@ -64,7 +67,7 @@ def _as_normal(problem: PoseProblem, solved: Solved) -> np.ndarray:
     """``(C,)`` nats, what the densities that stand for closures make of what all else says."""
     k, m, closure = problem.turns, problem.shifts, problem.mode.problem.closure
     total = solved.predictions.covariance.copy()
-    total[:, :k, :k] += (1 / solved.rotation_weight[closure])[:, None, None] * np.eye(k)
+    total[:, :k, :k] += (1 / solved.rotation_weight[closure, 0])[:, None, None] * np.eye(k)
     total[:, k:, k:] += (1 / solved.closure_weight)[:, None, None] * np.eye(m)
     mean = solved.predictions.mean
     square = (mean * np.linalg.solve(total, mean[:, :, None])[:, :, 0]).sum(axis=1)

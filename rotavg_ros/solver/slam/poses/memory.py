@@ -114,12 +114,13 @@ class PoseMemory:
         passed = lengths_passed(step, steps[new], self.pose.problem.typical)
         # Beyond its anchor a node's way turns with the anchor's heading, and with its own steps'.
         way = np.linalg.norm(position[self.num_nodes :] - position[growth.anchor], axis=1)
-        turned = noise.turn * growth.along(steps[growth.edge])
+        step_turn = self.pose.problem.mean_turn(noise)
+        turned = step_turn * growth.along(steps[growth.edge])
         lever = (poses.variance[growth.anchor] + turned / WALK) * way**2 * ACROSS
         shifted = lever + noise.way * growth.along(passed[growth.edge - self.num_edges])
         variance = np.append(poses.variance, poses.variance[growth.anchor] + turned)
         position_variance = np.append(poses.position_variance, poses.position_variance[growth.anchor] + shifted)
-        precision = np.stack((1 / (noise.turn * steps[new]), 1 / (noise.way * passed)), axis=1)
+        precision = np.stack((1 / (step_turn * steps[new]), 1 / (noise.way * passed)), axis=1)
         nothing = np.zeros(len(new))
         alone = _laid_on(self.alone, growth)
         grown_poses = replace(

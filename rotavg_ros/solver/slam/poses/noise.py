@@ -31,13 +31,19 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
 
     unit = np.eye(problem.shifts)
     by_way = by_shifts(noise.way * solved.way.length[segments, None, None] * unit)
-    by_turns = by_shifts(noise.turn * problem.bent(solved.way)[segments])
-    redundant = np.trace(redundancy[:, :k, :k], axis1=1, axis2=2).sum()
-    by_turns += np.array([(solved.left[segments, :k] ** 2).sum(), redundant])
+    bent, left, turns = problem.bent(solved.way)[:, segments], solved.left[segments, :k, 0], redundancy[:, :k, :k]
+
+    def by_axes(axes: np.ndarray) -> np.ndarray:
+        """``(2,)`` the same of turns about some axes, ``(k, k)`` onto which turns are projected."""
+        return np.array([((left @ axes) ** 2).sum(), np.trace(turns @ axes, axis1=1, axis2=2).sum()])
+
+    about = problem.about_vertical
+    by_turns = by_shifts(noise.turn * bent[0]) + by_axes(about)
+    by_tilts = by_shifts(noise.tilt * bent[1]) + by_axes(np.eye(k) - about)
     by_closures = np.stack((places.squares, places.freedom), axis=1)
     runs = slice(len(problem.drawn.source), None)
     alike = (solved.left[runs, k:] ** 2).sum(), np.trace(solved.factor.redundancy[runs, k:, k:], axis1=1, axis2=2).sum()
-    found = (by_turns, by_closures[0], by_way, *by_closures[1:], alike)
+    found = (by_turns, by_closures[0], by_way, *by_closures[1:], alike, by_tilts)
     logarithms = [
         likeliest_variance(before * squares, max(freedom, 0.0), np.log(before), median, spread)
         for (squares, freedom), before, (median, spread) in zip(
@@ -49,7 +55,8 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     most = problem.priors.most_common
     farthest = problem.priors.largest_step**2 * problem.typical
     common = min(noise.common, most / (1 - most) * noise.closure)
-    return replace(noise, common=common, way=min(noise.way, farthest))
+    tilt = noise.turn if problem.vertical is None else max(noise.tilt, problem.priors.least_tilt**2 * noise.turn)
+    return replace(noise, common=common, way=min(noise.way, farthest), tilt=tilt)
 
 
 def log_noise_prior(problem: PoseProblem, noise: PoseNoise) -> float:
@@ -59,7 +66,7 @@ def log_noise_prior(problem: PoseProblem, noise: PoseNoise) -> float:
 
 
 def priors_of(problem: PoseProblem, noise: PoseNoise) -> tuple[_Prior, ...]:
-    """Logarithms of median variances, and how far those of their roots spread; what runs share goes with the noise."""
+    """Logarithms of median variances, and how far those of their roots spread; some go with others."""
     of_turns, of_shifts, typical = problem.mode.problem.priors, problem.priors, problem.typical
     own = 2 * float(np.log(of_shifts.closure * typical)) + float(np.log1p(-of_shifts.common))
     return (
@@ -69,4 +76,5 @@ def priors_of(problem: PoseProblem, noise: PoseNoise) -> tuple[_Prior, ...]:
         (own, of_shifts.closure_spread),
         (2 * float(np.log(of_shifts.relative)), of_shifts.relative_spread),
         (float(np.log(noise.closure * of_shifts.common / (1 - of_shifts.common))), of_shifts.common_spread),
+        (float(np.log(noise.turn)), of_shifts.tilt_spread),
     )

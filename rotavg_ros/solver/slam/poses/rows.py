@@ -33,6 +33,8 @@ _LEAST_LENGTH = 1e-3
 _NONE = 1e-6
 # A closure that is longer than so many times all of odometry is as wrong as if it were as long.
 _FARTHEST = 1e3
+# An axis is nearly the vertical within this, rad.
+_NEARLY_VERTICAL = np.radians(20.0)
 # The weight of what does not pull, in that of what does.
 _NOTHING = 1e-8
 # Roots are tied down so many times more stiffly than any row.
@@ -44,12 +46,14 @@ class PoseNoise:
     """Variances per component.
 
     Attributes:
-        turn: rad², of one step of odometry.
+        turn: rad², of one step of odometry, about the vertical where the robot knows one.
         closure_turn: rad², of a good closure that states what is typical.
         way: m² per metre passed, of odometry.
         closure: m², of a good closure's translation, and …
         relative: … by what of its squared length that grows: some front ends tell directions rather than lengths.
         common: m², of what closures near each other err alike, on top.
+        tilt: rad², of one step of odometry about any other axis: gravity may hold it. The same where no vertical is
+            known.
     """
 
     turn: float
@@ -58,15 +62,16 @@ class PoseNoise:
     closure: float
     relative: float
     common: float
+    tilt: float
 
     @property
     def logarithms(self) -> np.ndarray:
-        """``(6,)``."""
-        return np.log([self.turn, self.closure_turn, self.way, self.closure, self.relative, self.common])
+        """``(7,)``."""
+        return np.log([self.turn, self.closure_turn, self.way, self.closure, self.relative, self.common, self.tilt])
 
     @classmethod
     def of(cls, logarithms: np.ndarray) -> PoseNoise:
-        """From ``(6,)``."""
+        """From ``(7,)``."""
         return cls(*np.exp(logarithms).tolist())
 
     def of_closures(self, square_length: np.ndarray | float) -> np.ndarray:
@@ -150,6 +155,36 @@ class PoseProblem:
         is_planar = off <= _PLANAR * np.abs(self.lengths).max(initial=0.0)
         return axes[:, 2:], axes[:, :2] if is_planar else np.eye(3)
 
+    @cached_property
+    def vertical(self) -> np.ndarray | None:
+        """``(3,)`` the direction of the world that the robot keeps in its body, unit; None if it knows none.
+
+        A robot on slopes does not keep it on average. If odometry errs about one axis most that is nearly the same, it
+        is this one.
+        """
+        problem = self.mode.problem
+        known = problem.vertical if self.turns == 3 and "tilt" not in problem.without else None
+        if known is None:
+            return None
+        segments = np.flatnonzero(self.mode.state.is_good[: self.drawn.num_segments])
+        residual = self.mode.evaluation.residual[segments]
+        most = np.linalg.eigh((residual.T / self.own[segments]) @ residual)[1][:, 2]
+        return most if abs(most @ known.axis) > np.cos(_NEARLY_VERTICAL) else known.axis
+
+    @cached_property
+    def about_vertical(self) -> np.ndarray:
+        """``(k, k)`` what of a turn is about the vertical: all of it where none is known."""
+        return np.eye(self.turns) if self.vertical is None else np.outer(self.vertical, self.vertical)
+
+    @property
+    def num_about(self) -> int:
+        """How many components of a turn are about the vertical."""
+        return self.turns if self.vertical is None else 1
+
+    def mean_turn(self, noise: PoseNoise) -> float:
+        """rad², of one step of odometry, the mean over components."""
+        return (noise.turn * self.num_about + noise.tilt * (self.turns - self.num_about)) / self.turns
+
     @property
     def turns(self) -> int:
         """How many components a turn has, k."""
@@ -200,7 +235,8 @@ class PoseProblem:
         noise, priors, typical = self.mode.state.noise, self.priors, self.typical
         way, closure = priors.step**2 * typical, (priors.closure * typical) ** 2
         own, common = (1 - priors.common) * closure, priors.common * closure
-        return PoseNoise(noise.step_variance, noise.closure_variance, way, own, priors.relative**2, common)
+        step = noise.step_variance
+        return PoseNoise(step, noise.closure_variance, way, own, priors.relative**2, common, step)
 
     @cached_property
     def slipped(self) -> np.ndarray:
@@ -244,11 +280,16 @@ class PoseProblem:
         slip = np.radians(priors.slip_deg) ** 2
         return np.asarray(np.where(is_odometry & ~state.is_good, own + slip, own / state.others.relative))
 
+    def rotation_variances(self, noise: PoseNoise) -> np.ndarray:
+        """``(E, 2)`` the same about the vertical, and about any other axis."""
+        about, other = (self.rotation_variance(replace(noise, turn=turn)) for turn in (noise.turn, noise.tilt))
+        return np.stack((about, other), axis=1)
+
     def bridge_variance(self, noise: PoseNoise) -> np.ndarray:
-        """``(S,)`` rad² a step, within segments; one that slipped did so anywhere."""
+        """``(2, S)`` rad² a step, within segments, about the vertical and any other axis; a slip is anywhere."""
         slip = np.radians(self.mode.problem.priors.slip_deg) ** 2
         steps = np.maximum(self.steps, 1.0)
-        return np.asarray(noise.turn + np.where(self.slipped, slip / steps, 0.0))
+        return np.asarray(np.array([[noise.turn], [noise.tilt]]) + np.where(self.slipped, slip / steps, 0.0))
 
     @cached_property
     def segment_of_node(self) -> np.ndarray:
@@ -386,13 +427,22 @@ class PoseProblem:
         variance[num_segments:] = np.where(slipped, variance / _NOTHING, variance)[num_segments:]
         variance[self.mode.problem.closure] = self.own_variance(noise)
         covariance = variance[:, None, None] * unit
-        covariance[: drawn.num_segments] += self.bridge_variance(noise)[:, None, None] * self.bent(way)
+        bending = self.bridge_variance(noise)[:, :, None, None] * self.bent(way)
+        covariance[: drawn.num_segments] += bending.sum(axis=0)
         return np.asarray(covariance)
 
     def bent(self, way: Displacements) -> np.ndarray:
-        """``(S, m, m)`` m² per rad² a step, of segments' shifts by what bends them."""
-        shifts = self.bases[1]
-        return np.asarray(shifts.T @ way.bridge[: self.drawn.num_segments] @ shifts)
+        """``(2, S, m, m)`` m² per rad² a step, of segments' shifts by what bends them: about the vertical, and not.
+
+        Turns about n alone have ∫ (d × n) (d × n)ᵀ dq of ∫ (‖d‖² I − d dᵀ) dq.
+        """
+        shifts, bridge = self.bases[1], way.bridge[: self.drawn.num_segments]
+        about = bridge
+        if self.vertical is not None:
+            second = np.trace(bridge, axis1=1, axis2=2)[:, None, None] / 2 * np.eye(3) - bridge
+            crossed = np.cross(np.eye(3), self.vertical)
+            about = crossed.T @ second @ crossed
+        return np.asarray(shifts.T @ np.stack((about, bridge - about)) @ shifts)
 
     def whitening(
         self,
@@ -405,7 +455,7 @@ class PoseProblem:
 
         Args:
             covariance: ``(E, m, m)`` of shifts.
-            rotation_weight: ``(E,)`` rad⁻².
+            rotation_weight: ``(E, 2)`` rad⁻², about the vertical and any other axis.
             closure_weight: ``(C,)`` m⁻², in the place of closures' covariances.
             state: noise.
         """
@@ -413,7 +463,8 @@ class PoseProblem:
         num_edges = len(covariance)
         root = np.zeros((num_edges + self.num_runs, k + m, k + m))
         edges, common = root[:num_edges], root[num_edges:]
-        edges[:, :k, :k] = np.sqrt(rotation_weight)[:, None, None] * np.eye(k)
+        about, other = np.sqrt(rotation_weight).T[:, :, None, None]
+        edges[:, :k, :k] = about * self.about_vertical + other * (np.eye(k) - self.about_vertical)
         # Upper triangular: Cholesky's from the last component on.
         edges[:, k:, k:] = inverse_root(covariance[:, ::-1, ::-1])[:, ::-1, ::-1]
         edges[self.mode.problem.closure, k:, k:] = np.sqrt(closure_weight)[:, None, None] * np.eye(m)

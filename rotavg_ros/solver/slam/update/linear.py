@@ -8,7 +8,7 @@ the node that they hang on.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -97,7 +97,7 @@ class Linear:
             problem.components,
             None,
             None,
-            PoseNoise(noise.step_variance, noise.closure_variance, 0.0, 0.0, 0.0, 0.0),
+            PoseNoise(noise.step_variance, noise.closure_variance, 0.0, 0.0, 0.0, 0.0, noise.step_variance),
             int(is_good.sum()),
             int((~is_good).sum()),
             1.0,
@@ -110,7 +110,9 @@ class Linear:
     @classmethod
     def of_poses(cls, pose: PoseMode) -> Linear:
         """Of a joint solve."""
-        problem, solved, noise, drawn = pose.problem, pose.solved, pose.state.noise, pose.problem.drawn
+        problem, solved, drawn = pose.problem, pose.solved, pose.problem.drawn
+        # Between ticks a turn counts as one about any axis.
+        noise = replace(pose.state.noise, turn=problem.mean_turn(pose.state.noise))
         turns, shifts = problem.bases
         segment = problem.segment_of_node
         length = np.where(segment >= 0, solved.way.length[np.maximum(segment, 0)], 0.0)

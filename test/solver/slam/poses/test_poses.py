@@ -37,6 +37,21 @@ def graph_of(run: SimulatedRun) -> ViewGraph:
     return replace(run.graph, translation=torch.from_numpy(run.edge_translation))
 
 
+def held_by_gravity(run: SimulatedRun, yaw_deg: float, seed: int = 0) -> ViewGraph:
+    """The same, but that odometry errs about the vertical alone, by so many degrees a step."""
+    graph, rng = graph_of(run), np.random.default_rng(seed)
+    steps = graph.is_odometry.numpy()
+    world_from_body = Rotation.from_quat(run.world_from_body)
+    source, target = graph.source.numpy()[steps], graph.target.numpy()[steps]
+    up = world_from_body[target].inv().apply([0.0, 0.0, 1.0])
+    noise = Rotation.from_rotvec(np.radians(yaw_deg) * rng.normal(size=(len(up), 1)) * up)
+    turn = graph.target_from_source.clone()
+    turn[graph.is_odometry] = torch.from_numpy(
+        (noise * world_from_body[target].inv() * world_from_body[source]).as_quat()
+    )
+    return replace(graph, target_from_source=rotations.normalize(turn))
+
+
 def errors(run: SimulatedRun, solution: Solution) -> tuple[float, float]:
     """Mean degrees and RMS metres."""
     truth = torch.from_numpy(Rotation.from_quat(run.world_from_body).inv().as_quat())
@@ -53,19 +68,19 @@ def pose_mode(graph: ViewGraph, without: Collection[str] = ()) -> PoseMode:
 
 
 @pytest.mark.parametrize("backward", [False, True])
-@pytest.mark.parametrize("hills", [False, True])
-def test_what_is_drawn_together_is_the_whole_graphs_optimum(hills: bool, backward: bool) -> None:
+@pytest.mark.parametrize("kind", ["plane", "hills", "gravity"])
+def test_what_is_drawn_together_is_the_whole_graphs_optimum(kind: str, backward: bool) -> None:
     """Every keyframe where gtsam puts it, by the same noise, from levers and bridges alone."""
     gtsam = pytest.importorskip("gtsam")
     run = simulated(
-        **(HILLS if hills else {}),
+        **({} if kind == "plane" else HILLS),
         odometry_backward=backward,
         num_keyframes=150,
         closures_per_keyframe=0.1,
         odometry_noise_deg=0.3,
         closure_noise_deg=1.0,
     )
-    graph = graph_of(run)
+    graph = held_by_gravity(run, 0.3) if kind == "gravity" else graph_of(run)
     # Far from each other: neighbours share an error, which gtsam is not told of.
     closure = np.flatnonzero(~graph.is_odometry.numpy())
     kept = graph.is_odometry.clone()
@@ -83,15 +98,23 @@ def test_what_is_drawn_together_is_the_whole_graphs_optimum(hills: bool, backwar
     length = np.linalg.norm(translation, axis=1)
     shift_sigma = np.sqrt(solved.state.noise.way * np.maximum(length, 0.05 * problem.typical))
     edges = problem.drawn.view_graph_edge[closures - problem.drawn.num_segments]
-    rotation_sigma[edges] = solved.rotation_weight[closures] ** -0.5
+    rotation_sigma[edges] = solved.rotation_weight[closures, 0] ** -0.5
     shift_sigma[edges] = solved.closure_weight**-0.5
     found, _ = answer([mode], np.ones(1))
     world_from_body = Rotation.from_quat(found.body_from_world).inv()
     for node in range(graph.num_nodes):
         start.insert(node, gtsam.Pose3(gtsam.Rot3(world_from_body[node].as_matrix()), found.position[node]))
+    about, other = problem.about_vertical, np.eye(problem.turns) - problem.about_vertical
+    axes = about + np.sqrt(solved.state.noise.tilt / solved.state.noise.turn) * other
+    assert (solved.state.noise.tilt < 0.1 * solved.state.noise.turn) == (kind == "gravity")
     for edge in range(graph.num_edges):
         sigmas = np.repeat([rotation_sigma[edge], shift_sigma[edge]], 3)
-        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        covariance = np.diag(sigmas**2)
+        if odometry[edge] and problem.turns == 3:
+            # gtsam counts turns in the target's frame.
+            errs = rotation_sigma[edge] * world_from_body[target[edge]].as_matrix().T @ axes
+            covariance[:3, :3] = errs @ errs.T
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
         measured = gtsam.Pose3(gtsam.Rot3(turn[edge]), translation[edge])
         factors.add(gtsam.BetweenFactorPose3(int(source[edge]), int(target[edge]), measured, noise))
     factors.add(gtsam.PriorFactorPose3(0, start.atPose3(0), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))

@@ -57,7 +57,9 @@ def without_runs(rival: Rival) -> Rival:
     if "doubted-runs" in rival.mode.problem.without:
         return rival
     for _ in range(_MAX_RUNS):
-        doubted = [moved(rival, PoseStart.doubting(rival.pose, run)) for run in runs_to_doubt(rival.pose)[:_MAX_DOUBTED]]
+        doubted = [
+            moved(rival, PoseStart.doubting(rival.pose, run)) for run in runs_to_doubt(rival.pose)[:_MAX_DOUBTED]
+        ]
         likeliest = min(doubted, key=lambda each: each.cost, default=rival)
         if likeliest.cost > rival.cost - LEAST_GAIN:
             break
