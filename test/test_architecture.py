@@ -154,7 +154,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "mode": {"left_out", "objective", "problem", "state"},
         "moves": {"densities", "em", "labels", "left_out", "mode", "objective", "priors", "problem", "rows", "state"},
         "inference": {"em", "mode", "moves", "problem", "rows", "state"},
-        "modes": {"em", "left_out", "mode", "problem", "state"},
+        "publishing": {"em", "left_out", "mode", "problem", "rows", "state", "system"},
         "solve": {"bias", "inference", "mode", "moves", "priors", "problem", "state"},
     },
     "online": {

@@ -15,10 +15,10 @@ from rotavg_ros.solver.slam import stages as slam_stages
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.posterior.inference import Search
-from rotavg_ros.solver.slam.posterior.modes import of_mode, publish
 from rotavg_ros.solver.slam.posterior.moves.noise import tuned
 from rotavg_ros.solver.slam.posterior.moves.starts import at, noise_of
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
+from rotavg_ros.solver.slam.posterior.publishing.modes import of_mode, publish
 from rotavg_ros.solver.slam.posterior.solve import Drawn, Found, search
 from rotavg_ros.view_graph import ViewGraph
 

@@ -23,7 +23,7 @@ from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.poses.search.jumps import of_jumps
 from rotavg_ros.solver.slam.poses.solve import has_places, median_poses
 from rotavg_ros.solver.slam.posterior.mode import Mode
-from rotavg_ros.solver.slam.posterior.modes import of_slips, publish
+from rotavg_ros.solver.slam.posterior.publishing.modes import of_slips, publish
 from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.preparation import Prepared, prepare
 from rotavg_ros.solver.slam.update.memory import SlamMemory, estimate_of, with_poses

@@ -18,6 +18,11 @@ from rotavg_ros.solver.algebra import quaternion_rows
 # A robot stays upright whose tilt varies by no more than this standard deviation of a component, rad; and turns about
 # the vertical so far that no other direction of the world is that steady in its body.
 _MOST_TILT, _TURNS = np.radians(15.0), 0.8
+# An axis is nearly the vertical within this, rad; and odometry errs about it most if by so many times the variance.
+_NEARLY_VERTICAL, _STANDS_OUT = np.radians(20.0), 2.0
+# What a step of odometry errs by about other axes than the vertical, over what it errs by about that: standard
+# deviation of the logarithm, and the least.
+TILT_SPREAD, LEAST_TILT = 1.5, 0.03
 # Bodies that tilt by less are told apart by nobody, rad.
 _LEAST_TILT = np.radians(2.0)
 
@@ -47,6 +52,20 @@ class Vertical:
         if variance > _MOST_TILT**2 or float(length[1]) > _TURNS:
             return None
         return cls(directions[0].numpy(), max(variance, _LEAST_TILT**2))
+
+    def sharpened(self, residual: np.ndarray, variance: np.ndarray) -> np.ndarray:
+        """``(3,)`` the axis about which odometry errs most, if that is nearly the vertical; else the vertical.
+
+        A robot on slopes does not keep the vertical on average. Where gravity holds the other axes this is nearer.
+
+        Args:
+            residual: ``(n, 3)`` rad, of odometry, in the world.
+            variance: ``(n,)`` rad².
+        """
+        square, axes = np.linalg.eigh((residual.T / variance) @ residual)
+        stands_out = square[2] > _STANDS_OUT * square[1]
+        is_near = abs(axes[:, 2] @ self.axis) > np.cos(_NEARLY_VERTICAL)
+        return np.asarray(axes[:, 2] if stands_out and is_near else self.axis)
 
     def density_ratio(self, turn: np.ndarray, predicted: np.ndarray) -> np.ndarray:
         """``(n,)`` by how much likelier turns are about the vertical, by any angle, than they are among all turns.

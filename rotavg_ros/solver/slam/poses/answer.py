@@ -9,7 +9,7 @@ import numpy as np
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
 from rotavg_ros.solver.slam.poses.estimate import PoseMode
-from rotavg_ros.solver.slam.posterior.modes import FAR_TURN, LIKELY, median
+from rotavg_ros.solver.slam.posterior.publishing.modes import FAR_TURN, LIKELY, median
 from rotavg_ros.solver.slam.stages import outlier_scores
 from rotavg_ros.view_graph import FALSE_CLOSURE_M
 
@@ -118,8 +118,8 @@ def _precision(pose: PoseMode) -> np.ndarray:
 def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """``(4, N)`` and ``(N, 3)`` poses of all nodes, and how far along its segment each lies by variance, ``(N,)``.
 
-    What a segment's shift is off by bends it: of a Brownian bridge b with z = −∫ d × dε, E[b | z] = σ² G × Cov(z)⁻¹ z,
-    G the lever up to there. What is left then goes with the way passed.
+    What a segment's shift is off by bends it: of a Brownian bridge b with z = −∫ d × dε, E[b | z] = Σ (G × Cov(z)⁻¹ z),
+    Σ of a step, G the lever up to there. What is left then goes with the way passed.
     """
     problem, state, drawn = pose.problem, pose.state, pose.problem.drawn
     segments, shifts = slice(drawn.num_segments), problem.bases[1]
@@ -132,7 +132,7 @@ def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray
     pulled = np.linalg.solve(pose.solved.covariance[segments], off[:, :, None])[:, :, 0] @ shifts.T
     bent = np.zeros((3, drawn.paths.forest.parent.shape[0]))
     lever = np.cross(way.lever[inner], pulled[segment]) @ problem.bases[0]
-    about = lever @ problem.about_vertical
+    about = lever @ problem.about_drift_axis
     of_about, of_others = problem.bridge_variance(state.noise)[:, segment, None]
     bent[:, inner] = ((of_about * about + of_others * (lever - about)) @ problem.bases[0].T).T
     orientation = quaternion_rows.normalize(quaternion_rows.multiply(orientation, quaternion_rows.exp(bent)))
@@ -153,7 +153,7 @@ def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
     problem, places, mode = pose.problem, pose.solved.places, pose.problem.mode
     predictions = pose.solved.predictions
     closure, k = mode.problem.closure, problem.turns
-    own = problem.rotation_variance(pose.state.noise)[closure]
+    own = problem.closure_turns(pose.state.noise)
     turn = np.sqrt((predictions.mean[:, :k] ** 2).sum(axis=1))
     predicted = np.trace(predictions.covariance[:, :k, :k], axis1=1, axis2=2) / k
     part = own / (own + predicted)

@@ -16,6 +16,8 @@ from rotavg_ros.solver.slam.posterior.densities import log_half_turn
 GOOD = 2
 # The class of those that join the same wrong places as another one does, from the end.
 REPEATS = -2
+# What does not pull, in what it would: the system stays solvable.
+NOTHING = 1e-8
 # Two judge a closure's place otherwise if its chances to be right differ by this.
 _OTHERWISE = 0.5
 # In which errors are longer than a limit: in a plane, too, where that is a little too often.

@@ -15,7 +15,7 @@ import numpy as np
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.running.work import rest, spend
 from rotavg_ros.solver.slam.poses.block_system import BlockFactor
-from rotavg_ros.solver.slam.poses.closures import ANYHOW, REPEATS, Places, Predictions, Scale
+from rotavg_ros.solver.slam.poses.closures import ANYHOW, NOTHING, REPEATS, Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.evidence import translation_cost
 from rotavg_ros.solver.slam.poses.noise import likeliest_noise, log_noise_prior
 from rotavg_ros.solver.slam.poses.places.judge import Judge
@@ -48,8 +48,6 @@ _LEAST_RATIO, _LARGEST_RATIO = -2.0, 0.6
 _SHARE, _LEAST_SHARE = 0.5, 0.1
 # At rest: a step's root mean square in standard errors; chances of classes; logarithms of variances.
 _STEP_CONVERGED, _CHANCE_CONVERGED, _NOISE_CONVERGED = 0.05, 0.1, 0.1
-# What does not pull, in what it would.
-_NOTHING = 1e-6
 # No two places are nearer than so many typical steps.
 _LEAST_EXTENT = 3.0
 
@@ -107,18 +105,18 @@ class PoseStart:
         chance[:, closures] = 0.0
         chance[0, closures] = 1.0
         weight[closures] = 1 / problem.own_variance(noise)[closures]
-        rotation[closures] = 1 / problem.rotation_variance(noise)[problem.mode.problem.closure[closures]]
+        rotation[closures] = 1 / problem.closure_turns(noise)[closures]
         begun = replace(places, chance=chance, weight=weight, rotation_weight=rotation)
         return replace(cls.at(pose), places=begun)
 
     @classmethod
     def doubting(cls, pose: PoseMode, closures: np.ndarray) -> PoseStart:
-        """Of the same labelling, but that some closures ``(n,)`` join the same wrong places."""
+        """Of the same labelling, but that some closures ``(n,)`` join the same wrong places, turned as they say."""
         places = pose.solved.places
         chance, weight = places.chance.copy(), places.weight.copy()
         chance[:, closures] = 0.0
         chance[REPEATS, closures] = 1.0
-        weight[closures] *= _NOTHING
+        weight[closures] *= NOTHING
         return replace(cls.at(pose), places=replace(places, chance=chance, weight=weight))
 
     def over(self, places: Places) -> Places:
@@ -184,7 +182,7 @@ def estimate_poses(
         places = _following(after, problem, solved.state.noise, state.noise)
     if not hold:
         return PoseMode(problem, solved, math.nan)
-    used = problem.rotation_variance(solved.state.noise)[problem.mode.problem.closure]
+    used = problem.closure_turns(solved.state.noise)
     judge = replace(judge, told=replace(judge.told, rotation_variance=used))
     in_order = judge(solved.predictions, solved.maps, solved.places.chance, solved.scale, in_order=True)
     return PoseMode(problem, solved, translation_cost(problem, solved, in_order))
@@ -195,8 +193,8 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     closure, k, num_nodes = problem.mode.problem.closure, problem.turns, problem.drawn.num_nodes
     way = problem.displacements(problem.orientations(state))
     residual, covariance = problem.residuals(state, way), problem.shift_covariance(state, way)
-    rotation_variance = problem.rotation_variances(state.noise)
-    rotation_weight = 1 / rotation_variance
+    turn_variances = problem.turn_variances(state.noise)
+    rotation_weight = 1 / turn_variances
     rotation_weight[closure] = places.rotation_weight[:, None]
     rest()
     root = problem.whitening(covariance, rotation_weight, places.weight, state)
@@ -224,7 +222,7 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     anywhere = scale.extent + (problem.lengths[problem.closures] ** 2).sum(axis=1)
     spend(_ROW * len(jacobian))
     predictions = _left_out(factor, root, left, closure).within(k, ANYHOW, anywhere)
-    judge = replace(judge, told=replace(judge.told, rotation_variance=rotation_variance[closure, 0]))
+    judge = replace(judge, told=replace(judge.told, rotation_variance=turn_variances[closure, 0]))
     spend(_ROW * len(jacobian))
     maps = MapTurns.of(problem, state.position, predictions, scale.good)
     spend(_ROW * len(jacobian))

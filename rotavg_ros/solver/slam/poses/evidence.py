@@ -83,6 +83,6 @@ def _gained_by_rotations(problem: PoseProblem) -> np.ndarray:
         return np.asarray(-(square / variance + k * np.log(2 * np.pi * variance)) / 2)
 
     is_good = problem.mode.state.is_good[closure]
-    own = log_normal(problem.rotation_variance(problem.turn_noise)[closure] + predicted)
+    own = log_normal(problem.closure_turns(problem.turn_noise) + predicted)
     stands = log_normal(1 / problem.mode.evaluation.weight[closure] + predicted)
     return np.asarray(np.where(is_good, own, problem.told.false_odds) - stands)

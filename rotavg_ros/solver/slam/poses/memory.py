@@ -95,7 +95,9 @@ class PoseMemory:
         orientation, position = grown
         correction = drawn.corrections(orientation).numpy().T
         common = np.zeros((problem.num_runs, 6))
-        state = PoseState(np.ascontiguousarray(correction), position[drawn.nodes], common, self.noise)
+        # Whether the robot keeps a vertical may be seen otherwise since.
+        noise = self.noise if problem.drift_axis is not None else replace(self.noise, tilt=self.noise.turn)
+        state = PoseState(np.ascontiguousarray(correction), position[drawn.nodes], common, noise)
         column = np.full(graph.num_edges, -1)
         column[self.edge] = np.arange(len(self.edge))
         return PoseStart(state, column[closures], self.places)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
+from rotavg_ros.solver.slam.noise.vertical import LEAST_TILT, TILT_SPREAD
 from rotavg_ros.solver.slam.poses.rows import PoseNoise, PoseProblem
 from rotavg_ros.solver.slam.poses.solved import Solved
 from rotavg_ros.solver.slam.posterior.em import likeliest_variance
@@ -37,25 +38,29 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
         """``(2,)`` the same of turns about some axes, ``(k, k)`` onto which turns are projected."""
         return np.array([((left @ axes) ** 2).sum(), np.trace(turns @ axes, axis1=1, axis2=2).sum()])
 
-    about = problem.about_vertical
+    about = problem.about_drift_axis
     by_turns = by_shifts(noise.turn * bent[0]) + by_axes(about)
     by_tilts = by_shifts(noise.tilt * bent[1]) + by_axes(np.eye(k) - about)
     by_closures = np.stack((places.squares, places.freedom), axis=1)
     runs = slice(len(problem.drawn.source), None)
     alike = (solved.left[runs, k:] ** 2).sum(), np.trace(solved.factor.redundancy[runs, k:, k:], axis1=1, axis2=2).sum()
-    found = (by_turns, by_closures[0], by_way, *by_closures[1:], alike, by_tilts)
-    logarithms = [
-        likeliest_variance(before * squares, max(freedom, 0.0), np.log(before), median, spread)
-        for (squares, freedom), before, (median, spread) in zip(
-            found, np.exp(noise.logarithms).tolist(), priors_of(problem, noise), strict=True
-        )
-    ]
-    noise = PoseNoise.of(np.log(logarithms))
+    used, priors = np.exp(noise.logarithms), priors_of(problem, noise)
+    found = np.stack((by_turns, by_closures[0], by_way, *by_closures[1:], alike, by_tilts))
+    found[:, 0] *= used
+
+    def likeliest(told: np.ndarray, number: int) -> float:
+        return likeliest_variance(told[0], max(told[1], 0.0), float(np.log(used[number])), *priors[number])
+
+    noise = PoseNoise.of(np.log([likeliest(told, number) for number, told in enumerate(found)]))
+    if problem.drift_axis is None or noise.tilt > noise.turn:
+        # Gravity holds or does not: false closures would make room for themselves by tilts.
+        alone = likeliest(found[0] + found[-1], 0)
+        noise = replace(noise, turn=alone, tilt=alone)
     # Runs that join wrong places have more than that in common, and would make room for themselves.
     most = problem.priors.most_common
     farthest = problem.priors.largest_step**2 * problem.typical
     common = min(noise.common, most / (1 - most) * noise.closure)
-    tilt = noise.turn if problem.vertical is None else max(noise.tilt, problem.priors.least_tilt**2 * noise.turn)
+    tilt = max(noise.tilt, LEAST_TILT**2 * noise.turn)
     return replace(noise, common=common, way=min(noise.way, farthest), tilt=tilt)
 
 
@@ -76,5 +81,5 @@ def priors_of(problem: PoseProblem, noise: PoseNoise) -> tuple[_Prior, ...]:
         (own, of_shifts.closure_spread),
         (2 * float(np.log(of_shifts.relative)), of_shifts.relative_spread),
         (float(np.log(noise.closure * of_shifts.common / (1 - of_shifts.common))), of_shifts.common_spread),
-        (float(np.log(noise.turn)), of_shifts.tilt_spread),
+        (float(np.log(noise.turn)), TILT_SPREAD),
     )

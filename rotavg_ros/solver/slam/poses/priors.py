@@ -19,9 +19,6 @@ class PlacePriors:
         closure_spread: … and that of its logarithm.
         relative: median of what a good closure's translation errs by, of its own length, …
         relative_spread: … and standard deviation of its logarithm: most front ends measure lengths, some guess them.
-        tilt_spread: standard deviation of the logarithm of what a step of odometry errs by about other axes than the
-            vertical, over what it errs by about that, …
-        least_tilt: … which is this at least.
         slip: standard deviation of how far a step is off by where it slipped, beside what its turn bends.
         common: share of a closure's variance that it has in common with those near it, in the median; …
         common_spread: … standard deviation of the logarithm of what they share over what they do not; …
@@ -49,8 +46,6 @@ class PlacePriors:
     closure_spread: float = 1.0
     relative: float = 0.05
     relative_spread: float = 1.5
-    tilt_spread: float = 1.5
-    least_tilt: float = 0.03
     slip: float = 1.0
     common: float = 0.5
     common_spread: float = 1.0

@@ -15,7 +15,7 @@ from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.poses.block_system import BlockEquations
-from rotavg_ros.solver.slam.poses.closures import ANYHOW, Told
+from rotavg_ros.solver.slam.poses.closures import ANYHOW, NOTHING, Told
 from rotavg_ros.solver.slam.poses.displacements import Displacements, DrawnSteps
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 from rotavg_ros.solver.slam.posterior.densities import log_false, log_good
@@ -33,10 +33,6 @@ _LEAST_LENGTH = 1e-3
 _NONE = 1e-6
 # A closure that is longer than so many times all of odometry is as wrong as if it were as long.
 _FARTHEST = 1e3
-# An axis is nearly the vertical within this, rad.
-_NEARLY_VERTICAL = np.radians(20.0)
-# The weight of what does not pull, in that of what does.
-_NOTHING = 1e-8
 # Roots are tied down so many times more stiffly than any row.
 _GROUNDING = 1e6
 
@@ -156,30 +152,24 @@ class PoseProblem:
         return axes[:, 2:], axes[:, :2] if is_planar else np.eye(3)
 
     @cached_property
-    def vertical(self) -> np.ndarray | None:
-        """``(3,)`` the direction of the world that the robot keeps in its body, unit; None if it knows none.
-
-        A robot on slopes does not keep it on average. If odometry errs about one axis most that is nearly the same, it
-        is this one.
-        """
+    def drift_axis(self) -> np.ndarray | None:
+        """``(3,)`` unit vector of the world, the vertical, where the robot knows one; None: all axes are alike."""
         problem = self.mode.problem
-        known = problem.vertical if self.turns == 3 and "tilt" not in problem.without else None
+        known = problem.upright if self.turns == 3 and "tilt" not in problem.without else None
         if known is None:
             return None
-        segments = np.flatnonzero(self.mode.state.is_good[: self.drawn.num_segments])
-        residual = self.mode.evaluation.residual[segments]
-        most = np.linalg.eigh((residual.T / self.own[segments]) @ residual)[1][:, 2]
-        return most if abs(most @ known.axis) > np.cos(_NEARLY_VERTICAL) else known.axis
+        sound = np.flatnonzero(self.mode.state.is_good[: self.drawn.num_segments])
+        return known.sharpened(self.mode.evaluation.residual[sound], self.own[sound])
 
     @cached_property
-    def about_vertical(self) -> np.ndarray:
-        """``(k, k)`` what of a turn is about the vertical: all of it where none is known."""
-        return np.eye(self.turns) if self.vertical is None else np.outer(self.vertical, self.vertical)
+    def about_drift_axis(self) -> np.ndarray:
+        """``(k, k)`` what of a turn is about the drift axis: all of it where there is none."""
+        return np.eye(self.turns) if self.drift_axis is None else np.outer(self.drift_axis, self.drift_axis)
 
     @property
     def num_about(self) -> int:
-        """How many components of a turn are about the vertical."""
-        return self.turns if self.vertical is None else 1
+        """How many components of a turn are about the drift axis: all of them where there is none."""
+        return self.turns if self.drift_axis is None else 1
 
     def mean_turn(self, noise: PoseNoise) -> float:
         """rad², of one step of odometry, the mean over components."""
@@ -272,21 +262,25 @@ class PoseProblem:
         """``(S,)`` m² per component, variance of a jump of each segment: as far as its longest step reports."""
         return np.asarray(np.maximum(self._step_reports[self.longest_steps], _LEAST_LENGTH * self.typical) ** 2)
 
-    def rotation_variance(self, noise: PoseNoise) -> np.ndarray:
-        """``(E,)`` rad², of odometry as labelled and of closures as good ones, tails as the last solve weighed them."""
-        state, priors, is_odometry = self.mode.state, self.mode.problem.priors, self.drawn.is_odometry
-        turn, closure = noise.turn / state.noise.step_variance, noise.closure_turn / state.noise.closure_variance
-        own = self.own * np.where(is_odometry, turn, closure)
-        slip = np.radians(priors.slip_deg) ** 2
-        return np.asarray(np.where(is_odometry & ~state.is_good, own + slip, own / state.others.relative))
+    def turn_variances(self, noise: PoseNoise) -> np.ndarray:
+        """``(E, 2)`` rad² about the drift axis and any other one, tails as the last solve weighed them.
 
-    def rotation_variances(self, noise: PoseNoise) -> np.ndarray:
-        """``(E, 2)`` the same about the vertical, and about any other axis."""
-        about, other = (self.rotation_variance(replace(noise, turn=turn)) for turn in (noise.turn, noise.tilt))
-        return np.stack((about, other), axis=1)
+        Of odometry as labelled, of closures as good ones, which err alike about all axes.
+        """
+        state, priors, is_odometry = self.mode.state, self.mode.problem.priors, self.drawn.is_odometry
+        steps = np.array([[noise.turn, noise.tilt]]) / state.noise.step_variance
+        closure = noise.closure_turn / state.noise.closure_variance
+        own = self.own[:, None] * np.where(is_odometry[:, None], steps, closure)
+        slip = np.radians(priors.slip_deg) ** 2
+        slipped = (is_odometry & ~state.is_good)[:, None]
+        return np.asarray(np.where(slipped, own + slip, own / state.others.relative[:, None]))
+
+    def closure_turns(self, noise: PoseNoise) -> np.ndarray:
+        """``(C,)`` rad², of closures as good ones."""
+        return np.asarray(self.turn_variances(noise)[self.mode.problem.closure, 0])
 
     def bridge_variance(self, noise: PoseNoise) -> np.ndarray:
-        """``(2, S)`` rad² a step, within segments, about the vertical and any other axis; a slip is anywhere."""
+        """``(2, S)`` rad² a step, within segments, about the drift axis and any other one; a slip is anywhere."""
         slip = np.radians(self.mode.problem.priors.slip_deg) ** 2
         steps = np.maximum(self.steps, 1.0)
         return np.asarray(np.array([[noise.turn], [noise.tilt]]) + np.where(self.slipped, slip / steps, 0.0))
@@ -336,7 +330,7 @@ class PoseProblem:
         broad = predicted / (1 + predicted / ANYHOW)
         false_odds += log_false(square, k, priors, predicted=broad) - log_false(square, k, priors)
         is_known = np.isfinite(self.translation).all(axis=1)[self.closures]
-        own = self.rotation_variance(self.turn_noise)[closure]
+        own = self.closure_turns(self.turn_noise)
         order = problem.detection, problem.detected
         return Told(own, false_odds, is_known, label, problem.run, problem.follows, problem.sign, *order)
 
@@ -424,7 +418,7 @@ class PoseProblem:
         variance += np.where(slipped, (self.priors.slip * self.typical) ** 2, 0.0)
         variance[:num_segments] += self.jumps
         # Odometry beside the chain that is not believed, which nothing hangs on, does not pull.
-        variance[num_segments:] = np.where(slipped, variance / _NOTHING, variance)[num_segments:]
+        variance[num_segments:] = np.where(slipped, variance / NOTHING, variance)[num_segments:]
         variance[self.mode.problem.closure] = self.own_variance(noise)
         covariance = variance[:, None, None] * unit
         bending = self.bridge_variance(noise)[:, :, None, None] * self.bent(way)
@@ -432,15 +426,15 @@ class PoseProblem:
         return np.asarray(covariance)
 
     def bent(self, way: Displacements) -> np.ndarray:
-        """``(2, S, m, m)`` m² per rad² a step, of segments' shifts by what bends them: about the vertical, and not.
+        """``(2, S, m, m)`` m² per rad² a step, of segments' shifts by what bends them: about the drift axis, and not.
 
         Turns about n alone have ∫ (d × n) (d × n)ᵀ dq of ∫ (‖d‖² I − d dᵀ) dq.
         """
         shifts, bridge = self.bases[1], way.bridge[: self.drawn.num_segments]
         about = bridge
-        if self.vertical is not None:
+        if self.drift_axis is not None:
             second = np.trace(bridge, axis1=1, axis2=2)[:, None, None] / 2 * np.eye(3) - bridge
-            crossed = np.cross(np.eye(3), self.vertical)
+            crossed = np.cross(np.eye(3), self.drift_axis)
             about = crossed.T @ second @ crossed
         return np.asarray(shifts.T @ np.stack((about, bridge - about)) @ shifts)
 
@@ -455,7 +449,7 @@ class PoseProblem:
 
         Args:
             covariance: ``(E, m, m)`` of shifts.
-            rotation_weight: ``(E, 2)`` rad⁻², about the vertical and any other axis.
+            rotation_weight: ``(E, 2)`` rad⁻², about the drift axis and any other one.
             closure_weight: ``(C,)`` m⁻², in the place of closures' covariances.
             state: noise.
         """
@@ -464,7 +458,7 @@ class PoseProblem:
         root = np.zeros((num_edges + self.num_runs, k + m, k + m))
         edges, common = root[:num_edges], root[num_edges:]
         about, other = np.sqrt(rotation_weight).T[:, :, None, None]
-        edges[:, :k, :k] = about * self.about_vertical + other * (np.eye(k) - self.about_vertical)
+        edges[:, :k, :k] = about * self.about_drift_axis + other * (np.eye(k) - self.about_drift_axis)
         # Upper triangular: Cholesky's from the last component on.
         edges[:, k:, k:] = inverse_root(covariance[:, ::-1, ::-1])[:, ::-1, ::-1]
         edges[self.mode.problem.closure, k:, k:] = np.sqrt(closure_weight)[:, None, None] * np.eye(m)

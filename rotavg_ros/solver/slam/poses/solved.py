@@ -21,7 +21,7 @@ class Solved:
         state: after the step, with the noise that it was done with.
         way: displacements before it.
         covariance: ``(E, m, m)`` m², of shifts.
-        rotation_weight: ``(E, 2)`` rad⁻², of turns about the vertical and any other axis.
+        rotation_weight: ``(E, 2)`` rad⁻², of turns about the drift axis and any other one.
         closure_weight: ``(C,)`` m⁻², of closures' translations.
         left: ``(E + R, d, 1)`` what it leaves of whitened rows.
         factor: of its normal equations.

@@ -145,11 +145,14 @@ class Problem:
         return np.where(is_sane, np.maximum(ratio, np.log(self.priors.least_stated_ratio)), 0.0)
 
     @cached_property
+    def upright(self) -> Vertical | None:
+        """The vertical that the robot keeps, in space; None if it keeps none, or several robots differ in it."""
+        return None if self.components == 1 else Vertical.of(self.graph.odometry_orientation)
+
+    @property
     def vertical(self) -> Vertical | None:
-        """That the robot knows, where rotations have three components; None if none, or several robots differ in it."""
-        if self.components == 1 or "vertical" in self.without:
-            return None
-        return Vertical.of(self.graph.odometry_orientation)
+        """The same, for false closures' turns."""
+        return None if "vertical" in self.without else self.upright
 
     @cached_property
     def run(self) -> np.ndarray:

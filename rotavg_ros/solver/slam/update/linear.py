@@ -112,7 +112,8 @@ class Linear:
         """Of a joint solve."""
         problem, solved, drawn = pose.problem, pose.solved, pose.problem.drawn
         # Between ticks a turn counts as one about any axis.
-        noise = replace(pose.state.noise, turn=problem.mean_turn(pose.state.noise))
+        turn = problem.mean_turn(pose.state.noise)
+        noise = replace(pose.state.noise, turn=turn, tilt=turn)
         turns, shifts = problem.bases
         segment = problem.segment_of_node
         length = np.where(segment >= 0, solved.way.length[np.maximum(segment, 0)], 0.0)

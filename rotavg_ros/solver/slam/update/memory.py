@@ -27,8 +27,8 @@ from rotavg_ros.solver.slam.poses.memory import PoseMemory
 from rotavg_ros.solver.slam.posterior.inference import Search
 from rotavg_ros.solver.slam.posterior.left_out import relabelled
 from rotavg_ros.solver.slam.posterior.mode import Mode
-from rotavg_ros.solver.slam.posterior.modes import Published, publish
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
+from rotavg_ros.solver.slam.posterior.publishing.modes import Published, publish
 from rotavg_ros.solver.slam.posterior.solve import Drawn
 from rotavg_ros.solver.slam.posterior.state import Noise, Others, State
 from rotavg_ros.solver.slam.stages import outlier_scores

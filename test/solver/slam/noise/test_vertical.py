@@ -56,3 +56,18 @@ def test_what_is_predicted_less_well_may_swing_farther() -> None:
     turn = Rotation.from_rotvec([[np.radians(20.0), 0, 0]]) * Rotation.from_rotvec([[0, 0, 1.0]])
     exact, vague = (vertical.density_ratio(turn.as_rotvec(), np.array([p]))[0] for p in (0.0, np.radians(15.0) ** 2))
     assert exact < 1e-6 < 1 < vague
+
+
+def test_an_axis_that_odometry_errs_about_most_is_the_vertical_if_it_is_near() -> None:
+    """Of three axes, errs about one of them by ten times as much; the body's own is 10° off it, or 40°."""
+    rng = np.random.default_rng(0)
+    drift = np.array([0.0, np.sin(np.radians(10.0)), np.cos(np.radians(10.0))])
+    about = rng.normal(size=(200, 1)) * drift
+    residual, variance = about + 0.1 * rng.normal(size=(200, 3)), np.ones(200)
+    kept = Vertical(np.array([0.0, 0.0, 1.0]), 0.01)
+    assert abs(kept.sharpened(residual, variance) @ drift) > 0.999
+    far = Vertical(np.array([0.0, -np.sin(np.radians(30.0)), np.cos(np.radians(30.0))]), 0.01)
+    assert (far.sharpened(residual, variance) == far.axis).all()
+    alike = rng.normal(size=(200, 3))
+    assert (kept.sharpened(alike, variance) == kept.axis).all()
+    assert (kept.sharpened(np.zeros((0, 3)), np.zeros(0)) == kept.axis).all()

@@ -101,6 +101,12 @@ def _closures(rng: np.random.Generator, floors: int, false_share: float) -> tupl
     return np.concatenate(older), np.concatenate(newer)
 
 
+def false_kept(made: Building, method: str) -> int:
+    """How many closures of another floor are believed."""
+    score = solve(made.graph, method=method).outlier_score.numpy()[~made.graph.is_odometry.numpy()]
+    return int((made.is_false & (score < 0.5)).sum())
+
+
 def check(made: Building, farthest: float) -> None:
     solution = solve(made.graph)
     flagged = solution.outlier_score.numpy()[~made.graph.is_odometry.numpy()] > 0.5
@@ -116,9 +122,9 @@ def test_floors_stay_apart(seed: int) -> None:
     check(building(seed), 0.6)
 
 
-@pytest.mark.parametrize("seed", [1, 11])
-def test_gravity_tells_floors_apart(seed: int) -> None:
-    """Most closures are of another floor, but odometry that hardly tilts does not lose a floor."""
-    made = building(seed, false_share=0.65, tilts=0.05)
+def test_gravity_tells_floors_apart() -> None:
+    """Most closures of upper floors are of another one, but odometry that hardly tilts does not lose a floor."""
+    made = building(1, false_share=0.65, tilts=0.05)
     assert made.is_false.mean() > 0.4
+    assert false_kept(made, "neurora~tilt") > 20
     check(made, 0.4)

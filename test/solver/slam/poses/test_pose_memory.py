@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -15,7 +16,7 @@ from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import EdgeLabel
 
-from .test_poses import displaced, graph_of, simulated
+from .test_poses import HILLS, displaced, graph_of, held_by_gravity, simulated
 
 
 def run_of(seed: int = 0) -> SimulatedRun:
@@ -62,9 +63,15 @@ def test_odometry_alone_is_laid_on_as_a_whole_solve_has_it() -> None:
     torch.testing.assert_close(found.edge_precision[added], whole.edge_precision[added], rtol=0.3, atol=0)
 
 
-def test_updates_say_what_a_whole_solve_says() -> None:
+def held_run() -> ViewGraph:
+    """On hills, by odometry whose roll and pitch gravity holds."""
+    return held_by_gravity(simulated(2, **HILLS, closures_per_keyframe=0.3, false_share=0.2), 0.3)
+
+
+@pytest.mark.parametrize("made", [lambda: displaced(run_of(1), 0.3, 1)[0], held_run], ids=["plane", "gravity"])
+def test_updates_say_what_a_whole_solve_says(made: Callable[[], ViewGraph]) -> None:
     """And no closure's flag goes to and fro between an update, which judges by both, and a whole solve."""
-    graph, _ = displaced(run_of(1), 0.3, 1)
+    graph = made()
     answer = solve(up_to(graph, 250))
     flips, last, updates = 0, answer.outlier_score > 0.5, 0
     for nodes in range(252, 401, 2):

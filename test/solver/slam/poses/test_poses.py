@@ -104,7 +104,7 @@ def test_what_is_drawn_together_is_the_whole_graphs_optimum(kind: str, backward:
     world_from_body = Rotation.from_quat(found.body_from_world).inv()
     for node in range(graph.num_nodes):
         start.insert(node, gtsam.Pose3(gtsam.Rot3(world_from_body[node].as_matrix()), found.position[node]))
-    about, other = problem.about_vertical, np.eye(problem.turns) - problem.about_vertical
+    about, other = problem.about_drift_axis, np.eye(problem.turns) - problem.about_drift_axis
     axes = about + np.sqrt(solved.state.noise.tilt / solved.state.noise.turn) * other
     assert (solved.state.noise.tilt < 0.1 * solved.state.noise.turn) == (kind == "gravity")
     for edge in range(graph.num_edges):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.solver.slam.posterior.modes import median
+from rotavg_ros.solver.slam.posterior.publishing.modes import median
 
 
 @given(seed=st.integers(0, 10_000), rivals=st.integers(1, 5))

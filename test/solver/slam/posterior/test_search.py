@@ -24,9 +24,9 @@ from rotavg_ros.solver.slam import posterior
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.posterior.em import settle
 from rotavg_ros.solver.slam.posterior.inference import Search
-from rotavg_ros.solver.slam.posterior.modes import of_mode
 from rotavg_ros.solver.slam.posterior.moves.slips import propose_slips
 from rotavg_ros.solver.slam.posterior.priors import SearchLimits, SlamPriors
+from rotavg_ros.solver.slam.posterior.publishing.modes import of_mode
 from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.stages import bootstrap
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
@@ -274,7 +274,8 @@ STRUCTURAL = {
     }
     | {"_LOG_FIRST", "_LOG_FOLLOWS", "_LOG_STEPS", "_OF_RUN", "_BEFORE"},
     "left_out": {"CERTAIN"},
-    "modes": {"_FAR", "_FAR_NOISE", "LIKELY", "FAR_TURN", "FAR_SLIP", "_SURELY_FALSE", "_ROUNDS"},
+    "publishing/gravity": {"_COMPONENTS", "_SOLVES", "_CONVERGED"},
+    "publishing/modes": {"_FAR", "_FAR_NOISE", "LIKELY", "FAR_TURN", "FAR_SLIP", "_SURELY_FALSE", "_ROUNDS"},
     "moves/flips": {"_PART", "_DECIDED", "_HOPE", "_LEAST_GAIN"},
     "mode": {"OTHER_NOISE", "_SAME", "_MAX_DENSE"},
     "moves/jumps": {"_MAX_ROUNDS", "_MAX_CANDIDATES", "_MIN_GAIN", "_MIN_CARRIED"},

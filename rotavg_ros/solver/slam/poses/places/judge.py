@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import expit
 
 from rotavg_ros.solver.running.work import rest
-from rotavg_ros.solver.slam.poses.closures import GOOD, Places, Predictions, Scale, Told, log_from_behind
+from rotavg_ros.solver.slam.poses.closures import GOOD, REPEATS, Places, Predictions, Scale, Told, log_from_behind
 from rotavg_ros.solver.slam.poses.places import pulls
 from rotavg_ros.solver.slam.poses.places.classes import BY_ITSELF, WRONG, Said, log_sum
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
@@ -66,7 +66,7 @@ class Judge:
         rest()
         in_turn, share = InTurn(told.detection, told.run, in_order), wrong_share(before, told, self.priors)
         wrong = before[GOOD:-1].sum(axis=0)
-        likely = shared_ways(repeats.elsewhere, np.ones(repeats.elsewhere.shape[1]), before[-2], in_turn)
+        likely = shared_ways(repeats.elsewhere, np.ones(repeats.elsewhere.shape[1]), before[REPEATS], in_turn)
         anywhere = _Others(repeats.has_elsewhere, (likely * repeats.elsewhere).sum(axis=1))
         alike = self._log_repeats(_Others(repeats.has_alike, repeats.alike), repeats, alone, wrong, in_turn)
         log_class += self._log_classes(share, alike, self._log_elsewhere(anywhere, alone, wrong, in_turn))

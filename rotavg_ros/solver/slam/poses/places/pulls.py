@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rotavg_ros.solver.slam.poses.closures import GOOD, Places, Scale, Told
+from rotavg_ros.solver.slam.poses.closures import GOOD, NOTHING, REPEATS, Places, Scale, Told
 from rotavg_ros.solver.slam.poses.places.classes import BY_ITSELF, CLASSES, Said, log_sum
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
-
-# What pulls least, of a good closure's weight: nothing, but the system stays solvable.
-_NOTHING = 1e-8
 
 
 def pulled(said: Said, told: Told, log_class: np.ndarray, number: np.ndarray) -> Places:
@@ -55,7 +52,7 @@ def nothing_known(told: Told, priors: PlacePriors, is_good: np.ndarray, square: 
     chance = np.zeros((CLASSES, len(is_good)))
     wrong = priors.wrong_place / priors.counted
     chance[0], chance[GOOD], chance[-1] = is_good * (1 - wrong), is_good * wrong, ~is_good
-    turn = np.where(is_good, 1.0, _NOTHING) / told.rotation_variance
+    turn = np.where(is_good, 1.0, NOTHING) / told.rotation_variance
     none = np.zeros_like(chance)
     zeros = np.zeros(3), np.zeros(3), np.zeros(len(is_good))
     return Places(chance, _least_weight(square, scale), turn, *zeros, none, none)
@@ -69,8 +66,8 @@ def _shift_weight(said: Said, told: Told, classes: tuple[np.ndarray, np.ndarray]
     """
     log_class, chance = classes
     alone = np.exp(log_class[BY_ITSELF] - log_sum(log_class[BY_ITSELF]))
-    number = np.maximum(np.bincount(told.run, chance[-2])[told.run], number)
-    each = np.concatenate((chance[:-2], chance[-2] * alone))[:, :, None]
+    number = np.maximum(np.bincount(told.run, chance[REPEATS])[told.run], number)
+    each = np.concatenate((chance[:REPEATS], chance[REPEATS] * alone))[:, :, None]
     variance = np.concatenate((said.variance[:-1], number * said.variance[BY_ITSELF]))[:, :, None]
     total = np.concatenate((said.spread[:-1], said.spread[BY_ITSELF])) + variance
     pull = (each / total).mean(axis=2).sum(axis=0)
@@ -86,10 +83,10 @@ def _of_turns(said: Said, chance: np.ndarray) -> tuple[np.ndarray, float, float]
     pull = right / (variance + spread) + alike / (nearly + spread)
     shrunk = right / (1 + spread / variance) + alike / (1 + spread / nearly) + chance[-1]
     square, total = (said.predictions.mean[:, :k] ** 2).sum(axis=1), variance + spread
-    weight = np.maximum(pull / shrunk, _NOTHING / variance)
+    weight = np.maximum(pull / shrunk, NOTHING / variance)
     return weight, float((right * square * variance / total**2).sum()), float((right * k * variance / total).sum())
 
 
 def _least_weight(square: np.ndarray, scale: Scale) -> np.ndarray:
     """``(C,)`` m⁻², of closures that are off by ``square`` m²: however far that is, they pull next to nothing."""
-    return np.asarray(_NOTHING / (scale.closure + square))
+    return np.asarray(NOTHING / (scale.closure + square))

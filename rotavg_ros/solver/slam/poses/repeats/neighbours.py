@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rotavg_ros.solver.slam.poses.closures import GOOD, Told
+from rotavg_ros.solver.slam.poses.closures import GOOD, REPEATS, Told
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 from rotavg_ros.solver.slam.poses.repeats.exactness import (
     WIDTHS,
@@ -74,7 +74,7 @@ def repeats_of(
     alike, turned = before[GOOD:-1].sum(axis=0), before[-1]
     pairs = _Pairs.of(np.where(can_tell & can_tell[told.follows], told.follows, -1), in_order=in_order)
     linked = np.zeros(len(alike))
-    linked[pairs.later] = before[-2, pairs.later] * alike[pairs.earlier]
+    linked[pairs.later] = before[REPEATS, pairs.later] * alike[pairs.earlier]
     in_turn = InTurn(told.detection, told.run, in_order)
     kinds = (errors.turn, errors.turn_variance), (errors.shift, errors.shift_variance)
     of_turns, of_shifts = (_Exactness.of(off, variance, pairs, linked, in_turn) for off, variance in kinds)

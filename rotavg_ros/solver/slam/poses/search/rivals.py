@@ -20,7 +20,7 @@ from rotavg_ros.view_graph import ViewGraph
 # more than the second are published together.
 _MAX_RIVALS, _FARTHEST, _FAR = 8, 20.0, 5.0
 # Whole runs are believed and doubted in so many labellings at most.
-_MAX_BELIEVING = 3
+_MAX_ASKED = 3
 # Jumps at most.
 _MAX_JUMPS = 8
 
@@ -59,7 +59,7 @@ def rival_poses(
     for pose, rival in zip(begun, ended[: len(begun)], strict=True):
         if rival.cost < least + HOPELESS and (other := _begun_otherwise(pose)) is not None:
             ended.append(settling(other, least))
-    ended.extend([without_runs(with_runs(rival)) for rival in _distinct(ended, HOPELESS)[:_MAX_BELIEVING]])
+    ended.extend([without_runs(with_runs(rival)) for rival in _distinct(ended, HOPELESS)[:_MAX_ASKED]])
     ended.extend(_jumping(min(ended, key=lambda rival: rival.cost)))
     rivals = _distinct(ended, _FAR)
     cost = np.array([rival.cost for rival in rivals])

@@ -29,7 +29,7 @@ _LOOKED_AT, _LEAST_MEMBERS, _MOST_MEMBERS = 32, 2, 96
 _WRONG = 0.5
 # Runs are doubted that would be as far off by chance with less than this probability.
 _UNLIKELY = 0.05
-# Runs that are believed, or doubted, at most; the most unlikely are tried, of which one is.
+# So many runs are believed, or doubted, at most, one after the other; each time so many are asked which gains most.
 _MAX_RUNS, _MAX_DOUBTED = 8, 4
 
 
@@ -61,7 +61,7 @@ def without_runs(rival: Rival) -> Rival:
             moved(rival, PoseStart.doubting(rival.pose, run)) for run in runs_to_doubt(rival.pose)[:_MAX_DOUBTED]
         ]
         likeliest = min(doubted, key=lambda each: each.cost, default=rival)
-        if likeliest.cost > rival.cost - LEAST_GAIN:
+        if not likeliest.cost < rival.cost - LEAST_GAIN:
             break
         rival = with_runs(likeliest)
     return rival
@@ -81,23 +81,29 @@ def runs_to_believe(pose: PoseMode) -> list[tuple[float, np.ndarray]]:
 
 
 def runs_to_doubt(pose: PoseMode) -> list[np.ndarray]:
-    """Closures of runs that are believed though all else says that they are off alike, the most unlikely first.
+    """Closures of runs that are believed though all else says that they are off alike, the most unlikely first."""
+    problem = pose.problem
+    of_run, run = problem.run[problem.mode.problem.closure], problem.told.run
+    could_be_wrong = problem.told.is_known & (problem.told.label == 0)
+    believed = np.flatnonzero((pose.solved.places.right > _WRONG) & (of_run >= 0) & could_be_wrong)
+    most = np.zeros(run.max(initial=-1) + 1)
+    np.maximum.at(most, run[believed], unlikely_offsets(pose)[of_run[believed]])
+    by_chance = chdtrc(problem.turns + problem.shifts, most)
+    order = np.argsort(-most, kind="stable")
+    members = [believed[run[believed] == each] for each in order[by_chance[order] < _UNLIKELY]]
+    return [each for each in members if len(each) >= _LEAST_MEMBERS]
+
+
+def unlikely_offsets(pose: PoseMode) -> np.ndarray:
+    """``(R,)`` squares, in standard deviations, of what each run's closures err alike by all that others say of it.
 
     What a run has in common is a row of the system by itself: all other rows say N(μ, P) of it, which is whitened.
     """
     problem, solved = pose.problem, pose.solved
-    of_run, run = problem.run[problem.mode.problem.closure], problem.told.run
     row = len(problem.drawn.source) + np.arange(problem.num_runs)
     others, covariance = solved.factor.without(row)
     off = np.matmul(others, solved.left[row])
-    square = (off * np.linalg.solve(covariance + np.eye(off.shape[1]), off)).sum(axis=(1, 2))
-    believed = np.flatnonzero((solved.places.right > _WRONG) & (of_run >= 0) & (problem.told.label == 0))
-    most = np.zeros(run.max(initial=-1) + 1)
-    np.maximum.at(most, run[believed], square[of_run[believed]])
-    by_chance = chdtrc(off.shape[1], most)
-    order = np.argsort(-most, kind="stable")
-    members = [believed[run[believed] == each] for each in order[by_chance[order] < _UNLIKELY]]
-    return [each for each in members if len(each) >= _LEAST_MEMBERS]
+    return np.asarray((off * np.linalg.solve(covariance + np.eye(off.shape[1]), off)).sum(axis=(1, 2)))
 
 
 def _nearest(pose: PoseMode, could: np.ndarray) -> list[np.ndarray]:
@@ -169,7 +175,7 @@ def _discrepancies(pose: PoseMode, members: np.ndarray) -> tuple[np.ndarray, np.
     """``(K d, K d)`` covariance of a run's discrepancies if its closures are right, and these ``(K d,)``."""
     problem, solved, k = pose.problem, pose.solved, pose.problem.turns
     rows, d = problem.mode.problem.closure[members], problem.turns + problem.shifts
-    own = np.repeat(problem.rotation_variance(pose.state.noise)[rows, None], d, axis=1)
+    own = np.repeat(problem.closure_turns(pose.state.noise)[members, None], d, axis=1)
     own[:, k:] = problem.own_variance(pose.state.noise)[members, None]
     total = solved.factor.covariance_between(problem.jacobian(solved.way)[rows], rows) + np.diag(own.ravel())
     return total, solved.predictions.mean[members].ravel()

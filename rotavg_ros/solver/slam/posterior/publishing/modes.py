@@ -16,6 +16,7 @@ from rotavg_ros.solver.slam.posterior.em import step
 from rotavg_ros.solver.slam.posterior.left_out import leave_one_out, scores
 from rotavg_ros.solver.slam.posterior.mode import OTHER_NOISE, Mode
 from rotavg_ros.solver.slam.posterior.problem import Problem
+from rotavg_ros.solver.slam.posterior.publishing.gravity import held_by_gravity
 from rotavg_ros.solver.slam.posterior.state import Noise
 
 # No labelling counts that is less likely by so many nats, and no other noise of the same labels.
@@ -190,7 +191,6 @@ def of_mode(mode: Mode) -> Published:
         state, _, _, factorised = step(problem, replace(state, trusted=trusted))
         if number < _ROUNDS - 1:
             left_out = leave_one_out(problem, state, factorised)
-    graph = problem.drawn(state.noise)
-    apart = factorised.resistance[: graph.num_segments]
-    variance = graph.variance(factorised.variance[: graph.num_nodes], apart, state.noise.step_variance)
-    return Published(graph, state.correction, score, variance, state.noise, 0, (1.0,))
+    graph, held = problem.drawn(state.noise), held_by_gravity(problem, state, factorised)
+    variance = graph.variance(held.variance, held.apart, held.step_variance)
+    return Published(graph, held.state.correction, score, variance, state.noise, 0, (1.0,))

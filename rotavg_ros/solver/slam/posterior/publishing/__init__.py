@@ -1,0 +1,1 @@
+"""What is published of the labellings that the search has found."""

@@ -1,0 +1,56 @@
+"""Orientations by rotations alone, where odometry errs about the vertical and hardly about other axes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros.solver.slam.posterior.publishing.gravity import held_by_gravity
+from rotavg_ros.solver.slam.posterior.rows import residuals
+
+from ..poses.test_poses import HILLS, graph_of, pose_mode, simulated
+from ..poses.test_poses import held_by_gravity as made_held
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("seed", range(2))
+def test_it_is_stationary_under_both_variances(seed: int) -> None:
+    """Forces of all rows on every node cancel, those of turns about the vertical and those of others."""
+    mode = pose_mode(made_held(simulated(seed, **HILLS), 0.3, seed)).problem.mode
+    problem, solved = mode.problem, mode.evaluation.factorised
+    held = held_by_gravity(problem, mode.state, solved)
+    assert held.factor[1] < 0.1 * held.factor[0]
+    vertical = problem.upright
+    assert vertical is not None
+    segments = slice(problem.graph.num_segments)
+    sound = np.flatnonzero(mode.state.is_good[segments])
+    axis = vertical.sharpened(residuals(problem, mode.state)[sound], 1 / solved.weight[sound])
+    about, residual, free = (
+        np.outer(axis, axis),
+        residuals(problem, held.state),
+        np.ones(solved.system.size, dtype=bool),
+    )
+    free[problem.graph.roots] = False
+    for axes, factor in zip((about, np.eye(3) - about), held.factor, strict=True):
+        weight = solved.weight.copy()
+        weight[sound] /= factor
+        force = np.abs(solved.system.rows.T @ (weight[:, None] * (residual @ axes)))
+        rows = abs(solved.system.rows).T @ (weight[:, None] * np.abs(residual @ axes))
+        assert (force[free] < 0.02 * rows[free].max()).all()
+
+
+@torch.no_grad()
+def test_without_a_vertical_nothing_changes() -> None:
+    mode = pose_mode(graph_of(simulated(0))).problem.mode
+    held = held_by_gravity(mode.problem, mode.state, mode.evaluation.factorised)
+    assert held.state is mode.state
+    assert (held.factor == 1).all()
+
+
+@torch.no_grad()
+def test_where_all_axes_err_alike_both_variances_come_out_so() -> None:
+    mode = pose_mode(graph_of(simulated(1, **HILLS))).problem.mode
+    held = held_by_gravity(mode.problem, mode.state, mode.evaluation.factorised)
+    assert 0.5 < held.factor[1] / held.factor[0] < 2.0
+    assert not np.array_equal(held.state.correction, mode.state.correction)
