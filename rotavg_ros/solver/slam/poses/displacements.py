@@ -6,7 +6,8 @@ those of its ends (interpolated) and a Brownian bridge between them, so that wit
     r = Σ W_i t_i − (p_b − p_a)   changes by   − δ_a × A − δ_b × B − (δp_b − δp_a),     A + B = Σ W_i t_i ,
 
 and errs by what the bridge turns: with d(q) what of the way is left at q, less its mean B, the covariance of that is
-σ² ∫ (‖d‖² I − d dᵀ) dq where all axes err alike. That is the lever arm of odometry's turns: exact to first order, and sums alone.
+σ² ∫ (‖d‖² I − d dᵀ) dq where all axes err alike. That is the lever arm of odometry's turns: exact to first order, and
+sums alone.
 """
 
 from __future__ import annotations
