@@ -6,38 +6,39 @@ from pathlib import Path
 
 import numpy as np
 
-from rotavg_ros.datasets.files.corrected_graph import write_corrected_graph
+from rotavg_ros.datasets.files.corrected_graph import is_told, write_corrected_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.files.pose_files import write_kitti, write_tum
 from rotavg_ros.solver.positions import Translations, fit_positions
+from rotavg_ros.solver.solution import Solution
 
 POSE_FILES = ("graph.g2o", "trajectory.kitti", "trajectory.tum")
 
 
-def write_corrected_poses(
-    folder: Path,
-    graph_file: GraphFile,
-    world_from_body: np.ndarray,
-    outlier_score: np.ndarray,
-    position: np.ndarray | None = None,
-    precision: np.ndarray | None = None,
-) -> None:
+def write_corrected_poses(folder: Path, graph_file: GraphFile, solution: Solution) -> None:
     """Write ``graph.g2o``, ``trajectory.kitti``, and ``trajectory.tum`` where the graph has stamps.
+
+    Positions are the answer's, or fitted to the edges' translations where it has none.
 
     Args:
         folder: where.
         graph_file: N nodes, M edges.
-        world_from_body: ``(N, 4)`` xyzw, the answer.
-        outlier_score: ``(M,)``.
-        position: ``(N, 3)`` metres, the answer's; default: fitted to the edges' translations.
-        precision: ``(M, 2)`` rad⁻² and m⁻², the answer's; default: what edges state.
+        solution: its answer.
 
     Raises:
         GraphFileError: a file cannot be written.
     """
-    if position is None:
-        position = _fitted(graph_file, world_from_body, outlier_score)
-    write_corrected_graph(folder / "graph.g2o", graph_file, world_from_body, position, outlier_score > 0.5, precision)
+    world_from_body, score = solution.world_from_body.cpu().numpy(), solution.outlier_score.cpu().numpy()
+    precision = None if solution.edge_precision is None else solution.edge_precision.cpu().numpy()
+    judged = None
+    if precision is not None and solution.rotation_score is not None:
+        judged = solution.rotation_score.cpu().numpy(), precision
+    if solution.position is None:
+        position = _fitted(graph_file, world_from_body, score)
+    else:
+        position = solution.position.cpu().numpy()
+    told = is_told(score > 0.5, graph_file.graph.is_odometry.cpu().numpy(), judged)
+    write_corrected_graph(folder / "graph.g2o", graph_file, world_from_body, position, told, precision)
     write_kitti(folder / "trajectory.kitti", position, world_from_body)
     if graph_file.stamps_ns is not None:
         order = np.argsort(graph_file.stamps_ns, kind="stable")

@@ -122,11 +122,7 @@ def solve_file(
     summary = summarize(job.graph, graph_file, solution, read_seconds, solve_seconds)
     write_answer(job.output, graph_file, solution, summary, edges)
     if poses:
-        world_from_body = solution.world_from_body.cpu().numpy()
-        position = None if solution.position is None else solution.position.cpu().numpy()
-        precision = None if solution.edge_precision is None else solution.edge_precision.cpu().numpy()
-        score = solution.outlier_score.cpu().numpy()
-        write_corrected_poses(job.output, graph_file, world_from_body, score, position, precision)
+        write_corrected_poses(job.output, graph_file, solution)
     return summary
 
 

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rotavg_ros.datasets.files.corrected_graph import write_corrected_graph
+from rotavg_ros.datasets.files.corrected_graph import is_told, write_corrected_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.online import Answer
 from rotavg_ros.replay.record import RunRecord
+from rotavg_ros.view_graph import EdgeKind
 
 # Rotations in a plane have no roll and pitch, and steps no height, beyond rounding.
 _PLANAR_TOLERANCE = 1e-9
@@ -18,7 +19,7 @@ _MOST_BETWEEN = 1 << 40
 
 
 def write_graph_of_run(path: Path, record: RunRecord) -> None:
-    """Write corrected vertices and the edges that are not outliers.
+    """Write corrected vertices and what is believed of the edges.
 
     Args:
         path: of the file.
@@ -46,9 +47,10 @@ def write_graph_of_run(path: Path, record: RunRecord) -> None:
         steps=answer.steps,
     )
     order = np.argsort(ids)
-    write_corrected_graph(
-        path, graph_file, answer.world_from_body[order], position[order], answer.outlier, answer.edge_precision
-    )
+    precision = answer.edge_precision
+    judged = None if precision is None or answer.rotation_score is None else (answer.rotation_score, precision)
+    told = is_told(answer.outlier, answer.kind == EdgeKind.ODOMETRY, judged)
+    write_corrected_graph(path, graph_file, answer.world_from_body[order], position[order], told, precision)
 
 
 def keyframe_ids(answer: Answer) -> np.ndarray:

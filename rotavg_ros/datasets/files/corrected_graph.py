@@ -1,4 +1,4 @@
-"""A solved pose graph in g2o: corrected vertices, and no outliers."""
+"""A solved pose graph in g2o: corrected vertices, and what is believed of the edges."""
 
 from __future__ import annotations
 
@@ -17,16 +17,36 @@ from rotavg_ros.datasets.files.pose_graph_rows import (
     rotation_information,
 )
 
+# A closure whose rotation is likelier wrong than right is left out.
+_FALSE = 0.5
+
+
+def is_told(outlier: np.ndarray, is_odometry: np.ndarray, judged: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray:
+    """``(M,)`` bool, edges that plain least squares may have: no outliers.
+
+    Where precisions were estimated these say what each edge is believed to tell. Closures of right rotation that join
+    the wrong place stay for the former, and odometry that slipped or jumped joins what it joined.
+
+    Args:
+        outlier: ``(M,)`` bool.
+        is_odometry: ``(M,)`` bool.
+        judged: ``(M,)`` probabilities that rotations are wrong, and ``(M, 2)`` precisions; None: not estimated.
+    """
+    if judged is None:
+        return ~outlier
+    rotation_score, precision = judged
+    return np.asarray((is_odometry | (rotation_score <= _FALSE)) & (precision > 0).any(axis=1))
+
 
 def write_corrected_graph(
     path: Path,
     graph_file: GraphFile,
     world_from_body: np.ndarray,
     position: np.ndarray,
-    outlier: np.ndarray,
+    told: np.ndarray,
     precision: np.ndarray | None = None,
 ) -> None:
-    """Write corrected vertices and the edges that are not outliers, so that plain least squares can go on from there.
+    """Write corrected vertices and some edges, so that plain least squares can go on from there.
 
     Unknown precisions become a typical one of those that are known, since the format has no other word for them; for
     an odometry edge that several were drawn together into, as much less.
@@ -35,13 +55,13 @@ def write_corrected_graph(
         path: of the g2o file.
         graph_file: N nodes, M edges; translations that are NaN are not known.
         world_from_body, position: ``(N, 4)`` xyzw and ``(N, 3)`` metres.
-        outlier: ``(M,)`` bool.
+        told: ``(M,)`` bool, which edges (:func:`is_told`).
         precision: ``(M, 2)`` rad⁻² and m⁻² per component as estimated; default: what edges state.
 
     Raises:
         GraphFileError: the file cannot be written.
     """
-    kept = np.flatnonzero(~outlier)
+    kept = np.flatnonzero(told)
     graph = graph_file.graph.select_edges(torch.from_numpy(kept).to(graph_file.graph.device))
     translation = graph_file.edge_translation
     translation = np.full((len(kept), 3), np.nan) if translation is None else translation[kept]

@@ -98,21 +98,22 @@ def _apart(pose: PoseMode) -> np.ndarray:
 
 
 def _precision(pose: PoseMode) -> np.ndarray:
-    """``(M, 2)`` rad⁻² and m⁻², with which the view-graph's edges count in the answer."""
+    """``(M, 2)`` rad⁻² and m⁻², with which the view-graph's edges count in the answer.
+
+    The steps of a segment share what it weighed, in the tails or not, as its variance passes along it.
+    """
     problem, noise, drawn = pose.problem, pose.state.noise, pose.problem.drawn
-    graph, closure, edges = problem.graph, problem.mode.problem.closure, problem.closures
-    variance = np.stack((problem.mean_turn(noise) * graph.steps.numpy(), noise.way * problem.lengths_passed), axis=1)
-    if (relative := problem.mode.problem.relative) is not None:
-        variance[:, 0] *= drawn.edge_values(relative)
+    closure, edges = problem.mode.problem.closure, problem.closures
+    turn = drawn.edge_values(problem.mean_over_axes(1 / pose.solved.rotation_weight)) * problem.drawn_steps.share
     slipped = drawn.edge_values((drawn.is_odometry & ~problem.mode.state.is_good).astype(np.float64))
-    slip = np.radians(problem.mode.problem.priors.slip_deg), problem.priors.slip * problem.typical
-    variance += (slipped * drawn.share_of_segment)[:, None] * np.square(slip)
+    slip = (problem.priors.slip * problem.typical) ** 2
+    shift = noise.way * problem.lengths_passed + slipped * drawn.share_of_segment * slip
     if problem.jump is not None:
-        variance[:, 1] += problem.jump
-    variance[edges, 0] = 1 / pose.solved.rotation_weight[closure, 0]
-    variance[edges, 1] = 1 / pose.solved.closure_weight
+        shift += problem.jump
+    turn[edges] = 1 / pose.solved.rotation_weight[closure, 0]
+    shift[edges] = 1 / pose.solved.closure_weight
     known = np.isfinite(problem.translation).all(axis=1)
-    return np.asarray(np.stack((1 / variance[:, 0], known / variance[:, 1]), axis=1))
+    return np.asarray(np.stack((1 / turn, known / shift), axis=1))
 
 
 def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

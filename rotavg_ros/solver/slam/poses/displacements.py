@@ -56,6 +56,9 @@ class DrawnSteps:
         translation: ``(M, 3)`` position of the target in the source's frame, metres.
         drawn: the same graph, drawn together into S segments.
         steps: ``(S,)`` their variance, in that of one step.
+
+    Attributes:
+        share: ``(M,)`` how much of its segment's variance each edge has; 1 of edges that are part of none.
     """
 
     def __init__(self, graph: ViewGraph, translation: np.ndarray, drawn: ClosureGraph, steps: np.ndarray) -> None:
@@ -71,6 +74,8 @@ class DrawnSteps:
         of_parent = drawn.fraction[parent]
         of_node = np.where(self._is_last, 1.0, drawn.fraction[self._node])
         self._variance_steps = (steps[self._segment] * (of_node - of_parent))[:, None]
+        self.share = np.ones(graph.num_edges)
+        self.share[self._edge] = of_node - of_parent
         # Where along its segment a step's translation was measured.
         self._measured_at = np.where(self._is_forward, of_parent, of_node)[:, None]
         self._source, self._translation = graph.source, torch.from_numpy(translation)

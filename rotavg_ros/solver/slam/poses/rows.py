@@ -173,7 +173,12 @@ class PoseProblem:
 
     def mean_turn(self, noise: PoseNoise) -> float:
         """rad², of one step of odometry, the mean over components."""
-        return (noise.turn * self.num_about + noise.tilt * (self.turns - self.num_about)) / self.turns
+        return float(self.mean_over_axes(np.array([noise.turn, noise.tilt])))
+
+    def mean_over_axes(self, variance: np.ndarray) -> np.ndarray:
+        """Variances about the drift axis and any other one, ``(…, 2)`` → their mean over components, ``(…)``."""
+        about = self.num_about / self.turns
+        return np.asarray(about * variance[..., 0] + (1 - about) * variance[..., 1])
 
     @property
     def turns(self) -> int:
