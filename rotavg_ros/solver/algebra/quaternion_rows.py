@@ -16,6 +16,9 @@ from rotavg_ros.solver.algebra.compiled import compiled
 # So small a squared sine or angle counts as this, which makes angle / sine what it is in the limit instead of 0/0.
 _MIN_SQUARE = 1e-30
 
+Quaternion = tuple[float, float, float, float]
+_product = compiled(hamilton_product)
+
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Hamilton product ``a ∘ b``, ``(4, n)``; either may be one rotation for all, ``(4, 1)``."""
@@ -56,6 +59,21 @@ def exp(vector: np.ndarray) -> np.ndarray:
     return quaternion
 
 
+def matrices(a: np.ndarray) -> np.ndarray:
+    """Unit quaternions → rotation matrices ``(n, 3, 3)``."""
+    x, y, z, w = a
+    rows = np.empty((a.shape[1], 3, 3))
+    rows[:, 0, 0], rows[:, 1, 1], rows[:, 2, 2] = (
+        1 - 2 * (y * y + z * z),
+        1 - 2 * (x * x + z * z),
+        1 - 2 * (x * x + y * y),
+    )
+    rows[:, 0, 1], rows[:, 1, 0] = 2 * (x * y - z * w), 2 * (x * y + z * w)
+    rows[:, 0, 2], rows[:, 2, 0] = 2 * (x * z + y * w), 2 * (x * z - y * w)
+    rows[:, 1, 2], rows[:, 2, 1] = 2 * (y * z - x * w), 2 * (y * z + x * w)
+    return rows
+
+
 def residual(correction: np.ndarray, measured: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """``(4, E)`` of either sign: e_uv as ``residuals.edge_residual`` computes it, from ``(4, K)`` and ``(4, E)``."""
     at_target = correction.take(target, axis=1)
@@ -71,19 +89,70 @@ def residual_vectors(
     vectors = np.empty((len(source), 3))
     for e in range(len(source)):
         u, v = source[e], target[e]
-        ax, ay, az, aw = measured[0, e], measured[1, e], measured[2, e], measured[3, e]
-        bx, by, bz, bw = correction[0, u], correction[1, u], correction[2, u], correction[3, u]
-        mx = aw * bx + ax * bw + ay * bz - az * by
-        my = aw * by - ax * bz + ay * bw + az * bx
-        mz = aw * bz + ax * by - ay * bx + az * bw
-        mw = aw * bw - ax * bx - ay * by - az * bz
-        cx, cy, cz, cw = -correction[0, v], -correction[1, v], -correction[2, v], correction[3, v]
-        x = cw * mx + cx * mw + cy * mz - cz * my
-        y = cw * my - cx * mz + cy * mw + cz * mx
-        z = cw * mz + cx * my - cy * mx + cz * mw
-        w = cw * mw - cx * mx - cy * my - cz * mz
-        sine = math.sqrt(max(x * x + y * y + z * z, _MIN_SQUARE))
-        # The sign of w makes the vector the same for a quaternion and its negative.
-        scale = 2 * math.atan2(sine, abs(w)) / sine * (1.0 if w >= 0 else -1.0)
-        vectors[e, 0], vectors[e, 1], vectors[e, 2] = scale * x, scale * y, scale * z
+        m = measured[0, e], measured[1, e], measured[2, e], measured[3, e]
+        at_source = correction[0, u], correction[1, u], correction[2, u], correction[3, u]
+        back = -correction[0, v], -correction[1, v], -correction[2, v], correction[3, v]
+        vectors[e, 0], vectors[e, 1], vectors[e, 2] = _rotation_vector(_product(back, _product(m, at_source)))
     return vectors
+
+
+@compiled
+def spread(orientation: np.ndarray, correction: np.ndarray, between: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    """Orientations R C ``(N, 4)``, C turned from one correction towards another one.
+
+    Args:
+        orientation: ``(N, 4)`` R.
+        correction: ``(K, 4)``.
+        between: ``(N, 2)`` which two.
+        fraction: ``(N,)`` how far.
+    """
+    turned = np.empty((len(orientation), 4))
+    last, turn = (-1, -1), (0.0, 0.0, 0.0)
+    for n in range(len(orientation)):
+        u, v = between[n, 0], between[n, 1]
+        own = correction[u, 0], correction[u, 1], correction[u, 2], correction[u, 3]
+        if u != v:
+            if (u, v) != last:
+                other = correction[v, 0], correction[v, 1], correction[v, 2], correction[v, 3]
+                last, turn = (u, v), _rotation_vector(_product((-own[0], -own[1], -own[2], own[3]), other))
+            part = fraction[n]
+            own = _product(own, _quaternion((part * turn[0], part * turn[1], part * turn[2])))
+        before = orientation[n, 0], orientation[n, 1], orientation[n, 2], orientation[n, 3]
+        x, y, z, w = _product(before, own)
+        norm = math.sqrt(x * x + y * y + z * z + w * w)
+        turned[n, 0], turned[n, 1], turned[n, 2], turned[n, 3] = x / norm, y / norm, z / norm, w / norm
+    return turned
+
+
+@compiled
+def turned_back(orientation: np.ndarray, which: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Vectors ``(n, 3)``, each turned by the inverse of the orientation that it is ``(n,)`` of, of ``(N, 4)``."""
+    turned = np.empty((len(vector), 3))
+    for n in range(len(vector)):
+        at = which[n]
+        x, y, z, w = -orientation[at, 0], -orientation[at, 1], -orientation[at, 2], orientation[at, 3]
+        a, b, c = vector[n, 0], vector[n, 1], vector[n, 2]
+        p, q, r = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
+        turned[n, 0] = a + w * p + y * r - z * q
+        turned[n, 1] = b + w * q + z * p - x * r
+        turned[n, 2] = c + w * r + x * q - y * p
+    return turned
+
+
+@compiled
+def _rotation_vector(a: Quaternion) -> tuple[float, float, float]:
+    """As :func:`log`."""
+    x, y, z, w = a
+    sine = math.sqrt(max(x * x + y * y + z * z, _MIN_SQUARE))
+    # The sign of w makes the vector the same for a quaternion and its negative.
+    scale = 2 * math.atan2(sine, abs(w)) / sine * (1.0 if w >= 0 else -1.0)
+    return scale * x, scale * y, scale * z
+
+
+@compiled
+def _quaternion(vector: tuple[float, float, float]) -> Quaternion:
+    """As :func:`exp`."""
+    x, y, z = vector
+    half_angle = math.sqrt(max(x * x + y * y + z * z, _MIN_SQUARE)) / 2
+    scale = math.sin(half_angle) / (2 * half_angle)
+    return scale * x, scale * y, scale * z, math.cos(half_angle)

@@ -155,12 +155,12 @@ class Cholesky:
         found = room.work[: width**2].reshape(width, width)
         found[num_pivots:, num_pivots:] = room.stack[top : top + num_rows**2].reshape(num_rows, num_rows)
         matrix, whole = torch.from_numpy(own), torch.from_numpy(found)
-        upper, beside = matrix[:, :num_pivots].triu(), matrix[:, num_pivots:]
-        across = -torch.linalg.solve_triangular(upper, beside @ whole[num_pivots:, num_pivots:], upper=True)
+        upper = matrix[:, :num_pivots]
+        told = torch.linalg.solve_triangular(upper, matrix[:, num_pivots:], upper=True)
+        across = -(told @ whole[num_pivots:, num_pivots:])
         whole[:num_pivots, num_pivots:], whole[num_pivots:, :num_pivots] = across, across.T
-        root = torch.linalg.solve_triangular(upper, torch.eye(num_pivots, dtype=torch.float64), upper=True)
-        within = root @ root.T - torch.linalg.solve_triangular(upper, beside @ across.T, upper=True)
-        whole[:num_pivots, :num_pivots] = (within + within.T) / 2
+        within = torch.cholesky_inverse(upper, upper=True)
+        whole[:num_pivots, :num_pivots] = within.addmm_(told, across.T, alpha=-1.0)
         return fronts.hand_down(self.elimination.shape, front, found, room, top)
 
 

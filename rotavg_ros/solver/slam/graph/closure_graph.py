@@ -87,13 +87,13 @@ class ClosureGraph:
 
     def orientations(self, correction: Tensor) -> Tensor:
         """Corrections of the key nodes ``(K, 4)`` → orientations of all nodes, body_from_world ``(N, 4)``."""
-        rows = np.ascontiguousarray(correction.numpy().T)
-        above, below = rows.take(self.above, axis=1), rows.take(self.below, axis=1)
-        turn = quaternion_rows.log(quaternion_rows.multiply(quaternion_rows.inverse(above), below))
-        spread = quaternion_rows.multiply(above, quaternion_rows.exp(self.fraction * turn))
-        odometry = np.ascontiguousarray(self.odometry_orientation.numpy().T)
-        orientation = torch.from_numpy(quaternion_rows.multiply(odometry, spread).T.copy())
-        return rotations.normalize(orientation)
+        odometry = self.odometry_orientation.numpy()
+        return torch.from_numpy(quaternion_rows.spread(odometry, correction.numpy(), self._between, self.fraction))
+
+    @property
+    def _between(self) -> np.ndarray:
+        """``(N, 2)`` key nodes above and below."""
+        return np.stack((self.above, self.below), axis=1)
 
     def variance(self, own: np.ndarray, apart: np.ndarray, step_variance: float) -> np.ndarray:
         """Variance of all nodes ``(N,)``, rad².

@@ -86,7 +86,7 @@ def _of_mode(pose: PoseMode) -> Poses:
     score, rotation = (outlier_scores(drawn, probability) for probability in _scores(pose))
     if problem.jump is not None:
         score = np.maximum(score, problem.jump > 0)
-    return Poses(np.ascontiguousarray(orientation.T), position, variance, between, score, rotation, _precision(pose))
+    return Poses(orientation, position, variance, between, score, rotation, _precision(pose))
 
 
 def _apart(pose: PoseMode) -> np.ndarray:
@@ -117,7 +117,7 @@ def _precision(pose: PoseMode) -> np.ndarray:
 
 
 def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``(4, N)`` and ``(N, 3)`` poses of all nodes, and how far along its segment each lies by variance, ``(N,)``.
+    """``(N, 4)`` and ``(N, 3)`` poses of all nodes, and how far along its segment each lies by variance, ``(N,)``.
 
     What a segment's shift is off by bends it: of a Brownian bridge b with z = −∫ d × dε, E[b | z] = Σ (G × Cov(z)⁻¹ z),
     Σ of a step, G the lever up to there. What is left then goes with the way passed.
@@ -136,7 +136,8 @@ def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray
     about = lever @ problem.about_drift_axis
     of_about, of_others = problem.bridge_variance(state.noise)[:, segment, None]
     bent[:, inner] = ((of_about * about + of_others * (lever - about)) @ problem.bases[0].T).T
-    orientation = quaternion_rows.normalize(quaternion_rows.multiply(orientation, quaternion_rows.exp(bent)))
+    turned = quaternion_rows.multiply(np.ascontiguousarray(orientation.T), quaternion_rows.exp(bent))
+    orientation = np.ascontiguousarray(quaternion_rows.normalize(turned).T)
     way = problem.displacements(orientation)
     position = state.position[drawn.above] + way.way
     passed = np.zeros(len(position))

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from rotavg_ros.solver.algebra.products import product
 from rotavg_ros.solver.algebra.small_matrices import inverse
 from rotavg_ros.solver.algebra.sparse.elimination import Elimination
 from rotavg_ros.solver.algebra.sparse.multifrontal import Cholesky
@@ -247,7 +248,8 @@ class BlockFactor:
             part = jacobian[:, :, third * d : (third + 1) * d]
             whole[np.arange(count), :, number[:, third]] += part
         rows = whole[:, :, :-1].reshape(count * d, -1)
-        return np.asarray(rows @ (half.T @ half) @ rows.T)
+        told = product(half, np.ascontiguousarray(rows.T))
+        return product(told.T, told)
 
     @property
     def leverage(self) -> np.ndarray:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rotavg_ros.solver.algebra.small_matrices import inverse_root
+from rotavg_ros.solver.algebra.small_matrices import eigh, inverse_root
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.noise.exceedance import exceedance
 from rotavg_ros.solver.slam.noise.repeats import Near, places_near
@@ -202,7 +202,7 @@ def given_turn(predictions: Predictions, variance: np.ndarray, turns: int) -> Gi
     log_turn = np.log(np.diagonal(root, axis1=1, axis2=2) / np.sqrt(2 * np.pi)).sum(axis=1)
     square = (whitened[:, :, 0] ** 2).sum(axis=1)
     given = mean[:, k:] - np.matmul(explained, whitened)[:, :, 0]
-    spread, axes = np.linalg.eigh(covariance[:, k:, k:] - np.matmul(explained, across))
+    spread, axes = eigh(covariance[:, k:, k:] - np.matmul(explained, across))
     return GivenTurn(
         log_turn - square / 2,
         square,
@@ -213,7 +213,7 @@ def given_turn(predictions: Predictions, variance: np.ndarray, turns: int) -> Gi
 
 def along_axes(predictions: Predictions, turns: int) -> tuple[np.ndarray, np.ndarray]:
     """``(C, m)`` metres and m² of shifts along the axes of their covariances, whatever the turns."""
-    spread, axes = np.linalg.eigh(predictions.covariance[:, turns:, turns:])
+    spread, axes = eigh(predictions.covariance[:, turns:, turns:])
     along = np.matmul(axes.transpose(0, 2, 1), predictions.mean[:, turns:, None])[:, :, 0]
     return along, np.maximum(spread, 0.0)
 

@@ -13,13 +13,13 @@ sums alone.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed, typical_length
+from rotavg_ros.solver.algebra.quaternion_rows import turned_back
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.view_graph import ViewGraph
 
@@ -48,6 +48,26 @@ class Displacements:
     way: np.ndarray
 
 
+class _Steps(NamedTuple):
+    """P steps of odometry, segment by segment.
+
+    Attributes:
+        first: ``(S + 1,)`` where each segment begins.
+        node: ``(P,)`` where each step ends.
+        is_forward: ``(P,)`` bool, whether its translation was measured where it begins; else where it ends.
+        is_last: ``(P,)`` bool, whether it ends at a key node.
+        measured_at: ``(P,)`` where along its segment that was.
+        variance: ``(P,)`` of its turn, in that of one step.
+    """
+
+    first: np.ndarray
+    node: np.ndarray
+    is_forward: np.ndarray
+    is_last: np.ndarray
+    measured_at: np.ndarray
+    variance: np.ndarray
+
+
 class DrawnSteps:
     """The steps of odometry in the order in which segments take them; what orientations do not change.
 
@@ -73,42 +93,32 @@ class DrawnSteps:
         self._is_last = drawn.nodes[drawn.target[self._segment]] == self._node
         of_parent = drawn.fraction[parent]
         of_node = np.where(self._is_last, 1.0, drawn.fraction[self._node])
-        self._variance_steps = (steps[self._segment] * (of_node - of_parent))[:, None]
         self.share = np.ones(graph.num_edges)
         self.share[self._edge] = of_node - of_parent
         # Where along its segment a step's translation was measured.
-        self._measured_at = np.where(self._is_forward, of_parent, of_node)[:, None]
-        self._source, self._translation = graph.source, torch.from_numpy(translation)
-        self._outside = drawn.view_graph_edge
+        measured_at = np.where(self._is_forward, of_parent, of_node)
+        along = np.where(self._is_forward, 1.0, -1.0)[:, None] * translation[self._edge]
+        first, variance = np.append(self._first, len(self._node)), steps[self._segment] * (of_node - of_parent)
+        self._steps = _Steps(first, self._node, self._is_forward, self._is_last, measured_at, variance)
+        source, outside = graph.source.numpy(), drawn.view_graph_edge
+        self._measured = source[self._edge], along
+        self._measured_outside = source[outside], np.ascontiguousarray(translation[outside])
         typical = typical_length(translation, graph.steps.numpy(), graph.is_odometry.numpy())
         length = lengths_passed(translation, graph.steps.numpy(), typical)
         passed = self._so_far(length[self._edge, None])
         self._passed = self._at_nodes(passed)[:, 0]
-        self._length = np.concatenate((self._whole(length[self._edge, None])[:, 0], length[self._outside]))
+        self._length = np.concatenate((self._whole(length[self._edge, None])[:, 0], length[outside]))
 
-    def displacements(self, body_from_world: Tensor) -> Displacements:
+    def displacements(self, body_from_world: np.ndarray) -> Displacements:
         """At orientations ``(N, 4)``."""
-        world_from_body = rotations.inverse(body_from_world)
-        world = rotations.rotate(world_from_body.index_select(0, self._source), self._translation).numpy()
-        step = np.where(self._is_forward[:, None], world[self._edge], -world[self._edge])
-        whole, after = self._whole(step), self._so_far(step)
-        at_target = self._whole(self._measured_at * step)
-        passed_by = np.where(self._is_forward[:, None], after, after - step)
-        d = (whole - at_target)[self._segment] - passed_by
-        weighted = self._variance_steps * d
-        second = self._whole((weighted[:, :, None] * d[:, None, :]).reshape(len(d), 9)).reshape(-1, 3, 3)
-        trace = np.trace(second, axis1=1, axis2=2)[:, None, None]
-        outside = world[self._outside]
-        nothing = np.zeros((len(outside), 3))
+        outside = turned_back(body_from_world, *self._measured_outside)
+        count = self._num_segments + len(outside)
+        at_source, at_target, bridge = np.empty((count, 3)), np.zeros((count, 3)), np.zeros((count, 3, 3))
+        lever, way = np.zeros((self._num_nodes, 3)), np.zeros((self._num_nodes, 3))
+        _walk(turned_back(body_from_world, *self._measured), self._steps, (at_source, at_target, bridge), (lever, way))
+        at_source[self._num_segments :] = outside
         return Displacements(
-            np.concatenate((whole, outside)),
-            np.concatenate((whole - at_target, outside)),
-            np.concatenate((at_target, nothing)),
-            np.concatenate((trace * np.eye(3) - second, np.zeros((len(outside), 3, 3)))),
-            self._length,
-            self._at_nodes(self._so_far(weighted)),
-            self._passed,
-            self._at_nodes(after),
+            at_source + at_target, at_source, at_target, bridge, self._length, lever, self._passed, way
         )
 
     def up_to_nodes(self, of_edge: np.ndarray) -> np.ndarray:
@@ -132,3 +142,48 @@ class DrawnSteps:
         out = np.zeros((self._num_nodes, value.shape[1]))
         out[self._node] = np.where(self._is_last[:, None], 0.0, value)
         return out
+
+
+@compiled
+def _walk(
+    world: np.ndarray,
+    steps: _Steps,
+    of_segments: tuple[np.ndarray, np.ndarray, np.ndarray],
+    at_nodes: tuple[np.ndarray, np.ndarray],
+) -> None:
+    """Fill A, B and the bridge of each segment, and the lever and the way up to each node.
+
+    Args:
+        world: ``(P, 3)`` metres, the steps.
+        steps: where they stand.
+        of_segments: ``(S, 3)`` A and B, ``(S, 3, 3)`` bridges; longer ones are left as they are from there on.
+        at_nodes: ``(N, 3)`` levers and ways; those of key nodes are left as they are.
+    """
+    at_source, at_target, bridge = of_segments
+    lever, way = at_nodes
+    passed, arm, d = np.empty(3), np.empty(3), np.empty(3)
+    for s in range(len(steps.first) - 1):
+        begin, end = steps.first[s], steps.first[s + 1]
+        own = at_source[s]
+        own[:] = 0.0
+        for p in range(begin, end):
+            for i in range(3):
+                own[i] += (1 - steps.measured_at[p]) * world[p, i]
+                at_target[s, i] += steps.measured_at[p] * world[p, i]
+        passed[:] = 0.0
+        arm[:] = 0.0
+        for p in range(begin, end):
+            for i in range(3):
+                before = passed[i]
+                passed[i] += world[p, i]
+                # What of the way is left where the step was measured.
+                d[i] = own[i] - (passed[i] if steps.is_forward[p] else before)
+                arm[i] += steps.variance[p] * d[i]
+            square = d[0] ** 2 + d[1] ** 2 + d[2] ** 2
+            for i in range(3):
+                bridge[s, i, i] += steps.variance[p] * square
+                for j in range(3):
+                    bridge[s, i, j] -= steps.variance[p] * d[i] * d[j]
+            if not steps.is_last[p]:
+                lever[steps.node[p]] = arm
+                way[steps.node[p]] = passed

@@ -355,9 +355,9 @@ class PoseProblem:
         return np.asarray(first[~np.isin(chain[first], chain[drawn.roots])])
 
     def orientations(self, state: PoseState) -> np.ndarray:
-        """``(4, N)`` body_from_world of all nodes."""
+        """``(N, 4)`` body_from_world of all nodes."""
         correction = torch.from_numpy(np.ascontiguousarray(state.correction.T))
-        return np.ascontiguousarray(self.drawn.orientations(correction).numpy().T)
+        return np.asarray(self.drawn.orientations(correction).numpy())
 
     @cached_property
     def drawn_steps(self) -> DrawnSteps:
@@ -365,8 +365,8 @@ class PoseProblem:
         return DrawnSteps(self.graph, self.lengths, self.drawn, self.steps)
 
     def displacements(self, body_from_world: np.ndarray) -> Displacements:
-        """At orientations ``(4, N)``."""
-        return self.drawn_steps.displacements(torch.from_numpy(np.ascontiguousarray(body_from_world.T)))
+        """At orientations ``(N, 4)``."""
+        return self.drawn_steps.displacements(body_from_world)
 
     def along_odometry(self, way: Displacements) -> np.ndarray:
         """``(K, 3)`` metres, positions of the key nodes by odometry's displacements from its roots on."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rotavg_ros.solver.slam.poses.closures import GOOD, NOTHING, REPEATS, Places, Scale, Told
-from rotavg_ros.solver.slam.poses.places.classes import BY_ITSELF, CLASSES, Said, log_sum
+from rotavg_ros.solver.slam.poses.places.classes import BY_ITSELF, CLASSES, Said, log_sum, over_components
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 
 
@@ -70,8 +70,9 @@ def _shift_weight(said: Said, told: Told, classes: tuple[np.ndarray, np.ndarray]
     each = np.concatenate((chance[:REPEATS], chance[REPEATS] * alone))[:, :, None]
     variance = np.concatenate((said.variance[:-1], number * said.variance[BY_ITSELF]))[:, :, None]
     total = np.concatenate((said.spread[:-1], said.spread[BY_ITSELF])) + variance
-    pull = (each / total).mean(axis=2).sum(axis=0)
-    shrunk = (each * variance / total).mean(axis=2).sum(axis=0) + chance[-1]
+    components = total.shape[2]
+    pull = over_components(each / total).sum(axis=0) / components
+    shrunk = over_components(each * variance / total).sum(axis=0) / components + chance[-1]
     return np.asarray(pull / shrunk)
 
 

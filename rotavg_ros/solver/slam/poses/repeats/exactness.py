@@ -18,8 +18,8 @@ from rotavg_ros.solver.slam.noise.repeats import Near
 
 # Squared widths of what repeats differ by, in those of two good closures: so many, each a sixteenth of the one before.
 _BROADEST, WIDTHS = 256.0, 3
-# A kernel ends at so many widths, where it is 1e-8 of its height.
-_FARTHEST = 6.0
+# A kernel ends at so many widths, where it is 4e-6 of its height.
+_FARTHEST = 5.0
 # No density is less.
 _LEAST = 1e-300
 # A repeat differs by one of them from the closure before, or from the mean of all before that it follows.
@@ -154,12 +154,19 @@ def repeated_anywhere(
     density = np.zeros((len(wrong), WIDTHS * WIDTHS))
     total, alike = np.zeros(len(wrong)), np.zeros(len(wrong))
     turned, shifted = np.empty(WIDTHS), np.empty(WIDTHS)
+    asks, tells = np.zeros(len(wrong), np.bool_), np.zeros(len(wrong), np.bool_)
+    asks[rows], tells[others] = True, True
+    # Whoever is compared with those after it, and tells as well as asks, is so with each of them both ways at once.
+    both_ways = asks & tells & (between[:, 2] < between[:, 3]).any()
     for n in range(len(rows)):
         row = rows[n]
         for side in range(2):
             for place in range(between[n, 2 * side], between[n, 2 * side + 1]):
                 other = others[place]
                 total[row] += wrong[other]
+                is_both = both_ways[row] and both_ways[other]
+                if is_both and side == 1:
+                    continue
                 of_turn = errors.turn_variance[row] + errors.turn_variance[other]
                 of_shift = errors.shift_variance[row] + errors.shift_variance[other]
                 for sign in (1, -1):
@@ -172,11 +179,13 @@ def repeated_anywhere(
                         continue
                     _kernels(turned, square, of_turn, turns)
                     same = turned.mean() * shifted.mean()
-                    alike[row] += wrong[other] * same / max(same + alone[row], _LEAST)
-                    for of_turns in range(WIDTHS):
-                        for of_shifts in range(WIDTHS):
-                            both = turned[of_turns] * shifted[of_shifts]
-                            density[row, of_turns * WIDTHS + of_shifts] += wrong[other] * both / 2
+                    for end in range(2 if is_both else 1):
+                        one, another = (row, other) if end == 0 else (other, row)
+                        alike[one] += wrong[another] * same / max(same + alone[one], _LEAST)
+                        for of_turns in range(WIDTHS):
+                            told = wrong[another] / 2 * turned[of_turns]
+                            for of_shifts in range(WIDTHS):
+                                density[one, of_turns * WIDTHS + of_shifts] += told * shifted[of_shifts]
     return density, total, alike
 
 

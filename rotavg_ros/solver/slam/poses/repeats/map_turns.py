@@ -60,14 +60,15 @@ class MapTurns:
         shift = predictions.mean[:, k:] @ shifts.T
         # Where the newer end is the source: the inverse, F⁻¹ x = Fᵀ (x − target − ε) + target.
         inverse = quaternion_rows.inverse(forward)
-        seen = _rotated(inverse, source - target - shift)
+        back = quaternion_rows.matrices(inverse)
+        seen = np.matmul(back, (source - target - shift)[:, :, None])[:, :, 0]
         change = np.zeros((len(closure), k + m, k + m))
         change[:, :k, :k], change[:, k:, k:] = -np.eye(k), np.eye(m)
-        back = np.stack([_rotated(inverse, np.broadcast_to(axis, source.shape)) for axis in np.eye(3)], axis=2)
-        is_back = ~is_forward
-        change[is_back, :k, :k] = (turns.T @ back @ turns)[is_back]
-        change[is_back, k:, :k] = -(shifts.T @ _crossed(seen) @ back @ turns)[is_back]
-        change[is_back, k:, k:] = -(shifts.T @ back @ shifts)[is_back]
+        is_back = np.flatnonzero(~is_forward)
+        back = back[is_back]
+        change[is_back, :k, :k] = turns.T @ back @ turns
+        change[is_back, k:, :k] = -shifts.T @ _crossed(seen[is_back]) @ back @ turns
+        change[is_back, k:, k:] = -shifts.T @ back @ shifts
         own = np.repeat(np.stack((problem.told.rotation_variance, closure_variance), axis=1), (k, m), axis=1)
         noise = own[:, :, None] * np.eye(k + m)
         back_turned = change.transpose(0, 2, 1)
@@ -121,13 +122,11 @@ class MapTurns:
         return Axes(*(np.ascontiguousarray(basis) for basis in self.bases))
 
 
-def _rotated(turn: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """``(n, 3)`` vectors turned by quaternions ``(4, n)``."""
-    axis = turn[:3].T
-    across = 2 * np.cross(axis, vector)
-    return np.asarray(vector + turn[3][:, None] * across + np.cross(axis, across))
-
-
 def _crossed(vector: np.ndarray) -> np.ndarray:
     """``(n, 3, 3)`` of v ×."""
-    return np.asarray(np.cross(vector[:, None, :], np.eye(3)).transpose(0, 2, 1))
+    x, y, z = vector.T
+    rows = np.zeros((len(vector), 3, 3))
+    rows[:, 0, 1], rows[:, 1, 0] = -z, z
+    rows[:, 0, 2], rows[:, 2, 0] = y, -y
+    rows[:, 1, 2], rows[:, 2, 1] = -x, x
+    return rows

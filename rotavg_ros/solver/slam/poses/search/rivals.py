@@ -55,10 +55,11 @@ def rival_poses(
     begun = [estimate_poses(PoseProblem(graph, translation, mode)) for mode in _first(modes)]
     for pose in begun:
         ended.append(settling(pose, min((rival.cost for rival in ended), default=np.inf)))
+    # How far odometry errs is a robot's, whatever the labels.
     least = min(rival.cost for rival in ended)
-    for pose, rival in zip(begun, ended[: len(begun)], strict=True):
-        if rival.cost < least + HOPELESS and (other := _begun_otherwise(pose)) is not None:
-            ended.append(settling(other, least))
+    likeliest = next(pose for pose, rival in zip(begun, ended, strict=True) if rival.cost == least)
+    if (other := _begun_otherwise(likeliest)) is not None:
+        ended.append(settling(other, least))
     ended.extend([without_runs(with_runs(rival)) for rival in _distinct(ended, HOPELESS)[:_MAX_ASKED]])
     ended.extend(_jumping(min(ended, key=lambda rival: rival.cost)))
     rivals = _distinct(ended, _FAR)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
+from rotavg_ros.solver.algebra.products import inverse_of
 from rotavg_ros.solver.running.work import rest, stop_if_abandoned
 from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart
 from rotavg_ros.solver.slam.poses.places.judge import Judge
@@ -148,7 +149,7 @@ class _Run:
         rest()
         d = pose.problem.turns + pose.problem.shifts
         total, off = _discrepancies(pose, members)
-        precision = np.linalg.inv(total)
+        precision = inverse_of(total)
         while len(members) >= _LEAST_MEMBERS:
             pulled = (precision @ off).reshape(-1, d)
             each = np.arange(len(members))
