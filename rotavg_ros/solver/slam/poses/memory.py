@@ -102,6 +102,11 @@ class PoseMemory:
         column[self.edge] = np.arange(len(self.edge))
         return PoseStart(state, column[closures], self.places)
 
+    @property
+    def step_variance(self) -> float:
+        """rad², of one step of odometry, the mean over components and steps."""
+        return self.pose.problem.mean_turn(self.noise)
+
     def extended(self, graph: ViewGraph, growth: Growth) -> PoseMemory | None:
         """With odometry alone, on which new nodes hang; None where it has no translations."""
         new = np.arange(self.num_edges, graph.num_edges)
@@ -116,13 +121,12 @@ class PoseMemory:
         passed = lengths_passed(step, steps[new], self.pose.problem.typical)
         # Beyond its anchor a node's way turns with the anchor's heading, and with its own steps'.
         way = np.linalg.norm(position[self.num_nodes :] - position[growth.anchor], axis=1)
-        step_turn = self.pose.problem.mean_turn(noise)
-        turned = step_turn * growth.along(steps[growth.edge])
+        turned = self.step_variance * growth.along(steps[growth.edge])
         lever = (poses.variance[growth.anchor] + turned / WALK) * way**2 * ACROSS
         shifted = lever + noise.way * growth.along(passed[growth.edge - self.num_edges])
         variance = np.append(poses.variance, poses.variance[growth.anchor] + turned)
         position_variance = np.append(poses.position_variance, poses.position_variance[growth.anchor] + shifted)
-        precision = np.stack((1 / (step_turn * steps[new]), 1 / (noise.way * passed)), axis=1)
+        precision = np.stack((1 / (self.step_variance * steps[new]), 1 / (noise.way * passed)), axis=1)
         nothing = np.zeros(len(new))
         alone = _laid_on(self.alone, growth)
         grown_poses = replace(

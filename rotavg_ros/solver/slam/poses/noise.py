@@ -32,7 +32,8 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
 
     unit = np.eye(problem.shifts)
     by_way = by_shifts(noise.way * solved.way.length[segments, None, None] * unit)
-    bent, left, turns = problem.bent(solved.way)[:, segments], solved.left[segments, :k, 0], redundancy[:, :k, :k]
+    bent = (problem.bent(solved.way) * problem.tailed[:, None, None])[:, segments]
+    left, turns = solved.left[segments, :k, 0], redundancy[:, :k, :k]
 
     def by_axes(axes: np.ndarray) -> np.ndarray:
         """``(2,)`` the same of turns about some axes, ``(k, k)`` onto which turns are projected."""

@@ -287,8 +287,14 @@ class PoseProblem:
     def bridge_variance(self, noise: PoseNoise) -> np.ndarray:
         """``(2, S)`` rad² a step, within segments, about the drift axis and any other one; a slip is anywhere."""
         slip = np.radians(self.mode.problem.priors.slip_deg) ** 2
-        steps = np.maximum(self.steps, 1.0)
-        return np.asarray(np.array([[noise.turn], [noise.tilt]]) + np.where(self.slipped, slip / steps, 0.0))
+        of_step = np.array([[noise.turn], [noise.tilt]])
+        slipped = of_step + slip / np.maximum(self.steps, 1.0)
+        return np.asarray(np.where(self.slipped, slipped, of_step * self.tailed))
+
+    @cached_property
+    def tailed(self) -> np.ndarray:
+        """``(S,)`` how many times its variance each segment has, in the tails as the last solve weighed them."""
+        return np.asarray(1 / self.mode.state.others.relative[: self.drawn.num_segments])
 
     @cached_property
     def segment_of_node(self) -> np.ndarray:

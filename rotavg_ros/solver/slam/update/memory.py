@@ -283,11 +283,5 @@ def with_poses(graph: ViewGraph, estimate: Estimate, memory: PoseMemory) -> Esti
         variance=torch.from_numpy(poses.variance),
         places=places,
         memory=goes_on.with_poses(memory) if isinstance(goes_on, SlamMemory) else None,
-        step_variance=_step_variance(graph, poses.precision),
+        step_variance=memory.step_variance,
     )
-
-
-def _step_variance(graph: ViewGraph, precision: np.ndarray) -> float:
-    """rad², of one step of sound odometry, from the precisions ``(M, 2)`` with which edges count."""
-    odometry = graph.is_odometry.numpy()
-    return float(np.median(1 / (precision[odometry, 0] * graph.steps.numpy()[odometry])))

