@@ -1,0 +1,43 @@
+"""Swarm-SLAM: where a chain of keyframes ends."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace as Fields
+
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.inputs import EDGE_CONVERTERS, Source
+from rotavg_ros.online import EstimatorOptions, RejectReason
+
+from .square import (
+    converter,
+    edges,
+    keyframe_odometry,
+    quaternion,
+    stamp,
+)
+
+
+def test_keyframes_whose_numbers_start_again_begin_a_new_chain() -> None:
+    convert = converter("cslam_common_interfaces/msg/KeyframeOdom")
+    pairs = []
+    for number in (0, 1, 3, 0, 4, 5):
+        pairs.extend(
+            edge if isinstance(edge, RejectReason) else (edge.source.keyframe_id, edge.target.keyframe_id)
+            for edge in edges(convert(Fields(id=number, odom=keyframe_odometry(number).odom)))
+        )
+    assert pairs == [(0, 1), (1, 3), RejectReason.OUT_OF_ORDER_ODOMETRY, (4, 5)]
+
+
+def test_keyframes_of_odometry_that_begins_anew_begin_a_new_chain() -> None:
+    limits = EstimatorOptions().continuity_limits
+    convert = EDGE_CONVERTERS["cslam_common_interfaces/msg/KeyframeOdom"](Source("b", limits=limits))
+    pairs = []
+    for number in range(8):
+        pose = Fields(position=Fields(x=20.0 + number if number < 4 else 0.0, y=0.0, z=0.0))
+        pose.orientation = quaternion(Rotation.from_euler("z", 90 + number if number < 4 else number - 4, degrees=True))
+        odom = Fields(header=Fields(stamp=stamp(number)), pose=Fields(pose=pose))
+        pairs += [
+            (edge.source.keyframe_id, edge.target.keyframe_id) for edge in edges(convert(Fields(id=number, odom=odom)))
+        ]
+    assert pairs == [(0, 1), (1, 2), (2, 3), (4, 5), (5, 6), (6, 7)]

@@ -1,0 +1,95 @@
+"""Edges that the estimator refuses, drops, or keeps waiting."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rotavg_ros.online import EdgeMeasurement, KeyframeReference
+
+from .drives import OPTIONS, SECOND, at, closure, drive, feed, final, make
+
+
+def test_closures_by_id_wait_for_their_keyframe(solver):
+    run, estimator = drive(), make(solver)
+    rotation = run.truth[30].inv() * run.truth[0]
+    edge = EdgeMeasurement(1, KeyframeReference("r", 0), KeyframeReference("r", 10), rotation.as_quat())
+    estimator.add_edge(edge)
+    feed(estimator, run, stop=30)
+    assert estimator.counts().pending == 1
+    feed(estimator, run, start=30)
+    assert estimator.counts().pending == 0
+    assert estimator.counts().edges == 14
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"target_from_source": (0, 0, math.nan, 1)}, "nan_rotation"),
+        ({"target_from_source": (0, 0, 0, math.inf)}, "nan_rotation"),
+        ({"target_from_source": (0, 0, 0, 0)}, "zero_quaternion"),
+        ({"target_from_source": (0, 0, 1, 1)}, "unnormalized_quaternion"),
+        ({"kind": 2}, "bad_kind"),
+        ({"precision": -1.0}, "bad_precision"),
+        ({"precision": math.nan}, "bad_precision"),
+        ({"precision": math.inf}, "bad_precision"),
+        ({"edge_id": -1}, "id_out_of_range"),
+        ({"edge_id": 2**64}, "id_out_of_range"),
+        ({"source": KeyframeReference("r", 2**64)}, "id_out_of_range"),
+        ({"source": KeyframeReference("r")}, "bad_reference"),
+        ({"source": at(-5)}, "bad_stamp"),
+        ({"source": KeyframeReference("r", 3), "target": KeyframeReference("r", 3)}, "self_edge"),
+        ({"source": at(1_700_000_001 * SECOND), "target": at(1_700_000_001 * SECOND + 1)}, "self_edge"),
+        ({"source": at(1_600_000_000 * SECOND)}, "stamp_out_of_range"),
+    ],
+)
+def test_a_bad_edge_is_counted_and_changes_nothing(solver, change, reason):
+    run, estimator = drive(), make(solver)
+    feed(estimator, run)
+    estimator.add_edge(closure(run, 1, 0, 30))
+    final(estimator)
+    assert estimator.add_edge(replace(closure(run, 2, 3, 33), **change)) == reason
+    assert estimator.counts().rejected == {reason: 1}
+    assert estimator.tick() is None
+
+
+def test_edges_that_wait_in_vain_are_counted(solver):
+    run = drive()
+    estimator = make(solver, replace(OPTIONS, pending_capacity=2, pending_timeout_s=1.0))
+    for edge_id in range(3):
+        estimator.add_edge(
+            EdgeMeasurement(edge_id, KeyframeReference("r", 0), KeyframeReference("r", 99), (0, 0, 0, 1))
+        )
+    assert estimator.counts().rejected == {"pending_overflow": 1}
+    feed(estimator, run)
+    assert estimator.counts().rejected == {"pending_overflow": 1, "pending_timeout": 2}
+    assert estimator.counts().pending == 0
+
+
+def test_a_stamp_just_ahead_of_the_odometry_is_settled_when_the_input_is_silent(solver):
+    run, estimator = drive(), make(solver)
+    feed(estimator, run)
+    ahead = replace(closure(run, 1, 0, 39), target=at(run.stamps[39] + SECOND // 20))
+    too_far = replace(closure(run, 2, 0, 39), target=at(run.stamps[39] + SECOND // 5))
+    estimator.add_edge(ahead)
+    estimator.add_edge(too_far)
+    assert estimator.counts().pending == 2
+    assert final(estimator).edge_id.tolist()[-1] == 1
+    assert estimator.counts().pending == 1
+
+
+def test_retransmissions_are_dropped_and_repeated_measurements_kept(solver):
+    run, estimator = drive(), make(solver)
+    feed(estimator, run)
+    edge = closure(run, 1, 0, 30)
+    again = replace(
+        edge,
+        target_from_source=(Rotation.from_quat(edge.target_from_source) * Rotation.from_rotvec([0, 0, 1e-6])).as_quat(),
+    )
+    reasons = [estimator.add_edge(e) for e in (edge, edge, again, replace(edge, edge_id=2))]
+    assert reasons == [None, "duplicate_edge", None, None]
+    waiting = replace(edge, target=KeyframeReference("r", 77))
+    assert [estimator.add_edge(waiting), estimator.add_edge(waiting)] == [None, "duplicate_edge"]
