@@ -13,15 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.algebra.sparse.block_system import BlockFactor
 from rotavg_ros.solver.running.work import rest, spend
-from rotavg_ros.solver.slam.poses.block_system import BlockFactor
 from rotavg_ros.solver.slam.poses.closures import ANYHOW, NOTHING, REPEATS, Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.evidence import translation_cost
 from rotavg_ros.solver.slam.poses.noise import likeliest_noise, log_noise_prior
 from rotavg_ros.solver.slam.poses.places.judge import Judge
 from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
-from rotavg_ros.solver.slam.poses.rows import PoseNoise, PoseProblem, PoseState
+from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.solved import Solved
+from rotavg_ros.solver.slam.poses.state import PoseNoise, PoseState
 
 # Units of work for each row, of each third of what is done beside the factorisation.
 _ROW = 0.012

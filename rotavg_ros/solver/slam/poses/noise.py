@@ -8,8 +8,9 @@ import numpy as np
 
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.slam.noise.vertical import LEAST_TILT, TILT_SPREAD
-from rotavg_ros.solver.slam.poses.rows import PoseNoise, PoseProblem
+from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.solved import Solved
+from rotavg_ros.solver.slam.poses.state import PoseNoise
 from rotavg_ros.solver.slam.posterior.em import likeliest_variance
 
 # Each variance's own prior: median and standard deviation of the logarithm of its root.

@@ -12,12 +12,13 @@ from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed, typical_length
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
+from rotavg_ros.solver.algebra.sparse.block_system import BlockEquations
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
-from rotavg_ros.solver.slam.poses.block_system import BlockEquations
 from rotavg_ros.solver.slam.poses.closures import ANYHOW, NOTHING, Told
 from rotavg_ros.solver.slam.poses.displacements import Displacements, DrawnSteps
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
+from rotavg_ros.solver.slam.poses.state import PoseNoise, PoseState
 from rotavg_ros.solver.slam.posterior.densities import log_false, log_good
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.rows import tails, variances
@@ -35,66 +36,6 @@ _NONE = 1e-6
 _FARTHEST = 1e3
 # Roots are tied down so many times more stiffly than any row.
 _GROUNDING = 1e6
-
-
-@dataclass(frozen=True)
-class PoseNoise:
-    """Variances per component.
-
-    Attributes:
-        turn: rad², of one step of odometry, about the vertical where the robot knows one.
-        closure_turn: rad², of a good closure that states what is typical.
-        way: m² per metre passed, of odometry.
-        closure: m², of a good closure's translation, and …
-        relative: … by what of its squared length that grows: some front ends tell directions rather than lengths.
-        common: m², of what closures near each other err alike, on top.
-        tilt: rad², of one step of odometry about any other axis: gravity may hold it. The same where no vertical is
-            known.
-    """
-
-    turn: float
-    closure_turn: float
-    way: float
-    closure: float
-    relative: float
-    common: float
-    tilt: float
-
-    @property
-    def logarithms(self) -> np.ndarray:
-        """``(7,)``."""
-        return np.log([self.turn, self.closure_turn, self.way, self.closure, self.relative, self.common, self.tilt])
-
-    @classmethod
-    def of(cls, logarithms: np.ndarray) -> PoseNoise:
-        """From ``(7,)``."""
-        return cls(*np.exp(logarithms).tolist())
-
-    def of_closures(self, square_length: np.ndarray | float) -> np.ndarray:
-        """m² per component, of good closures' translations of this squared length, m²; all that they err by."""
-        return np.asarray(self.closure + self.common + self.relative * square_length)
-
-    def of_shifts_times(self, of_odometry: float, of_closures: float) -> PoseNoise:
-        """With variances of shifts so many times as large, but for what goes with their length."""
-        closure, common = of_closures * self.closure, of_closures * self.common
-        return replace(self, way=of_odometry * self.way, closure=closure, common=common)
-
-
-@dataclass(frozen=True)
-class PoseState:
-    """Of K key nodes and R runs; d = k + m unknowns each.
-
-    Attributes:
-        correction: ``(4, K)`` C, world-frame corrections of the odometry's orientations.
-        position: ``(K, 3)`` metres.
-        common: ``(R, 6)`` common errors of runs: rad, metres.
-        noise: how far everything errs.
-    """
-
-    correction: np.ndarray
-    position: np.ndarray
-    common: np.ndarray
-    noise: PoseNoise
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rotavg_ros.solver.slam.poses.estimate import PoseMode
-from rotavg_ros.solver.slam.poses.rows import PoseNoise
+from rotavg_ros.solver.slam.poses.state import PoseNoise
 from rotavg_ros.solver.slam.posterior.mode import Mode
 
 # Of a factor, that a column passes in one unit of work; half a column passes only what is eliminated after a closure's

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rotavg_ros.solver.slam.poses.rows import PoseNoise
+from rotavg_ros.solver.slam.poses.state import PoseNoise
 from rotavg_ros.solver.slam.update.columns import Columns
 from rotavg_ros.solver.slam.update.linear import Linear
 

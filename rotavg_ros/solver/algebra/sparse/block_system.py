@@ -1,4 +1,4 @@
-"""The sparse system of poses: as :mod:`rotavg_ros.solver.slam.posterior.system`, with a block of unknowns a node.
+"""The sparse system of poses in a pose graph: a block of unknowns a node.
 
 A node's block is its turn (k components) and its shift (m), a run's block what its closures err in common. The three
 blocks of a row are those of its target, its source and its run. H = Jᵀ W J is factorised once for each choice of J
@@ -14,11 +14,17 @@ from scipy.sparse.csgraph import connected_components
 
 from rotavg_ros.solver.algebra.products import product
 from rotavg_ros.solver.algebra.small_matrices import inverse
+from rotavg_ros.solver.algebra.sparse.block_rows import (
+    covariance_of_rows,
+    exceed,
+    gradient,
+    normal_matrix,
+    predicted_rows,
+)
 from rotavg_ros.solver.algebra.sparse.elimination import Elimination
 from rotavg_ros.solver.algebra.sparse.multifrontal import Cholesky
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.running.work import rest, spend, stop_if_abandoned
-from rotavg_ros.solver.slam.poses.block_rows import covariance_of_rows, exceed, gradient, normal_matrix, predicted_rows
 
 _NUM_SAMPLES, _SEED = 48, 0
 # What a solve of one column costs, in what the factor does.

@@ -1,0 +1,67 @@
+"""Where the key nodes are, and how far odometry and closures err, rotations and translations together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class PoseNoise:
+    """Variances per component.
+
+    Attributes:
+        turn: rad², of one step of odometry, about the vertical where the robot knows one.
+        closure_turn: rad², of a good closure that states what is typical.
+        way: m² per metre passed, of odometry.
+        closure: m², of a good closure's translation, and …
+        relative: … by what of its squared length that grows: some front ends tell directions rather than lengths.
+        common: m², of what closures near each other err alike, on top.
+        tilt: rad², of one step of odometry about any other axis: gravity may hold it. The same where no vertical is
+            known.
+    """
+
+    turn: float
+    closure_turn: float
+    way: float
+    closure: float
+    relative: float
+    common: float
+    tilt: float
+
+    @property
+    def logarithms(self) -> np.ndarray:
+        """``(7,)``."""
+        return np.log([self.turn, self.closure_turn, self.way, self.closure, self.relative, self.common, self.tilt])
+
+    @classmethod
+    def of(cls, logarithms: np.ndarray) -> PoseNoise:
+        """From ``(7,)``."""
+        return cls(*np.exp(logarithms).tolist())
+
+    def of_closures(self, square_length: np.ndarray | float) -> np.ndarray:
+        """m² per component, of good closures' translations of this squared length, m²; all that they err by."""
+        return np.asarray(self.closure + self.common + self.relative * square_length)
+
+    def of_shifts_times(self, of_odometry: float, of_closures: float) -> PoseNoise:
+        """With variances of shifts so many times as large, but for what goes with their length."""
+        closure, common = of_closures * self.closure, of_closures * self.common
+        return replace(self, way=of_odometry * self.way, closure=closure, common=common)
+
+
+@dataclass(frozen=True)
+class PoseState:
+    """Of K key nodes and R runs; d = k + m unknowns each.
+
+    Attributes:
+        correction: ``(4, K)`` C, world-frame corrections of the odometry's orientations.
+        position: ``(K, 3)`` metres.
+        common: ``(R, 6)`` common errors of runs: rad, metres.
+        noise: how far everything errs.
+    """
+
+    correction: np.ndarray
+    position: np.ndarray
+    common: np.ndarray
+    noise: PoseNoise
