@@ -61,11 +61,13 @@ class PoseMode:
         problem: the graph.
         solved: the last solve.
         cost: −log p of translations given what rotations say, nats; NaN unless rotations' labels were held.
+        first: nats, what the first solve made of closures and noise (:func:`likeliest_level`).
     """
 
     problem: PoseProblem
     solved: Solved
     cost: float
+    first: float
 
     @property
     def state(self) -> PoseState:
@@ -161,6 +163,8 @@ def estimate_poses(
     number, held, most = 0, *((HELD, _MAX_SOLVES) if start is None else (0, start.solves))
     while True:
         solved = _solve(problem, state, places, judge)
+        if number == 0:
+            first = _log_likely(problem, solved)
         rest()
         chance, sorted_by = _settling(solved.places.chance, places.chance, sorted_by)
         after, pace = pace.towards(replace(solved.places, chance=chance), places, is_new & (number == 0))
@@ -182,11 +186,11 @@ def estimate_poses(
         state, change = _with_noise(solved.state, noise, change, is_held=held_for is not None or number <= held)
         places = _following(after, problem, solved.state.noise, state.noise)
     if not hold:
-        return PoseMode(problem, solved, math.nan)
+        return PoseMode(problem, solved, math.nan, first)
     used = problem.closure_turns(solved.state.noise)
     judge = replace(judge, told=replace(judge.told, rotation_variance=used))
     in_order = judge(solved.predictions, solved.maps, solved.places.chance, solved.scale, in_order=True)
-    return PoseMode(problem, solved, translation_cost(problem, solved, in_order))
+    return PoseMode(problem, solved, translation_cost(problem, solved, in_order), first)
 
 
 def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge) -> Solved:
@@ -244,19 +248,26 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     )
 
 
-def likeliest_level(problem: PoseProblem) -> Level:
+def likeliest_level(usual: PoseMode) -> Level:
     """The level of shifts' noise under which closures are likeliest, each by itself, before any of them pulls.
 
     Odometry that errs by anything has room for every false closure, and they keep it so; taken for better than it is,
     it holds true regions to be wrong. What it tells of closures by itself is a guess at which; −log p decides.
+
+    Args:
+        usual: the same labelling, begun with what is believed beforehand.
     """
-    told: list[float] = []
+    problem, told = usual.problem, [usual.first]
     judge = Judge(problem.told, problem.turns, problem.priors)
-    for level in _LEVELS:
+    for level in _LEVELS[1:]:
         state = _begin(problem, level)
-        solved = _solve(problem, state, _nothing_known(problem, state, judge), judge)
-        told.append(float(solved.places.log_density.sum()) + log_noise_prior(problem, state.noise))
+        told.append(_log_likely(problem, _solve(problem, state, _nothing_known(problem, state, judge), judge)))
     return _LEVELS[int(np.argmax(told))]
+
+
+def _log_likely(problem: PoseProblem, solved: Solved) -> float:
+    """Nats, of closures, each by itself, and of the noise."""
+    return float(solved.places.log_density.sum()) + log_noise_prior(problem, solved.state.noise)
 
 
 def _begin(problem: PoseProblem, level: Level) -> PoseState:

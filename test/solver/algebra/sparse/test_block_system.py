@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rotavg_ros.solver.algebra.sparse.block_system import BlockEquations
 from rotavg_ros.solver.algebra.sparse import block_system
+from rotavg_ros.solver.algebra.sparse.block_system import BlockEquations
 
 _SIZE = (1, 2)
 _D = sum(_SIZE)

@@ -65,7 +65,7 @@ def test_false_runs_are_found_from_the_noise_that_odometry_tells(seed: int) -> N
 
 @torch.no_grad()
 def test_the_noise_to_begin_with_is_what_odometry_tells() -> None:
-    levels = [likeliest_level(pose_mode(city(0, step_m).graph).problem) for step_m in (0.0005, 0.05)]
+    levels = [likeliest_level(pose_mode(city(0, step_m).graph)) for step_m in (0.0005, 0.05)]
     assert levels[0][0] < USUAL[0] == levels[1][0]
 
 

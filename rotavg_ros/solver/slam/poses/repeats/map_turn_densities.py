@@ -176,13 +176,13 @@ def _difference(turned: np.ndarray, axes: Axes, row: int, other: int, difference
     # a ∘ b⁻¹ as a rotation vector.
     a0, a1, a2, a3 = turned[row, 0], turned[row, 1], turned[row, 2], turned[row, 3]
     b0, b1, b2, b3 = turned[other, 0], turned[other, 1], turned[other, 2], turned[other, 3]
-    x = -a3 * b0 + a0 * b3 - a1 * b2 + a2 * b1
-    y = -a3 * b1 + a1 * b3 - a2 * b0 + a0 * b2
-    z = -a3 * b2 + a2 * b3 - a0 * b1 + a1 * b0
     w = a3 * b3 + a0 * b0 + a1 * b1 + a2 * b2
     # cos a ≥ 1 − a²/2: whoever is turned otherwise by far is told without a sine.
     if abs(w) < 1 - _FARTHEST**2 * (own + of_turn) / 8:
         return -1.0, -1.0
+    x = -a3 * b0 + a0 * b3 - a1 * b2 + a2 * b1
+    y = -a3 * b1 + a1 * b3 - a2 * b0 + a0 * b2
+    z = -a3 * b2 + a2 * b3 - a0 * b1 + a1 * b0
     sine = math.sqrt(max(x * x + y * y + z * z, _TINY))
     angle = 2 * math.atan2(sine, abs(w))
     if not angle**2 < _FARTHEST**2 * (own + of_turn):

@@ -144,7 +144,7 @@ def _first(modes: Sequence[Mode]) -> list[Mode]:
 
 def _begun_otherwise(usual: PoseMode) -> PoseMode | None:
     """Poses of the same labelling, begun with the noise that odometry tells of in the place of what is believed."""
-    level = likeliest_level(usual.problem)
+    level = likeliest_level(usual)
     if level == USUAL:
         return None
     other = estimate_poses(usual.problem, level=level, until=usual)
