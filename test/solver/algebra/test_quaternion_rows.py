@@ -37,3 +37,24 @@ def test_residuals_are_what_edges_disagree_by() -> None:
     for sign in (1, -1):
         vectors = quaternion_rows.residual_vectors(nodes.as_quat().T, sign * measured.as_quat().T, source, target)
         np.testing.assert_allclose(vectors, expected, atol=1e-12)
+
+
+def test_matrices_and_turns_back_are_those_of_scipy() -> None:
+    turn, which = _random(30, 6), np.random.default_rng(7).integers(0, 30, 80)
+    np.testing.assert_allclose(quaternion_rows.matrices(turn.as_quat().T), turn.as_matrix(), atol=1e-14)
+    vector = np.random.default_rng(8).normal(size=(80, 3))
+    back = quaternion_rows.turned_back(turn.as_quat(), which, vector)
+    np.testing.assert_allclose(back, turn[which].inv().apply(vector), atol=1e-14)
+
+
+def test_corrections_are_spread_along_the_shorter_way() -> None:
+    """Whatever the signs of both quaternions, and one after another within a segment."""
+    rng = np.random.default_rng(9)
+    orientation, correction = _random(60, 10), _random(8, 11)
+    between = np.repeat(rng.integers(0, 8, (20, 2)), 3, axis=0)
+    fraction = rng.random(60)
+    above, below = (correction[ends] for ends in between.T)
+    expected = orientation * above * Rotation.from_rotvec(fraction[:, None] * (above.inv() * below).as_rotvec())
+    signs = np.where(rng.random(8) < 0.5, -1.0, 1.0)[:, None]
+    spread = quaternion_rows.spread(orientation.as_quat(), signs * correction.as_quat(), between, fraction)
+    np.testing.assert_allclose((Rotation.from_quat(spread).inv() * expected).magnitude(), 0.0, atol=1e-12)

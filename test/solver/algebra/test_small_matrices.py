@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rotavg_ros.solver.algebra.small_matrices import inverse, inverse_root
+from rotavg_ros.solver.algebra.small_matrices import eigh, inverse, inverse_root
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 6])
@@ -33,3 +33,25 @@ def test_none_at_all() -> None:
 def test_one_that_is_not_positive_definite() -> None:
     with pytest.raises(np.linalg.LinAlgError, match="positive definite"):
         inverse_root(np.stack((np.eye(2), np.ones((2, 2)))))
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_eigenvectors_are_numpys(size: int) -> None:
+    """Of any symmetric ones: definite or not, with equal eigenvalues, next to diagonal, of no size at all."""
+    rng = np.random.default_rng(size)
+    part = rng.standard_normal((200, size, size)) * 10.0 ** rng.uniform(-6, 6, (200, size, 1))
+    matrices = part + part.transpose(0, 2, 1)
+    matrices[0], matrices[1], matrices[2] = 0.0, np.eye(size), 1e-300 * np.ones((size, size))
+    matrices[3] = np.eye(size) + 1e-17 * np.ones((size, size))
+    before = matrices.copy()
+    value, vector = eigh(matrices)
+    np.testing.assert_array_equal(matrices, before)
+    largest = np.abs(before).max(axis=(1, 2)).clip(1e-300)
+    np.testing.assert_allclose(
+        np.sort(value, axis=1) / largest[:, None], np.linalg.eigvalsh(before) / largest[:, None], atol=1e-13
+    )
+    np.testing.assert_allclose(
+        vector.transpose(0, 2, 1) @ vector, np.broadcast_to(np.eye(size), before.shape), atol=1e-13
+    )
+    made = vector @ (value[:, :, None] * vector.transpose(0, 2, 1))
+    np.testing.assert_allclose(made / largest[:, None, None], before / largest[:, None, None], atol=1e-13)
