@@ -22,3 +22,15 @@ def inverse_of(matrix: np.ndarray) -> np.ndarray:
         torch.linalg.LinAlgError: it has none.
     """
     return np.asarray(torch.linalg.inv(torch.from_numpy(matrix)).numpy())
+
+
+def inverse_of_positive(matrix: np.ndarray) -> np.ndarray:
+    """Of a positive definite ``(n, n)``, of which the lower triangle is read, or what rounding has left of one.
+
+    Raises:
+        torch.linalg.LinAlgError: it has none.
+    """
+    lower, info = torch.linalg.cholesky_ex(torch.from_numpy(matrix))
+    if int(info):
+        return inverse_of(matrix)
+    return np.asarray(torch.cholesky_inverse(lower).numpy())

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from rotavg_ros.solver.algebra.products import inverse_of, product
+from rotavg_ros.solver.algebra.products import inverse_of, inverse_of_positive, product
 
 
 @pytest.mark.parametrize("shape", [(3, 4, 5), (0, 4, 2), (3, 0, 2), (300, 200, 1)])
@@ -25,6 +25,10 @@ def test_the_inverse_is_one() -> None:
     rows = np.random.default_rng(1).normal(size=(60, 40))
     matrix = rows.T @ rows
     np.testing.assert_allclose(inverse_of(matrix) @ matrix, np.eye(40), atol=1e-9)
+    np.testing.assert_allclose(inverse_of_positive(matrix) @ matrix, np.eye(40), atol=1e-9)
+    assert inverse_of_positive(np.empty((0, 0))).shape == (0, 0)
+    indefinite = np.array([[1.0, 2.0], [2.0, 1.0]])  # as rounding may leave it
+    np.testing.assert_allclose(inverse_of_positive(indefinite) @ indefinite, np.eye(2), atol=1e-12)
 
 
 _BESIDES = """

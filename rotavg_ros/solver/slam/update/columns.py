@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.products import product
 from rotavg_ros.solver.slam.update.linear import Linear
 
@@ -49,6 +50,7 @@ class Columns:
         covariance: ``(n d, n d)`` A H⁻¹ Aᵀ.
         anchors: ``(b,)`` blocks, ascending, that new nodes hang on.
         units: ``((K + R) d, b d)`` what is left of columns that are one in these.
+        at_anchors: ``(n d, b d)`` what closures have in common with them.
     """
 
     edge: np.ndarray
@@ -57,12 +59,13 @@ class Columns:
     covariance: np.ndarray
     anchors: np.ndarray
     units: np.ndarray
+    at_anchors: np.ndarray
 
     @classmethod
     def none(cls) -> Columns:
         """Of no closures."""
         nothing = np.empty(0, dtype=np.int64)
-        return cls(nothing, (), (), np.empty((0, 0)), nothing, np.empty((0, 0)))
+        return cls(nothing, (), (), np.empty((0, 0)), nothing, np.empty((0, 0)), np.empty((0, 0)))
 
     def and_of(self, linear: Linear, edge: np.ndarray, right: np.ndarray) -> Columns:
         """With more closures.
@@ -78,9 +81,17 @@ class Columns:
         between = self._with_all(self.left, half)
         own = rows.with_each(half)
         covariance = np.block([[self.covariance, between], [between.T, (own + own.T) / 2]])
-        halves = (*self.half, _Rows.of(half))
+        whole = _Rows.of(half)
+        known = self.at_anchors
+        if len(self.anchors):
+            known = np.concatenate((known, whole.with_each(self.units)))
         return replace(
-            self, edge=np.append(self.edge, edge), left=(*self.left, rows), half=halves, covariance=covariance
+            self,
+            edge=np.append(self.edge, edge),
+            left=(*self.left, rows),
+            half=(*self.half, whole),
+            covariance=covariance,
+            at_anchors=known,
         )
 
     def with_anchors(self, linear: Linear, blocks: np.ndarray) -> Columns:
@@ -90,7 +101,8 @@ class Columns:
         d, anchors = linear.size, np.unique(blocks)
         units = np.zeros((linear.num_blocks, d, len(anchors), d))
         units[anchors, :, np.arange(len(anchors))] = np.eye(d)
-        return replace(self, anchors=anchors, units=linear.left(units.reshape(linear.num_blocks, d, -1)))
+        units = linear.left(units.reshape(linear.num_blocks, d, -1))
+        return replace(self, anchors=anchors, units=units, at_anchors=self._with_all(self.half, units))
 
     def moves(self, linear: Linear, pull: np.ndarray) -> np.ndarray:
         """``(K + R, d, q)`` what moves where so much pulls at each row, ``(n d, q)``."""
@@ -98,16 +110,24 @@ class Columns:
         first = 0
         for half in self.half:
             count = half.value.shape[1]
-            total[half.index] += product(half.value, pull[first : first + count])
+            _add_rows(total, half.index, product(half.value, pull[first : first + count]))
             first += count
         return linear.ended(total)
 
     def at(self, blocks: np.ndarray) -> np.ndarray:
         """``(…, d, n d)`` of blocks, which :meth:`with_anchors` was told of."""
-        count, told = len(self.anchors), self._with_all(self.half, self.units).T
+        count, told = len(self.anchors), self.at_anchors.T
         told = told.reshape(count, len(told) // max(count, 1), len(self.covariance))
         return np.asarray(told[np.searchsorted(self.anchors, blocks)])
 
     def _with_all(self, parts: tuple[_Rows, ...], columns: np.ndarray) -> np.ndarray:
         """``(n d, m)`` products of some ``parts`` with ``((K + R) d, m)``."""
         return np.concatenate([np.empty((0, columns.shape[1])), *(part.with_each(columns) for part in parts)])
+
+
+@compiled
+def _add_rows(total: np.ndarray, index: np.ndarray, value: np.ndarray) -> None:
+    """``(s, q)`` to the rows ``(s,)`` of ``total``, each of which is named once."""
+    for i in range(len(index)):
+        for j in range(value.shape[1]):
+            total[index[i], j] += value[i, j]

@@ -16,7 +16,8 @@ from scipy.sparse import csr_array
 from scipy.special import expit
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.products import inverse_of, product
+from rotavg_ros.solver.algebra.compiled import compiled
+from rotavg_ros.solver.algebra.products import inverse_of_positive, product
 from rotavg_ros.solver.algebra.small_matrices import inverse
 from rotavg_ros.solver.running.work import count as count_units
 from rotavg_ros.solver.running.work import rest
@@ -94,46 +95,65 @@ def conditioned(
     columns = columns.with_anchors(linear, system.anchors)
     count = len(columns.edge)
     covariance = system.covariance(columns.covariance, count)
-    accepted = np.zeros(count, dtype=bool)
+    given = _Given.of(covariance, np.zeros(count, dtype=bool))
     for _ in range(_ROUNDS):
-        given = accepted
-        mean, left_out = _left_out(covariance, system.residual[:count], given)
+        mean, left_out = given.left_out(covariance, system.residual[:count])
         odds, rotation_odds = system.log_odds(mean, left_out, slice(count))
         accepted = odds > 0
-        if (accepted == given).all():
+        if (accepted == given.is_given).all():
             break
+        given = _Given.of(covariance, accepted)
     apart = system.log_odds(system.residual[count:], system.independent(slice(count, None)), slice(count, None))
     score = expit(-np.append(odds, apart[0]))
     rotation_score = expit(-np.append(rotation_odds, apart[1]))
-    return Conditioned(system.moved(columns, covariance, accepted), score, np.minimum(score, rotation_score), columns)
+    return Conditioned(system.moved(columns, given), score, np.minimum(score, rotation_score), columns)
 
 
-def _left_out(covariance: np.ndarray, residual: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals ``(n, d, q)`` less what those that are ``given`` say of them, and their covariances ``(n, d, d)``.
+@dataclass(frozen=True)
+class _Given:
+    """Some of n closures, whose residuals are given.
 
-    Args:
-        covariance: ``(n, d, n, d)``.
-        residual: ``(n, d, q)``.
-        given: ``(n,)`` bool; of one that is given the others say it.
+    Attributes:
+        is_given: ``(n,)`` bool.
+        precision: ``(g d, g d)`` inverse of their covariance.
     """
-    count, size = residual.shape[:2]
-    inside = np.arange(count)
-    own = covariance[inside, :, inside]
-    if not given.any():
-        return residual, own
-    among = covariance[given][:, :, given].reshape(-1, given.sum() * size)
-    precision = inverse_of((among + among.T) / 2)
-    off = residual[given].reshape(len(precision), -1)
-    pulled = product(precision, off).reshape(-1, size, residual.shape[2])
-    gain = product(covariance[:, :, given].reshape(count * size, -1), precision)
-    mean = residual - product(gain, off).reshape(residual.shape)
-    taken = np.einsum("iak,ibk->iab", gain.reshape(count, size, -1), covariance[:, :, given].reshape(count, size, -1))
-    left = own - taken
-    among_given = np.arange(given.sum())
-    blocks = precision.reshape(-1, size, len(among_given), size)[among_given, :, among_given]
-    left[given] = inverse((blocks + blocks.transpose(0, 2, 1)) / 2)
-    mean[given] = left[given] @ pulled
-    return mean, (left + left.transpose(0, 2, 1)) / 2
+
+    is_given: np.ndarray
+    precision: np.ndarray
+
+    @classmethod
+    def of(cls, covariance: np.ndarray, is_given: np.ndarray) -> _Given:
+        """By the covariance ``(n, d, n, d)`` of all."""
+        count = int(is_given.sum()) * covariance.shape[1]
+        among = covariance[is_given][:, :, is_given].reshape(count, count)
+        return cls(is_given, inverse_of_positive((among + among.T) / 2))
+
+    def left_out(self, covariance: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals ``(n, d, q)`` less what those that are given say of them, and their covariances ``(n, d, d)``.
+
+        Of one that is given the others say it.
+
+        Args:
+            covariance: ``(n, d, n, d)``.
+            residual: ``(n, d, q)``.
+        """
+        count, size = residual.shape[:2]
+        inside, given, others = np.arange(count), self.is_given, ~self.is_given
+        left = covariance[inside, :, inside]
+        if not given.any():
+            return residual, left
+        mean, precision = residual.copy(), self.precision
+        off = residual[given].reshape(len(precision), -1)
+        between = covariance[others][:, :, given].reshape(-1, len(precision))
+        gain = product(between, precision)
+        mean[others] -= product(gain, off).reshape(mean[others].shape)
+        by_row = (-1, size, len(precision))
+        left[others] -= np.matmul(gain.reshape(by_row), between.reshape(by_row).transpose(0, 2, 1))
+        among = np.arange(given.sum())
+        blocks = precision.reshape(-1, size, len(among), size)[among, :, among]
+        left[given] = inverse((blocks + blocks.transpose(0, 2, 1)) / 2)
+        mean[given] = left[given] @ product(precision, off).reshape(-1, size, residual.shape[2])
+        return mean, (left + left.transpose(0, 2, 1)) / 2
 
 
 @dataclass(frozen=True)
@@ -261,20 +281,14 @@ class _System:
         return between
 
     def _walked(self, node: np.ndarray, sign: np.ndarray, count: int) -> np.ndarray:
-        """``(2, …, n)`` rad², m², what errors that odometry has made since have in common with those of closures.
+        """``(2, m, n)`` rad², m², what errors that odometry has made since have in common with those of closures.
 
         Args:
-            node: ``(2, …)`` nodes, which count with a sign each.
-            sign: ``(2,)`` theirs.
+            node: ``(s, m)`` nodes, which count with a sign each.
+            sign: ``(s,)`` theirs.
             count: n, of the first closures.
         """
-        total = np.zeros((2, *node.shape[1:], count))
-        for one, own_sign in zip(node, sign, strict=True):
-            for other, its_sign in ((self.target[:count], 1.0), (self.source[:count], -1.0)):
-                is_same = self.anchor[one][..., None] == self.anchor[other]
-                shared = np.minimum(self.along[:, one][..., None], self.along[:, other].reshape(2, *[1] * one.ndim, -1))
-                total += own_sign * its_sign * is_same * shared
-        return total
+        return _shared_way(self.anchor, self.along, node, sign, np.stack((self.target[:count], self.source[:count])))
 
     def _besides(self, which: slice) -> np.ndarray:
         """``(2, n)`` rad², m², closures' own noise and what nodes err between key nodes."""
@@ -311,33 +325,33 @@ class _System:
         both = told + _log_normal(mean, covariance, 1) - false_turn - false_place
         return np.where(self.is_known[which], both, rotation), rotation
 
-    def moved(self, columns: Columns, covariance: np.ndarray, accepted: np.ndarray) -> LaidOn:
-        """All nodes, as closures that are ``accepted`` ``(n,)`` of those with columns move them."""
+    def moved(self, columns: Columns, by: _Given) -> LaidOn:
+        """All nodes, as those of the closures with columns move them that are given."""
+        accepted, precision = by.is_given, by.precision
         if not accepted.any():
             return self.laid
         linear, d, k, count = self.linear, self.linear.size, self._widths[0], len(accepted)
         q = self.residual.shape[2]
-        among = covariance[accepted][:, :, accepted].reshape(-1, accepted.sum() * d)
-        precision = inverse_of((among + among.T) / 2)
         laid = replace(self.laid, variance=self._surer(columns, precision, accepted))
         pull = np.zeros((count, d, q))
         pull[accepted] = product(precision, self.residual[:count][accepted].reshape(-1, q)).reshape(-1, d, q)
         step = columns.moves(linear, pull.reshape(-1, q))
         new = np.arange(linear.num_nodes, len(self.anchor))
         walked = self._walked(new[None], np.ones(1), count)
-        turn = self._at_nodes(0, step[:, :k])
-        turn[new] += np.einsum("nc,cdq->ndq", walked[0], pull[:, :k])
-        turn = turn[:, 0] if linear.turns is None else turn[:, :, 0] @ linear.turns.T
-        rotated = rotations.exp(torch.from_numpy(turn))
-        orientation = rotations.normalize(rotations.multiply(self.laid.body_from_world, rotated))
+        # Vectors of the world: one for each block, and what new nodes have besides.
+        turn, walked_turn = step[:, :k], np.einsum("nc,cdq->ndq", walked[0], pull[:, :k])
+        turn, walked_turn = (
+            each[:, 0] if linear.turns is None else each[:, :, 0] @ linear.turns.T for each in (turn, walked_turn)
+        )
+        before = self.laid.body_from_world.numpy()
+        hangs = self.anchor, linear.above, linear.below, linear.share
+        orientation = torch.from_numpy(_turned(*hangs, turn, walked_turn, before))
         if linear.shifts is None or self.laid.position is None:
             return replace(laid, body_from_world=orientation)
-        shift = self._at_nodes(1, step[:, k:])[:, :, 0] @ linear.shifts.T
-        shift[new] += np.einsum("nc,cd->nd", walked[1], pull[:, k:, 0]) @ linear.shifts.T
-        # The way from its anchor turns with that.
-        at_anchor = rotations.inverse(rotated[torch.from_numpy(self.anchor)])
-        shift += rotations.rotate(at_anchor, torch.from_numpy(self.way)).numpy() - self.way
-        return replace(laid, body_from_world=orientation, position=self.laid.position + shift)
+        shift = step[:, k:, 0] @ linear.shifts.T
+        walked_shift = np.einsum("nc,cd->nd", walked[1], pull[:, k:, 0]) @ linear.shifts.T
+        position = _shifted(*hangs, turn, shift, walked_shift, self.way, self.laid.position)
+        return replace(laid, body_from_world=orientation, position=position)
 
     def _surer(self, columns: Columns, precision: np.ndarray, accepted: np.ndarray) -> np.ndarray:
         """``(2, N')`` rad², m² of nodes: of new ones with what closures tell of them; older ones stay as they were.
@@ -371,12 +385,6 @@ class _System:
                 variance[kind, new] = np.maximum(before - part.mean(axis=1), _SUREST * before)
         return variance
 
-    def _at_nodes(self, kind: int, step: np.ndarray) -> np.ndarray:
-        """``(N', …)`` of unknowns ``(K + R, …)``, at the nodes that all nodes move with."""
-        linear, anchor = self.linear, self.anchor
-        share = linear.share[kind][anchor][:, None, None]
-        return np.asarray((1 - share) * step[linear.above[anchor]] + share * step[linear.below[anchor]])
-
 
 def _log_normal(mean: np.ndarray, covariance: np.ndarray, times: int) -> np.ndarray:
     """``(n,)`` log N(0, covariance) of ``(n, d, q)``; the determinant counts so many times."""
@@ -384,3 +392,101 @@ def _log_normal(mean: np.ndarray, covariance: np.ndarray, times: int) -> np.ndar
     square = (mean * np.linalg.solve(covariance, mean)).sum(axis=(1, 2))
     log_det = np.linalg.slogdet(covariance)[1] + size * np.log(2 * np.pi)
     return np.asarray(-(square + times * log_det) / 2)
+
+
+@compiled
+def _shared_way(
+    anchor: np.ndarray, along: np.ndarray, node: np.ndarray, sign: np.ndarray, end: np.ndarray
+) -> np.ndarray:
+    """``(2, m, n)``: of nodes ``(s, m)`` and closures' targets and sources ``(2, n)`` with one anchor, the lesser."""
+    total = np.zeros((2, node.shape[1], end.shape[1]))
+    for i in range(node.shape[1]):
+        for j in range(end.shape[1]):
+            for s in range(len(sign)):
+                for e in range(2):
+                    one, other = node[s, i], end[e, j]
+                    if anchor[one] == anchor[other]:
+                        own = sign[s] if e == 0 else -sign[s]
+                        total[0, i, j] += own * min(along[0, one], along[0, other])
+                        total[1, i, j] += own * min(along[1, one], along[1, other])
+    return total
+
+
+@compiled
+def _between(
+    above: np.ndarray, below: np.ndarray, share: np.ndarray, of_block: np.ndarray, v: int, vector: np.ndarray
+) -> None:
+    """To ``vector`` ``(3,)``, of node v of the last solve: by its share ``(N,)`` between blocks of ``(K + R, 3)``."""
+    for i in range(3):
+        vector[i] = (1 - share[v]) * of_block[above[v], i] + share[v] * of_block[below[v], i]
+
+
+@compiled
+def _exp(vector: np.ndarray) -> tuple[float, float, float, float]:
+    """xyzw, as :func:`rotavg_ros.rotations.exp` has it."""
+    square = vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]
+    if square < 1e-8:
+        half_sinc, cosine = 0.5 - square / 48, 1 - square / 8
+    else:
+        half = np.sqrt(square) / 2
+        half_sinc, cosine = np.sin(half) / (2 * half), np.cos(half)
+    return vector[0] * half_sinc, vector[1] * half_sinc, vector[2] * half_sinc, cosine
+
+
+@compiled
+def _turned(
+    anchor: np.ndarray,
+    above: np.ndarray,
+    below: np.ndarray,
+    share: np.ndarray,
+    turn: np.ndarray,
+    walked: np.ndarray,
+    before: np.ndarray,
+) -> np.ndarray:
+    """``(N', 4)`` orientations after turns of blocks ``(K + R, 3)``, and of new nodes by ``(n, 3)`` besides, w ≥ 0."""
+    found, first, vector = np.empty_like(before), len(above), np.empty(3)
+    for v in range(len(anchor)):
+        _between(above, below, share[0], turn, anchor[v], vector)
+        if v >= first:
+            for i in range(3):
+                vector[i] += walked[v - first, i]
+        a, b, c, d = _exp(vector)
+        x, y, z, w = before[v, 0], before[v, 1], before[v, 2], before[v, 3]
+        nx, ny, nz = w * a + x * d + y * c - z * b, w * b - x * c + y * d + z * a, w * c + x * b - y * a + z * d
+        nw = w * d - x * a - y * b - z * c
+        length = np.sqrt(nx * nx + ny * ny + nz * nz + nw * nw)
+        if nw < 0.0:
+            length = -length
+        found[v, 0], found[v, 1], found[v, 2], found[v, 3] = nx / length, ny / length, nz / length, nw / length
+    return found
+
+
+@compiled
+def _shifted(
+    anchor: np.ndarray,
+    above: np.ndarray,
+    below: np.ndarray,
+    share: np.ndarray,
+    turn: np.ndarray,
+    shift: np.ndarray,
+    walked: np.ndarray,
+    way: np.ndarray,
+    before: np.ndarray,
+) -> np.ndarray:
+    """``(N', 3)`` positions likewise; the way ``(N', 3)`` of a new node from its anchor turns with that."""
+    found, first, vector = np.empty_like(before), len(above), np.empty(3)
+    for v in range(len(anchor)):
+        _between(above, below, share[1], shift, anchor[v], vector)
+        for i in range(3):
+            found[v, i] = before[v, i] + vector[i]
+        if v < first:
+            continue
+        _between(above, below, share[0], turn, anchor[v], vector)
+        a, b, c, d = _exp(vector)
+        x, y, z = way[v]
+        # By the inverse of that turn: v + 2 w (u × v) + 2 u × (u × v), u = -(a, b, c).
+        tx, ty, tz = 2 * (c * y - b * z), 2 * (a * z - c * x), 2 * (b * x - a * y)
+        found[v, 0] += walked[v - first, 0] + d * tx + c * ty - b * tz
+        found[v, 1] += walked[v - first, 1] + d * ty + a * tz - c * tx
+        found[v, 2] += walked[v - first, 2] + d * tz + b * tx - a * ty
+    return found
