@@ -176,6 +176,13 @@ class ViewGraph:
         """The graph of all nodes and the edges chosen by a mask or by indices, in that order."""
         return replace(self, **{name: column[edges] for name, column in self._columns.items()})
 
+    def first_edges(self, count: int, then: Tensor) -> ViewGraph:
+        """The graph of all nodes, the first ``count`` edges, and after them those of these indices."""
+        columns: dict[str, Any] = {
+            name: torch.cat((column[:count], column[then])) for name, column in self._columns.items()
+        }
+        return replace(self, **columns)
+
     def reverse_edges(self, edges: Tensor) -> ViewGraph:
         """The same graph, some edges of which are stated from the target to the source.
 
@@ -220,12 +227,13 @@ class ViewGraph:
         by_source = csr_array((target, source, edge), shape=(len(source), self.num_nodes)).tocsc()
         ones = np.ones(len(source))
         adjacency = csr_array((ones, by_source.data, by_source.indptr), shape=(self.num_nodes, self.num_nodes))
-        _, labels = connected_components(adjacency, directed=False)
+        count, labels = connected_components(adjacency, directed=False)
         # scipy numbers components in the order of a traversal; ours follow the nodes' order.
-        _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
-        rank = np.empty(len(first), dtype=np.int64)
-        rank[np.argsort(first)] = np.arange(len(first))
-        return torch.from_numpy(rank[inverse]).to(self.device)
+        first = np.empty(count, dtype=np.int64)
+        first[labels[::-1]] = np.arange(len(labels))[::-1]  # of those with one number the last stays, which comes first
+        rank = np.empty(count, dtype=np.int64)
+        rank[np.argsort(first)] = np.arange(count)
+        return torch.from_numpy(rank[labels]).to(self.device)
 
 
 class HoldsViewGraph(Protocol):

@@ -164,6 +164,8 @@ def test_select_edges() -> None:
     graph = ViewGraph.create([0, 1, 2], [1, 2, 3], [_UNIT] * 3, kind=[0, 1, 0], precision=[1, 2, 3])
     chosen = graph.select_edges(graph.is_odometry)
     assert chosen.num_nodes == 4 and chosen.source.tolist() == [0, 2] and chosen.precision.tolist() == [1, 3]
+    first = graph.first_edges(1, torch.tensor([2]))
+    assert first.num_nodes == 4 and first.source.tolist() == [0, 2] and first.precision.tolist() == [1, 3]
 
 
 def test_translations_that_cannot_be_are_unknown() -> None:

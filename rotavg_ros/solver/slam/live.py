@@ -197,7 +197,9 @@ def _laid_on(graph: ViewGraph, known: SlamMemory, ration: float) -> Estimate | N
         return None
     if len(closure) == 0:
         return known.along_odometry(graph, growth)
-    estimate = known.along_odometry(graph.select_edges(torch.from_numpy(kept)), growth.among(kept))
+    older = known.graph.num_edges
+    along = graph.first_edges(older, torch.from_numpy(kept[older:]))
+    estimate = known.along_odometry(along, growth.among(kept))
     linear = _linear(known)
     if linear.num_nodes != known.graph.num_nodes:
         growth = _growth(graph, known, linear)
@@ -251,11 +253,13 @@ def _with_closures(
         linear: that they were told by.
         edges: ``(m,)`` and ``(n,)`` their numbers in the whole graph.
     """
-    order = torch.from_numpy(np.argsort(np.concatenate(edges)))
+    kept, closure = (torch.from_numpy(each) for each in edges)
     laid = told.laid
 
     def merged(before: torch.Tensor, value: np.ndarray) -> torch.Tensor:
-        return torch.cat((before, torch.from_numpy(value)))[order]
+        both = before.new_empty(len(before) + len(value), *before.shape[1:])
+        both[kept], both[closure] = before, torch.from_numpy(value)
+        return both
 
     places = estimate.places
     if places is not None and laid.position is not None:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.pointer_jumping import doublings, follow
 from rotavg_ros.solver.algebra.residuals import edge_residual
 from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root, compose_orientations
@@ -80,7 +81,7 @@ class Growth:
     parent: np.ndarray
     anchor: np.ndarray
     turn: Tensor
-    _forest: SpanningForest
+    _num_known: int
 
     @classmethod
     def of(cls, graph: ViewGraph, edge: np.ndarray, num_known: int) -> Growth | None:
@@ -91,22 +92,9 @@ class Growth:
         child, parent, edge = child[order], parent[order], edge[order]
         if not np.array_equal(child, np.arange(num_known, graph.num_nodes)):
             return None
-        # The new nodes as a graph of their own, rooted at the older ones that they hang on.
-        is_rooted = parent < num_known
-        root, root_of = np.unique(parent[is_rooted], return_inverse=True)
-        above = np.concatenate((np.arange(len(root)), parent - num_known + len(root)))
-        above[len(root) :][is_rooted] = root_of
-        forest = SpanningForest(above, np.append(np.full(len(root), -1), np.arange(len(child))), above)
-        measured = graph.target_from_source[torch.from_numpy(edge)]
-        enters = torch.from_numpy(graph.target.numpy()[edge] == child)[:, None]
-        local = ViewGraph.create(
-            above[len(root) :],
-            np.arange(len(root), len(above)),
-            torch.where(enters, measured, rotations.inverse(measured)),
-            num_nodes=len(above),
-        )
-        turn = compose_orientations(forest, local)[len(root) :]
-        return cls(edge, parent, root[follow(above)[len(root) :]], turn, forest)
+        enters = graph.target.numpy()[edge] == child
+        anchor, turn = _turns(parent, num_known, graph.target_from_source.numpy()[edge], enters)
+        return cls(edge, parent, anchor, torch.from_numpy(turn), num_known)
 
     def among(self, kept: np.ndarray) -> Growth:
         """The same in a graph of the edges ``kept`` ``(M',)`` alone, ascending, its own among these."""
@@ -114,8 +102,45 @@ class Growth:
 
     def along(self, value: np.ndarray) -> np.ndarray:
         """Sums of edges' values ``(n,)`` from the anchors on."""
-        num_roots = len(self._forest.parent) - len(value)
-        return accumulate_to_root(self._forest, np.append(np.zeros(num_roots), value))[num_roots:]
+        return _sums(self.parent, self._num_known, value)
+
+
+@compiled
+def _turns(parent: np.ndarray, known: int, measured: np.ndarray, enters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``(n,)`` and ``(n, 4)``: the known node that each new one hangs on, and how far it is turned from that, w ≥ 0."""
+    anchor, turn = np.empty(len(parent), dtype=np.int64), np.empty((len(parent), 4))
+    for i in range(len(parent)):
+        x, y, z, w = measured[i]
+        if not enters[i]:
+            x, y, z = -x, -y, -z
+        above = parent[i] - known
+        anchor[i] = parent[i]
+        if above >= 0:
+            anchor[i] = anchor[above]
+            a, b, c, d = turn[above]
+            x, y, z, w = (
+                w * a + x * d + y * c - z * b,
+                w * b - x * c + y * d + z * a,
+                w * c + x * b - y * a + z * d,
+                w * d - x * a - y * b - z * c,
+            )
+        length = np.sqrt(x * x + y * y + z * z + w * w)
+        if w < 0.0:
+            length = -length
+        turn[i, 0], turn[i, 1], turn[i, 2], turn[i, 3] = x / length, y / length, z / length, w / length
+    return anchor, turn
+
+
+@compiled
+def _sums(parent: np.ndarray, known: int, value: np.ndarray) -> np.ndarray:
+    """``(n,)`` of new nodes, of what each adds to its parent's."""
+    total = np.empty(len(value))
+    for i in range(len(value)):
+        above = parent[i] - known
+        total[i] = value[i]
+        if above >= 0:
+            total[i] += total[above]
+    return total
 
 
 def _canonical_order(graph: ViewGraph, edges: np.ndarray) -> np.ndarray:

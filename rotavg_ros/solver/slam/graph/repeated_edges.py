@@ -63,3 +63,12 @@ def first_of_each(graph: ViewGraph) -> tuple[np.ndarray, np.ndarray] | None:
     if is_first.all():
         return None
     return np.flatnonzero(is_first), (np.cumsum(is_first) - 1)[says_as]
+
+
+def repeats_since(graph: ViewGraph, count: int) -> bool:
+    """Whether edges from ``count`` on say again what any edge says, in a graph whose first ones repeat nothing."""
+    source, target = graph.source.numpy(), graph.target.numpy()
+    touched = np.zeros(graph.num_nodes, dtype=bool)
+    touched[source[count:]] = touched[target[count:]] = True
+    between = np.flatnonzero(touched[source] & touched[target])
+    return first_of_each(graph.select_edges(torch.from_numpy(between))) is not None

@@ -20,7 +20,7 @@ from rotavg_ros.solver.running.resumable import Resumable
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.fine_net.tuning import fine_tuned
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
-from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
+from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each, repeats_since
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.poses.memory import PoseMemory
@@ -147,8 +147,8 @@ class SlamMemory:
         return replace(self, unexplained=before.unexplained + flagged + turned)
 
     def is_grown_to(self, graph: ViewGraph) -> bool:
-        """Whether a graph has grown from this one, and states nothing twice."""
-        return begins_with(graph, self.graph) and first_of_each(graph) is None
+        """Whether a graph has grown from this one, which states nothing twice, and does not either."""
+        return begins_with(graph, self.graph) and not repeats_since(graph, self.graph.num_edges)
 
     def thinned_to(self, graph: ViewGraph) -> SlamMemory | None:
         """The labels of a graph that has lost keyframes since, for :meth:`updated`; None where that would not do.
