@@ -21,7 +21,7 @@ IndexArray = NDArray[np.int64]
 
 # Loops whose squared Mahalanobis norm exceeds this quantile do not agree. All pairs of a clique have to: at 0.99 up to
 # a third of the good closures is left out, beyond 0.9999 little changes (buildings and CSAIL, seeds 0 and 1).
-_PROBABILITY = 0.9999
+PROBABILITY = 0.9999
 # Pairs of closures that are looked at together, and starts of the search for a clique.
 _ROWS, _STARTS = 200_000, 50
 _PLANAR = np.array([2, 3, 4])
@@ -85,7 +85,7 @@ def consistent_closures(graph: ViewGraph, sigma: FloatArray, odometry: tuple[Flo
     """
     closures = np.flatnonzero(~graph.is_odometry.numpy())
     kept = graph.is_odometry.numpy().copy()
-    kept[closures[largest_clique(_agreement(graph, sigma, odometry, closures))]] = True
+    kept[closures[largest_clique(agreement(graph, sigma, odometry, closures))]] = True
     return np.asarray(kept)
 
 
@@ -113,14 +113,24 @@ def largest_clique(agrees: BoolArray) -> IndexArray:
     return np.array(sorted(best), dtype=np.int64)
 
 
-def _agreement(
-    graph: ViewGraph, sigma: FloatArray, odometry: tuple[FloatArray, FloatArray], closures: IndexArray
+def agreement(
+    graph: ViewGraph,
+    sigma: FloatArray,
+    odometry: tuple[FloatArray, FloatArray],
+    closures: IndexArray,
+    probability: float = PROBABILITY,
 ) -> BoolArray:
-    """``(K, K)``: which closures agree with which."""
+    """``(K, K)``: which closures agree with which.
+
+    Args:
+        graph, sigma, odometry: see :func:`consistent_closures`.
+        closures: ``(K,)`` edges.
+        probability: with which two good closures agree.
+    """
     assert graph.translation is not None
     chain = _Chain.along(Rotation.from_quat(odometry[1]), odometry[0])
     components = _PLANAR if is_planar(graph) else np.arange(6)
-    threshold = float(chi2.ppf(_PROBABILITY, len(components)))
+    threshold = float(chi2.ppf(probability, len(components)))
     earlier, later, measured = _from_the_earlier_end(graph, closures)
     step = np.median(sigma[graph.is_odometry.numpy()], axis=0)
     first, second = np.triu_indices(len(closures), 1)

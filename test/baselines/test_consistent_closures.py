@@ -10,8 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.baselines import consistent_closures as module
-from rotavg_ros.baselines.consistent_closures import consistent_closures, largest_clique
+from rotavg_ros.baselines.consistent_closures import agreement, consistent_closures, largest_clique
 from rotavg_ros.datasets.dead_reckoning import chain_poses
 from rotavg_ros.view_graph import ViewGraph
 
@@ -68,9 +67,8 @@ def test_the_larger_of_two_groups_is_kept() -> None:
 
 
 @pytest.mark.parametrize("planar", [True, False])
-def test_good_closures_agree_as_often_as_the_quantile_says(planar: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_good_closures_agree_as_often_as_the_quantile_says(planar: bool) -> None:
     """The covariance of a loop is that of its noise: lever arms, closures in both directions and all."""
-    monkeypatch.setattr(module, "_PROBABILITY", 0.9)
     closures = [(first, second) for first in range(0, 20, 3) for second in range(22, 40, 5)]
     closures = [pair[::-1] if number % 2 else pair for number, pair in enumerate(closures)]
     shares = []
@@ -79,7 +77,7 @@ def test_good_closures_agree_as_often_as_the_quantile_says(planar: bool, monkeyp
         assert graph.translation is not None
         odometry = chain_poses(graph, graph.translation.numpy())
         edges = np.arange(STEPS - 1, graph.num_edges)
-        agrees = module._agreement(graph, sigma, odometry, edges)
+        agrees = agreement(graph, sigma, odometry, edges, 0.9)
         shares.append(agrees[np.triu_indices(len(edges), 1)].mean())
     assert np.mean(shares) == pytest.approx(0.9, abs=0.03)
 

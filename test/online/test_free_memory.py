@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import platform
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -26,8 +27,8 @@ def resident_bytes() -> int:
 
 
 def test_free_memory_below_what_is_kept_goes_back() -> None:
-    if free_memory._malloc_trim() is None:
-        pytest.skip("the C library cannot give memory back")
+    if platform.libc_ver()[0] != "glibc":
+        pytest.skip("another C library cannot give memory back")
     pieces = [bytearray(10_000) for _ in range(10_000)]
     kept = pieces[-1]
     full = resident_bytes()

@@ -7,6 +7,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
+# Written at once by default: some MB of characters.
 _BLOCK_ROWS = 1 << 16
 
 
@@ -21,15 +22,20 @@ class Column(NamedTuple):
     decimals: int = 0
 
 
-def write_csv(file: BinaryIO, columns: Sequence[Column]) -> None:
+def write_csv(file: BinaryIO, columns: Sequence[Column], *, block_rows: int = _BLOCK_ROWS) -> None:
     """Write a header and one line per row.
+
+    Args:
+        file: open for bytes.
+        columns: of the same length.
+        block_rows: so many rows are in memory at a time; what is written does not depend on it.
 
     Raises:
         ValueError: an infinite value.
     """
     file.write((",".join(column.name for column in columns) + "\n").encode("ascii"))
-    for start in range(0, len(columns[0].values), _BLOCK_ROWS):
-        block = slice(start, start + _BLOCK_ROWS)
+    for start in range(0, len(columns[0].values), block_rows):
+        block = slice(start, start + block_rows)
         parts = []
         for column in columns:
             parts += [_digits(column.values[block], column.decimals), _literal(b",", len(column.values[block]))]

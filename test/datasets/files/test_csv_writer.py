@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rotavg_ros.datasets.files import csv_writer
 from rotavg_ros.datasets.files.csv_writer import Column, write_csv
 
 INTEGERS = st.integers(-(2**62), 2**63 - 1)
@@ -20,9 +19,8 @@ REALS = st.floats(-1000, 1000)
 def test_rows(rows: list[tuple[int, float, int]], decimals: int, block: int) -> None:
     columns = [np.array([row[i] for row in rows], dtype=[np.int64, np.float64, np.int64][i]) for i in range(3)]
     file = io.BytesIO()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(csv_writer, "_BLOCK_ROWS", block)
-        write_csv(file, [Column("a", columns[0]), Column("b", columns[1], decimals), Column("c", columns[2])])
+    named = [Column("a", columns[0]), Column("b", columns[1], decimals), Column("c", columns[2])]
+    write_csv(file, named, block_rows=block)
     header, *lines = file.getvalue().decode().splitlines()
     assert header == "a,b,c"
     assert len(lines) == len(rows)

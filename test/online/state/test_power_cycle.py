@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 from scipy.spatial.transform import Rotation
@@ -32,11 +32,17 @@ def drive(estimator: OnlineEstimator, first: int, stop: int, start_s: float, awa
         estimator.add_odometry("r", stamp_ns, turn, position)
 
 
-def restarted(before: OnlineEstimator, folder: Path) -> OnlineEstimator:
-    before.save(folder / "state.npz")
-    after = OnlineEstimator(before.options, before._solver)
-    after.load(folder / "state.npz")
-    return after
+@pytest.fixture
+def restarted(solver, tmp_path) -> Callable[[OnlineEstimator], OnlineEstimator]:
+    """The estimator of the same options that goes on from the state of another one."""
+
+    def begun_after(before: OnlineEstimator) -> OnlineEstimator:
+        before.save(tmp_path / "state.npz")
+        after = OnlineEstimator(before.options, solver)
+        after.load(tmp_path / "state.npz")
+        return after
+
+    return begun_after
 
 
 def odometry_edges_across(answer: Answer, first_of_today: int) -> int:
@@ -65,8 +71,8 @@ TODAY = {
 
 
 @pytest.mark.parametrize("today_s", TODAY.values(), ids=TODAY.keys())
-def test_today_is_a_component_until_a_closure_joins_it(yesterday, tmp_path, today_s) -> None:
-    estimator = restarted(yesterday, tmp_path)
+def test_today_is_a_component_until_a_closure_joins_it(yesterday, restarted, today_s) -> None:
+    estimator = restarted(yesterday)
     drive(estimator, LENGTH, 2 * LENGTH, today_s)
     answer = estimator.tick()
     today = len(answer.keyframe_id) - LENGTH
@@ -84,9 +90,9 @@ def test_today_is_a_component_until_a_closure_joins_it(yesterday, tmp_path, toda
 
 
 @pytest.mark.parametrize("today_s", TODAY.values(), ids=TODAY.keys())
-def test_closures_by_stamp_join_the_two(yesterday, tmp_path, today_s) -> None:
+def test_closures_by_stamp_join_the_two(yesterday, restarted, today_s) -> None:
     """Also those to stamps that today's clock has not come to yet, or left behind long ago."""
-    estimator = restarted(yesterday, tmp_path)
+    estimator = restarted(yesterday)
     drive(estimator, LENGTH, 2 * LENGTH, today_s)
     stamps = [YESTERDAY + 0.7, today_s + 2.0]
     source, target = (KeyframeReference("r", stamp_ns=round(stamp * SECOND)) for stamp in stamps)
@@ -99,22 +105,22 @@ def test_closures_by_stamp_join_the_two(yesterday, tmp_path, today_s) -> None:
 
 
 @pytest.mark.parametrize("parked_m", [0.0, 0.05, 0.8])
-def test_a_robot_that_was_parked_where_it_began(solver, tmp_path, parked_m) -> None:
+def test_a_robot_that_was_parked_where_it_began(solver, restarted, parked_m) -> None:
     """There odometry that begins at zero is no jump, so only the restart tells."""
     yesterday = OnlineEstimator(OPTIONS, solver)
     for index in range(LENGTH):
         out = parked_m + 3 * math.sin(math.pi * index / (LENGTH - 1))
         yesterday.add_odometry("r", YESTERDAY * SECOND + index * SECOND // 10, (0, 0, 0, 1), (out, 0, 0))
-    estimator = restarted(yesterday, tmp_path)
+    estimator = restarted(yesterday)
     drive(estimator, LENGTH, 2 * LENGTH, END + 20)
     answer = estimator.tick()
     assert answer.num_components == 2 and odometry_edges_across(answer, LENGTH) == 0
 
 
 @pytest.mark.parametrize("missed", [0, 400])
-def test_odometry_that_ran_on_while_the_node_was_down_is_joined(yesterday, tmp_path, missed) -> None:
+def test_odometry_that_ran_on_while_the_node_was_down_is_joined(yesterday, restarted, missed) -> None:
     """The robot went on, or drove about for 40 seconds and is two metres from where it was."""
-    estimator = restarted(yesterday, tmp_path)
+    estimator = restarted(yesterday)
     for index in range(LENGTH, LENGTH + 20):
         turn = (truth(0).inv() * truth(index)).as_quat().tolist()
         position = (5.0 * math.sin(0.05 * index), 2.0 if missed else 0.0, 0.0)
@@ -126,9 +132,9 @@ def test_odometry_that_ran_on_while_the_node_was_down_is_joined(yesterday, tmp_p
 
 @pytest.mark.parametrize(("moved_m", "components"), [(0.0, 1), (0.05, 1), (0.5, 2)])
 def test_after_a_longer_break_only_the_very_same_pose_shows_that_it_ran_on(
-    yesterday, tmp_path, moved_m, components
+    yesterday, restarted, moved_m, components
 ) -> None:
-    estimator = restarted(yesterday, tmp_path)
+    estimator = restarted(yesterday)
     start = YESTERDAY * SECOND + LENGTH * SECOND // 10 + 3600 * SECOND
     pose = (truth(0).inv() * truth(LENGTH - 1)).as_quat().tolist()
     parked_m = 5.0 * math.sin(0.05 * (LENGTH - 1))
@@ -138,8 +144,8 @@ def test_after_a_longer_break_only_the_very_same_pose_shows_that_it_ran_on(
 
 
 @pytest.mark.parametrize("today_s", TODAY.values(), ids=TODAY.keys())
-def test_the_orientation_and_the_path_go_on_from_where_the_robot_was(yesterday, tmp_path, today_s) -> None:
-    estimator = restarted(yesterday, tmp_path)
+def test_the_orientation_and_the_path_go_on_from_where_the_robot_was(yesterday, restarted, today_s) -> None:
+    estimator = restarted(yesterday)
     before = Rotation.from_quat(estimator.current_orientation("r"))
     drive(estimator, LENGTH, LENGTH + 30, today_s)
     turned = (Rotation.from_quat(estimator.current_orientation("r")) * before.inv()).magnitude()
@@ -151,14 +157,14 @@ def test_the_orientation_and_the_path_go_on_from_where_the_robot_was(yesterday, 
     assert answer.newest_stamp_ns == pytest.approx(newest_s * SECOND, abs=SECOND // 10)
 
 
-def test_a_power_cycle_every_day_for_a_week(solver, tmp_path) -> None:
+def test_a_power_cycle_every_day_for_a_week(solver, restarted) -> None:
     """Also twice at zero with the same stamps: three time lines may cover a stamp, and the latest is meant."""
     estimator = OnlineEstimator(OPTIONS, solver)
     starts = [YESTERDAY, YESTERDAY, YESTERDAY + DAY, 5, 5, YESTERDAY, YESTERDAY + 2 * DAY]
     for day, start_s in enumerate(starts):
         drive(estimator, day * LENGTH, (day + 1) * LENGTH, start_s)
         estimator.tick()
-        estimator = restarted(estimator, tmp_path)
+        estimator = restarted(estimator)
     answer = estimator.tick(force_cold=True)
     assert answer.num_components == 7
     edge = EdgeMeasurement(

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 from rclpy.node import Node
@@ -69,13 +69,17 @@ class EdgeFrames:
             )
             with user_error_about(_TOPIC):
                 node.create_subscription(
-                    message_type, _TOPIC, self._sensors.take, qos, qos_overriding_options=overrides()
+                    message_type, _TOPIC, self.note_transforms, qos, qos_overriding_options=overrides()
                 )
 
     @property
     def waiting(self) -> int:
         """How many edges wait."""
         return len(self._waiting)
+
+    def note_transforms(self, message: Any) -> None:
+        """Remember how frames sit in each other, see :meth:`SensorFrames.take`."""
+        self._sensors.take(message)
 
     def note_body(self, robot: str, frame: str, body_from_frame: Quaternion) -> None:
         """Remember in which frame a robot's odometry moves, see :meth:`SensorFrames.note_body`."""

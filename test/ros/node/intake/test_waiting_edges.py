@@ -69,7 +69,7 @@ def test_edges_wait_for_the_body_and_for_the_transform(node: Node) -> None:
     frames.take(EdgeRecord(edge(3), frame_id=""), edges)
     assert [each.edge_id for each in taken] == [3] and frames.waiting == 3
     assert edges.placement == {("a", "camera"): Placement.AWAITED}
-    frames._sensors.take(camera_on_base())
+    frames.note_transforms(camera_on_base())
     frames.note_body("a", "base_link", (0.0, 0.0, 0.0, 1.0))
     spin(node, lambda: frames.waiting == 0)
     assert [each.edge_id for each in taken] == [3, 0, 1, 2]
@@ -118,7 +118,7 @@ def test_a_reset_drops_what_waits(node: Node) -> None:
     intake.take(topic(), TopicCounter(), iter([EdgeRecord(edge(number), frame_id="camera") for number in range(3)]))
     assert intake.frames.waiting == 3
     estimator.reset()
-    intake.frames._sensors.take(camera_on_base())
+    intake.frames.note_transforms(camera_on_base())
     intake.frames.note_body("a", "base_link", (0.0, 0.0, 0.0, 1.0))
     spin(node, lambda: intake.frames.waiting == 0)
     assert estimator.counts().edges == 0 and refused == []
