@@ -53,7 +53,7 @@ def test_few_graphs_do_for_what_is_slow(tmp_path: Path, monkeypatch: pytest.Monk
     with (tmp_path / "synthetic-paper-graphs.csv").open() as file:
         graphs = [row for row in csv.DictReader(file) if row["method"] == "oracle"]
     assert len(graphs) == 3
-    assert few[rows["oracle"]] == pytest.approx(np.mean([float(row["mean_deg"]) for row in graphs[:2]]))
+    assert few[rows["oracle"]] == pytest.approx(np.mean([float(row["mean_deg"]) for row in graphs[:2]]), rel=1e-4)
 
 
 def test_robustness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

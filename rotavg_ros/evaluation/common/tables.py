@@ -13,6 +13,9 @@ from rotavg_ros.results import ResultError, provenance
 
 Cell = str | float | int | None
 
+# A hundredth of a per cent: seeds and machines make figures differ by far more.
+_CSV_FORMAT = ".5g"
+
 
 @dataclass(frozen=True)
 class Column:
@@ -43,11 +46,11 @@ class Table:
         return f"## {self.title}\n\n" + "\n".join(lines) + "\n" + notes
 
     def to_csv(self) -> str:
-        """Headings and rows, numbers in full."""
+        """Headings and rows, whatever the columns' formats; numbers that are not whole have five significant digits."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow([column.heading for column in self.columns])
-        writer.writerows(["" if _is_empty(cell) else cell for cell in row] for row in self.rows)
+        writer.writerows([_csv_cell(cell) for cell in row] for row in self.rows)
         return text.getvalue()
 
     def _texts(self, row: Sequence[Cell]) -> list[str]:
@@ -98,6 +101,12 @@ class Report:
 
 def _line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
+
+
+def _csv_cell(cell: Cell) -> str | int:
+    if isinstance(cell, float):
+        return "" if _is_empty(cell) else format(cell, _CSV_FORMAT)
+    return "" if cell is None else cell
 
 
 def _is_empty(cell: Cell) -> bool:

@@ -32,5 +32,5 @@ def test_a_row_for_every_case() -> None:
     key = {"graph": "name", "condition": "kind", "seed": "seed"}
     lines = per_case("Title", SCORES, FIGURES, key).to_csv().splitlines()
     assert lines[0] == "graph,condition,seed,method,mean °,recall"
-    assert lines[1:] == ["graph,kind,0,a,1.0,1.0", "graph,kind,0,b,5.0,1.0", "graph,kind,1,a,3.0,0.5"]
-    assert per_case("Title", SCORES, FIGURES).to_csv().startswith("graph,method,mean °,recall\ngraph,a,1.0,1.0\n")
+    assert lines[1:] == ["graph,kind,0,a,1,1", "graph,kind,0,b,5,1", "graph,kind,1,a,3,0.5"]
+    assert per_case("Title", SCORES, FIGURES).to_csv().startswith("graph,method,mean °,recall\ngraph,a,1,1\n")

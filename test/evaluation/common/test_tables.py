@@ -11,7 +11,7 @@ from rotavg_ros.evaluation.common.tables import Column, Report, Table
 TABLE = Table(
     "Errors",
     (Column("method"), Column("mean °", ".2f"), Column("graphs", "d")),
-    (("ours", 1.23456, 3), ("theirs", float("nan"), None)),
+    (("ours", 1.23456, 1_234_567), ("theirs", float("nan"), None)),
     ("A note.",),
 )
 
@@ -21,15 +21,15 @@ def test_markdown() -> None:
         "## Errors\n\n"
         "| method | mean ° | graphs |\n"
         "| --- | ---: | ---: |\n"
-        "| ours | 1.23 | 3 |\n"
+        "| ours | 1.23 | 1234567 |\n"
         "| theirs |  |  |\n"
         "\nA note.\n"
     )
 
 
-def test_csv_has_every_digit() -> None:
+def test_csv_has_five_digits_and_whole_numbers_in_full() -> None:
     rows = list(csv.reader(TABLE.to_csv().splitlines()))
-    assert rows == [["method", "mean °", "graphs"], ["ours", "1.23456", "3"], ["theirs", "", ""]]
+    assert rows == [["method", "mean °", "graphs"], ["ours", "1.2346", "1234567"], ["theirs", "", ""]]
 
 
 def test_report(tmp_path: Path) -> None:

@@ -19,6 +19,8 @@ from rotavg_ros.metrics import OutlierCounts
 
 from ..laps import answer_of, spoiled
 
+FIVE_DIGITS = 1e-4  # relative, as CSV files have them
+
 
 def scored(contender: str, kind: str, errors: list[float]) -> list[Score]:
     counts = OutlierCounts(3, 1, 0, 6)
@@ -46,10 +48,10 @@ def test_report(tmp_path: Path) -> None:
     (hard,) = (
         row for row in read(tmp_path / "stress-kinds.csv") if (row["kind"], row["method"]) == ("hard", "neurora")
     )
-    assert float(hard["geometric_mean"]) == pytest.approx(120 ** (1 / 3))
+    assert float(hard["geometric_mean"]) == pytest.approx(120 ** (1 / 3), rel=FIVE_DIGITS)
     assert float(hard["worst"]) == 10
     assert float(hard["p90"]) == pytest.approx(8.8)
-    assert (float(hard["share_over_2"]), float(hard["share_over_5"])) == (1, pytest.approx(1 / 3))
+    assert (float(hard["share_over_2"]), float(hard["share_over_5"])) == (1, pytest.approx(1 / 3, rel=FIVE_DIGITS))
     ours, gnc, oracle = read(tmp_path / "stress-totals.csv")
     assert float(ours["share over 2×"]) == 0.5
     assert float(ours["kinds where a peer is better"]) == 0.5
@@ -58,7 +60,7 @@ def test_report(tmp_path: Path) -> None:
     (better,) = read(tmp_path / "stress-better.csv")
     assert (better["kind"], better["cases"]) == ("hard", "3")
     assert len(read(tmp_path / "stress-cases.csv")) == 18
-    assert read(tmp_path / "stress-worst.csv")[0]["ratio"] == "10.0"
+    assert read(tmp_path / "stress-worst.csv")[0]["ratio"] == "10"
 
 
 def test_a_report_of_nothing(tmp_path: Path) -> None:
