@@ -9,6 +9,7 @@ the last solve's tangent: noise, labels and FineNet's weights stay as they were 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -344,13 +345,13 @@ class _System:
             each[:, 0] if linear.turns is None else each[:, :, 0] @ linear.turns.T for each in (turn, walked_turn)
         )
         before = self.laid.body_from_world.numpy()
-        hangs = self.anchor, linear.above, linear.below, linear.share
-        orientation = torch.from_numpy(_turned(*hangs, turn, walked_turn, before))
+        hangs = _Hangs(self.anchor, linear.above, linear.below, linear.share)
+        orientation = torch.from_numpy(_turned(hangs, turn, walked_turn, before))
         if linear.shifts is None or self.laid.position is None:
             return replace(laid, body_from_world=orientation)
         shift = step[:, k:, 0] @ linear.shifts.T
         walked_shift = np.einsum("nc,cd->nd", walked[1], pull[:, k:, 0]) @ linear.shifts.T
-        position = _shifted(*hangs, turn, shift, walked_shift, self.way, self.laid.position)
+        position = _shifted(hangs, turn, (shift, walked_shift), self.way, self.laid.position)
         return replace(laid, body_from_world=orientation, position=position)
 
     def _surer(self, columns: Columns, precision: np.ndarray, accepted: np.ndarray) -> np.ndarray:
@@ -412,13 +413,28 @@ def _shared_way(
     return total
 
 
+class _Hangs(NamedTuple):
+    """Where N' nodes hang, of which the last solve had N.
+
+    Attributes:
+        anchor: ``(N',)`` the node of the last solve that each hangs on.
+        above, below: ``(N,)`` blocks between which each of these lies.
+        share: ``(2, N)`` how far, in turns and in shifts.
+    """
+
+    anchor: np.ndarray
+    above: np.ndarray
+    below: np.ndarray
+    share: np.ndarray
+
+
 @compiled
-def _between(
-    above: np.ndarray, below: np.ndarray, share: np.ndarray, of_block: np.ndarray, v: int, vector: np.ndarray
-) -> None:
-    """To ``vector`` ``(3,)``, of node v of the last solve: by its share ``(N,)`` between blocks of ``(K + R, 3)``."""
+def _between(hangs: _Hangs, kind: int, of_block: np.ndarray, v: int, vector: np.ndarray) -> None:
+    """To ``vector`` ``(3,)``: of ``of_block`` ``(K + R, 3)``, turns (0) or shifts (1), what node v's anchor has."""
+    node = hangs.anchor[v]
+    share, above, below = hangs.share[kind, node], hangs.above[node], hangs.below[node]
     for i in range(3):
-        vector[i] = (1 - share[v]) * of_block[above[v], i] + share[v] * of_block[below[v], i]
+        vector[i] = (1 - share) * of_block[above, i] + share * of_block[below, i]
 
 
 @compiled
@@ -434,19 +450,11 @@ def _exp(vector: np.ndarray) -> tuple[float, float, float, float]:
 
 
 @compiled
-def _turned(
-    anchor: np.ndarray,
-    above: np.ndarray,
-    below: np.ndarray,
-    share: np.ndarray,
-    turn: np.ndarray,
-    walked: np.ndarray,
-    before: np.ndarray,
-) -> np.ndarray:
+def _turned(hangs: _Hangs, turn: np.ndarray, walked: np.ndarray, before: np.ndarray) -> np.ndarray:
     """``(N', 4)`` orientations after turns of blocks ``(K + R, 3)``, and of new nodes by ``(n, 3)`` besides, w ≥ 0."""
-    found, first, vector = np.empty_like(before), len(above), np.empty(3)
-    for v in range(len(anchor)):
-        _between(above, below, share[0], turn, anchor[v], vector)
+    found, first, vector = np.empty_like(before), len(hangs.above), np.empty(3)
+    for v in range(len(hangs.anchor)):
+        _between(hangs, 0, turn, v, vector)
         if v >= first:
             for i in range(3):
                 vector[i] += walked[v - first, i]
@@ -463,25 +471,17 @@ def _turned(
 
 @compiled
 def _shifted(
-    anchor: np.ndarray,
-    above: np.ndarray,
-    below: np.ndarray,
-    share: np.ndarray,
-    turn: np.ndarray,
-    shift: np.ndarray,
-    walked: np.ndarray,
-    way: np.ndarray,
-    before: np.ndarray,
+    hangs: _Hangs, turn: np.ndarray, shifts: tuple[np.ndarray, np.ndarray], way: np.ndarray, before: np.ndarray
 ) -> np.ndarray:
     """``(N', 3)`` positions likewise; the way ``(N', 3)`` of a new node from its anchor turns with that."""
-    found, first, vector = np.empty_like(before), len(above), np.empty(3)
-    for v in range(len(anchor)):
-        _between(above, below, share[1], shift, anchor[v], vector)
+    (shift, walked), found, first, vector = shifts, np.empty_like(before), len(hangs.above), np.empty(3)
+    for v in range(len(hangs.anchor)):
+        _between(hangs, 1, shift, v, vector)
         for i in range(3):
             found[v, i] = before[v, i] + vector[i]
         if v < first:
             continue
-        _between(above, below, share[0], turn, anchor[v], vector)
+        _between(hangs, 0, turn, v, vector)
         a, b, c, d = _exp(vector)
         x, y, z = way[v]
         # By the inverse of that turn: v + 2 w (u × v) + 2 u × (u × v), u = -(a, b, c).
