@@ -6,18 +6,15 @@ half as long as one of torch's. The conventions are those of ``rotations.py``; t
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from rotavg_ros.hamilton import hamilton_product
+from rotavg_ros.solver.algebra import quaternion_loops
 from rotavg_ros.solver.algebra.compiled import compiled
+from rotavg_ros.solver.algebra.quaternion_loops import MIN_SQUARE
 
-# So small a squared sine or angle counts as this, which makes angle / sine what it is in the limit instead of 0/0.
-_MIN_SQUARE = 1e-30
-
-Quaternion = tuple[float, float, float, float]
-_product = compiled(hamilton_product)
+_product, _inverse, _unit = quaternion_loops.product, quaternion_loops.inverse, quaternion_loops.unit
+_log, _exp, _rotate = quaternion_loops.log, quaternion_loops.exp, quaternion_loops.rotate
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -43,7 +40,7 @@ def normalize(a: np.ndarray) -> np.ndarray:
 def log(a: np.ndarray) -> np.ndarray:
     """Unit quaternions of either sign → rotation vectors ``(3, n)`` in radians, of length at most π."""
     vector = a[:3]
-    sine = np.sqrt(np.maximum(np.einsum("in,in->n", vector, vector), _MIN_SQUARE))
+    sine = np.sqrt(np.maximum(np.einsum("in,in->n", vector, vector), MIN_SQUARE))
     # The arc tangent has the sign of w, so the vector comes out the same for a quaternion and its negative.
     with np.errstate(divide="ignore"):
         half_angle = np.arctan(sine / a[3])
@@ -52,7 +49,7 @@ def log(a: np.ndarray) -> np.ndarray:
 
 def exp(vector: np.ndarray) -> np.ndarray:
     """Rotation vectors ``(3, n)`` in radians → unit quaternions ``(4, n)``."""
-    half_angle = np.sqrt(np.maximum(np.einsum("in,in->n", vector, vector), _MIN_SQUARE)) / 2
+    half_angle = np.sqrt(np.maximum(np.einsum("in,in->n", vector, vector), MIN_SQUARE)) / 2
     quaternion = np.empty((4, vector.shape[1]))
     np.multiply(vector, np.sin(half_angle) / (2 * half_angle), out=quaternion[:3])
     np.cos(half_angle, out=quaternion[3])
@@ -91,8 +88,8 @@ def residual_vectors(
         u, v = source[e], target[e]
         m = measured[0, e], measured[1, e], measured[2, e], measured[3, e]
         at_source = correction[0, u], correction[1, u], correction[2, u], correction[3, u]
-        back = -correction[0, v], -correction[1, v], -correction[2, v], correction[3, v]
-        vectors[e, 0], vectors[e, 1], vectors[e, 2] = _rotation_vector(_product(back, _product(m, at_source)))
+        at_target = correction[0, v], correction[1, v], correction[2, v], correction[3, v]
+        vectors[e, 0], vectors[e, 1], vectors[e, 2] = _log(_product(_inverse(at_target), _product(m, at_source)))
     return vectors
 
 
@@ -114,13 +111,11 @@ def spread(orientation: np.ndarray, correction: np.ndarray, between: np.ndarray,
         if u != v:
             if (u, v) != last:
                 other = correction[v, 0], correction[v, 1], correction[v, 2], correction[v, 3]
-                last, turn = (u, v), _rotation_vector(_product((-own[0], -own[1], -own[2], own[3]), other))
+                last, turn = (u, v), _log(_product(_inverse(own), other))
             part = fraction[n]
-            own = _product(own, _quaternion((part * turn[0], part * turn[1], part * turn[2])))
+            own = _product(own, _exp((part * turn[0], part * turn[1], part * turn[2])))
         before = orientation[n, 0], orientation[n, 1], orientation[n, 2], orientation[n, 3]
-        x, y, z, w = _product(before, own)
-        norm = math.sqrt(x * x + y * y + z * z + w * w)
-        turned[n, 0], turned[n, 1], turned[n, 2], turned[n, 3] = x / norm, y / norm, z / norm, w / norm
+        turned[n, 0], turned[n, 1], turned[n, 2], turned[n, 3] = _unit(_product(before, own))
     return turned
 
 
@@ -130,29 +125,6 @@ def turned_back(orientation: np.ndarray, which: np.ndarray, vector: np.ndarray) 
     turned = np.empty((len(vector), 3))
     for n in range(len(vector)):
         at = which[n]
-        x, y, z, w = -orientation[at, 0], -orientation[at, 1], -orientation[at, 2], orientation[at, 3]
-        a, b, c = vector[n, 0], vector[n, 1], vector[n, 2]
-        p, q, r = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
-        turned[n, 0] = a + w * p + y * r - z * q
-        turned[n, 1] = b + w * q + z * p - x * r
-        turned[n, 2] = c + w * r + x * q - y * p
+        back = _inverse((orientation[at, 0], orientation[at, 1], orientation[at, 2], orientation[at, 3]))
+        turned[n, 0], turned[n, 1], turned[n, 2] = _rotate(back, (vector[n, 0], vector[n, 1], vector[n, 2]))
     return turned
-
-
-@compiled
-def _rotation_vector(a: Quaternion) -> tuple[float, float, float]:
-    """As :func:`log`."""
-    x, y, z, w = a
-    sine = math.sqrt(max(x * x + y * y + z * z, _MIN_SQUARE))
-    # The sign of w makes the vector the same for a quaternion and its negative.
-    scale = 2 * math.atan2(sine, abs(w)) / sine * (1.0 if w >= 0 else -1.0)
-    return scale * x, scale * y, scale * z
-
-
-@compiled
-def _quaternion(vector: tuple[float, float, float]) -> Quaternion:
-    """As :func:`exp`."""
-    x, y, z = vector
-    half_angle = math.sqrt(max(x * x + y * y + z * z, _MIN_SQUARE)) / 2
-    scale = math.sin(half_angle) / (2 * half_angle)
-    return scale * x, scale * y, scale * z, math.cos(half_angle)

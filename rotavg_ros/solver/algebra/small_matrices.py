@@ -1,6 +1,7 @@
 """Many symmetric matrices of a few rows at once.
 
-NumPy's own hand each matrix to LAPACK by itself, which costs microseconds; here each operation is one on all of them.
+NumPy's own hand each matrix to LAPACK by itself, which costs microseconds; here each operation is one on all of them,
+or a loop that is compiled.
 """
 
 from __future__ import annotations

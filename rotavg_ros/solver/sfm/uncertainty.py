@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rotavg_ros.solver.algebra.probes import probe_signs
 from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem
 from rotavg_ros.solver.sfm.priors import RefinementPriors
+from rotavg_ros.solver.sfm.probes import probe_signs
 from rotavg_ros.view_graph import ViewGraph
 
 _WELL_KNIT_DEGREE = RefinementPriors().well_knit_degree

@@ -11,6 +11,7 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.pointer_jumping import doublings, follow
+from rotavg_ros.solver.algebra.quaternion_loops import canonical, inverse, product, unit
 from rotavg_ros.solver.algebra.residuals import edge_residual
 from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root, compose_orientations
 from rotavg_ros.view_graph import ViewGraph
@@ -110,24 +111,15 @@ def _turns(parent: np.ndarray, known: int, measured: np.ndarray, enters: np.ndar
     """``(n,)`` and ``(n, 4)``: the known node that each new one hangs on, and how far it is turned from that, w ≥ 0."""
     anchor, turn = np.empty(len(parent), dtype=np.int64), np.empty((len(parent), 4))
     for i in range(len(parent)):
-        x, y, z, w = measured[i]
+        own = measured[i, 0], measured[i, 1], measured[i, 2], measured[i, 3]
         if not enters[i]:
-            x, y, z = -x, -y, -z
+            own = inverse(own)
         above = parent[i] - known
         anchor[i] = parent[i]
         if above >= 0:
             anchor[i] = anchor[above]
-            a, b, c, d = turn[above]
-            x, y, z, w = (
-                w * a + x * d + y * c - z * b,
-                w * b - x * c + y * d + z * a,
-                w * c + x * b - y * a + z * d,
-                w * d - x * a - y * b - z * c,
-            )
-        length = np.sqrt(x * x + y * y + z * z + w * w)
-        if w < 0.0:
-            length = -length
-        turn[i, 0], turn[i, 1], turn[i, 2], turn[i, 3] = x / length, y / length, z / length, w / length
+            own = product(own, (turn[above, 0], turn[above, 1], turn[above, 2], turn[above, 3]))
+        turn[i, 0], turn[i, 1], turn[i, 2], turn[i, 3] = unit(canonical(own))
     return anchor, turn
 
 

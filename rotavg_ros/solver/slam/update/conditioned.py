@@ -9,7 +9,6 @@ the last solve's tangent: noise, labels and FineNet's weights stay as they were 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,8 +17,7 @@ from scipy.special import expit
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.compiled import compiled
-from rotavg_ros.solver.algebra.products import inverse_of_positive, product
-from rotavg_ros.solver.algebra.small_matrices import inverse
+from rotavg_ros.solver.algebra.products import product
 from rotavg_ros.solver.running.work import count as count_units
 from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
@@ -27,7 +25,9 @@ from rotavg_ros.solver.slam.poses.memory import ACROSS, WALK
 from rotavg_ros.solver.slam.posterior.densities import log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.update.columns import Columns
+from rotavg_ros.solver.slam.update.given import Given
 from rotavg_ros.solver.slam.update.linear import Linear
+from rotavg_ros.solver.slam.update.moved import Hangs, shifted, turned
 from rotavg_ros.view_graph import ViewGraph
 
 # Columns of so many closures are worked out at once.
@@ -96,65 +96,18 @@ def conditioned(
     columns = columns.with_anchors(linear, system.anchors)
     count = len(columns.edge)
     covariance = system.covariance(columns.covariance, count)
-    given = _Given.of(covariance, np.zeros(count, dtype=bool))
+    given = Given.of(covariance, np.zeros(count, dtype=bool))
     for _ in range(_ROUNDS):
         mean, left_out = given.left_out(covariance, system.residual[:count])
         odds, rotation_odds = system.log_odds(mean, left_out, slice(count))
         accepted = odds > 0
         if (accepted == given.is_given).all():
             break
-        given = _Given.of(covariance, accepted)
+        given = Given.of(covariance, accepted)
     apart = system.log_odds(system.residual[count:], system.independent(slice(count, None)), slice(count, None))
     score = expit(-np.append(odds, apart[0]))
     rotation_score = expit(-np.append(rotation_odds, apart[1]))
     return Conditioned(system.moved(columns, given), score, np.minimum(score, rotation_score), columns)
-
-
-@dataclass(frozen=True)
-class _Given:
-    """Some of n closures, whose residuals are given.
-
-    Attributes:
-        is_given: ``(n,)`` bool.
-        precision: ``(g d, g d)`` inverse of their covariance.
-    """
-
-    is_given: np.ndarray
-    precision: np.ndarray
-
-    @classmethod
-    def of(cls, covariance: np.ndarray, is_given: np.ndarray) -> _Given:
-        """By the covariance ``(n, d, n, d)`` of all."""
-        count = int(is_given.sum()) * covariance.shape[1]
-        among = covariance[is_given][:, :, is_given].reshape(count, count)
-        return cls(is_given, inverse_of_positive((among + among.T) / 2))
-
-    def left_out(self, covariance: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals ``(n, d, q)`` less what those that are given say of them, and their covariances ``(n, d, d)``.
-
-        Of one that is given the others say it.
-
-        Args:
-            covariance: ``(n, d, n, d)``.
-            residual: ``(n, d, q)``.
-        """
-        count, size = residual.shape[:2]
-        inside, given, others = np.arange(count), self.is_given, ~self.is_given
-        left = covariance[inside, :, inside]
-        if not given.any():
-            return residual, left
-        mean, precision = residual.copy(), self.precision
-        off = residual[given].reshape(len(precision), -1)
-        between = covariance[others][:, :, given].reshape(-1, len(precision))
-        gain = product(between, precision)
-        mean[others] -= product(gain, off).reshape(mean[others].shape)
-        by_row = (-1, size, len(precision))
-        left[others] -= np.matmul(gain.reshape(by_row), between.reshape(by_row).transpose(0, 2, 1))
-        among = np.arange(given.sum())
-        blocks = precision.reshape(-1, size, len(among), size)[among, :, among]
-        left[given] = inverse((blocks + blocks.transpose(0, 2, 1)) / 2)
-        mean[given] = left[given] @ product(precision, off).reshape(-1, size, residual.shape[2])
-        return mean, (left + left.transpose(0, 2, 1)) / 2
 
 
 @dataclass(frozen=True)
@@ -326,7 +279,7 @@ class _System:
         both = told + _log_normal(mean, covariance, 1) - false_turn - false_place
         return np.where(self.is_known[which], both, rotation), rotation
 
-    def moved(self, columns: Columns, by: _Given) -> LaidOn:
+    def moved(self, columns: Columns, by: Given) -> LaidOn:
         """All nodes, as those of the closures with columns move them that are given."""
         accepted, precision = by.is_given, by.precision
         if not accepted.any():
@@ -345,13 +298,13 @@ class _System:
             each[:, 0] if linear.turns is None else each[:, :, 0] @ linear.turns.T for each in (turn, walked_turn)
         )
         before = self.laid.body_from_world.numpy()
-        hangs = _Hangs(self.anchor, linear.above, linear.below, linear.share)
-        orientation = torch.from_numpy(_turned(hangs, turn, walked_turn, before))
+        hangs = Hangs(self.anchor, linear.above, linear.below, linear.share)
+        orientation = torch.from_numpy(turned(hangs, turn, walked_turn, before))
         if linear.shifts is None or self.laid.position is None:
             return replace(laid, body_from_world=orientation)
         shift = step[:, k:, 0] @ linear.shifts.T
         walked_shift = np.einsum("nc,cd->nd", walked[1], pull[:, k:, 0]) @ linear.shifts.T
-        position = _shifted(hangs, turn, (shift, walked_shift), self.way, self.laid.position)
+        position = shifted(hangs, turn, (shift, walked_shift), self.way, self.laid.position)
         return replace(laid, body_from_world=orientation, position=position)
 
     def _surer(self, columns: Columns, precision: np.ndarray, accepted: np.ndarray) -> np.ndarray:
@@ -411,82 +364,3 @@ def _shared_way(
                         total[0, i, j] += own * min(along[0, one], along[0, other])
                         total[1, i, j] += own * min(along[1, one], along[1, other])
     return total
-
-
-class _Hangs(NamedTuple):
-    """Where N' nodes hang, of which the last solve had N.
-
-    Attributes:
-        anchor: ``(N',)`` the node of the last solve that each hangs on.
-        above, below: ``(N,)`` blocks between which each of these lies.
-        share: ``(2, N)`` how far, in turns and in shifts.
-    """
-
-    anchor: np.ndarray
-    above: np.ndarray
-    below: np.ndarray
-    share: np.ndarray
-
-
-@compiled
-def _between(hangs: _Hangs, kind: int, of_block: np.ndarray, v: int, vector: np.ndarray) -> None:
-    """To ``vector`` ``(3,)``: of ``of_block`` ``(K + R, 3)``, turns (0) or shifts (1), what node v's anchor has."""
-    node = hangs.anchor[v]
-    share, above, below = hangs.share[kind, node], hangs.above[node], hangs.below[node]
-    for i in range(3):
-        vector[i] = (1 - share) * of_block[above, i] + share * of_block[below, i]
-
-
-@compiled
-def _exp(vector: np.ndarray) -> tuple[float, float, float, float]:
-    """xyzw, as :func:`rotavg_ros.rotations.exp` has it."""
-    square = vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]
-    if square < 1e-8:
-        half_sinc, cosine = 0.5 - square / 48, 1 - square / 8
-    else:
-        half = np.sqrt(square) / 2
-        half_sinc, cosine = np.sin(half) / (2 * half), np.cos(half)
-    return vector[0] * half_sinc, vector[1] * half_sinc, vector[2] * half_sinc, cosine
-
-
-@compiled
-def _turned(hangs: _Hangs, turn: np.ndarray, walked: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """``(N', 4)`` orientations after turns of blocks ``(K + R, 3)``, and of new nodes by ``(n, 3)`` besides, w ≥ 0."""
-    found, first, vector = np.empty_like(before), len(hangs.above), np.empty(3)
-    for v in range(len(hangs.anchor)):
-        _between(hangs, 0, turn, v, vector)
-        if v >= first:
-            for i in range(3):
-                vector[i] += walked[v - first, i]
-        a, b, c, d = _exp(vector)
-        x, y, z, w = before[v, 0], before[v, 1], before[v, 2], before[v, 3]
-        nx, ny, nz = w * a + x * d + y * c - z * b, w * b - x * c + y * d + z * a, w * c + x * b - y * a + z * d
-        nw = w * d - x * a - y * b - z * c
-        length = np.sqrt(nx * nx + ny * ny + nz * nz + nw * nw)
-        if nw < 0.0:
-            length = -length
-        found[v, 0], found[v, 1], found[v, 2], found[v, 3] = nx / length, ny / length, nz / length, nw / length
-    return found
-
-
-@compiled
-def _shifted(
-    hangs: _Hangs, turn: np.ndarray, shifts: tuple[np.ndarray, np.ndarray], way: np.ndarray, before: np.ndarray
-) -> np.ndarray:
-    """``(N', 3)`` positions likewise; the way ``(N', 3)`` of a new node from its anchor turns with that."""
-    (shift, walked), found, first, vector = shifts, np.empty_like(before), len(hangs.above), np.empty(3)
-    for v in range(len(hangs.anchor)):
-        _between(hangs, 1, shift, v, vector)
-        for i in range(3):
-            found[v, i] = before[v, i] + vector[i]
-        if v < first:
-            continue
-        _between(hangs, 0, turn, v, vector)
-        a, b, c, d = _exp(vector)
-        x, y, z = way[v]
-        # By the inverse of that turn: v + 2 w (u × v) + 2 u × (u × v), u = -(a, b, c).
-        tx, ty, tz = 2 * (c * y - b * z), 2 * (a * z - c * x), 2 * (b * x - a * y)
-        found[v, 0] += walked[v - first, 0] + d * tx + c * ty - b * tz
-        found[v, 1] += walked[v - first, 1] + d * ty + a * tz - c * tx
-        found[v, 2] += walked[v - first, 2] + d * tz + b * tx - a * ty
-    return found

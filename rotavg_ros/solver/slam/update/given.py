@@ -1,0 +1,57 @@
+"""What those of some closures that are believed say of the others, and of each other: conditional normal densities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rotavg_ros.solver.algebra.products import inverse_of_positive, product
+from rotavg_ros.solver.algebra.small_matrices import inverse
+
+
+@dataclass(frozen=True)
+class Given:
+    """Some of n closures, whose residuals are given.
+
+    Attributes:
+        is_given: ``(n,)`` bool.
+        precision: ``(g d, g d)`` inverse of their covariance.
+    """
+
+    is_given: np.ndarray
+    precision: np.ndarray
+
+    @classmethod
+    def of(cls, covariance: np.ndarray, is_given: np.ndarray) -> Given:
+        """By the covariance ``(n, d, n, d)`` of all."""
+        count = int(is_given.sum()) * covariance.shape[1]
+        among = covariance[is_given][:, :, is_given].reshape(count, count)
+        return cls(is_given, inverse_of_positive((among + among.T) / 2))
+
+    def left_out(self, covariance: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals ``(n, d, q)`` less what those that are given say of them, and their covariances ``(n, d, d)``.
+
+        Of one that is given the others say it.
+
+        Args:
+            covariance: ``(n, d, n, d)``.
+            residual: ``(n, d, q)``.
+        """
+        count, size = residual.shape[:2]
+        inside, given, others = np.arange(count), self.is_given, ~self.is_given
+        left = covariance[inside, :, inside]
+        if not given.any():
+            return residual, left
+        mean, precision = residual.copy(), self.precision
+        off = residual[given].reshape(len(precision), -1)
+        between = covariance[others][:, :, given].reshape(-1, len(precision))
+        gain = product(between, precision)
+        mean[others] -= product(gain, off).reshape(mean[others].shape)
+        by_row = (-1, size, len(precision))
+        left[others] -= np.matmul(gain.reshape(by_row), between.reshape(by_row).transpose(0, 2, 1))
+        among = np.arange(given.sum())
+        blocks = precision.reshape(-1, size, len(among), size)[among, :, among]
+        left[given] = inverse((blocks + blocks.transpose(0, 2, 1)) / 2)
+        mean[given] = left[given] @ product(precision, off).reshape(-1, size, residual.shape[2])
+        return mean, (left + left.transpose(0, 2, 1)) / 2
