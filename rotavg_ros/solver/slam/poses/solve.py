@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rotavg_ros.solver.slam.poses.answer import answer
-from rotavg_ros.solver.slam.poses.estimate import estimate_poses
+from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.memory import PoseMemory
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.search.rivals import rival_poses

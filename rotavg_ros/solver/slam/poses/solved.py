@@ -10,6 +10,7 @@ from rotavg_ros.solver.algebra.sparse.block_system import BlockFactor
 from rotavg_ros.solver.slam.poses.closures import Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.displacements import Displacements
 from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
+from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.state import PoseState
 
 
@@ -44,3 +45,29 @@ class Solved:
     predictions: Predictions
     maps: MapTurns
     places: Places
+
+
+@dataclass(frozen=True)
+class PoseMode:
+    """A labelling's poses.
+
+    Attributes:
+        problem: the graph.
+        solved: the last solve.
+        cost: −log p of translations given what rotations say, nats; NaN unless rotations' labels were held.
+        first: nats, what the first solve made of closures and noise (:func:`likeliest_level`).
+    """
+
+    problem: PoseProblem
+    solved: Solved
+    cost: float
+    first: float
+
+    @property
+    def state(self) -> PoseState:
+        """Where the key nodes are, and the noise."""
+        return self.solved.state
+
+    def jumps_like(self, other: PoseMode) -> bool:
+        """Whether odometry's position jumps in the same segments."""
+        return np.array_equal(self.problem.jumps > 0, other.problem.jumps > 0)

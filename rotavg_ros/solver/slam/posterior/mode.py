@@ -58,11 +58,15 @@ class Mode:
 
         No slip differs, nor two closures of a run.
         """
-        differs = self.state.is_good != other.is_good
-        if differs[self.problem.graph.is_odometry].any():
-            return False
-        in_run = np.bincount(self.problem.run[differs[self.problem.closure]])
-        return in_run.max(initial=0) < 2 and self.is_turned_like(other)
+        odometry = self.problem.graph.is_odometry
+        slips_alike = np.array_equal(self.state.is_good[odometry], other.is_good[odometry])
+        return slips_alike and self.holds_like(other) and self.is_turned_like(other)
+
+    def holds_like(self, other: State) -> bool:
+        """Whether no two closures of a run have another label."""
+        closure = self.problem.closure
+        differs = self.state.is_good[closure] != other.is_good[closure]
+        return bool(np.bincount(self.problem.run[differs]).max(initial=0) < 2)
 
     def is_turned_like(self, other: State) -> bool:
         """Whether orientations are the same up to what closures err."""

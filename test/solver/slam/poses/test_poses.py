@@ -19,8 +19,9 @@ from rotavg_ros.solver import Solution, solve
 from rotavg_ros.solver.neurora.network_store import Networks
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.poses.answer import answer
-from rotavg_ros.solver.slam.poses.estimate import PoseMode, estimate_poses
+from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.stages import bootstrap
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph

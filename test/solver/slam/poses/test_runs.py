@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from rotavg_ros.solver.slam.poses.closures import NOTHING
-from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart, estimate_poses
+from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
+from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.search.runs import (
     runs_to_believe,
     runs_to_doubt,
@@ -17,6 +18,7 @@ from rotavg_ros.solver.slam.poses.search.runs import (
     without_runs,
 )
 from rotavg_ros.solver.slam.poses.search.settling import Rival
+from rotavg_ros.solver.slam.poses.solved import PoseMode
 
 from .test_floors import building
 from .test_poses import graph_of, pose_mode, simulated

@@ -14,7 +14,7 @@ from rotavg_ros.datasets.simulation.poses.drawn import DrawnPoses, Noise, Poses,
 from rotavg_ros.datasets.worlds import World
 from rotavg_ros.metrics.positions import position_errors
 from rotavg_ros.solver import solve
-from rotavg_ros.solver.slam.poses.estimate import USUAL, likeliest_level
+from rotavg_ros.solver.slam.poses.em.estimate import USUAL, likeliest_level
 
 from .test_poses import HILLS, graph_of, pose_mode, simulated
 

@@ -13,7 +13,7 @@ from rotavg_ros import rotations
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver import solve
-from rotavg_ros.solver.slam.poses.estimate import PoseMode
+from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.view_graph import ViewGraph
 
 from .test_poses import HILLS, graph_of, held_by_gravity, pose_mode, simulated

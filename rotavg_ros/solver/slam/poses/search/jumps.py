@@ -14,10 +14,11 @@ import numpy as np
 
 from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.poses.closures import given_turn
-from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart
+from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.places.judge import Judge
 from rotavg_ros.solver.slam.poses.repeats.neighbours import log_places
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.labels import log_slip_prior
 
 # Shifts agree that differ by so many standard deviations of what they are known to.

@@ -7,11 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rotavg_ros.solver.slam.poses.estimate import HELD, USUAL, PoseMode, PoseStart, estimate_poses, likeliest_level
+from rotavg_ros.solver.slam.poses.em.convergence import HELD, Ending
+from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses, likeliest_level
+from rotavg_ros.solver.slam.poses.em.start import USUAL, PoseStart
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.search.jumps import jumps_too_far, likeliest_jump, with_jump, without_odd_jumps
 from rotavg_ros.solver.slam.poses.search.runs import with_runs, without_runs
 from rotavg_ros.solver.slam.poses.search.settling import HOPELESS, SLACK, Rival, settled, settling
+from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
 
@@ -52,7 +55,9 @@ def rival_poses(
         tuned: the same labelling with the noise of each edge as FineNet has it, for its poses.
     """
     ended: list[Rival] = []
-    begun = [estimate_poses(PoseProblem(graph, translation, mode)) for mode in _first(modes)]
+    begun: list[PoseMode] = []
+    for mode in _first(modes):
+        begun.append(_begun(PoseProblem(graph, translation, mode), begun))
     for pose in begun:
         ended.append(settling(pose, min((rival.cost for rival in ended), default=np.inf)))
     # How far odometry errs is a robot's, whatever the labels.
@@ -70,6 +75,13 @@ def rival_poses(
         problem = replace(rival.pose.problem, mode=tuned(rival.mode))
         poses.append(estimate_poses(problem, start=PoseStart.at(rival.pose)))
     return Rivals([rival.mode for rival in rivals], poses, share / share.sum())
+
+
+def _begun(problem: PoseProblem, others: Sequence[PoseMode]) -> PoseMode:
+    """Poses of a labelling, from nothing, or from those of another one that holds nearly the same closures."""
+    similar = next((pose for pose in others if problem.mode.holds_like(pose.problem.mode.state)), None)
+    start = None if similar is None else PoseStart.beside(similar, problem)
+    return estimate_poses(problem, start=start)
 
 
 def _distinct(ended: Sequence[Rival], farthest: float) -> list[Rival]:
@@ -92,7 +104,7 @@ def _jumping(rival: Rival) -> list[Rival]:
     # they are looked for before closures pull, and before variances grow.
     has_grown = rival.pose.state.noise.way > before.turn_noise.way
     for solves in (1, HELD) if has_grown else (1,):
-        jumped = _with_jumps(estimate_poses(before, held_for=solves))
+        jumped = _with_jumps(estimate_poses(before, ending=Ending(held_for=solves)))
         if jumped.problem is not before and not any(jumped.jumps_like(other.pose) for other in begun):
             begun.append(settled(jumped.problem, PoseStart.at(jumped)))
     found = [likelier for start in begun for likelier in _jumping_further(start)]
@@ -121,7 +133,7 @@ def _with_jumps(pose: PoseMode) -> PoseMode:
         if jump is None or jump.gained < 0:
             break
         problem, start = with_jump(pose, jump)
-        pose = estimate_poses(problem, start=start, held_for=HELD)
+        pose = estimate_poses(problem, start=start, ending=Ending(held_for=HELD))
     return pose
 
 
@@ -147,5 +159,6 @@ def _begun_otherwise(usual: PoseMode) -> PoseMode | None:
     level = likeliest_level(usual)
     if level == USUAL:
         return None
-    other = estimate_poses(usual.problem, level=level, until=usual)
+    ending = Ending(until=usual.solved.places)
+    other = estimate_poses(usual.problem, level=level, ending=ending)
     return None if other.solved.places.is_like(usual.solved.places) else other

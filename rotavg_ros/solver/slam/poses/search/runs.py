@@ -19,10 +19,11 @@ from scipy.special import chdtrc
 
 from rotavg_ros.solver.algebra.products import inverse_of
 from rotavg_ros.solver.running.work import rest, stop_if_abandoned
-from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart
+from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.places.judge import Judge
 from rotavg_ros.solver.slam.poses.repeats.neighbours import log_all_right
 from rotavg_ros.solver.slam.poses.search.settling import LEAST_GAIN, SLACK, Rival, moved
+from rotavg_ros.solver.slam.poses.solved import PoseMode
 
 # So many runs are looked at, those first that are off by the fewest standard deviations; of so many closures at least,
 # and so many of longer ones: what these come to tells the others.

@@ -10,9 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rotavg_ros.solver.slam.poses.estimate import PoseMode, PoseStart, estimate_poses
+from rotavg_ros.solver.slam.poses.em.convergence import Ending
+from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
+from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.search.jumps import log_jump_prior
+from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode
 
@@ -62,7 +65,7 @@ def settling(pose: PoseMode, least: float = np.inf) -> Rival:
         if best is not None and rival.cost > best.cost - LEAST_GAIN:
             break
         best = rival
-        if best.cost > least + HOPELESS:
+        if best.cost > least + HOPELESS or mode is pose.problem.mode:
             break
         pose = estimate_poses(rival.pose.problem, start=PoseStart.at(rival.pose))
     assert best is not None
@@ -79,7 +82,8 @@ def settled(problem: PoseProblem, start: PoseStart) -> Rival:
 
 def moved(rival: Rival, start: PoseStart) -> Rival:
     """What another start of the same labelling comes to; the same where places end as they were."""
-    pose = estimate_poses(rival.pose.problem, start=start, until=rival.pose)
+    ending = Ending(until=rival.pose.solved.places)
+    pose = estimate_poses(rival.pose.problem, start=start, ending=ending)
     is_same = pose.solved.places.is_like(rival.pose.solved.places)
     return rival if is_same else settling(pose, rival.cost)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rotavg_ros.solver.slam.poses.closures import Places
-from rotavg_ros.solver.slam.poses.noise import log_noise_prior
+from rotavg_ros.solver.slam.poses.em.noise import log_noise_prior
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.solved import Solved
 

@@ -1,0 +1,198 @@
+"""Poses by expectation–maximisation around the joint solve.
+
+It begins with the orientations that rotations alone give and no closure's translation believed. What odometry and turns
+predict of each, lever arms included, tells which may be; a closure pulls as far as its classes' mean lets it, so that
+those near by come in first, and what they tie down judges the others.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from rotavg_ros.solver.algebra import quaternion_rows
+from rotavg_ros.solver.algebra.sparse.block_system import BlockFactor
+from rotavg_ros.solver.running.work import rest, spend
+from rotavg_ros.solver.slam.poses.closures import ANYHOW, Places, Predictions, Scale
+from rotavg_ros.solver.slam.poses.em.convergence import (
+    HELD,
+    TO_REST,
+    Ending,
+    Pace,
+    damped,
+    following,
+    noise_rests,
+    poses_rest,
+    with_noise,
+)
+from rotavg_ros.solver.slam.poses.em.evidence import translation_cost
+from rotavg_ros.solver.slam.poses.em.noise import likeliest_noise, log_noise_prior
+from rotavg_ros.solver.slam.poses.em.start import MAX_SOLVES, USUAL, Level, PoseStart, along_odometry
+from rotavg_ros.solver.slam.poses.places.judge import Judge
+from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
+from rotavg_ros.solver.slam.poses.rows import PoseProblem
+from rotavg_ros.solver.slam.poses.solved import PoseMode, Solved
+from rotavg_ros.solver.slam.poses.state import PoseState
+
+# Units of work for each row, of each third of what is done beside the factorisation.
+_ROW = 0.012
+# A step turns nothing by more than this, rad.
+_MAX_TURN = 0.3
+# With which variances of shifts it is begun otherwise.
+_LEVELS: tuple[Level, ...] = (USUAL, (1 / 16, 1 / 16), (1 / 256, 1 / 256), (1.0, 1 / 256), (1.0, 1 / 4096))
+# No two places are nearer than so many typical steps.
+_LEAST_EXTENT = 3.0
+
+
+def estimate_poses(
+    problem: PoseProblem,
+    *,
+    hold: bool = False,
+    start: PoseStart | None = None,
+    level: Level = USUAL,
+    ending: Ending = TO_REST,
+) -> PoseMode:
+    """Poses of a labelling.
+
+    Args:
+        problem: the labelling, and translations.
+        hold: leave the labels of rotations as they are.
+        start: where to begin; default: at what rotations say, no closure's translation believed, …
+        level: … with variances of shifts so many times what is believed beforehand.
+        ending: where to end.
+    """
+    is_good = problem.mode.state.is_good[problem.mode.problem.closure]
+    judge = Judge(problem.told, problem.turns, problem.priors, is_good if hold else None)
+    state = along_odometry(problem, level) if start is None else start.state
+    places, is_new = _nothing_known(problem, state, judge), np.ones(len(is_good), dtype=bool)
+    if start is not None:
+        places, is_new = start.over(places), start.column < 0
+    change, sorted_by = np.zeros(len(state.noise.logarithms)), np.zeros_like(places.chance)
+    pace = Pace.of(len(is_good))
+    number, held, most = 0, *((HELD, MAX_SOLVES) if start is None else (0, start.solves))
+    while True:
+        solved = _solve(problem, state, places, judge)
+        if number == 0:
+            first = _log_likely(problem, solved)
+        rest()
+        chance, sorted_by = damped(solved.places.chance, places.chance, sorted_by)
+        after, pace = pace.towards(replace(solved.places, chance=chance), places, is_new & (number == 0))
+        noise = likeliest_noise(problem, solved).logarithms
+        rest()
+        is_at_rest = poses_rest(solved.moved, after, places)
+        number += 1
+        if is_at_rest:
+            held = min(held, number)
+        if number == most or ending.is_early(number, after, is_at_rest=is_at_rest):
+            break
+        if number > held and is_at_rest and noise_rests(noise - state.noise.logarithms):
+            break
+        is_held = ending.held_for is not None or number <= held
+        state, change = with_noise(solved.state, noise, change, is_held=is_held)
+        places = following(after, problem, solved.state.noise, state.noise)
+    if not hold:
+        return PoseMode(problem, solved, math.nan, first)
+    used = problem.closure_turns(solved.state.noise)
+    judge = replace(judge, told=replace(judge.told, rotation_variance=used))
+    in_order = judge(solved.predictions, solved.maps, solved.places.chance, solved.scale, in_order=True)
+    return PoseMode(problem, solved, translation_cost(problem, solved, in_order), first)
+
+
+def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge) -> Solved:
+    """One Gauss–Newton step, and classes of closures by what it tells."""
+    closure, k, num_nodes = problem.mode.problem.closure, problem.turns, problem.drawn.num_nodes
+    way = problem.displacements(problem.orientations(state))
+    residual, covariance = problem.residuals(state, way), problem.shift_covariance(state, way)
+    turn_variances = problem.turn_variances(state.noise)
+    rotation_weight = 1 / turn_variances
+    rotation_weight[closure] = places.rotation_weight[:, None]
+    rest()
+    root = problem.whitening(covariance, rotation_weight, places.weight, state)
+    jacobian = np.matmul(root, problem.jacobian(way))
+    factor = problem.equations.factorise(jacobian, problem.root_weight(rotation_weight, state))
+    whitened = np.matmul(root, residual[:, :, None])
+    step = factor.fit(whitened)
+    turns, shifts = problem.bases
+    moved = np.concatenate((step[:, :k, 0] @ turns.T, step[:, k:, 0] @ shifts.T), axis=1)
+    turned = float(np.abs(moved[:num_nodes, :3]).max(initial=0.0))
+    moved /= max(1.0, turned / _MAX_TURN)
+    correction = quaternion_rows.multiply(state.correction, quaternion_rows.exp(moved[:num_nodes, :3].T))
+    state = replace(
+        state,
+        correction=quaternion_rows.normalize(correction),
+        position=state.position + moved[:num_nodes, 3:],
+        common=state.common + moved[num_nodes:],
+    )
+    explained = factor.predicted(step)
+    left = whitened - explained
+    # xᵀ H x of a step x, whose mean is one for each unknown where x is drawn from N(0, H⁻¹).
+    moved_by = math.sqrt(float((explained**2).sum()) / max(step.size, 1))
+    scale = _scale(problem, state)
+    # Wherever a closure's source is, and however it is turned.
+    anywhere = scale.extent + (problem.lengths[problem.closures] ** 2).sum(axis=1)
+    spend(_ROW * len(jacobian))
+    predictions = _left_out(factor, root, left, closure).within(k, ANYHOW, anywhere)
+    judge = replace(judge, told=replace(judge.told, rotation_variance=turn_variances[closure, 0]))
+    spend(_ROW * len(jacobian))
+    maps = MapTurns.of(problem, state.position, predictions, scale.good)
+    spend(_ROW * len(jacobian))
+    judged = judge(predictions, maps, places.chance, scale)
+    return Solved(
+        state,
+        way,
+        covariance,
+        rotation_weight,
+        places.weight,
+        left,
+        factor,
+        moved_by,
+        scale,
+        predictions,
+        maps,
+        judged,
+    )
+
+
+def likeliest_level(usual: PoseMode) -> Level:
+    """The level of shifts' noise under which closures are likeliest, each by itself, before any of them pulls.
+
+    Odometry that errs by anything has room for every false closure, and they keep it so; taken for better than it is,
+    it holds true regions to be wrong. What it tells of closures by itself is a guess at which; −log p decides.
+
+    Args:
+        usual: the same labelling, begun with what is believed beforehand.
+    """
+    problem, told = usual.problem, [usual.first]
+    judge = Judge(problem.told, problem.turns, problem.priors)
+    for level in _LEVELS[1:]:
+        state = along_odometry(problem, level)
+        told.append(_log_likely(problem, _solve(problem, state, _nothing_known(problem, state, judge), judge)))
+    return _LEVELS[int(np.argmax(told))]
+
+
+def _log_likely(problem: PoseProblem, solved: Solved) -> float:
+    """Nats, of closures, each by itself, and of the noise."""
+    return float(solved.places.log_density.sum()) + log_noise_prior(problem, solved.state.noise)
+
+
+def _nothing_known(problem: PoseProblem, state: PoseState, judge: Judge) -> Places:
+    closure = problem.mode.problem.closure
+    residual = problem.residuals(state, problem.displacements(problem.orientations(state)))
+    square = (residual[closure, problem.turns :] ** 2).sum(axis=1)
+    return judge.nothing_known(problem.mode.state.is_good[closure], square, _scale(problem, state))
+
+
+def _scale(problem: PoseProblem, state: PoseState) -> Scale:
+    spread = float(np.var(state.position @ problem.bases[1], axis=0).mean())
+    good, own = problem.closure_variance(state.noise), problem.own_variance(state.noise)
+    return Scale(good, own, state.noise.closure / own, 2 * spread + (_LEAST_EXTENT * problem.typical) ** 2)
+
+
+def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.ndarray) -> Predictions:
+    """What all else says of some rows, whose ``root`` is diagonal, by what is left of them and their leverages."""
+    sigma = 1 / np.diagonal(root[rows], axis1=1, axis2=2)
+    others, covariance = factor.without(rows)
+    mean = sigma * np.matmul(others, left[rows])[:, :, 0]
+    return Predictions(mean, sigma[:, :, None] * covariance * sigma[:, None, :])
