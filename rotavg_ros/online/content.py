@@ -29,6 +29,7 @@ class Counts:
     Attributes:
         keyframes, edges, pending: sizes now.
         queued: closures in the graph that wait to be solved, see :mod:`~rotavg_ros.online.answer.closure_queue`.
+        by_chance: of these, how many the last answer explains, as it would as many random ones.
         rejected: inputs refused, by :class:`RejectReason` value.
         time_jumps: how often the data's time went back.
         time_is_back: whether odometry is refused since such a jump, and somebody has to decide.
@@ -56,6 +57,7 @@ class Counts:
     longest_pending: KeyframeReference | None = None
     longest_pending_s: float = 0.0
     queued: int = 0
+    by_chance: int = 0
 
 
 @dataclass
@@ -219,7 +221,7 @@ class Content:
             last.queue.let_in(snapshot.graph, last.known, last.outlier, idle=idle)
         cold = force_cold or (is_last and not anew) or not self.builder.options.warm_start
         answered = last.body_from_world, last.component, last.outlier
-        return Problem(snapshot, cold, *answered, self._memory, last.queue.order, anew)
+        return Problem(snapshot, cold, *answered, self._memory, last.queue.order, last.queue.prior_log_odds, anew)
 
     def accept(self, answer: AcceptedAnswer) -> None:
         """Make the answer to the last problem the last answer."""
@@ -249,6 +251,7 @@ class Content:
             edges=growth.graph.num_edges,
             pending=len(growth.pending),
             queued=len(self.state.last.queue),
+            by_chance=self.state.last.queue.num_by_chance,
             rejected=dict(growth.rejected),
             time_jumps=time_jumps,
             time_is_back=growth.backward_jumps.is_back and growth.options.on_time_jump == "error",

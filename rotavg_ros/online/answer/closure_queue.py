@@ -3,8 +3,10 @@
 What a tick costs follows the closures that are new to it, and how many of those in it are false. So in each tick only
 so many enter: those first that the last answer explains, the nearest to the newest keyframes before others. One closure
 that enters is one unit of work; nothing here knows of seconds, so a bag leads to the same answers on every machine.
-A closure that waits is no part of the solve. Its score comes from its residual
-(:mod:`~rotavg_ros.online.answer.screening`). While nothing comes, twice as many enter with each tick, until all are in.
+Where no more of those that came together are explained than random ones would be, those that are wait, too
+(:mod:`~rotavg_ros.online.answer.arrivals`). A closure that waits is no part of the solve. Its score comes from its
+residual (:mod:`~rotavg_ros.online.answer.screening`). While nothing comes, twice as many enter with each tick, until
+all are in.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rotavg_ros.online.answer.arrivals import FALSE, GOOD, Arrivals
 from rotavg_ros.online.answer.screening import Known
 from rotavg_ros.online.compaction.renumbering import Renumbering
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
@@ -54,11 +57,17 @@ class ClosureQueue:
         order: edges that have entered, in that order; what the solver remembers of its last solve goes by it. None: all
             are in, in their own order.
         idle_ticks: how often in a row it was asked while nothing came.
+        arrivals: what came together.
+        prior_log_odds: ``(m,)`` nats, of those that wait, to be good before each was looked at; 0 of others.
+        num_by_chance: how many wait that the last answer explains, since as many random ones would be.
     """
 
     waits: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     order: NDArray[np.int64] | None = None
     idle_ticks: int = 0
+    arrivals: Arrivals = field(default_factory=Arrivals)
+    prior_log_odds: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    num_by_chance: int = 0
     limits: EntryLimits = field(default_factory=EntryLimits)
 
     def __len__(self) -> int:
@@ -68,11 +77,13 @@ class ClosureQueue:
     def renumber(self, renumbering: Renumbering) -> None:
         """Follow a compaction of the graph; what the solver remembers fits no graph after one."""
         self.waits, self.order = renumbering.flags(self.waits), None
+        self.arrivals.forget()
 
     def let_in_all(self, graph: ViewGraph) -> None:
         """The next solve is of the whole graph."""
         self.waits = np.zeros(graph.num_edges, dtype=bool)
         self.order, self.idle_ticks = None, 0
+        self.prior_log_odds, self.num_by_chance = np.zeros(graph.num_edges), 0
 
     def let_in(self, graph: ViewGraph, known: Known | None, outlier: NDArray[np.bool_], *, idle: bool) -> None:
         """Choose what enters the next solve.
@@ -91,6 +102,10 @@ class ClosureQueue:
         was_in[entered] = True
         is_closure = graph.kind.numpy() == EdgeKind.LOOP_CLOSURE
         waits = ~was_in & is_closure & (graph.label.numpy() == EdgeLabel.AUTOMATIC)
+        self.prior_log_odds, self.num_by_chance = np.zeros(graph.num_edges), 0
+        num_known = 0 if known is None else len(known.body_from_world)
+        later_end = torch.maximum(graph.source, graph.target).numpy()
+        self.arrivals.take(is_closure, later_end >= num_known - self.limits.newest)
         if known is not None and waits.any() and bool(graph.is_odometry.any()):
             flagged = np.zeros(graph.num_edges, dtype=bool)
             flagged[: len(outlier)] = outlier
@@ -112,18 +127,27 @@ class ClosureQueue:
         if len(candidates) <= most:
             return candidates
         closures = graph.select_edges(torch.from_numpy(candidates))
-        log_odds = known.carried_on(graph.select_edges(torch.from_numpy(~waits))).log_odds(closures)
+        told = known.carried_on(graph.select_edges(torch.from_numpy(~waits))).log_odds(closures, graph)
+        prior = self.arrivals.prior_log_odds(candidates, told)
+        self.prior_log_odds[candidates] = prior
+        is_good = told + prior >= 0
+        # The solve would believe these, whatever they came with.
+        would_be = told + np.log(((~solved).sum() + GOOD) / (solved.sum() + FALSE)) >= 0
+        self.num_by_chance = int((would_be & ~is_good).sum())
         later_end = torch.maximum(closures.source, closures.target).numpy()
         at_newest = later_end >= num_known - limits.newest
-        explained = np.flatnonzero(log_odds >= 0)
-        explained = explained[np.argsort(-later_end[explained], kind="stable")][:most]
-        may_enter, spare = log_odds < 0, most - len(explained)
+        explained = np.flatnonzero(is_good)
+        explained = explained[np.argsort(-(told + prior)[explained], kind="stable")][:most]
+        may_enter, spare = ~is_good, most - len(explained)
         if not self.idle_ticks:
+            # Of a flood in which most are false none is worth asking the solve for.
+            is_ordinary = self.arrivals.num_together(candidates) <= limits.at_least
+            may_enter &= ~would_be & (is_ordinary | (prior >= 0))
             spare = min(spare, int(limits.contradicting * most))
             if solved.sum() > max(limits.at_least, limits.flagged * (~solved).sum()):
                 may_enter &= at_newest
         others = np.flatnonzero(may_enter)
-        others = others[np.lexsort((-log_odds[others], ~at_newest[others]))][:spare]
+        others = others[np.lexsort((-told[others], ~at_newest[others]))][:spare]
         return candidates[np.concatenate((explained, others))]
 
 

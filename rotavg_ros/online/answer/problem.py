@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -33,6 +33,7 @@ class Problem:
         outlier: ``(m,)`` flags of the last answer, of the first edges.
         memory: what the solver remembers of the last answer.
         order: edges to be solved, in the order in which they have entered; None: all, in their own. The others wait.
+        prior_log_odds: ``(M,)`` nats, of closures that wait, to be good before each was looked at.
         anew: nothing is new, and the answer is to become what a solve from scratch says.
     """
 
@@ -43,6 +44,7 @@ class Problem:
     outlier: NDArray[np.bool_]
     memory: object | None
     order: NDArray[np.int64] | None = None
+    prior_log_odds: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     anew: bool = False
 
     @cached_property
@@ -96,7 +98,8 @@ class Problem:
         graph, order, waits = self.snapshot.graph, torch.from_numpy(self.order), torch.from_numpy(self.waits)
         score = torch.empty(graph.num_edges, dtype=torch.float64)
         score[order] = solution.outlier_score.cpu().double()
-        score[waits] = torch.from_numpy(score_of(known.log_odds(graph.select_edges(waits))))
+        log_odds = known.log_odds(graph.select_edges(waits), graph) + self.prior_log_odds[self.waits]
+        score[waits] = torch.from_numpy(score_of(log_odds))
         rotation_score, precision = solution.rotation_score, solution.edge_precision
         if rotation_score is not None:
             rotation_score = score.clone().index_copy(0, order, rotation_score.cpu())

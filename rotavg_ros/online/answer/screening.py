@@ -120,22 +120,30 @@ class Known:
             ),
         )
 
-    def log_odds(self, closures: ViewGraph) -> NDArray[np.float64]:
+    def log_odds(self, closures: ViewGraph, graph: ViewGraph) -> NDArray[np.float64]:
         """``(K,)`` nats, of each closure being good to its being false, both as likely before it was looked at.
 
         A good one errs normally, by its own deviation and those of its ends, which count as independent. A false one
         has any rotation, and any place within the map. Between components nothing is known: 0.
+
+        Args:
+            closures: K of its edges.
+            graph: where all rotations share an axis, any rotation is one about that.
         """
+        components = graph.rotation_components
         source, target = closures.source, closures.target
         turned = np.radians(angles_off(self.body_from_world, closures.target_from_source, source, target))
         variance = self.deviation**2 + (self.variance[source] + self.variance[target]).numpy()
-        # The density of an angle r's rotation vector where all rotations are as likely: (2 sin(r/2) / r)² / 8π².
-        anywhere = np.log(8 * np.pi**2) - 2 * np.log(np.sinc(turned / (2 * np.pi)))
-        odds = anywhere - 1.5 * np.log(2 * np.pi * variance) - turned**2 / (2 * variance)
-        odds += self._log_odds_of_places(closures)
+        if components == 1:
+            anywhere = np.full(len(turned), np.log(2 * np.pi))
+        else:
+            # The density of an angle r's rotation vector where all rotations are as likely: (2 sin(r/2) / r)² / 8π².
+            anywhere = np.log(8 * np.pi**2) - 2 * np.log(np.sinc(turned / (2 * np.pi)))
+        odds = anywhere - components / 2 * np.log(2 * np.pi * variance) - turned**2 / (2 * variance)
+        odds += self._log_odds_of_places(closures, 2 if components == 1 else 3)
         return np.where((self.component[source] == self.component[target]).numpy(), odds, 0.0)
 
-    def _log_odds_of_places(self, closures: ViewGraph) -> NDArray[np.float64]:
+    def _log_odds_of_places(self, closures: ViewGraph, components: int) -> NDArray[np.float64]:
         """The same by translations alone; 0 where a position or a translation is not known."""
         if self.position is None or self.position_variance is None or closures.translation is None:
             return np.zeros(closures.num_edges)
@@ -143,8 +151,8 @@ class Known:
         moved = distances_off(self.body_from_world, self.position, closures.translation, source, target)
         size = max(_extent(self.position.numpy()), self.deviation_m)
         variance = self.deviation_m**2 + (self.position_variance[source] + self.position_variance[target]).numpy()
-        anywhere = np.log(4 / 3 * np.pi * size**3)
-        odds = anywhere - 1.5 * np.log(2 * np.pi * variance) - moved**2 / (2 * variance)
+        anywhere = np.log(np.pi * size**2 if components == 2 else 4 / 3 * np.pi * size**3)
+        odds = anywhere - components / 2 * np.log(2 * np.pi * variance) - moved**2 / (2 * variance)
         return np.asarray(np.nan_to_num(odds))
 
 

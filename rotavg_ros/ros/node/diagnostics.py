@@ -153,6 +153,7 @@ def _values(health: Health, counts: Counts, paused: bool, now: float) -> dict[st
         "dropped closures": str(counts.dropped_closures),
         "pending": str(counts.pending),
         "queued closures": str(counts.queued),
+        "queued closures that agree by chance": str(counts.by_chance),
         "held back": str(health.held_back),
         "waiting for frames": str(health.waiting_for_frames),
         "answer version": str(0 if answer is None else answer.version),

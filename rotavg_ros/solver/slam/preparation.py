@@ -32,8 +32,6 @@ _BIAS_ROUNDS = 2
 # It is not looked for, or not any further, where a cheaper look promises less than such parts of that gain: at most the
 # closures that disagree and are confirmed by a neighbour, and what the first round explains.
 _BIAS_CONFIRMED, _BIAS_EXPLAINED = 0.75, 0.4
-# Rotations whose axes spread less than this (relative) are all about one axis.
-_PLANAR_SPREAD = 1e-10
 
 
 @dataclass(frozen=True)
@@ -83,7 +81,7 @@ def prepare_as_it_is(graph: ViewGraph) -> Prepared:
     squared_angle = (rotations.log(closure_graph.residual) ** 2).sum(dim=1).numpy()[closure]
     path_steps = closure_graph.path_steps[closure]
     pairs = agreement_pairs(closure_graph)
-    noise = estimate_noise(discrepancies(squared_angle, path_steps, pairs), rotation_components(graph))
+    noise = estimate_noise(discrepancies(squared_angle, path_steps, pairs), graph.rotation_components)
     return Prepared(closure_graph, squared_angle, path_steps, pairs, noise, forest)
 
 
@@ -119,10 +117,3 @@ def draw_together(graph: ViewGraph) -> tuple[ClosureGraph, SpanningForest]:
     # A rejected edge may only be used where nothing else connects.
     forest = minimum_spanning_forest(graph, torch.where(usable, cost, _CLOSURE_COST**2))
     return contract(graph, forest), forest
-
-
-def rotation_components(graph: ViewGraph) -> int:
-    """1 if all measured rotations share one axis (planar motion), else 3."""
-    vectors = rotations.log(graph.target_from_source)
-    spread = torch.linalg.eigvalsh(vectors.T @ vectors)
-    return 1 if float(spread[1]) <= _PLANAR_SPREAD * float(spread[2]) else 3

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online import Answer, EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
+from rotavg_ros.online.answer import screening
 from rotavg_ros.online.answer.closure_queue import EntryLimits
 from rotavg_ros.solver.slam.update.grown_edges import begins_with
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
@@ -149,11 +150,12 @@ def test_a_flood_enters_in_batches_good_ones_first(flooded: Run) -> None:
         answer = run.tick()
         most = LIMITS.at_least + LIMITS.share * before + LIMITS.per_keyframe
         now = closures(run.solver.graphs[-1])
-        assert before < now <= before + most
+        assert before <= now <= before + most
         assert int(answer.waits.sum()) == run.online.counts().queued == 3300 + 200 - now
         good = answer.edge_id < FLOOD
-        if tick >= 3:  # 300 good ones have entered by then, however late they came
-            assert not (answer.waits & good).any()
+        if tick >= 3:  # 300 good ones have entered by then, however late they came, but for some that err by most
+            assert (answer.waits & good).sum() < 0.03 * good.sum()
+        assert answer.waits[~good].all()  # of so many false ones none is tried
         before = now
         run.drive(1)
 
@@ -162,7 +164,7 @@ def test_what_waits_has_a_score_from_its_residual_and_pulls_nothing(flooded: Run
     answer = flooded.tick()
     is_false = answer.edge_id > FLOOD
     assert (answer.outlier_score[answer.waits & is_false] > 0.99).all()
-    assert (answer.outlier_score[answer.waits & ~is_false] < 0.1).all()
+    assert (answer.outlier_score[answer.waits & ~is_false] < 0.5).mean() > 0.95
     assert closures(flooded.solver.graphs[-1]) + int(answer.waits.sum()) == 3500
     turned = Rotation.from_quat(answer.world_from_body).as_rotvec()[:, 2] - np.radians(STEP_DEG) * np.arange(202)
     assert np.degrees(np.abs((turned + np.pi) % (2 * np.pi) - np.pi)).max() < 1e-6
@@ -247,3 +249,48 @@ def test_they_wait_on(flooded: Run, tmp_path: Path, change: str) -> None:
     assert {*answer.edge_id[answer.waits].tolist()} <= {*waiting, flooded.closures}
     assert closures(flooded.solver.graphs[-1]) == int((answer.kind == EdgeKind.LOOP_CLOSURE).sum() - answer.waits.sum())
     assert answer.waits.any() and (online.counts().dropped_closures > 0) == (change == "compact")
+
+
+def test_of_a_flood_of_random_closures_none_is_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though the answer is so unsure that it explains a tenth of them; what the robot finds meanwhile is."""
+    monkeypatch.setattr(screening, "_DEVIATION", np.radians(10))
+    monkeypatch.setattr(screening, "_LEAST_DEVIATION", np.radians(10))
+    run = Run()
+    run.drive(KEYFRAMES)
+    run.close(200)
+    run.tick()
+    run.drive(1)
+    for _ in range(4000):
+        source, target = sorted(run.rng.choice(KEYFRAMES - LIMITS.newest, 2, replace=False).tolist())
+        run.online.add_edge(edge(FLOOD, source, target, run.rng.uniform(-180, 180), EdgeKind.LOOP_CLOSURE))
+    for _ in range(5):
+        run.drive(2)
+        for source in run.rng.choice(KEYFRAMES, 3).tolist():
+            turn = STEP_DEG * (run.keyframes - source) + run.rng.normal()
+            run.online.add_edge(edge(1, source, run.keyframes, turn, EdgeKind.LOOP_CLOSURE))
+        answer = run.tick()
+        is_false, is_closure = answer.edge_id == FLOOD, answer.kind == EdgeKind.LOOP_CLOSURE
+        assert answer.waits[is_false].all() and answer.outlier[is_false].all()
+        assert not answer.waits[is_closure & ~is_false].any() and not answer.outlier[is_closure & ~is_false].any()
+        assert answer.residual_deg[is_false].min() < 1
+        assert run.online.counts().by_chance > 100
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_enters_does_not_depend_on_the_order_in_which_a_flood_comes(seed: int) -> None:
+    entered = []
+    for order in (np.arange(1200), np.random.default_rng(seed).permutation(1200)):
+        run = Run()
+        run.drive(KEYFRAMES)
+        run.close(200)
+        run.tick()
+        run.drive(1)
+        rng = np.random.default_rng(seed)
+        ends = np.sort([rng.choice(KEYFRAMES, 2, replace=False) for _ in range(1200)], axis=1)
+        turns = np.where(np.arange(1200) < 200, STEP_DEG * (ends[:, 1] - ends[:, 0]), 0)
+        turns = turns + np.where(np.arange(1200) < 200, rng.normal(size=1200), rng.uniform(-180, 180, 1200))
+        for i in order.tolist():
+            run.online.add_edge(edge(FLOOD + i, *ends[i].tolist(), turns[i], EdgeKind.LOOP_CLOSURE))
+        answer = run.tick()
+        entered.append(np.sort(answer.edge_id[~answer.waits & (answer.edge_id >= FLOOD)]))
+    np.testing.assert_array_equal(*entered)

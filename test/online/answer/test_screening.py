@@ -15,6 +15,8 @@ from scipy.stats import multivariate_normal
 from rotavg_ros.online.answer.screening import Known, score_of
 from rotavg_ros.view_graph import ViewGraph
 
+IN_SPACE = ViewGraph.create([0, 0], [1, 1], Rotation.from_rotvec([[0.1, 0, 0], [0, 0.1, 0]]).as_quat())
+
 NODES = 6
 
 
@@ -45,8 +47,18 @@ def test_log_odds_are_those_of_scipys_densities(seed: int, angle: float, deviati
     good = multivariate_normal(cov=variance * np.eye(3)).logpdf(angle * axis)
     # Of rotations that are all as likely, the angle has the density (1 - cos r) / π; on a sphere of 4 π r².
     anywhere = np.log((1 - np.cos(angle)) / np.pi / (4 * np.pi * angle**2))
-    found = answer.log_odds(closure(answer, 1, 4, Rotation.from_rotvec(angle * axis)))
+    found = answer.log_odds(closure(answer, 1, 4, Rotation.from_rotvec(angle * axis)), IN_SPACE)
     np.testing.assert_allclose(found, good - anywhere, rtol=1e-6, atol=1e-6)
+
+
+@given(angle=st.floats(0.001, 3.1), deviation=st.floats(0.02, 0.5))
+@settings(max_examples=20, deadline=None)
+def test_where_all_turn_about_one_axis_any_rotation_is_one_about_that(angle: float, deviation: float) -> None:
+    answer = replace(known(0, deviation), body_from_world=torch.tensor([[0.0, 0, 0, 1]] * NODES, dtype=torch.float64))
+    turned = closure(answer, 1, 4, Rotation.from_rotvec([0, 0, angle]))
+    variance = deviation**2 + float(answer.variance[1] + answer.variance[4])
+    expected = multivariate_normal(cov=variance).logpdf(angle) + np.log(2 * np.pi)
+    np.testing.assert_allclose(answer.log_odds(turned, turned), expected, rtol=1e-6, atol=1e-6)
 
 
 def test_a_score_is_the_probability_that_the_log_odds_say() -> None:
@@ -56,7 +68,8 @@ def test_a_score_is_the_probability_that_the_log_odds_say() -> None:
 
 def test_between_components_nothing_is_known() -> None:
     answer = known(1)
-    assert answer.log_odds(closure(answer, 0, 5, Rotation.from_rotvec([1.0, 0, 0]))).tolist() == [0.0]
+    between = closure(answer, 0, 5, Rotation.from_rotvec([1.0, 0, 0]))
+    assert answer.log_odds(between, IN_SPACE).tolist() == [0.0]
 
 
 def test_a_wrong_place_is_told_by_the_translation() -> None:
@@ -67,10 +80,10 @@ def test_a_wrong_place_is_told_by_the_translation() -> None:
     exact = closure(answer, 0, 3, Rotation.identity())
     seen = Rotation.from_quat(answer.body_from_world[0].numpy()).apply(at[3] - at[0])
     right, wrong = (
-        answer.log_odds(replace(exact, translation=torch.from_numpy(seen + off)[None]))[0]
+        answer.log_odds(replace(exact, translation=torch.from_numpy(seen + off)[None]), IN_SPACE)[0]
         for off in ([0, 0, 0], [20, 0, 0])
     )
-    rotation_alone = answer.log_odds(exact)[0]
+    rotation_alone = answer.log_odds(exact, IN_SPACE)[0]
     assert wrong < 0 < rotation_alone < right
 
 
