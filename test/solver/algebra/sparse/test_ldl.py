@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rotavg_ros.solver.algebra.sparse import ldl
 from rotavg_ros.solver.algebra.sparse.ldl import RowPattern
 
 
@@ -28,8 +29,9 @@ def dense(column: np.ndarray, value: np.ndarray, size: int) -> np.ndarray:
     return jacobian
 
 
-@given(st.integers(0, 10_000), st.integers(3, 40), st.integers(0, 60))
-def test_all_of_it_is_that_of_dense_algebra(seed: int, size: int, count: int) -> None:
+@given(st.integers(0, 10_000), st.integers(3, 40), st.integers(0, 60), st.sampled_from([2, 10, 100]))
+def test_all_of_it_is_that_of_dense_algebra(seed: int, size: int, count: int, many: int) -> None:
+    """Whether or not its last columns, where they are full, are a dense factor."""
     rng = np.random.default_rng(seed)
     column, value = rows(rng, size, count)
     weight, extra = rng.uniform(0.1, 100.0, len(column)), np.zeros(size)
@@ -38,7 +40,9 @@ def test_all_of_it_is_that_of_dense_algebra(seed: int, size: int, count: int) ->
     matrix = (jacobian.T * weight) @ jacobian + np.diag(extra)
     inverse = np.linalg.inv(matrix)
 
-    pattern = RowPattern(column, value, size)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ldl, "_MANY", many)
+        pattern = RowPattern(column, value, size)
     factor = pattern.factorise(weight, extra)
     assert factor.log_det == pytest.approx(np.linalg.slogdet(matrix)[1], rel=1e-9, abs=1e-9)
     right = rng.normal(size=(size, 3))
@@ -76,7 +80,9 @@ def test_the_factor_of_a_chain_has_no_fill() -> None:
     assert (pattern.num_entries, pattern.num_factor_entries) == (500 + 499, 499)
 
 
-def test_what_rounding_leaves_no_pivot_stays_positive() -> None:
+@pytest.mark.parametrize("many", [2, 100])
+def test_what_rounding_leaves_no_pivot_stays_positive(many: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ldl, "_MANY", many)
     column, value = rows(np.random.default_rng(0), 50, 0)
     factor = RowPattern(column, value, 50).factorise(np.full(49, 1e16), np.append(1e-3, np.zeros(49)))
     assert (factor.diagonal > 0).all()
