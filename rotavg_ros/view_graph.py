@@ -10,8 +10,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from rotavg_ros.errors import UserError
@@ -229,6 +227,10 @@ class ViewGraph:
 
     @cached_property
     def _components(self) -> Tensor:
+        # Loads a tenth of a second; whoever imports this module may never ask.
+        from scipy.sparse import csr_array
+        from scipy.sparse.csgraph import connected_components
+
         source, target = (end.cpu().int().numpy() for end in (self.source, self.target))
         # Transposing a matrix with one entry in every row, here an edge's target in the column of its source, sorts by
         # counting; scipy's own conversion takes longer than the search.

@@ -63,7 +63,7 @@ def test_a_node_needs_no_pictures_bags_or_evaluation_and_leaves_the_solver_to_it
     assert "rotavg_ros.ros.node.estimator_node" in modules
     assert not modules & _PICTURES_AND_BAGS
     assert not wings(modules) & {*_WINGS, "datasets", "metrics", "cli"}
-    assert not modules & {"rotavg_ros.solver.pipeline", "rotavg_ros.solver.networks", "safetensors"}
+    assert not modules & {"rotavg_ros.solver.pipeline", "rotavg_ros.solver.networks", "safetensors", "scipy", "numba"}
 
 
 @pytest.mark.parametrize("enabled", [True, False])

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online.answer.answer import Answer
 from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS
 from rotavg_ros.online.odometry.track import OdometryTrack
-from rotavg_ros.solver.positions import Translations, fit_positions
 from rotavg_ros.view_graph import EdgeKind
 
 
@@ -49,6 +47,8 @@ def corrected_trajectories(answer: Answer, tracks: Mapping[str, OdometryTrack]) 
     Returns:
         by robot; those without such keyframes are left out.
     """
+    from rotavg_ros.solver.positions import Translations, fit_positions  # loads SciPy, as below: a node may never ask
+
     nodes_of = {robot: nodes for robot in answer.robots if len(nodes := _nodes_by_time(answer, robot))}
     count = len(answer.keyframe_id)
     odometry = np.full((count, 4), np.nan), np.full((count, 3), np.nan)
@@ -110,6 +110,8 @@ def _odometry_steps(
     step = np.full((len(source), 3), np.nan)
     source, target = source[known], target[known]
     if len(source):
+        from scipy.spatial.transform import Rotation
+
         step[known] = Rotation.from_quat(world_from_body[source]).inv().apply(position[target] - position[source])
     return step
 
@@ -133,6 +135,8 @@ def dead_reckoning(
     """
     if len(odometry_position) < 2:
         return odometry_position
+    from scipy.spatial.transform import Rotation
+
     world_from_odometry = Rotation.from_quat(world_from_body) * Rotation.from_quat(odometry_world_from_body).inv()
     steps = world_from_odometry[:-1].apply(np.diff(odometry_position, axis=0))
     if chain is not None:

@@ -20,8 +20,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
 
 from rotavg_ros.online.compaction.marginalization import Columns, can_be_marginalized
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
@@ -43,6 +41,9 @@ class Way:
 
     @classmethod
     def along(cls, num_nodes: int, edges: Columns) -> Way:
+        from scipy.sparse import coo_array, csr_array  # loaded once a graph is full
+        from scipy.sparse.csgraph import connected_components, dijkstra
+
         odometry = edges["kind"] == EdgeKind.ODOMETRY
         ends = edges["source"][odometry], edges["target"][odometry]
         # Of parallel edges the shortest counts; a sparse matrix would add them up.
@@ -176,6 +177,9 @@ def _sparable_closures(
 
 def _bridges(way: Way, edges: Columns, false: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Edges of a spanning forest over the odometry chains, of those that are not false where there are any."""
+    from scipy.sparse import coo_array, csr_array
+    from scipy.sparse.csgraph import minimum_spanning_tree
+
     ends = np.stack((way.chain[edges["source"]], way.chain[edges["target"]]), axis=1)
     ends.sort(axis=1)
     between = np.flatnonzero(ends[:, 0] != ends[:, 1])
