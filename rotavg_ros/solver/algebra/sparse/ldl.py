@@ -29,12 +29,15 @@ from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.products import product
 from rotavg_ros.solver.algebra.sparse.sparse_factor import order_of_little_fill
 from rotavg_ros.solver.running.cached import cached_property
+from rotavg_ros.solver.running.work import spend
 
 _NOWHERE = -1
 # Where rounding leaves less than this of a diagonal entry, nothing is known of it but that it is positive.
 _ROUNDING = 1e-15
 # So many full columns are worth a dense factor.
 _MANY = 100
+# Products in one unit of work: of columns, of a dense factor, and of entries with rows that go up the tree.
+_PRODUCTS, _DENSE_PRODUCTS, _FAR_PRODUCTS = 1e6, 2e7, 2.4e6
 # So many rows go up the tree together, and so many are held.
 _AT_ONCE, _IN_MEMORY = 8, 1024
 
@@ -70,6 +73,7 @@ class RowPattern:
         rank: likewise.
         num_entries: of H, on the diagonal and on one side of it.
         num_factor_entries: of L.
+        units: of work that a factor costs, by its products; an inverse where it has entries costs as much.
     """
 
     def __init__(self, column: np.ndarray, value: np.ndarray, size: int, rank: np.ndarray | None = None) -> None:
@@ -83,6 +87,9 @@ class RowPattern:
         factor_begin = np.append(0, np.cumsum(counts))
         rows = factor_rows(begin, row, above, factor_begin)
         self.shape = _Shape(begin, row, above, factor_begin, rows, _first_full(counts))
+        # As floating-point numbers: whole ones overflow in millions of unknowns.
+        by_column = counts[: self.shape.full].astype(np.float64) ** 2
+        self.units = float(by_column.sum()) / _PRODUCTS + float(size - self.shape.full) ** 3 / _DENSE_PRODUCTS
 
     @property
     def num_entries(self) -> int:
@@ -140,6 +147,7 @@ class LDL:
     @cached_property
     def _inverse(self) -> tuple[np.ndarray, np.ndarray]:
         """Z's diagonal, and its entries where L has any."""
+        spend(self.pattern.units)
         return _selected_inverse(self.pattern.shape, self.lower, self.diagonal, self._full)
 
     @cached_property
@@ -163,6 +171,7 @@ class LDL:
         far = np.flatnonzero(~near)
         for first in range(0, len(far), _IN_MEMORY):
             some = far[first : first + _IN_MEMORY]
+            spend(len(some) * len(self.lower) / _FAR_PRODUCTS)
             before, left = _far_variance(shape, self.lower, self.diagonal, ranked[some], value[some])
             variance[some] = before + (product(left, self._full) * left).sum(axis=1)
         return variance

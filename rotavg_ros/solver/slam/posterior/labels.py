@@ -14,6 +14,7 @@ from scipy.special import betaln, softmax
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.compiled import compiled
+from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
 from rotavg_ros.solver.slam.noise.repeats import KERNELS, Closures, Near, Repeats, places_near, repeats
 from rotavg_ros.solver.slam.posterior.densities import anyhow, log_false
@@ -37,6 +38,8 @@ _OWN_SHARES = 0.25
 _TOLD = 0.5
 # The least density that counts; a product is turned into its logarithm beyond these.
 _LEAST, _SMALL, _LARGE = 1e-100, 1e-100, 1e100
+# Units of work for each closure that is looked at.
+_LOOKED_AT = 0.015
 
 
 # Each of the first two with each of the second.
@@ -188,6 +191,7 @@ def false_density(
         rows: ``(n,)`` closures to be told of.
         both_sides: given all others, not those before alone.
     """
+    spend(_LOOKED_AT * len(rows))
     k, count = problem.components, len(rows)
     square = (residual[rows] ** 2).sum(axis=1)
     near_misses = _near_miss_shares(problem.priors)[:, None]

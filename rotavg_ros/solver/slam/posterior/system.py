@@ -74,7 +74,7 @@ class NormalEquations:
         """With weights ``(E + R,)``, rad⁻²."""
         stop_if_abandoned()
         pattern = self._pattern(weight)
-        spend(pattern.rows.num_entries / ENTRIES)
+        spend(pattern.rows.num_entries / ENTRIES + pattern.rows.units)
         stiffness = root_stiffness(weight)
         extra = np.zeros(self.size)
         extra[self.roots] = stiffness

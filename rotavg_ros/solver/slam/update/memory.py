@@ -17,6 +17,7 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.solver.estimate import Estimate, Places
 from rotavg_ros.solver.running.resumable import Resumable
+from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.fine_net.tuning import fine_tuned
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
@@ -40,6 +41,9 @@ from rotavg_ros.view_graph import ViewGraph
 # new ones more than the second; with any new one where other answers were nearly as likely.
 _MAX_UNEXPLAINED, _MAX_GROWTH = 0.05, 0.25
 _FLAGGED = 0.5
+# Units of work for each edge, of each third of what an update does beside factorisations: drawing together, FineNet,
+# what is published.
+_EDGE = 0.01
 # In the place of labels that are not known; more than any.
 _NEW = 2.0
 _GOOD = 0.5
@@ -180,6 +184,7 @@ class SlamMemory:
             networks: CleanNet and FineNet, which is applied once.
             body_from_world: ``(N, 4)`` start, where a closure is new.
         """
+        spend(_EDGE * graph.num_edges)
         drawn = Drawn.of(graph, networks[0], bias=self.bias)
         problem = drawn.problem
         before = carried_over(self.trusted, problem.graph, _NEW)
@@ -193,7 +198,9 @@ class SlamMemory:
         mode = search.polished(start, "update")
         if self.poses is None:  # else places have a say in it
             mode = search.flipped(mode)
+        spend(_EDGE * graph.num_edges)
         fine = fine_tuned(mode, networks[1], passes=1)
+        spend(_EDGE * graph.num_edges)
         estimate = estimate_of(publish(problem, [fine]))
         memory = replace(
             self,
