@@ -65,7 +65,7 @@ def rival_poses(
     likeliest = next(pose for pose, rival in zip(begun, ended, strict=True) if rival.cost == least)
     if (other := _begun_otherwise(likeliest)) is not None:
         ended.append(settling(other, least))
-    ended.extend([without_runs(with_runs(rival)) for rival in _distinct(ended, HOPELESS)[:_MAX_ASKED]])
+    ended.extend(_with_other_runs(_distinct(ended, HOPELESS)[:_MAX_ASKED]))
     ended.extend(_jumping(min(ended, key=lambda rival: rival.cost)))
     rivals = _distinct(ended, _FAR)
     cost = np.array([rival.cost for rival in rivals])
@@ -92,6 +92,21 @@ def _distinct(ended: Sequence[Rival], farthest: float) -> list[Rival]:
         if not is_far and not any(rival.is_same(other) for other in rivals):
             rivals.append(rival)
     return rivals
+
+
+def _with_other_runs(rivals: Sequence[Rival]) -> list[Rival]:
+    """Whole runs believed and doubted where that is likelier.
+
+    Where none is, it is not asked of another labelling that holds nearly the same closures.
+    """
+    found: list[Rival] = []
+    unmoved: list[Rival] = []
+    for rival in rivals:
+        if any(rival.mode.holds_like(other.mode.state) for other in unmoved):
+            continue
+        other = without_runs(with_runs(rival))
+        (unmoved if other is rival else found).append(other)
+    return found
 
 
 def _jumping(rival: Rival) -> list[Rival]:
