@@ -195,8 +195,8 @@ class OnlineEstimator:
     def trajectories(self, answer: Answer) -> dict[str, Trajectory]:
         """Poses of every robot's keyframes in the answer that have a stamp, see :func:`corrected_trajectories`."""
         with self._lock:
-            tracks = dict(self._content.builder.tracks)
-        return corrected_trajectories(answer, tracks)
+            samples = {robot: track.samples.frozen() for robot, track in self._content.builder.tracks.items()}
+        return corrected_trajectories(answer, samples)
 
     def place(self, answer: Answer) -> dict[str, Trajectory]:
         """The same; from now on :meth:`odometry_frame` goes by them, unless the answer is of what was forgotten."""
@@ -366,7 +366,8 @@ class OnlineEstimator:
             raise TickAbandonedError(f"abandoned: {running.abandoned_by}") from None
         if problem.anew and not solution.is_anew:
             with self._lock:  # nothing but what the solver is about has changed
-                content.remember(solution.memory)
+                if options is self.options:
+                    content.remember(solution.memory)
             return None
         component = solution.component.cpu()
         known = problem.known(solution, options.outlier_threshold)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from rotavg_ros.errors import UserError
 from rotavg_ros.solver.sfm.options import PAPER_PARTS, SfmStages
 from rotavg_ros.solver.slam.options import SWITCHES as SWITCHES
 from rotavg_ros.solver.slam.options import SlamStages
@@ -80,6 +81,24 @@ def method_named(name: str) -> Method | None:
     if whole != DEFAULT_METHOD or len(switched_off) > 1 or not without <= SWITCHES.keys():
         return None
     return Method(slam=SlamStages(without=without))
+
+
+def check_choices(method: str, profile: str, device: str) -> None:
+    """That a solve knows them.
+
+    Raises:
+        UserError: it does not; the message names those that it does.
+    """
+    for name in method.split("+"):
+        if not is_method(name):
+            _check_choice("method", name, METHODS)
+    _check_choice("profile", profile, PROFILES)
+    _check_choice("device", device, DEVICES)
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise UserError(f"unknown {name} {value!r}; choose from {', '.join(choices)}")
 
 
 def is_method(name: str) -> bool:

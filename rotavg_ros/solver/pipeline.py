@@ -13,7 +13,7 @@ from rotavg_ros import baselines, rotations
 from rotavg_ros.errors import UserError
 from rotavg_ros.solver import devices, warnings
 from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
-from rotavg_ros.solver.methods import DEFAULT_METHOD, DEVICES, METHODS, PROFILES, is_method, method_named
+from rotavg_ros.solver.methods import DEFAULT_METHOD, check_choices, method_named
 from rotavg_ros.solver.neurora.network_store import Networks
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.running.threads import for_each, workers
@@ -52,8 +52,8 @@ def solve(
 
     Args:
         graph: N nodes, M edges; or what has it as its ``graph``, as the result of ``read_graph`` does.
-        method: one of :data:`METHODS`, or several joined by "+", of which each starts from the answer of the one
-            before. "neurora~A,B" is the default on robots' graphs without A and B
+        method: one of :data:`~rotavg_ros.solver.methods.METHODS`, or several joined by "+", of which each starts from
+            the answer of the one before. "neurora~A,B" is the default on robots' graphs without A and B
             (:data:`rotavg_ros.solver.slam.options.SWITCHES`); "neurora-paper~A,B" is the paper's with A and B as this
             package has them (:data:`rotavg_ros.solver.sfm.options.PAPER_PARTS`).
         profile: "slam" for odometry chains with loop closures, "sfm" for unordered view-graphs, "auto": "slam" if any
@@ -83,12 +83,8 @@ def solve(
         UserError: no view-graph, an option outside its choices, or a start of the wrong shape.
     """
     graph = view_graph_of(graph)
+    check_choices(method, profile, device)
     names = method.split("+")
-    for name in names:
-        if not is_method(name):
-            _check_choice("method", name, METHODS)
-    _check_choice("profile", profile, PROFILES)
-    _check_choice("device", device, DEVICES)
     if refinement_steps is not None and refinement_steps < 0:
         raise UserError(f"refinement steps must not be negative, got {refinement_steps}")
     if work is not None and not work >= 0:
@@ -253,8 +249,3 @@ def _root_at_identity(body_from_world: Tensor, component: Tensor) -> Tensor:
         return body_from_world
     gauge = rotations.inverse(body_from_world[_first_nodes(component)])[component]
     return rotations.normalize(rotations.multiply(body_from_world, gauge))
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise UserError(f"unknown {name} {value!r}; choose from {', '.join(choices)}")

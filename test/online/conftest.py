@@ -22,7 +22,7 @@ class TreeSolution:
     method: str = "tree"
     profile: str = "slam"
     device: str = "cpu"
-    memory: None = None
+    memory: object = None
     warnings: tuple[str, ...] = ()
     position: None = None
     position_uncertainty: None = None
@@ -30,6 +30,7 @@ class TreeSolution:
     edge_precision: None = None
     step_deviation: float = 0.0
     work: float = 0.0
+    is_anew: bool = True
 
 
 @dataclass

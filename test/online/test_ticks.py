@@ -29,6 +29,29 @@ def test_options_that_change_during_a_solve_are_in_the_next_answer(solver):
     assert estimator.tick() is not None and estimator.tick() is None
 
 
+def test_what_an_unfinished_solve_remembers_of_old_options_is_forgotten(solver):
+    """It goes on from tick to tick until it is what a solve from scratch says; not where options changed within it."""
+    remembered: list[object] = []
+
+    def changing(*arguments: Any, memory: object = None, anew: bool = False, **options: Any) -> Any:
+        remembered.append(memory)
+        solution = solver(*arguments, memory=memory, **options)
+        if not anew:
+            return replace(solution, memory="of an answer", is_anew=False)
+        if len(remembered) == 3:
+            estimator.set_options(replace(OPTIONS, outlier_threshold=0.9))
+        return replace(solution, memory="under way", is_anew=False)
+
+    run, estimator = drive(), make(changing)
+    feed(estimator, run, stop=10)
+    assert estimator.tick() is not None
+    feed(estimator, run, start=10, stop=20)
+    assert estimator.tick() is not None
+    assert estimator.tick() is None  # options change during this one
+    estimator.tick()
+    assert remembered[2] == "of an answer" and remembered[3] is None
+
+
 def test_warm_while_data_flows_then_cold_once_then_nothing(solver):
     run, estimator = drive(), make(solver)
     assert estimator.tick() is None

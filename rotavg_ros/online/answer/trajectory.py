@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rotavg_ros.online.answer.answer import Answer
 from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS
-from rotavg_ros.online.odometry.track import OdometryTrack
+from rotavg_ros.online.odometry.samples import OdometrySamples
 from rotavg_ros.view_graph import EdgeKind
 
 
@@ -37,12 +37,12 @@ class Trajectory:
     odometry_position: NDArray[np.float64]
 
 
-def corrected_trajectories(answer: Answer, tracks: Mapping[str, OdometryTrack]) -> dict[str, Trajectory]:
+def corrected_trajectories(answer: Answer, odometry_of: Mapping[str, OdometrySamples]) -> dict[str, Trajectory]:
     """Poses of every robot's keyframes that have a stamp.
 
     Args:
         answer: with N keyframes and M edges; where an odometry edge has no translation, the odometry's own stands in.
-        tracks: odometry by robot.
+        odometry_of: messages by robot, that stay as they are meanwhile.
 
     Returns:
         by robot; those without such keyframes are left out.
@@ -55,9 +55,9 @@ def corrected_trajectories(answer: Answer, tracks: Mapping[str, OdometryTrack]) 
     chain = np.full(count, -1)
     reckoned = np.full((count, 3), np.nan)
     for robot, nodes in nodes_of.items():
-        track = tracks.get(robot)
-        if track is not None and track.latest is not None:
-            odometry[0][nodes], odometry[1][nodes], chain[nodes] = track.samples.poses_at(
+        samples = odometry_of.get(robot)
+        if samples is not None and len(samples):
+            odometry[0][nodes], odometry[1][nodes], chain[nodes] = samples.poses_at(
                 answer.stamp_ns[nodes], answer.time_line[nodes]
             )
             reckoned[nodes] = dead_reckoning(

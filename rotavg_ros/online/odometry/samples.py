@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -68,6 +69,13 @@ class OdometrySamples:
         self._is_keyframe.append(False)
         self._chain.append(chain)
         self._time_line.append(time_line)
+
+    def frozen(self) -> OdometrySamples:
+        """The messages so far, to be read while others come and old ones are thinned out; not to be added to."""
+        frozen = copy.copy(self)
+        for name in _COLUMNS:
+            setattr(frozen, f"_{name}", copy.copy(getattr(self, f"_{name}")))
+        return frozen
 
     def mark_keyframe(self) -> None:
         """Let the last message never be thinned out."""

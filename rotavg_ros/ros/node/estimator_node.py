@@ -27,6 +27,7 @@ from rotavg_ros.ros.node.solver import Solver
 from rotavg_ros.ros.node.solving import Solving
 from rotavg_ros.ros.node.worker import Worker, Workers
 from rotavg_ros.settings.parameters import NODE_NAME, NodeParameters
+from rotavg_ros.solver.methods import check_choices
 from rotavg_ros.version import __version__
 
 _SHORT_SOLVE_S = 0.2  # a longer one need not be waited for at the end: nobody would read its answer
@@ -111,8 +112,9 @@ class RotavgNode(parameter_server.ParameterNode):
             UserError: the solver does not know its options; nothing has changed then.
         """
         old, options = self._settings, parameters.estimator
-        if (options.method, options.profile) != (self._estimator.options.method, self._estimator.options.profile):
-            self._solver.warm_up(options)
+        check_choices(
+            options.method, options.profile, options.device
+        )  # here, where the running solve is not waited for
         if options != self._estimator.options:
             self._estimator.set_options(options)
         self._settings = parameters

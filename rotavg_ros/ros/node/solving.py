@@ -83,8 +83,9 @@ class Solving:
         if answer is not None:
             self._budget.learn(answer.seconds, answer.work)
             self._publish(answer)
-            self._outputs.draw(answer)
         self._forwarding.decide(health.answer)
+        if answer is not None:
+            self.draw_quietly()
         return answer
 
     def _go_on(self) -> None:

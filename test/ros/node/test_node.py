@@ -204,6 +204,10 @@ def test_path_and_markers_for_those_who_look(live_node) -> None:
     spheres, lines = markers[0].markers
     assert spheres.type == Marker.SPHERE_LIST and len(spheres.points) == LENGTH
     assert lines.type == Marker.LINE_LIST and len(lines.points) == len(lines.colors) == 2 * (LENGTH - 1 + 10)
+    # What was drawn of a graph that is forgotten is taken back.
+    assert live_node.call("reset").success
+    live_node.spin_until(lambda: not paths[-1].poses and len(markers[-1].markers) == 1)
+    assert markers[-1].markers[0].action == Marker.DELETEALL and paths[-1].header.frame_id == "map"
 
 
 def test_it_works_with_simulated_time_and_no_clock(live_node) -> None:

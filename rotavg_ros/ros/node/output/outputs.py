@@ -19,7 +19,7 @@ from rotavg_ros.online import Answer, OnlineEstimator
 from rotavg_ros.online.answer.trajectory import Trajectory
 from rotavg_ros.ros.node.output.conversions import flags_message, orientations_message, to_quaternion_message
 from rotavg_ros.ros.node.output.robot_poses import RobotPoses
-from rotavg_ros.ros.node.output.visualization import markers_message, path_message
+from rotavg_ros.ros.node.output.visualization import markers_message, no_markers, no_path, path_message
 from rotavg_ros.ros.node.topics import LATCHED, publisher
 from rotavg_ros.settings.parameters import NodeParameters
 
@@ -74,9 +74,12 @@ class Outputs:
     def draw(self, answer: Answer | None) -> None:
         """Path and markers of the last answer, for those who look, and poses; again when somebody begins to.
 
+        Without an answer, since all was forgotten, what was drawn is taken back.
+
         Called once a second at least, so that what is left out because too much time went into drawing comes later.
         """
         if answer is None:
+            self._erase()
             return
         if self._poses.are_wanted:
             self._trajectories(answer)
@@ -88,12 +91,18 @@ class Outputs:
             return
         trajectories = self._trajectories(answer)
         for robot, path in self._paths.items():
-            if path in missing and robot in trajectories:
-                path.publish(path_message(trajectories[robot], self._frame_id))
+            if path in missing:
+                drawn = trajectories.get(robot)
+                path.publish(no_path(self._frame_id) if drawn is None else path_message(drawn, self._frame_id))
         if self._markers in missing:
             self._markers.publish(markers_message(answer, list(trajectories.values()), self._frame_id))
         ended = time.monotonic()
         self._rests_until = ended + _REST * (ended - started)
+
+    def _erase(self) -> None:
+        for picture in self._drawn:
+            picture.publish((no_markers if picture is self._markers else no_path)(self._frame_id))
+        self._drawn.clear()
 
     def _trajectories(self, answer: Answer) -> dict[str, Trajectory]:
         """Of the answer, by which poses go from now on."""

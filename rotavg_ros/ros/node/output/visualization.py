@@ -28,6 +28,16 @@ def path_message(trajectory: Trajectory, frame_id: str) -> Path:
     return Path(header=Header(stamp=to_time(newest), frame_id=frame_id), poses=poses)
 
 
+def no_path(frame_id: str) -> Path:
+    """Of a robot without keyframes."""
+    return Path(header=Header(frame_id=frame_id))
+
+
+def no_markers(frame_id: str) -> MarkerArray:
+    """In place of all that were drawn."""
+    return MarkerArray(markers=[Marker(header=Header(frame_id=frame_id), action=Marker.DELETEALL)])
+
+
 def markers_message(answer: Answer, trajectories: list[Trajectory], frame_id: str) -> MarkerArray:
     """One sphere list of the keyframes and one line list of the edges, green (inlier) to red (outlier)."""
     drawing = draw(answer, trajectories)
