@@ -11,8 +11,9 @@ from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.poses.state import PoseState
 
-# Solves from a start, at most; an update goes no further: the next one goes on from there.
-MAX_SOLVES, _MAX_UPDATE_SOLVES = 28, 6
+# Solves from a start, at most. An update goes no further: closures that are new pull from its second solve on, and the
+# next one goes on from there.
+MAX_SOLVES, _MAX_UPDATE_SOLVES = 28, 2
 # Variances of shifts to begin with, of odometry and of closures, in those that are believed beforehand.
 Level = tuple[float, float]
 USUAL: Level = (1.0, 1.0)
