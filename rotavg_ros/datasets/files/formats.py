@@ -7,8 +7,7 @@ from types import ModuleType
 
 from rotavg_ros.datasets.files import g2o, isam, lund, npz, onedsfm, toro
 from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, open_text
-
-_NUMBER_STARTS = frozenset(bytes([character]) for character in b"0123456789+-.")
+from rotavg_ros.datasets.files.text_rows import NUMBER_STARTS
 
 _FORMAT_OF_SUFFIX = {
     ".g2o": g2o,
@@ -79,4 +78,4 @@ def _format_of_content(path: Path, head: bytes) -> ModuleType:
     if head.startswith(b"MATLAB ") or path.suffix.lower() == ".mat":
         return lund
     first_line = next((line for line in head.splitlines() if line.strip() and not line.lstrip().startswith(b"#")), b"")
-    return onedsfm if first_line.lstrip()[:1] in _NUMBER_STARTS else g2o
+    return onedsfm if first_line.lstrip()[:1] in NUMBER_STARTS else g2o

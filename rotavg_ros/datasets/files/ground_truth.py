@@ -103,11 +103,23 @@ def _nearest(ascending: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def nanoseconds(path: Path, line: int, seconds: bytes) -> int:
     """Exact, where a float of seconds since 1970 would be off by a hundred nanoseconds."""
-    whole, _, fraction = seconds.partition(b".")
+    unsigned = seconds.removeprefix(b"-")
+    whole, _, fraction = unsigned.partition(b".")
     if whole.isdigit() and (fraction.isdigit() or not fraction):
         value = int(whole) * 10**9 + int(fraction[:9].ljust(9, b"0"))
+        value = value if unsigned == seconds else -value
     else:
         value = round(float(seconds) * 1e9)
+    return _in_range(path, line, value, f"stamp {shown(seconds)} is too large; stamps are in seconds")
+
+
+def whole_nanoseconds(path: Path, line: int, stamp: bytes) -> int:
+    """A stamp in nanoseconds, as EuRoC's are."""
+    value = int(stamp) if stamp.removeprefix(b"-").isdigit() else round(float(stamp))
+    return _in_range(path, line, value, f"stamp {shown(stamp)} is too large; EuRoC's stamps are in nanoseconds")
+
+
+def _in_range(path: Path, line: int, value: int, what: str) -> int:
     if abs(value) > np.iinfo(np.int64).max:
-        raise GraphFileError.at(path, line, f"stamp {shown(seconds)} is too large; stamps are in seconds")
+        raise GraphFileError.at(path, line, what)
     return value

@@ -9,9 +9,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.datasets.files.graph_file import GraphFileError, writing
-from rotavg_ros.datasets.files.ground_truth import nanoseconds
+from rotavg_ros.datasets.files.ground_truth import nanoseconds, whole_nanoseconds
 from rotavg_ros.datasets.files.kitti import read_poses
-from rotavg_ros.datasets.files.text_rows import Row, parse_rows, read_blocks, refuse, unit_quaternions, write_rows
+from rotavg_ros.datasets.files.text_rows import (
+    NUMBER_STARTS,
+    Row,
+    parse_rows,
+    read_blocks,
+    refuse,
+    unit_quaternions,
+    write_rows,
+)
 from rotavg_ros.datasets.planar import quaternion_of_heading
 
 _EXPECTED = (
@@ -46,8 +54,8 @@ def read_pose_file(path: str | Path) -> PoseFile:
     is_csv = any(b"," in b"".join(row) for _, row in rows[:2])
     if is_csv:
         rows = [(line, b" ".join(row).replace(b",", b" ").split()) for line, row in rows]
-        if rows and not rows[0][1][0][:1].isdigit():
-            rows = rows[1:]  # the header
+        if rows and _is_heading(rows[0][1][0]):
+            rows = rows[1:]
     if not rows:
         raise GraphFileError.at(path, None, f"the file has no rows; {_EXPECTED}")
     lines, cells = [line for line, _ in rows], [row for _, row in rows]
@@ -68,11 +76,20 @@ def read_pose_file(path: str | Path) -> PoseFile:
     raise GraphFileError.at(path, lines[0], f"{columns} columns; {_EXPECTED}")
 
 
+def _is_heading(cell: bytes) -> bool:
+    """Whether a row's first cell is that of a header; a damaged number is none, so that its line is refused."""
+    try:
+        float(cell)
+    except ValueError:
+        return cell[:1] not in NUMBER_STARTS
+    return False
+
+
 def _by_stamp(path: Path, lines: list[int], cells: list[Row], *, in_ns: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """``(K,)`` ascending stamps in nanoseconds and ``(K, …)`` the numbers after them."""
     _, numbers = parse_rows(path, lines, cells, 0, len(cells[0]))
     if in_ns:
-        stamps = [int(row[0]) if row[0].isdigit() else round(float(row[0])) for row in cells]
+        stamps = [whole_nanoseconds(path, line, row[0]) for line, row in zip(lines, cells, strict=True)]
     else:
         stamps = [nanoseconds(path, line, row[0]) for line, row in zip(lines, cells, strict=True)]
     stamps_ns = np.array(stamps, dtype=np.int64)
@@ -87,9 +104,10 @@ def write_tum(path: Path, stamps_ns: np.ndarray, position: np.ndarray, world_fro
     Raises:
         GraphFileError: the place cannot be written.
     """
-    seconds, rest = np.divmod(stamps_ns, 10**9)
+    sign = np.where(stamps_ns < 0, "-", "")  # by itself: before a second of 0 a number has none
+    seconds, rest = np.divmod(np.abs(stamps_ns), 10**9)
     with writing(path) as temporary, temporary.open("w", encoding="ascii") as file:
-        write_rows(file, f"%d.%09d{' %.9f' * 7}\n", [seconds, rest, position, world_from_body])
+        write_rows(file, f"%s%d.%09d{' %.9f' * 7}\n", [sign, seconds, rest, position, world_from_body])
 
 
 def write_kitti(path: Path, position: np.ndarray, world_from_body: np.ndarray) -> None:

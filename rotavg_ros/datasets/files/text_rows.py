@@ -18,6 +18,9 @@ from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE
 _BLOCK_BYTES = 1 << 16
 _BLOCK_ROWS = 1 << 14
 
+# First characters of a number.
+NUMBER_STARTS = frozenset(bytes([character]) for character in b"0123456789+-.")
+
 Row = list[bytes]
 
 

@@ -36,6 +36,20 @@ def test_tum(tmp_path: Path, poses) -> None:
     np.testing.assert_array_equal(back.stamps_ns, stamps_ns)  # which seconds in a float could not hold
 
 
+def test_stamps_before_zero(tmp_path: Path) -> None:
+    stamps_ns = np.array([-1_500_000_000, -500_000_000, -1, 0, 1_500_000_000])
+    write_tum(tmp_path / "ours.tum", stamps_ns, np.zeros((5, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (5, 1)))
+    read = file_interface.read_tum_trajectory_file(str(tmp_path / "ours.tum"))
+    np.testing.assert_allclose(read.timestamps, stamps_ns / 1e9, atol=1e-12)
+    np.testing.assert_array_equal(read_pose_file(tmp_path / "ours.tum").stamps_ns, stamps_ns)
+
+
+def test_a_first_row_before_zero_is_no_header(tmp_path: Path) -> None:
+    for header in ("", "stamp,x,y,heading\n"):
+        (tmp_path / "truth.csv").write_text(f"{header}-1.5,2,3,0\n2.5,2,4,0\n")
+        np.testing.assert_array_equal(read_pose_file(tmp_path / "truth.csv").stamps_ns, [-1_500_000_000, 2_500_000_000])
+
+
 def test_tum_of_evo(tmp_path: Path, poses) -> None:
     stamps_ns, position, orientation = poses
     theirs = PoseTrajectory3D(position, np.roll(orientation, 1, axis=1), stamps_ns / 1e9)
@@ -88,6 +102,9 @@ def test_headings_in_the_plane(tmp_path: Path) -> None:
         ("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 1\n", ":2: "),
         ("1 0 0 0 0 0 0 1\n2 0 0 nan 0 0 0 1\n", ":2: a number that is not finite"),
         ("1,a,0,0\n", ":1: 'a' is not a number"),
+        ("-1x,0,0,0\n2,0,0,0\n", ":1: '-1x' is not a number"),
+        ("1,0,0,0,1,0,0,0\n" + "9" * 20 + ",0,0,0,1,0,0,0\n", ":2: stamp '99999999999999999999' is too large"),
+        ("1,0,0,0,1,0,0,0\n1e30,0,0,0,1,0,0,0\n", ":2: stamp '1e30' is too large; EuRoC's stamps are in nanoseconds"),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", ":2: a stamp that is not after the one before"),
         ("2 0 0 0 0 1 0 0 0 0 1 0\n", ":1: a matrix that is not a rotation"),
     ],
