@@ -57,7 +57,11 @@ def read(path: Path) -> GraphFile:
             what = f"{name} has {len(arrays[name])} rows, source has {num_edges}; they must agree"
             raise GraphFileError.at(path, None, what)
     refuse(path, None, (source < 0) | (target < 0), "a negative id; ids must be integers from 0")
+    _check_node_ids(path, arrays.get("node_ids", source[:0]))
     quaternions = unit_quaternions(path, None, arrays["target_from_source"])
+    if "edge_information" in arrays:
+        not_finite = ~np.isfinite(arrays["edge_information"]).all(axis=1)
+        refuse(path, None, not_finite, "an edge_information that is not finite; write zeros where it is unknown")
     if "edge_translation" in arrays:
         too_long = (np.abs(arrays["edge_translation"]) > MAX_TRANSLATION).any(axis=1)
         refuse(path, None, too_long, f"a translation of more than {MAX_TRANSLATION:g} m; write NaN where it is unknown")
@@ -151,6 +155,17 @@ def _checked(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     if integer and array.dtype == np.uint64 and (array > np.iinfo(np.int64).max).any():
         raise GraphFileError.at(path, None, f"{name} holds a value above {np.iinfo(np.int64).max}, which is too large")
     return np.asarray(array, dtype=np.int64 if integer else np.float64)
+
+
+def _check_node_ids(path: Path, node_ids: np.ndarray) -> None:
+    """Rows of nodes are told apart by these."""
+    if (node_ids < 0).any():
+        what = f"node_ids holds {node_ids.min()}; ids must be integers from 0"
+        raise GraphFileError.at(path, None, what)
+    ids, counts = np.unique(node_ids, return_counts=True)
+    if (counts > 1).any():
+        what = f"node_ids holds {ids[counts > 1][0]} more than once; name every node once"
+        raise GraphFileError.at(path, None, what)
 
 
 def _rows_of_nodes(path: Path, name: str, arrays: dict[str, np.ndarray], node_ids: np.ndarray) -> np.ndarray:

@@ -94,6 +94,12 @@ def test_rgbd_scene(shared_data: Path) -> None:
         ({"body_from_world_gt": [IDENTITY]}, "1 rows for 3 nodes"),
         ({"body_from_world_gt": [[2.0, 0, 0, 0]] * 3}, "not of unit length"),
         ({"edge_translation": [[0, 0, 0], [0, -1e10, 0]]}, "edge 1 (from 0) has a translation of more than 1e+09 m"),
+        (
+            {"edge_information": [np.ones(21), np.full(21, np.nan)]},
+            "edge 1 (from 0) has an edge_information that is not",
+        ),
+        ({"node_ids": [10, 20, 40, -3]}, "node_ids holds -3; ids must be integers from 0"),
+        ({"node_ids": [10, 20, 20, 40], "stamps_ns": [1, 2, 3, 4]}, "node_ids holds 20 more than once"),
         ({"planar": True, "target_from_source": [[0.6, 0, 0, 0.8]] * 2}, "declared planar"),
     ],
 )
