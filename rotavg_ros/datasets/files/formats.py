@@ -7,7 +7,7 @@ from types import ModuleType
 
 from rotavg_ros.datasets.files import g2o, isam, lund, npz, onedsfm, toro
 from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, open_text
-from rotavg_ros.datasets.files.text_rows import NUMBER_STARTS
+from rotavg_ros.datasets.files.text_rows import NUMBER_STARTS, read_blocks
 
 _FORMAT_OF_SUFFIX = {
     ".g2o": g2o,
@@ -77,5 +77,5 @@ def _format_of_content(path: Path, head: bytes) -> ModuleType:
         return npz
     if head.startswith(b"MATLAB ") or path.suffix.lower() == ".mat":
         return lund
-    first_line = next((line for line in head.splitlines() if line.strip() and not line.lstrip().startswith(b"#")), b"")
-    return onedsfm if first_line.lstrip()[:1] in NUMBER_STARTS else g2o
+    first_row = next((row for block in read_blocks(path) for _, row in block), [b""])
+    return onedsfm if first_row[0][:1] in NUMBER_STARTS else g2o

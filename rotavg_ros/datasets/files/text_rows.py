@@ -18,6 +18,8 @@ from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE
 _BLOCK_BYTES = 1 << 16
 _BLOCK_ROWS = 1 << 14
 
+_MOST_DIGITS = len(str(MAX_NODE_ID))
+
 # First characters of a number.
 NUMBER_STARTS = frozenset(bytes([character]) for character in b"0123456789+-.")
 
@@ -48,8 +50,8 @@ def parse_rows(path: Path, lines: list[int], rows: list[Row], num_ids: int, num_
     """
     num_columns = num_ids + num_values
     try:
-        if any(len(row) != num_columns for row in rows):
-            raise ValueError
+        if any(len(row) != num_columns for row in rows) or b"_" in b" ".join(chain.from_iterable(rows)):
+            raise ValueError  # Python takes 1_0 for 10
         ids = np.fromiter(map(int, chain.from_iterable(row[:num_ids] for row in rows)), np.int64)
         numbers = np.fromiter(map(float, chain.from_iterable(islice(row, num_ids, None) for row in rows)), np.float64)
     except (ValueError, OverflowError):
@@ -99,15 +101,13 @@ def _problem(row: Row, num_ids: int, num_columns: int) -> str | None:
     if len(row) != num_columns:
         return f"{len(row)} numbers where {num_columns} belong; the line is malformed or the file truncated"
     for token in row[:num_ids]:
-        try:
-            value = int(token)
-        except ValueError:
+        if not token[token[:1] in (b"+", b"-") :].isdigit():
             return f"{shown(token)} is not an integer id"
-        if value > MAX_NODE_ID:
+        if len(token.lstrip(b"+-0")) > _MOST_DIGITS or int(token) > MAX_NODE_ID:
             return f"id {shown(token)} is too large; ids must be at most {MAX_NODE_ID}"
     for token in row[num_ids:]:
         try:
-            float(token)
+            float(token.replace(b"_", b"?"))
         except ValueError:
             return f"{shown(token)} is not a number"
     return None

@@ -30,6 +30,12 @@ def test_stored_rotation_is_the_transpose_of_target_from_source(tmp_path: Path) 
     assert graph_file.skipped == {"self-edge": 1}
 
 
+def test_a_long_comment_does_not_hide_the_format(tmp_path: Path) -> None:
+    path = tmp_path / "EGs.txt"
+    path.write_text("# where it is from\n" * 10_000 + "0 1 1 0 0 0 1 0 0 0 1 0 0 0\n")
+    assert read_graph(path).node_ids.tolist() == [0, 1]
+
+
 def test_consecutive_cameras_are_not_odometry(tmp_path: Path) -> None:
     path = tmp_path / "EGs.txt"
     path.write_text("0 1 1 0 0 0 1 0 0 0 1 0 0 0\n")
@@ -46,6 +52,9 @@ def test_consecutive_cameras_are_not_odometry(tmp_path: Path) -> None:
         ("1 2 0 0 0 0 0 0 0 0 0 0 0 0", "not a rotation matrix"),
         ("1 2 nan 0 0 0 1 0 0 0 1 0 0 0", "not finite"),
         ("1.5 2 1 0 0 0 1 0 0 0 1 0 0 0", "not an integer id"),
+        ("1_0 2 1 0 0 0 1 0 0 0 1 0 0 0", "'1_0' is not an integer id"),
+        ("1 2 1 0 0 0 1 0 0 0 1 0 0 1_0", "'1_0' is not a number"),
+        ("9" * 5000 + " 2 1 0 0 0 1 0 0 0 1 0 0 0", "too large"),
         ("x", "1 numbers where 14 belong"),
     ],
 )
