@@ -1,6 +1,10 @@
-"""The one exception family whose message is meant for a user."""
+"""The one exception family whose message is meant for a user, and what makes it of the system's own."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 
 class UserError(Exception):
@@ -8,3 +12,14 @@ class UserError(Exception):
 
     The command line prints the message and exits with 2; the node logs it and refuses to start.
     """
+
+
+@contextmanager
+def asking_about(path: Path, error: type[UserError]) -> Iterator[None]:
+    """Turn what the system answers to questions about a path (is it there, where does it lead) into a user's error."""
+    try:
+        yield
+    except OSError as problem:  # no rights to look, a name that is too long
+        raise error(f"{path}: {(problem.strerror or str(problem)).lower()}; check the path and its rights") from None
+    except RuntimeError:  # pathlib's word for it up to Python 3.12
+        raise error(f"{path}: its symbolic links lead in a circle; check the path") from None

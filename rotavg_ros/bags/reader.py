@@ -18,7 +18,7 @@ from rosbags.rosbag2 import ReaderError as Rosbag2Error
 from rotavg_ros.bags.lost import Lost
 from rotavg_ros.bags.message_types import typestore
 from rotavg_ros.bags.salvage import salvaging_reader
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, asking_about
 
 # Files that are bags by themselves.
 RECORDING_SUFFIXES = (".mcap", ".db3", ".bag")
@@ -298,15 +298,18 @@ class _Passed:
 
 def _bag_of(path: Path, salvage: bool) -> Path:
     """The bag that a path means: itself, or the rosbag2 folder around a recording."""
-    if not path.exists():
+    with asking_about(path, BagReadError):
+        exists, is_folder = path.exists(), path.is_dir()
+        has_metadata = ((path if is_folder else path.parent) / "metadata.yaml").exists()
+    if not exists:
         raise BagReadError(f"{path}: no such bag; check the path")
-    if path.is_dir():
-        if not (path / "metadata.yaml").exists() and not (salvage and _recordings(path)):
+    if is_folder:
+        if not has_metadata and not (salvage and _recordings(path)):
             raise BagReadError(f"{path}: is no rosbag2 folder (it has no metadata.yaml); give a bag")
         return path
     if path.suffix not in RECORDING_SUFFIXES:
         raise BagReadError(f"{path}: give a rosbag2 folder, or a file with suffix {', '.join(RECORDING_SUFFIXES)}")
-    return path.parent if (path.parent / "metadata.yaml").exists() else path
+    return path.parent if has_metadata else path
 
 
 def _recordings(bag: Path) -> list[Path]:

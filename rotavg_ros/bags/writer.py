@@ -14,7 +14,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 
 from rotavg_ros.bags import bulk
 from rotavg_ros.bags.message_types import typestore
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, asking_about
 
 _UNLIMITED = QosTime(2147483647, 4294967295)
 
@@ -127,11 +127,14 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
     Raises:
         BagWriteError: something is at the bag's place.
     """
-    if not path.exists():
+    with asking_about(path, BagWriteError):
+        exists = path.exists()
+        may_go = exists and path.is_dir() and _is_bag_or_empty(list(path.iterdir()))
+    if not exists:
         return
     if not overwrite:
         raise BagWriteError(f"{path}: exists already; choose another --output or give --overwrite")
-    if not path.is_dir() or not _is_bag_or_empty(list(path.iterdir())):
+    if not may_go:
         raise BagWriteError(f"{path}: is not a bag, so --overwrite leaves it alone; choose another --output")
 
 

@@ -12,7 +12,7 @@ from rotavg_ros.cli.main import print_warning
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.files import formats
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, asking_about
 
 
 class ConvertError(UserError):
@@ -64,24 +64,30 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check_output(source: Path, output: Path, *, overwrite: bool) -> None:
-    if output.exists() and not overwrite:
+    with asking_about(output, ConvertError):
+        exists, is_folder = output.exists(), output.is_dir()
+    with asking_about(source, ConvertError):
+        is_source = exists and source.exists() and output.samefile(source)
+    if exists and not overwrite:
         raise ConvertError(f"{output}: exists already; choose another OUTPUT or give --overwrite")
     # Comments, landmarks, a bag's other topics: what is not a view-graph's would be gone.
-    if output.exists() and source.exists() and output.samefile(source):
+    if is_source:
         raise ConvertError(f"{output}: is the INPUT itself; choose another OUTPUT")
     bags, files = FORMATS
     suffix = output.suffix.lower()
-    if suffix and suffix in bags.suffixes and not output.is_dir():
+    if suffix and suffix in bags.suffixes and not is_folder:
         raise ConvertError(f"{output}: a bag is written as a folder; choose an OUTPUT without {output.suffix}")
-    if suffix in files.suffixes and output.is_dir():
+    if suffix in files.suffixes and is_folder:
         raise ConvertError(f"{output}: is a folder; remove it or choose another OUTPUT")
 
 
 def format_of(path: Path) -> ModuleType:
     """The module that reads and writes ``path``."""
-    if path.is_dir():
+    with asking_about(path, ConvertError):
+        is_folder, is_file = path.is_dir(), path.is_file()
+    if is_folder:
         chosen = next(known for known in FORMATS if known.is_folder)
-    elif path.is_file() and not path.suffix:
+    elif is_file and not path.suffix:
         chosen = FORMATS[-1]
     else:
         chosen = next((known for known in FORMATS if path.suffix.lower() in known.suffixes), FORMATS[-1])

@@ -23,7 +23,7 @@ from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.evaluation.live.played_run import LiveReport, PlayedRun, edge_is_false, judge
 
 # Playing is paced so that the node works as it would live, and a visitor still stays.
@@ -84,8 +84,11 @@ def _new_folder(wanted: Path | None) -> Path:
     if wanted is None:
         names = ["rotavg_demo", *(f"rotavg_demo_{number}" for number in range(2, 1000))]
         wanted = next(Path(name) for name in names if not Path(name).exists())
-    elif wanted.exists() and (not wanted.is_dir() or any(wanted.iterdir())):
-        raise DemoError(f"{wanted}: exists already; choose another --output")
+    else:
+        with asking_about(wanted, DemoError):
+            is_taken = wanted.exists() and (not wanted.is_dir() or any(wanted.iterdir()))
+        if is_taken:
+            raise DemoError(f"{wanted}: exists already; choose another --output")
     try:
         wanted.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -13,7 +13,7 @@ from typing import Any
 from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.cli.main import print_warning
 from rotavg_ros.cli.progress import seconds_bar, working
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.replay.options import read_parameter_file, read_settings
 from rotavg_ros.replay.plan import Plan, Wishes, make_plan
 from rotavg_ros.replay.run import Window
@@ -60,7 +60,9 @@ def run(arguments: argparse.Namespace) -> int:
 def _check_inputs(bag: Path, plan: Plan, output: Path) -> None:
     """The answer's files must not take the place of what they are made from."""
     files = [reference for reference in plan.references.values() if isinstance(reference, Path)]
-    if output.resolve() == bag.resolve() or any(path.resolve().parent == output.resolve() for path in (bag, *files)):
+    with asking_about(output, ReplayUsageError):
+        place = output.resolve()
+    if place == bag.resolve() or any(path.resolve().parent == place for path in (bag, *files)):
         raise ReplayUsageError(f"{output}: has the bag or a reference in it; choose another --output")
 
 

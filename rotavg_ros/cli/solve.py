@@ -9,6 +9,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +24,7 @@ from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.files.csv_writer import Column, write_csv
 from rotavg_ros.datasets.files.formats import read_graph, stem_of
 from rotavg_ros.datasets.files.graph_file import GraphFile
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.solver import Solution, methods, solve
 from rotavg_ros.solver.networks import WEIGHTS_FOLDER
 from rotavg_ros.solver.solution import residual_deg, residual_m
@@ -133,6 +134,7 @@ def plan(graphs: list[Path], output: Path, *, poses: bool = False) -> list[Job]:
         SolveError: two graphs with one stem, an output folder that cannot be written, or a graph that an
             output would overwrite.
     """
+    graph_at = {os.path.realpath(graph): graph for graph in reversed(graphs)}
     jobs = [Job(graph, output if len(graphs) == 1 else output / stem_of(graph)) for graph in graphs]
     first_of: dict[Path, Path] = {}
     for job in jobs:
@@ -142,10 +144,12 @@ def plan(graphs: list[Path], output: Path, *, poses: bool = False) -> list[Job]:
         _check_writable(job.output)
         edge_files = (f"{_EDGES}.{suffix}" for suffix in EDGE_FORMATS)
         for name in (_ORIENTATIONS, _SUMMARY, *edge_files, *(POSE_FILES if poses else ())):
-            for graph in graphs:
-                if graph.resolve() == (job.output / name).resolve():
-                    raise SolveError(f"{graph} would be overwritten by the answer; choose another --output")
-            if (job.output / name).is_dir():
+            with asking_about(job.output / name, SolveError):
+                is_folder = (job.output / name).is_dir()
+            overwritten = graph_at.get(os.path.realpath(job.output / name))
+            if overwritten is not None:
+                raise SolveError(f"{overwritten} would be overwritten by the answer; choose another --output")
+            if is_folder:
                 raise SolveError(f"{job.output / name} is a folder; remove it or choose another --output")
     return jobs
 
@@ -153,7 +157,11 @@ def plan(graphs: list[Path], output: Path, *, poses: bool = False) -> list[Job]:
 def _check_weights(folder: Path | None) -> None:
     """A folder without any would pass silently, for every network may come from the package."""
     names = sorted(path.name for path in WEIGHTS_FOLDER.glob("*.safetensors"))
-    if folder is not None and not any((folder / name).is_file() for name in names):
+    if folder is None:
+        return
+    with asking_about(folder, SolveError):
+        has_weights = any((folder / name).is_file() for name in names)
+    if not has_weights:
         raise SolveError(f"{folder}: has no weights ({', '.join(names)}); `rotavg train` writes them into its --output")
 
 
@@ -215,7 +223,8 @@ def write_answer(output: Path, graph_file: GraphFile, solution: Solution, summar
         raise SolveError(f"{output}: cannot be written: {error.strerror or error}") from None
     finally:
         for path in temporary.values():
-            path.unlink(missing_ok=True)
+            with suppress(OSError):  # below what is no folder there is nothing to remove
+                path.unlink()
 
 
 def _orientation_columns(graph_file: GraphFile, solution: Solution) -> list[Column]:
@@ -249,8 +258,11 @@ def _warm_up_graph(has_odometry: bool) -> ViewGraph:
 
 
 def _check_writable(folder: Path) -> None:
-    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    if not existing.is_dir():
+    with asking_about(folder, SolveError):
+        above = (folder, *folder.absolute().parents)
+        existing = next(path for path in above if path.exists() or path.is_symlink())
+        is_folder = existing.is_dir()
+    if not is_folder:
         raise SolveError(f"{existing} is not a folder; choose another --output")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise SolveError(f"{existing}: permission denied; choose another --output")

@@ -12,7 +12,7 @@ import torch
 
 from rotavg_ros.cli import train_on_robot
 from rotavg_ros.cli.progress import working
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.results import make_folder
 from rotavg_ros.solver.networks import NETWORKS, WEIGHTS_FOLDER, CleanNet, PaperCleanNet, read_network
 from rotavg_ros.training.config import TrainingConfig, TrainingConfigError
@@ -63,7 +63,9 @@ def load_config(name: str) -> TrainingConfig:
     """
     shipped = {path.stem: path for path in sorted(_CONFIGS.glob("*.yaml"))}
     path = Path(name)
-    if not path.exists():
+    with asking_about(path, TrainingConfigError):
+        exists = path.exists()
+    if not exists:
         if name not in shipped:
             raise TrainingConfigError(f"{name}: no such file; the package's own are {', '.join(shipped)}")
         path = shipped[name]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rotavg_ros.datasets.files.csv_writer import Column, write_csv
 from rotavg_ros.datasets.files.pose_files import write_kitti, write_tum
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.online import Answer
 from rotavg_ros.replay.corrected_graph import keyframe_ids, write_graph_of_run
 from rotavg_ros.replay.record import RobotRecord, RunRecord
@@ -40,11 +40,13 @@ def output_folder(folder: Path, *, overwrite: bool) -> Iterator[Path]:
     Raises:
         OutputError: the folder has something in it (without ``overwrite``), or cannot be written.
     """
-    if folder.exists() and not folder.is_dir():
+    with asking_about(folder, OutputError):
+        is_new, is_folder = not folder.exists(), folder.is_dir()
+        has_content = is_folder and any(folder.iterdir())
+    if not is_new and not is_folder:
         raise OutputError(f"{folder} is not a folder; choose another --output")
-    if folder.exists() and not overwrite and any(folder.iterdir()):
+    if has_content and not overwrite:
         raise OutputError(f"{folder}: exists already; choose another --output or give --overwrite")
-    is_new = not folder.exists()
     workplace = folder / f".unfinished.{os.getpid()}"
     try:
         workplace.mkdir(parents=True)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from rotavg_ros.bags.reader import RECORDING_SUFFIXES, BagReader
 from rotavg_ros.datasets.files.pose_files import read_pose_file
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
 from rotavg_ros.replay.pace import Pace, WorkRates
 from rotavg_ros.replay.record import TopicUse
@@ -206,10 +206,12 @@ def _references(
     references: dict[str, Input | Path] = {}
     for robot, entry in zip(robots, wanted, strict=False):
         path, is_topic = Path(entry), entry.partition(":")[0] in bag.topics
-        if not is_topic and path.exists() and path.suffix not in RECORDING_SUFFIXES:
+        with asking_about(path, PlanError):
+            exists = path.exists()
+        if not is_topic and exists and path.suffix not in RECORDING_SUFFIXES:
             read_pose_file(entry)  # a mistake shows before the replay, not after it
             references[robot] = path
-        elif not is_topic and path.suffix and not path.exists():  # no topic's name has a dot
+        elif not is_topic and path.suffix and not exists:  # no topic's name has a dot
             names = ", ".join(candidate.topic for candidate in found.references) or "none"
             raise PlanError(f"{entry}: no such file, and no topic of that name; candidates for a reference: {names}")
         else:

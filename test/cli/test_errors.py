@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -190,6 +191,44 @@ def test_full_disk_leaves_the_old_answer(tmp_path: Path) -> None:
         assert result.stderr.startswith(f"rotavg: error: {out}: cannot be written: ")
         assert len(result.stderr.splitlines()) == 1
         assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_paths_that_cannot_be_looked_at(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, graph_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    too_long, ring = tmp_path / ("x" * 300), tmp_path / "ring"
+    ring.symlink_to(ring)
+    for command in (
+        ("solve", too_long, "--output", tmp_path / "out"),
+        ("solve", graph_path, "--output", too_long),
+        ("solve", graph_path, "--output", tmp_path / "out", "--weights", too_long),
+        ("convert", too_long, tmp_path / "out.g2o"),
+        ("convert", graph_path, too_long),
+        ("convert", graph_path, tmp_path / f"{'x' * 300}.g2o"),
+        ("replay", too_long, "--output", tmp_path / "out"),
+        ("simulate", "--output", too_long),
+        ("train", "clean-net", too_long, "--output", tmp_path / "out"),
+    ):
+        assert f"{'x' * 300}" in (line := refused(capsys, *command))
+        assert "file name too long" in line.lower()
+    for command in (
+        ("solve", ring, "--output", tmp_path / "out"),
+        ("solve", graph_path, "--output", ring),
+        ("convert", ring, tmp_path / "out.g2o"),
+        ("replay", ring, "--output", tmp_path / "out"),
+    ):
+        assert str(ring) in refused(capsys, *command)
+
+    def denied(path: Path) -> bool:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "exists", denied)
+    for command in (
+        ("solve", graph_path, "--output", tmp_path / "out"),
+        ("convert", graph_path, tmp_path / "out.g2o"),
+        ("replay", tmp_path / "bag", "--output", tmp_path / "out"),
+    ):
+        assert "permission denied; check the" in refused(capsys, *command)
 
 
 def test_interrupt(graph_path: Path, tmp_path: Path) -> None:

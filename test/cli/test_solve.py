@@ -18,6 +18,7 @@ from safetensors.torch import load_file, save_file
 
 from rotavg_ros import rotations, solve
 from rotavg_ros.cli.main import main
+from rotavg_ros.cli.solve import plan
 from rotavg_ros.datasets.files.formats import read_graph, write_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.solver.neurora.network_store import WEIGHTS_FOLDER
@@ -188,6 +189,17 @@ def test_several_graphs(graph_path: Path, tmp_path: Path) -> None:
     for stem, nodes, profile in (("run", 30, "slam"), ("other", 40, "slam"), ("EGs", 20, "sfm")):
         summary = json.loads((tmp_path / "out" / stem / "summary.json").read_text())
         assert (summary["nodes"], summary["profile"]) == (nodes, profile)
+
+
+def test_the_plan_looks_at_every_graph_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    looked, realpath = [], os.path.realpath
+    monkeypatch.setattr(os.path, "realpath", lambda path, **given: looked.append(path) or realpath(path, **given))
+    counts = []
+    for number in (10, 20):
+        looked.clear()
+        plan([tmp_path / f"{index}.g2o" for index in range(number)], tmp_path / "out")
+        counts.append(len(looked))
+    assert counts[1] == 2 * counts[0]
 
 
 def test_installed_command(graph_path: Path, tmp_path: Path) -> None:

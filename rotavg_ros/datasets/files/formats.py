@@ -6,7 +6,7 @@ from pathlib import Path
 from types import ModuleType
 
 from rotavg_ros.datasets.files import g2o, isam, lund, npz, onedsfm, toro
-from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, open_text
+from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, open_text, reading
 from rotavg_ros.datasets.files.text_rows import NUMBER_STARTS, read_blocks
 
 _FORMAT_OF_SUFFIX = {
@@ -31,7 +31,9 @@ def read_graph(path: str | Path) -> GraphFile:
         GraphFileError: anything that keeps the file from being read whole.
     """
     path = Path(path)
-    if path.exists() and not path.is_file() and not path.is_dir():
+    with reading(path):
+        is_special = path.exists() and not path.is_file() and not path.is_dir()
+    if is_special:
         raise GraphFileError.at(path, None, "is not a regular file (a pipe or a device); save the graph to one first")
     with open_text(path) as file:
         head = file.read(4096)
