@@ -15,6 +15,11 @@ from rotavg_ros.solver.solution import Solution
 POSE_FILES = ("graph.g2o", "trajectory.kitti", "trajectory.tum")
 
 
+def pose_files(graph_file: GraphFile) -> list[str]:
+    """Names of what :func:`write_corrected_poses` writes."""
+    return [name for name in POSE_FILES if graph_file.stamps_ns is not None or not name.endswith(".tum")]
+
+
 def write_corrected_poses(folder: Path, graph_file: GraphFile, solution: Solution) -> None:
     """Write ``graph.g2o``, ``trajectory.kitti``, and ``trajectory.tum`` where the graph has stamps.
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from rotavg_ros.cli.main import EXIT_USER_ERROR, print_error, print_warning
 from rotavg_ros.cli.options.solve import EDGE_FORMATS
-from rotavg_ros.cli.poses import POSE_FILES, write_corrected_poses
+from rotavg_ros.cli.poses import POSE_FILES, pose_files, write_corrected_poses
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.files.csv_writer import Column, write_csv
 from rotavg_ros.datasets.files.formats import read_graph, stem_of
@@ -121,6 +121,7 @@ def solve_file(
         solution = solve_graph(graph_file.graph)
     solve_seconds = time.perf_counter() - start
     summary = summarize(job.graph, graph_file, solution, read_seconds, solve_seconds)
+    summary["files"] = _files(graph_file, edges, poses=poses)
     write_answer(job.output, graph_file, solution, summary, edges)
     if poses:
         write_corrected_poses(job.output, graph_file, solution)
@@ -143,7 +144,8 @@ def plan(graphs: list[Path], output: Path, *, poses: bool = False) -> list[Job]:
             raise SolveError(f"{other} and {job.graph} would both go to {job.output}; solve them one by one")
         _check_writable(job.output)
         edge_files = (f"{_EDGES}.{suffix}" for suffix in EDGE_FORMATS)
-        for name in (_ORIENTATIONS, _SUMMARY, *edge_files, *(POSE_FILES if poses else ())):
+        pose_files = POSE_FILES if poses else _older_pose_files(job.output)
+        for name in (_ORIENTATIONS, _SUMMARY, *edge_files, *pose_files):
             with asking_about(job.output / name, SolveError):
                 is_folder = (job.output / name).is_dir()
             overwritten = graph_at.get(os.path.realpath(job.output / name))
@@ -152,6 +154,22 @@ def plan(graphs: list[Path], output: Path, *, poses: bool = False) -> list[Job]:
             if is_folder:
                 raise SolveError(f"{job.output / name} is a folder; remove it or choose another --output")
     return jobs
+
+
+def _files(graph_file: GraphFile, edges: str, *, poses: bool) -> list[str]:
+    """Names of an answer's files."""
+    names = [_ORIENTATIONS, _SUMMARY]
+    names += [] if edges == "none" else [f"{_EDGES}.{edges}"]
+    return sorted(names + (pose_files(graph_file) if poses else []))
+
+
+def _older_pose_files(folder: Path) -> list[str]:
+    """Those that the summary in a folder says it came with: a graph.g2o of somebody else's is none."""
+    try:
+        names = json.loads((folder / _SUMMARY).read_text(encoding="utf-8"))["files"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    return [name for name in POSE_FILES if name in names] if isinstance(names, list) else []
 
 
 def _check_weights(folder: Path | None) -> None:
@@ -193,7 +211,7 @@ def summarize(
 
 
 def write_answer(output: Path, graph_file: GraphFile, solution: Solution, summary: dict[str, Any], edges: str) -> None:
-    """Write all files under temporary names, then put them in place; an edges file of an older answer goes.
+    """Write all files under temporary names, then put them in place; the edges and poses of an older answer go.
 
     Raises:
         SolveError: the folder cannot be written; an older answer is then still intact.
@@ -211,14 +229,14 @@ def write_answer(output: Path, graph_file: GraphFile, solution: Solution, summar
     temporary = {name: output / f".{name}.{os.getpid()}.tmp" for name in writers}
     try:
         output.mkdir(parents=True, exist_ok=True)
+        older = {f"{_EDGES}.{suffix}" for suffix in EDGE_FORMATS} | set(_older_pose_files(output))
         for name, write in writers.items():
             with temporary[name].open("wb") as file:
                 write(file)
         for name in writers:
             os.replace(temporary[name], output / name)
-        for suffix in EDGE_FORMATS:
-            if f"{_EDGES}.{suffix}" not in writers:
-                (output / f"{_EDGES}.{suffix}").unlink(missing_ok=True)
+        for name in older - set(summary["files"]):
+            (output / name).unlink(missing_ok=True)
     except OSError as error:
         raise SolveError(f"{output}: cannot be written: {error.strerror or error}") from None
     finally:

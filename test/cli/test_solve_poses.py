@@ -50,6 +50,28 @@ def test_a_graph_is_not_overwritten_by_its_own_answer(tmp_path: Path, capsys: py
     assert "would be overwritten" in capsys.readouterr().err
 
 
+def test_an_older_answers_poses_go_and_others_graphs_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = simulate_slam_graph(SlamSimulationConfig(num_keyframes=100), np.random.default_rng(0))
+    write_graph(tmp_path / "run.npz", run.to_graph_file())
+    write_graph(tmp_path / "run.g2o", run.to_graph_file())  # without stamps
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "graph.g2o").write_text("somebody's own")
+    for words, names in (
+        (["run.g2o"], {"graph.g2o"}),
+        (["run.npz", "--poses"], {"graph.g2o", "trajectory.kitti", "trajectory.tum"}),
+        (["run.g2o", "--poses"], {"graph.g2o", "trajectory.kitti"}),
+        (["run.npz"], set()),
+    ):
+        assert main(["solve", str(tmp_path / words[0]), *words[1:], "--output", str(out)]) == 0
+        assert {path.name for path in out.iterdir()} - {"orientations.csv", "edges.csv", "summary.json"} == names
+    assert main(["solve", str(tmp_path / "run.g2o"), "--poses", "--output", str(out)]) == 0
+    capsys.readouterr()
+    assert main(["solve", str(out / "graph.g2o"), "--output", str(out)]) == 2
+    assert "graph.g2o would be overwritten" in capsys.readouterr().err
+    assert (out / "graph.g2o").exists()
+
+
 def error(estimate: PosePath3D, truth: PosePath3D) -> float:
     """Root mean square of the position error after alignment, by evo."""
     estimate = copy.deepcopy(estimate)
