@@ -22,25 +22,29 @@ from rotavg_ros.bags.messages import (
     odometry_message,
 )
 from rotavg_ros.bags.topics import EDGE_TOPIC, GRAPH_NOTE, ODOM_TOPIC, TRUTH_TOPIC
-from rotavg_ros.bags.writer import BagWriter
+from rotavg_ros.bags.writer import BagWriteError, BagWriter
 from rotavg_ros.datasets.dead_reckoning import chain_poses
 from rotavg_ros.datasets.files.graph_file import GraphFile
 
 # Stamps of a graph that has none: as if a keyframe had been taken every 0.1 s.
 START_STAMP_NS = 1_700_000_000_000_000_000
 DEFAULT_PERIOD_NS = 100_000_000
+# Seconds of a message's stamp are 32 bits with a sign, and a recording's times have none.
+_END_OF_TIME_NS = 2**31 * 1_000_000_000
 
 
 def write_graph_bag(path: str | Path, graph_file: GraphFile, *, overwrite: bool = False) -> None:
     """Write a graph as a rosbag2 MCAP folder; each edge is published when the later of its ends exists.
 
     Raises:
-        BagWriteError: the folder exists (without ``overwrite``), or its place cannot be written.
+        BagWriteError: the folder exists (without ``overwrite``), its place cannot be written, or a stamp is none that
+            a message can have.
     """
     graph = graph_file.graph
     stamps_ns = graph_file.stamps_ns
     if stamps_ns is None:
         stamps_ns = START_STAMP_NS + DEFAULT_PERIOD_NS * np.arange(graph.num_nodes)
+    _check_stamps(Path(path), graph_file.node_ids, stamps_ns)
     source, target = graph.source.cpu().numpy(), graph.target.cpu().numpy()
     published_ns = np.maximum(stamps_ns[source], stamps_ns[target])
     # At one instant: where the robot is, where it truly is, then what it measured.
@@ -78,6 +82,13 @@ def write_graph_bag(path: str | Path, graph_file: GraphFile, *, overwrite: bool 
             else:
                 sequence += 1
                 bag.write(EDGE_TOPIC, stamp, edge_message(replace(edges[index], sequence=sequence)))
+
+
+def _check_stamps(path: Path, node_ids: NDArray[np.int64], stamps_ns: NDArray[np.int64]) -> None:
+    bad = np.flatnonzero((stamps_ns < 0) | (stamps_ns >= _END_OF_TIME_NS))
+    if len(bad):
+        stamp = f"node {node_ids[bad[0]]} has the stamp {stamps_ns[bad[0]] / 1e9:.15g} s"
+        raise BagWriteError(f"{path}: {stamp}; a bag's stamps lie between 1970 and 2038: give others with --stamps")
 
 
 def _note(graph_file: GraphFile) -> dict[str, object]:

@@ -15,7 +15,7 @@ from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_mess
 from rotavg_ros.bags.reader import BagReader, BagReadError
 from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.bags.topics import EDGE_TOPIC, ODOM_TOPIC, TRUTH_TOPIC
-from rotavg_ros.bags.writer import BagWriter
+from rotavg_ros.bags.writer import BagWriteError, BagWriter
 from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
@@ -87,6 +87,14 @@ def test_round_trip_of_a_real_robot(tmp_path: Path, shared_data: Path) -> None:
     with BagReader(tmp_path / "bag") as bag:
         assert bag.num_messages([ODOM_TOPIC]) == 8358
         assert bag.num_messages([TRUTH_TOPIC]) == 7352
+
+
+@pytest.mark.parametrize("seconds", [-1, 9_000_000_000])
+def test_stamps_that_no_message_can_have(tmp_path: Path, seconds: int) -> None:
+    graph_file = replace(simulated().to_graph_file(), stamps_ns=np.arange(300) + seconds * 10**9)
+    with pytest.raises(BagWriteError, match=f"bag: node 0 has the stamp {seconds} s; a bag's stamps lie"):
+        write_graph_bag(tmp_path / "bag", graph_file)
+    assert not (tmp_path / "bag").exists()
 
 
 def test_edges_are_published_when_their_later_end_exists(tmp_path: Path) -> None:
