@@ -12,10 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION
-from rotavg_ros.bags.messages import Edge, Keyframe, read_edge, read_odometry
+from rotavg_ros.bags.edge_frames import EdgeFrames
+from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION, RELATIVE_ROTATION_ARRAY
+from rotavg_ros.bags.messages import Edge, Keyframe, read_edge, read_edges, read_odometry
 from rotavg_ros.bags.reader import BagReader, BagReadError
-from rotavg_ros.bags.topics import EDGE_TOPIC, GRAPH_NOTE, ODOM_TOPIC, TRUTH_TOPIC
+from rotavg_ros.bags.topics import (
+    EDGE_ARRAY_TOPIC,
+    EDGE_TOPIC,
+    GRAPH_NOTE,
+    ODOM_TOPIC,
+    TRUTH_TOPIC,
+    static_transforms,
+)
 from rotavg_ros.datasets.files.graph_file import MAX_NODE_ID, GraphFile
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, ViewGraphError
 
@@ -28,6 +36,8 @@ _PLANAR_TOLERANCE = 1e-9
 # Stamp in ns, position, world-from-body xyzw.
 _Pose = tuple[int, list[float], list[float]]
 
+_EDGES = {EDGE_TOPIC: RELATIVE_ROTATION, EDGE_ARRAY_TOPIC: RELATIVE_ROTATION_ARRAY}
+
 _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 
 
@@ -39,6 +49,8 @@ class _Content:
     odometry: list[_Pose] = field(default_factory=list)
     truth: list[_Pose] = field(default_factory=list)
     note: dict[str, Any] = field(default_factory=dict)
+    edge_topics: str = ""
+    warnings: tuple[str, ...] = ()
 
     @property
     def by_id(self) -> bool:
@@ -56,14 +68,16 @@ def read_graph_bag(path: str | Path) -> GraphFile:
 
     Where the edges name their ends by id, they are the graph, in the order of the edges' own numbers. Where they name
     them by stamp, every odometry message is a keyframe, consecutive ones are joined by odometry edges, and an end
-    belongs to the nearest odometry message within 0.05 s; edges without such a message are skipped and counted. Of a
-    damaged bag the graph is that of what can be read.
+    belongs to the nearest odometry message within 0.05 s; edges without such a message are skipped and counted. Edges
+    between sensors are taken into the body's frame by the bag's static transforms. Of a damaged bag the graph is that
+    of what can be read.
 
     Raises:
         BagReadError: an unreadable bag, one without edges, or one that needs odometry and has none.
     """
     with BagReader(path, salvage=True) as bag:
-        bag.require(EDGE_TOPIC, RELATIVE_ROTATION)
+        if bag.topics.get(EDGE_ARRAY_TOPIC) != RELATIVE_ROTATION_ARRAY:
+            bag.require(EDGE_TOPIC, RELATIVE_ROTATION)
         content = _read(bag)
         if not content.by_id:
             bag.require(ODOM_TOPIC, ODOMETRY)
@@ -74,22 +88,31 @@ def read_graph_bag(path: str | Path) -> GraphFile:
     try:
         graph_file = _from_ids(content) if content.by_id else _from_stamps(content)
     except ViewGraphError as error:
-        raise BagReadError(f"{path}: {EDGE_TOPIC}: {error}") from None
-    return _with_truth(replace(graph_file, damage=damage), content)
+        raise BagReadError(f"{path}: {content.edge_topics}: {error}") from None
+    return _with_truth(replace(graph_file, damage=damage, warnings=content.warnings), content)
 
 
 def _read(bag: BagReader) -> _Content:
     note = json.loads(bag.note(GRAPH_NOTE) or "{}")
-    content = _Content(note=note)
-    known = {EDGE_TOPIC: RELATIVE_ROTATION, ODOM_TOPIC: ODOMETRY, TRUTH_TOPIC: ODOMETRY}
+    content, frames = _Content(note=note), EdgeFrames()
+    transforms = static_transforms(bag.topics)
+    known = {**_EDGES, ODOM_TOPIC: ODOMETRY, TRUTH_TOPIC: ODOMETRY}
     topics = [topic for topic, kind in known.items() if bag.topics.get(topic) == kind]
-    for topic, _, message in bag.decoded(topics):
+    content.edge_topics = ", ".join(topic for topic in topics if topic in _EDGES)
+    for topic, _, message in bag.decoded([*topics, *transforms]):
         if topic == EDGE_TOPIC:
             content.edges.append(read_edge(message))
+        elif topic == EDGE_ARRAY_TOPIC:
+            content.edges += read_edges(message)
         elif topic == ODOM_TOPIC:
             content.odometry.append(read_odometry(message))
-        else:
+            frames.note_body(message.child_frame_id)
+        elif topic == TRUTH_TOPIC:
             content.truth.append(read_odometry(message))
+        else:
+            frames.take(message)
+    content.edges = list(map(frames.edge_of_body, content.edges))  # the last transform may come after them
+    content.warnings = frames.warnings
     return content
 
 

@@ -16,6 +16,8 @@ from rotavg_ros.errors import UserError
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 RELATIVE_ROTATION = "rotavg_msgs/msg/RelativeRotation"
+RELATIVE_ROTATION_ARRAY = "rotavg_msgs/msg/RelativeRotationArray"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 
 class MessageTypeError(UserError):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -43,6 +43,7 @@ class Edge:
         precision: rad⁻²; NaN: unknown.
         kind: :class:`rotavg_ros.view_graph.EdgeKind`.
         translation: ``(3,)`` position of the target in the source frame, metres; None: unknown.
+        frame_id: of the sensor between whose poses it was measured; empty: the body's.
     """
 
     stamp_ns: int
@@ -54,6 +55,7 @@ class Edge:
     precision: float
     kind: int
     translation: NDArray[np.float64] | None = None
+    frame_id: str = ""
 
 
 def _time(stamp_ns: int) -> Any:
@@ -109,7 +111,7 @@ def read_odometry(message: Any) -> tuple[int, list[float], list[float]]:
 def edge_message(edge: Edge) -> Any:
     """A ``rotavg_msgs/msg/RelativeRotation``."""
     return _type("rotavg_msgs/msg/RelativeRotation")(
-        header=_header(edge.stamp_ns, ""),
+        header=_header(edge.stamp_ns, edge.frame_id),
         id=edge.id,
         sequence=edge.sequence,
         source=_keyframe_message(edge.source),
@@ -142,7 +144,14 @@ def read_edge(message: Any) -> Edge:
         precision=float(message.precision) if message.precision > 0 else float("nan"),
         kind=int(message.kind),
         translation=np.array(message.translation, dtype=np.float64) if len(message.translation) == 3 else None,
+        frame_id=message.header.frame_id,
     )
+
+
+def read_edges(message: Any) -> list[Edge]:
+    """What a ``rotavg_msgs/msg/RelativeRotationArray`` says."""
+    edges = map(read_edge, message.edges)
+    return [replace(edge, frame_id=edge.frame_id or message.header.frame_id) for edge in edges]
 
 
 def _keyframe_message(keyframe: Keyframe) -> Any:

@@ -60,6 +60,8 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"{arguments.input} → {arguments.output}: {counts}{skipped}{left_out}")
     if graph_file.damage is not None:
         print_warning(f"{graph_file.damage}; {arguments.output} has the graph of that")
+    for warning in graph_file.warnings:
+        print_warning(f"{arguments.input}: {warning}")
     return 0
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from itertools import islice
 
 from rotavg_ros.bags.reader import BagReader
+from rotavg_ros.bags.topics import static_transforms
 from rotavg_ros.inputs import ODOMETRY_CONVERTERS
 from rotavg_ros.inputs.sensor_frames import SensorFrames
 from rotavg_ros.online import EdgeMeasurement
 from rotavg_ros.online.measurements import RejectedInputError
 from rotavg_ros.replay.plan import Plan
-from rotavg_ros.replay.topics import static_transforms
 
 
 class BagFrames:
@@ -24,7 +24,7 @@ class BagFrames:
         self._is_on = plan.edge_frames_from_tf
         self._sensors, self._bodies = SensorFrames(), set[str]()
         self._unknown: dict[str, dict[str, None]] = {}
-        for _, _, message in bag.decoded(static_transforms(bag) if self._is_on else []):
+        for _, _, message in bag.decoded(static_transforms(bag.topics) if self._is_on else []):
             self._sensors.take(message)
         parameters = plan.parameters
         for robot, source, sensor in zip(parameters.robots, plan.odometry, parameters.odometry_sensors(), strict=False):

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rotavg_ros.bags.reader import RECORDING_SUFFIXES, BagReader
+from rotavg_ros.bags.topics import static_transforms
 from rotavg_ros.datasets.files.pose_files import read_pose_file
 from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
 from rotavg_ros.replay.pace import Pace, WorkRates
 from rotavg_ros.replay.record import TopicUse
-from rotavg_ros.replay.topics import Candidate, Candidates, find_candidates, static_transforms
+from rotavg_ros.replay.topics import Candidate, Candidates, find_candidates
 from rotavg_ros.settings.parameters import NodeParameters
 
 # Parameters that name topics, and those with so many numbers or names for each of them.
@@ -230,7 +231,7 @@ def _uses(bag: BagReader, found: Candidates, plan: Plan) -> tuple[TopicUse, ...]
     for robot, reference in plan.references.items():
         if isinstance(reference, Input):
             roles.setdefault(reference.topic, []).append(f"reference for {robot}")
-    for topic in static_transforms(bag) if plan.edge_frames_from_tf and plan.edges else ():
+    for topic in static_transforms(bag.topics) if plan.edge_frames_from_tf and plan.edges else ():
         roles.setdefault(topic, []).append("frames of sensors")
     could_be = {candidate.topic: "could be a reference: --reference" for candidate in found.references}
     could_be |= {candidate.topic: "could be odometry: --odometry" for candidate in found.odometry}

@@ -15,7 +15,6 @@ from rotavg_ros.online.quaternion import IDENTITY
 from rotavg_ros.view_graph import EdgeKind
 
 _ODOMETRY, _IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu"
-_TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _TRUTH_NAME = re.compile(r"ground.?truth|(^|[/_])(gt|truth|mocap|vicon|optitrack)([/_]|$)", re.IGNORECASE)
 # Into so many messages of edges is looked for the kind of graph they make.
 _FIRST_EDGES = 100
@@ -86,11 +85,6 @@ def find_candidates(bag: BagReader) -> Candidates:
         brings_keyframes=any(edge.type_name in BRINGS_KEYFRAMES or _has_odometry_edges(bag, edge) for edge in edges),
         why_not=why_not,
     )
-
-
-def static_transforms(bag: BagReader) -> list[str]:
-    """Topics of static transforms, ``/tf_static`` of each namespace."""
-    return [topic for topic, kind in bag.topics.items() if kind == _TRANSFORMS and topic.endswith("/tf_static")]
 
 
 def _as_odometry(candidate: Candidate) -> tuple[int, int, int, str]:

@@ -10,12 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros.bags.graph_from_bag import read_graph_bag
 from rotavg_ros.bags.graph_to_bag import write_graph_bag
-from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION
+from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION, RELATIVE_ROTATION_ARRAY, TRANSFORMS, typestore
 from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_message
 from rotavg_ros.bags.reader import BagReader, BagReadError
 from rotavg_ros.bags.run_bag import write_run_bag
-from rotavg_ros.bags.topics import EDGE_TOPIC, ODOM_TOPIC, TRUTH_TOPIC
+from rotavg_ros.bags.topics import EDGE_ARRAY_TOPIC, EDGE_TOPIC, ODOM_TOPIC, TRUTH_TOPIC
 from rotavg_ros.bags.writer import BagWriteError, BagWriter
+from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
@@ -217,3 +218,55 @@ def test_what_odometry_cannot_place_is_skipped_and_counted(tmp_path: Path) -> No
     assert graph_file.graph.source.tolist() == [0, 1, 0]
     assert graph_file.graph.target.tolist() == [1, 2, 2]
     assert graph_file.graph.kind.tolist() == [0, 0, 1]
+
+
+def bag_of_a_camera(path: Path, frame: str, *, with_transform: bool, in_array: bool) -> tuple[Rotation, Path]:
+    """Two odometry messages, a quarter of a turn apart, and the closure between them as a camera sees it."""
+    turn, camera = Rotation.from_euler("z", 90, degrees=True), Rotation.from_euler("zx", [90, 90], degrees=True)
+    seen = replace(
+        edge(0, Keyframe(None, 10**9), Keyframe(None, 2 * 10**9)),
+        source_from_target=(camera.inv() * turn * camera).as_quat(),
+        translation=camera.inv().apply([1.0, 0.0, 0.0]),
+        frame_id="" if in_array else frame,
+    )
+    types = typestore().types
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), frame)
+    array = types[RELATIVE_ROTATION_ARRAY](header, [edge_message(seen)])
+    at = types["geometry_msgs/msg/Transform"](
+        types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0),
+        types["geometry_msgs/msg/Quaternion"](*camera.as_quat().tolist()),
+    )
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), "base_link")
+    transforms = types[TRANSFORMS]([types["geometry_msgs/msg/TransformStamped"](header, "camera", at)])
+    with BagWriter(path) as bag:
+        bag.add_topic(ODOM_TOPIC, ODOMETRY)
+        bag.add_topic("/tf_static", TRANSFORMS)
+        topic = EDGE_ARRAY_TOPIC if in_array else EDGE_TOPIC
+        bag.add_topic(topic, RELATIVE_ROTATION_ARRAY if in_array else RELATIVE_ROTATION)
+        for index, turned in enumerate((Rotation.identity(), turn)):
+            stamp = (index + 1) * 10**9
+            bag.write(ODOM_TOPIC, stamp, odometry_message(stamp, np.array([index, 0.0, 0.0]), turned.as_quat(), "odom"))
+        bag.write(topic, 3 * 10**9, array if in_array else edge_message(seen))
+        if with_transform:
+            bag.write("/tf_static", 4 * 10**9, transforms)
+    return turn, path
+
+
+@pytest.mark.parametrize("in_array", [False, True])
+def test_edges_of_a_camera_become_the_bodys(tmp_path: Path, in_array: bool) -> None:
+    turn, bag = bag_of_a_camera(tmp_path / "bag", "camera", with_transform=True, in_array=in_array)
+    graph_file = read_graph_bag(bag)
+    assert graph_file.graph.kind.tolist() == [0, 1] and graph_file.warnings == ()
+    for measured in Rotation.from_quat(graph_file.graph.target_from_source.numpy()):
+        assert (measured * turn).magnitude() < 1e-12
+    np.testing.assert_allclose(graph_file.edge_translation, [[1, 0, 0]] * 2, atol=1e-12)
+
+
+@pytest.mark.parametrize(("frame", "is_told"), [("camera", True), ("base_link", False), ("", False)])
+def test_edges_that_nothing_places_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], frame: str, is_told: bool
+) -> None:
+    _, bag = bag_of_a_camera(tmp_path / "bag", frame, with_transform=False, in_array=False)
+    assert main(["convert", str(bag), str(tmp_path / "graph.g2o")]) == 0
+    warning = f"rotavg: warning: {bag}: edges are in frame camera, but odometry tells of base_link, and the bag has no "
+    assert [line.startswith(warning) for line in capsys.readouterr().err.splitlines()] == [True] * is_told

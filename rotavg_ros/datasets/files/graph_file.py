@@ -60,6 +60,7 @@ class GraphFile:
         position_gt: ``(N, 3)`` ground truth in the world frame, metres; NaN rows where unknown.
         skipped: number of lines that were left out on reading, by kind.
         damage: what of a damaged recording could not be read; None: it was whole.
+        warnings: why the graph may not be what was meant, a line each.
     """
 
     graph: ViewGraph
@@ -72,6 +73,7 @@ class GraphFile:
     skipped: dict[str, int] = field(default_factory=dict)
     edge_information: np.ndarray | None = None
     damage: str | None = None
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """The graph has the translations, too: a solver sees nothing else."""
