@@ -26,7 +26,6 @@ from rotavg_ros.datasets.files.formats import read_graph, stem_of
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.solver import Solution, methods, solve
-from rotavg_ros.solver.networks import WEIGHTS_FOLDER
 from rotavg_ros.solver.solution import residual_deg, residual_m
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
@@ -54,7 +53,6 @@ def run(arguments: argparse.Namespace) -> int:
             raise SolveError(f"--without is for --method {methods.DEFAULT_METHOD}, not {arguments.method}")
         arguments.method = methods.without(*arguments.without)
     jobs = plan(arguments.graphs, arguments.output, poses=arguments.poses)
-    _check_weights(arguments.weights)
     solve_graph: Callable[[ViewGraph], Solution] = partial(
         solve,
         method=arguments.method,
@@ -170,17 +168,6 @@ def _older_pose_files(folder: Path) -> list[str]:
     except (OSError, ValueError, KeyError, TypeError):
         return []
     return [name for name in POSE_FILES if name in names] if isinstance(names, list) else []
-
-
-def _check_weights(folder: Path | None) -> None:
-    """A folder without any would pass silently, for every network may come from the package."""
-    names = sorted(path.name for path in WEIGHTS_FOLDER.glob("*.safetensors"))
-    if folder is None:
-        return
-    with asking_about(folder, SolveError):
-        has_weights = any((folder / name).is_file() for name in names)
-    if not has_weights:
-        raise SolveError(f"{folder}: has no weights ({', '.join(names)}); `rotavg train` writes them into its --output")
 
 
 def summarize(

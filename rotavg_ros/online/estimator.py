@@ -353,10 +353,7 @@ class OnlineEstimator:
             with abandonable(running.is_abandoned):
                 solution = self._solver(
                     _solved_graph(problem.graph, options),
-                    method=options.method,
-                    profile=options.profile,
-                    device=options.device,
-                    refinement_steps=options.max_refinement_steps,
+                    **options.for_solver,
                     warm_start=warm_start,
                     memory=None if warm_start is None else problem.memory,
                     work=work,

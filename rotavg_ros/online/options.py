@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from rotavg_ros.online.odometry.continuity import ContinuityLimits
 from rotavg_ros.online.odometry.keyframe_choice import KeyframePolicy
@@ -122,6 +124,7 @@ class EstimatorOptions:
     method: str = option("neurora", "solver, as in `rotavg solve --method`", live=True)
     profile: str = option("auto", "'slam', 'sfm', or by what the edges are", choices=PROFILES, live=True)
     device: str = option("auto", "where the networks run", choices=DEVICES)
+    weights: str = option("", "folder of networks that `rotavg train` wrote; those that it lacks are the package's")
     refinement_steps: int = option(
         -1, "refinement steps at most, 0 for none, -1 for the profile's own number", within=(-1, 1000), live=True
     )
@@ -138,9 +141,15 @@ class EstimatorOptions:
         check_options(self)
 
     @property
-    def max_refinement_steps(self) -> int | None:
-        """As :func:`rotavg_ros.solve` wants it; None: the profile's own number."""
-        return None if self.refinement_steps < 0 else self.refinement_steps
+    def for_solver(self) -> dict[str, Any]:
+        """What of it :func:`rotavg_ros.solve` is told, by its arguments' names."""
+        return {
+            "method": self.method,
+            "profile": self.profile,
+            "device": self.device,
+            "refinement_steps": None if self.refinement_steps < 0 else self.refinement_steps,
+            "weights": Path(self.weights) if self.weights else None,
+        }
 
     @property
     def most_edges(self) -> int:

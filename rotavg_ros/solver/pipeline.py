@@ -14,7 +14,7 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.solver import devices, warnings
 from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
 from rotavg_ros.solver.methods import DEFAULT_METHOD, check_choices, method_named
-from rotavg_ros.solver.neurora.network_store import Networks
+from rotavg_ros.solver.neurora.network_store import Networks, check_folder
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.running.threads import for_each, workers
 from rotavg_ros.solver.running.work import metered
@@ -84,6 +84,8 @@ def solve(
     """
     graph = view_graph_of(graph)
     check_choices(method, profile, device)
+    if weights is not None:
+        check_folder(weights)
     names = method.split("+")
     if refinement_steps is not None and refinement_steps < 0:
         raise UserError(f"refinement steps must not be negative, got {refinement_steps}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pydoc
 import re
+from pathlib import Path
 
 import pytest
 import yaml
@@ -57,8 +58,9 @@ def test_the_units_of_the_library_are_those_of_its_names() -> None:
     assert (options.max_turn_rate, options.max_speed) == (pytest.approx(6.28318530717959), 50.0)
     changed = NodeParameters().changed({"keyframe_angle_deg": 180, "max_speed_m_s": 3, "refinement_steps": 0})
     assert changed.estimator.keyframe_angle == pytest.approx(3.14159265358979)
-    assert (changed.estimator.max_speed, changed.estimator.max_refinement_steps) == (3.0, 0)
-    assert options.max_refinement_steps is None
+    assert (changed.estimator.max_speed, changed.estimator.for_solver["refinement_steps"]) == (3.0, 0)
+    assert options.for_solver["refinement_steps"] is None and options.for_solver["weights"] is None
+    assert NodeParameters().changed({"weights": "robot"}).estimator.for_solver["weights"] == Path("robot")
 
 
 def test_a_change_keeps_the_rest_and_ignores_other_nodes_parameters() -> None:

@@ -43,13 +43,7 @@ class Solver:
         triangle = ViewGraph.create(
             [0, 1, 0], [1, 2, 2], [[0.0, 0.0, 0.0, 1.0]] * 3, kind=[EdgeKind.ODOMETRY] * 2 + [EdgeKind.LOOP_CLOSURE]
         )
-        return self.solve(
-            triangle,
-            method=options.method,
-            profile=options.profile,
-            device=options.device,
-            refinement_steps=options.max_refinement_steps,
-        ).device
+        return self.solve(triangle, **options.for_solver).device
 
     def close(self) -> None:
         """End the process, if there is one."""

@@ -52,6 +52,19 @@ class Networks:
         return load_network(kind, self.device)
 
 
+def check_folder(folder: Path) -> None:
+    """That a user's folder has a network: without any it would pass silently, for every one may come from the package.
+
+    Raises:
+        WeightsError: it has none.
+    """
+    names = sorted(path.name for path in WEIGHTS_FOLDER.glob("*.safetensors"))
+    if not any((folder / name).is_file() for name in names):
+        raise WeightsError(
+            f"{folder}: has no weights ({', '.join(names)}); `rotavg train` writes them into its --output"
+        )
+
+
 def metadata(name: str) -> dict[str, str]:
     """What a weights file says of itself."""
     return {"network": name, "architecture_version": ARCHITECTURE_VERSION}

@@ -284,6 +284,7 @@ def test_a_flood_is_survived_and_every_loss_counted(live_node) -> None:
         ("use_sim_time:=perhaps", "use_sim_time"),
         ("state_file:=/no/such/folder/state", "there is no folder /no/such/folder"),
         ("world_frame:=''", "world_frame is ''; name the frame"),
+        ("weights:=/no/such/folder", "/no/such/folder: has no weights"),
     ],
 )
 def test_a_mistake_at_the_start_is_one_line_and_exit_code_2(parameter: str, message: str) -> None:
