@@ -20,5 +20,5 @@ class World(str, Enum):
 
 
 PLANAR_WORLDS = (World.CORRIDOR, World.BUILDING, World.GRID, World.CITY, World.LAPS, World.ROAM)
-# Those of :mod:`rotavg_ros.datasets.robot_run`.
+# Those of :mod:`rotavg_ros.datasets.simulation.robot_run`.
 ROBOT_WORLDS = (World.BUILDING.value, World.CITY.value)

@@ -89,7 +89,7 @@ def thin(
 
     Args:
         num_nodes: N.
-        edges: of the graph, see :data:`~rotavg_ros.online.marginalization.Columns`.
+        edges: of the graph, see :data:`~rotavg_ros.online.compaction.marginalization.Columns`.
         is_false: ``(M,)`` edges that were judged outliers.
         protected: ``(N,)`` nodes that must stay; the first of every chain does in any case.
         surplus_nodes, surplus_edges: how many have to go.

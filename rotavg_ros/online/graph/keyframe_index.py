@@ -14,7 +14,7 @@ from rotavg_ros.online.measurements import UNKNOWN_STAMP_NS
 class KeyframeIndex:
     """Nodes of one robot by keyframe id, and by the moments of those that have a stamp.
 
-    A moment is a stamp on a time line, see :class:`~rotavg_ros.online.odometry_samples.OdometrySamples`.
+    A moment is a stamp on a time line, see :class:`~rotavg_ros.online.odometry.samples.OdometrySamples`.
     """
 
     def __init__(self) -> None:
