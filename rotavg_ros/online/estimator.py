@@ -60,7 +60,8 @@ class _Tick:
 
 
 class OnlineEstimator:
-    """Thread-safe: inputs may come while another thread solves; they wait for microseconds only.
+    """Thread-safe: inputs may come while another thread solves; they wait for microseconds, but where a full
+    graph is compacted: some tenths of a second at 200 000 keyframes, once a tenth of them is new.
 
     A tick solves from the previous answer while data flows (warm), and once more from scratch (cold) when the graph
     has not changed since the tick before. So the last answer before silence is what ``rotavg solve`` says of the

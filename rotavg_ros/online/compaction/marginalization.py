@@ -29,8 +29,8 @@ def is_plain_odometry(edges: Columns) -> NDArray[np.bool_]:
     return np.asarray((edges["kind"] == EdgeKind.ODOMETRY) & (edges["label"] == EdgeLabel.AUTOMATIC))
 
 
-def can_be_marginalized(num_nodes: int, edges: Columns) -> NDArray[np.bool_]:
-    """Nodes between exactly two plain odometry edges to different nodes and without any other edge, ``(N,)``."""
+def are_between(num_nodes: int, edges: Columns) -> NDArray[np.bool_]:
+    """Nodes between exactly two plain odometry edges to different nodes, whatever other edges they have, ``(N,)``."""
     plain = is_plain_odometry(edges)
     source, target = edges["source"], edges["target"]
     both = np.concatenate((source[plain], target[plain]))
@@ -39,9 +39,7 @@ def can_be_marginalized(num_nodes: int, edges: Columns) -> NDArray[np.bool_]:
     total = np.bincount(both, opposite, num_nodes)
     # Exact in float64: two equal neighbours n have 2 n² for the sum of squares of n + n.
     squares = np.bincount(both, opposite**2, num_nodes)
-    free = (degree == 2) & (2 * squares != total**2)
-    free[source[~plain]] = free[target[~plain]] = False
-    return np.asarray(free)
+    return np.asarray((degree == 2) & (2 * squares != total**2))
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,7 @@ class Contraction:
 def marginalize(
     keyframes: Columns, edges: Columns, remove: NDArray[np.bool_], marginalized: MarginalizedKeyframes
 ) -> Contraction:
-    """Take the nodes of a mask ``(N,)`` out, each of which :func:`can_be_marginalized`.
+    """Take the nodes of a mask ``(N,)`` out, each of which :func:`are_between` steps and has no other edge.
 
     Where only a pair of nodes would be left of a cycle of odometry, one node in it stays.
 

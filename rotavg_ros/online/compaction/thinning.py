@@ -21,8 +21,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rotavg_ros.online.compaction.marginalization import Columns, can_be_marginalized
+from rotavg_ros.online.compaction.marginalization import Columns, are_between, is_plain_odometry
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
+
+
+def load() -> None:
+    """What a full graph needs of SciPy, by whom nobody waits for: loading it takes some tenths of a second."""
+    import scipy.sparse.csgraph  # noqa: F401
 
 
 @dataclass(frozen=True)
@@ -99,9 +104,13 @@ def thin(
     stays[way.first] = True
     dropped = np.zeros(len(edges["source"]), dtype=bool)
 
+    # Only what is no plain odometry may be dropped: nodes lie between the same steps whatever is.
+    between, others = are_between(num_nodes, edges) & ~stays, np.flatnonzero(~is_plain_odometry(edges))
+
     def free() -> NDArray[np.bool_]:
-        left = {name: edges[name][~dropped] for name in ("source", "target", "kind", "label")}
-        return np.asarray(can_be_marginalized(num_nodes, left) & ~stays)
+        free, left = between.copy(), others[~dropped[others]]
+        free[edges["source"][left]] = free[edges["target"][left]] = False
+        return np.asarray(free)
 
     def lacking() -> bool:
         nodes = int(free().sum())
@@ -166,8 +175,8 @@ def _sparable_closures(
     rank[np.lexsort((-closure, false[closure], may_go[closure]))] = np.arange(len(closure))
     width = 1.0
     while width < 4 * way.length + 4:
-        stretches = np.stack((chain, np.floor_divide(position, width)), axis=-1).reshape(-1, 2)
-        stretch = np.unique(stretches, axis=0, return_inverse=True)[1].reshape(-1, 2)
+        along = np.floor_divide(position, width).astype(np.int64)
+        stretch = np.unique(chain * (along.max(initial=0) + 1) + along, return_inverse=True)[1].reshape(-1, 2)
         best = np.full(stretch.max(initial=-1) + 1, len(closure))
         np.minimum.at(best, stretch, rank[:, None])
         redundant = (best[stretch] != rank[:, None]).all(axis=1) | (span <= width)

@@ -15,6 +15,7 @@ from rclpy.timer import Timer
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import Discarded, OnlineEstimator
+from rotavg_ros.online.compaction import thinning
 from rotavg_ros.online.odometry.time_jumps import KEEPS_TIME_LINE
 from rotavg_ros.ros.node import parameter_server
 from rotavg_ros.ros.node.diagnostics import TIME_WENT_BACK, Reporter
@@ -69,6 +70,7 @@ class RotavgNode(parameter_server.ParameterNode):
         self._solving.tick_budget_s = parameters.tick_budget_s
         workers = Workers(solver=self._worker, saver=self._saver)
         Services(self, self._estimator, self._solving, workers, parameters.robots[0])
+        self._worker.submit(thinning.load)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # ticks though /clock is paused or absent
         self._solve_timer = self._create_timer(parameters.solve_period_s, self._on_solve_timer)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.datasets.simulation.trajectories import World
-from rotavg_ros.online.compaction.marginalization import Columns, can_be_marginalized, marginalize
+from rotavg_ros.online.compaction.marginalization import Columns, are_between, is_plain_odometry, marginalize
 from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedIndex, MarginalizedKeyframes
 from rotavg_ros.solver import solve
 from rotavg_ros.view_graph import ViewGraph
@@ -34,6 +34,13 @@ def keyframes_of(count: int) -> Columns:
         "stamp_ns": 10 * numbers,
         "time_line": np.zeros(count, np.int64),
     }
+
+
+def can_be_marginalized(num_nodes: int, edges: Columns) -> np.ndarray:
+    """Between two steps of odometry, and in no other edge."""
+    free, other = are_between(num_nodes, edges), ~is_plain_odometry(edges)
+    free[edges["source"][other]] = free[edges["target"][other]] = False
+    return free
 
 
 def laplacian(num_nodes: int, edges: Columns) -> np.ndarray:
