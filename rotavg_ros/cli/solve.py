@@ -21,7 +21,7 @@ from rotavg_ros.cli.main import EXIT_USER_ERROR, print_error, print_warning
 from rotavg_ros.cli.options.solve import EDGE_FORMATS
 from rotavg_ros.cli.poses import POSE_FILES, pose_files, write_corrected_poses
 from rotavg_ros.cli.progress import working
-from rotavg_ros.datasets.files.csv_writer import Column, write_csv
+from rotavg_ros.datasets.files.csv_writer import Column, edge_columns, orientation_columns, write_csv
 from rotavg_ros.datasets.files.formats import read_graph, stem_of
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.errors import UserError, asking_about
@@ -233,27 +233,17 @@ def write_answer(output: Path, graph_file: GraphFile, solution: Solution, summar
 
 
 def _orientation_columns(graph_file: GraphFile, solution: Solution) -> list[Column]:
-    world_from_body = solution.world_from_body.cpu().numpy()
-    quaternion = [Column(name, world_from_body[:, i], decimals=12) for i, name in enumerate(("qx", "qy", "qz", "qw"))]
-    return [Column("id", graph_file.node_ids), *quaternion, Column("component", solution.component.cpu().numpy())]
+    world_from_body, component = solution.world_from_body.cpu().numpy(), solution.component.cpu().numpy()
+    return orientation_columns(graph_file.node_ids, world_from_body, component)
 
 
 def _edge_columns(graph_file: GraphFile, solution: Solution) -> list[Column]:
     graph, ids = graph_file.graph, graph_file.node_ids
-    score = solution.outlier_score.cpu().numpy()
-    columns = [
-        Column("source", ids[graph.source.cpu().numpy()]),
-        Column("target", ids[graph.target.cpu().numpy()]),
-        Column("outlier_score", score, decimals=6),
-        Column("outlier", (score > OUTLIER_THRESHOLD).astype(np.int64)),
-    ]
+    score, judged = solution.outlier_score.cpu().numpy(), None
     if solution.rotation_score is not None:
-        columns += [
-            Column("rotation_score", solution.rotation_score.cpu().numpy(), decimals=6),
-            Column("residual_deg", residual_deg(graph, solution), decimals=4),
-            Column("residual_m", residual_m(graph, solution), decimals=4),
-        ]
-    return columns
+        judged = solution.rotation_score.cpu().numpy(), residual_deg(graph, solution), residual_m(graph, solution)
+    ends = ids[graph.source.cpu().numpy()], ids[graph.target.cpu().numpy()]
+    return edge_columns(ends, score, score > OUTLIER_THRESHOLD, judged)
 
 
 def _warm_up_graph(has_odometry: bool) -> ViewGraph:

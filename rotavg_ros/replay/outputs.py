@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rotavg_ros.datasets.files.csv_writer import Column, write_csv
+from rotavg_ros.datasets.files.csv_writer import Column, edge_columns, orientation_columns, write_csv
 from rotavg_ros.datasets.files.pose_files import write_kitti, write_tum
 from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.online import Answer
@@ -135,23 +135,19 @@ def _write_tum(
 def _orientation_columns(answer: Answer) -> list[Column]:
     """As `rotavg solve` writes them; with several robots their number is the last column."""
     order = np.lexsort((answer.keyframe_id, answer.keyframe_robot))
-    orientation = answer.world_from_body[order]
-    columns = [Column("id", keyframe_ids(answer)[order])]
-    columns += [Column(name, orientation[:, axis], decimals=12) for axis, name in enumerate(("qx", "qy", "qz", "qw"))]
-    columns.append(Column("component", answer.component[order]))
+    columns = orientation_columns(keyframe_ids(answer)[order], answer.world_from_body[order], answer.component[order])
     if len(answer.robots) > 1:
         columns.append(Column("robot", answer.keyframe_robot[order]))
     return columns
 
 
 def _edge_columns(answer: Answer) -> list[Column]:
-    ids, robot = keyframe_ids(answer), answer.keyframe_robot
-    columns = [
-        Column("source", ids[answer.source]),
-        Column("target", ids[answer.target]),
-        Column("outlier_score", answer.outlier_score, decimals=6),
-        Column("outlier", answer.outlier.astype(np.int64)),
-    ]
+    """As `rotavg solve` writes them, and the senders' ids; with several robots their numbers are the last columns."""
+    ids, robot, judged = keyframe_ids(answer), answer.keyframe_robot, None
+    if answer.rotation_score is not None and answer.residual_m is not None:
+        judged = answer.rotation_score, answer.residual_deg, answer.residual_m
+    columns = edge_columns((ids[answer.source], ids[answer.target]), answer.outlier_score, answer.outlier, judged)
+    columns.append(Column("edge_id", answer.edge_id))
     if len(answer.robots) > 1:
         columns += [Column("source_robot", robot[answer.source]), Column("target_robot", robot[answer.target])]
     return columns

@@ -16,6 +16,7 @@ from evo.tools import file_interface
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
+from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 
 EVERYTHING = {
@@ -31,7 +32,7 @@ EVERYTHING = {
 def read_csv(path: Path) -> dict[str, np.ndarray]:
     with path.open() as file:
         rows = list(csv.DictReader(file))
-    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    return {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]}
 
 
 def truth_of(run: SimulatedRun) -> PoseTrajectory3D:
@@ -85,7 +86,14 @@ def test_the_graph_loads_in_gtsam_and_is_near_its_own_least_squares(run: Simulat
 def test_tables_are_like_those_of_solve(run: SimulatedRun, replayed: Path) -> None:
     orientations, edges = read_csv(replayed / "orientations.csv"), read_csv(replayed / "edges.csv")
     assert list(orientations) == ["id", "qx", "qy", "qz", "qw", "component"]
-    assert list(edges) == ["source", "target", "outlier_score", "outlier"]
+    judged = ["rotation_score", "residual_deg", "residual_m"]
+    assert list(edges) == ["source", "target", "outlier_score", "outlier", *judged, "edge_id"]
+    with BagReader(replayed / "run.mcap") as recording:
+        *_, (_, _, flags) = recording.decoded(["/outlier_flags"])
+    np.testing.assert_array_equal(edges["edge_id"], flags.edge_ids.astype(float))
+    np.testing.assert_allclose(edges["residual_deg"], flags.residuals_deg, atol=1e-4)
+    np.testing.assert_allclose(edges["residual_m"], flags.residuals_m, atol=1e-4)
+    np.testing.assert_allclose(edges["rotation_score"], flags.rotation_scores, atol=1e-6)
     summary = json.loads((replayed / "summary.json").read_text())
     assert summary["warnings"] == []
     assert len(orientations["id"]) == summary["keyframes"]

@@ -1,4 +1,7 @@
-"""Numeric csv files, written tens of times faster than row by row: digits are computed for whole columns."""
+"""Numeric csv files, written tens of times faster than row by row: digits are computed for whole columns.
+
+The columns of an answer's two tables are the same whoever has answered.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +23,42 @@ class Column(NamedTuple):
     name: str
     values: np.ndarray
     decimals: int = 0
+
+
+def orientation_columns(ids: np.ndarray, world_from_body: np.ndarray, component: np.ndarray) -> list[Column]:
+    """Of ``orientations.csv``: ``(N,)`` ids, ``(N, 4)`` xyzw and ``(N,)`` components."""
+    quaternion = [Column(name, world_from_body[:, i], decimals=12) for i, name in enumerate(("qx", "qy", "qz", "qw"))]
+    return [Column("id", ids), *quaternion, Column("component", component)]
+
+
+def edge_columns(
+    ends: tuple[np.ndarray, np.ndarray],
+    score: np.ndarray,
+    outlier: np.ndarray,
+    judged: tuple[np.ndarray, np.ndarray, np.ndarray] | None,
+) -> list[Column]:
+    """Of ``edges.csv``.
+
+    Args:
+        ends: ids of the sources and of the targets, ``(M,)`` each.
+        score, outlier: ``(M,)`` in [0, 1], and bool.
+        judged: ``(M,)`` each, where translations were used: the rotation's own score, and the residuals in degrees and
+            in metres (NaN without a translation).
+    """
+    columns = [
+        Column("source", ends[0]),
+        Column("target", ends[1]),
+        Column("outlier_score", score, decimals=6),
+        Column("outlier", outlier.astype(np.int64)),
+    ]
+    if judged is not None:
+        rotation_score, residual_deg, residual_m = judged
+        columns += [
+            Column("rotation_score", rotation_score, decimals=6),
+            Column("residual_deg", residual_deg, decimals=4),
+            Column("residual_m", residual_m, decimals=4),
+        ]
+    return columns
 
 
 def write_csv(file: BinaryIO, columns: Sequence[Column], *, block_rows: int = _BLOCK_ROWS) -> None:
@@ -53,7 +92,7 @@ def _digits(values: np.ndarray, decimals: int) -> tuple[np.ndarray, np.ndarray]:
             raise ValueError("a csv column holds an infinite value")
         known = ~np.isnan(values)[:, None]
         values = np.rint(np.nan_to_num(values, nan=0.0).astype(np.float64) * 10.0**decimals)
-    number = values.astype(np.int64)
+    number = values if np.issubdtype(values.dtype, np.unsignedinteger) else values.astype(np.int64)
     rest = np.abs(number)
     num_digits = max(decimals + 1, len(str(rest.max(initial=0))))
     characters, keep = [], []

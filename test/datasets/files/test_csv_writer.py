@@ -38,3 +38,9 @@ def test_refuses_what_is_infinite_and_leaves_what_is_unknown_empty() -> None:
     columns = Column("a", np.array([1, 2])), Column("b", np.array([np.nan, -0.5]), decimals=3)
     write_csv(file, [*columns, columns[0]._replace(name="c")])
     assert file.getvalue() == b"a,b,c\n1,,1\n2,-0.500,2\n"
+
+
+def test_ids_of_64_bits_without_a_sign() -> None:
+    file = io.BytesIO()
+    write_csv(file, [Column("a", np.array([0, 2**63, 2**64 - 1], dtype=np.uint64))])
+    assert file.getvalue() == b"a\n0\n9223372036854775808\n18446744073709551615\n"
