@@ -8,6 +8,7 @@ import os
 import stat
 import tempfile
 import zipfile
+import zlib
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -117,7 +118,7 @@ def read(path: Path) -> Arrays:
         raise StateFileError(f"there is no state file {path}; save one first") from error
     except OSError as error:
         raise StateFileError(f"cannot read the state file {path}: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
+    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
         raise StateFileError(f"{path} is not a whole state file of rotavg; delete it or save a new one") from error
     if format_version not in _READABLE:
         raise StateFileError(

@@ -7,8 +7,10 @@ import json
 import os
 import pickle
 import socket
+import struct
 import subprocess
 import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -92,6 +94,13 @@ def test_foreign_and_damaged_files_are_refused_and_the_old_state_kept(filled, tm
         damaged = bytearray(content)
         damaged[position] ^= 0xFF
         (tmp_path / f"damaged{position}.npz").write_bytes(damaged)
+    np.savez_compressed(tmp_path / "stream.npz", **arrays)
+    with zipfile.ZipFile(tmp_path / "stream.npz") as archive:
+        begin = archive.infolist()[0].header_offset + 30
+    packed = (tmp_path / "stream.npz").read_bytes()
+    name_and_extra = sum(struct.unpack("<HH", packed[begin - 4 : begin]))
+    at = begin + name_and_extra
+    (tmp_path / "stream.npz").write_bytes(packed[:at] + b"\xff" + packed[at + 1 :])
     for name, change in {
         "short": {"keyframe_id": arrays["keyframe_id"][:-1]},
         "wide": {"answered": np.zeros((2, 3))},
