@@ -92,10 +92,12 @@ def fit_positions(
 
     position = solve(np.where(is_odometry, 1.0, _NEXT_TO_NOTHING))
     if not is_odometry.all():
+        # Closures that fit exactly are off by what rounding leaves of the longest step, and are no scale for others.
+        rounding = max((np.finfo(float).eps * np.abs(step).max()) ** 2, np.finfo(float).tiny)
         for _ in range(_PASSES):
             squared = ((position[target] - position[source] - step) ** 2).sum(axis=1)
-            variance = np.median(squared[~is_odometry]) / _MEDIAN_OF_SQUARED
-            share = 1 / (1 + squared / max(_SCALE_SIGMAS**2 * variance, np.finfo(float).tiny)) ** 2
+            variance = max(np.median(squared[~is_odometry]) / _MEDIAN_OF_SQUARED, rounding)
+            share = 1 / (1 + squared / (_SCALE_SIGMAS**2 * variance)) ** 2
             position = solve(np.where(is_odometry, 1.0, np.maximum(share, _NEXT_TO_NOTHING)))
     position += np.nan_to_num(origin[roots])[component]
     touched = np.zeros(num_nodes, dtype=bool)

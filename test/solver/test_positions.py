@@ -96,3 +96,17 @@ def test_parts_that_nothing_joins_begin_where_they_are_told() -> None:
     )
     np.testing.assert_allclose(positions[:4], [[0, 0, 0], [0, 1, 0], [5, 0, 0], [5, -2, 0]], atol=1e-5)
     assert np.isnan(positions[4]).all()
+
+
+@pytest.mark.parametrize(("step", "num_nodes"), [(1.0, 4), (0.3, 8), (10.1, 6)])
+def test_closures_that_fit_exactly(step: float, num_nodes: int) -> None:
+    """Along a line, where the residuals of some are 0 and of others rounding."""
+    position = step * np.arange(num_nodes)[:, None] * [1, 0, 0]
+    chain = np.arange(num_nodes - 1)
+    source, target = np.triu_indices(num_nodes, 2)
+    source, target = np.append(chain, source), np.append(chain + 1, target)
+    is_odometry = np.arange(len(source)) < len(chain)
+    score, steps = np.zeros(len(source)), np.ones(len(source))
+    edges = Translations(source, target, position[target] - position[source], is_odometry, score, steps)
+    fitted = fit_positions(np.tile([0.0, 0, 0, 1], (num_nodes, 1)), edges, np.zeros((num_nodes, 3)))
+    np.testing.assert_allclose(fitted, position, atol=1e-12 * step * num_nodes)
