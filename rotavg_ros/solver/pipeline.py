@@ -25,7 +25,7 @@ from rotavg_ros.solver.slam.noise import exceedance
 from rotavg_ros.solver.slam.solve import solve_slam
 from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.solver.solution import Solution
-from rotavg_ros.view_graph import EdgeKind, EdgeLabel, HoldsViewGraph, ViewGraph, view_graph_of
+from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, EdgeLabel, HoldsViewGraph, ViewGraph, view_graph_of
 
 # The noise that makes an edge an outlier, in radians.
 _OUTLIER_ANGLE = {"sfm": NUMBERS.outlier_angle, "slam": exceedance.OUTLIER_ANGLE}
@@ -80,7 +80,7 @@ def solve(
         ``component`` and ``uncertainty`` ``(N,)``; and what was run.
 
     Raises:
-        UserError: no view-graph, an option outside its choices, or a start of the wrong shape.
+        UserError: no view-graph, an option outside its choices, or a start of the wrong shape or not of rotations.
     """
     graph = view_graph_of(graph)
     check_choices(method, profile, device)
@@ -93,6 +93,12 @@ def solve(
         raise UserError(f"work must be a number of units, 0 or more, got {work}")
     if warm_start is not None and tuple(warm_start.shape) != (graph.num_nodes, 4):
         raise UserError(f"the warm start has shape {tuple(warm_start.shape)}, the graph needs ({graph.num_nodes}, 4)")
+    if warm_start is not None:
+        length = warm_start.double().norm(dim=1)
+        not_unit = ~((length - 1).abs() <= UNIT_NORM_TOLERANCE)
+        if bool(not_unit.any()):
+            row = int(not_unit.nonzero()[0])
+            raise UserError(f"the warm start's row {row} has length {length[row]:.6g}; give unit quaternions")
     if profile == "auto":
         profile = "slam" if bool(graph.is_odometry.any()) else "sfm"
     where = (

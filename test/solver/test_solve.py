@@ -226,6 +226,8 @@ def test_the_networks_beat_the_tree(recipe: ReleasedRecipe | PaperRecipe) -> Non
         ({"work": -1.0}, "work must be a number of units"),
         ({"work": float("nan")}, "work must be a number of units"),
         ({"warm_start": torch.zeros(3, 4)}, r"the warm start has shape \(3, 4\)"),
+        ({"warm_start": torch.full((300, 4), torch.nan)}, "the warm start's row 0 has length nan; give unit quat"),
+        ({"warm_start": torch.ones(300, 4)}, "the warm start's row 0 has length 2; give unit quaternions"),
     ],
 )
 def test_mistakes_are_one_line(options: dict[str, object], message: str) -> None:
