@@ -47,6 +47,7 @@ class RejectReason(str, Enum):
     PENDING_TIMEOUT = "pending_timeout"
     GRAPH_FULL = "graph_full"
     MARGINALIZED_KEYFRAME = "marginalized_keyframe"
+    WRONG_LENGTH = "wrong_length"
 
 
 class RejectedInputError(Exception):
@@ -159,8 +160,9 @@ def checked_rotation(xyzw: Sequence[float]) -> Quaternion:
     """The unit quaternion with w ≥ 0, from one within 1e-3 of unit length.
 
     Raises:
-        RejectedInputError: not finite, zero, or far from unit length.
+        RejectedInputError: not four numbers, not finite, zero, or far from unit length.
     """
+    check_length(xyzw, 4)
     length = quaternion.norm(xyzw)
     if not math.isfinite(length):
         raise RejectedInputError(RejectReason.NAN_ROTATION)
@@ -168,6 +170,16 @@ def checked_rotation(xyzw: Sequence[float]) -> Quaternion:
         zero = length < UNIT_NORM_TOLERANCE
         raise RejectedInputError(RejectReason.ZERO_QUATERNION if zero else RejectReason.UNNORMALIZED_QUATERNION)
     return quaternion.normalize(xyzw)
+
+
+def check_length(numbers: Sequence[float] | None, length: int) -> None:
+    """Refuse what has another length; None is of any.
+
+    Raises:
+        RejectedInputError: it has.
+    """
+    if numbers is not None and len(numbers) != length:
+        raise RejectedInputError(RejectReason.WRONG_LENGTH)
 
 
 def checked_stamp(stamp_ns: int) -> int:
@@ -205,4 +217,5 @@ def check_edge(edge: EdgeMeasurement) -> Quaternion:
         raise RejectedInputError(RejectReason.ID_OUT_OF_RANGE)
     if edge.source.key == edge.target.key:
         raise RejectedInputError(RejectReason.SELF_EDGE)
+    check_length(edge.translation, 3)
     return checked_rotation(edge.target_from_source)

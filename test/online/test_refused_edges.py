@@ -32,6 +32,8 @@ def test_closures_by_id_wait_for_their_keyframe(solver):
         ({"target_from_source": (0, 0, 0, math.inf)}, "nan_rotation"),
         ({"target_from_source": (0, 0, 0, 0)}, "zero_quaternion"),
         ({"target_from_source": (0, 0, 1, 1)}, "unnormalized_quaternion"),
+        ({"target_from_source": (0, 0, 1)}, "wrong_length"),
+        ({"translation": (1.0, 2.0)}, "wrong_length"),
         ({"kind": 2}, "bad_kind"),
         ({"precision": -1.0}, "bad_precision"),
         ({"precision": math.nan}, "bad_precision"),
@@ -53,6 +55,17 @@ def test_a_bad_edge_is_counted_and_changes_nothing(solver, change, reason):
     final(estimator)
     assert estimator.add_edge(replace(closure(run, 2, 3, 33), **change)) == reason
     assert estimator.counts().rejected == {reason: 1}
+    assert estimator.tick() is None
+
+
+@pytest.mark.parametrize(("rotation", "position"), [((0, 0, 1), None), ((0, 0, 0, 1), (1.0, 2.0)), ((), ())])
+def test_odometry_of_wrong_lengths_is_counted_and_changes_nothing(solver, rotation, position):
+    run, estimator = drive(), make(solver)
+    feed(estimator, run)
+    final(estimator)
+    assert estimator.add_odometry("r", run.stamps[-1] + SECOND, rotation, position) == "wrong_length"
+    assert estimator.add_odometry("another", run.stamps[-1] + SECOND, rotation, position) == "wrong_length"
+    assert estimator.counts().rejected == {"wrong_length": 2}
     assert estimator.tick() is None
 
 

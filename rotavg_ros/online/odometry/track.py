@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rotavg_ros.online import quaternion
-from rotavg_ros.online.measurements import RejectedInputError, RejectReason, checked_rotation, checked_stamp
+from rotavg_ros.online.measurements import (
+    RejectedInputError,
+    RejectReason,
+    check_length,
+    checked_rotation,
+    checked_stamp,
+)
 from rotavg_ros.online.odometry.continuity import ANY_MOTION, ContinuityCheck, ContinuityLimits, OdometrySample
 from rotavg_ros.online.odometry.keyframe_choice import KeyframePolicy
 from rotavg_ros.online.odometry.samples import OdometryBounds, OdometrySamples
@@ -67,11 +73,12 @@ class OdometryTrack:
             position: metres, or None; one that is not finite counts as None.
 
         Raises:
-            RejectedInputError: a stamp not after the last one, a rotation that is none, or a message that does not
-                go on from the last one and that no other sides with yet.
+            RejectedInputError: a stamp not after the last one, a rotation or position that is none, or a message that
+                does not go on from the last one and that no other sides with yet.
         """
         stamp_ns = checked_stamp(stamp_ns)
         rotation = checked_rotation(world_from_body)
+        check_length(position, 3)
         if self.latest is not None and stamp_ns <= self.latest.stamp_ns and not self._begins_time_line:
             repeated = stamp_ns == self.latest.stamp_ns
             raise RejectedInputError(RejectReason.REPEATED_STAMP if repeated else RejectReason.OUT_OF_ORDER_ODOMETRY)
