@@ -95,13 +95,6 @@ class SparseFactor:
         return np.asarray(self._factor.perm_c.astype(np.int64))
 
     @property
-    def lower_pattern(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of L, in compressed columns: ``(N + 1,)`` where each begins, and the rows of each, ascending."""
-        lower: csc_array = csc_array(self._factor.L)
-        lower.sort_indices()
-        return lower.indptr.astype(np.int64), lower.indices.astype(np.int64)
-
-    @property
     def num_entries(self) -> int:
         """Of L and U together."""
         return int(self._factor.nnz)
