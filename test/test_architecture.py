@@ -371,3 +371,8 @@ def test_parameters_that_travel_together_are_a_class() -> None:
                     given += node.args.kwonlyargs
                 count = sum(argument.arg not in ("self", "cls") for argument in given)
                 assert count <= MAX_PARAMETERS, f"{file}: {node.name} takes {count} parameters"
+
+
+def test_a_seconds_nanoseconds_are_defined_once() -> None:
+    defining = re.compile(r"^_?NANOSECONDS\b.*=", re.MULTILINE)
+    assert [name for name, file in MODULES.items() if defining.search(file.read_text("utf-8"))] == ["online.options"]

@@ -15,6 +15,7 @@ from rotavg_ros.bags.message_types import typestore
 from rotavg_ros.online import Answer
 from rotavg_ros.online.answer.drawing import EDGE_WIDTH_M, KEYFRAME_COLOR, KEYFRAME_SIZE_M, PALETTE, Drawing
 from rotavg_ros.online.answer.trajectory import Trajectory
+from rotavg_ros.online.options import NANOSECONDS
 from rotavg_ros.online.quaternion import Quaternion
 
 ORIENTATIONS = "rotavg_msgs/msg/AbsoluteOrientations"
@@ -24,7 +25,6 @@ PATH = "nav_msgs/msg/Path"
 MARKERS = "visualization_msgs/msg/MarkerArray"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
-_NANOSECONDS = 1_000_000_000
 _END_OF_TIME_S = 2**31  # seconds of a stamp are 32 bits with a sign
 
 
@@ -74,7 +74,7 @@ def orientation_message(stamp_ns: int, world_from_body: Quaternion, frame_id: st
 
 def path_message(trajectory: Trajectory, frame_id: str) -> Any:
     """A ``nav_msgs/msg/Path`` with its poses in bulk; the origin where positions are not known."""
-    stamp = np.stack(np.divmod(trajectory.stamp_ns, _NANOSECONDS), axis=1)
+    stamp = np.stack(np.divmod(trajectory.stamp_ns, NANOSECONDS), axis=1)
     stamp[(stamp[:, 0] < 0) | (stamp[:, 0] >= _END_OF_TIME_S)] = 0
     pose = np.concatenate((np.nan_to_num(trajectory.position), trajectory.world_from_body), axis=1)
     poses = StampedPoses(stamp, frame_id, pose)
@@ -125,7 +125,7 @@ def diagnostics_message(stamp_ns: int, level: int, name: str, message: str, valu
 
 
 def _header(stamp_ns: int, frame_id: str) -> Any:
-    seconds, nanosec = divmod(stamp_ns, _NANOSECONDS)
+    seconds, nanosec = divmod(stamp_ns, NANOSECONDS)
     time = (seconds, nanosec) if 0 <= seconds < _END_OF_TIME_S else (0, 0)
     return _type("std_msgs/msg/Header")(stamp=_type("builtin_interfaces/msg/Time")(*time), frame_id=frame_id)
 

@@ -25,12 +25,13 @@ from rotavg_ros.bags.topics import EDGE_TOPIC, GRAPH_NOTE, ODOM_TOPIC, TRUTH_TOP
 from rotavg_ros.bags.writer import BagWriteError, BagWriter
 from rotavg_ros.datasets.dead_reckoning import chain_poses
 from rotavg_ros.datasets.files.graph_file import GraphFile
+from rotavg_ros.online.options import NANOSECONDS
 
 # Stamps of a graph that has none: as if a keyframe had been taken every 0.1 s.
 START_STAMP_NS = 1_700_000_000_000_000_000
 DEFAULT_PERIOD_NS = 100_000_000
 # Seconds of a message's stamp are 32 bits with a sign, and a recording's times have none.
-_END_OF_TIME_NS = 2**31 * 1_000_000_000
+_END_OF_TIME_NS = 2**31 * NANOSECONDS
 
 
 def write_graph_bag(path: str | Path, graph_file: GraphFile, *, overwrite: bool = False) -> None:

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rotavg_ros.bags.message_types import typestore
+from rotavg_ros.online.options import NANOSECONDS
 
 # Not estimated by anybody: 36 zeros, as most odometry sources send.
 _NO_COVARIANCE = np.zeros(36)
-_NANOSECONDS = 1_000_000_000
 
 
 @cache
@@ -59,12 +59,12 @@ class Edge:
 
 
 def _time(stamp_ns: int) -> Any:
-    seconds, nanoseconds = divmod(int(stamp_ns), _NANOSECONDS)
+    seconds, nanoseconds = divmod(int(stamp_ns), NANOSECONDS)
     return _type("builtin_interfaces/msg/Time")(sec=seconds, nanosec=nanoseconds)
 
 
 def _nanoseconds(time: Any) -> int:
-    return int(time.sec) * _NANOSECONDS + int(time.nanosec)
+    return int(time.sec) * NANOSECONDS + int(time.nanosec)
 
 
 def _header(stamp_ns: int, frame_id: str) -> Any:

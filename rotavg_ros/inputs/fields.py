@@ -12,9 +12,8 @@ from typing import Any
 
 from rotavg_ros.online import RejectReason, quaternion
 from rotavg_ros.online.measurements import RejectedInputError, checked_rotation
+from rotavg_ros.online.options import NANOSECONDS
 from rotavg_ros.online.quaternion import Quaternion, Vector
-
-NANOSECONDS = 1_000_000_000
 
 # The diagonal of the rotation's block in a row-major 6 × 6 matrix over (x, y, z, rotation about x, about y, about z).
 _ROTATION_DIAGONAL = (21, 28, 35)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-NANOSECONDS = 1_000_000_000
+from rotavg_ros.online.options import NANOSECONDS
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from rotavg_ros.inputs import ODOMETRY_CONVERTERS, OdometryRecord
 from rotavg_ros.online import Answer, OnlineEstimator
 from rotavg_ros.online.content import Counts
 from rotavg_ros.online.measurements import OWN_EDGE_ID
+from rotavg_ros.online.options import NANOSECONDS
 from rotavg_ros.replay import left_waiting
 from rotavg_ros.replay.feed import Feed
 from rotavg_ros.replay.frames import BagFrames
@@ -25,7 +26,6 @@ from rotavg_ros.replay.plan import Plan
 from rotavg_ros.replay.record import TickRecord
 from rotavg_ros.replay.recording import Recording
 
-_NANOSECONDS = 1_000_000_000
 _NAP_S = 0.1
 
 
@@ -121,12 +121,12 @@ def replay(
         records = bag.decoded(feed.topics, *((None, None) if is_whole else (start_ns, stop_ns)))
         for topic, time_ns, message in records:
             if window.rate > 0:
-                _wait_until(started + (time_ns - start_ns) / _NANOSECONDS / window.rate, onlooker.stop)
+                _wait_until(started + (time_ns - start_ns) / NANOSECONDS / window.rate, onlooker.stop)
             if interrupted := onlooker.stop():
                 break
             loop.advance(time_ns)
             feed(topic, message)
-            onlooker.progress((time_ns - end_ns) / _NANOSECONDS)
+            onlooker.progress((time_ns - end_ns) / NANOSECONDS)
             end_ns = time_ns
         damage = bag.damage
         answer = loop.finish()
@@ -242,14 +242,14 @@ def _flips(before: Answer, now: Answer) -> int:
 
 def _bounds(bag: BagReader, window: Window) -> tuple[int, int]:
     """First moment to replay and the one after the last. The bag has messages."""
-    start_ns = bag.start_ns + round(window.start_s * _NANOSECONDS)
+    start_ns = bag.start_ns + round(window.start_s * NANOSECONDS)
     if start_ns >= bag.end_ns:
         raise ReplayError(
             f"{bag.path}: lasts {bag.duration_s:.1f} s, so nothing is left after --start {window.start_s:g}"
         )
     stop_ns = bag.end_ns
     if window.duration_s is not None:
-        stop_ns = min(stop_ns, start_ns + round(window.duration_s * _NANOSECONDS))
+        stop_ns = min(stop_ns, start_ns + round(window.duration_s * NANOSECONDS))
     return start_ns, stop_ns
 
 

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros.evaluation.common.tables import Column, Table
 from rotavg_ros.online import Answer, EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator, free_memory
+from rotavg_ros.online.options import NANOSECONDS
 
 _RATE_HZ = 50
 _LAP_S = 200.0
@@ -26,7 +27,6 @@ _CLOSURE_EVERY_S = 1.0
 _CLOSURE_NOISE_DEG = 1.0
 _FALSE_SHARE = 0.2
 _TICK_EVERY_S = 10
-_NANOSECONDS = 1_000_000_000
 _ROBOT = "robot"
 
 
@@ -132,7 +132,7 @@ class _Course:
 
     def errors_deg(self, answer: Answer) -> tuple[float, float]:
         """Mean error of an answer's keyframes and of the odometry at them, degrees."""
-        at = np.rint(answer.stamp_ns * (_RATE_HZ / _NANOSECONDS)).astype(np.int64)
+        at = np.rint(answer.stamp_ns * (_RATE_HZ / NANOSECONDS)).astype(np.int64)
         heading = Rotation.from_quat(answer.world_from_body).as_rotvec()[:, 2]
         off = (np.exp(1j * (values - self.heading[at])) for values in (heading, self.drifted[at]))
         answered, odometry = (float(np.degrees(np.abs(np.angle(turn)).mean())) for turn in off)
@@ -237,7 +237,7 @@ def _warm_up() -> None:
     """What a process pays once: networks, pages of code."""
     tiny = OnlineEstimator()
     for index in range(3):
-        tiny.add_odometry(_ROBOT, index * _NANOSECONDS, (0.0, 0.0, 0.0, 1.0), (index, 0.0, 0.0))
+        tiny.add_odometry(_ROBOT, index * NANOSECONDS, (0.0, 0.0, 0.0, 1.0), (index, 0.0, 0.0))
     tiny.add_edge(EdgeMeasurement(0, KeyframeReference(_ROBOT, 0), KeyframeReference(_ROBOT, 2), (0.0, 0.0, 0.0, 1.0)))
     tiny.tick()
 
@@ -251,4 +251,4 @@ def _resident_bytes() -> int:
 
 def _stamps(message: NDArray[np.int64]) -> NDArray[np.int64]:
     """Nanoseconds of messages by number."""
-    return np.asarray(message * (_NANOSECONDS // _RATE_HZ))
+    return np.asarray(message * (NANOSECONDS // _RATE_HZ))

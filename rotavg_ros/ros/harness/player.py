@@ -18,6 +18,7 @@ from rosgraph_msgs.msg import Clock
 
 from rotavg_ros.bags.reader import BagMessage, BagReader
 from rotavg_ros.errors import UserError
+from rotavg_ros.online.options import NANOSECONDS
 
 # A publisher keeps so many messages to send lost ones again. Fast DDS asks its readers what they miss every 3 s.
 _DEPTH = 10_000
@@ -179,5 +180,5 @@ def _message_types(path: str, bag: BagReader, wanted: Collection[str] | None) ->
 
 def _clock_message(time_ns: int) -> Clock:
     message = Clock()
-    message.clock.sec, message.clock.nanosec = divmod(time_ns, 1_000_000_000)
+    message.clock.sec, message.clock.nanosec = divmod(time_ns, NANOSECONDS)
     return message

@@ -12,8 +12,8 @@ from numpy.typing import DTypeLike, NDArray
 from rotavg_msgs.msg import AbsoluteOrientations, OutlierFlags
 from std_msgs.msg import Header
 
-from rotavg_ros.inputs.fields import NANOSECONDS
 from rotavg_ros.online import Answer
+from rotavg_ros.online.options import NANOSECONDS
 from rotavg_ros.online.quaternion import Quaternion
 
 
