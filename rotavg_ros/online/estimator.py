@@ -60,8 +60,9 @@ class _Tick:
 
 
 class OnlineEstimator:
-    """Thread-safe: inputs may come while another thread solves; they wait for microseconds, but where a full
-    graph is compacted: some tenths of a second at 200 000 keyframes, once a tenth of them is new.
+    """Thread-safe: inputs may come while another thread solves; they wait for microseconds.
+
+    Only where a full graph is compacted it is some tenths of a second, at 200 000 keyframes once in 20 000.
 
     A tick solves from the previous answer while data flows (warm), and once more from scratch (cold) when the graph
     has not changed since the tick before. So the last answer before silence is what ``rotavg solve`` says of the
