@@ -25,13 +25,12 @@ from rotavg_ros.bags.topics import (
     static_transforms,
 )
 from rotavg_ros.datasets.files.graph_file import MAX_NODE_ID, GraphFile
+from rotavg_ros.datasets.planar import are_about_z
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, ViewGraphError
 
 # A stamp that names a keyframe may be this far from the odometry message that is meant.
 MAX_STAMP_DISTANCE_NS = 50_000_000
 
-# Rotations in a plane have no roll and pitch beyond rounding.
-_PLANAR_TOLERANCE = 1e-9
 
 # Stamp in ns, position, world-from-body xyzw.
 _Pose = tuple[int, list[float], list[float]]
@@ -146,7 +145,7 @@ def _from_ids(content: _Content) -> GraphFile:
         lone_ids=np.array(note.get("lone_ids", []), dtype=np.int64),
         kind=np.array([edge.kind for edge in edges]),
         precision=np.array([edge.precision for edge in edges]),
-        planar=bool(note.get("planar", _is_planar(source_from_target))),
+        planar=bool(note.get("planar", are_about_z(source_from_target))),
         edge_translation=_translations(edges) if content.has_translations else None,
         skipped={"self-edges": len(content.edges) - len(proper)} if len(proper) < len(content.edges) else {},
     )
@@ -189,7 +188,7 @@ def _from_stamps(content: _Content) -> GraphFile:
         lone_ids=np.arange(len(stamps_ns)),
         kind=np.array([EdgeKind.ODOMETRY] * num_steps + [edge.kind for edge in closures])[order],
         precision=np.array([np.nan] * num_steps + [edge.precision for edge in closures])[order],
-        planar=_is_planar(source_from_target),
+        planar=are_about_z(source_from_target),
         edge_translation=translations,
         skipped={what: count for what, count in skipped.items() if count},
     )
@@ -235,7 +234,3 @@ def _with_truth(graph_file: GraphFile, content: _Content) -> GraphFile:
     if not content.note.get("stamps", True):
         graph_file = replace(graph_file, stamps_ns=None)
     return graph_file
-
-
-def _is_planar(quaternions: NDArray[np.float64]) -> bool:
-    return bool((np.abs(quaternions[:, :2]) < _PLANAR_TOLERANCE).all())

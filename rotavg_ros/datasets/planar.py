@@ -4,6 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+# In half angles: rotations off z by less are rounding of 32-bit numbers, which is 6e-8.
+_ROUNDING = 1e-6
+
+
+def are_about_z(quaternions: np.ndarray) -> bool:
+    """Whether all of ``(K, 4)`` xyzw rotations are about z."""
+    return bool((np.abs(quaternions[:, :2]) <= _ROUNDING).all())
+
 
 def quaternion_of_heading(heading: np.ndarray) -> np.ndarray:
     """``(K,)`` angles in radians to ``(K, 4)`` xyzw, for any finite angle."""

@@ -8,12 +8,13 @@ import numpy as np
 
 from rotavg_ros.datasets.files.corrected_graph import is_told, write_corrected_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
+from rotavg_ros.datasets.planar import are_about_z
 from rotavg_ros.online import Answer
 from rotavg_ros.replay.record import RunRecord
 from rotavg_ros.view_graph import EdgeKind
 
-# Rotations in a plane have no roll and pitch, and steps no height, beyond rounding.
-_PLANAR_TOLERANCE = 1e-9
+# Steps in a plane have no height beyond rounding, metres.
+_FLAT_M = 1e-6
 # A robot's own numbers that are farther apart are only counted; so many robots do not have that numbers run out.
 _MOST_BETWEEN = 1 << 40
 
@@ -33,7 +34,8 @@ def write_graph_of_run(path: Path, record: RunRecord) -> None:
     for robot in record.robots:
         if robot.position is not None:
             position[robot.nodes] = np.nan_to_num(robot.position)
-    flat = [answer.target_from_source[:, :2], answer.world_from_body[:, :2], np.nan_to_num(answer.translation[:, 2:])]
+    turns = np.concatenate((answer.target_from_source, answer.world_from_body))
+    is_flat = bool((np.abs(np.nan_to_num(answer.translation[:, 2])) <= _FLAT_M).all())
     ids = keyframe_ids(answer)
     graph_file = GraphFile.from_ids(
         ids[answer.source],
@@ -42,7 +44,7 @@ def write_graph_of_run(path: Path, record: RunRecord) -> None:
         lone_ids=ids,
         kind=answer.kind,
         precision=answer.precision,
-        planar=all(bool((np.abs(values) < _PLANAR_TOLERANCE).all()) for values in flat),
+        planar=is_flat and are_about_z(turns),
         edge_translation=answer.translation,
         steps=answer.steps,
     )

@@ -19,6 +19,7 @@ import numpy as np
 
 from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, reading, writing
 from rotavg_ros.datasets.files.text_rows import refuse, unit_quaternions
+from rotavg_ros.datasets.planar import are_about_z
 from rotavg_ros.view_graph import MAX_TRANSLATION, EdgeKind
 
 _SHAPES: dict[str, tuple[int, ...]] = {  # of one row
@@ -37,8 +38,6 @@ _SHAPES: dict[str, tuple[int, ...]] = {  # of one row
 }
 _REQUIRED = ("source", "target", "target_from_source")
 _INTEGER = ("source", "target", "kind", "node_ids", "stamps_ns")
-# Sine of half a tilt that is rounding.
-_PLANAR_TOLERANCE = 1e-9
 _EDGE_EXTRAS = ("edge_translation", "edge_information")
 _PER_NODE = ("body_from_world_gt", "stamps_ns", "position_gt")
 
@@ -70,7 +69,7 @@ def read(path: Path) -> GraphFile:
     proper = source != target
     if not proper.any():
         raise GraphFileError.at(path, None, "no edges between nodes; there is nothing to solve")
-    turns_about_z = bool((np.abs(quaternions[:, :2]) <= _PLANAR_TOLERANCE).all())
+    turns_about_z = are_about_z(quaternions)
     if planar and not turns_about_z:
         raise GraphFileError.at(path, None, "is declared planar, but has rotations that are not about z")
     graph_file = GraphFile.from_ids(
