@@ -13,20 +13,16 @@ from typing import NamedTuple
 import numpy as np
 
 from rotavg_ros.solver.algebra.compiled import compiled
+from rotavg_ros.solver.algebra.sparse import merging
 from rotavg_ros.solver.algebra.sparse.ldl import elimination_tree, factor_rows
+from rotavg_ros.solver.algebra.sparse.merging import Fronts, merged
 from rotavg_ros.solver.algebra.sparse.sparse_factor import order_of_little_fill
 from rotavg_ros.solver.running.work import rest
 
-# What a front takes besides its arithmetic, seconds; numbers multiplied and moved a second, on one core of 2020. They
-# decide on merging and are what work is counted in; no answer depends on them.
-_FRONT_S, _PRODUCTS_PER_S, _MOVES_PER_S = 1.5e-6, 3e9, 5e8
-# Where products are as many as this, those of whole matrices take less, and so many are made a second.
-_DENSE, _DENSE_PER_S = 4e5, 2.5e10
 # Seconds to a unit: as long as one takes of a solve by rotations alone, with all that is done around it.
 _UNIT_S = 5e-4
 # A solve may rest after so many seconds.
 _REST_S = 1e-3
-_NOWHERE = -1
 # What begins a matrix of its own lies at a multiple of so many numbers: products come out alike to the last bit.
 _ALIGNED = 8
 
@@ -97,13 +93,13 @@ class Elimination:
         factor_begin = np.append(0, np.cumsum(counts))
         factor_row = factor_rows(begin, row, above, factor_begin)
         rest()
-        fronts = _Fronts(*_merged(above, counts, factor_begin, factor_row, size))
+        fronts = Fronts(*merged(above, counts, factor_begin, factor_row, size))
         self.rank = fronts.place[order]
         rest()
         lower, upper = np.minimum(self.rank[first], self.rank[second]), np.maximum(self.rank[first], self.rank[second])
         self._lay_out(fronts, lower, upper)
 
-    def _lay_out(self, fronts: _Fronts, lower: np.ndarray, upper: np.ndarray) -> None:
+    def _lay_out(self, fronts: Fronts, lower: np.ndarray, upper: np.ndarray) -> None:
         """All of it in single unknowns, with places for what ties blocks ``lower`` ≤ ``upper`` ``(E,)`` or itself."""
         d, num_blocks, diagonal = self.size, self.num_blocks, np.arange(self.num_blocks)
         pivots, rows = np.diff(fronts.begin), np.diff(fronts.row_begin)
@@ -141,9 +137,9 @@ class Elimination:
 
     def _count(self, pivots: np.ndarray, rows: np.ndarray) -> None:
         """Stretches, and the work that they are."""
-        products = _products(pivots, rows)
-        is_dense = products > _DENSE
-        units = _seconds(pivots, rows) / _UNIT_S
+        products = merging.products(pivots, rows)
+        is_dense = products > merging.DENSE
+        units = merging.seconds(pivots, rows) / _UNIT_S
         number = _stretch(units * _UNIT_S, is_dense, _REST_S)
         first = np.flatnonzero(np.diff(number, prepend=-1))
         each = np.add.reduceat(units, first)
@@ -169,24 +165,6 @@ class Elimination:
         return int(self.shape.store[-1])
 
 
-class _Fronts(NamedTuple):
-    """In blocks, in the order of elimination.
-
-    Attributes:
-        place: ``(B,)`` where each block of the order before stands in this one.
-        begin: ``(F + 1,)`` first pivot of each front.
-        above: ``(F,)`` the front that each leaves its rows to, -1: none.
-        row_begin, row, within: as :class:`Shape` has them.
-    """
-
-    place: np.ndarray
-    begin: np.ndarray
-    above: np.ndarray
-    row_begin: np.ndarray
-    row: np.ndarray
-    within: np.ndarray
-
-
 def _upper(first: np.ndarray, second: np.ndarray, num_blocks: int) -> tuple[np.ndarray, np.ndarray]:
     """The upper triangle's columns, where each begins and its rows."""
     lower, upper = np.minimum(first, second), np.maximum(first, second)
@@ -198,153 +176,6 @@ def _upper(first: np.ndarray, second: np.ndarray, num_blocks: int) -> tuple[np.n
 def _singly(blocks: np.ndarray, size: int) -> np.ndarray:
     """``(n d,)`` unknowns of blocks ``(n,)``."""
     return np.asarray((blocks[:, None] * size + np.arange(size)).ravel())
-
-
-@compiled
-def _products(pivots: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Numbers that are multiplied to eliminate so many pivots beside so many rows."""
-    products: np.ndarray = pivots * pivots * pivots / 6 + pivots * pivots * rows / 2 + pivots * rows * rows / 2
-    return products
-
-
-@compiled
-def _seconds(pivots: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """What fronts of so many pivots and rows take."""
-    products = _products(pivots, rows)
-    rate = np.where(products > _DENSE, _DENSE_PER_S, _PRODUCTS_PER_S)
-    seconds: np.ndarray = _FRONT_S + products / rate + (rows * rows + pivots * (pivots + rows)) / _MOVES_PER_S
-    return seconds
-
-
-@compiled
-def _merged(
-    above: np.ndarray, counts: np.ndarray, factor_begin: np.ndarray, factor_row: np.ndarray, size: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Fronts of L's pattern in blocks: see :class:`_Fronts`.
-
-    Columns that are tied to the same later ones are one front (fundamental supernodes, Liu, Ng and Peyton 1993), and a
-    front takes in those below it that cost more by themselves.
-    """
-    num_blocks = len(above)
-    num_below = np.zeros(num_blocks, np.int64)
-    for j in range(num_blocks):
-        if above[j] >= 0:
-            num_below[above[j]] += 1
-    of_column, first = np.empty(num_blocks, np.int64), np.empty(num_blocks, np.int64)
-    count = 0
-    for j in range(num_blocks):
-        goes_on = j > 0 and above[j - 1] == j and counts[j] == counts[j - 1] - 1 and num_below[j] == 1
-        if not goes_on:
-            first[count] = j
-            count += 1
-        of_column[j] = count - 1
-    last = np.empty(count, np.int64)
-    for s in range(count):
-        last[s] = (first[s + 1] if s + 1 < count else num_blocks) - 1
-    pivots, rows, cost = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
-    for s in range(count):
-        pivots[s], rows[s] = last[s] - first[s] + 1, counts[last[s]]
-    # Linked lists: those below each, and those that are one with it, in the order of elimination.
-    below, beside = np.full(count, _NOWHERE), np.full(count, _NOWHERE)
-    head, follows = np.arange(count), np.full(count, _NOWHERE)
-    one, other = np.empty(1, np.int64), np.empty(1, np.int64)
-    for s in range(count):
-        one[0], other[0] = size * pivots[s], size * rows[s]
-        cost[s] = _seconds(one, other)[0]
-        many = 0
-        child = below[s]
-        while child >= 0:
-            many += 1
-            child = beside[child]
-        children, by_rows = np.empty(many, np.int64), np.empty(many, np.int64)
-        child, many = below[s], 0
-        while child >= 0:
-            children[many], by_rows[many] = child, -rows[child]
-            many += 1
-            child = beside[child]
-        below[s] = _NOWHERE
-        for at in np.argsort(by_rows, kind="mergesort"):
-            child = children[at]
-            one[0], other[0] = size * (pivots[s] + pivots[child]), size * rows[s]
-            together = _seconds(one, other)[0]
-            if together < cost[s] + cost[child]:
-                pivots[s] += pivots[child]
-                cost[s] = together
-                follows[child] = head[s]
-                head[s] = head[child]
-                grandchild = below[child]
-                while grandchild >= 0:
-                    after = beside[grandchild]
-                    beside[grandchild] = below[s]
-                    below[s] = grandchild
-                    grandchild = after
-            else:
-                beside[child] = below[s]
-                below[s] = child
-        if rows[s] > 0:
-            parent = of_column[factor_row[factor_begin[last[s]]]]
-            beside[s] = below[parent]
-            below[parent] = s
-    # Every front right after all below it.
-    order, waiting = np.empty(count, np.int64), np.empty(count, np.int64)
-    num_fronts, end = 0, 0
-    for s in range(count):
-        if rows[s] == 0:
-            waiting[end] = s
-            end += 1
-    while end > 0:
-        end -= 1
-        s = waiting[end]
-        order[num_fronts] = s
-        num_fronts += 1
-        child = below[s]
-        while child >= 0:
-            waiting[end] = child
-            end += 1
-            child = beside[child]
-    order = order[:num_fronts][::-1]
-    number = np.full(count, _NOWHERE)
-    begin, row_begin = np.zeros(num_fronts + 1, np.int64), np.zeros(num_fronts + 1, np.int64)
-    place = np.empty(num_blocks, np.int64)
-    at = 0
-    for f in range(num_fronts):
-        s = order[f]
-        number[s] = f
-        part = head[s]
-        while True:
-            for j in range(first[part], last[part] + 1):
-                place[j] = at
-                at += 1
-            if part == s:
-                break
-            part = follows[part]
-        begin[f + 1] = at
-        row_begin[f + 1] = row_begin[f] + rows[s]
-    over = np.full(num_fronts, _NOWHERE)
-    for f in range(num_fronts):
-        child = below[order[f]]
-        while child >= 0:
-            over[number[child]] = f
-            child = beside[child]
-    row, within = np.empty(row_begin[-1], np.int64), np.empty(row_begin[-1], np.int64)
-    for f in range(num_fronts):
-        column = last[order[f]]
-        for i in range(rows[order[f]]):
-            row[row_begin[f] + i] = place[factor_row[factor_begin[column] + i]]
-        row[row_begin[f] : row_begin[f + 1]].sort()
-    for f in range(num_fronts):
-        g = over[f]
-        if g == _NOWHERE:
-            continue
-        among = row_begin[g]
-        for i in range(row_begin[f], row_begin[f + 1]):
-            if row[i] < begin[g + 1]:
-                within[i] = row[i] - begin[g]
-            else:
-                while row[among] != row[i]:
-                    among += 1
-                within[i] = begin[g + 1] - begin[g] + among - row_begin[g]
-    return place, begin, over, row_begin, row, within
 
 
 @compiled

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rotavg_ros.solver.algebra.sparse import elimination as module
+from rotavg_ros.solver.algebra.sparse import merging
 from rotavg_ros.solver.algebra.sparse.elimination import Elimination
 from rotavg_ros.solver.algebra.sparse.multifrontal import Cholesky
 from rotavg_ros.solver.running.work import metered, resting
@@ -35,7 +35,7 @@ def _elimination(first: np.ndarray, second: np.ndarray, blocks: int, size: int, 
     """With fronts as small as they come, or held to be large, each of them."""
     with pytest.MonkeyPatch.context() as patch:
         if is_dense:
-            patch.setattr(module, "_DENSE", -1.0)
+            patch.setattr(merging, "DENSE", -1.0)
         elimination = Elimination(first, second, blocks, size)
     assert all(stretch.is_dense == is_dense for stretch in elimination.stretches)
     return elimination
