@@ -90,6 +90,7 @@ def _quaternions(path: Path, name: str, matrix: np.ndarray) -> np.ndarray:
 
 
 def _information(hessian: np.ndarray) -> np.ndarray:
-    """``(M, 21)``: zeros for the translation, and the upper triangle of the Hessian for the rotation."""
+    """``(M, 21)``: zeros for the translation, and the Hessian's upper triangle, if it is finite, for the rotation."""
+    hessian = np.where(np.isfinite(hessian).all(axis=(1, 2), keepdims=True), hessian, 0.0)
     row, column = np.triu_indices(3)
     return np.concatenate((np.zeros((len(hessian), 15)), hessian[:, row, column]), axis=1)

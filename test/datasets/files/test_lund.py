@@ -11,7 +11,7 @@ import torch
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.datasets.files.formats import read_graph
+from rotavg_ros.datasets.files.formats import read_graph, write_graph
 from rotavg_ros.datasets.files.graph_file import GraphFileError
 from rotavg_ros.metrics import true_edge_noise
 
@@ -49,6 +49,18 @@ def test_edges_agree_with_the_truth(tmp_path: Path) -> None:
     assert graph.information is not None
     np.testing.assert_array_equal(graph.information.numpy(), [np.diag([1.0, 2.0, 3.0])] * 3)
     np.testing.assert_allclose(graph.precision.numpy(), 3 / (1 + 1 / 2 + 1 / 3))
+
+
+def test_a_hessian_that_is_not_finite_is_unknown(tmp_path: Path) -> None:
+    hessian = arrays()["H"]
+    hessian[0, 3] = np.nan
+    graph_file = read_graph(saved(tmp_path, H=hessian))
+    write_graph(tmp_path / "scene.npz", graph_file)
+    back = read_graph(tmp_path / "scene.npz")
+    np.testing.assert_array_equal(back.edge_information, graph_file.edge_information)
+    assert (back.edge_information == 0).all(axis=1).sum() == 1
+    write_graph(tmp_path / "scene.g2o", graph_file)
+    assert read_graph(tmp_path / "scene.g2o").graph.num_edges == len(EDGES)
 
 
 def test_hessians_are_optional(tmp_path: Path) -> None:
