@@ -32,7 +32,7 @@ class Command(NamedTuple):
 
 
 COMMANDS = (
-    Command("solve", "rotavg_ros.cli.solve", "solve view-graph files (g2o, 1DSfM, npz)"),
+    Command("solve", "rotavg_ros.cli.solve", "solve view-graph files (g2o, TORO, iSAM, 1DSfM, npz, Lund)"),
     Command("demo", "rotavg_ros.cli.demo", "play a simulated run, or your graph, to the live node"),
     Command("simulate", "rotavg_ros.cli.simulate", "simulate a robot's run and write it as a bag"),
     Command("convert", "rotavg_ros.cli.convert", "convert view-graphs between files and bags"),

@@ -5,6 +5,7 @@
   .isam               iSAM pose graph, in the plane
   .txt                1DSfM EGs.txt
   .npz                arrays, see docs/formats.md
+  .mat                Lund's MATLAB files, read only
   a folder            rosbag2 (MCAP): edges, chained odometry, ground truth; also read: .mcap, .db3, .bag
 
 Says what the output format has no room for.

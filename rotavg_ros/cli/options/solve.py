@@ -1,6 +1,7 @@
 """Solve view-graph files: absolute orientations and an outlier score for every edge.
 
-Reads g2o, TORO, iSAM, 1DSfM EGs.txt (gzipped, too) and npz. Writes to DIR, or to DIR/<stem> for several graphs:
+Reads g2o, TORO, iSAM, 1DSfM EGs.txt (gzipped, too), npz and Lund's .mat.
+Writes to DIR, or to DIR/<stem> for several graphs:
   orientations.csv  id,qx,qy,qz,qw,component   world_from_body, ascending by id
   edges.csv         source,target,outlier_score,outlier   in the order of the file (or edges.npz)
   summary.json      counts, warnings, seconds, memory, device, method, version

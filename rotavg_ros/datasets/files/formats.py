@@ -38,7 +38,8 @@ def read_graph(path: str | Path) -> GraphFile:
     with open_text(path) as file:
         head = file.read(4096)
     if not head:
-        raise GraphFileError.at(path, None, "the file is empty; expected a view-graph (g2o, EGs.txt or npz)")
+        expected = "a view-graph (g2o, TORO, iSAM, EGs.txt, npz or Lund's .mat)"
+        raise GraphFileError.at(path, None, f"the file is empty; expected {expected}")
     return _format_of_content(path, head).read(path)  # type: ignore[no-any-return]
 
 
@@ -68,9 +69,8 @@ def stem_of(path: Path) -> str:
 def _format_of_suffix(path: Path) -> ModuleType:
     chosen = _FORMAT_OF_SUFFIX.get(path.suffix.lower())
     if chosen is None:
-        raise GraphFileError.at(
-            path, None, f"unknown suffix {path.suffix!r}; use .g2o, .toro, .isam, .npz or .txt (1DSfM EGs.txt)"
-        )
+        usable = ".g2o, .toro, .graph (TORO), .isam, .npz or .txt (1DSfM EGs.txt)"
+        raise GraphFileError.at(path, None, f"unknown suffix {path.suffix!r}; use {usable}")
     return chosen
 
 

@@ -263,7 +263,7 @@ def test_what_a_format_cannot_store_is_named(graph_file: GraphFile) -> None:
 
 def test_unknown_suffix(tmp_path: Path) -> None:
     graph_file = GraphFile.from_ids(np.array([0]), np.array([1]), np.array([[0.0, 0, 0, 1]]))
-    with pytest.raises(GraphFileError, match=r"unknown suffix '.foo'; use .g2o"):
+    with pytest.raises(GraphFileError, match=r"unknown suffix '.foo'; use .g2o, .toro, .graph"):
         write_graph(tmp_path / "graph.foo", graph_file)
 
 
