@@ -13,7 +13,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import nn
 
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, asking_about
 
 # Raised when a network's definition changes so that older weights no longer fit it.
 ARCHITECTURE_VERSION = "1"
@@ -59,7 +59,9 @@ def check_folder(folder: Path) -> None:
         WeightsError: it has none.
     """
     names = sorted(path.name for path in WEIGHTS_FOLDER.glob("*.safetensors"))
-    if not any((folder / name).is_file() for name in names):
+    with asking_about(folder, WeightsError):
+        has_any = any((folder / name).is_file() for name in names)
+    if not has_any:
         raise WeightsError(
             f"{folder}: has no weights ({', '.join(names)}); `rotavg train` writes them into its --output"
         )
