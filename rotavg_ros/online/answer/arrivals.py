@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-# So many good and false closures the prior of the share counts for, a Beta density, as in the solver's.
+# So many good and false closures the prior of the share counts for, a Beta density: the solver's, by a test.
 GOOD, FALSE = 3.0, 1.0
 # Beyond it nothing changes in double precision.
 _CERTAIN = 30.0

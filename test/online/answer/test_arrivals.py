@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
 from rotavg_ros.online.answer.arrivals import FALSE, GOOD, Arrivals, log_odds_of_share
+from rotavg_ros.solver.diagnosis import SlamPriors
 
 
 def drawn(good: int, false: int, deviation: float, seed: int = 0) -> np.ndarray:
@@ -77,3 +78,9 @@ def test_those_at_the_newest_keyframes_and_those_of_each_tick_are_groups() -> No
     arrivals.take(np.append(is_closure, [True, True]), np.append(at_newest, [True, True]))
     assert arrivals.group.tolist() == [0, 1, -1, 3, 3]
     assert arrivals.num_together(np.array([0, 1, 3, 4])).tolist() == [2, 2, 2, 2]
+
+
+def test_the_share_of_good_closures_is_believed_beforehand_as_in_the_solver() -> None:
+    priors = SlamPriors()
+    share, count = priors.outlier_share, priors.outlier_count
+    np.testing.assert_allclose([GOOD, FALSE], [(1 - share) * count, share * count])
