@@ -272,7 +272,7 @@ STRUCTURAL = {
         "_OWN_SHARES",
         "_NEAR_MISS_QUANTILES",
     }
-    | {"_LOG_FIRST", "_LOG_FOLLOWS", "_LOG_STEPS", "_OF_RUN", "_BEFORE"},
+    | {"_LOG_FIRST", "_LOG_FOLLOWS", "_LOG_STEPS", "_OF_RUN", "_BEFORE", "_LOOKED_AT"},
     "left_out": {"CERTAIN"},
     "publishing/gravity": {"_COMPONENTS", "_SOLVES", "_CONVERGED"},
     "publishing/modes": {"_FAR", "_FAR_NOISE", "LIKELY", "FAR_TURN", "FAR_SLIP", "_SURELY_FALSE", "_ROUNDS"},
