@@ -59,8 +59,8 @@ _TICKS_INTRODUCTION = """\
 The estimator in this process, and iSAM2 (GTSAM) after it, on a simulated city of {keyframes} keyframes with as many
 loop closures, a tenth of them false; two keyframes a tick go on coming, with two closures. An answer is of all
 keyframes: ours orientations and flags, or poses; iSAM2's poses. What goes on after an answer is 200 units of work,
-about a millisecond each, and one factorisation more. iSAM2 knows the noise's deviations, has Cauchy's loss on closures
-and judges none.
+about half a millisecond each, and one factorisation more. iSAM2 knows the noise's deviations, has Cauchy's loss on
+closures and judges none.
 Wall-clock milliseconds; loops beside them that keep a core busy each: {busy}. The load average was {load} before the
 run.
 

@@ -13,7 +13,7 @@ from rotavg_ros.online.options import NANOSECONDS
 
 @dataclass(frozen=True)
 class WorkRates:
-    """What a tick costs, and what a replay may spend, in the solver's units of work, about a millisecond each.
+    """What a tick costs, and what a replay may spend, in the solver's units of work, about half a millisecond each.
 
     Attributes:
         bare: units that a tick costs besides for each keyframe and edge of the graph.
@@ -62,6 +62,6 @@ class Pace:
         if self._rates is None:
             return every
         return (
-            f"{every}, less often where ticks are dear: {self._rates.per_second:g} units of work a second, about a "
-            "millisecond each; -p solve_period_s:=S sets it"
+            f"{every}, less often where ticks are dear: {self._rates.per_second:g} units of work a second, about "
+            "half a millisecond each; -p solve_period_s:=S sets it"
         )
