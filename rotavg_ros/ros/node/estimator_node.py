@@ -114,9 +114,8 @@ class RotavgNode(parameter_server.ParameterNode):
             UserError: the solver does not know its options; nothing has changed then.
         """
         old, options = self._settings, parameters.estimator
-        check_choices(
-            options.method, options.profile, options.device
-        )  # here, where the running solve is not waited for
+        # Here, for the solver would tell only after the solve that runs.
+        check_choices(options.method, options.profile, options.device)
         if options != self._estimator.options:
             self._estimator.set_options(options)
         self._settings = parameters
