@@ -14,7 +14,7 @@ import numpy as np
 
 from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.sparse import merging
-from rotavg_ros.solver.algebra.sparse.ldl import elimination_tree, factor_rows
+from rotavg_ros.solver.algebra.sparse.elimination_tree import elimination_tree, factor_rows
 from rotavg_ros.solver.algebra.sparse.merging import Fronts, merged
 from rotavg_ros.solver.algebra.sparse.sparse_factor import order_of_little_fill
 from rotavg_ros.solver.running.work import rest

@@ -1,0 +1,253 @@
+"""Loops over L's entries: the factor, its triangles, and the inverse where L has any.
+
+The formulas stand in :mod:`~rotavg_ros.solver.algebra.sparse.ldl`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rotavg_ros.solver.algebra.compiled import compiled
+
+_NOWHERE = -1
+# Where rounding leaves less than this of a diagonal entry, nothing is known of it but that it is positive.
+_ROUNDING = 1e-15
+# So many rows go up the tree together.
+_AT_ONCE = 8
+
+
+class Shape(NamedTuple):
+    """Where entries stand, in the order of elimination.
+
+    Attributes:
+        begin, row: of H's upper triangle by columns, each beginning with the diagonal.
+        above: ``(N,)`` what each unknown is eliminated into, or -1.
+        factor_begin, factor_row: of L below its diagonal, by columns.
+        full: from this column on L has all entries; N where they are too few for a dense factor.
+    """
+
+    begin: np.ndarray
+    row: np.ndarray
+    above: np.ndarray
+    factor_begin: np.ndarray
+    factor_row: np.ndarray
+    full: int
+
+
+@compiled
+def factorise(shape: Shape, entries: np.ndarray, full: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """L's numbers and D before column ``full``, of H's numbers, and what is left of H from there on, its lower half."""
+    begin, row, above, factor_begin, factor_row, _ = shape
+    size = len(above)
+    lower, diagonal = np.empty(len(factor_row)), np.empty(size)
+    remaining = np.zeros((size - full, size - full))
+    free = factor_begin[:-1].copy()
+    # Row k of L solves L₁ D₁ l = h for the rows before; it has entries on ways up the tree alone, in that order.
+    work, seen = np.zeros(size), np.empty(size, np.int32)
+    way, waiting = np.empty(size, np.int32), np.empty(size, np.int32)
+    for k in range(size):
+        seen[k] = k
+        top = size
+        for at in range(begin[k], begin[k + 1]):
+            i = row[at]
+            work[i] += entries[at]
+            count = 0
+            while seen[i] != k:
+                waiting[count] = i
+                count += 1
+                seen[i] = k
+                i = above[i]
+            while count > 0:
+                count -= 1
+                top -= 1
+                way[top] = waiting[count]
+        pivot = work[k]
+        work[k] = 0.0
+        for place in range(top, size):
+            i = way[place]
+            left = work[i]
+            work[i] = 0.0
+            if i >= full:
+                remaining[k - full, i - full] = left
+                continue
+            for at in range(factor_begin[i], free[i]):
+                work[factor_row[at]] -= lower[at] * left
+            ratio = left / diagonal[i]
+            pivot -= ratio * left
+            lower[free[i]] = ratio
+            free[i] += 1
+        if k >= full:
+            remaining[k - full, k - full] = pivot
+        diagonal[k] = max(pivot, _ROUNDING * entries[begin[k]])
+    return lower, diagonal, remaining
+
+
+@compiled
+def put_full(shape: Shape, root: np.ndarray, lower: np.ndarray, diagonal: np.ndarray) -> None:
+    """L and D where columns are full, of a root C with C Cᵀ = L D Lᵀ."""
+    _, _, _, factor_begin, _, full = shape
+    for j in range(len(root)):
+        diagonal[full + j] = root[j, j] ** 2
+        first = factor_begin[full + j] - j - 1
+        for i in range(j + 1, len(root)):
+            lower[first + i] = root[i, j] / root[j, j]
+
+
+@compiled
+def full_root(shape: Shape, lower: np.ndarray, diagonal: np.ndarray) -> np.ndarray:
+    """That root."""
+    _, _, above, factor_begin, _, full = shape
+    size = len(above) - full
+    root = np.zeros((size, size))
+    for j in range(size):
+        root[j, j] = np.sqrt(diagonal[full + j])
+        first = factor_begin[full + j] - j - 1
+        for i in range(j + 1, size):
+            root[i, j] = lower[first + i] * root[j, j]
+    return root
+
+
+@compiled
+def solve(shape: Shape, lower: np.ndarray, diagonal: np.ndarray, columns: np.ndarray) -> None:
+    """``(N, k)`` columns in place."""
+    _, _, _, factor_begin, factor_row, _ = shape
+    size, width = columns.shape
+    for j in range(size):
+        for at in range(factor_begin[j], factor_begin[j + 1]):
+            i, factor = factor_row[at], lower[at]
+            for c in range(width):
+                columns[i, c] -= factor * columns[j, c]
+    for j in range(size - 1, -1, -1):
+        for c in range(width):
+            columns[j, c] /= diagonal[j]
+        for at in range(factor_begin[j], factor_begin[j + 1]):
+            i, factor = factor_row[at], lower[at]
+            for c in range(width):
+                columns[j, c] -= factor * columns[i, c]
+
+
+@compiled
+def selected_inverse(
+    shape: Shape, lower: np.ndarray, diagonal: np.ndarray, whole: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Z's diagonal and its entries where L has any, of the ``whole`` of it where columns are full."""
+    _, _, _, factor_begin, factor_row, full = shape
+    size = len(diagonal)
+    own, inverse = np.empty(size), np.empty(len(lower))
+    place, total = np.full(size, _NOWHERE, np.int64), np.empty(size)
+    for j in range(full, size):
+        own[j] = whole[j - full, j - full]
+        for at in range(factor_begin[j], factor_begin[j + 1]):
+            inverse[at] = whole[factor_row[at] - full, j - full]
+    for j in range(full - 1, -1, -1):
+        first, end = factor_begin[j], factor_begin[j + 1]
+        for at in range(first, end):
+            place[factor_row[at]] = at - first
+            total[at - first] = 0.0
+        for at in range(first, end):
+            k, factor = factor_row[at], lower[at]
+            so_far = total[at - first] - factor * own[k]
+            if k >= full:
+                for other in range(at + 1, end):
+                    value = whole[factor_row[other] - full, k - full]
+                    total[other - first] -= factor * value
+                    so_far -= lower[other] * value
+            else:
+                # The rows of column j from k on are among those of column k.
+                for other in range(factor_begin[k], factor_begin[k + 1]):
+                    to = place[factor_row[other]]
+                    if to >= 0:
+                        total[to] -= factor * inverse[other]
+                        so_far -= lower[first + to] * inverse[other]
+            total[at - first] = so_far
+        left = 1 / diagonal[j]
+        for at in range(first, end):
+            inverse[at] = total[at - first]
+            left -= lower[at] * inverse[at]
+            place[factor_row[at]] = _NOWHERE
+        own[j] = left
+    return own, inverse
+
+
+@compiled
+def is_near(shape: Shape, column: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """``(n,)`` whether all pairs of a row's unknowns are entries of L."""
+    _, _, _, factor_begin, factor_row, _ = shape
+    near = np.ones(len(column), np.bool_)
+    for e in range(len(column)):
+        for a in range(3):
+            for b in range(a):
+                if value[e, a] != 0 and value[e, b] != 0:
+                    i, j = max(column[e, a], column[e, b]), min(column[e, a], column[e, b])
+                    first, end = factor_begin[j], factor_begin[j + 1]
+                    at = first + np.searchsorted(factor_row[first:end], i)
+                    if at == end or factor_row[at] != i:
+                        near[e] = False
+    return near
+
+
+@compiled
+def row_variance(
+    shape: Shape, own: np.ndarray, inverse: np.ndarray, column: np.ndarray, value: np.ndarray
+) -> np.ndarray:
+    """Values j Z jᵀ of rows whose pairs of unknowns all are entries of L."""
+    _, _, _, factor_begin, factor_row, _ = shape
+    variance = np.empty(len(column))
+    for e in range(len(column)):
+        total = 0.0
+        for a in range(3):
+            if value[e, a] == 0:
+                continue
+            total += value[e, a] * value[e, a] * own[column[e, a]]
+            for b in range(a):
+                if value[e, b] != 0:
+                    i, j = max(column[e, a], column[e, b]), min(column[e, a], column[e, b])
+                    at = factor_begin[j] + np.searchsorted(factor_row[factor_begin[j] : factor_begin[j + 1]], i)
+                    total += 2 * value[e, a] * value[e, b] * inverse[at]
+        variance[e] = total
+    return variance
+
+
+@compiled
+def far_variance(
+    shape: Shape, lower: np.ndarray, diagonal: np.ndarray, column: np.ndarray, value: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values j Z jᵀ of any rows: squares of L⁻¹ jᵀ over D, along the ways up the tree of a row's unknowns.
+
+    Only as far as columns are not full; and what is left of jᵀ there, ``(n, N - full)``, between which Z stands.
+    """
+    _, _, above, factor_begin, factor_row, full = shape
+    size = len(above)
+    variance, work = np.zeros(len(column)), np.zeros((size, _AT_ONCE))
+    way, seen = np.empty(size, np.int64), np.full(size, _NOWHERE, np.int64)
+    left, remaining = np.empty(_AT_ONCE), np.empty((len(column), size - full))
+    for first in range(0, len(column), _AT_ONCE):
+        last, count = min(first + _AT_ONCE, len(column)), 0
+        for e in range(first, last):
+            for a in range(3):
+                j = column[e, a]
+                if value[e, a] != 0:
+                    work[j, e - first] += value[e, a]
+                    while j != _NOWHERE and j < full and seen[j] != first:
+                        seen[j] = first
+                        way[count] = j
+                        count += 1
+                        j = above[j]
+        # What comes later in the order leads back to nothing that was before.
+        for j in np.sort(way[:count]):
+            for c in range(_AT_ONCE):
+                left[c] = work[j, c]
+                work[j, c] = 0.0
+            for e in range(first, last):
+                variance[e] += left[e - first] * left[e - first] / diagonal[j]
+            for at in range(factor_begin[j], factor_begin[j + 1]):
+                i, factor = factor_row[at], lower[at]
+                for c in range(_AT_ONCE):
+                    work[i, c] -= factor * left[c]
+        for e in range(first, last):
+            for j in range(full, size):
+                remaining[e, j - full] = work[j, e - first]
+                work[j, e - first] = 0.0
+    return variance, remaining
