@@ -16,7 +16,7 @@ from rotavg_ros.solver.slam.fine_net.tuning import PASSES, Tuned, applied
 from rotavg_ros.solver.slam.posterior.densities import log_false, log_good
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode
-from rotavg_ros.solver.slam.posterior.rows import residuals
+from rotavg_ros.solver.slam.posterior.rows import residuals, tails
 
 # An edge whose own noise makes up less of what is seen of it says little.
 _TOLD = 0.5
@@ -134,8 +134,8 @@ def _density(mode: Mode, tuned: Tuned, edges: np.ndarray) -> np.ndarray:
     square, predicted = evidence.square[edges], evidence.predicted[edges]
     shared = problem.system(noise).shared[edges] * noise.common_share * noise.closure_variance
     own = evidence.own[edges] * np.exp(-evidence.log_relative[edges]) + shared
-    tails = np.full(len(edges), mode.state.noise.closure_tails)
-    good = log_good(square, own, predicted, k, tails, problem.priors.tail_ratio)[0]
+    tailed = tails(problem, mode.state.noise).of(edges)
+    good = log_good(square, own, predicted, k, tailed)[0]
     share = float(np.clip(mode.is_false.mean(), _LEAST_SHARE, 1 - _LEAST_SHARE))
     false = log_false(square, k, problem.priors, predicted=predicted)
     return np.asarray(np.logaddexp(np.log1p(-share) + good, np.log(share) + false))

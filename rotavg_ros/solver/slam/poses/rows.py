@@ -270,9 +270,9 @@ class PoseProblem:
         """What rotations alone say of closures."""
         problem, state, left_out = self.mode.problem, self.mode.state, self.mode.left_out
         closure, k = problem.closure, problem.components
-        tailed = tails(problem, state.noise)[closure]
+        tailed = tails(problem, state.noise).of(closure)
         square, predicted = left_out.square[closure], left_out.predicted[closure]
-        good, _ = log_good(square, self.own[closure], predicted, k, tailed, problem.priors.tail_ratio)
+        good, _ = log_good(square, self.own[closure], predicted, k, tailed)
         odds = problem.log_odds[closure]
         label = np.where(np.isinf(odds), np.sign(odds), 0.0)
         with np.errstate(invalid="ignore"):

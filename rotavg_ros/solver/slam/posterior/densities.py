@@ -3,14 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from rotavg_ros.solver.slam.noise.exceedance import exceedance
 from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 
 # Rad.
 _QUARTER_TURN = np.pi / 2
+
+
+class Tails(NamedTuple):
+    """Of n good edges, how many err by far more than others, and by how much.
+
+    Attributes:
+        share: ``(n,)`` t, chance of each to be in the tails.
+        ratio: ``(n,)`` τ, how many times its variance it has there.
+    """
+
+    share: np.ndarray
+    ratio: np.ndarray
+
+    def of(self, edges: np.ndarray) -> Tails:
+        """Of some of them."""
+        return Tails(self.share[edges], self.ratio[edges])
 
 
 def anyhow(components: int) -> float:
@@ -29,8 +47,7 @@ def log_good(
     variance: np.ndarray,
     predicted: np.ndarray | float,
     components: int,
-    tails: np.ndarray,
-    tail_ratio: float,
+    tails: Tails,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Of good edges: log [(1 − t) N(r; v + p) + t N(r; τ v + p)], and the share of the first.
 
@@ -39,14 +56,28 @@ def log_good(
         variance: ``(n,)`` rad², v, of the edge's own noise.
         predicted: rad², p, of what r is compared with.
         components: k.
-        tails: ``(n,)`` t.
-        tail_ratio: τ.
+        tails: t and τ.
     """
-    exact = log_normal(square, variance + predicted, components) + np.log1p(-tails)
+    exact = log_normal(square, variance + predicted, components) + np.log1p(-tails.share)
     with np.errstate(divide="ignore"):
-        tail = log_normal(square, tail_ratio * variance + predicted, components) + np.log(tails)
+        tail = log_normal(square, tails.ratio * variance + predicted, components) + np.log(tails.share)
     both = np.logaddexp(exact, tail)
     return both, np.exp(exact - both)
+
+
+def beyond(
+    angle: float, square: np.ndarray, variance: np.ndarray, predicted: np.ndarray, components: int, tails: Tails
+) -> np.ndarray:
+    """``(n,)`` probability that the noise of a good edge exceeds ``angle``, rad.
+
+    What others say of the residual, N(μ, p), and its own density, of :func:`log_good`, tell it together.
+    """
+    _, exact = log_good(square, variance, predicted, components, tails)
+    chances = []
+    for total in (variance, tails.ratio * variance):
+        part = total / (total + predicted)
+        chances.append(exceedance(part * np.sqrt(square), part * predicted, angle, components))
+    return np.asarray(exact * chances[0] + (1 - exact) * chances[1])
 
 
 @dataclass(frozen=True)
@@ -81,15 +112,14 @@ class Sites:
         variance: np.ndarray,
         predicted: np.ndarray,
         components: int,
-        tails: np.ndarray,
-        tail_ratio: float,
+        tails: Tails,
     ) -> Sites:
         """Of densities of :func:`log_good`."""
-        log_density, exact = log_good(square, variance, predicted, components, tails, tail_ratio)
+        log_density, exact = log_good(square, variance, predicted, components, tails)
         near = exact / (variance + predicted)
-        far = (1 - exact) / (tail_ratio * variance + predicted)
-        shrinkage = variance * (near + tail_ratio * far)
-        misfit = near / (variance + predicted) + tail_ratio * far / (tail_ratio * variance + predicted)
+        far = (1 - exact) / (tails.ratio * variance + predicted)
+        shrinkage = variance * (near + tails.ratio * far)
+        misfit = near / (variance + predicted) + tails.ratio * far / (tails.ratio * variance + predicted)
         return cls(square, predicted, (near + far) / shrinkage, shrinkage, square * variance * misfit, log_density)
 
 

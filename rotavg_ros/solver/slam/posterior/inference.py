@@ -15,6 +15,7 @@ from rotavg_ros.solver.slam.posterior.moves.flips import flipped
 from rotavg_ros.solver.slam.posterior.moves.runs import propose_rejected_runs
 from rotavg_ros.solver.slam.posterior.moves.splits import propose_splits
 from rotavg_ros.solver.slam.posterior.moves.starts import starts, turned_further, turned_parts
+from rotavg_ros.solver.slam.posterior.moves.tails import propose_tails
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import with_noise
 from rotavg_ros.solver.slam.posterior.state import State
@@ -177,5 +178,7 @@ def proposals(mode: Mode) -> Iterator[Proposal]:
         yield from slips.propose_shifts(mode)
     if not without & {"slips", "mending"}:
         yield from slips.propose_mending(mode)
+    if not without & {"slips", "tails", "wide-tails"}:
+        yield from propose_tails(mode)
     if not without & {"slips", "splits"}:
         yield from propose_splits(mode)

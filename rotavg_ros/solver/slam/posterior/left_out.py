@@ -9,15 +9,9 @@ from scipy.special import expit
 
 from rotavg_ros.solver.running.work import rest
 from rotavg_ros.solver.slam.noise.exceedance import OUTLIER_ANGLE, exceedance
-from rotavg_ros.solver.slam.posterior.densities import log_false, log_good, log_slipped
-from rotavg_ros.solver.slam.posterior.labels import (
-    false_density,
-    if_false,
-    label_log_odds,
-    log_false_set,
-    log_label_prior,
-    log_slip_odds,
-)
+from rotavg_ros.solver.slam.posterior.densities import beyond, log_false, log_good, log_slipped
+from rotavg_ros.solver.slam.posterior.labels.false_closures import false_density, if_false, log_false_set
+from rotavg_ros.solver.slam.posterior.labels.prior import label_log_odds, log_label_prior, log_slip_odds
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import residuals, sites, tails, variances, with_others
 from rotavg_ros.solver.slam.posterior.state import State
@@ -68,7 +62,7 @@ def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> Lef
     odds[odometry] -= log_slip_odds(problem, graph.own_steps[odometry], slips)
     odds[odometry] -= log_slipped(square[odometry], own[odometry], predicted[odometry], k, priors)
 
-    if_good = log_good(k * (own + predicted), own, predicted, k, tails(problem, state.noise), priors.tail_ratio)[0]
+    if_good = log_good(k * (own + predicted), own, predicted, k, tails(problem, state.noise))[0]
     log_odds = site.log_density + odds
     unrepeated = log_odds.copy()
     unrepeated[closure] = site.log_density[closure] + label_odds - np.log(alone)
@@ -83,18 +77,15 @@ def scores(problem: Problem, state: State, left_out: LeftOut) -> tuple[np.ndarra
     """
     closure, k = problem.closure, problem.components
     good = expit(left_out.log_odds)
-    score, trust = 1 - good, good.copy()
-    square, predicted = left_out.square[closure], left_out.predicted[closure]
+    square, predicted = left_out.square, left_out.predicted
     # A shared error is part of a closure's noise, too.
-    is_shared = problem.system(state.noise).shared[closure]
-    shared = is_shared * state.noise.common_share * state.noise.closure_variance
-    total = variances(problem, state.noise)[closure] + shared
-    part = total / (total + predicted)
-    exceeds = exceedance(part * np.sqrt(square), part * predicted, OUTLIER_ANGLE, k)
-    if_false = exceedance(np.sqrt(square), predicted, OUTLIER_ANGLE, k)
-    trust[closure] = good[closure] * (1 - exceeds)
-    score[closure] = good[closure] * exceeds + (1 - good[closure]) * if_false
-    return score, trust
+    shared = problem.system(state.noise).shared[: len(good)]
+    total = variances(problem, state.noise)[: len(good)]
+    total = total + shared * state.noise.common_share * state.noise.closure_variance
+    exceeds = beyond(OUTLIER_ANGLE, square, total, predicted, k, tails(problem, state.noise))
+    otherwise = np.ones(len(good))
+    otherwise[closure] = exceedance(np.sqrt(square[closure]), predicted[closure], OUTLIER_ANGLE, k)
+    return good * exceeds + (1 - good) * otherwise, good * (1 - exceeds)
 
 
 def relabelled(problem: Problem, state: State) -> np.ndarray:
@@ -123,7 +114,7 @@ def _log_densities(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarr
     square = (residuals(problem, without_common) ** 2).sum(axis=1)[:num_edges]
     own = variances(problem, state.noise)[:num_edges]
     slack = np.where(graph.is_odometry, 0.0, state.noise.closure_variance)
-    good = log_good(square, own, slack, k, tails(problem, state.noise), priors.tail_ratio)[0]
+    good = log_good(square, own, slack, k, tails(problem, state.noise))[0]
     good += np.clip(problem.log_odds, -CERTAIN, CERTAIN)
     otherwise = np.empty(num_edges)
     otherwise[closure] = log_false(square[closure], k, priors)

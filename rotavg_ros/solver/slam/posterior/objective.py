@@ -18,7 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rotavg_ros.solver.slam.posterior.densities import log_normal, log_slipped
-from rotavg_ros.solver.slam.posterior.labels import false_density, log_false_set, log_label_prior, log_slip_prior
+from rotavg_ros.solver.slam.posterior.labels.false_closures import false_density, log_false_set
+from rotavg_ros.solver.slam.posterior.labels.prior import log_label_prior, log_slip_prior
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import residuals, sites, variances, weights, weights_if_good, with_others
@@ -26,6 +27,7 @@ from rotavg_ros.solver.slam.posterior.state import (
     COMMON_SHARES,
     EXPONENTS,
     RUN_STEPS,
+    STEP_TAIL_RATIOS,
     TAIL_SHARES,
     TURN_SHARES,
     Noise,
@@ -119,5 +121,6 @@ def log_noise_prior(noise: Noise, priors: SlamPriors) -> float:
     some = priors.turn_errors / (len(TURN_SHARES) - 1)
     turns = np.log(some if noise.turn_share > 0 else 1 - priors.turn_errors)
     some = priors.tails / (len(TAIL_SHARES) - 1)
-    tailed = sum(np.log(some if share > 0 else 1 - priors.tails) for share in (noise.step_tails, noise.closure_tails))
+    tailed = np.log(some if noise.closure_tails > 0 else 1 - priors.tails)
+    tailed += np.log(some / len(STEP_TAIL_RATIOS) if noise.step_tails > 0 else 1 - priors.tails)
     return float(believed + common + turns + tailed - (step**2 + closure**2) / (2 * priors.noise_spread**2))

@@ -132,6 +132,15 @@ class Problem:
         return np.argsort(self.detection)
 
     @cached_property
+    def preceded(self) -> np.ndarray:
+        """``(C,)`` the closure that was detected last before each, if shortly before, else -1."""
+        newer = self.ends[self.detection, 1]
+        is_near = np.diff(newer) <= self.priors.run_gap_steps
+        preceded = np.full(len(newer), -1, dtype=np.int64)
+        preceded[self.detection[1:]] = np.where(is_near, self.detection[:-1], -1)
+        return preceded
+
+    @cached_property
     def stated_ratio(self) -> np.ndarray:
         """``(C,)`` logarithm of stated variances over the typical one, the median; 0 where unknown or absurd."""
         stated = self.graph.stated_variance[self.closure]

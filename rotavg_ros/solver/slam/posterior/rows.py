@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from rotavg_ros.solver.algebra import quaternion_rows
-from rotavg_ros.solver.slam.posterior.densities import Sites, anyhow
+from rotavg_ros.solver.slam.posterior.densities import Sites, Tails, anyhow
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.state import Noise, Others, State
 from rotavg_ros.solver.slam.posterior.system import Factorised
@@ -36,9 +36,13 @@ def variances(problem: Problem, noise: Noise) -> np.ndarray:
     return np.concatenate((variance, common))
 
 
-def tails(problem: Problem, noise: Noise) -> np.ndarray:
-    """``(E,)`` chance of each edge to be in the tails of its kind if it is good."""
-    return np.where(problem.graph.is_odometry, noise.step_tails, noise.closure_tails)
+def tails(problem: Problem, noise: Noise) -> Tails:
+    """Of each of E edges, the tails of its kind if it is good."""
+    is_odometry = problem.graph.is_odometry
+    return Tails(
+        np.where(is_odometry, noise.step_tails, noise.closure_tails),
+        np.where(is_odometry, noise.step_tail_ratio, problem.priors.tail_ratio),
+    )
 
 
 def residuals(problem: Problem, state: State) -> np.ndarray:
@@ -78,7 +82,7 @@ def sites(problem: Problem, state: State, residual: np.ndarray, variance: np.nda
     num_edges = len(others.rest)
     square = np.minimum((residual[:num_edges] ** 2).sum(axis=1) / others.rest**2, np.pi**2)
     own, tailed = variance[:num_edges], tails(problem, state.noise)
-    return Sites.of(square, own, others.predicted, problem.components, tailed, problem.priors.tail_ratio)
+    return Sites.of(square, own, others.predicted, problem.components, tailed)
 
 
 def weights_if_good(state: State, own: np.ndarray, site: Sites) -> np.ndarray:

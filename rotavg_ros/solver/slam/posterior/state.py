@@ -14,8 +14,10 @@ RUN_STEPS = (0.0, 20.0, 60.0)
 # … and over the share of odometry's variance that goes with how far it turns: half at most, since with
 # more F falls on B25b while its error grows.
 TURN_SHARES = (0.0, 0.5)
-# … and over the share of edges of a kind that are in its tails.
+# … and over the share of edges of a kind that are in its tails, and by how many times the variance odometry's are: a
+# floor that is a little uneven, or a bump.
 TAIL_SHARES = (0.0, 0.02, 0.1, 0.3)
+STEP_TAIL_RATIOS = (16.0, 64.0, 256.0)
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,7 @@ class Noise:
         common_share: κ, share of a closure's error variance that its run has in common.
         turn_share: share of odometry's variance that goes with the squares of the turns of its steps, not their number.
         step_tails, closure_tails: share of sound segments, and of good closures, that err by far more than others.
+        step_tail_ratio: τ, how many times the variance of other segments those have.
         run_steps: no run is longer at its older end, in steps of odometry; 0 where closures err independently.
     """
 
@@ -40,6 +43,7 @@ class Noise:
     turn_share: float = 0.0
     step_tails: float = TAIL_SHARES[0]
     closure_tails: float = TAIL_SHARES[0]
+    step_tail_ratio: float = STEP_TAIL_RATIOS[0]
 
     def chosen_as(self, other: Noise) -> Noise:
         """The same variances with what another one has chosen from grids."""
@@ -52,7 +56,7 @@ class Noise:
 
     @property
     def chosen(self) -> tuple[float, ...]:
-        """What is chosen from grids: α, κ, the length of runs, the share that goes with turns, and of tails."""
+        """What is chosen from grids: α, κ, the length of runs, the share that goes with turns, and tails."""
         return (
             self.exponent,
             self.common_share,
@@ -60,6 +64,7 @@ class Noise:
             self.turn_share,
             self.step_tails,
             self.closure_tails,
+            self.step_tail_ratio,
         )
 
 

@@ -11,14 +11,8 @@ from scipy.special import logsumexp
 
 from rotavg_ros.solver.slam.noise.repeats import Repeats
 from rotavg_ros.solver.slam.posterior.densities import log_false
-from rotavg_ros.solver.slam.posterior.labels import (
-    FalseDensity,
-    false_density,
-    label_log_odds,
-    log_false_set,
-    log_label_prior,
-    log_slip_prior,
-)
+from rotavg_ros.solver.slam.posterior.labels.false_closures import FalseDensity, false_density, log_false_set
+from rotavg_ros.solver.slam.posterior.labels.prior import label_log_odds, log_label_prior, log_slip_prior
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.view_graph import ViewGraph
 

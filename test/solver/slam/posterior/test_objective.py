@@ -15,7 +15,7 @@ from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.objective import evaluate
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import with_noise
-from rotavg_ros.solver.slam.posterior.state import Noise
+from rotavg_ros.solver.slam.posterior.state import STEP_TAIL_RATIOS, Noise
 from rotavg_ros.view_graph import ViewGraph
 
 from .planar import NOISE, log_evidence, planar, problem_of, state_of, yaw
@@ -51,24 +51,26 @@ def _log_evidence_of_tails(problem: Problem, noise: Noise) -> float:
     segment, across = segment[across.any(axis=0)], across[:, across.any(axis=0)]
     variance = np.append(graph.own_steps[segment] * noise.step_variance, np.full(len(closure), noise.closure_variance))
     share = np.append(np.full(len(segment), noise.step_tails), np.full(len(closure), noise.closure_tails))
+    ratio = np.append(np.full(len(segment), noise.step_tail_ratio), np.full(len(closure), problem.priors.tail_ratio))
     design = np.hstack((across, np.eye(len(closure))))
     logs = []
     for tail in map(np.array, product([False, True], repeat=len(variance))):
-        inflated = variance * np.where(tail, problem.priors.tail_ratio, 1.0)
+        inflated = variance * np.where(tail, ratio, 1.0)
         normal = multivariate_normal(np.zeros(len(closure)), (design * inflated) @ design.T)
         with np.errstate(divide="ignore"):
             logs.append(normal.logpdf(discrepancy) + np.log(np.where(tail, share, 1 - share)).sum())
     return float(logsumexp(logs))
 
 
+@pytest.mark.parametrize("ratio", STEP_TAIL_RATIOS)
 @pytest.mark.parametrize("seed", range(6))
-def test_tails_have_the_evidence_of_the_sum_over_what_is_in_them(seed: int) -> None:
+def test_tails_have_the_evidence_of_the_sum_over_what_is_in_them(seed: int, ratio: float) -> None:
     graph, _ = planar(seed, 4, 0.0, length=40)
     problem = problem_of(graph)
     state = state_of(problem, np.zeros(4, dtype=bool))
     by_f, exactly = [], []
     for share in (0.0, 0.1):
-        noise = replace(NOISE, run_steps=0.0, step_tails=share, closure_tails=share)
+        noise = replace(NOISE, run_steps=0.0, step_tails=share, closure_tails=share, step_tail_ratio=ratio)
         _, evaluation = polish(problem, with_noise(problem, state, noise), hold_noise=True)
         terms = evaluation.terms
         by_f.append(terms["odometry"] + terms["good closures"] + terms["orientations"])

@@ -9,12 +9,8 @@ import numpy as np
 import pytest
 
 from rotavg_ros.solver.slam.posterior.em import polish
-from rotavg_ros.solver.slam.posterior.labels import (
-    FalseDensity,
-    false_density,
-    label_log_odds,
-    repeat_rates,
-)
+from rotavg_ros.solver.slam.posterior.labels.false_closures import FalseDensity, false_density, repeat_rates
+from rotavg_ros.solver.slam.posterior.labels.prior import label_log_odds
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.moves.noise import tuned
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
@@ -48,6 +44,7 @@ def _tuned(problem: Problem) -> set[str]:
         ("own-repeats", lambda problem: not np.isfinite(repeat_rates(problem, _repeated(problem))).all()),
         ("repeats", lambda problem: not _repeated(problem).repeats.density.any()),
         ("label-runs", lambda problem: _stickiness(problem) == pytest.approx(0.0, abs=1e-9)),
+        ("label-bursts", lambda problem: _bursts(problem) == pytest.approx(0.0, abs=1e-9)),
     ],
 )
 def test_a_term_is_there_until_it_is_switched_off(name: str, is_off: Callable[[Problem], bool]) -> None:
@@ -68,6 +65,14 @@ def _stickiness(problem: Problem) -> float:
     """How far the odds of good closures differ, of which one follows a false one."""
     is_false = np.arange(len(problem.closure)) == problem.follows.max()
     return float(np.ptp(label_log_odds(problem, is_false)[~is_false]))
+
+
+def _bursts(problem: Problem) -> float:
+    """By how much odds change with the label of the closure that was detected last, where no run is followed."""
+    alone = replace(problem, follows=np.full(len(problem.closure), -1))
+    is_false = np.arange(len(problem.closure)) == problem.detection[0]
+    odds = label_log_odds(alone, is_false)
+    return float(odds[problem.detection[3]] - odds[problem.detection[1]])
 
 
 def test_turn_steps_are_as_many_as_steps_and_lie_where_odometry_turns() -> None:

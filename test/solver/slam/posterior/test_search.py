@@ -31,6 +31,8 @@ from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.stages import bootstrap
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
+WITHOUT_WIDE = without("wide-tails")
+
 
 @cache
 def drawn(kind: str, seed: int) -> DrawnGraph:
@@ -64,6 +66,26 @@ def test_a_slip_that_three_pairs_of_places_tell_of_is_found(witnesses: int) -> N
     assert not (solution.outlier_score.numpy() > 0.5)[case.is_closure].any()
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_odometry_that_is_off_by_some_degrees_now_and_then_has_wide_tails(seed: int) -> None:
+    """By 3 to 13° at one percent of the steps: as slips, each would have to pay for itself."""
+    case = drawn("city: small slips, 30 % grouped, noisy closures", seed)
+    found, without = (solve(case.graph, profile="slam", method=method) for method in (DEFAULT_METHOD, WITHOUT_WIDE))
+    error, before = (error_deg(case.graph, each, case.body_from_world) for each in (found, without))
+    assert error < 0.55
+    assert error < 0.85 * before
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_false_closures_of_a_while_are_false_together(seed: int) -> None:
+    """Whatever run each is of: one by one they would cost more than bending the odometry to them."""
+    kind = "building: 30 % near misses in groups"
+    case, solution = drawn(kind, seed), solved(kind, seed)
+    assert error_deg(case.graph, solution, case.body_from_world) < 1.1
+    without_bursts = solve(case.graph, profile="slam", method=without("label-bursts"))
+    assert error_deg(case.graph, without_bursts, case.body_from_world) > 1.5
+
+
 @pytest.mark.parametrize(("kind", "seed"), [("grid: 4° steps, 50 % random", 9), ("building: 4° steps, 50 % random", 4)])
 def test_odometry_may_err_far_more_than_is_believed_beforehand(kind: str, seed: int) -> None:
     """By thirteen times: held for as good as usual, it makes nearly all closures false."""
@@ -75,13 +97,18 @@ def test_odometry_may_err_far_more_than_is_believed_beforehand(kind: str, seed: 
 
 @pytest.mark.parametrize("seed", [3, 4])
 def test_two_places_that_look_alike_are_mistaken_for_each_other_both_ways(seed: int) -> None:
-    """On every lap, the one for the other and the other for the one: four or five slips would save them all."""
+    """On every lap, the one for the other and the other for the one: four or five slips would save them all.
+
+    Of the second drawing these slips are nearly as likely.
+    """
     case = drawn("building: 30 % of two places that look alike", seed)
     solution = solved("building: 30 % of two places that look alike", seed)
     assert error_deg(case.graph, solution, case.body_from_world) < 1.0
     is_flagged = solution.outlier_score.numpy() > 0.5
     assert not is_flagged[~case.is_closure].any()
-    assert (is_flagged == case.is_false)[case.is_closure].mean() > 0.95
+    is_divided = any("nearly as likely" in warning for warning in solution.warnings)
+    assert is_divided == (seed == 4)
+    assert (is_flagged == case.is_false)[case.is_closure].mean() > (0.6 if is_divided else 0.95)
 
 
 @pytest.mark.parametrize(
@@ -258,9 +285,8 @@ STRUCTURAL = {
     "em": {"_SETTLED_TURN", "_MAX_UNSETTLED", "_SLOWEST", "_PROBABILITY_CONVERGED"}
     | {"_NEWTON_STEPS", "_NEWTON_CONVERGED", "_FARTHEST"},
     "inference": {"_GAIN", "_BEAM"},
-    "labels": {
-        "_SHARES",
-        "_STAY",
+    "labels/prior": {"_SHARES", "_STAY", "_LAST_SHARES", "_BURSTS", "_LOG_STEPS", "_DIGITS"},
+    "labels/false_closures": {
         "_RUN_SHARES",
         "_NEAR_SHARES",
         "_FAR_SHARES",
@@ -272,14 +298,14 @@ STRUCTURAL = {
         "_OWN_SHARES",
         "_NEAR_MISS_QUANTILES",
     }
-    | {"_LOG_FIRST", "_LOG_FOLLOWS", "_LOG_STEPS", "_OF_RUN", "_BEFORE", "_LOOKED_AT"},
+    | {"_OF_RUN", "_BEFORE", "_LOOKED_AT"},
     "left_out": {"CERTAIN"},
     "publishing/gravity": {"_COMPONENTS", "_SOLVES", "_CONVERGED"},
     "publishing/modes": {"_FAR", "_FAR_NOISE", "LIKELY", "FAR_TURN", "FAR_SLIP", "_SURELY_FALSE", "_ROUNDS"},
     "moves/flips": {"_PART", "_DECIDED", "_HOPE", "_LEAST_GAIN"},
-    "mode": {"OTHER_NOISE", "_SAME", "_MAX_DENSE"},
+    "mode": {"OTHER_NOISE", "_LIKELY", "_SAME", "_MAX_DENSE"},
     "moves/jumps": {"_MAX_ROUNDS", "_MAX_CANDIDATES", "_MIN_GAIN", "_MIN_CARRIED"},
-    "moves/noise": {"_GRIDS", "_REACH", "_JOINT", "_SCALES", "_MIN_SPREAD", "_FIRST_SOLVES", "_WORSE_STEPS"},
+    "moves/noise": {"_GRIDS", "STEP_TAILS", "_JOINT", "SCALES", "_MIN_SPREAD", "_FIRST_SOLVES", "_WORSE_STEPS"},
     "moves/runs": {"_LEAST_MEMBERS"},
     "moves/slips": {"LEAST_WITNESSES", "_AGREE", "_AGREE_ANGLE", "OPTIMISM", "SETTLING", "SAME_PLACE"},
     "moves/starts": {"_INLIER_SQUARE", "_SHARP", "_STEP_LEVELS", "_CLOSURE_LEVEL", "_ROBUST_POWER"}
@@ -292,7 +318,7 @@ STRUCTURAL = {
     "problem": {"_NONE", "_SAME_TURNS"},
     "rows": {"_NOTHING", "_MAX_TURN", "_LEAST_REST"},
     "solve": {"Begin", "_BIAS_ROUNDS", "_LEAST_GAIN"},
-    "state": {"EXPONENTS", "COMMON_SHARES", "RUN_STEPS", "TURN_SHARES", "TAIL_SHARES"},
+    "state": {"EXPONENTS", "COMMON_SHARES", "RUN_STEPS", "TURN_SHARES", "TAIL_SHARES", "STEP_TAIL_RATIOS"},
     "system": {"_MAX_LEVERAGE", "_NO_WEIGHT", "_MAX_PATTERNS", "_LACKING", "_MORE"},
 }
 

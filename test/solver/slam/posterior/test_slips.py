@@ -82,12 +82,22 @@ def test_slips_that_nearly_cancel_do_not_pass_for_drift(seed: int) -> None:
 
 @pytest.mark.parametrize("planar", [True, False])
 def test_a_slip_that_few_closures_span_is_found(planar: bool) -> None:
-    """Near the end of the run one closure in nine spans it; each of those speaks against the odometry there."""
+    """Near the end of the run one closure in nine spans it; each of those speaks against the odometry there.
+
+    All of them are the last ones, so they may as well be false together. In the plane that is nearly as likely.
+    """
     graph, truth, _, is_slip = laps(planar, false_share=0.0, slips={150: 40.0})
     solution = solve(graph, profile="slam")
     errors = orientation_errors(solution.body_from_world, as_quaternions(truth), graph.components())
-    assert np.degrees(float(errors.mean())) < 0.5
-    np.testing.assert_array_equal((solution.outlier_score > 0.5).numpy(), is_slip)
+    is_right = np.degrees(float(errors.mean())) < 0.5
+    if planar:
+        assert any("nearly as likely" in warning for warning in solution.warnings)
+        spans = (graph.source <= 150) & (graph.target > 150) & ~graph.is_odometry
+        assert bool(((solution.outlier_score[spans] > 0.05) & (solution.outlier_score[spans] < 0.95)).all())
+        assert is_right or float(solution.uncertainty[151:].min()) > 0.5 * np.radians(40.0)
+    else:
+        assert is_right
+        np.testing.assert_array_equal((solution.outlier_score > 0.5).numpy(), is_slip)
 
 
 def test_groups_of_false_closures_do_not_pass_for_slips() -> None:

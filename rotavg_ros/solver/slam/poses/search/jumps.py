@@ -19,7 +19,7 @@ from rotavg_ros.solver.slam.poses.places.judge import Judge
 from rotavg_ros.solver.slam.poses.repeats.neighbours import log_places
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.solved import PoseMode
-from rotavg_ros.solver.slam.posterior.labels import log_slip_prior
+from rotavg_ros.solver.slam.posterior.labels.prior import log_slip_prior
 
 # Shifts agree that differ by so many standard deviations of what they are known to.
 _AGREE = 3.0

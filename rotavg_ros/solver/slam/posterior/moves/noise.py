@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -14,24 +15,33 @@ from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.objective import log_noise_prior
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import tails, variances, with_noise
-from rotavg_ros.solver.slam.posterior.state import COMMON_SHARES, EXPONENTS, RUN_STEPS, TAIL_SHARES, TURN_SHARES, Noise
+from rotavg_ros.solver.slam.posterior.state import (
+    COMMON_SHARES,
+    EXPONENTS,
+    RUN_STEPS,
+    STEP_TAIL_RATIOS,
+    TAIL_SHARES,
+    TURN_SHARES,
+    Noise,
+)
 
-_GRIDS = {
-    "turn_share": TURN_SHARES,
-    "step_tails": TAIL_SHARES,
-    "closure_tails": TAIL_SHARES,
-    "exponent": EXPONENTS,
-    "run_steps": RUN_STEPS,
-    "common_share": COMMON_SHARES,
+# What odometry's tails may be.
+STEP_TAILS = tuple(product(TAIL_SHARES[1:], STEP_TAIL_RATIOS))
+# What is chosen together, and its values.
+_GRIDS: dict[tuple[str, ...], tuple[tuple[float, ...], ...]] = {
+    ("turn_share",): tuple(product(TURN_SHARES)),
+    ("step_tails", "step_tail_ratio"): ((TAIL_SHARES[0], STEP_TAIL_RATIOS[0]), *STEP_TAILS),
+    ("closure_tails",): tuple(product(TAIL_SHARES)),
+    ("exponent",): tuple(product(EXPONENTS)),
+    ("run_steps",): tuple(product(RUN_STEPS)),
+    ("common_share",): tuple(product(COMMON_SHARES)),
 }
 # Where the logarithms of stated variances spread by less, weights could gain 4 % of variance at most.
 _MIN_SPREAD = 0.2
-# Values of a grid so many places from the best one are looked at.
-_REACH = 2
 # What errors have in common is no matter of single edges.
-_JOINT = ("run_steps", "common_share")
+_JOINT = (("run_steps",), ("common_share",))
 # By what a variance changes when other noise is believed, at most and in steps.
-_SCALES = np.exp(np.linspace(-2.0, 1.2, 17))
+SCALES = np.exp(np.linspace(-3.6, 1.2, 25))
 # Labels are settled from a variance of odometry's steps so many times as large, too.
 _WORSE_STEPS = 4.0
 # After so many solves F is about what it will be.
@@ -41,18 +51,18 @@ _FIRST_SOLVES = 2
 def tuned(mode: Mode) -> Iterator[Mode]:
     """Modes of the same labels with other noise: values of one grid after the other, from the best so far."""
     begun = mode
-    for name, grid in _GRIDS.items():
-        if not _tells(mode, name):
+    for names, grid in _GRIDS.items():
+        if not _tells(mode, names[0]):
             continue
-        at = grid.index(getattr(mode.state.noise, name))
-        for number in sorted(set(range(len(grid))) - {at}, key=lambda number: abs(number - at)):
-            best = getattr(mode.state.noise, name)
-            noise = replace(mode.state.noise, **{name: grid[number]})
-            is_near = abs(number - grid.index(best)) <= _REACH
-            if is_near and (name in _JOINT or _predicted(mode, noise) <= mode.problem.limits.slack):
-                found = _tried(mode, noise)
-                yield found
-                mode = min(mode, found, key=lambda either: either.cost)
+        left = [values for values in grid if values != _values(mode, names) and _is_open(mode.problem, names, values)]
+        while left:
+            values, noise = _next(mode, names, left)
+            if noise is None:
+                break
+            left.remove(values)
+            found = _tried(mode, noise)
+            yield found
+            mode = min(mode, found, key=lambda either: either.cost)
     if mode is not begun:
         yield _polished(mode, mode.state.noise)
 
@@ -73,36 +83,81 @@ def _opens_labels(mode: Mode, factor: float) -> bool:
     """Whether a closure's label, decided now, would be open if what is predicted of it varied so many times as much."""
     problem, told, closure = mode.problem, mode.left_out, mode.problem.closure
     noise = mode.state.noise
-    own, tailed = variances(problem, noise)[closure], tails(problem, noise)[closure]
-    square, predicted, ratio = told.square[closure], told.predicted[closure], problem.priors.tail_ratio
+    own, tailed = variances(problem, noise)[closure], tails(problem, noise).of(closure)
+    square, predicted = told.square[closure], told.predicted[closure]
 
     def log_density(predicted: np.ndarray) -> np.ndarray:
-        return log_good(square, own, predicted, problem.components, tailed, ratio)[0]
+        return log_good(square, own, predicted, problem.components, tailed)[0]
 
     side, decided = np.sign(told.log_odds[closure]), problem.limits.slack
     changed = told.log_odds[closure] + log_density(factor * predicted) - log_density(predicted)
     return bool(((side * told.log_odds[closure] > decided) & (side * changed < decided)).any())
 
 
-def _predicted(mode: Mode, noise: Noise) -> float:
+def _values(mode: Mode, names: tuple[str, ...]) -> tuple[float, ...]:
+    return tuple(getattr(mode.state.noise, name) for name in names)
+
+
+def _is_open(problem: Problem, names: tuple[str, ...], values: tuple[float, ...]) -> bool:
+    is_wide = "step_tail_ratio" in names and values[-1] > STEP_TAIL_RATIOS[0]
+    return not (is_wide and "wide-tails" in problem.without)
+
+
+def _next(mode: Mode, names: tuple[str, ...], left: list[tuple[float, ...]]) -> tuple[tuple[float, ...], Noise | None]:
+    """Which of some values is to be tried, and the noise to begin with; None if none may pay.
+
+    Of edges by themselves that for which F is predicted to be least, or else one that is next to what there is: other
+    tails change what others say of each edge by more than a prediction knows.
+    """
+    noise = [replace(mode.state.noise, **dict(zip(names, values, strict=True))) for values in left]
+    if names in _JOINT:
+        return left[0], noise[0]
+    predicted = [_predicted(mode, each) for each in noise]
+    number = int(np.argmin([change for change, _ in predicted]))
+    if predicted[number][0] <= mode.problem.limits.slack:
+        return left[number], predicted[number][1]
+    at = _values(mode, names)
+    near = [number for number, values in enumerate(left) if _are_next(at, values)]
+    if not near:
+        return left[0], None
+    number = min(near, key=lambda number: predicted[number][0])
+    return left[number], predicted[number][1]
+
+
+def _are_next(some: tuple[float, ...], others: tuple[float, ...]) -> bool:
+    """Whether tails are next to each other on their grid of shares and ratios."""
+    if len(some) < 2 or min(some[0], others[0]) == 0:
+        return False
+    share, ratio = (
+        abs(grid.index(either) - grid.index(other))
+        for grid, either, other in zip((TAIL_SHARES, STEP_TAIL_RATIOS), some, others, strict=True)
+    )
+    return share + ratio == 1
+
+
+def _predicted(mode: Mode, noise: Noise) -> tuple[float, Noise]:
     """By how much F changes, nats, if what others say of each edge stays, and each kind has its best variance.
 
     At the optimum that is the slope of F along the noise.
+
+    Returns:
+        nats, and the noise with these variances.
     """
     problem, told, good = mode.problem, mode.left_out, mode.state.is_good
-    before = mode.state.noise
+    before, k = mode.state.noise, problem.components
     changed = log_noise_prior(before, problem.priors) - log_noise_prior(noise, problem.priors)
     own, others = variances(problem, noise)[: len(good)], variances(problem, before)[: len(good)]
-    share, share_before = tails(problem, noise), tails(problem, before)
-
-    def log_density(kind: np.ndarray, variance: np.ndarray, tailed: np.ndarray) -> float:
-        square, predicted, ratio = told.square[kind], told.predicted[kind], problem.priors.tail_ratio
-        return float(log_good(square, variance[kind], predicted, problem.components, tailed[kind], ratio)[0].sum())
-
+    tailed, tailed_before = tails(problem, noise), tails(problem, before)
+    best = []
     for kind in (problem.graph.is_odometry & good, problem.graph.is_closure & good):
-        changed += log_density(kind, others, share_before)
-        changed -= max(log_density(kind, scale * own, share) for scale in _SCALES)
-    return changed
+        square, predicted = told.square[kind], told.predicted[kind]
+        changed += float(log_good(square, others[kind], predicted, k, tailed_before.of(kind))[0].sum())
+        scaled = SCALES[:, None] * own[kind]
+        log_density = log_good(square, scaled, predicted, k, tailed.of(kind))[0].sum(axis=1)
+        best.append(SCALES[int(log_density.argmax())])
+        changed -= float(log_density.max())
+    step, closure = best[0] * noise.step_variance, best[1] * noise.closure_variance
+    return changed, replace(noise, step_variance=step, closure_variance=closure)
 
 
 def uneven(problem: Problem, noise: Noise) -> Noise:

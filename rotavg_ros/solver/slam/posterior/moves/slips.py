@@ -11,7 +11,8 @@ import numpy as np
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.slam.posterior.densities import log_false
 from rotavg_ros.solver.slam.posterior.em import settle
-from rotavg_ros.solver.slam.posterior.labels import false_density, log_false_set, log_label_prior, log_slip_odds
+from rotavg_ros.solver.slam.posterior.labels.false_closures import false_density, log_false_set
+from rotavg_ros.solver.slam.posterior.labels.prior import log_label_prior, log_slip_odds
 from rotavg_ros.solver.slam.posterior.left_out import relabelled, rough_cost
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.rows import variances

@@ -124,13 +124,13 @@ def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: li
 
 
 def of_slips(mode: Mode) -> tuple[str, ...]:
-    """What is to be known of a labelling by which odometry slipped by far: a sentence, or none."""
-    graph, slipped = mode.problem.graph, mode.slipped
-    turned = np.sqrt((mode.evaluation.residual[slipped] ** 2).sum(axis=1))
-    far = slipped[turned > FAR_SLIP]
+    """What is to be known of a labelling by which odometry is off by far somewhere: a sentence, or none."""
+    graph, off = mode.problem.graph, mode.off
+    turned = np.sqrt((mode.evaluation.residual[off] ** 2).sum(axis=1))
+    far = off[turned > FAR_SLIP]
     if len(far) == 0:
         return ()
-    largest = slipped[int(turned.argmax())]
+    largest = off[int(turned.argmax())]
     first, last = sorted((int(graph.nodes[graph.source[largest]]), int(graph.nodes[graph.target[largest]])))
     times = "once" if len(far) == 1 else f"{len(far)} times"
     return (

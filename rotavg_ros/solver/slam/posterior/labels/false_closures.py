@@ -1,7 +1,4 @@
-"""Densities of labels: which closures are false, one by one or as repeats of one wrong turn, and where odometry slips.
-
-Rates that are not known are integrated over a grid, so that no labelling is judged by the rates of another one.
-"""
+"""The density of false closures: wrong one by one, or repeats of one wrong turn."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.special import betaln, softmax
+from scipy.special import softmax
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.compiled import compiled
@@ -21,11 +18,8 @@ from rotavg_ros.solver.slam.posterior.densities import anyhow, log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 
-# Nodes of the sums that stand for integrals over rates: the share of false closures and the probability that a label is
-# its predecessor's; the shares of false closures that repeat their run's turn, that of one shortly before and any
-# one's; and of those that repeat none but are near misses.
-_SHARES = np.array([0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98])
-_STAY = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 0.97])
+# Nodes of the sums that stand for integrals over rates: the shares of false closures that repeat their run's turn, that
+# of one shortly before and any one's; and of those that repeat none but are near misses.
 _RUN_SHARES = np.array([0.05, 0.5, 0.95])
 _NEAR_SHARES = np.array([0.05, 0.5, 0.95])
 _FAR_SHARES = np.array([0.01, 0.05, 0.2, 0.5])
@@ -283,100 +277,3 @@ def _own_shares(problem: Problem, rows: np.ndarray, by_shares: np.ndarray) -> np
     own = of_run[problem.run]
     own[rows] -= log
     return np.asarray(softmax(own.T, axis=0))
-
-
-def _log_transitions() -> tuple[np.ndarray, np.ndarray]:
-    """Over the grid of shares and of staying: log P(first) ``(G, 2)`` and log P(next | last) ``(G, 2, 2)``."""
-    share, stay = (values.ravel() for values in np.meshgrid(_SHARES, _STAY, indexing="ij"))
-    first = np.stack((1 - share, share), axis=1)
-    follows = (1 - stay)[:, None, None] * first[:, None, :] + stay[:, None, None] * np.eye(2)
-    return np.log(first), np.log(follows)
-
-
-_LOG_FIRST, _LOG_FOLLOWS = _log_transitions()
-# Both as one matrix ``(G, 6)``: what each kind of step counts.
-_LOG_STEPS = np.concatenate((_LOG_FIRST, _LOG_FOLLOWS.reshape(-1, 4)), axis=1)
-
-
-@cache
-def _log_grid_prior(priors: SlamPriors, has_runs: bool) -> np.ndarray:
-    """``(G,)`` of the grid's points: a Beta density on the shares, all stickiness as likely, or none."""
-    a = priors.outlier_share * priors.outlier_count
-    b = (1 - priors.outlier_share) * priors.outlier_count
-    log = (a - 1) * np.log(_SHARES) + (b - 1) * np.log1p(-_SHARES) + np.log(np.gradient(_SHARES))
-    stay = np.zeros(len(_STAY)) if has_runs else np.where(_STAY > 0, -np.inf, 0.0)
-    log = (log[:, None] + stay).ravel()
-    return np.asarray(log - np.logaddexp.reduce(log))
-
-
-def _kind_of_step(last: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """Column of ``_LOG_STEPS``; ``last`` is 2 where there is none."""
-    return np.asarray(np.where(last == 2, label, 2 + 2 * last + label))
-
-
-def _last(problem: Problem, label: np.ndarray) -> np.ndarray:
-    """``(C,)`` label of the closure that each follows, or 2."""
-    return np.where(problem.follows >= 0, label[problem.follows], 2)
-
-
-def log_label_prior(problem: Problem, is_false: np.ndarray) -> float:
-    """Of all closures' labels: each is its predecessor's or drawn anew; the shares of either are integrated."""
-    label = is_false.astype(np.int64)
-    counts = np.bincount(_kind_of_step(_last(problem, label), label), minlength=_LOG_STEPS.shape[1])
-    told = problem.log_odds[problem.closure]
-    finite = np.where(np.isfinite(told), told, 0.0)
-    return float(
-        np.logaddexp.reduce(_LOG_STEPS @ counts + _log_grid_prior(problem.priors, "label-runs" not in problem.without))
-        - finite[is_false].sum()
-    )
-
-
-def label_log_odds(problem: Problem, is_false: np.ndarray) -> np.ndarray:
-    """``(C,)`` prior log-odds of each closure to be good, given the labels of all others."""
-    label = is_false.astype(np.int64)
-    if len(label) == 0:
-        return np.zeros(0)
-    last = _last(problem, label)
-    log_rates = _LOG_STEPS @ np.bincount(_kind_of_step(last, label), minlength=_LOG_STEPS.shape[1])
-    log_rates = log_rates + _log_grid_prior(problem.priors, "label-runs" not in problem.without)
-    follower = np.flatnonzero(problem.follows >= 0)
-    good, false = (
-        np.bincount(problem.follows[follower], label[follower] == value, len(label)).astype(np.int64)
-        for value in (0, 1)
-    )
-    # Closures with the same neighbours have the same odds.
-    contexts, which = np.unique(np.stack((label, last, good, false)), axis=1, return_inverse=True)
-    own, last, good, false = contexts
-
-    def log_with(value: int) -> np.ndarray:
-        changed = np.repeat(log_rates[:, None], len(own), axis=1)
-        for sign, given in ((-1, own), (1, np.full(len(own), value))):
-            changed += sign * _LOG_STEPS[:, _kind_of_step(last, given)]
-            for count, next_label in ((good, 0), (false, 1)):
-                changed += sign * count * _LOG_STEPS[:, _kind_of_step(given, np.full(len(own), next_label))]
-        return np.asarray(np.logaddexp.reduce(changed, axis=0))
-
-    odds = (log_with(0) - log_with(1))[which.reshape(-1)]
-    return np.asarray(odds + problem.log_odds[problem.closure])
-
-
-def log_slip_prior(problem: Problem, slipped: np.ndarray) -> float:
-    """Of which segments slipped: Beta–binomial over all steps, and any step of a segment.
-
-    The rate is integrated, so the first slip is dear and later ones are cheaper.
-
-    Args:
-        problem: the graph.
-        slipped: edges.
-    """
-    priors, count, total = problem.priors, len(slipped), problem.total_steps
-    prior = betaln(priors.slip_count + count, priors.slip_steps + total - count)
-    steps = np.maximum(problem.graph.own_steps[slipped], 1.0)
-    return float(prior - betaln(priors.slip_count, priors.slip_steps) + np.log(steps).sum())
-
-
-def log_slip_odds(problem: Problem, steps: np.ndarray, slips: int) -> np.ndarray:
-    """Prior log-odds of segments of ``steps`` ``(n,)`` to have slipped, given that ``slips`` have."""
-    priors = problem.priors
-    rate = (priors.slip_count + slips) / (priors.slip_steps + problem.total_steps)
-    return np.asarray(np.log(rate * np.maximum(steps, 1.0)))
