@@ -57,7 +57,9 @@ class Resumable(Generic[Result]):
         return result
 
     def go_on(self, units: float) -> bool:
-        """Solve until so many units of work are spent, and the factorisation that passes them; whether it has ended.
+        """Solve until so many units of work are spent; whether it has ended.
+
+        A piece of more than what is left waits for the next call, unless this one has done nothing yet.
 
         Raises:
             Exception: what the solve raises, :class:`~rotavg_ros.solver.running.work.Abandoned` among them where
@@ -82,7 +84,7 @@ class _Turns(Generic[Result]):
     def __init__(self, solve: Callable[[], Result]) -> None:
         self._solve = solve
         self._theirs, self._ours = threading.Semaphore(0), threading.Semaphore(0)
-        self._until = 0.0
+        self._begun = self._until = 0.0
         self._is_given_up = False
         self._is_abandoned: Callable[[], bool] = lambda: False
         self._thread: threading.Thread | None = None
@@ -95,7 +97,8 @@ class _Turns(Generic[Result]):
         """Let the other thread run, until it rests or ends."""
         if self.has_ended or self.error is not None:
             return
-        self._until, self._is_abandoned = self.spent + units, abandonment()
+        self._begun, self._is_abandoned = self.spent, abandonment()
+        self._until = self.spent + units
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="rotavg-resumable", daemon=True)
             self._thread.start()
@@ -130,7 +133,8 @@ class _Turns(Generic[Result]):
         return self._is_given_up or self._is_abandoned()
 
     def _rest(self, units: float) -> None:
-        if self.spent >= self._until and threading.current_thread() is self._thread:
+        is_too_much = self.spent > self._begun and self.spent + units > self._until
+        if (is_too_much or self.spent >= self._until) and threading.current_thread() is self._thread:
             with without_workers():
                 self._ours.release()
                 self._theirs.acquire()

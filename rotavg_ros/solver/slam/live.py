@@ -33,7 +33,7 @@ from rotavg_ros.view_graph import ViewGraph
 
 # Of the work that a tick leaves an update has so much while a whole search waits for the rest; of the tick's own new
 # closures' columns have so much.
-_UPDATES, _COLUMNS = 0.5, 0.2
+_UPDATES, _COLUMNS = 0.5, 0.8
 # No more closures than this are reckoned in by the tangent: as many as come while two updates of a large map run. Their
 # covariance is inverted once or twice a tick, 12 ms with translations.
 _MOST = 200

@@ -9,6 +9,7 @@ import torch
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, minimum_spanning_forest
+from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs, agreement_pairs
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract
 from rotavg_ros.solver.slam.noise.gyro_bias import estimate_bias, without_bias
@@ -29,6 +30,8 @@ _CLOSURE_COST = 1e6
 _BIASED_SHARE = 0.5
 _BIAS_GAIN = 0.2
 _BIAS_ROUNDS = 2
+# Units of work of drawing an edge together, and of comparing a closure with its neighbours.
+_EDGE, _CLOSURE = 0.002, 0.008
 # It is not looked for, or not any further, where a cheaper look promises less than such parts of that gain: at most the
 # closures that disagree and are confirmed by a neighbour, and what the first round explains.
 _BIAS_CONFIRMED, _BIAS_EXPLAINED = 0.75, 0.4
@@ -77,6 +80,7 @@ def prepare(graph: ViewGraph) -> Prepared:
 def prepare_as_it_is(graph: ViewGraph) -> Prepared:
     """The same whatever the odometry's bias."""
     closure_graph, forest = draw_together(graph)
+    spend(_CLOSURE * int(closure_graph.is_closure.sum()))
     closure = closure_graph.is_closure
     squared_angle = (rotations.log(closure_graph.residual) ** 2).sum(dim=1).numpy()[closure]
     path_steps = closure_graph.path_steps[closure]
@@ -112,6 +116,7 @@ def _may_be_biased(prepared: Prepared) -> bool:
 
 def draw_together(graph: ViewGraph) -> tuple[ClosureGraph, SpanningForest]:
     """The closure graph, and the forest along which the chains were drawn together; rejected edges take no part."""
+    spend(_EDGE * graph.num_edges)
     usable = graph.label != EdgeLabel.REJECTED
     cost = torch.where(graph.is_odometry, 1.0, _CLOSURE_COST)
     # A rejected edge may only be used where nothing else connects.

@@ -10,6 +10,7 @@ from scipy.special import expit
 from torch import Tensor
 
 from rotavg_ros.solver.algebra.spanning_forest import compose_orientations, shortest_path_forest
+from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.network import SlamCleanNet, closure_features, false_log_odds
@@ -24,6 +25,8 @@ _FALSE_SQUARE = np.pi**2 / 3 + 2
 # evidence, and the less the more closures are false, since agreement by chance is then as common as by truth.
 _NETWORK_SHARE = 0.6
 _MAX_NETWORK_LOG_ODDS = 4.0
+# Units of work for each closure that the network judges.
+_JUDGED = 0.013
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,7 @@ def judge_closures(
     by_chain = judge_by_chain(noise, squared_angle, path_steps) + noise.prior_log_odds
     if network is None or len(by_chain) == 0:
         return by_chain, np.zeros(len(by_chain))
+    spend(_JUDGED * len(by_chain))
     by_network = -false_log_odds(network, closure_features(noise, squared_angle, path_steps, pairs)).double().numpy()
     bounded = np.clip(by_network, -_MAX_NETWORK_LOG_ODDS, _MAX_NETWORK_LOG_ODDS)
     return np.minimum(by_chain, by_network), _NETWORK_SHARE * (1 - noise.outlier_share) * bounded

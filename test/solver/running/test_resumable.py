@@ -53,6 +53,21 @@ def test_it_does_so_much_at_a_time_and_ends_where_it_would_at_once() -> None:
     assert solve.go_on(1.0)  # and stays so
 
 
+def test_a_piece_that_does_not_fit_waits_unless_nothing_else_was_done() -> None:
+    seen: list[float] = []
+
+    def pieces() -> None:
+        for units in (3.0, 6.0, 20.0, 1.0):
+            spend(units)
+            seen.append(units)
+
+    solve, spent = Resumable(pieces), []
+    while not solve.go_on(10.0):
+        spent.append(solve.spent)
+    assert spent == [9.0, 29.0]
+    assert seen == [3.0, 6.0, 20.0, 1.0]
+
+
 def test_between_turns_nothing_of_it_runs() -> None:
     seen: list[int] = []
     solve = Resumable(lambda: counting(1000, seen))

@@ -24,7 +24,7 @@ from rotavg_ros.solver.algebra.sparse.block_rows import (
 from rotavg_ros.solver.algebra.sparse.elimination import Elimination
 from rotavg_ros.solver.algebra.sparse.multifrontal import Cholesky
 from rotavg_ros.solver.running.cached import cached_property
-from rotavg_ros.solver.running.work import rest, spend, stop_if_abandoned
+from rotavg_ros.solver.running.work import spend, stop_if_abandoned
 
 _NUM_SAMPLES, _SEED = 48, 0
 # What a solve of one column costs, in what the factor does.
@@ -36,6 +36,8 @@ _NEXT_TO_NOTHING, _WORTH_LEAVING_OUT = 1e-8, 200
 # does.
 _LEAST, _NEARLY = 1e-9, 1e-4
 _NOWHERE = -1
+# Units of work for each row, of where its products stand and what they are.
+_ROW = 0.001
 
 
 class BlockEquations:
@@ -80,7 +82,7 @@ class BlockEquations:
         """
         stop_if_abandoned()
         pattern = self._pattern_of(jacobian)
-        rest()
+        spend(_ROW * len(jacobian))
         entries = normal_matrix(
             np.ascontiguousarray(jacobian[pattern.kept]),
             pattern.place[pattern.kept],
@@ -150,7 +152,7 @@ class _Pattern:
         first, second = first[pair], second[pair]
         self.elimination = Elimination(first, second, num_blocks, d)
         self.rank = self.elimination.rank
-        rest()
+        spend(_ROW * len(blocks))
         lower = np.minimum(self.rank[first], self.rank[second])
         upper = np.maximum(self.rank[first], self.rank[second])
         slot = np.full(9 * len(blocks), _NOWHERE)
@@ -185,9 +187,9 @@ class BlockFactor:
     def fit(self, whitened: np.ndarray) -> np.ndarray:
         """Unknowns ``(blocks, d, n)`` that explain whitened rows ``(E + R, d, n)`` best."""
         place, elimination = self._pattern.place, self._factor.elimination
-        spend(_SOLVED * whitened.shape[2] * elimination.units)
+        units = _SOLVED * whitened.shape[2] * elimination.units
         right = gradient(self._jacobian, place, np.ascontiguousarray(whitened), elimination.num_blocks)
-        return self._by_block(self._factor.solve(right.reshape(-1, whitened.shape[2])))
+        return self._by_block(self._factor.solve(right.reshape(-1, whitened.shape[2]), units))
 
     def _by_block(self, ordered: np.ndarray) -> np.ndarray:
         """``(blocks, d, n)``, in which block v stood at its rank."""
@@ -221,9 +223,9 @@ class BlockFactor:
         """``(blocks, d, 48)`` drawn from N(0, H⁻¹), in the order of elimination."""
         elimination = self._factor.elimination
         shape = elimination.num_blocks, elimination.size, _NUM_SAMPLES
-        spend(_SOLVED * _NUM_SAMPLES * elimination.units / 2)
+        units = _SOLVED * _NUM_SAMPLES * elimination.units / 2
         drawn = np.random.default_rng(_SEED).standard_normal(shape)
-        return self._factor.ended(drawn.reshape(-1, _NUM_SAMPLES)).reshape(shape)
+        return self._factor.ended(drawn.reshape(-1, _NUM_SAMPLES), units).reshape(shape)
 
     def covariance(self, jacobian: np.ndarray, row: np.ndarray) -> np.ndarray:
         """``(n, d, d)`` of J x, x ~ N(0, H⁻¹), J ``(n, d, 3 d)`` of the blocks of rows ``(n,)``."""

@@ -17,7 +17,7 @@ from rotavg_ros.solver.algebra.sparse import merging
 from rotavg_ros.solver.algebra.sparse.elimination_tree import elimination_tree, factor_rows
 from rotavg_ros.solver.algebra.sparse.merging import Fronts, merged
 from rotavg_ros.solver.algebra.sparse.sparse_factor import order_of_little_fill
-from rotavg_ros.solver.running.work import rest
+from rotavg_ros.solver.running.work import spend
 
 # Seconds to a unit: as long as one takes of a solve by rotations alone, with all that is done around it.
 _UNIT_S = 5e-4
@@ -25,6 +25,8 @@ _UNIT_S = 5e-4
 _REST_S = 1e-3
 # What begins a matrix of its own lies at a multiple of so many numbers: products come out alike to the last bit.
 _ALIGNED = 8
+# Units of work for each block, of each part of the pattern.
+_BLOCK = 0.004
 
 
 class Shape(NamedTuple):
@@ -86,16 +88,17 @@ class Elimination:
 
     def __init__(self, first: np.ndarray, second: np.ndarray, num_blocks: int, size: int) -> None:
         self.num_blocks, self.size = num_blocks, size
+        spend(_BLOCK * num_blocks)
         order = order_of_little_fill(first, second, num_blocks)
-        rest()
+        spend(_BLOCK * num_blocks)
         begin, row = _upper(order[first], order[second], num_blocks)
         above, counts = elimination_tree(begin, row)
         factor_begin = np.append(0, np.cumsum(counts))
         factor_row = factor_rows(begin, row, above, factor_begin)
-        rest()
+        spend(_BLOCK * num_blocks)
         fronts = Fronts(*merged(above, counts, factor_begin, factor_row, size))
         self.rank = fronts.place[order]
-        rest()
+        spend(_BLOCK * num_blocks)
         lower, upper = np.minimum(self.rank[first], self.rank[second]), np.maximum(self.rank[first], self.rank[second])
         self._lay_out(fronts, lower, upper)
 

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 
 from rotavg_ros.solver.algebra.sparse import fronts
-from rotavg_ros.solver.algebra.sparse.elimination import Elimination
+from rotavg_ros.solver.algebra.sparse.elimination import Elimination, Stretch
 from rotavg_ros.solver.algebra.sparse.fronts import Room
 from rotavg_ros.solver.running.cached import cached_property
-from rotavg_ros.solver.running.work import rest, spend, stop_if_abandoned
+from rotavg_ros.solver.running.work import spend, stop_if_abandoned
 
 # Where rounding leaves a large front without a pivot, so much of its largest diagonal is added, and ever more, up to
 # that.
@@ -91,15 +91,15 @@ class Cholesky:
         diagonal = np.repeat(shape.store[:-1], pivots) + number * (np.repeat(pivots + rows, pivots) + 1)
         return 2 * float(np.log(self._store[diagonal]).sum())
 
-    def solve(self, right_hand_side: np.ndarray) -> np.ndarray:
-        """The solution of ``(B d, k)`` columns, blocks in the order of elimination."""
-        return self.ended(self.begun(right_hand_side))
+    def solve(self, right_hand_side: np.ndarray, units: float = 0.0) -> np.ndarray:
+        """The solution of ``(B d, k)`` columns, blocks in the order of elimination; ``units`` as :meth:`ended` has."""
+        return self.ended(self.begun(right_hand_side, units / 2), units / 2)
 
-    def begun(self, right_hand_side: np.ndarray) -> np.ndarray:
-        """U⁻ᵀ of columns ``(B d, k)``; where they have numbers and in fronts above those."""
+    def begun(self, right_hand_side: np.ndarray, units: float = 0.0) -> np.ndarray:
+        """U⁻ᵀ of columns ``(B d, k)``; where they have numbers and in fronts above those. ``units`` as below."""
         shape, columns = self.elimination.shape, np.array(right_hand_side, order="C")
         for stretch in self.elimination.stretches:
-            rest()
+            self._spend(units, stretch)
             if not stretch.is_dense or columns.shape[1] < _MANY:
                 fronts.solve_lower(shape, stretch.first, stretch.last, self._store, columns)
                 continue
@@ -110,11 +110,16 @@ class Cholesky:
                 columns[row] -= (beside.T @ own).numpy()
         return columns
 
-    def ended(self, half: np.ndarray) -> np.ndarray:
-        """U⁻¹ of columns ``(B d, k)``."""
+    def ended(self, half: np.ndarray, units: float = 0.0) -> np.ndarray:
+        """U⁻¹ of columns ``(B d, k)``.
+
+        Args:
+            half: the columns.
+            units: of work that this is, spent stretch by stretch; 0: somebody counts them elsewhere.
+        """
         shape, columns = self.elimination.shape, np.array(half, order="C")
         for stretch in reversed(self.elimination.stretches):
-            rest()
+            self._spend(units, stretch)
             if not stretch.is_dense or columns.shape[1] < _MANY:
                 fronts.solve_upper(shape, stretch.first, stretch.last, self._store, columns)
                 continue
@@ -123,6 +128,10 @@ class Cholesky:
             told = torch.addmm(own, beside, torch.from_numpy(columns[row]), alpha=-1.0)
             own.copy_(torch.linalg.solve_triangular(upper, told, upper=True))
         return columns
+
+    def _spend(self, units: float, stretch: Stretch) -> None:
+        """A stretch's part of what is done with all of them; it may rest in any case."""
+        spend(units * stretch.units / self.elimination.units)
 
     def _dense(self, front: int) -> tuple[torch.Tensor, torch.Tensor, slice, np.ndarray]:
         """U of a front's pivots and of its rows, and where in a column these stand."""

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
+from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.posterior.bias import Bias
@@ -25,6 +26,8 @@ from rotavg_ros.view_graph import ViewGraph
 
 # A bias is made better so many times at most, as long as F falls by more than this, nats.
 _BIAS_ROUNDS, _LEAST_GAIN = 3, 0.5
+# Units of work for each edge of what a problem is told beforehand.
+_EDGE = 0.002
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ class Drawn:
         corrected = graph if bias is None else without_bias(graph, bias)
         prepared = prepare_as_it_is(corrected)
         cleaned = clean(network, prepared, graph.label)
+        spend(_EDGE * graph.num_edges)
         of_bias = None if bias is None else Bias.of(corrected, prepared, bias)
         turned = _turned(corrected, prepared)
         problem = Problem.of(

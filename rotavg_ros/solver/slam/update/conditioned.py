@@ -18,8 +18,7 @@ from scipy.special import expit
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.products import product
-from rotavg_ros.solver.running.work import count as count_units
-from rotavg_ros.solver.running.work import rest
+from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.poses.memory import ACROSS, WALK
 from rotavg_ros.solver.slam.posterior.densities import log_false
@@ -90,8 +89,7 @@ def conditioned(
     known = len(columns.edge)
     for first in range(known, min(known + most, len(edge)), _AT_ONCE):
         some = slice(first, min(first + _AT_ONCE, known + most))
-        count_units(linear.column_work * linear.size * len(edge[some]))
-        rest()
+        spend(linear.column_work * linear.size * len(edge[some]))
         columns = columns.and_of(linear, edge[some], system.columns(some))
     columns = columns.with_anchors(linear, system.anchors)
     count = len(columns.edge)

@@ -41,9 +41,8 @@ from rotavg_ros.view_graph import ViewGraph
 # new ones more than the second; with any new one where other answers were nearly as likely.
 _MAX_UNEXPLAINED, _MAX_GROWTH = 0.05, 0.25
 _FLAGGED = 0.5
-# Units of work for each edge, of each third of what an update does beside factorisations: drawing together, FineNet,
-# what is published.
-_EDGE = 0.01
+# Units of work for each edge, of each part of what an update does beside all that others count.
+_EDGE = 0.002
 # In the place of labels that are not known; more than any.
 _NEW = 2.0
 _GOOD = 0.5
@@ -184,24 +183,25 @@ class SlamMemory:
             networks: CleanNet and FineNet, which is applied once.
             body_from_world: ``(N, 4)`` start, where a closure is new.
         """
-        spend(_EDGE * graph.num_edges)
         drawn = Drawn.of(graph, networks[0], bias=self.bias)
         problem = drawn.problem
+        spend(_EDGE * graph.num_edges)
         before = carried_over(self.trusted, problem.graph, _NEW)
         is_new = before == _NEW
         correction = problem.graph.corrections(body_from_world).numpy().T
         common = np.zeros((problem.system(self.noise).num_runs, 3))
         trusted, others = np.minimum(before, 1.0), Others.before_any(len(before))
         start = State(np.ascontiguousarray(correction), common, trusted, self.noise, others)
+        spend(_EDGE * graph.num_edges)
         start = replace(start, trusted=np.where(is_new, relabelled(problem, start), before))
         search = Search(problem)
         mode = search.polished(start, "update")
         if self.poses is None:  # else places have a say in it
             mode = search.flipped(mode)
-        spend(_EDGE * graph.num_edges)
         fine = fine_tuned(mode, networks[1], passes=1)
+        published = publish(problem, [fine])
         spend(_EDGE * graph.num_edges)
-        estimate = estimate_of(publish(problem, [fine]))
+        estimate = estimate_of(published)
         memory = replace(
             self,
             graph=graph,

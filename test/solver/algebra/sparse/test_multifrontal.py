@@ -153,6 +153,13 @@ def test_it_can_be_left_between_fronts_and_its_work_is_counted() -> None:
     assert meter.spent == pytest.approx(elimination.units) == pytest.approx(sum(left))
     right = rng.normal(size=(2700, 1))
     np.testing.assert_array_equal(rested.solve(right), Cholesky(elimination, entries).solve(right))
+    # What it is said to cost is spent where it is done, none of it before.
+    told: list[float] = []
+    with resting(told.append):
+        rested.solve(right, 100.0)
+    assert sum(told) == pytest.approx(100.0)
+    assert len(told) == 2 * len(elimination.stretches)
+    assert told[0] == pytest.approx(50.0 * elimination.stretches[0].units / elimination.units)
 
 
 def test_a_front_that_rounding_leaves_no_pivot_is_lifted() -> None:

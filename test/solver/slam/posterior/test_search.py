@@ -301,7 +301,8 @@ STRUCTURAL = {
     | {"_OF_RUN", "_BEFORE", "_LOOKED_AT"},
     "left_out": {"CERTAIN"},
     "publishing/gravity": {"_COMPONENTS", "_SOLVES", "_CONVERGED"},
-    "publishing/modes": {"_FAR", "_FAR_NOISE", "LIKELY", "FAR_TURN", "FAR_SLIP", "_SURELY_FALSE", "_ROUNDS"},
+    "publishing/modes": {"_FAR", "_FAR_NOISE", "LIKELY", "FAR_TURN", "FAR_SLIP", "_SURELY_FALSE", "_ROUNDS"}
+    | {"_SCORED"},
     "moves/flips": {"_PART", "_DECIDED", "_HOPE", "_LEAST_GAIN"},
     "mode": {"OTHER_NOISE", "_LIKELY", "_SAME", "_MAX_DENSE"},
     "moves/jumps": {"_MAX_ROUNDS", "_MAX_CANDIDATES", "_MIN_GAIN", "_MIN_CARRIED"},
@@ -317,7 +318,7 @@ STRUCTURAL = {
     "objective": {"_UNKNOWN"},
     "problem": {"_NONE", "_SAME_TURNS"},
     "rows": {"_NOTHING", "_MAX_TURN", "_LEAST_REST"},
-    "solve": {"Begin", "_BIAS_ROUNDS", "_LEAST_GAIN"},
+    "solve": {"Begin", "_BIAS_ROUNDS", "_LEAST_GAIN", "_EDGE"},
     "state": {"EXPONENTS", "COMMON_SHARES", "RUN_STEPS", "TURN_SHARES", "TAIL_SHARES", "STEP_TAIL_RATIOS"},
     "system": {"_MAX_LEVERAGE", "_NO_WEIGHT", "_MAX_PATTERNS", "_LACKING", "_MORE"},
 }

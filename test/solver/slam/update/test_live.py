@@ -17,12 +17,18 @@ from rotavg_ros.solver import Solution, advance, solve
 from rotavg_ros.solver.estimate import Run, Stopwatch
 from rotavg_ros.solver.neurora.network_store import Networks
 from rotavg_ros.solver.running.resumable import Resumable
-from rotavg_ros.solver.running.work import Abandoned, abandonable, metered
+from rotavg_ros.solver.running.work import Abandoned, abandonable, metered, resting
+from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
+from rotavg_ros.solver.slam.fine_net.tuning import fine_tuned
+from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.options import SlamStages
+from rotavg_ros.solver.slam.poses.solve import poses_of_update
+from rotavg_ros.solver.slam.posterior.solve import Drawn
 from rotavg_ros.solver.slam.solve import whole
 from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
+from .test_conditioned import drawn as simulated
 from .test_memory import drawn, error_deg, grown, until
 
 # Less than an update takes: each tick lays on what is new.
@@ -55,6 +61,31 @@ def test_little_by_little_it_ends_where_it_does_at_once() -> None:
     assert ahead.spent == pytest.approx(meter.spent)
     assert torch.equal(ahead.result.body_from_world, at_once.body_from_world)
     assert torch.equal(ahead.result.outlier_score, at_once.outlier_score)
+
+
+@torch.no_grad()
+def test_all_that_an_update_does_is_counted_where_it_is_done() -> None:
+    """A piece that takes part of a second on a large map and says nothing would be done beside a whole ration."""
+    graph, _ = simulated(translations=True, planar=True)
+    solution, networks = solve(until(graph, graph.num_nodes - 10), profile="slam"), Networks("cpu")
+    memory, pieces = remembered(solution), list[float]()
+    clean_net, fine_net = networks.load(SlamCleanNet), networks.load(SlamFineNet)
+    with resting(pieces.append):
+        Drawn.of(graph, clean_net)
+    # Odometry, neighbours, CleanNet, the rest.
+    assert len(pieces) == 4 and min(pieces) > 0.0
+    assert max(pieces) < 0.6 * sum(pieces)
+    found = memory.updated(graph, (clean_net, fine_net), grown(graph, solution))
+    assert memory.poses is not None
+    pieces.clear()
+    with resting(pieces.append):
+        assert poses_of_update(graph, found.mode, memory.poses) is not None
+    silent = sum(units == 0.0 for units in pieces)
+    assert silent < 0.2 * len(pieces)
+    pieces.clear()
+    with resting(pieces.append):
+        fine_tuned(found.mode, fine_net, passes=1)
+    assert pieces[0] > 0.0 and pieces[1] > 0.0
 
 
 def test_ticks_answer_at_once_and_the_rest_leads_to_the_same_answer() -> None:

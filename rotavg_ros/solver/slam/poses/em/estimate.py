@@ -14,7 +14,7 @@ import numpy as np
 
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.sparse.block_system import BlockFactor
-from rotavg_ros.solver.running.work import rest, spend
+from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.poses.closures import ANYHOW, Places, Predictions, Scale
 from rotavg_ros.solver.slam.poses.em.convergence import (
     HELD,
@@ -36,8 +36,8 @@ from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.solved import PoseMode, Solved
 from rotavg_ros.solver.slam.poses.state import PoseState
 
-# Units of work for each row, of each third of what is done beside the factorisation.
-_ROW = 0.012
+# Units of work for each row, of each part of what is done beside the factorisation.
+_ROW = 0.001
 # A step turns nothing by more than this, rad.
 _MAX_TURN = 0.3
 # With which variances of shifts it is begun otherwise.
@@ -76,11 +76,11 @@ def estimate_poses(
         solved = _solve(problem, state, places, judge)
         if number == 0:
             first = _log_likely(problem, solved)
-        rest()
+        spend(_ROW * len(solved.left))
         chance, sorted_by = damped(solved.places.chance, places.chance, sorted_by)
         after, pace = pace.towards(replace(solved.places, chance=chance), places, is_new & (number == 0))
         noise = likeliest_noise(problem, solved).logarithms
-        rest()
+        spend(_ROW * len(solved.left))
         is_at_rest = poses_rest(solved.moved, after, places)
         number += 1
         if is_at_rest:
@@ -108,7 +108,7 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
     turn_variances = problem.turn_variances(state.noise)
     rotation_weight = 1 / turn_variances
     rotation_weight[closure] = places.rotation_weight[:, None]
-    rest()
+    spend(_ROW * len(turn_variances))
     root = problem.whitening(covariance, rotation_weight, places.weight, state)
     jacobian = np.matmul(root, problem.jacobian(way))
     factor = problem.equations.factorise(jacobian, problem.root_weight(rotation_weight, state))

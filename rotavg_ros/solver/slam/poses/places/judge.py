@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit
 
-from rotavg_ros.solver.running.work import rest
+from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.poses.closures import GOOD, REPEATS, Places, Predictions, Scale, Told, log_from_behind
 from rotavg_ros.solver.slam.poses.places import pulls
 from rotavg_ros.solver.slam.poses.places.classes import BY_ITSELF, WRONG, Said, log_sum
@@ -27,6 +27,8 @@ _LOG_NOTHING = -1e6
 _LEAST_CHANCE, _SHARE = 1e-9, 0.01
 # Who is good, or false, with less than this chance becomes so by itself before others tell of it.
 _UNLIKELY = 1e-3
+# Units of work for each closure, of each part of what is asked.
+_CLOSURE = 0.007
 
 
 @dataclass(frozen=True)
@@ -59,11 +61,12 @@ class Judge:
         """
         told, known = self.told, self.told.is_known
         said = Said.of(predictions, told, self.turns, scale, self.priors)
-        rest()
+        spend(_CLOSURE * len(known))
         log_class = said.log_turn + said.log_shift
         alone = log_sum(log_class[BY_ITSELF]) - np.log(WRONG)
+        spend(2 * _CLOSURE * len(known))
         repeats = self._repeats(said, maps, before, alone, in_order=in_order)
-        rest()
+        spend(_CLOSURE * len(known))
         in_turn, share = InTurn(told.detection, told.run, in_order), wrong_share(before, told, self.priors)
         wrong = before[GOOD:-1].sum(axis=0)
         likely = shared_ways(repeats.elsewhere, np.ones(repeats.elsewhere.shape[1]), before[REPEATS], in_turn)
@@ -127,7 +130,7 @@ class Judge:
         by_itself, wrong = np.logaddexp(log_wrong, log_right), before[-1] * expit(log_wrong - log_right)
         could_be = self._could_be(before[-1], 0)
         has_turned, turned = maps.repeats(wrong, by_itself, told, could_be, in_order=in_turn.by_those_before)
-        rest()
+        spend(_CLOSURE * len(repeats.turned))
         # The same wrong places as before, or as all that are off by the same turn of the map.
         ways = np.concatenate((repeats.turned, repeats.has_turned[:, None] * turned), axis=1)
         with np.errstate(divide="ignore"):

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros.solver.algebra import quaternion_rows
-from rotavg_ros.solver.running.work import rest
+from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.posterior.em import step
 from rotavg_ros.solver.slam.posterior.left_out import leave_one_out, scores
@@ -28,6 +28,8 @@ FAR_SLIP = np.radians(10.0)
 # What is less likely good than this does not pull at all.
 _SURELY_FALSE = 0.05
 _ROUNDS = 2
+# Units of work for each edge that is scored.
+_SCORED = 0.0015
 
 
 @dataclass(frozen=True)
@@ -182,7 +184,7 @@ def of_mode(mode: Mode) -> Published:
     problem, state, left_out = mode.problem, mode.state, mode.left_out
     is_decided, decided = np.isinf(problem.log_odds) | problem.graph.is_odometry, state.is_good
     for number in range(_ROUNDS):
-        rest()
+        spend(_SCORED * len(state.trusted))
         score, trust = scores(problem, state, left_out)
         if number > 0:  # closures that answer each other would swing from round to round
             trust = (trust + state.trusted) / 2
@@ -191,6 +193,7 @@ def of_mode(mode: Mode) -> Published:
         state, _, _, factorised = step(problem, replace(state, trusted=trusted))
         if number < _ROUNDS - 1:
             left_out = leave_one_out(problem, state, factorised)
+    spend(_SCORED * len(state.trusted))
     graph, held = problem.drawn(state.noise), held_by_gravity(problem, state, factorised)
     variance = graph.variance(held.variance, held.apart, held.step_variance)
     return Published(graph, held.state.correction, score, variance, state.noise, 0, (1.0,))
