@@ -23,7 +23,7 @@ from queue import SimpleQueue
 
 import numpy as np
 from scipy.sparse import coo_array, csc_array
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import SuperLU, spilu, splu
 
 # What is tied to nothing by itself, beside ties of one: enough for any order of elimination, too little to let fill
 # that lies far apart vanish.
@@ -48,8 +48,26 @@ def tied_matrix(first: np.ndarray, second: np.ndarray, size: int) -> csc_array:
 
 
 def order_of_little_fill(first: np.ndarray, second: np.ndarray, size: int) -> np.ndarray:
-    """``(N,)`` where each unknown stands in an order of elimination of minimum degree, for such ties."""
-    return SparseFactor(tied_matrix(first, second, size), is_ordered=False).rank
+    """``(N,)`` where each unknown stands in an order of elimination of minimum degree, for such ties.
+
+    SuperLU tells it of a factor alone. It is chosen before anything is eliminated, so a factor that drops all fill has
+    the same, and takes a tenth of the time where much fills in.
+    """
+    found: list[np.ndarray] = []
+    _keeper.wait_for(partial(_put_in_order, found, tied_matrix(first, second, size)))
+    return found[0]
+
+
+def _put_in_order(found: list[np.ndarray], matrix: csc_array) -> None:
+    factor = spilu(
+        matrix,
+        drop_tol=1.0,
+        fill_factor=1.0,
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    found.append(factor.perm_c.astype(np.int64))
 
 
 class SparseFactor:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_array, eye_array, random_array
 
-from rotavg_ros.solver.algebra.sparse.sparse_factor import SparseFactor
+from rotavg_ros.solver.algebra.sparse.sparse_factor import SparseFactor, order_of_little_fill, tied_matrix
 
 
 def _matrix(size: int, density: float) -> csc_array:
@@ -85,7 +85,7 @@ _SCRIPT = """
 import os, threading
 import numpy as np
 from scipy.sparse import csc_array, eye_array
-from rotavg_ros.solver.algebra.sparse.sparse_factor import SparseFactor
+from rotavg_ros.solver.algebra.sparse.sparse_factor import SparseFactor, order_of_little_fill, tied_matrix
 
 factor = SparseFactor(csc_array(2.0 * eye_array(5)), is_ordered=True)
 child = os.fork()
@@ -113,3 +113,12 @@ def test_it_stays_what_it_was_when_the_matrix_gets_other_values() -> None:
     matrix.data = 2 * matrix.data
     factor.let_go()
     np.testing.assert_array_equal(factor.solve(np.ones(5)), before)
+
+
+def test_an_order_of_little_fill_is_that_of_the_whole_factor() -> None:
+    rng = np.random.default_rng(0)
+    for size, far in ((1, 0), (2, 1), (50, 20), (400, 600)):
+        chain = np.arange(size - 1)
+        first, second = np.concatenate((np.stack((chain, chain + 1)), rng.integers(0, size, (2, far))), axis=1)
+        whole = SparseFactor(tied_matrix(first, second, size), is_ordered=False)
+        np.testing.assert_array_equal(order_of_little_fill(first, second, size), whole.rank)
