@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -153,7 +153,12 @@ class GrowingViewGraph:
         return self.marginalized.is_forgotten(self._robot_index.get(robot, -1), keyframe_id)
 
     def compact(
-        self, surplus_keyframes: int, surplus_edges: int, is_false: NDArray[np.bool_], max_marginalized: int
+        self,
+        surplus_keyframes: int,
+        surplus_edges: int,
+        is_false: NDArray[np.bool_],
+        max_marginalized: int,
+        needed: Sequence[int],
     ) -> Renumbering | None:
         """Do without so many keyframes and edges, as :func:`thin` chooses them; None if nothing can be spared.
 
@@ -161,12 +166,15 @@ class GrowingViewGraph:
             surplus_keyframes, surplus_edges: how many.
             is_false: edges judged to be outliers, of the first M' ≤ M.
             max_marginalized: keyframes beyond it that were marginalised are forgotten.
+            needed: nodes that stay, beside the robots' latest.
         """
         keyframes: Columns = {name: column.view for name, column in self._keyframe.items()}
         edges: Columns = {name: column.view for name, column in self._edge.items()}
         false = np.zeros(self.num_edges, dtype=bool)
         false[: len(is_false)] = is_false
-        thinning = thin(self.num_keyframes, edges, false, self._latest(), surplus_keyframes, surplus_edges)
+        protected = self._latest()
+        protected[list(needed)] = True
+        thinning = thin(self.num_keyframes, edges, false, protected, surplus_keyframes, surplus_edges)
         if not thinning.nodes.any() and not thinning.edges.any():
             return None
         stays = np.flatnonzero(~thinning.edges)

@@ -72,9 +72,15 @@ class Growth:
         return self.graph.num_edges < self.options.most_edges
 
     def _make_room(self) -> None:
-        if self.room.make(self.graph, self.options.max_keyframes, self.options.most_edges, self.answer):
+        limits = self.options.max_keyframes, self.options.most_edges
+        if self.room.make(self.graph, *limits, self.answer, self._gone_on_from()):
             for robot, track in self.tracks.items():
                 track.samples.release_keyframes(*self.graph.moments(robot))
+
+    def _gone_on_from(self) -> list[int]:
+        """Nodes that odometry's next keyframes will be tied to; edges may have named them long before odometry came."""
+        last = ((robot, track.num_keyframes - 1) for robot, track in self.tracks.items() if track.last_keyframe)
+        return [node for key in last if (node := self.graph.node(*key)) is not None]
 
     def time_line_of(self, robot: str, stamp_ns: int | None) -> int:
         """Number of the robot's time line that a stamp means, see :meth:`OdometrySamples.time_line_of`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -53,8 +54,17 @@ class Room:
         """The limits have changed."""
         self.compact_from_revision = [0, 0]
 
-    def make(self, graph: GrowingViewGraph, max_keyframes: int, max_edges: int, answer: GraphsAnswer) -> bool:
-        """Take keyframes and closures that can be spared out of a full graph; whether there were any."""
+    def make(
+        self, graph: GrowingViewGraph, max_keyframes: int, max_edges: int, answer: GraphsAnswer, needed: Sequence[int]
+    ) -> bool:
+        """Take keyframes and closures that can be spared out of a full graph; whether there were any.
+
+        Args:
+            graph: perhaps full.
+            max_keyframes, max_edges: what it may have.
+            answer: to it.
+            needed: nodes that cannot be spared, whatever their place among the robots' keyframes.
+        """
         sizes, limits = (graph.num_keyframes, graph.num_edges), (max_keyframes, max_edges)
         surplus = [
             size - int(_FILL * limit) if size >= limit and graph.revision >= from_revision else 0
@@ -63,7 +73,7 @@ class Room:
         if not any(surplus):
             return False
         remembered = max(_REMEMBERED * max_keyframes, _REMEMBERED_AT_LEAST)
-        renumbering = graph.compact(surplus[0], surplus[1], answer.outlier, remembered)
+        renumbering = graph.compact(surplus[0], surplus[1], answer.outlier, remembered, needed)
         gained = sizes[0] - graph.num_keyframes, sizes[1] - graph.num_edges
         for index, limit in enumerate(limits):
             if surplus[index] and gained[index] < max(1, _WORTHWHILE * limit):

@@ -236,3 +236,16 @@ def test_fingerprints_hold_the_newest_and_forget_the_oldest():
         known.add(number)
         again.add(number)
         assert (numbers[-5_000] in again) == (numbers[-5_000] in known)
+
+
+def test_odometry_goes_on_from_a_keyframe_that_edges_named_long_before_it_came(solver):
+    """It is not among the latest then, and may lie between two edges of odometry."""
+    options = replace(EVERY_MESSAGE, unknown_keyframes="create", max_keyframes=40)
+    estimator = OnlineEstimator(options, solver)
+    for keyframe_id in range(30, 45):
+        ends = KeyframeReference("a", keyframe_id), KeyframeReference("a", keyframe_id + 1000)
+        estimator.add_edge(EdgeMeasurement(keyframe_id, *ends, (0, 0, 0, 1), EdgeKind.ODOMETRY))
+    Drive(estimator, 60).go(60)
+    assert estimator.counts().marginalized > 40
+    graph = estimator.snapshot()
+    assert len(graph.keyframe_id) <= 40 and {59} <= set(graph.keyframe_id[graph.keyframe_robot == 0].tolist())
