@@ -308,7 +308,7 @@ def _axes(source: Tensor, target: Tensor, rows: Tensor, component: Tensor) -> Te
 def evenly_spread(group: Tensor, num_groups: int, largest: int) -> Tensor:
     """Indices of members, evenly spread, at most about ``largest`` of each group ``(M,)``."""
     if num_groups == 1:
-        return torch.arange(0, len(group), 1 + (len(group) - 1) // largest, device=group.device)
+        return torch.arange(0, len(group), 1 + max(0, len(group) - 1) // largest, device=group.device)
     order = group.sort(stable=True).indices
     count = torch.bincount(group, minlength=num_groups)
     ordered = group[order]

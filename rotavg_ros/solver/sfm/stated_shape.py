@@ -104,6 +104,8 @@ def believed_units(
         return None
     shapes = _Shapes.of(information, is_known, shape.least_ratio)
     known = (is_known & is_telling(residuals.lengths, priors)).nonzero().squeeze(1)
+    if len(known) == 0:
+        return None
     chosen = known[evenly_spread(residuals.component[known], len(residuals.redundancy), priors.max_sample)]
     sampled = _Shapes(shapes.axes[chosen], shapes.log_variance[chosen])
     edges = torch.bincount(residuals.component, minlength=len(residuals.redundancy)).clamp(min=1)

@@ -110,3 +110,20 @@ def test_copies_state_the_highest_precision_of_any() -> None:
         form = CanonicalForm.of(graph.select_edges(torch.tensor(order)))
         place = form.edge[[order.index(number) for number in (0, 2, 1, 3)]]
         np.testing.assert_array_equal(form.graph.precision[place].numpy(), [5.0, 5.0, np.nan, 3.0])
+
+
+@pytest.mark.parametrize("states_shapes", [False, True])
+def test_where_only_an_edge_that_nothing_checks_states_something_it_tells_nothing(states_shapes: bool) -> None:
+    """A triangle that states nothing, and a bridge to a fourth camera that does."""
+    turns = Rotation.from_rotvec([[0.1, 0, 0], [0, 0.2, 0], [0.3, 0.1, 0], [0, 0, 0.5]]).as_quat()
+    silent = ViewGraph.create([0, 1, 0, 2], [1, 2, 2, 3], turns)
+    if states_shapes:
+        stated = ViewGraph.create(
+            silent.source,
+            silent.target,
+            turns,
+            information=[*[np.full((3, 3), np.nan)] * 3, np.diag([1.0, 4.0, 9.0])],
+        )
+    else:
+        stated = replace(silent, precision=torch.tensor([torch.nan] * 3 + [4.0], dtype=torch.float64))
+    assert torch.equal(solve(stated).body_from_world, solve(silent).body_from_world)
