@@ -157,3 +157,25 @@ def test_wrong_options_are_refused():
     ):
         with pytest.raises(UserError, match=next(iter(change))):
             EstimatorOptions(**change)
+
+
+@pytest.mark.parametrize("max_keyframes", [1000, 8])
+def test_odometry_numbers_its_keyframes_past_those_of_a_front_end(solver, tmp_path, max_keyframes):
+    """A node that is started without ``keyframe_source:=edges`` lays nothing of today on yesterday's keyframes."""
+    options = replace(OPTIONS, keyframe_source="edges", max_keyframes=max_keyframes)
+    yesterday, run = OnlineEstimator(options, solver), drive()
+    for index in range(12):
+        step = run.truth[index + 1].inv() * run.truth[index]
+        ends = (KeyframeReference("r", number, int(run.stamps[number])) for number in (index, index + 1))
+        yesterday.add_edge(EdgeMeasurement(index, *ends, step.as_quat().tolist(), EdgeKind.ODOMETRY))
+    yesterday.save(tmp_path / "state.npz")
+    today = OnlineEstimator(OPTIONS, solver)
+    today.load(tmp_path / "state.npz")
+    feed(today, replace(run, stamps=run.stamps + 1000 * SECOND))
+    before, after = yesterday.snapshot(), today.snapshot()
+    added = after.keyframe_id[len(before.keyframe_id) :]
+    assert len(added) == 14 and len(set(after.keyframe_id.tolist())) == len(after.keyframe_id)
+    assert not set(added.tolist()) & set(range(13))
+    new_edges = slice(len(before.edge_id), None)
+    assert int(after.graph.source[new_edges].min()) == len(before.keyframe_id)
+    assert len(after.edge_id) == len(before.edge_id) + 13

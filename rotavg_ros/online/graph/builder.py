@@ -7,7 +7,13 @@ from rotavg_ros.online.graph.edge_placement import EdgePlacement
 from rotavg_ros.online.graph.growing_view_graph import GrowingViewGraph
 from rotavg_ros.online.graph.growth import Growth
 from rotavg_ros.online.graph.snapshot import GraphEdge
-from rotavg_ros.online.measurements import EdgeMeasurement, OdometryMessage, RejectedInputError, RejectReason
+from rotavg_ros.online.measurements import (
+    UNKNOWN_STAMP_NS,
+    EdgeMeasurement,
+    OdometryMessage,
+    RejectedInputError,
+    RejectReason,
+)
 from rotavg_ros.online.odometry.time_jumps import KEEPS_TIME_LINE
 from rotavg_ros.online.odometry.track import OdometryTrack
 from rotavg_ros.online.options import EstimatorOptions
@@ -136,10 +142,13 @@ class GraphBuilder:
     def _add_keyframe(self, robot: str, track: OdometryTrack) -> None:
         """Make the latest odometry message a keyframe, with an edge from the one before on the same chain."""
         assert track.latest is not None
-        keyframe_id, previous, latest = track.num_keyframes, track.last_keyframe, track.latest
+        previous, latest = track.last_keyframe, track.latest
+        source = self.graph.node(robot, track.num_keyframes - 1)
+        while self._is_anothers(robot, track.num_keyframes, (latest.stamp_ns, track.time_line)):
+            track.num_keyframes += 1
+        keyframe_id = track.num_keyframes
         node = self.graph.add_keyframe(robot, keyframe_id, latest.stamp_ns, track.time_line)
         if previous is not None:
-            source = self.graph.node(robot, keyframe_id - 1)
             assert source is not None
             turn = quaternion.multiply(quaternion.inverse(latest.world_from_body), previous.world_from_body)
             step = difference(latest.position or UNKNOWN_VECTOR, previous.position or UNKNOWN_VECTOR)
@@ -149,3 +158,11 @@ class GraphBuilder:
             )
         track.mark_keyframe()
         self._edges.place_all(self.growth.pending.pop_keyframe(robot, keyframe_id))
+
+    def _is_anothers(self, robot: str, keyframe_id: int, moment: tuple[int, int]) -> bool:
+        """Whether a keyframe of another moment has this id: a front end may have chosen some before odometry did."""
+        node = self.graph.node(robot, keyframe_id)
+        if node is None:
+            return self.graph.lies_on_an_edge(robot, keyframe_id)
+        stamp_ns, _ = known = self.graph.moment_of(node)
+        return stamp_ns != UNKNOWN_STAMP_NS and known != moment

@@ -146,9 +146,13 @@ class GrowingViewGraph:
         qx, qy, qz, qw = rotation.tolist()
         return int(self._edge["source" if at_source else "target"].view[edge]), (qx, qy, qz, qw), (x, y, z)
 
+    def lies_on_an_edge(self, robot: str, keyframe_id: int) -> bool:
+        """Whether it is a marginalised keyframe of which it is known where it was."""
+        return self._marginalized_row(robot, keyframe_id) is not None
+
     def was_marginalized(self, robot: str, keyframe_id: int) -> bool:
         """Whether there was such a keyframe, known or forgotten."""
-        if self._marginalized_row(robot, keyframe_id) is not None:
+        if self.lies_on_an_edge(robot, keyframe_id):
             return True
         return self.marginalized.is_forgotten(self._robot_index.get(robot, -1), keyframe_id)
 

@@ -36,6 +36,7 @@ class OdometryTrack:
         chain: number of the latest message's chain, from 0.
         time_line: number of the latest message's time line, from 0.
         anchors: world_from_odometry, one for every chain but the first, where whoever knows the world has set it.
+        num_keyframes: number of the next keyframe; how many there are, where no other's bear a number between.
     """
 
     def __init__(self, bounds: OdometryBounds, limits: ContinuityLimits = ANY_MOTION) -> None:
