@@ -24,6 +24,8 @@ class PlotError(UserError):
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw."""
+    if arguments.output is not None and arguments.output.is_dir():
+        raise PlotError(f"{arguments.output}: is a folder; give --output a picture's name in it, such as noise.png")
     return _run_training(arguments) if arguments.kind == "training" else _run_statistics(arguments)
 
 

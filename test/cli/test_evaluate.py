@@ -157,6 +157,19 @@ def test_plot_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert main(["plot", "training", str(tmp_path / "none"), "--output", str(picture)]) == 2
 
 
+@pytest.mark.parametrize("kind", ["statistics", "training"])
+@pytest.mark.parametrize("folder", [".", "/", "pictures"])
+def test_a_picture_is_no_folder(kind: str, folder: str, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("pictures").mkdir()
+    Path("graph.g2o").write_text("EDGE_SE2 0 1 1 0 0.1 1 0 0 1 0 1\n")
+    Path("log").write_text("".join(f'{{"epoch": {epoch}, "validation_objective": 1}}\n' for epoch in range(5)))
+    read = {"statistics": "graph.g2o", "training": "log"}[kind]
+    assert main(["plot", kind, read, "--output", folder]) == 2
+    assert f"rotavg: error: {folder}: is a folder; give --output a picture's name" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"pictures", "graph.g2o", "log"}
+
+
 def test_rgbd(tmp_path: Path) -> None:
     """Two folds of two scenes each; what is trained differs from the package's networks, which run beside it."""
     folder = tmp_path / "rgbd" / "redwood_fgr"
