@@ -47,7 +47,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise OwnRobotError(f"{tried}: is there from before; remove it or choose another --output")
     make_folder(tried)
     plain = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(family).items()}
-    (tried / "robots.yaml").write_text(yaml.safe_dump({"robots": plain}, sort_keys=False))
+    configuration = {"family": "slam", "recipe": "robots", "robots": plain}
+    (tried / "robots.yaml").write_text(yaml.safe_dump(configuration, sort_keys=False))
     network = fine_tune(family, noises, tried, arguments.minutes, lambda line: print(line, flush=True))
     with working("comparing on stretches that are held back"):
         verdict = compare(runs, network)

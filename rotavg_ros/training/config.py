@@ -82,7 +82,7 @@ class TrainingConfig:
             if not 10 <= low <= high:
                 raise TrainingConfigError(f"{name} is [{low}, {high}]; use an ascending pair of at least 10")
         if self.robots is not None and self.recipe != "robots":
-            raise TrainingConfigError("robots is for `recipe: robots` of the family slam; add that line")
+            raise TrainingConfigError("robots is for `family: slam` and `recipe: robots`; add these two lines")
         if self.warmup_epochs < 0:
             raise TrainingConfigError(f"warmup_epochs is {self.warmup_epochs}; it must not be negative")
         if not 0 < self.learning_rate < math.inf:

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import yaml
 
 from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.files.formats import write_graph
@@ -18,6 +17,7 @@ from rotavg_ros.datasets.simulation.stress.drawn import DrawnGraph
 from rotavg_ros.datasets.simulation.stress.family import RobotFamily
 from rotavg_ros.solver.learning.robot_runs import RobotNoise
 from rotavg_ros.training import own_robot
+from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.own_robot import Verdict, family_of
 
 NOISE = RobotNoise(
@@ -72,8 +72,8 @@ def test_a_network_is_kept_only_if_it_is_better(
     assert Path("robot/slam-fine-net.safetensors").exists() == is_better
     verdict = json.loads(Path("robot/verdict.json").read_text())
     assert verdict["kept"] == is_better and verdict["stretches"] > 1
-    family = RobotFamily.of(yaml.safe_load(Path("robot/tried/robots.yaml").read_text())["robots"])
-    assert family.planar_share == 1.0
+    family = TrainingConfig.load(Path("robot/tried/robots.yaml")).robots
+    assert family is not None and family.planar_share == 1.0
     if is_better:
         assert main(["solve", "run.g2o", "--weights", "robot", "--output", "out"]) == 0
     assert main(command) == 2

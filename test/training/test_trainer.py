@@ -261,5 +261,5 @@ def test_a_family_survives_a_file(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"robots.yaml: robots: worlds is \['moon'\]; choose some of building"):
         TrainingConfig.load(path)
     path.write_text("family: slam\nrecipe: wide\nrobots:\n  planar_share: 1\n")
-    with pytest.raises(UserError, match="robots is for `recipe: robots`"):
+    with pytest.raises(UserError, match="robots is for `family: slam` and `recipe: robots`"):
         TrainingConfig.load(path)
