@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -251,6 +251,11 @@ def test_a_stated_family_is_what_both_networks_of_robots_see() -> None:
     assert float(false.double().mean()) == pytest.approx(0.3, abs=0.05)
     runs = SlamFineTask(replace(config, graphs=2, validation_graphs=1)).runs
     assert all(run.first.told.components == 1 for run in runs)
+
+
+def test_the_guide_names_all_that_a_family_is_made_of() -> None:
+    guide = (Path(__file__).parents[2] / "docs" / "train-on-your-noise.md").read_text()
+    assert [field.name for field in fields(RobotFamily) if f"`{field.name}`" not in guide] == []
 
 
 def test_a_family_survives_a_file(tmp_path: Path) -> None:
