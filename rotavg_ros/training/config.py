@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -127,7 +128,7 @@ class TrainingConfig:
                 values[key] = None if value is None else _family(value, origin)
                 continue
             try:
-                values[key] = tuple(int(item) for item in value) if kind is tuple else kind(value)
+                values[key] = tuple(_whole(item) for item in value) if kind is tuple else _CONVERSIONS[kind](value)
             except (TypeError, ValueError, OverflowError):
                 raise TrainingConfigError(f"{origin}: {key} is {value!r}, expected like {defaults[key]!r}") from None
             if kind is tuple and len(values[key]) != 2:
@@ -141,6 +142,22 @@ class TrainingConfig:
         """Plain values, as :meth:`from_dict` takes them."""
         plain = {key: value for key, value in asdict(self).items() if key != "robots" or value is not None}
         return {key: _plain(value) for key, value in plain.items()}
+
+
+def _whole(value: Any) -> int:
+    """The number, if it is a whole one; ``int`` would cut a fraction off and take ``true`` for 1."""
+    if isinstance(value, bool) or (isinstance(value, float) and not value.is_integer()):
+        raise ValueError(value)
+    return int(value)
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool):
+        raise ValueError(value)
+    return float(value)
+
+
+_CONVERSIONS: dict[type, Callable[[Any], Any]] = {int: _whole, float: _number, str: str}
 
 
 def _plain(value: Any) -> Any:

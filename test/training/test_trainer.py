@@ -268,3 +268,15 @@ def test_a_family_survives_a_file(tmp_path: Path) -> None:
     path.write_text("family: slam\nrecipe: wide\nrobots:\n  planar_share: 1\n")
     with pytest.raises(UserError, match="robots is for `family: slam` and `recipe: robots`"):
         TrainingConfig.load(path)
+
+
+@pytest.mark.parametrize(
+    "line", ["graphs: 2.5", "epochs: true", "nodes: [10.5, 20]", "learning_rate: true", "graphs: [3]"]
+)
+def test_numbers_are_taken_as_they_are_or_not_at_all(line: str, tmp_path: Path) -> None:
+    path = tmp_path / "robots.yaml"
+    path.write_text(f"{line}\n")
+    with pytest.raises(UserError, match=rf"robots.yaml: {line.split(':')[0]} is .*, expected like"):
+        TrainingConfig.load(path)
+    path.write_text("graphs: 20.0\nlearning_rate: 1\n")  # these say the same
+    assert TrainingConfig.load(path) == TrainingConfig(graphs=20, learning_rate=1.0)
