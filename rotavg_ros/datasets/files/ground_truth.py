@@ -16,6 +16,8 @@ from rotavg_ros.rotations import canonical, inverse
 # Ground truth by stamp belongs to a node only if it is this close in time.
 MAX_STAMP_DISTANCE_NS = 150_000_000
 
+_TOO_LARGE = 1e18  # seconds; 64 bits of nanoseconds end at 9.2e9
+
 _BY_ID_HEADER = b"id,qx,qy,qz,qw"
 
 
@@ -109,7 +111,8 @@ def nanoseconds(path: Path, line: int, seconds: bytes) -> int:
         value = int(whole) * 10**9 + int(fraction[:9].ljust(9, b"0"))
         value = value if unsigned == seconds else -value
     else:
-        value = round(float(seconds) * 1e9)
+        # Some numbers of seconds are floats whose nanoseconds are none.
+        value = round(min(max(float(seconds), -_TOO_LARGE), _TOO_LARGE) * 1e9)
     return _in_range(path, line, value, f"stamp {shown(seconds)} is too large; stamps are in seconds")
 
 

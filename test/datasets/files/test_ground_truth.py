@@ -34,7 +34,12 @@ def test_stamps_are_exact(tmp_path: Path, graph_file: GraphFile) -> None:
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("1\n2\n", "2 stamps for 3 nodes"), ("1\nx\n3\n", ":2: 'x' is not a number"), ("1e30\n2\n3\n", ":1: .*too large")],
+    [
+        ("1\n2\n", "2 stamps for 3 nodes"),
+        ("1\nx\n3\n", ":2: 'x' is not a number"),
+        ("1e30\n2\n3\n", ":1: .*too large"),
+        ("1\n-1e300\n3\n", ":2: stamp '-1e300' is too large; stamps are in seconds"),
+    ],
 )
 def test_bad_stamps(tmp_path: Path, graph_file: GraphFile, text: str, message: str) -> None:
     with pytest.raises(GraphFileError, match=message):
