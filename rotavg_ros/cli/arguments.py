@@ -7,6 +7,8 @@ import math
 
 # As for the node's solver_threads; far more exhaust the process's memory maps before anything is solved.
 _MAX_THREADS = 1024
+# Of seconds, degrees, rates … none means more, and multiples of what is far beyond are numbers no more.
+_MAX_NUMBER = 1e12
 
 
 def whole_number(text: str) -> int:
@@ -34,19 +36,19 @@ def thread_count(text: str) -> int:
 
 
 def positive_number(text: str) -> float:
-    """A finite number above 0."""
+    """A number above 0."""
     number = _number(text)
     if not 0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"is {text}; it must be positive")
-    return number
+    return _sensible(number, text)
 
 
 def non_negative_number(text: str) -> float:
-    """A finite number, 0 or more."""
+    """A number, 0 or more."""
     number = _number(text)
     if not 0 <= number < math.inf:
         raise argparse.ArgumentTypeError(f"is {text}; it must be 0 or more")
-    return number
+    return _sensible(number, text)
 
 
 def finite_number(text: str) -> float:
@@ -62,6 +64,12 @@ def share(text: str) -> float:
     number = _number(text)
     if not 0 <= number <= 1:
         raise argparse.ArgumentTypeError(f"is {text}; it must lie between 0 and 1")
+    return number
+
+
+def _sensible(number: float, text: str) -> float:
+    if number > _MAX_NUMBER:
+        raise argparse.ArgumentTypeError(f"is {text}; it must be {_MAX_NUMBER:g} or less")
     return number
 
 
