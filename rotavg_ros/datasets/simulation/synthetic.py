@@ -153,16 +153,19 @@ class PaperRecipe:
     """The generator as the paper's text describes it (§5.1). Pairs are ranges of uniform draws.
 
     Attributes:
-        cameras: number of cameras, all turned about the vertical alone.
+        cameras: number of cameras.
         pair_share: share of all pairs that are measured.
-        noise_deg: standard deviation of the noise's angle, drawn once per graph, about axes in a vertical plane.
+        noise_deg: standard deviation of the noise's angle, drawn once per graph.
         outlier_share: share of the edges replaced by random rotations.
+        planar: cameras are turned about the vertical alone, and noise axes lie in a vertical plane; otherwise both
+            are anywhere (the paper's table 3 says no more than "planar" or not).
     """
 
     cameras: tuple[int, int] = (250, 1000)
     pair_share: tuple[float, float] = (0.1, 0.3)
     noise_deg: tuple[float, float] = (5.0, 30.0)
     outlier_share: tuple[float, float] = (0.0, 0.3)
+    planar: bool = True
 
     def sample(self, rng: np.random.Generator) -> SyntheticGraph:
         """Draw one graph; pairs that leave cameras unconnected are joined by a random chain."""
@@ -177,6 +180,8 @@ class PaperRecipe:
 
     def orientations(self, n: int, rng: np.random.Generator) -> Rotation:
         """True body_from_world of ``n`` cameras."""
+        if not self.planar:
+            return Rotation.from_quat(_random_quaternions(n, rng))
         yaw = np.zeros((n, 3))
         yaw[:, 1] = rng.uniform(-np.pi, np.pi, n)
         return Rotation.from_rotvec(yaw)
@@ -184,11 +189,11 @@ class PaperRecipe:
     def noise(self, m: int, rng: np.random.Generator) -> EdgeNoise:
         """Noise of the ``m`` edges of one graph, outliers included."""
         sigma = np.radians(rng.uniform(*self.noise_deg))
-        rotvec = _axes(m, True, rng) * sigma * rng.standard_normal((m, 1))
+        rotvec = _axes(m, self.planar, rng) * sigma * rng.standard_normal((m, 1))
         noise = Rotation.from_rotvec(rotvec).as_quat()
         replaced = rng.choice(m, int(rng.uniform(*self.outlier_share) * m), replace=False)
         noise[replaced] = _random_quaternions(len(replaced), rng)
-        covariance = _covariance(sigma**2 * _axis_moment(True), _ANY_ROTATION * np.eye(3), replaced, m)
+        covariance = _covariance(sigma**2 * _axis_moment(self.planar), _ANY_ROTATION * np.eye(3), replaced, m)
         return EdgeNoise(Rotation.from_quat(noise), covariance)
 
 

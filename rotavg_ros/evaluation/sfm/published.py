@@ -31,18 +31,40 @@ class Scene(NamedTuple):
     figures: dict[str, Published]
 
 
+class Configuration(NamedTuple):
+    """A kind of graph, as table 3 states it.
+
+    Attributes:
+        cameras: of every graph.
+        pairs_percent: share of all pairs that have an edge.
+        noise_deg: σ of the noise is at most so many degrees.
+        outliers_percent: share of the edges.
+        planar: else in space.
+    """
+
+    cameras: int
+    pairs_percent: float
+    noise_deg: float
+    outliers_percent: float
+    planar: bool
+
+    def __str__(self) -> str:
+        place = "planar" if self.planar else "in space"
+        return f"{self.cameras}, {self.pairs_percent:g} %, {self.noise_deg:g}°, {self.outliers_percent:g} %, {place}"
+
+
 class Robustness(NamedTuple):
     """Networks trained on one kind of graph and tested on another.
 
     Attributes:
         varied: what differs.
-        trained, tested: cameras, percent of the pairs, σ up to so many degrees, percent of outliers, planar.
+        trained, tested: kinds of graphs.
         neurora, chatterjee: figures; None where the paper has none.
     """
 
     varied: str
-    trained: tuple[int, float, float, float, bool]
-    tested: tuple[int, float, float, float, bool]
+    trained: Configuration
+    tested: Configuration
     neurora: Published
     chatterjee: Published | None
 
@@ -299,70 +321,29 @@ REAL: dict[str, Scene] = {
     ),
 }
 
-# Table 3.
+# Table 3: what networks are trained on, then its rows.
+_DENSE = Configuration(1000, 25.0, 30.0, 10.0, True)
+_SMALL = Configuration(250, 25.0, 30.0, 10.0, True)
+_SPARSE = Configuration(1000, 2.5, 30.0, 10.0, True)
+_QUIET = Configuration(1000, 25.0, 10.0, 5.0, True)
+_IN_SPACE = Configuration(1000, 25.0, 30.0, 10.0, False)
 ROBUSTNESS: tuple[Robustness, ...] = (
+    Robustness("cameras", _DENSE, _SMALL, Published(1.1, 0.9, 0.1), Published(1.8, 1.7, 0.3)),
     Robustness(
         "cameras",
-        (1000, 25.0, 30.0, 10.0, True),
-        (250, 25.0, 30.0, 10.0, True),
-        Published(1.1, 0.9, 0.1),
-        Published(1.8, 1.7, 0.3),
-    ),
-    Robustness(
-        "cameras",
-        (250, 25.0, 30.0, 10.0, True),
-        (5000, 2.5, 30.0, 10.0, True),
+        _SMALL,
+        Configuration(5000, 2.5, 30.0, 10.0, True),
         Published(1.1, 1.0, 4.9),
         Published(1.4, 1.3, 720.0),
     ),
-    Robustness(
-        "cameras", (250, 25.0, 30.0, 10.0, True), (10000, 2.5, 30.0, 10.0, True), Published(0.7, 0.6, 18.7), None
-    ),
-    Robustness(
-        "cameras", (250, 25.0, 30.0, 10.0, True), (25000, 2.5, 30.0, 10.0, True), Published(0.6, 0.5, 142.6), None
-    ),
-    Robustness(
-        "edges",
-        (1000, 25.0, 30.0, 10.0, True),
-        (1000, 2.5, 30.0, 10.0, True),
-        Published(2.4, 2.1, 0.1),
-        Published(3.0, 2.8, 3.3),
-    ),
-    Robustness(
-        "edges",
-        (1000, 2.5, 30.0, 10.0, True),
-        (1000, 25.0, 30.0, 10.0, True),
-        Published(0.5, 0.4, 2.5),
-        Published(0.9, 0.8, 43.2),
-    ),
-    Robustness(
-        "noise and outliers",
-        (1000, 25.0, 30.0, 10.0, True),
-        (1000, 25.0, 10.0, 5.0, True),
-        Published(0.4, 0.3, 2.5),
-        Published(0.3, 0.3, 31.6),
-    ),
-    Robustness(
-        "noise and outliers",
-        (1000, 25.0, 10.0, 5.0, True),
-        (1000, 25.0, 30.0, 10.0, True),
-        Published(0.6, 0.5, 2.5),
-        Published(0.9, 0.8, 43.2),
-    ),
-    Robustness(
-        "planar",
-        (1000, 25.0, 30.0, 10.0, True),
-        (1000, 25.0, 30.0, 10.0, False),
-        Published(2.2, 1.6, 2.5),
-        Published(0.9, 0.8, 26.3),
-    ),
-    Robustness(
-        "planar",
-        (1000, 25.0, 30.0, 10.0, False),
-        (1000, 25.0, 30.0, 10.0, True),
-        Published(0.9, 0.7, 2.5),
-        Published(0.9, 0.8, 26.3),
-    ),
+    Robustness("cameras", _SMALL, Configuration(10000, 2.5, 30.0, 10.0, True), Published(0.7, 0.6, 18.7), None),
+    Robustness("cameras", _SMALL, Configuration(25000, 2.5, 30.0, 10.0, True), Published(0.6, 0.5, 142.6), None),
+    Robustness("edges", _DENSE, _SPARSE, Published(2.4, 2.1, 0.1), Published(3.0, 2.8, 3.3)),
+    Robustness("edges", _SPARSE, _DENSE, Published(0.5, 0.4, 2.5), Published(0.9, 0.8, 43.2)),
+    Robustness("noise and outliers", _DENSE, _QUIET, Published(0.4, 0.3, 2.5), Published(0.3, 0.3, 31.6)),
+    Robustness("noise and outliers", _QUIET, _DENSE, Published(0.6, 0.5, 2.5), Published(0.9, 0.8, 43.2)),
+    Robustness("planar", _DENSE, _IN_SPACE, Published(2.2, 1.6, 2.5), Published(0.9, 0.8, 26.3)),
+    Robustness("planar", _IN_SPACE, _DENSE, Published(0.9, 0.7, 2.5), Published(0.9, 0.8, 26.3)),
 )
 
 # Table 4: a ScanNet scene by VisualSFM, about 1401 cameras and 5.8 % of the pairs.

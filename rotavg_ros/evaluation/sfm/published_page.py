@@ -51,8 +51,8 @@ def _robustness() -> Table:
     rows: tuple[tuple[Cell, ...], ...] = tuple(
         (
             each.varied,
-            _kind(*each.trained),
-            _kind(*each.tested),
+            str(each.trained),
+            str(each.tested),
             _together(each.neurora),
             "" if each.chatterjee is None else _together(each.chatterjee),
         )
@@ -60,10 +60,6 @@ def _robustness() -> Table:
     )
     note = "Cameras, share of the pairs, σ at most, outliers. The paper has no figure where it is empty."
     return Table("Table 3: robustness", headings, rows, (note,))
-
-
-def _kind(cameras: int, pairs: float, noise: float, outliers: float, planar: bool) -> str:
-    return f"{cameras}, {pairs:g} %, {noise:g}°, {outliers:g} %, {'planar' if planar else 'in space'}"
 
 
 def _together(figures: Published) -> str:
