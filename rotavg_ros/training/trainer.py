@@ -111,6 +111,11 @@ class Trainer:
     def epochs_done(self) -> int:
         return self._state.epoch
 
+    @property
+    def seconds(self) -> float:
+        """That its epochs have taken, those before an interruption included."""
+        return self._state.seconds
+
     def run(self, max_epochs: int | None = None) -> dict[str, float]:
         """Train to the end (or ``max_epochs`` more epochs); returns the last validation's figures.
 

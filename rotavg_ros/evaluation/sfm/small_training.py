@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -14,10 +12,11 @@ import torch
 from rotavg_ros.solver.networks import NETWORKS, CleanNet, load_network, read_network
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.sfm_tasks import GivenGraphs, SfmCleanTask, SfmFineTask
-from rotavg_ros.training.trainer import Trainer, TrainingTask
+from rotavg_ros.training.timed import train_in_time
+from rotavg_ros.training.trainer import TrainingTask
 
 # CleanNet has the harder problem.
-_CLEAN_NET_SHARE = 0.6
+CLEAN_NET_SHARE = 0.6
 _CONFIG = TrainingConfig(batch_graphs=4, learning_rate=2e-3, weight_decay=0.0)
 
 
@@ -33,10 +32,10 @@ def train_networks(
     config = replace(_CONFIG, seed=seed)
     cpu = torch.device("cpu")
     make_clean = _maker("sfm-clean-net", partial(SfmCleanTask, config, cpu, graphs), from_package)
-    _train("sfm-clean-net", make_clean, config, folder, seconds * _CLEAN_NET_SHARE)
+    train_in_time(folder, "sfm-clean-net", make_clean, config, seconds * CLEAN_NET_SHARE)
     clean_net = read_network(CleanNet, folder / "sfm-clean-net.safetensors")
     make_fine = _maker("sfm-fine-net", partial(SfmFineTask, config, cpu, clean_net, graphs), from_package)
-    _train("sfm-fine-net", make_fine, config, folder, seconds * (1 - _CLEAN_NET_SHARE))
+    train_in_time(folder, "sfm-fine-net", make_fine, config, seconds * (1 - CLEAN_NET_SHARE))
 
 
 def _maker(name: str, make_task: Callable[[], TrainingTask], from_package: bool) -> Callable[[], TrainingTask]:
@@ -49,15 +48,3 @@ def _maker(name: str, make_task: Callable[[], TrainingTask], from_package: bool)
         return task
 
     return make
-
-
-def _train(
-    name: str, make_task: Callable[[], TrainingTask], config: TrainingConfig, folder: Path, seconds: float
-) -> None:
-    """As many epochs as fit: the learning rate's schedule needs their number beforehand, so one is timed first."""
-    start = time.perf_counter()
-    with tempfile.TemporaryDirectory() as trial:
-        Trainer(make_task(), replace(config, epochs=1), Path(trial), name).run()
-    epoch_seconds = time.perf_counter() - start
-    epochs = max(1, int((seconds - epoch_seconds) / epoch_seconds))
-    Trainer(make_task(), replace(config, epochs=epochs), folder, name).run()
