@@ -11,7 +11,6 @@ import torch
 
 from rotavg_ros.cli import evaluate_slam
 from rotavg_ros.cli.data_folder import data_folder
-from rotavg_ros.cli.options.evaluate import ROBUSTNESS_METHODS
 from rotavg_ros.cli.progress import progress, working
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.common.cases import Kind, drawings
@@ -21,8 +20,10 @@ from rotavg_ros.evaluation.common.named_peers import is_available
 from rotavg_ros.evaluation.common.score_tables import per_case
 from rotavg_ros.evaluation.common.scoring import Scores, Step, score_all
 from rotavg_ros.evaluation.common.tables import Report, Table
-from rotavg_ros.evaluation.sfm import real, rgbd, robustness, synthetic
+from rotavg_ros.evaluation.sfm import real, rgbd, robustness, robustness_report, synthetic
 from rotavg_ros.evaluation.sfm.contenders import ROSTER
+from rotavg_ros.evaluation.sfm.published import Configuration
+from rotavg_ros.evaluation.sfm.robustness_training import Trained, train
 from rotavg_ros.evaluation.sfm.small_training import train_networks
 from rotavg_ros.results import make_folder
 
@@ -58,24 +59,23 @@ def _run_synthetic(arguments: argparse.Namespace) -> Path:
 
 
 def _run_robustness(arguments: argparse.Namespace) -> Path:
-    names = tuple(arguments.methods or ROBUSTNESS_METHODS)
-    contenders(names, ROSTER)  # mistakes show before any training
-    scores = {}
-    with tempfile.TemporaryDirectory() as folder:
-        trained = {robustness.SETTINGS[setting].training for setting in arguments.settings} - {robustness.PACKAGE}
-        for training in sorted(trained):
-            with working(f"drawing the graphs to train on ({training})"):
-                graphs = robustness.training_graphs(training, arguments.seed)
-            train_networks(Path(folder) / training, graphs, 60 * arguments.minutes)
-        for setting in arguments.settings:
-            training = robustness.SETTINGS[setting].training
-            weights = None if training == robustness.PACKAGE else Path(folder) / training
-            fit = [name for name in names if robustness.is_fit(setting, name)]
-            chosen = _contenders(fit, (), weights, arguments.keep)
-            count = robustness.num_graphs(setting, arguments.graphs)
-            scores[setting] = _score([robustness.kind(setting, arguments.seed)], range(count), chosen, setting)
-    with working("writing the report"):
-        return robustness.report(arguments.output, scores, names, arguments.command_line)
+    scores: dict[str, Scores] = {}
+    trained: dict[Configuration, Trained] = {}
+    path: Path = arguments.output
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) if arguments.keep is None else arguments.keep.folder / "trained"
+        for name in arguments.settings:
+            setting = robustness.SETTINGS[name]
+            trained[setting.trained] = train(folder, setting.trained, 60 * arguments.minutes, arguments.seed)
+            *others, papers = sorted(robustness.methods_of(name), key=lambda method: method == robustness.PAPER)
+            chosen = {
+                **_contenders((papers,), (), trained[setting.trained].folder),
+                **_contenders(others, (), keep=arguments.keep),
+            }
+            count = robustness.num_graphs(setting.tested, arguments.graphs)
+            scores[name] = _score([robustness.kind(setting.tested, arguments.seed)], range(count), chosen, name)
+            path = robustness_report.write(arguments.output, scores, trained, arguments.command_line)
+    return path
 
 
 def _run_real(arguments: argparse.Namespace) -> Path:

@@ -7,16 +7,16 @@ from __future__ import annotations
 
 SYNTHETIC_RECIPES = ("released", "released-spatial", "paper")
 ROBUSTNESS_SETTINGS = (
-    "paper",
-    "small",
-    "easy",
-    "hard",
-    "easy-easy",
-    "easy-hard",
-    "hard-easy",
-    "hard-hard",
-    "5000",
-    "25000",
+    "cameras-250",
+    "cameras-5000",
+    "cameras-10000",
+    "cameras-25000",
+    "pairs-2.5",
+    "pairs-25",
+    "noise-10",
+    "noise-30",
+    "in-space",
+    "planar",
 )
 RGBD_SETS = ("scannet_fgr", "scannet_super4pcs", "redwood_fgr", "redwood_super4pcs")
 SLAM_SUITES = ("recorded", "stress", "poses")

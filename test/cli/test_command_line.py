@@ -27,7 +27,7 @@ def meaning(arguments: argparse.Namespace) -> dict[str, Any]:
         ("benchmark --soak --hours 0.5 --max-k=400", "benchmark --soak --hours 0.5 --max-keyframes 400"),
         ("benchmark --families recipe --contenders gnc neurora --threads 2 --output here", None),
         ("evaluate synthetic --graphs 100 --methods spt+wang oracle --few-graphs 0 --keep there", None),
-        ("evaluate robustness --settings easy 5000 --methods neurora --minutes 1.5", None),
+        ("evaluate robustness --settings planar cameras-5000 --minutes 1.5", None),
         ("evaluate real --methods neurora spt --seed 3 --data /somewhere", None),
         ("evaluate rgbd --sets redwood_fgr --scenes 9 --folds 2", None),
         (

@@ -15,7 +15,9 @@ from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.evaluation.common.named_peers import is_available
 from rotavg_ros.evaluation.common.training_plot import read_log
-from rotavg_ros.evaluation.sfm import robustness, synthetic
+from rotavg_ros.evaluation.sfm import robustness, robustness_training, synthetic
+from rotavg_ros.evaluation.sfm.published import Configuration
+from rotavg_ros.training.trainer import Trainer
 
 
 def test_synthetic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -56,23 +58,52 @@ def test_few_graphs_do_for_what_is_slow(tmp_path: Path, monkeypatch: pytest.Monk
     assert few[rows["oracle"]] == pytest.approx(np.mean([float(row["mean_deg"]) for row in graphs[:2]]), rel=1e-4)
 
 
+@pytest.fixture
+def tiny_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two of the ten rows, of small graphs."""
+    trained, tested = Configuration(20, 50, 10, 5, True), Configuration(30, 50, 10, 5, False)
+    for name in ("planar", "in-space"):
+        row = robustness.SETTINGS[name]._replace(trained=trained, tested=tested)
+        monkeypatch.setitem(robustness.SETTINGS, name, row)
+    monkeypatch.setattr(robustness_training, "_MOST_GRAPHS", 2)
+
+
+@pytest.mark.usefixtures("tiny_rows")
 def test_robustness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    tiny = PaperRecipe(cameras=(20, 30), pair_share=(0.3, 0.5))
-    monkeypatch.setitem(robustness.TRAINING_RECIPES, "easy", tiny)
-    for name in ("easy", "easy-easy"):
-        setting = robustness.SETTINGS[name]
-        monkeypatch.setitem(robustness.SETTINGS, name, robustness.Setting(setting.title, setting.training, tiny))
-    command = ["evaluate", "robustness", "--graphs", "1", "--minutes", "0.001", "--settings", "easy", "easy-easy"]
-    assert main([*command, "--methods", "neurora-v1", "--output", str(tmp_path), "--threads", "1"]) == 0
-    assert (
-        "`rotavg evaluate robustness --threads 1 --graphs 1 --methods neurora-v1 --settings easy easy-easy"
-        in (tmp_path / "robustness.md").read_text()
-    )
+    command = ["evaluate", "robustness", "--graphs", "1", "--minutes", "0.001", "--keep", str(tmp_path / "keep")]
+    command += ["--output", str(tmp_path), "--threads", "1"]
+    assert main([*command, "--settings", "in-space"]) == 0
     with (tmp_path / "robustness.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert rows[0]["trained on"] == "the package's networks"
-    assert rows[1]["trained on"].startswith("60–200 cameras")
-    assert rows[0]["mean °"] != rows[1]["mean °"]
+    assert len(rows) == 10 * 3
+    assert [row["graphs"] for row in rows] == [*["not run"] * 24, *["1"] * 3, *["not run"] * 3]
+    by_method = {row["method"]: row for row in rows[24:27]}
+    assert len({row["mean °"] for row in by_method.values()}) == 3
+    # The paper's figures stand beside the methods that it has.
+    theirs = [row["paper: mean °"] for row in by_method.values()]
+    assert theirs == ["2.2", "0.9", ""]
+    report = (tmp_path / "robustness.md").read_text()
+    assert "`rotavg evaluate robustness --threads 1 --graphs 1 --settings in-space --minutes 0.001`" in report
+    assert (tmp_path / "robustness-training.png").read_bytes().startswith(b"\x89PNG")
+    with (tmp_path / "robustness-curves.csv").open() as file:
+        assert [row["network"] for row in csv.DictReader(file)] == ["paper-clean-net", "paper-fine-net"]
+
+    # What has been trained is not trained again, for another row either.
+    monkeypatch.setattr(Trainer, "run", None)
+    assert main([*command, "--settings", "planar", "in-space"]) == 0
+    with (tmp_path / "robustness.csv").open() as file:
+        again = list(csv.DictReader(file))[24:]
+    assert [row["mean °"] for row in again] == [row["mean °"] for row in rows[24:27]] * 2
+
+
+@pytest.mark.usefixtures("tiny_rows")
+def test_the_page_of_robustness_is_there_after_every_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = iter((robustness.kind, None))
+    monkeypatch.setattr(robustness, "kind", lambda *args: next(drawn)(*args))  # type: ignore[misc]
+    command = ["evaluate", "robustness", "--graphs", "1", "--minutes", "0.001", "--threads", "1"]
+    with pytest.raises(TypeError):
+        main([*command, "--output", str(tmp_path), "--settings", "in-space", "planar"])
+    assert (tmp_path / "robustness.md").read_text().count("| not run |") == 27
 
 
 def test_real(tmp_path: Path) -> None:
@@ -107,7 +138,6 @@ def test_real(tmp_path: Path) -> None:
         (["synthetic", "--methods", "magic"], "unknown method 'magic'"),
         (["synthetic", "--graphs", "0"], "must be 1 or more"),
         (["synthetic", "--seed", "-1"], "must be 0 or more"),
-        (["robustness", "--methods", "magic"], "unknown method 'magic'"),
         (["robustness", "--settings", "odd"], "odd"),
         (["robustness", "--minutes", "0"], "must be positive"),
         (["real"], "--data or $ROTAVG_DATA"),

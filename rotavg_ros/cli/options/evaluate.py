@@ -12,8 +12,6 @@ from rotavg_ros.cli.data_folder import add_data_argument
 from rotavg_ros.cli.options import evaluate_slam
 from rotavg_ros.evaluation.names import RGBD_SETS, ROBUSTNESS_SETTINGS, SYNTHETIC_RECIPES
 
-ROBUSTNESS_METHODS = ("chatterjee", "neurora-v1", "neurora")
-
 
 class _Suite(NamedTuple):
     """A table of the evaluation, and its options."""
@@ -42,7 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--keep",
             type=Path,
             metavar="DIR",
-            help="keep answers here: a run that was interrupted goes on, and only what has changed is solved again",
+            help="keep answers (and the networks that robustness trains) here: a run that was interrupted goes on, and "
+            "only what has changed is solved again",
         )
         suite.add_arguments(suite_parser)
 
@@ -68,17 +67,17 @@ def _add_synthetic(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_robustness(parser: argparse.ArgumentParser) -> None:
-    _add_drawing(parser, 10)
-    _add_methods(parser, " ".join(ROBUSTNESS_METHODS))
+    _add_drawing(parser, 20)
     parser.add_argument(
         "--settings",
         nargs="+",
         choices=ROBUSTNESS_SETTINGS,
         metavar="NAME",
         default=list(ROBUSTNESS_SETTINGS),
-        help=f"rows of the table (default: {' '.join(ROBUSTNESS_SETTINGS)})",
+        help="rows of the table to run, in this order, the page rewritten after each; the others are said not to have "
+        f"been (default: {' '.join(ROBUSTNESS_SETTINGS)})",
     )
-    _add_minutes(parser)
+    _add_minutes(parser, 60)
 
 
 def _add_real(parser: argparse.ArgumentParser) -> None:
@@ -103,16 +102,16 @@ def _add_rgbd(parser: argparse.ArgumentParser) -> None:
         "--folds", type=positive_whole_number, default=4, metavar="K", help="of the cross-validation (default: 4)"
     )
     parser.add_argument("--scenes", type=positive_whole_number, metavar="N", help="of each set, at most (default: all)")
-    _add_minutes(parser)
+    _add_minutes(parser, 10)
 
 
-def _add_minutes(parser: argparse.ArgumentParser) -> None:
+def _add_minutes(parser: argparse.ArgumentParser, minutes: int) -> None:
     parser.add_argument(
         "--minutes",
         type=positive_number,
-        default=10.0,
+        default=float(minutes),
         metavar="M",
-        help="training time of each pair of networks (default: 10)",
+        help=f"training time of each pair of networks (default: {minutes})",
     )
 
 
@@ -132,7 +131,9 @@ def _add_methods(parser: argparse.ArgumentParser, default: str) -> None:
 
 _SUITES = (
     _Suite("synthetic", "the paper's synthetic table, and how well outliers are told", _add_synthetic),
-    _Suite("robustness", "trained on one kind of graph, tested on another", _add_robustness),
+    _Suite(
+        "robustness", "the paper's table of that name: trained on one kind of graph, tested on another", _add_robustness
+    ),
     _Suite("real", "Lund with ground truth, Madrid without, real topologies", _add_real),
     _Suite("rgbd", "RGB-D scans, networks cross-validated over the scenes", _add_rgbd),
     _Suite("slam", "pose graphs with false closures, in one go and edge by edge", evaluate_slam.add_arguments),

@@ -48,7 +48,7 @@ class KeptAnswers:
 
     def __init__(self, folder: Path, weights: Path = networks.WEIGHTS_FOLDER) -> None:
         make_folder(folder)
-        self._folder, self._weights = folder, weights
+        self.folder, self._weights = folder, weights
         self._versions: dict[tuple[str, ...], str] = {}
 
     def keeping(
@@ -70,7 +70,7 @@ class KeptAnswers:
 
         def answer(question: QuestionT) -> Answer | None:
             version = f"{self._version(tuple(modules), libraries)}, {torch.get_num_threads()} threads"
-            path = self._folder / f"{name.replace('/', '_')}-{_digest(question, name, version)}.npz"
+            path = self.folder / f"{name.replace('/', '_')}-{_digest(question, name, version)}.npz"
             with suppress(*_UNREADABLE):
                 return _read(path)
             found = solver(question)

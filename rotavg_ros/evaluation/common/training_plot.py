@@ -1,9 +1,9 @@
-"""A picture of training runs: what validation said after every epoch."""
+"""Pictures of training runs: what validation said after every epoch."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -57,4 +57,25 @@ def draw_training(path: Path, logs: Sequence[Path]) -> None:
         style(axes, log.name.removesuffix(".log.jsonl"))
         axes.set_xlabel("epoch", fontsize=9, color=MUTED)
         axes.set_ylabel("validation", fontsize=9, color=MUTED)
+    figure.savefig(path)
+
+
+def draw_together(path: Path, logs: Mapping[str, Mapping[str, Path]]) -> None:
+    """A panel for each kind of network, with a curve for each run of it, over the share of its epochs.
+
+    Args:
+        logs: by what is said of the run, by the panel's title.
+    """
+    figure = Figure(figsize=(4.6 * len(logs), 3.6), dpi=110, facecolor="white", layout="constrained")
+    panels = figure.subplots(1, len(logs), squeeze=False)[0]
+    for axes, (title, runs) in zip(panels, logs.items(), strict=True):
+        for colour, (label, log) in zip(PALETTE, runs.items(), strict=False):
+            epochs, objective = read_log(log)
+            best, share = int(objective.argmin()), epochs / epochs[-1]
+            axes.plot(share, objective, color=colour, linewidth=1.0, label=label)
+            axes.plot(share[best], objective[best], "o", color=colour, markersize=4)
+        axes.set_yscale("log")
+        style(axes, title)
+        axes.set_xlabel("share of the epochs", fontsize=9, color=MUTED)
+        axes.legend(frameon=False, fontsize=7)
     figure.savefig(path)

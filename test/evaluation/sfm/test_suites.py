@@ -12,10 +12,11 @@ from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.common.cases import drawings
 from rotavg_ros.evaluation.common.contenders import contenders
-from rotavg_ros.evaluation.sfm import real, rgbd, robustness, small_training, synthetic
+from rotavg_ros.evaluation.sfm import real, rgbd, small_training, synthetic
 from rotavg_ros.evaluation.sfm.contenders import ROSTER
 from rotavg_ros.solver.networks import NETWORKS
 from rotavg_ros.solver.neurora.network_store import read_network
+from rotavg_ros.training.sfm_tasks import GivenGraphs
 
 
 def test_graphs_are_the_same_whatever_their_number(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -32,20 +33,10 @@ def test_rows_can_all_run() -> None:
     contenders([name for name in synthetic.ROWS if name not in ROSTER.peers], ROSTER)
 
 
-def test_settings_that_differ_in_training_alone_share_their_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
-    tiny = PaperRecipe(cameras=(20, 30))
-    for name in ("easy", "easy-easy"):
-        monkeypatch.setitem(robustness.SETTINGS, name, robustness.Setting("", robustness.SETTINGS[name].training, tiny))
-    one, other = (next(drawings([robustness.kind(name, 0)], [0])) for name in ("easy", "easy-easy"))
-    assert torch.equal(one.graph.target_from_source, other.graph.target_from_source)
-    assert robustness.num_graphs("25000", 10) == 1
-    assert robustness.num_graphs("paper", 10) == 10
-
-
-def test_networks_trained_on_given_graphs_can_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(robustness.TRAINING_RECIPES, "easy", PaperRecipe(cameras=(12, 16), pair_share=(0.5, 0.5)))
-    graphs = robustness.training_graphs("easy", 0, count=3)
-    assert (len(graphs.training), len(graphs.validation)) == (3, 1)
+def test_networks_trained_on_given_graphs_can_be_used(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    recipe = PaperRecipe(cameras=(12, 16), pair_share=(0.5, 0.5))
+    graphs = GivenGraphs([recipe.sample(rng) for _ in range(3)], [recipe.sample(rng)])
     small_training.train_networks(tmp_path, graphs, seconds=0)
     for name in ("sfm-clean-net", "sfm-fine-net"):
         read_network(NETWORKS[name], tmp_path / f"{name}.safetensors")
