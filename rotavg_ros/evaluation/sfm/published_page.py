@@ -10,11 +10,11 @@ from rotavg_ros.evaluation.sfm.synthetic import ROWS
 
 _INTRODUCTION = f"""\
 What the paper publishes (Purkait, Chin & Reid, *NeuRoRA: Neural Robust Rotation Averaging*, ECCV 2020), as printed:
-degrees and seconds, its graphs, its machine. Ours are on other pages: [synthetic graphs](synthetic-paper.md) have the
-two side by side, [real graphs](real.md) and [scans](rgbd.md) have what data we had. Our generator follows the paper's
-text, which disagrees with its released scripts, so its graphs may be easier or harder; compare ratios rather than
-degrees. On a GPU the paper states {GPU_SECONDS[0]} s for a synthetic graph and {GPU_SECONDS[1]} s for the ScanNet one;
-none was at hand here.
+degrees and seconds, its graphs, its machine. Ours are on other pages: [synthetic graphs](synthetic-paper.md) and
+[robustness](robustness.md) have the two side by side, [real graphs](real.md) and [scans](rgbd.md) have what data we
+had. Our generator follows the paper's text, which disagrees with its released scripts, so its graphs may be easier or
+harder; compare ratios rather than degrees. On a GPU the paper states {GPU_SECONDS[0]} s for a synthetic graph and
+{GPU_SECONDS[1]} s for the ScanNet one; none was at hand here.
 """
 
 
