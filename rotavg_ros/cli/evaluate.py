@@ -75,6 +75,8 @@ def _run_robustness(arguments: argparse.Namespace) -> Path:
             count = robustness.num_graphs(setting.tested, arguments.graphs)
             scores[name] = _score([robustness.kind(setting.tested, arguments.seed)], range(count), chosen, name)
             path = robustness_report.write(arguments.output, scores, trained, arguments.command_line)
+            if scores[name].interrupted:
+                break
     return path
 
 

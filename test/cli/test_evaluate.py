@@ -13,6 +13,7 @@ from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
+from rotavg_ros.evaluation.common.cases import Kind
 from rotavg_ros.evaluation.common.named_peers import is_available
 from rotavg_ros.evaluation.common.training_plot import read_log
 from rotavg_ros.evaluation.sfm import robustness, robustness_training, synthetic
@@ -98,11 +99,20 @@ def test_robustness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("tiny_rows")
 def test_the_page_of_robustness_is_there_after_every_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn = iter((robustness.kind, None))
-    monkeypatch.setattr(robustness, "kind", lambda *args: next(drawn)(*args))  # type: ignore[misc]
+    """An interruption in the second row leaves the first, and no third is begun."""
+    kind, drawn = robustness.kind, []
+
+    def interrupted_at_second(configuration: Configuration, seed: int) -> Kind:
+        drawn.append(configuration)
+        return kind(configuration, seed) if len(drawn) == 1 else Kind("", interrupt)
+
+    def interrupt(_: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(robustness, "kind", interrupted_at_second)
     command = ["evaluate", "robustness", "--graphs", "1", "--minutes", "0.001", "--threads", "1"]
-    with pytest.raises(TypeError):
-        main([*command, "--output", str(tmp_path), "--settings", "in-space", "planar"])
+    assert main([*command, "--output", str(tmp_path), "--settings", "in-space", "planar", "in-space"]) == 0
+    assert len(drawn) == 2
     assert (tmp_path / "robustness.md").read_text().count("| not run |") == 27
 
 
