@@ -88,6 +88,14 @@ def scores(problem: Problem, state: State, left_out: LeftOut) -> tuple[np.ndarra
     return good * exceeds + (1 - good) * otherwise, good * (1 - exceeds)
 
 
+def slipped_or_tailed(problem: Problem, state: State, left_out: LeftOut) -> np.ndarray:
+    """Edges of odometry that slipped, or that are in its tails more likely than not."""
+    own = variances(problem, state.noise)[: len(left_out.square)]
+    tailed = tails(problem, state.noise)
+    _, usual = log_good(left_out.square, own, left_out.predicted, problem.components, tailed)
+    return np.flatnonzero(problem.graph.is_odometry & (~state.is_good | (usual < 1 - usual)))
+
+
 def relabelled(problem: Problem, state: State) -> np.ndarray:
     """``(E,)`` 1 for edges that residuals as they are speak for, else 0."""
     good, otherwise = _log_densities(problem, state)

@@ -8,17 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from rotavg_ros.solver.running.cached import cached_property
-from rotavg_ros.solver.slam.posterior.densities import log_good
 from rotavg_ros.solver.slam.posterior.left_out import LeftOut, leave_one_out
 from rotavg_ros.solver.slam.posterior.objective import Evaluation
 from rotavg_ros.solver.slam.posterior.problem import Problem
-from rotavg_ros.solver.slam.posterior.rows import tails, variances
 from rotavg_ros.solver.slam.posterior.state import State
 
 # Noise is another one if the ratio of a step's variance and a closure's differs by this, in the logarithm.
 OTHER_NOISE = 1.0
-# More likely than not.
-_LIKELY = 0.5
 # Orientations are the same up to so many standard deviations of a closure.
 _SAME = 3.0
 # Covariances of up to so many closures are computed all at once.
@@ -103,14 +99,6 @@ class Mode:
         graph = self.problem.graph
         edges = np.flatnonzero(graph.is_odometry & ~self.state.is_good)
         return np.asarray(edges[np.argsort(graph.position[graph.source[edges]], kind="stable")])
-
-    @cached_property
-    def off(self) -> np.ndarray:
-        """Edges of odometry that slipped, or that are in its tails rather than not."""
-        problem, noise, told = self.problem, self.state.noise, self.left_out
-        own = variances(problem, noise)[: len(told.square)]
-        _, usual = log_good(told.square, own, told.predicted, problem.components, tails(problem, noise))
-        return np.flatnonzero(problem.graph.is_odometry & (~self.state.is_good | (usual < _LIKELY)))
 
 
 @dataclass(frozen=True)

@@ -304,9 +304,18 @@ STRUCTURAL = {
     "publishing/modes": {"_FAR", "_FAR_NOISE", "LIKELY", "FAR_TURN", "FAR_SLIP", "_SURELY_FALSE", "_ROUNDS"}
     | {"_SCORED"},
     "moves/flips": {"_PART", "_DECIDED", "_HOPE", "_LEAST_GAIN"},
-    "mode": {"OTHER_NOISE", "_LIKELY", "_SAME", "_MAX_DENSE"},
+    "mode": {"OTHER_NOISE", "_SAME", "_MAX_DENSE"},
     "moves/jumps": {"_MAX_ROUNDS", "_MAX_CANDIDATES", "_MIN_GAIN", "_MIN_CARRIED"},
-    "moves/noise": {"_GRIDS", "STEP_TAILS", "_JOINT", "SCALES", "_MIN_SPREAD", "_FIRST_SOLVES", "_WORSE_STEPS"},
+    "moves/noise": {
+        "_GRIDS",
+        "_Values",
+        "STEP_TAILS",
+        "_JOINT",
+        "SCALES",
+        "_MIN_SPREAD",
+        "_FIRST_SOLVES",
+        "_WORSE_STEPS",
+    },
     "moves/runs": {"_LEAST_MEMBERS"},
     "moves/slips": {"LEAST_WITNESSES", "_AGREE", "_AGREE_ANGLE", "OPTIMISM", "SETTLING", "SAME_PLACE"},
     "moves/starts": {"_INLIER_SQUARE", "_SHARP", "_STEP_LEVELS", "_CLOSURE_LEVEL", "_ROBUST_POWER"}

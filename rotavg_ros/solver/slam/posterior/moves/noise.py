@@ -25,10 +25,11 @@ from rotavg_ros.solver.slam.posterior.state import (
     Noise,
 )
 
+_Values = tuple[float, ...]
 # What odometry's tails may be.
 STEP_TAILS = tuple(product(TAIL_SHARES[1:], STEP_TAIL_RATIOS))
 # What is chosen together, and its values.
-_GRIDS: dict[tuple[str, ...], tuple[tuple[float, ...], ...]] = {
+_GRIDS: dict[tuple[str, ...], tuple[_Values, ...]] = {
     ("turn_share",): tuple(product(TURN_SHARES)),
     ("step_tails", "step_tail_ratio"): ((TAIL_SHARES[0], STEP_TAIL_RATIOS[0]), *STEP_TAILS),
     ("closure_tails",): tuple(product(TAIL_SHARES)),
@@ -56,11 +57,11 @@ def tuned(mode: Mode) -> Iterator[Mode]:
             continue
         left = [values for values in grid if values != _values(mode, names) and _is_open(mode.problem, names, values)]
         while left:
-            values, noise = _next(mode, names, left)
-            if noise is None:
+            chosen = _next(mode, names, left)
+            if chosen is None:
                 break
-            left.remove(values)
-            found = _tried(mode, noise)
+            left.remove(chosen[0])
+            found = _tried(mode, chosen[1])
             yield found
             mode = min(mode, found, key=lambda either: either.cost)
     if mode is not begun:
@@ -94,37 +95,34 @@ def _opens_labels(mode: Mode, factor: float) -> bool:
     return bool(((side * told.log_odds[closure] > decided) & (side * changed < decided)).any())
 
 
-def _values(mode: Mode, names: tuple[str, ...]) -> tuple[float, ...]:
+def _values(mode: Mode, names: tuple[str, ...]) -> _Values:
     return tuple(getattr(mode.state.noise, name) for name in names)
 
 
-def _is_open(problem: Problem, names: tuple[str, ...], values: tuple[float, ...]) -> bool:
+def _is_open(problem: Problem, names: tuple[str, ...], values: _Values) -> bool:
     is_wide = "step_tail_ratio" in names and values[-1] > STEP_TAIL_RATIOS[0]
     return not (is_wide and "wide-tails" in problem.without)
 
 
-def _next(mode: Mode, names: tuple[str, ...], left: list[tuple[float, ...]]) -> tuple[tuple[float, ...], Noise | None]:
+def _next(mode: Mode, names: tuple[str, ...], left: list[_Values]) -> tuple[_Values, Noise] | None:
     """Which of some values is to be tried, and the noise to begin with; None if none may pay.
 
-    Of edges by themselves that for which F is predicted to be least, or else one that is next to what there is: other
-    tails change what others say of each edge by more than a prediction knows.
+    Of what is a matter of single edges, that for which F is predicted to be least. Where none is predicted to pay,
+    tails next to those that there are: other tails change what others say of each edge by more than is predicted.
     """
-    noise = [replace(mode.state.noise, **dict(zip(names, values, strict=True))) for values in left]
+    noise = {values: replace(mode.state.noise, **dict(zip(names, values, strict=True))) for values in left}
     if names in _JOINT:
-        return left[0], noise[0]
-    predicted = [_predicted(mode, each) for each in noise]
-    number = int(np.argmin([change for change, _ in predicted]))
-    if predicted[number][0] <= mode.problem.limits.slack:
-        return left[number], predicted[number][1]
-    at = _values(mode, names)
-    near = [number for number, values in enumerate(left) if _are_next(at, values)]
-    if not near:
-        return left[0], None
-    number = min(near, key=lambda number: predicted[number][0])
-    return left[number], predicted[number][1]
+        return left[0], noise[left[0]]
+    predicted = {values: _predicted(mode, each) for values, each in noise.items()}
+    may_pay = [values for values in left if predicted[values][0] <= mode.problem.limits.slack]
+    may_pay = may_pay or [values for values in left if _are_next(_values(mode, names), values)]
+    if not may_pay:
+        return None
+    best = min(may_pay, key=lambda values: predicted[values][0])
+    return best, predicted[best][1]
 
 
-def _are_next(some: tuple[float, ...], others: tuple[float, ...]) -> bool:
+def _are_next(some: _Values, others: _Values) -> bool:
     """Whether tails are next to each other on their grid of shares and ratios."""
     if len(some) < 2 or min(some[0], others[0]) == 0:
         return False

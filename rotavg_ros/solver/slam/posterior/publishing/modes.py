@@ -13,7 +13,7 @@ from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.posterior.em import step
-from rotavg_ros.solver.slam.posterior.left_out import leave_one_out, scores
+from rotavg_ros.solver.slam.posterior.left_out import leave_one_out, scores, slipped_or_tailed
 from rotavg_ros.solver.slam.posterior.mode import OTHER_NOISE, Mode
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.publishing.gravity import held_by_gravity
@@ -127,7 +127,7 @@ def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: li
 
 def of_slips(mode: Mode) -> tuple[str, ...]:
     """What is to be known of a labelling by which odometry is off by far somewhere: a sentence, or none."""
-    graph, off = mode.problem.graph, mode.off
+    graph, off = mode.problem.graph, slipped_or_tailed(mode.problem, mode.state, mode.left_out)
     turned = np.sqrt((mode.evaluation.residual[off] ** 2).sum(axis=1))
     far = off[turned > FAR_SLIP]
     if len(far) == 0:
