@@ -38,8 +38,8 @@ _NOWHERE = -1
 _MANY = 100
 # Products in one unit of work: of columns, of a dense factor, and of entries with rows that go up the tree.
 _PRODUCTS, _DENSE_PRODUCTS, _FAR_PRODUCTS = 1e6, 2e7, 2.4e6
-# So many rows that go up the tree are held.
-_IN_MEMORY = 1024
+# So many rows that go up the tree are held; and of unknowns that do, so many numbers.
+_IN_MEMORY, _NUMBERS = 1024, 2e7
 
 
 class RowPattern:
@@ -151,12 +151,35 @@ class LDL:
         if near.any():
             variance[near] = loops.row_variance(shape, *self._inverse, ranked[near], value[near])
         far = np.flatnonzero(~near)
+        ends = np.unique(ranked[far][value[far] != 0])
+        begin = loops.ways(shape, ends)
+        if len(far) > len(ends) and begin[-1] + len(ends) * len(self._full) < _NUMBERS:
+            variance[far] = self._by_ends(ends, begin, ranked[far], value[far])
+            return variance
         for first in range(0, len(far), _IN_MEMORY):
             some = far[first : first + _IN_MEMORY]
             spend(len(some) * len(self.lower) / _FAR_PRODUCTS)
             before, left = loops.far_variance(shape, self.lower, self.diagonal, ranked[some], value[some])
             variance[some] = before + (product(left, self._full) * left).sum(axis=1)
         return variance
+
+    def _by_ends(self, ends: np.ndarray, begin: np.ndarray, column: np.ndarray, value: np.ndarray) -> np.ndarray:
+        """``(n,)`` j H⁻¹ jᵀ of rows that have few unknowns among them: each of these goes up the tree once.
+
+        Args:
+            ends: ``(m,)`` unknowns, ascending.
+            begin: ``(m + 1,)`` where the way of each begins.
+            column, value: ``(n, 3)`` rows.
+        """
+        shape = self.pattern.shape
+        spend(len(ends) * len(self.lower) / _FAR_PRODUCTS)
+        way, left = loops.up_the_tree(shape, self.lower, self.diagonal, ends, begin)
+        if len(self._full):
+            # Of Z = C⁻ᵀ C⁻¹ where columns are full: what is left, by C⁻¹.
+            root = torch.from_numpy(loops.full_root(shape, self.lower, self.diagonal))
+            left = torch.linalg.solve_triangular(root, torch.from_numpy(left).T, upper=False).T.contiguous().numpy()
+        number = np.searchsorted(ends, column)
+        return loops.variance_by_ways(shape, (ends, begin, way, left), np.minimum(number, len(ends) - 1), value)
 
 
 def _first_full(counts: np.ndarray) -> int:

@@ -251,3 +251,79 @@ def far_variance(
                 remaining[e, j - full] = work[j, e - first]
                 work[j, e - first] = 0.0
     return variance, remaining
+
+
+@compiled
+def ways(shape: Shape, ends: np.ndarray) -> np.ndarray:
+    """``(m + 1,)`` how many unknowns lie on the ways up the tree from all before each, as far as none is full."""
+    begin = np.zeros(len(ends) + 1, np.int64)
+    for e in range(len(ends)):
+        j, count = ends[e], 0
+        while j != _NOWHERE and j < shape.full:
+            count += 1
+            j = shape.above[j]
+        begin[e + 1] = begin[e] + count
+    return begin
+
+
+@compiled
+def up_the_tree(
+    shape: Shape, lower: np.ndarray, diagonal: np.ndarray, ends: np.ndarray, begin: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """D^-½ L⁻¹ of single unknowns along their ways; and what is left where columns are full, ``(m, N - full)``."""
+    _, _, above, factor_begin, factor_row, full = shape
+    work, way = np.zeros(len(above)), np.empty(begin[-1])
+    remaining = np.empty((len(ends), len(above) - full))
+    for e in range(len(ends)):
+        j = ends[e]
+        work[j] = 1.0
+        for place in range(begin[e], begin[e + 1]):
+            left = work[j]
+            work[j] = 0.0
+            way[place] = left / np.sqrt(diagonal[j])
+            for at in range(factor_begin[j], factor_begin[j + 1]):
+                work[factor_row[at]] -= lower[at] * left
+            j = above[j]
+        for i in range(full, len(above)):
+            remaining[e, i - full] = work[i]
+            work[i] = 0.0
+    return way, remaining
+
+
+@compiled
+def variance_by_ways(
+    shape: Shape,
+    of_ends: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    number: np.ndarray,
+    value: np.ndarray,
+) -> np.ndarray:
+    """Values j Z jᵀ of rows ``(n, 3)`` by what :func:`up_the_tree` tells of ends: ways that have met stay together."""
+    ends, begin, way, left = of_ends
+    variance = np.empty(len(number))
+    for n in range(len(number)):
+        total = 0.0
+        for a in range(3):
+            if value[n, a] == 0:
+                continue
+            for b in range(a + 1):
+                if value[n, b] == 0:
+                    continue
+                u, v = number[n, a], number[n, b]
+                i, j = ends[u], ends[v]
+                one, other = begin[u], begin[v]
+                while one < begin[u + 1] and other < begin[v + 1] and i != j:
+                    if i < j:
+                        i = shape.above[i]
+                        one += 1
+                    else:
+                        j = shape.above[j]
+                        other += 1
+                together = 0.0
+                if i == j:
+                    for step in range(begin[u + 1] - one):
+                        together += way[one + step] * way[other + step]
+                for at in range(left.shape[1]):
+                    together += left[u, at] * left[v, at]
+                total += value[n, a] * value[n, b] * together * (1 if a == b else 2)
+        variance[n] = total
+    return variance

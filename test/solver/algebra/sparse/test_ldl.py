@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from rotavg_ros.solver.algebra.sparse import ldl
 from rotavg_ros.solver.algebra.sparse.ldl import RowPattern
+from rotavg_ros.solver.running.work import metered
 
 
 def rows(rng: np.random.Generator, size: int, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -49,10 +50,26 @@ def test_all_of_it_is_that_of_dense_algebra(seed: int, size: int, count: int, ma
     np.testing.assert_allclose(factor.solve(right), inverse @ right, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(factor.variance, np.diag(inverse), rtol=1e-6)
     np.testing.assert_allclose(factor.row_variance, np.einsum("ei,ij,ej->e", jacobian, inverse, jacobian), rtol=1e-6)
-    others, factors = rows(rng, size, 20)
-    far = dense(others, factors, size)
-    expected = np.einsum("ei,ij,ej->e", far, inverse, far)
-    np.testing.assert_allclose(factor.variance_of(others, factors), expected, rtol=1e-6, atol=1e-12)
+    # Few rows go up the tree each, of many each unknown does.
+    for count in (20, 300):
+        others, factors = rows(rng, size, count)
+        far = dense(others, factors, size)
+        expected = np.einsum("ei,ij,ej->e", far, inverse, far)
+        np.testing.assert_allclose(factor.variance_of(others, factors), expected, rtol=1e-6, atol=1e-12)
+
+
+def test_what_many_rows_are_told_costs_no_more_than_their_unknowns() -> None:
+    """By their ends or each by itself they come out alike, to rounding."""
+    rng, size = np.random.default_rng(3), 300
+    column, value = rows(rng, size, 200)
+    factor = RowPattern(column, value, size).factorise(rng.uniform(0.1, 100.0, len(column)), np.full(size, 0.01))
+    others, factors = rows(rng, size, 5000)
+    with metered() as by_ends:
+        found = factor.variance_of(others, factors)
+    with pytest.MonkeyPatch.context() as patch, metered() as each:
+        patch.setattr(ldl, "_NUMBERS", 0.0)
+        np.testing.assert_allclose(factor.variance_of(others, factors), found, rtol=1e-11)
+    assert by_ends.spent < 0.1 * each.spent
 
 
 @given(st.integers(0, 10_000), st.integers(3, 40), st.integers(0, 60))
