@@ -11,15 +11,17 @@ all are in.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rotavg_ros.online.answer.arrivals import FALSE, GOOD, Arrivals
+from rotavg_ros.online.answer.arrivals import FALSE, GAP, GOOD, Arrivals, beside
 from rotavg_ros.online.answer.screening import Known
 from rotavg_ros.online.compaction.renumbering import Renumbering
+from rotavg_ros.online.compaction.thinning import Way
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel, ViewGraph
 
 _MOST_DOUBLINGS = 30
@@ -109,18 +111,22 @@ class ClosureQueue:
         if known is not None and waits.any() and bool(graph.is_odometry.any()):
             flagged = np.zeros(graph.num_edges, dtype=bool)
             flagged[: len(outlier)] = outlier
-            solved = flagged[was_in & is_closure]
-            waits[self._chosen(graph, waits, known, solved)] = False
+            waits[self._chosen(graph, waits, known, np.flatnonzero(was_in & is_closure), flagged)] = False
         else:
             waits[:] = False
         self.waits = waits
         self.order = None if in_own_order and not waits.any() else np.concatenate((entered, _new(waits, was_in)))
 
     def _chosen(
-        self, graph: ViewGraph, waits: NDArray[np.bool_], known: Known, solved: NDArray[np.bool_]
+        self,
+        graph: ViewGraph,
+        waits: NDArray[np.bool_],
+        known: Known,
+        closures_in: NDArray[np.int64],
+        flagged: NDArray[np.bool_],
     ) -> NDArray[np.int64]:
-        """Which of the closures that wait ``(M,)`` enter, given the flags ``(C,)`` of those that are in the solve."""
-        candidates, limits = np.flatnonzero(waits), self.limits
+        """Which of the closures that wait ``(M,)`` enter, given those in the solve ``(C,)`` and all flags ``(M,)``."""
+        candidates, limits, solved = np.flatnonzero(waits), self.limits, flagged[closures_in]
         num_known = len(known.body_from_world)
         most = limits.at_least + limits.share * len(solved) + limits.per_keyframe * (graph.num_nodes - num_known)
         most = int(most * 2.0 ** min(self.idle_ticks, _MOST_DOUBLINGS))
@@ -128,7 +134,9 @@ class ClosureQueue:
             return candidates
         closures = graph.select_edges(torch.from_numpy(candidates))
         told = known.carried_on(graph.select_edges(torch.from_numpy(~waits))).log_odds(closures, graph)
-        prior = self.arrivals.prior_log_odds(candidates, told)
+        is_open = candidates[self.arrivals.are_open(candidates, told)]
+        self.arrivals.beside[is_open], believed = _beside(graph, is_open, closures_in[~solved])
+        prior = self.arrivals.prior_log_odds(candidates, told, believed)
         self.prior_log_odds[candidates] = prior
         is_good = told + prior >= 0
         # The solve would believe these, whatever they came with.
@@ -149,6 +157,16 @@ class ClosureQueue:
         others = np.flatnonzero(may_enter)
         others = others[np.lexsort((-told[others], ~at_newest[others]))][:spare]
         return candidates[np.concatenate((explained, others))]
+
+
+def _beside(graph: ViewGraph, asked: NDArray[np.int64], believed: NDArray[np.int64]) -> Sequence[NDArray[np.int64]]:
+    """``(K,)`` how near some closures are to one of ``(B,)`` others, and these to each other."""
+    names = ("source", "target", "kind", "steps")
+    way = Way.along(graph.num_nodes, {name: getattr(graph, name).numpy() for name in names})
+    position = way.position + way.chain * (way.length + 3 * GAP)
+    ends = np.stack((graph.source.numpy(), graph.target.numpy()), axis=1)
+    known = position[ends[believed]]
+    return beside(position[ends[asked]], known), beside(known, known, is_one=True)
 
 
 def _new(waits: NDArray[np.bool_], was_in: NDArray[np.bool_]) -> NDArray[np.int64]:
