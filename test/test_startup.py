@@ -55,6 +55,7 @@ def test_a_solve_needs_no_pictures_bags_robots_or_evaluation(tmp_path: Path) -> 
     assert (tmp_path / "answer" / "orientations.csv").is_file() and "torch" in modules
     assert not modules & (_PICTURES_AND_BAGS | {"rclpy"})  # numba looks for settings of its own in YAML
     assert not wings(modules) & {*_WINGS, "online", "inputs", "settings", "ros"}
+    assert "rotavg_ros.solver.slam.solve" in modules and "rotavg_ros.solver.sfm.solve" not in modules
 
 
 @pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="needs ROS 2")

@@ -63,13 +63,14 @@ def run(arguments: argparse.Namespace) -> int:
     )
     if arguments.translation_scale == "none":
         solve_graph = _blind_to_translations(solve_graph)
-    # One-time costs (loading weights, first kernels) are not the graphs', and wrong options show before any work.
-    for has_odometry in (True, False):
-        solve_graph(_warm_up_graph(has_odometry))
+    # One-time costs (loading weights, first kernels) are not the graphs', and wrong options show before any work; what
+    # photo collections alone need is loaded with the first of them.
+    warm = _Warm(solve_graph)
+    warm.up(has_odometry=True)
     errors: list[UserError] = []
     for job in jobs:
         try:
-            summary = solve_file(job, solve_graph, arguments.edges, poses=arguments.poses)
+            summary = solve_file(job, warm, arguments.edges, poses=arguments.poses)
         except UserError as mistake:
             errors.append(mistake)
         else:
@@ -96,14 +97,12 @@ def _told(summary: dict[str, Any]) -> str:
     return f"{summary['nodes']} nodes, {edges} edges, {verdicts}, {components}, {summary['solve_seconds']:.2f} s"
 
 
-def solve_file(
-    job: Job, solve_graph: Callable[[ViewGraph], Solution], edges: str, *, poses: bool = False
-) -> dict[str, Any]:
+def solve_file(job: Job, solver: _Warm, edges: str, *, poses: bool = False) -> dict[str, Any]:
     """Read, solve and write one graph.
 
     Args:
         job: which, and where to.
-        solve_graph: the solver with its options.
+        solver: with its options.
         edges: format of the edges' file, or ``none``.
         poses: write positions as well.
 
@@ -114,6 +113,7 @@ def solve_file(
     with working(f"reading {job.graph}"):
         graph_file = read_graph(job.graph)
     read_seconds = time.perf_counter() - start
+    solve_graph = solver.for_graph(graph_file.graph)
     start = time.perf_counter()
     with working(f"solving {job.graph}"):
         solution = solve_graph(graph_file.graph)
@@ -244,6 +244,25 @@ def _edge_columns(graph_file: GraphFile, solution: Solution) -> list[Column]:
         judged = solution.rotation_score.cpu().numpy(), residual_deg(graph, solution), residual_m(graph, solution)
     ends = ids[graph.source.cpu().numpy()], ids[graph.target.cpu().numpy()]
     return edge_columns(ends, score, score > OUTLIER_THRESHOLD, judged)
+
+
+class _Warm:
+    """A solver that has solved a graph of the same kind before."""
+
+    def __init__(self, solve_graph: Callable[[ViewGraph], Solution]) -> None:
+        self._solve_graph = solve_graph
+        self._is_warm: set[bool] = set()
+
+    def up(self, *, has_odometry: bool) -> None:
+        """For graphs of a kind."""
+        if has_odometry not in self._is_warm:
+            self._is_warm.add(has_odometry)
+            self._solve_graph(_warm_up_graph(has_odometry))
+
+    def for_graph(self, graph: ViewGraph) -> Callable[[ViewGraph], Solution]:
+        """The solver, warm for a graph."""
+        self.up(has_odometry=bool(graph.is_odometry.any()))
+        return self._solve_graph
 
 
 def _warm_up_graph(has_odometry: bool) -> ViewGraph:

@@ -18,7 +18,6 @@ from rotavg_ros.solver.neurora.network_store import Networks, check_folder
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.running.threads import for_each, workers
 from rotavg_ros.solver.running.work import metered
-from rotavg_ros.solver.sfm.solve import solve_sfm
 from rotavg_ros.solver.slam.live import advance as advance_slam
 from rotavg_ros.solver.slam.live import update_slam
 from rotavg_ros.solver.slam.noise import exceedance
@@ -225,6 +224,8 @@ def _solve_once(job: _Job, name: str, run: Run) -> Estimate:
         return _solve_baseline(job, name, run)
     if job.profile == "slam":
         return solve_slam(graph, method.slam, run)
+    from rotavg_ros.solver.sfm.solve import solve_sfm  # a robot's graph has no use for it
+
     return solve_sfm(graph, job.component, method.sfm, run)
 
 
