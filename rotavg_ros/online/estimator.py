@@ -17,7 +17,13 @@ from rotavg_ros.online.answer.odometry_frame import OdometryFrame, placed_frames
 from rotavg_ros.online.answer.trajectory import Trajectory, corrected_trajectories
 from rotavg_ros.online.content import AcceptedAnswer, Content, ContentState, Counts
 from rotavg_ros.online.graph.snapshot import GraphSnapshot
-from rotavg_ros.online.measurements import EdgeMeasurement, OdometryMessage, RejectReason
+from rotavg_ros.online.measurements import (
+    EdgeMeasurement,
+    OdometryMessage,
+    RejectReason,
+    plain_number,
+    plain_numbers,
+)
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.online.state import content as state_content
@@ -132,8 +138,10 @@ class OnlineEstimator:
         Returns:
             why it was refused and counted; None if it was taken.
         """
+        turn, place = plain_numbers(world_from_body), plain_numbers(position)
+        message = OdometryMessage(robot, plain_number(stamp_ns), turn or (), place)
         with self._lock:
-            reason, since_jump = self._content.add_odometry(OdometryMessage(robot, stamp_ns, world_from_body, position))
+            reason, since_jump = self._content.add_odometry(message)
             if not since_jump:
                 return reason
             self._time_jumps += 1
@@ -170,7 +178,7 @@ class OnlineEstimator:
     def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
         """Accept or reject for good every edge with a sender's id, or hand it back; returns how many there are."""
         with self._lock:
-            return self._content.builder.label_edge(source_robot, edge_id, label)
+            return self._content.builder.label_edge(source_robot, plain_number(edge_id), label)
 
     def current_orientation(self, robot: str) -> Quaternion | None:
         """world_from_body now: the robot's last corrected keyframe, then odometry. None before its first odometry."""

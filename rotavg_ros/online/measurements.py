@@ -6,8 +6,9 @@ import hashlib
 import math
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.quaternion import Quaternion
@@ -163,13 +164,14 @@ def checked_rotation(xyzw: Sequence[float]) -> Quaternion:
         RejectedInputError: not four numbers, not finite, zero, or far from unit length.
     """
     check_length(xyzw, 4)
-    length = quaternion.norm(xyzw)
+    x, y, z, w = map(float, xyzw)
+    length = quaternion.norm((x, y, z, w))
     if not math.isfinite(length):
         raise RejectedInputError(RejectReason.NAN_ROTATION)
     if abs(length - 1) > UNIT_NORM_TOLERANCE:
         zero = length < UNIT_NORM_TOLERANCE
         raise RejectedInputError(RejectReason.ZERO_QUATERNION if zero else RejectReason.UNNORMALIZED_QUATERNION)
-    return quaternion.normalize(xyzw)
+    return quaternion.normalize((x, y, z, w))
 
 
 def check_length(numbers: Sequence[float] | None, length: int) -> None:
@@ -193,11 +195,27 @@ def checked_stamp(stamp_ns: int) -> int:
     return stamp_ns
 
 
-def check_edge(edge: EdgeMeasurement) -> Quaternion:
+def plain_number(number: Any) -> Any:
+    """Python's own, where somebody has NumPy's, which JSON cannot say."""
+    return number.item() if hasattr(number, "item") else number
+
+
+def plain_numbers(numbers: Sequence[float] | None) -> tuple[float, ...] | None:
+    """The same of several; an array has no truth, either."""
+    return None if numbers is None else tuple(map(float, numbers))
+
+
+def _plain_end(end: KeyframeReference) -> KeyframeReference:
+    if not (hasattr(end.keyframe_id, "item") or hasattr(end.stamp_ns, "item")):
+        return end
+    return KeyframeReference(end.robot, plain_number(end.keyframe_id), plain_number(end.stamp_ns))
+
+
+def checked_edge(edge: EdgeMeasurement) -> EdgeMeasurement:
     """Everything about an edge that can be judged without knowing the graph.
 
     Returns:
-        ``edge.target_from_source`` normalised.
+        the edge with ``target_from_source`` normalised and Python's own numbers.
 
     Raises:
         RejectedInputError: with the first reason that applies.
@@ -218,4 +236,13 @@ def check_edge(edge: EdgeMeasurement) -> Quaternion:
     if edge.source.key == edge.target.key:
         raise RejectedInputError(RejectReason.SELF_EDGE)
     check_length(edge.translation, 3)
-    return checked_rotation(edge.target_from_source)
+    return replace(
+        edge,
+        edge_id=plain_number(edge.edge_id),
+        source=_plain_end(edge.source),
+        target=_plain_end(edge.target),
+        target_from_source=checked_rotation(edge.target_from_source),
+        kind=int(edge.kind),
+        precision=float(edge.precision),
+        translation=plain_numbers(edge.translation),
+    )

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
-from rotavg_ros.view_graph import EdgeKind
+from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
 from .drives import OPTIONS, SECOND, Drive, at, closure, drive, feed, final, make
 
@@ -179,3 +179,38 @@ def test_odometry_numbers_its_keyframes_past_those_of_a_front_end(solver, tmp_pa
     new_edges = slice(len(before.edge_id), None)
     assert int(after.graph.source[new_edges].min()) == len(before.keyframe_id)
     assert len(after.edge_id) == len(before.edge_id) + 13
+
+
+def test_numpys_numbers_mean_what_pythons_do(solver, tmp_path):
+    """In all that a file keeps: edges that wait, labels, stamps and late messages."""
+
+    def grown(whole, real) -> tuple[OnlineEstimator, list[object]]:
+        """``whole`` and ``real`` make of numbers what is handed over."""
+        online, told = make(solver), []
+        for index in range(12):
+            pose = real([0.6, 0.0, 0.0, 0.8]), real([0.25 * index, 0.0, 0.0])
+            online.add_odometry("r", whole(index * SECOND), *pose)
+        for target, stamp_ns in ((3, None), (50, None), (None, 4 * SECOND), (None, 90 * SECOND)):
+            by = (None if target is None else whole(target)), (None if stamp_ns is None else whole(stamp_ns))
+            ends = KeyframeReference("r", whole(0)), KeyframeReference("r", *by)
+            turn, place = real([0.0, 0.0, 0.6, 0.8]), real([0.5, 0.0, 0.0])
+            edge = EdgeMeasurement(whole(7), *ends, turn, whole(1), real(3.0), place)
+            told.append(online.add_edge(edge))
+        again = EdgeMeasurement(7, KeyframeReference("r", 0), KeyframeReference("r", 3), (0.0, 0.0, 0.6, 0.8))
+        told.append(online.add_edge(again))
+        for stamp_ns in (SECOND, 2 * SECOND):
+            told.append(online.add_odometry("r", whole(stamp_ns), *pose))
+        told.append(online.label_edge("r", whole(7), EdgeLabel.REJECTED))
+        online.tick()
+        return online, told
+
+    def content(online: OnlineEstimator) -> dict[str, object]:
+        online.save(tmp_path / "state.npz")
+        OnlineEstimator(OPTIONS, solver).load(tmp_path / "state.npz")
+        with np.load(tmp_path / "state.npz", allow_pickle=False) as archive:
+            return {name: archive[name].tobytes() for name in archive.files}
+
+    plain, told = grown(lambda number: number, lambda numbers: numbers)
+    numpys, told_too = grown(np.int64, np.float64)
+    assert told_too == told and content(numpys) == content(plain)
+    assert numpys.counts().pending == 2 and told[4] == "duplicate_edge"

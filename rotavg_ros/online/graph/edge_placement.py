@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
 
 from rotavg_ros.online.graph.attachment import attach, between_keyframes
 from rotavg_ros.online.graph.growth import Growth
@@ -16,7 +15,7 @@ from rotavg_ros.online.measurements import (
     KeyframeReference,
     RejectedInputError,
     RejectReason,
-    check_edge,
+    checked_edge,
 )
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
@@ -31,7 +30,7 @@ class EdgePlacement:
         """Take an edge into the graph or into the waiting room; returns why it was refused, if it was."""
         growth = self._growth
         try:
-            edge = replace(edge, target_from_source=check_edge(edge))
+            edge = checked_edge(edge)
             undecided = self._undecided_end(edge)
             is_known = undecided is None and self._fingerprint(edge) in growth.fingerprints
             if is_known or edge in growth.pending:

@@ -164,5 +164,5 @@ class PendingEdges:
 
 
 def _stamp(reference: KeyframeReference) -> int:
-    assert reference.stamp_ns is not None  # a reference without an id has a stamp (check_edge)
+    assert reference.stamp_ns is not None  # a reference without an id has a stamp (checked_edge)
     return reference.stamp_ns
