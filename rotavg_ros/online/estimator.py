@@ -18,6 +18,7 @@ from rotavg_ros.online.answer.trajectory import Trajectory, corrected_trajectori
 from rotavg_ros.online.content import AcceptedAnswer, Content, ContentState, Counts
 from rotavg_ros.online.graph.snapshot import GraphSnapshot
 from rotavg_ros.online.measurements import (
+    MAX_ID,
     EdgeMeasurement,
     OdometryMessage,
     RejectReason,
@@ -30,7 +31,7 @@ from rotavg_ros.online.state import content as state_content
 from rotavg_ros.online.state import file as state_file
 from rotavg_ros.online.state.discarded import Discarded
 from rotavg_ros.solver import Abandoned, abandonable
-from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph, ViewGraphError
 
 if TYPE_CHECKING:
     from rotavg_ros.solver import Solution
@@ -176,9 +177,20 @@ class OnlineEstimator:
             self._content.state.growth.refuse(reason)
 
     def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
-        """Accept or reject for good every edge with a sender's id, or hand it back; returns how many there are."""
+        """Accept or reject for good every edge with a sender's id, or hand it back; returns how many there are.
+
+        Raises:
+            ViewGraphError: no :class:`EdgeLabel`; a file with another could never be loaded.
+        """
+        edge_id = plain_number(edge_id)
+        try:
+            label = EdgeLabel(label)
+        except ValueError:
+            raise ViewGraphError(f"label {label!r}; 0 is automatic, 1 accepted, 2 rejected") from None
+        if not 0 <= edge_id <= MAX_ID:
+            return 0
         with self._lock:
-            return self._content.builder.label_edge(source_robot, plain_number(edge_id), label)
+            return self._content.builder.label_edge(source_robot, edge_id, label)
 
     def current_orientation(self, robot: str) -> Quaternion | None:
         """world_from_body now: the robot's last corrected keyframe, then odometry. None before its first odometry."""

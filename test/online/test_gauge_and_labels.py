@@ -10,7 +10,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.online import EdgeMeasurement, KeyframeReference
+from rotavg_ros.errors import UserError
+from rotavg_ros.online import EdgeMeasurement, KeyframeReference, OnlineEstimator
 from rotavg_ros.view_graph import EdgeLabel
 
 from .drives import OPTIONS, closure, drive, feed, final, make
@@ -89,3 +90,16 @@ def test_a_label_holds_for_waiting_edges_and_later_ones(solver):
     assert final(estimator).outlier.tolist() == [False] * 13 + [True, True]
     assert estimator.label_edge("r", 4, EdgeLabel.AUTOMATIC) == 2
     assert not final(estimator).outlier.any()
+
+
+def test_what_is_no_label_or_no_id_labels_nothing(solver, tmp_path):
+    """A file with a label that does not exist could never be loaded."""
+    run, online = drive(), make(solver)
+    feed(online, run)
+    online.add_edge(closure(run, 1, 0, 30))
+    for label in (7, -1, "rejected"):
+        with pytest.raises(UserError, match=r"label .*; 0 is automatic, 1 accepted, 2 rejected"):
+            online.label_edge("r", 1, label)
+    assert [online.label_edge("r", edge_id, EdgeLabel.REJECTED) for edge_id in (-1, 2**64, 1)] == [0, 0, 1]
+    online.save(tmp_path / "state.npz")
+    OnlineEstimator(OPTIONS, solver).load(tmp_path / "state.npz")
