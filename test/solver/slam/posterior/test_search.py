@@ -150,6 +150,17 @@ def test_order_and_direction_of_edges_change_nothing(kind: str) -> None:
     torch.testing.assert_close(again.outlier_score, solution.outlier_score[order], atol=0.02, rtol=0)
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_two_closures_that_alone_join_two_keyframes_are_solved(seed: int) -> None:
+    """Without them nothing tells of either, up to rounding."""
+    rng = np.random.default_rng(seed)
+    measured = rotations.exp(torch.from_numpy(0.01 * rng.normal(size=(2, 3))))
+    graph = ViewGraph.create([0, 0], [1, 1], measured, num_nodes=2, kind=[1, 1], precision=rng.uniform(1, 9e3, 2))
+    solution = solve(graph, profile="slam")
+    assert bool(torch.isfinite(solution.body_from_world).all())
+    assert not bool((solution.outlier_score > 0.5).any())
+
+
 @pytest.mark.parametrize("name", SWITCHES)
 def test_there_is_an_answer_without_any_part(name: str) -> None:
     case = drawn("building: 15 closures", 1)

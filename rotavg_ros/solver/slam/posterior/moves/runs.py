@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.linalg import cho_solve
 
 from rotavg_ros.solver.slam.posterior.em import settle
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
@@ -61,11 +62,13 @@ def _without(mode: Mode, members: np.ndarray) -> tuple[float, np.ndarray] | None
     own = variances(problem, mode.state.noise)[rows]
     left = np.diag(own) - mode.covariance_of(members) * sign * sign.T
     try:
-        log_det_left = 2 * float(np.log(np.diagonal(np.linalg.cholesky(left))).sum())
+        factor = np.linalg.cholesky(left)
     except np.linalg.LinAlgError:
         return None
+    # By rounding there may be a factor where members are all that joins two parts; what it gives is beyond any turn.
+    log_det_left = 2 * float(np.log(np.diagonal(factor)).sum())
     residual = mode.evaluation.residual[rows] * sign
-    solved = np.linalg.solve(left, residual)
+    solved = cho_solve((factor, True), residual)
     off = own[:, None] * solved
     if not (np.abs(off) < np.pi).all():
         return None
