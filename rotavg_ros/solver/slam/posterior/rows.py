@@ -18,8 +18,8 @@ from rotavg_ros.solver.slam.posterior.system import Factorised
 _NOTHING = 1e-10
 # What is left of an edge without itself, at least; one that alone holds two parts together tells nothing of them.
 _LEAST_REST = 1e-6
-# Odometry errs by far more than usual for so many steps at most, as on an uneven floor. Without such a bound a slip of half a
-# turn in a long segment passes for drift; with 15 or 60 steps B25b 0.250, which is divided, ends at 1.35 and 1.84 instead of 1.80°.
+# Odometry errs by far more than usual for so many steps at most, as on an uneven floor. Without such a bound a slip of
+# half a turn in a long segment passes for drift; as long as closures of a run are apart.
 _LONGEST_STRETCH = 30.0
 # A step turns nothing by more than this, rad; beyond, the linear system says nothing.
 _MAX_TURN = 1.0

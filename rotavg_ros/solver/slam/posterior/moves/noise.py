@@ -123,14 +123,11 @@ def _next(mode: Mode, names: tuple[str, ...], left: list[_Values]) -> tuple[_Val
 
 
 def _are_next(some: _Values, others: _Values) -> bool:
-    """Whether tails are next to each other on their grid of shares and ratios."""
+    """Whether tails differ by their share alone, or by one place of the grid of ratios alone."""
     if len(some) < 2 or min(some[0], others[0]) == 0:
         return False
-    share, ratio = (
-        abs(grid.index(either) - grid.index(other))
-        for grid, either, other in zip((TAIL_SHARES, STEP_TAIL_RATIOS), some, others, strict=True)
-    )
-    return share + ratio == 1
+    places = abs(STEP_TAIL_RATIOS.index(some[1]) - STEP_TAIL_RATIOS.index(others[1]))
+    return places == 0 or (places == 1 and some[0] == others[0])
 
 
 def _predicted(mode: Mode, noise: Noise) -> tuple[float, Noise]:
