@@ -19,9 +19,8 @@ _NOTHING = 1e-10
 # What is left of an edge without itself, at least; one that alone holds two parts together tells nothing of them.
 _LEAST_REST = 1e-6
 # Odometry errs by far more than usual for so many steps at most: a bump, a stretch of uneven floor. Without a bound a
-# slip of half a turn in a long segment passes for drift. With 30 B25b, which is divided, ends at 1.27, 1.80 and 1.67
-# instead of 1.47, 1.35 and 1.68°.
-_LONGEST_STRETCH = 15.0
+# slip of half a turn in a long segment passes for drift.
+_LONGEST_STRETCH = 30.0
 # A step turns nothing by more than this, rad; beyond, the linear system says nothing.
 _MAX_TURN = 1.0
 

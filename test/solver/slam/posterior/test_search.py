@@ -296,7 +296,7 @@ STRUCTURAL = {
     "em": {"_SETTLED_TURN", "_MAX_UNSETTLED", "_SLOWEST", "_PROBABILITY_CONVERGED"}
     | {"_NEWTON_STEPS", "_NEWTON_CONVERGED", "_FARTHEST"},
     "inference": {"_GAIN", "_BEAM"},
-    "labels/prior": {"_SHARES", "_STAY", "_LAST_SHARES", "_BURSTS", "_LOG_STEPS", "_DIGITS"},
+    "labels/prior": {"_SHARES", "_STAY", "_LAST_SHARES", "_LOG_STEPS", "_DIGITS"},
     "labels/false_closures": {
         "_RUN_SHARES",
         "_NEAR_SHARES",

@@ -15,8 +15,6 @@ from rotavg_ros.solver.slam.posterior.problem import Problem
 _SHARES = np.array([0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98])
 _STAY = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 0.97])
 _LAST_SHARES = np.array([0.0, 0.5, 1.0])
-# That it ever is, beforehand.
-_BURSTS = 0.5
 
 
 def _log_steps() -> np.ndarray:
@@ -42,13 +40,12 @@ _DIGITS = np.multiply.accumulate(np.full(_LOG_STEPS.shape[1], 636413622384679300
 
 @cache
 def _log_grid_prior(priors: SlamPriors, without: frozenset[str]) -> np.ndarray:
-    """``(G,)`` of the grid's points: a Beta density on the shares, stickiness as likely as none, bursts as none."""
+    """``(G,)`` of the grid's points: a Beta density on the shares, all else as likely, or as it is switched off."""
     a = priors.outlier_share * priors.outlier_count
     b = (1 - priors.outlier_share) * priors.outlier_count
     log = (a - 1) * np.log(_SHARES) + (b - 1) * np.log1p(-_SHARES) + np.log(np.gradient(_SHARES))
     stay = np.where(("label-runs" in without) & (_STAY > 0), -np.inf, 0.0)
-    by_last = np.log(_BURSTS / (len(_LAST_SHARES) - 1)) if "label-bursts" not in without else -np.inf
-    last = np.where(_LAST_SHARES > 0, by_last, np.log1p(-_BURSTS))
+    last = np.where(("label-bursts" in without) & (_LAST_SHARES > 0), -np.inf, 0.0)
     log = (log[:, None, None] + stay[:, None] + last).ravel()
     return np.asarray(log - np.logaddexp.reduce(log))
 
