@@ -22,9 +22,13 @@ def propose_tails(mode: Mode) -> Iterator[Proposal]:
     Many small slips are what odometry with a few far worse segments looks like. One by one they are not taken back:
     without tails each is a slip, and while they are slips nothing is left to be in the tails.
     """
-    if len(mode.slipped) == 0:
+    # What a label rejects stays rejected.
+    slips = mode.slipped[np.isfinite(mode.problem.log_odds[mode.slipped])]
+    if len(slips) == 0:
         return
-    mended = min((_Mended.of(mode, share, ratio) for share, ratio in STEP_TAILS), key=lambda each: each.predicted)
+    mended = min(
+        (_Mended.of(mode, slips, share, ratio) for share, ratio in STEP_TAILS), key=lambda each: each.predicted
+    )
     if mended.explained.any():
         yield Proposal("tails", mended.predicted, lambda: mended.state(mode), mode.problem.limits.rival)
 
@@ -34,22 +38,24 @@ class _Mended(NamedTuple):
 
     Attributes:
         predicted: by how much F changes, nats, if what others say of each edge stays.
+        slips: ``(S,)`` edges.
         noise: θ with the tails that explain them, and the step's best variance.
         explained: ``(S,)`` bool, which of the slips.
     """
 
     predicted: float
+    slips: np.ndarray
     noise: Noise
     explained: np.ndarray
 
     @classmethod
-    def of(cls, mode: Mode, share: float, ratio: float) -> _Mended:
+    def of(cls, mode: Mode, slips: np.ndarray, share: float, ratio: float) -> _Mended:
         """With tails of a share and ratio."""
         problem, told, before = mode.problem, mode.left_out, mode.state.noise
         noise = replace(before, step_tails=share, step_tail_ratio=ratio)
         # The slips come last.
         sound = np.flatnonzero(problem.graph.is_odometry & mode.state.is_good)
-        edges = np.concatenate((sound, mode.slipped))
+        edges = np.concatenate((sound, slips))
         square, predicted = told.square[edges], told.predicted[edges]
 
         def log_density(of: Noise, scale: np.ndarray) -> np.ndarray:
@@ -57,13 +63,14 @@ class _Mended(NamedTuple):
             return log_good(square, scale * own, predicted, problem.components, tailed)[0]
 
         now = log_density(before, np.ones(1))
-        now[len(sound) :] -= told.log_odds[mode.slipped]
+        now[len(sound) :] -= told.log_odds[slips]
         then = log_density(noise, SCALES[:, None])
         best = np.concatenate((then[:, : len(sound)], np.maximum(then, now)[:, len(sound) :]), axis=1)
         number = int(best.sum(axis=1).argmax())
         changed = log_noise_prior(before, problem.priors) - log_noise_prior(noise, problem.priors)
         return cls(
             float(now.sum() - best[number].sum()) + changed,
+            slips,
             replace(noise, step_variance=float(SCALES[number]) * noise.step_variance),
             then[number, len(sound) :] > now[len(sound) :],
         )
@@ -71,5 +78,5 @@ class _Mended(NamedTuple):
     def state(self, mode: Mode) -> State:
         """To begin from."""
         trusted = mode.state.trusted.copy()
-        trusted[mode.slipped[self.explained]] = 1.0
+        trusted[self.slips[self.explained]] = 1.0
         return replace(with_noise(mode.problem, mode.state, self.noise), trusted=trusted)
