@@ -21,14 +21,16 @@ class Tails(NamedTuple):
     Attributes:
         share: ``(n,)`` t, chance of each to be in the tails.
         ratio: ``(n,)`` τ, how many times its variance it has there.
+        told: ``(n,)`` φ, how much of what all components tell of that holds: less than 1 where they go together.
     """
 
     share: np.ndarray
     ratio: np.ndarray
+    told: np.ndarray
 
     def of(self, edges: np.ndarray) -> Tails:
         """Of some of them."""
-        return Tails(self.share[edges], self.ratio[edges])
+        return Tails(self.share[edges], self.ratio[edges], self.told[edges])
 
 
 def anyhow(components: int) -> float:
@@ -49,18 +51,20 @@ def log_good(
     components: int,
     tails: Tails,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of good edges: log [(1 − t) N(r; v + p) + t N(r; τ v + p)], and the share of the first.
+    """Of good edges: log N(r; v + p) + log [(1 − t) + t (N(r; τ v + p) / N(r; v + p))^φ], and the share of the first.
 
     Args:
         square: ``(n,)`` rad², ‖r‖².
         variance: ``(n,)`` rad², v, of the edge's own noise.
         predicted: rad², p, of what r is compared with.
         components: k.
-        tails: t and τ.
+        tails: t, τ and φ.
     """
-    exact = log_normal(square, variance + predicted, components) + np.log1p(-tails.share)
+    normal = log_normal(square, variance + predicted, components)
+    exact = normal + np.log1p(-tails.share)
     with np.errstate(divide="ignore"):
-        tail = log_normal(square, tails.ratio * variance + predicted, components) + np.log(tails.share)
+        farther = log_normal(square, tails.ratio * variance + predicted, components) - normal
+        tail = normal + tails.told * farther + np.log(tails.share)
     both = np.logaddexp(exact, tail)
     return both, np.exp(exact - both)
 

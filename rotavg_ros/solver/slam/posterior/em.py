@@ -16,6 +16,7 @@ from rotavg_ros.solver.slam.posterior.rows import (
     moved,
     residuals,
     sites,
+    step_told,
     variances,
     weights,
     weights_if_good,
@@ -166,6 +167,7 @@ def estimate_noise(problem: Problem, state: State, factorised: Factorised) -> No
         noise,
         step_variance=likeliest(is_step, noise.step_variance, priors.step_deg),
         closure_variance=likeliest(~is_step, noise.closure_variance, priors.closure_deg),
+        step_told=step_told(problem, state, factorised.weight, residual),
     )
 
 

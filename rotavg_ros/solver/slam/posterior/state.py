@@ -32,6 +32,7 @@ class Noise:
         turn_share: share of odometry's variance that goes with the squares of the turns of its steps, not their number.
         step_tails, closure_tails: share of sound segments, and of good closures, that err by far more than others.
         step_tail_ratio: τ, how many times the variance of other segments those have.
+        step_told: φ, k_eff / k of odometry, 1 where it errs alike about all axes (`rows.step_told`).
         run_steps: no run is longer at its older end, in steps of odometry; 0 where closures err independently.
     """
 
@@ -44,10 +45,12 @@ class Noise:
     step_tails: float = TAIL_SHARES[0]
     closure_tails: float = TAIL_SHARES[0]
     step_tail_ratio: float = STEP_TAIL_RATIOS[0]
+    step_told: float = 1.0
 
     def chosen_as(self, other: Noise) -> Noise:
-        """The same variances with what another one has chosen from grids."""
-        return replace(other, step_variance=self.step_variance, closure_variance=self.closure_variance)
+        """What residuals told of the one with what another one has chosen from grids."""
+        told = {name: getattr(self, name) for name in ("step_variance", "closure_variance", "step_told")}
+        return replace(other, **told)
 
     @property
     def log_ratio(self) -> float:

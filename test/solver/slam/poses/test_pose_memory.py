@@ -77,7 +77,7 @@ def test_odometry_that_is_laid_on_counts_as_in_a_whole_solve(method: str, most: 
 
 def held_run() -> ViewGraph:
     """On hills, by odometry whose roll and pitch gravity holds."""
-    return held_by_gravity(simulated(2, **HILLS, closures_per_keyframe=0.3, false_share=0.2), 0.1)
+    return held_by_gravity(simulated(2, **HILLS, closures_per_keyframe=0.3, false_share=0.2), 0.3)
 
 
 @pytest.mark.parametrize("made", [lambda: displaced(run_of(1), 0.3, 1)[0], held_run], ids=["plane", "gravity"])
