@@ -15,7 +15,7 @@ from rotavg_ros.solver.slam.posterior.moves.flips import flipped
 from rotavg_ros.solver.slam.posterior.moves.runs import propose_rejected_runs
 from rotavg_ros.solver.slam.posterior.moves.splits import propose_splits
 from rotavg_ros.solver.slam.posterior.moves.starts import starts, turned_further, turned_parts
-from rotavg_ros.solver.slam.posterior.moves.tails import propose_tails
+from rotavg_ros.solver.slam.posterior.moves.tails import hides_slips, propose_tails
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import with_noise
 from rotavg_ros.solver.slam.posterior.state import State
@@ -69,8 +69,7 @@ class Search:
     def _cut_further(self, prepared: Prepared) -> None:
         """Minimum cuts from the best mode, as long as what they find is better."""
         least = np.inf
-        while self.modes[0].cost < least - _GAIN and len(self.modes[0].slipped) > 0:
-            best = self.modes[0]
+        while self.modes[0].cost < least - _GAIN and _has_slipped(best := self.modes[0]):
             least = best.cost
             self._begun("minimum cuts", turned_further(self.problem, prepared, best.state))
             self.move_on()
@@ -97,7 +96,7 @@ class Search:
     def _seems_slipped(self, mode: Mode) -> bool:
         if "slips" in self.problem.without:
             return False
-        return len(mode.slipped) > 0 or slips.may_have_slipped(mode)
+        return _has_slipped(mode) or slips.may_have_slipped(mode)
 
     def move_on(self) -> None:
         """The search from the modes that are kept."""
@@ -161,6 +160,11 @@ class Search:
             if not any(mode.is_like(other.state) for other in best):
                 best.append(mode)
         return best
+
+
+def _has_slipped(mode: Mode) -> bool:
+    """Whether odometry slipped, or would have if its tails were not as wide."""
+    return len(mode.slipped) > 0 or hides_slips(mode)
 
 
 def proposals(mode: Mode) -> Iterator[Proposal]:

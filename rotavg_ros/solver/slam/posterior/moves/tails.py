@@ -1,4 +1,4 @@
-"""Slips that are taken back all at once, for odometry with tails explains them."""
+"""Slips and tails of odometry explain the same: slips that tails explain, and tails that hide slips."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.moves.noise import SCALES, STEP_TAILS
 from rotavg_ros.solver.slam.posterior.objective import log_noise_prior
 from rotavg_ros.solver.slam.posterior.rows import tails, variances, with_noise
-from rotavg_ros.solver.slam.posterior.state import Noise, State
+from rotavg_ros.solver.slam.posterior.state import STEP_TAIL_RATIOS, Noise, State
 
 
 def propose_tails(mode: Mode) -> Iterator[Proposal]:
@@ -31,6 +31,23 @@ def propose_tails(mode: Mode) -> Iterator[Proposal]:
     )
     if mended.explained.any():
         yield Proposal("tails", mended.predicted, lambda: mended.state(mode), mode.problem.limits.rival)
+
+
+def hides_slips(mode: Mode) -> bool:
+    """Whether a segment is in wide tails that would clearly be a slip if tails were no wider than the least.
+
+    It is off by as much as by a slip, and what lies between two of those may be turned: what tells is the same.
+    """
+    noise, problem, told = mode.state.noise, mode.problem, mode.left_out
+    if noise.step_tail_ratio == STEP_TAIL_RATIOS[0] or "slips" in problem.without:
+        return False
+    sound = np.flatnonzero(problem.graph.is_odometry & mode.state.is_good)
+    own, k = variances(problem, noise)[sound], problem.components
+    if_wide, if_narrow = (
+        log_good(told.square[sound], own, told.predicted[sound], k, tails(problem, each).of(sound))[0]
+        for each in (noise, replace(noise, step_tail_ratio=STEP_TAIL_RATIOS[0]))
+    )
+    return bool((told.log_odds[sound] - (if_wide - if_narrow) < -problem.limits.rival).any())
 
 
 class _Mended(NamedTuple):
