@@ -16,7 +16,6 @@ from rotavg_ros.solver.slam.posterior.rows import (
     moved,
     residuals,
     sites,
-    step_told,
     variances,
     weights,
     weights_if_good,
@@ -167,8 +166,33 @@ def estimate_noise(problem: Problem, state: State, factorised: Factorised) -> No
         noise,
         step_variance=likeliest(is_step, noise.step_variance, priors.step_deg),
         closure_variance=likeliest(~is_step, noise.closure_variance, priors.closure_deg),
-        step_told=step_told(problem, state, factorised.weight, residual),
+        step_told=_step_told(problem, state, factorised.weight, residual),
     )
+
+
+def _step_told(problem: Problem, state: State, weight: np.ndarray, residual: np.ndarray) -> float:
+    """How many of the components that odometry errs in tell of its tails, of all k: k_eff / k.
+
+    Where gravity holds roll and pitch the squares of its turns are those of one normal component, not of three that
+    are smaller; these seem to have tails. A sum of squares of normal components with shares q of the variance is about
+    χ² with 1 / Σ q² degrees of freedom (Satterthwaite 1946).
+
+    Args:
+        problem: the graph.
+        state: after a solve.
+        weight: ``(E + R,)`` rad⁻² in that.
+        residual: ``(E + R, 3)`` rad after it.
+    """
+    vertical = None if problem.components == 1 or "tilt" in problem.without else problem.upright
+    sound = np.flatnonzero(problem.graph.is_odometry & state.is_good)
+    if vertical is None or len(sound) == 0:
+        return 1.0
+    weight, residual = weight[sound], residual[sound]
+    axis = vertical.sharpened(residual, 1 / weight)
+    # As if one edge more erred alike about all axes; and about others no more than about the vertical.
+    about = 1 + float(weight @ (residual @ axis) ** 2)
+    share = max(about / (3 + float(weight @ (residual**2).sum(axis=1))), 1 / 3)
+    return 1 / (share**2 + (1 - share) ** 2 / 2) / 3
 
 
 def likeliest_variance(squares: float, freedom: float, log_variance: float, log_prior: float, spread: float) -> float:

@@ -50,31 +50,6 @@ def tails(problem: Problem, noise: Noise) -> Tails:
     )
 
 
-def step_told(problem: Problem, state: State, weight: np.ndarray, residual: np.ndarray) -> float:
-    """How many of the components that odometry errs in tell of its tails, of all k: k_eff / k.
-
-    Where gravity holds roll and pitch the squares of its turns are those of one normal component, not of three that
-    are smaller; these seem to have tails. A sum of squares of normal components with shares q of the variance is about
-    χ² with 1 / Σ q² degrees of freedom (Satterthwaite 1946).
-
-    Args:
-        problem: the graph.
-        state: after a solve.
-        weight: ``(E + R,)`` rad⁻² in that.
-        residual: ``(E + R, 3)`` rad after it.
-    """
-    vertical = None if problem.components == 1 or "tilt" in problem.without else problem.upright
-    sound = np.flatnonzero(problem.graph.is_odometry & state.is_good)
-    if vertical is None or len(sound) == 0:
-        return 1.0
-    weight, residual = weight[sound], residual[sound]
-    axis = vertical.sharpened(residual, 1 / weight)
-    # As if one edge more erred alike about all axes; and about others no more than about the vertical.
-    about = 1 + float(weight @ (residual @ axis) ** 2)
-    share = max(about / (3 + float(weight @ (residual**2).sum(axis=1))), 1 / 3)
-    return 1 / (share**2 + (1 - share) ** 2 / 2) / 3
-
-
 def residuals(problem: Problem, state: State) -> np.ndarray:
     """``(E + R, 3)`` rad, of all rows."""
     graph, system = problem.graph, problem.system(state.noise)

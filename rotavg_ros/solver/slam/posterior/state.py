@@ -32,7 +32,7 @@ class Noise:
         turn_share: share of odometry's variance that goes with the squares of the turns of its steps, not their number.
         step_tails, closure_tails: share of sound segments, and of good closures, that err by far more than others.
         step_tail_ratio: τ, how many times the variance of other segments those have.
-        step_told: φ, k_eff / k of odometry, 1 where it errs alike about all axes (`rows.step_told`).
+        step_told: φ, k_eff / k of odometry, 1 where it errs alike about all axes (estimated with the variances).
         run_steps: no run is longer at its older end, in steps of odometry; 0 where closures err independently.
     """
 

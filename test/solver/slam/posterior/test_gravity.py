@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
+from rotavg_ros import rotations, solve
+from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver.slam.posterior.publishing.gravity import held_by_gravity
 from rotavg_ros.solver.slam.posterior.rows import residuals
 
@@ -64,3 +69,30 @@ def test_what_errs_about_one_axis_has_no_tails_for_that(seed: int) -> None:
     held, free = (pose_mode(graph).problem.mode.state.noise for graph in (made_held(run, 0.3, seed), graph_of(run)))
     assert held.step_tails == 0
     assert held.step_told < 0.75 < 0.95 < free.step_told
+
+
+@pytest.mark.parametrize("change", ["axes of the body", "order and direction"])
+def test_what_gravity_holds_is_held_in_whatever_axes_and_order(change: str) -> None:
+    run = simulated(4, **HILLS, closures_per_keyframe=0.3, false_share=0.2)
+    graph = replace(made_held(run, 0.3, 4), translation=None)
+    solution, turn = solve(graph), rotations.identity(1)
+    if change == "axes of the body":
+        turn = torch.from_numpy(Rotation.random(1, random_state=3).as_quat())
+        turned = rotations.multiply(rotations.multiply(turn, graph.target_from_source), rotations.inverse(turn))
+        other = solve(replace(graph, target_from_source=rotations.normalize(turned)))
+        scores = other.outlier_score
+    else:
+        backwards = torch.arange(graph.num_edges).flip(0)
+        reverse = graph.select_edges(backwards)
+        other = solve(
+            replace(
+                reverse,
+                source=reverse.target,
+                target=reverse.source,
+                target_from_source=rotations.inverse(reverse.target_from_source),
+            )
+        )
+        scores = other.outlier_score[backwards]
+    found = rotations.multiply(rotations.inverse(turn), other.body_from_world)
+    assert float(orientation_errors(found, solution.body_from_world).max()) < 1e-6
+    torch.testing.assert_close(scores, solution.outlier_score, rtol=0, atol=1e-5)
