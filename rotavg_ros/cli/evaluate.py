@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -36,9 +37,16 @@ def run(arguments: argparse.Namespace) -> int:
     """Run one suite."""
     if arguments.threads is not None:
         torch.set_num_threads(arguments.threads)
+    is_new = not arguments.output.exists()
     make_folder(arguments.output)
-    arguments.keep = None if arguments.keep is None else KeptAnswers(arguments.keep)
-    print(_RUN[arguments.suite](arguments))
+    try:
+        arguments.keep = None if arguments.keep is None else KeptAnswers(arguments.keep)
+        print(_RUN[arguments.suite](arguments))
+    except UserError:
+        if is_new:
+            with suppress(OSError):  # something was written
+                arguments.output.rmdir()
+        raise
     return 0
 
 
