@@ -55,7 +55,18 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "sfm": {"algebra", "estimate", "neurora", "running"},
         "": {"batch", "methods", "pipeline", "running", "solution"},
         "pipeline": {
-            *("devices", "estimate", "methods", "neurora", "running", "sfm", "slam", "solution", "warnings"),
+            *(
+                "devices",
+                "estimate",
+                "kept_labels",
+                "methods",
+                "neurora",
+                "running",
+                "sfm",
+                "slam",
+                "solution",
+                "warnings",
+            ),
         },
     },
     "solver/neurora": {
@@ -107,7 +118,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
             *("fine_net", "graph", "network", "noise", "options", "poses"),
             *("posterior", "preparation", "stages", "update"),
         },
-        "live": {"fine_net", "graph", "network", "options", "poses", "solve", "update"},
+        "live": {"fine_net", "graph", "network", "options", "poses", "posterior", "solve", "update"},
     },
     "solver/slam/fine_net": {
         "": set(),

@@ -62,7 +62,7 @@ class Counts:
 
 @dataclass
 class ContentState:
-    """What a content consists of, apart from what the solver remembers.
+    """What a content consists of.
 
     Attributes:
         growth: the graph, and what is needed to grow it.
@@ -71,6 +71,7 @@ class ContentState:
         ticked_revision: the graph's when it was last solved.
         world_from_odometry: by robot: world_from_body = world_from_odometry ∘ odometry, as of its last corrected
             keyframe.
+        memory: what the solver remembers of the last answer; of it a file keeps the labels.
     """
 
     growth: Growth
@@ -78,6 +79,7 @@ class ContentState:
     version: int = 0
     ticked_revision: int = 0
     world_from_odometry: dict[str, Quaternion] = field(default_factory=dict)
+    memory: object | None = None
 
     @classmethod
     def begin(cls, options: EstimatorOptions, version: int = 0) -> ContentState:
@@ -110,8 +112,7 @@ class AcceptedAnswer:
 class Content:
     """All of it is forgotten together, by a new one in its place. Not thread-safe.
 
-    What the solver remembers of its last answer is not part of the state, so the first answer after a load is a cold
-    one; nor is where it placed the robots' odometry, which is known again with that answer.
+    Where the last answer placed the robots' odometry is not part of the state; it is known again with the next one.
 
     Attributes:
         builder: the graph, and what is needed to grow it.
@@ -124,7 +125,6 @@ class Content:
         self.builder = GraphBuilder(state.growth)
         self.first_version = state.version
         self._frames: dict[str, OdometryFrame] = {}
-        self._memory: object | None = None
         self._answered_revision = 0
         self._answer_was_cold = True
 
@@ -195,7 +195,7 @@ class Content:
     def solve_anew(self) -> None:
         """Let the next tick solve though the graph is the same."""
         self._answered_revision = -1
-        self._memory = None
+        self.state.memory = None
 
     def next_problem(self, force_cold: bool) -> Problem | None:
         """What is to be solved now; None if the last answer still stands."""
@@ -211,7 +211,7 @@ class Content:
         waited = len(last.queue)
         # In silence the answer comes to what a solve from scratch says, beside ticks where the solver can do that.
         is_last = idle and not waited
-        may_go_on = self.builder.options.warm_start and self._memory is not None
+        may_go_on = self.builder.options.warm_start and self.state.memory is not None
         anew = is_last and not force_cold and may_go_on
         if anew and self.is_behind:  # the last tick failed: what is new comes first
             is_last = anew = False
@@ -221,14 +221,15 @@ class Content:
             last.queue.let_in(snapshot.graph, last.known, last.outlier, idle=idle)
         cold = force_cold or (is_last and not anew) or not self.builder.options.warm_start
         answered = last.body_from_world, last.component, last.outlier
-        return Problem(snapshot, cold, *answered, self._memory, last.queue.order, last.queue.prior_log_odds, anew)
+        return Problem(snapshot, cold, *answered, self.state.memory, last.queue.order, last.queue.prior_log_odds, anew)
 
     def accept(self, answer: AcceptedAnswer) -> None:
         """Make the answer to the last problem the last answer."""
         state = self.state
         state.last.replace(answer.body_from_world, answer.component, answer.outlier, answer.known)
         # After a compaction the labels alone of what is remembered fit the graph, and the solver sees that.
-        self._answered_revision, self._answer_was_cold, self._memory = answer.revision, answer.was_cold, answer.memory
+        self._answered_revision, self._answer_was_cold = answer.revision, answer.was_cold
+        state.memory = answer.memory
         state.version += 1
         assert self.answered is not None
         state.world_from_odometry = corrections(self.builder, self.answered)
@@ -236,11 +237,11 @@ class Content:
     @property
     def memory(self) -> object | None:
         """What the solver remembers of the last answer."""
-        return self._memory
+        return self.state.memory
 
     def remember(self, memory: object | None) -> None:
         """What the solver is about, where the answer stays as it was."""
-        self._memory = memory
+        self.state.memory = memory
 
     def counts(self, time_jumps: int) -> Counts:
         """Sizes and refusals now."""

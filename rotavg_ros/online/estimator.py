@@ -377,7 +377,7 @@ class OnlineEstimator:
                     _solved_graph(problem.graph, options),
                     **options.for_solver,
                     warm_start=warm_start,
-                    memory=None if warm_start is None else problem.memory,
+                    memory=None if warm_start is None else problem.goes_on_from,
                     work=work,
                     anew=problem.anew,
                 )

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from rotavg_ros.solver.batch import solve_batch
     from rotavg_ros.solver.methods import DEVICES, METHODS, PROFILES, TRANSLATION_SCALES
     from rotavg_ros.solver.pipeline import advance, solve
+    from rotavg_ros.solver.running.kept_labels import KeptLabels
     from rotavg_ros.solver.running.work import Abandoned, abandonable, stop_if_abandoned
     from rotavg_ros.solver.solution import Solution
 
@@ -20,6 +21,7 @@ __all__ = [
     "PROFILES",
     "TRANSLATION_SCALES",
     "Abandoned",
+    "KeptLabels",
     "Solution",
     "abandonable",
     "advance",
@@ -38,6 +40,10 @@ def __getattr__(name: str) -> Any:
         from rotavg_ros.solver.running import work
 
         return getattr(work, name)
+    if name == "KeptLabels":
+        from rotavg_ros.solver.running import kept_labels
+
+        return kept_labels.KeptLabels
     if name == "Solution":
         from rotavg_ros.solver import solution
 

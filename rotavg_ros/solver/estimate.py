@@ -72,7 +72,7 @@ class Run:
         watch: for the seconds of the stages.
         refinement_steps: at most, 0 for none; None: as many as the stages like.
         warm_start: ``(N, 4)`` body_from_world to begin with instead of the tree's.
-        memory: of the profile's last solve, if the method is the same; the graph may be another one.
+        memory: of the profile's last solve by the same method, or its labels alone; the graph may be another one.
         work: units that an update may spend; it leaves the rest to be gone on with. None: all it takes.
         anew: an update is to lead to what a solve without a memory does.
     """

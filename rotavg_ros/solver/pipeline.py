@@ -16,10 +16,11 @@ from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
 from rotavg_ros.solver.methods import DEFAULT_METHOD, check_choices, method_named
 from rotavg_ros.solver.neurora.network_store import Networks, check_folder
 from rotavg_ros.solver.neurora.numbers import NUMBERS
+from rotavg_ros.solver.running.kept_labels import KeptLabels
 from rotavg_ros.solver.running.threads import for_each, workers
 from rotavg_ros.solver.running.work import metered
 from rotavg_ros.solver.slam.live import advance as advance_slam
-from rotavg_ros.solver.slam.live import update_slam
+from rotavg_ros.solver.slam.live import resume_slam, update_slam
 from rotavg_ros.solver.slam.noise import exceedance
 from rotavg_ros.solver.slam.solve import solve_slam
 from rotavg_ros.solver.slam.update.memory import SlamMemory
@@ -63,8 +64,9 @@ def solve(
         refinement_steps: refinement steps at most, 0 for none; default: the method's own number. The SLAM profile
             has 0 or all.
         warm_start: ``(N, 4)`` body_from_world of an earlier solution to start from.
-        memory: that of the earlier solution by the same method, if the graph has only grown since; with it a warm start
-            of a SLAM graph judges the new edges and goes on from all other verdicts. Where many closures are not
+        memory: that of the earlier solution by the same method, if the graph has only grown since, or its ``labels``,
+            the part of it that can be written down; with it a warm start of a SLAM graph judges the new edges and goes
+            on from all other verdicts. Where many closures are not
             explained by these, everything is judged anew beside it.
         work: units (:attr:`~rotavg_ros.solver.solution.Solution.work`) that such a solve may spend. Where it takes
             more, the answer is what is known with what has come laid on, and :func:`advance` goes on with the rest.
@@ -178,9 +180,9 @@ class _Job:
     profile: str
 
 
-def _memory_of(names: list[str], memory: object | None) -> SlamMemory | None:
+def _memory_of(names: list[str], memory: object | None) -> SlamMemory | KeptLabels | None:
     """What a method by these names can go on from, if it is that."""
-    return memory if names == [DEFAULT_METHOD] and isinstance(memory, SlamMemory) else None
+    return memory if names == [DEFAULT_METHOD] and isinstance(memory, SlamMemory | KeptLabels) else None
 
 
 def _run(job: _Job, run: Run) -> Estimate:
@@ -190,11 +192,14 @@ def _run(job: _Job, run: Run) -> Estimate:
     for name in job.names[:-1]:
         before = _solve_once(job, name, replace(run, refinement_steps=None))
         run = replace(run, warm_start=before.body_from_world)
-    memory = run.memory
-    if isinstance(memory, SlamMemory) and run.warm_start is not None and job.profile == "slam":
-        estimate = update_slam(job.graph, memory, run)
-        if estimate is not None:
-            return _with_warnings(job.graph, estimate)
+    memory, estimate = run.memory, None
+    if run.warm_start is not None and job.profile == "slam":
+        if isinstance(memory, SlamMemory):
+            estimate = update_slam(job.graph, memory, run)
+        elif isinstance(memory, KeptLabels):
+            estimate = resume_slam(job.graph, memory, run)
+    if estimate is not None:
+        return _with_warnings(job.graph, estimate)
     if run.anew:  # nothing can be gone on from, and nothing is to be begun with
         run = replace(run, warm_start=None)
     estimate = _solve_once(job, job.names[-1], run)

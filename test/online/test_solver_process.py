@@ -117,6 +117,23 @@ def test_a_process_that_dies_is_an_error_and_the_next_solve_starts_another():
         solver.close()
 
 
+def test_another_process_goes_on_from_the_labels_of_one_that_has_died():
+    solver, whole = SolverProcess(threads=1), graph()
+    try:
+        first = solver(grown(whole, 298), **OPTIONS)
+        os.kill(solver.pid, signal.SIGKILL)
+        while solver.is_alive:
+            time.sleep(0.01)
+        start = torch.cat((first.body_from_world, first.body_from_world[-1:]))
+        second = solver(grown(whole, 299), warm_start=start, memory=first.memory, **OPTIONS)
+        assert set(second.stage_seconds) == {"update"}
+        assert ((first.outlier_score > 0.5) != (second.outlier_score[: len(first.outlier_score)] > 0.5)).sum() <= 1
+        third = solver(whole, warm_start=torch.cat((start, start[-1:])), memory=second.memory, **OPTIONS)
+        assert set(third.stage_seconds) == {"update"}  # by what it remembers itself now
+    finally:
+        solver.close()
+
+
 def test_an_answer_that_nobody_takes_any_more_ends_it_without_a_word(monkeypatch):
     """Whoever asked has gone, and the thread that listens has not heard of it yet."""
     ours, theirs = socket.socketpair()

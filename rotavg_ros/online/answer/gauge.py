@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
+import numpy as np
 import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.online import quaternion
 from rotavg_ros.online.quaternion import Quaternion
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
+
+# Of closures that join two components so many are compared with each other, and beyond this angle none agrees.
+_MOST_JOINTS, _FAR = 200, math.radians(30)
 
 
 def component_roots(component: Tensor) -> Tensor:
@@ -43,6 +50,63 @@ def joins_components(previous: Tensor, current: Tensor) -> bool:
     """
     now = current[component_roots(previous)]
     return len(torch.unique(now)) < len(now)
+
+
+def joined(body_from_world: Tensor, component: Tensor, graph: ViewGraph) -> Tensor:
+    """Orientations of all nodes in one gauge for each component of the graph, where closures have joined some.
+
+    Each component is turned as the one closure to those before it says that most others agree with.
+
+    Args:
+        body_from_world: ``(n, 4)`` of the first n nodes, in the gauges of components that were apart.
+        component: ``(n,)`` of these.
+        graph: with N ≥ n nodes and odometry, on the CPU.
+
+    Returns:
+        ``(N, 4)``; the component with the first node of all that have become one stays as it is.
+    """
+    odometry = graph.is_odometry
+    start = extend_along_edges(body_from_world, graph.select_edges(odometry)).clone()
+    apart = _components_by_odometry(component, graph)
+    is_joint = (apart[graph.source] != apart[graph.target]) & ~odometry & (graph.label != EdgeLabel.REJECTED)
+    joints = graph.select_edges(is_joint)
+    ends = torch.stack((apart[joints.source], apart[joints.target])).numpy()
+    placed = np.zeros(int(apart.max()) + 1, dtype=bool)
+    for seed in range(len(placed)):
+        placed[seed] = True
+        while (reaching := placed[ends[0]] != placed[ends[1]]).any():
+            edges = np.flatnonzero(reaching)
+            beyond = np.where(placed[ends[0, edges]], ends[1, edges], ends[0, edges])
+            nearest = int(np.bincount(beyond).argmax())
+            turn = _most_agreed(_turns(start, joints, edges[beyond == nearest], placed[ends[0]]))
+            is_turned = apart == nearest
+            start[is_turned] = rotations.normalize(rotations.multiply(start[is_turned], turn))
+            placed[nearest] = True
+    return start
+
+
+def _components_by_odometry(component: Tensor, graph: ViewGraph) -> Tensor:
+    """``(N,)`` numbered by first node: those of the first n nodes, with odometry since and no closures."""
+    to_root = torch.stack((component_roots(component)[component], torch.arange(len(component))))
+    odometry = torch.stack((graph.source, graph.target))[:, graph.is_odometry]
+    links = torch.cat((to_root, odometry), dim=1).numpy()
+    matrix = coo_array((np.ones(links.shape[1]), links), shape=(graph.num_nodes, graph.num_nodes))
+    return torch.from_numpy(connected_components(matrix, directed=False)[1].astype(np.int64))
+
+
+def _turns(start: Tensor, joints: ViewGraph, edges: np.ndarray, source_placed: np.ndarray) -> Tensor:
+    """``(n, 4)`` W by which orientations at the other ends, R → R W, fit those that are placed."""
+    chosen = torch.from_numpy(edges[:: len(edges) // _MOST_JOINTS + 1])
+    measured, begins = joints.target_from_source[chosen], torch.from_numpy(source_placed)[chosen]
+    source, target = start[joints.source[chosen]], start[joints.target[chosen]]
+    forward = rotations.multiply(rotations.multiply(rotations.inverse(target), measured), source)
+    return torch.where(begins[:, None], forward, rotations.inverse(forward))
+
+
+def _most_agreed(turns: Tensor) -> Tensor:
+    """``(4,)`` the one that the others are nearest to; none counts for more than :data:`_FAR`."""
+    apart = rotations.angle(rotations.multiply(rotations.inverse(turns)[:, None], turns[None]))
+    return turns[int(apart.clamp(max=_FAR).sum(dim=1).argmin())]
 
 
 def extend_along_edges(body_from_world: Tensor, graph: ViewGraph) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rotavg_ros.online.answer.gauge import extend_along_edges, joins_components
+from rotavg_ros.online.answer.gauge import extend_along_edges, joined, joins_components
 from rotavg_ros.online.answer.screening import Known, score_of
 from rotavg_ros.online.graph.snapshot import GraphSnapshot
 from rotavg_ros.solver.solution import Solution
@@ -61,13 +61,23 @@ class Problem:
             waits[self.order] = False
         return waits
 
+    @cached_property
+    def joins(self) -> bool:
+        """Whether components of the last answer have become one."""
+        return self.component is not None and joins_components(self.component, self.graph.components())
+
+    @cached_property
+    def goes_on_from(self) -> object | None:
+        """What the solver is given of :attr:`memory`: where components have become one, the labels alone."""
+        return getattr(self.memory, "labels", None) if self.joins else self.memory
+
     def warm_start(self) -> Tensor | None:
         """The last answer carried on to all keyframes ``(N, 4)``; None where it is no good start."""
         if self.cold or self.answered is None or self.component is None:
             return None
-        if joins_components(self.component, self.graph.components()):
-            return None
-        return extend_along_edges(self.answered, self.graph)
+        if not self.joins:
+            return extend_along_edges(self.answered, self.graph)
+        return None if self.goes_on_from is None else joined(self.answered, self.component, self.graph)
 
     def thresholds(self, threshold: float, was_cold: bool) -> NDArray[np.float64]:
         """The score above which each edge is an outlier ``(M,)``; the last answer's flags are kept when in doubt.

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.online.solver_process.wire import ABANDON, Advance, Request, from_arrays, to_arrays
-from rotavg_ros.solver import Abandoned, Solution, stop_if_abandoned
+from rotavg_ros.solver import Abandoned, KeptLabels, Solution, stop_if_abandoned
 from rotavg_ros.view_graph import ViewGraph
 
 # So often a solve that is waited for is asked whether anybody still wants it.
@@ -36,9 +36,15 @@ main()
 
 @dataclass(frozen=True)
 class _Remembered:
-    """Stands for what the other process remembers of its last solve."""
+    """Stands for what the other process remembers of its last solve.
+
+    Attributes:
+        number: of the solve.
+        labels: that are left if the process dies, or is another one after a load.
+    """
 
     number: int
+    labels: KeptLabels | None
 
 
 class SolverProcess:
@@ -46,7 +52,8 @@ class SolverProcess:
 
     Python runs one thread at a time, so that a solve of small steps in the same process delays each odometry message by
     milliseconds, and by a hundred on a busy machine. Here only arrays come and go. What a solve remembers for the next
-    one stays in the other process. If that process dies, the solve fails, and the next one starts another.
+    one stays in the other process, but for the labels. If that process dies, the solve fails, and the next one starts
+    another, which goes on from these.
     """
 
     def __init__(self, threads: int) -> None:
@@ -57,7 +64,7 @@ class SolverProcess:
         """
         self._threads = threads
         self._lock = threading.Lock()
-        self._solves = 0
+        self._solves = self._first = 0
         self._start()
         atexit.register(self.close)
 
@@ -98,15 +105,22 @@ class SolverProcess:
             if not self.is_alive:
                 self.close()
                 self._start()
+                self._first = self._solves + 1
             self._solves += 1
-            remembered = memory.number if isinstance(memory, _Remembered) else None
-            request = Request(self._solves, to_arrays(graph), None, remembered, options)
+            request = Request(self._solves, to_arrays(graph), None, None, options)
+            if isinstance(memory, _Remembered) and memory.number >= self._first:
+                request.remembered = memory.number
+            elif isinstance(memory, _Remembered | KeptLabels) and (kept := memory.labels) is not None:
+                request.labels = kept.arrays(), to_arrays(kept.graph)
             if warm_start is not None:
                 request.warm_start = warm_start.numpy()
-            solution: dict[str, Any] = from_arrays(self._outcome(request))
-            if solution.pop("remembers"):
-                solution["memory"] = _Remembered(request.number)
-            return Solution(**solution)
+            outcome: dict[str, Any] = self._outcome(request)
+            remembers, labels = (outcome.pop(name) for name in ("remembers", "labels"))
+            solution = Solution(**from_arrays(outcome))
+            if not remembers:
+                return solution
+            kept = None if labels is None else KeptLabels.of_arrays(graph, labels)
+            return replace(solution, memory=_Remembered(request.number, kept))
 
     def advance(self, memory: object | None, work: float) -> float:
         """See :func:`rotavg_ros.solver.advance`.

@@ -14,7 +14,7 @@ import torch
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import free_memory
 from rotavg_ros.online.solver_process.wire import ABANDON, Advance, Request, from_arrays, to_arrays
-from rotavg_ros.solver import Abandoned, abandonable, advance, solve
+from rotavg_ros.solver import Abandoned, KeptLabels, abandonable, advance, solve
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -64,18 +64,25 @@ class _Server:
         return spent
 
     def _solve(self, request: Request) -> dict[str, object]:
-        number, memory = self._memory
         with abandonable(lambda: self._is_abandoned):
             solution = solve(
                 ViewGraph(**from_arrays(request.graph)),
                 warm_start=None if request.warm_start is None else torch.from_numpy(request.warm_start),
-                memory=memory if number == request.remembered else None,
+                memory=self._memory_for(request),
                 **request.options,
             )
         self._memory = request.number, solution.memory
         free_memory.give_back_after(len(solution.outlier_score), solution.stage_seconds)
-        values = to_arrays(solution)
-        return values | {"memory": None, "remembers": values["memory"] is not None}
+        labels: KeptLabels | None = getattr(solution.memory, "labels", None)
+        told = {"labels": None if labels is None else labels.arrays(), "remembers": solution.memory is not None}
+        return to_arrays(solution) | {"memory": None} | told
+
+    def _memory_for(self, request: Request) -> object | None:
+        number, memory = self._memory
+        if request.labels is None:
+            return memory if number == request.remembered else None
+        arrays, graph = request.labels
+        return KeptLabels.of_arrays(ViewGraph(**from_arrays(graph)), arrays)
 
 
 def main() -> None:

@@ -23,6 +23,8 @@ class Request:
         warm_start: ``(N, 4)``.
         remembered: number of the solve whose memory may be gone on from.
         options: of :func:`rotavg_ros.solve`.
+        labels: what is left of a memory that the other side does not have: arrays of
+            :class:`rotavg_ros.solver.KeptLabels`, and a :class:`ViewGraph`'s fields.
     """
 
     number: int
@@ -30,6 +32,7 @@ class Request:
     warm_start: np.ndarray | None
     remembered: int | None
     options: dict[str, Any]
+    labels: tuple[dict[str, np.ndarray], dict[str, Any]] | None = None
 
 
 @dataclass

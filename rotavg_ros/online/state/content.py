@@ -30,10 +30,12 @@ from rotavg_ros.online.odometry.track import OdometryTrack
 from rotavg_ros.online.options import EstimatorOptions
 from rotavg_ros.online.state.file import FORMAT, FORMAT_VERSION, Arrays, StateFileError
 from rotavg_ros.online.state.upgrade import upgraded
+from rotavg_ros.solver import KeptLabels
 from rotavg_ros.view_graph import ViewGraph
 
 _MARGINALIZED = "marginalized_"
 _FINGERPRINTS = "fingerprints_"
+_LABELS = "labels_"
 _GRAPH_COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
 _KEYFRAME_COLUMNS = ("keyframe_robot", "keyframe_id", "stamp_ns", "time_line", "edge_id", "translation")
 
@@ -66,7 +68,9 @@ def collect(content: ContentState) -> State:
     arrays: Arrays = {name: getattr(snapshot, name) for name in _KEYFRAME_COLUMNS}
     arrays |= {name: getattr(snapshot.graph, name).numpy() for name in _GRAPH_COLUMNS}
     arrays["answered"] = np.empty((0, 4)) if last.body_from_world is None else last.body_from_world.numpy()
+    arrays["component"] = np.empty(0, dtype=np.int64) if last.component is None else last.component.numpy()
     arrays["outlier"], arrays["queued"] = last.outlier, np.flatnonzero(last.queue.waits)
+    arrays |= _prefixed(_LABELS, _labels(content))
     arrays |= _prefixed(_FINGERPRINTS, growth.fingerprints.arrays())
     arrays |= _prefixed(_MARGINALIZED, marginalized.keyframes.arrays())
     for index, track in enumerate(growth.tracks.values()):
@@ -90,6 +94,28 @@ def collect(content: ContentState) -> State:
     return State(arrays, header, growth.pending.waiting())
 
 
+def _labels(content: ContentState) -> Arrays:
+    """Those that the solver remembers, of the graph's edges in their own order; nothing if they are of another graph.
+
+    The solver has edges in the order in which they entered.
+    """
+    kept: KeptLabels | None = getattr(content.memory, "labels", None)
+    if kept is None:
+        return {}
+    graph = content.growth.graph.snapshot().graph
+    order, count = content.last.queue.order, len(kept.trusted)
+    edges = np.arange(graph.num_edges) if order is None else order
+    if count > len(edges):
+        return {}
+    edges = edges[:count]
+    for name in ("source", "target", "target_from_source", "kind", "label"):
+        if not np.array_equal(getattr(graph, name).numpy()[edges], getattr(kept.graph, name).numpy()[:count]):
+            return {}
+    trusted = np.full(graph.num_edges, np.nan)
+    trusted[edges] = kept.trusted
+    return kept.arrays() | {"trusted": trusted}
+
+
 def restore(arrays: Arrays, options: EstimatorOptions) -> ContentState:
     """What :func:`collect` took, to go on with.
 
@@ -111,7 +137,12 @@ def _restore(arrays: Arrays, header: dict[str, Any], options: EstimatorOptions) 
         raise ValueError("more flags than edges")
     queued = np.zeros(graph.num_edges, dtype=bool)
     queued[arrays["queued"]] = True
-    last = LastAnswer(answered if len(answered) else None, outlier=arrays["outlier"], queued=queued)
+    component = torch.from_numpy(arrays["component"])
+    if len(component) not in {0, len(answered)}:
+        raise ValueError("components of other keyframes")
+    last = LastAnswer(
+        answered if len(answered) else None, component if len(component) else None, arrays["outlier"], queued
+    )
     growth = Growth(
         options,
         last,
@@ -138,7 +169,18 @@ def _restore(arrays: Arrays, header: dict[str, Any], options: EstimatorOptions) 
         world_from_odometry = {robot: (x, y, z, w) for robot, (x, y, z, w) in known.items()}
     else:
         world_from_odometry = {} if last.body_from_world is None else corrections(builder, last.body_from_world)
-    return ContentState(growth, last, header["version"], header["ticked_revision"], world_from_odometry)
+    memory = _kept_labels(_with_prefix(_LABELS, arrays), graph.snapshot().graph, queued)
+    return ContentState(growth, last, header["version"], header["ticked_revision"], world_from_odometry, memory)
+
+
+def _kept_labels(arrays: Arrays, graph: ViewGraph, queued: NDArray[np.bool_]) -> KeptLabels | None:
+    """In the order in which edges enter now."""
+    if not arrays:
+        return None
+    entered = np.flatnonzero(~queued)
+    return KeptLabels.of_arrays(
+        graph.select_edges(torch.from_numpy(entered)), arrays | {"trusted": arrays["trusted"][entered]}
+    )
 
 
 def _graph(arrays: Arrays, header: dict[str, Any]) -> GrowingViewGraph:

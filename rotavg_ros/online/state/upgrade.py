@@ -15,6 +15,8 @@ _FIRST_WITH_STEPS = 3
 _FIRST_WITH_TIME_LINES = 4
 # Before it, every closure was part of the next solve.
 _FIRST_WITH_QUEUE = 5
+# Before it, the first answer after a load was a cold one.
+_FIRST_WITH_LABELS = 6
 
 
 def upgraded(arrays: Arrays, header: dict[str, Any]) -> tuple[Arrays, dict[str, Any]]:
@@ -31,6 +33,8 @@ def upgraded(arrays: Arrays, header: dict[str, Any]) -> tuple[Arrays, dict[str, 
         arrays, header = _with_time_lines(arrays), _with_surroundings(header, arrays)
     if header["format_version"] < _FIRST_WITH_QUEUE:
         arrays = arrays | {"queued": np.zeros(0, dtype=np.int64)}
+    if header["format_version"] < _FIRST_WITH_LABELS:
+        arrays = arrays | {"component": np.zeros(0, dtype=np.int64)}
     return arrays, header
 
 

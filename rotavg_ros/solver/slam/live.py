@@ -9,24 +9,30 @@ the tangent of the last solve (:mod:`~rotavg_ros.solver.slam.update.conditioned`
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import cast
 
 import numpy as np
 import torch
 
+from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.residuals import edge_residual
 from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
+from rotavg_ros.solver.running.kept_labels import KeptLabels
 from rotavg_ros.solver.running.resumable import Resumable
 from rotavg_ros.solver.running.work import metered
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
+from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.poses.solve import has_places, poses_of_labels, poses_of_update
+from rotavg_ros.solver.slam.posterior.state import Noise
 from rotavg_ros.solver.slam.solve import whole
 from rotavg_ros.solver.slam.update.columns import Columns
 from rotavg_ros.solver.slam.update.conditioned import Conditioned, LaidOn, conditioned
+from rotavg_ros.solver.slam.update.grown_edges import begins_with
 from rotavg_ros.solver.slam.update.linear import Linear
 from rotavg_ros.solver.slam.update.memory import SlamMemory, with_poses
 from rotavg_ros.view_graph import ViewGraph
@@ -38,6 +44,8 @@ _UPDATES, _COLUMNS = 0.5, 0.8
 # covariance is inverted once or twice a tick, 12 ms with translations.
 _MOST = 200
 _FLAGGED = 0.5
+# Closures that join what was apart and are this far from how they are held to do so, rad, are false to begin with.
+_FAR = math.radians(30)
 
 
 def update_slam(graph: ViewGraph, memory: SlamMemory, run: Run) -> Estimate | None:
@@ -70,6 +78,43 @@ def update_slam(graph: ViewGraph, memory: SlamMemory, run: Run) -> Estimate | No
         known = _searched_ahead(graph, known, run)
     with run.watch.stage("update"):
         return _laid_on(graph, known, math.inf if run.work is None else run.work)
+
+
+def resume_slam(graph: ViewGraph, labels: KeptLabels, run: Run) -> Estimate | None:
+    """The answer of a graph of which labels are left, and nothing else of the last solve; None if they do not fit it.
+
+    There is nothing to answer by meanwhile, so it goes to the end. Where closures have joined what was apart, the start
+    says how; which of them are good is gone into by a whole search beside the next answers.
+    """
+    if run.warm_start is None or labels.by_places is not has_places(graph) or first_of_each(graph) is not None:
+        return None
+    if len(labels.noise) != len(fields(Noise)) or not begins_with(graph, labels.graph, len(labels.trusted)):
+        return None
+    with run.watch.stage("update"):
+        start = run.warm_start.double()
+        joints = _joints(graph, len(labels.trusted))
+        found = SlamMemory.of_labels(labels, graph, _networks(run), start, _far_from(graph, joints, start))
+        estimate, memory = found.estimate, found.estimate.memory
+        assert isinstance(memory, SlamMemory)
+        if len(joints):
+            estimate = replace(estimate, memory=memory.with_all_unexplained())
+        if labels.by_places:
+            estimate = with_poses(graph, estimate, poses_of_labels(memory.unbiased(graph), found.mode))
+    return replace(estimate, warnings=memory.notes, is_anew=False)
+
+
+def _joints(graph: ViewGraph, known: int) -> np.ndarray:
+    """``(n,)`` closures after the first ``known`` edges that join what these and odometry leave apart."""
+    is_later = torch.arange(graph.num_edges) >= known
+    apart = graph.select_edges(~is_later | graph.is_odometry).components()
+    return torch.nonzero(is_later & (apart[graph.source] != apart[graph.target]))[:, 0].numpy()
+
+
+def _far_from(graph: ViewGraph, edges: np.ndarray, start: torch.Tensor) -> np.ndarray:
+    """Those of some edges ``(n,)`` that contradict orientations ``(N, 4)``."""
+    chosen = graph.select_edges(torch.from_numpy(edges))
+    off = edge_residual(start, chosen.target_from_source, chosen.source, chosen.target)
+    return np.asarray(edges[(rotations.angle(off) > _FAR).numpy()])
 
 
 def advance(memory: SlamMemory, work: float) -> None:
@@ -153,13 +198,16 @@ def _thinned_out(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory |
     before = memory.thinned_to(graph)
     if before is None or run.warm_start is None or (memory.poses is None) is has_places(graph):
         return None
-    networks = run.networks.load(SlamCleanNet), run.networks.load(SlamFineNet)
-    found = before.updated(graph, networks, run.warm_start.double())
+    found = before.updated(graph, _networks(run), run.warm_start.double())
     estimate = found.estimate
     if memory.poses is not None:
         estimate = with_poses(graph, estimate, poses_of_labels(before.unbiased(graph), found.mode))
     assert isinstance(estimate.memory, SlamMemory)
     return estimate.memory
+
+
+def _networks(run: Run) -> tuple[SlamCleanNet, SlamFineNet]:
+    return run.networks.load(SlamCleanNet), run.networks.load(SlamFineNet)
 
 
 def _growth(graph: ViewGraph, known: SlamMemory, since: ViewGraph | Linear) -> Growth | None:
@@ -176,8 +224,7 @@ def _updated(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | Non
     start = run.warm_start.double() if before is None else before.start_alone(unbiased)
     if start is None or (before is None) is has_places(graph):
         return None
-    networks = run.networks.load(SlamCleanNet), run.networks.load(SlamFineNet)
-    found = memory.updated(graph, networks, start)
+    found = memory.updated(graph, _networks(run), start)
     estimate = found.estimate
     if before is not None:
         poses = poses_of_update(unbiased, found.mode, before)

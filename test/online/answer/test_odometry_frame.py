@@ -186,7 +186,9 @@ def test_nobody_is_placed_by_what_was_forgotten_nor_after_a_load_until_there_is_
     assert estimator.odometry_frame("r") is None
     estimator.load(tmp_path / "state")
     assert estimator.odometry_frame("r") is None
-    estimator.place(answered(estimator))
+    cold = estimator.tick(force_cold=True)
+    assert cold is not None
+    estimator.place(cold)
     again = frame_of(estimator)
     np.testing.assert_allclose(again.origin, placed.origin, atol=1e-6)
     np.testing.assert_allclose(again.orientation, placed.orientation, atol=1e-8)

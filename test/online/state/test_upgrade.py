@@ -34,7 +34,7 @@ def as_of_version(path: Path, version: int) -> dict:
     header = json.loads(arrays.pop("header").tobytes())
     names = ("older", "younger", "newest")
     arrays["fingerprints"] = np.concatenate([arrays.pop(f"fingerprints_{name}") for name in names])
-    added = ("time_line", "limit", "refused_", "begins_time_line", "outlier", "queued")
+    added = ("time_line", "limit", "refused_", "begins_time_line", "outlier", "queued", "component")
     arrays = {name: values for name, values in arrays.items() if not any(word in name for word in added)}
     room = header.pop("room")
     old = {
@@ -76,3 +76,20 @@ def test_it_goes_on(solver, tmp_path, version: int) -> None:
         np.testing.assert_allclose(getattr(second, name), getattr(first, name), atol=1e-12, err_msg=name)
     again.save(path)
     assert json.loads(state_file.read(path)["header"].tobytes())["format_version"] == state_file.FORMAT_VERSION
+
+
+def test_without_labels_the_first_answer_is_from_nothing(tmp_path) -> None:
+    """As version 5 wrote them."""
+    today, path = OnlineEstimator(OPTIONS), tmp_path / "state.npz"
+    feed(today, 0, 60)
+    today.add_edge(closure(5, KeyframeReference("r", 0), KeyframeReference("r", 50)))
+    today.tick()
+    today.save(path)
+    arrays = state_file.read(path)
+    header = json.loads(arrays["header"].tobytes()) | {"format_version": 5}
+    arrays = {name: value for name, value in arrays.items() if not name.startswith(("component", "labels_"))}
+    state_file.write(path, arrays | {"header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)})
+    again = OnlineEstimator(OPTIONS)
+    again.load(path)
+    answer = again.tick()
+    assert answer is not None and answer.was_cold

@@ -11,12 +11,12 @@ from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 _COLUMNS = ("source", "target", "target_from_source", "kind", "label", "steps")
 
 
-def begins_with(graph: ViewGraph, earlier: ViewGraph) -> bool:
-    """Whether all edges of ``earlier`` come first in ``graph``, as they were, and of the others none has a label."""
-    count = earlier.num_edges
+def begins_with(graph: ViewGraph, earlier: ViewGraph, count: int | None = None) -> bool:
+    """Whether edges of ``earlier``, all or so many, come first in ``graph``, as they were, and others have no label."""
+    count = earlier.num_edges if count is None else count
     if count > graph.num_edges or bool((graph.label[count:] != EdgeLabel.AUTOMATIC).any()):
         return False
-    return all(torch.equal(getattr(graph, name)[:count], getattr(earlier, name)) for name in _COLUMNS)
+    return all(torch.equal(getattr(graph, name)[:count], getattr(earlier, name)[:count]) for name in _COLUMNS)
 
 
 def carried_over(value: np.ndarray, closure_graph: ClosureGraph, otherwise: float) -> np.ndarray:

@@ -7,7 +7,7 @@ explain: others only make it likelier. Odometry that no closure judges yet says 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,35 +16,28 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.estimate import Estimate, Places
+from rotavg_ros.solver.running.kept_labels import KeptLabels
 from rotavg_ros.solver.running.resumable import Resumable
-from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
-from rotavg_ros.solver.slam.fine_net.tuning import fine_tuned
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each, repeats_since
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.poses.memory import PoseMemory
-from rotavg_ros.solver.slam.posterior.inference import Search
-from rotavg_ros.solver.slam.posterior.left_out import relabelled
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
-from rotavg_ros.solver.slam.posterior.publishing.modes import Published, publish
-from rotavg_ros.solver.slam.posterior.solve import Drawn
-from rotavg_ros.solver.slam.posterior.state import Noise, Others, State
+from rotavg_ros.solver.slam.posterior.publishing.modes import Published, of_slips
+from rotavg_ros.solver.slam.posterior.state import Noise
 from rotavg_ros.solver.slam.stages import outlier_scores
 from rotavg_ros.solver.slam.update.columns import Columns
-from rotavg_ros.solver.slam.update.grown_edges import begins_with, carried_over, thinned_out
+from rotavg_ros.solver.slam.update.grown_edges import begins_with, thinned_out
+from rotavg_ros.solver.slam.update.labelled import UNKNOWN, Labelled, solved_from
 from rotavg_ros.view_graph import ViewGraph
 
 # The whole search is due once closures that are not explained are more than this share of those that were searched, or
 # new ones more than the second; with any new one where other answers were nearly as likely.
 _MAX_UNEXPLAINED, _MAX_GROWTH = 0.05, 0.25
 _FLAGGED = 0.5
-# Units of work for each edge, of each part of what an update does beside all that others count.
-_EDGE = 0.002
-# In the place of labels that are not known; more than any.
-_NEW = 2.0
 _GOOD = 0.5
 
 
@@ -120,12 +113,53 @@ class SlamMemory:
         notes = estimate.warnings
         return cls(graph, trusted, state.noise, mode, bias, *told, len(problem.closure), is_divided, notes=notes)
 
+    @classmethod
+    def of_labels(
+        cls,
+        labels: KeptLabels,
+        graph: ViewGraph,
+        networks: tuple[SlamCleanNet, SlamFineNet],
+        body_from_world: Tensor,
+        contradicting: np.ndarray,
+    ) -> SearchedOn:
+        """Solve a graph that has grown from one of which nothing else is left.
+
+        Args:
+            labels: of :attr:`labels`.
+            graph: N nodes.
+            networks: CleanNet and FineNet, which is applied once.
+            body_from_world: ``(N, 4)`` start.
+            contradicting: ``(n,)`` edges that are new and false, to begin with.
+        """
+        trusted = np.append(labels.trusted, np.full(graph.num_edges - len(labels.trusted), np.nan))
+        trusted = np.where(np.isnan(trusted), UNKNOWN, trusted)
+        trusted[contradicting] = 0.0
+        noise, bias = Noise(*labels.noise.tolist()), labels.bias if len(labels.bias) else None
+        found = solved_from(Labelled(trusted, noise, bias, labels.by_places), graph, networks, body_from_world)
+        estimate = estimate_of(found.published)
+        told = estimate.body_from_world, estimate.outlier_score, estimate.variance
+        searched = int((~graph.is_odometry).sum())
+        memory = cls(graph, found.trusted, found.noise, found.mode, bias, *told, searched, notes=of_slips(found.mode))
+        return SearchedOn(replace(estimate, memory=memory), found.mode)
+
+    @property
+    def labels(self) -> KeptLabels | None:
+        """What :meth:`of_labels` needs; None where odometry is held to have jumped, of which labels say nothing."""
+        if self.poses is not None and self.poses.pose.problem.jump is not None:
+            return None
+        bias = np.zeros(0) if self.bias is None else self.bias
+        return KeptLabels(self.graph, self.trusted, np.array(astuple(self.noise)), bias, self.poses is not None)
+
     @property
     def is_due(self) -> bool:
         """Whether the whole search should run again."""
         num_closures = int((~self.graph.is_odometry).sum())
         grown = num_closures > (1 if self.is_divided else 1 + _MAX_GROWTH) * self.searched
         return grown or self.unexplained > _MAX_UNEXPLAINED * self.searched
+
+    def with_all_unexplained(self) -> SlamMemory:
+        """The same, but that the whole search is due."""
+        return replace(self, unexplained=self.searched + 1)
 
     def with_poses(self, poses: PoseMemory) -> SlamMemory:
         """The same with what is known of places, by which closures' labels go."""
@@ -165,7 +199,7 @@ class SlamMemory:
             return None
         if self.poses is not None and self.poses.pose.problem.jump is not None:
             return None
-        trusted = thinned_out(self.trusted, self.graph, graph, _NEW)
+        trusted = thinned_out(self.trusted, self.graph, graph, UNKNOWN)
         if trusted is None:
             return None
         share = int((~graph.is_odometry).sum()) / max(int((~odometry).sum()), 1)
@@ -183,36 +217,20 @@ class SlamMemory:
             networks: CleanNet and FineNet, which is applied once.
             body_from_world: ``(N, 4)`` start, where a closure is new.
         """
-        drawn = Drawn.of(graph, networks[0], bias=self.bias)
-        problem = drawn.problem
-        spend(_EDGE * graph.num_edges)
-        before = carried_over(self.trusted, problem.graph, _NEW)
-        is_new = before == _NEW
-        correction = problem.graph.corrections(body_from_world).numpy().T
-        common = np.zeros((problem.system(self.noise).num_runs, 3))
-        trusted, others = np.minimum(before, 1.0), Others.before_any(len(before))
-        start = State(np.ascontiguousarray(correction), common, trusted, self.noise, others)
-        spend(_EDGE * graph.num_edges)
-        start = replace(start, trusted=np.where(is_new, relabelled(problem, start), before))
-        search = Search(problem)
-        mode = search.polished(start, "update")
-        if self.poses is None:  # else places have a say in it
-            mode = search.flipped(mode)
-        fine = fine_tuned(mode, networks[1], passes=1)
-        published = publish(problem, [fine])
-        spend(_EDGE * graph.num_edges)
-        estimate = estimate_of(published)
+        labelled = Labelled(self.trusted, self.noise, self.bias, self.poses is not None)
+        found = solved_from(labelled, graph, networks, body_from_world)
+        estimate = estimate_of(found.published)
         memory = replace(
             self,
             graph=graph,
-            trusted=problem.graph.edge_values(mode.state.trusted),
-            noise=mode.state.noise,
-            mode=fine,
+            trusted=found.trusted,
+            noise=found.noise,
+            mode=found.mode,
             body_from_world=estimate.body_from_world,
             outlier_score=estimate.outlier_score,
             variance=estimate.variance,
         )
-        return SearchedOn(replace(estimate, memory=memory), fine)
+        return SearchedOn(replace(estimate, memory=memory), found.mode)
 
     def along_odometry(self, graph: ViewGraph, new: Growth) -> Estimate | None:
         """The answer with odometry alone, on which new nodes hang; None where that has lost its translations.

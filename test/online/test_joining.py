@@ -1,0 +1,75 @@
+"""Closures join what was apart: that tick takes no search, which follows beside the next answers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from rotavg_ros import rotations, solve
+from rotavg_ros.datasets.simulation.stress.drawn import DrawnGraph
+from rotavg_ros.datasets.simulation.stress.kinds import KINDS
+from rotavg_ros.evaluation.live.feed import Feed
+from rotavg_ros.metrics import orientation_errors
+from rotavg_ros.online import Answer, EstimatorOptions, OnlineEstimator
+from rotavg_ros.view_graph import ViewGraph
+
+OPTIONS = EstimatorOptions(keyframe_source="edges", gauge="identity")
+
+
+def restarted(graph: ViewGraph, node: int) -> tuple[ViewGraph, ViewGraph]:
+    """The graph without what joins nodes before and after, and the closures that do."""
+    before, after = (edge < node for edge in (graph.source, graph.target))
+    return graph.select_edges(before == after), graph.select_edges((before != after) & ~graph.is_odometry)
+
+
+def error_deg(case: DrawnGraph, graph: ViewGraph, answer: Answer) -> float:
+    at = torch.from_numpy(answer.keyframe_id.astype(np.int64))
+    found = rotations.inverse(torch.from_numpy(answer.world_from_body.copy()))
+    truth = torch.from_numpy(case.body_from_world)[at]
+    return float(np.degrees(orientation_errors(found, truth, graph.components()).numpy().mean()))
+
+
+@pytest.mark.parametrize("with_places", [False, True])
+@pytest.mark.parametrize("kind", ["building: 30 % random", "hills: 30 % grouped"])
+def test_a_robot_that_was_switched_off_and_on_is_joined_at_once(kind: str, with_places: bool) -> None:
+    case = next(one for one in KINDS if one.name == kind).drawn(1)
+    graph = replace(case.graph, translation=torch.from_numpy(case.edge_translation) if with_places else None)
+    half = graph.num_nodes // 2
+    own, joints = restarted(graph, half)
+    online = OnlineEstimator(OPTIONS)
+    feed, joining = Feed(own, online), Feed(joints, online)
+    feed.until(half)
+    online.tick()
+    feed.until(half + 60)
+    apart = online.tick()
+    assert apart is not None and apart.num_components == 2
+    joining.until(half + 60)
+    joined = online.tick()
+    assert joined is not None and joined.num_components == 1
+    assert set(joined.stage_seconds) == {"update"} and not joined.was_cold
+    now = online.snapshot().graph
+    cold = solve(now, profile="slam")
+    assert ((cold.outlier_score.numpy() > 0.5) != joined.outlier).sum() <= 1
+    whole = replace(joined, world_from_body=cold.world_from_body.numpy())
+    assert error_deg(case, now, joined) < 1.2 * error_deg(case, now, whole) + 0.1
+    # The older part has not turned.
+    np.testing.assert_allclose(joined.world_from_body[0], apart.world_from_body[0], atol=1e-12)
+    # Which of the joints are good is gone into beside the next answers.
+    memory = online._content.memory
+    assert memory.is_due or memory.ahead is not None
+
+
+def test_without_labels_it_is_a_solve_from_nothing() -> None:
+    """By a method that remembers nothing."""
+    case = next(one for one in KINDS if one.name == "building: 15 closures").drawn(1)
+    half = case.graph.num_nodes // 2
+    own, joints = restarted(case.graph, half)
+    online = OnlineEstimator(replace(OPTIONS, method="neurora~tails"))
+    Feed(own, online).until(case.graph.num_nodes)
+    assert online.tick() is not None
+    Feed(joints, online).until(case.graph.num_nodes)
+    answer = online.tick()
+    assert answer is not None and answer.num_components == 1 and answer.was_cold
