@@ -20,6 +20,14 @@ from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 _MOST_JOINTS, _FAR = 200, math.radians(30)
 
 
+def is_numbered_by_first_node(component: Tensor) -> bool:
+    """Whether labels ``(N,)`` are those of components, each new one the next number."""
+    if component.ndim != 1 or component.dtype != torch.int64:
+        return False
+    highest = torch.cummax(torch.cat((torch.tensor([-1]), component)), 0).values
+    return bool(((component >= 0) & (component <= highest[:-1] + 1)).all())
+
+
 def component_roots(component: Tensor) -> Tensor:
     """First node of every component, ``(C,)``, from the components' labels ``(N,)`` numbered by first node."""
     nodes = torch.arange(len(component), device=component.device)

@@ -40,7 +40,7 @@ class _Remembered:
 
     Attributes:
         number: of the solve.
-        labels: that are left if the process dies, or is another one after a load.
+        labels: that are left if the process dies.
     """
 
     number: int

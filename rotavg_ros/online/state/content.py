@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.online.answer.anchoring import corrections
+from rotavg_ros.online.answer.gauge import is_numbered_by_first_node
 from rotavg_ros.online.answer.last_answer import LastAnswer
 from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedIndex, MarginalizedKeyframes
 from rotavg_ros.online.content import ContentState
@@ -138,7 +139,7 @@ def _restore(arrays: Arrays, header: dict[str, Any], options: EstimatorOptions) 
     queued = np.zeros(graph.num_edges, dtype=bool)
     queued[arrays["queued"]] = True
     component = torch.from_numpy(arrays["component"])
-    if len(component) not in {0, len(answered)}:
+    if len(component) not in {0, len(answered)} or not is_numbered_by_first_node(component):
         raise ValueError("components of other keyframes")
     last = LastAnswer(
         answered if len(answered) else None, component if len(component) else None, arrays["outlier"], queued

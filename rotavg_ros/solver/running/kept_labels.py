@@ -45,9 +45,13 @@ class KeptLabels:
 
         Raises:
             KeyError: an array is missing.
-            ValueError: they have no such shapes.
+            ValueError: they have no such shapes or values.
         """
         trusted, noise, bias = (np.asarray(arrays[name], dtype=float) for name in ("trusted", "noise", "bias"))
         if trusted.ndim != 1 or len(trusted) > graph.num_edges or noise.ndim != 1 or bias.shape not in {(0,), (3,)}:
             raise ValueError("labels that fit no graph")
+        if ((trusted < 0) | (trusted > 1)).any() or not (np.isfinite(noise) & (noise >= 0)).all():
+            raise ValueError("labels beyond 0 to 1, or noise below 0")
+        if not np.isfinite(bias).all():
+            raise ValueError("a bias that is no number")
         return cls(graph, trusted, noise, bias, bool(arrays["by_places"]))

@@ -88,7 +88,8 @@ def resume_slam(graph: ViewGraph, labels: KeptLabels, run: Run) -> Estimate | No
     """
     if run.warm_start is None or labels.by_places is not has_places(graph) or first_of_each(graph) is not None:
         return None
-    if len(labels.noise) != len(fields(Noise)) or not begins_with(graph, labels.graph, len(labels.trusted)):
+    is_known = len(labels.noise) == len(fields(Noise)) and Noise(*labels.noise.tolist()).is_possible
+    if not is_known or not begins_with(graph, labels.graph, len(labels.trusted)):
         return None
     with run.watch.stage("update"):
         start = run.warm_start.double()

@@ -131,14 +131,36 @@ def test_other_options_other_answers(tmp_path: Path) -> None:
     assert not is_without_a_search(answer) and answer.position is None
 
 
-@pytest.mark.parametrize("name", ["labels_trusted", "labels_noise", "labels_bias", "component"])
-def test_a_file_whose_labels_fit_nothing_is_refused(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        *((name, np.zeros((3, 3))) for name in ("labels_trusted", "labels_noise", "labels_bias", "component")),
+        ("labels_trusted", np.full(100, 2.0)),
+        ("labels_noise", np.full(10, np.nan)),
+        ("labels_noise", np.full(10, -1.0)),
+        ("labels_bias", np.full(3, np.inf)),
+        ("component", np.full(30, 10**12)),
+        ("component", np.arange(30)[::-1]),
+        ("component", np.zeros(30)),
+    ],
+)
+def test_a_file_whose_labels_fit_nothing_is_refused(name: str, values: np.ndarray, tmp_path: Path) -> None:
     graph, path = drawn(False), tmp_path / "state.npz"
     online = OnlineEstimator(OPTIONS)
     Feed(graph, online).until(30)
     online.tick()
     online.save(path)
     arrays = state_file.read(path)
-    state_file.write(path, arrays | {name: np.zeros((3, 3))})
+    state_file.write(path, arrays | {name: values})
     with pytest.raises(state_file.StateFileError, match="inconsistent"):
         loaded(path)
+
+
+def test_noise_of_a_file_that_cannot_be_begins_nothing(tmp_path: Path) -> None:
+    graph, path = drawn(False), tmp_path / "state.npz"
+    online = OnlineEstimator(OPTIONS)
+    Feed(graph, online).until(30)
+    online.tick()
+    online.save(path)
+    state_file.write(path, state_file.read(path) | {"labels_noise": np.zeros(10)})
+    assert not is_without_a_search(answered(loaded(path)))

@@ -47,6 +47,13 @@ class Noise:
     step_tail_ratio: float = STEP_TAIL_RATIOS[0]
     step_told: float = 1.0
 
+    @property
+    def is_possible(self) -> bool:
+        """Whether it is one, where it comes from a file."""
+        variances = self.step_variance, self.closure_variance, self.step_tail_ratio, self.step_told
+        shares = self.common_share, self.turn_share, self.step_tails, self.closure_tails
+        return min(variances) > 0 and max(shares) < 1
+
     def chosen_as(self, other: Noise) -> Noise:
         """What residuals told of the one with what another one has chosen from grids."""
         told = {name: getattr(self, name) for name in ("step_variance", "closure_variance", "step_told")}
