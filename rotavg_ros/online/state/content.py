@@ -112,9 +112,7 @@ def _labels(content: ContentState) -> Arrays:
     for name in ("source", "target", "target_from_source", "kind", "label"):
         if not np.array_equal(getattr(graph, name).numpy()[edges], getattr(kept.graph, name).numpy()[:count]):
             return {}
-    trusted = np.full(graph.num_edges, np.nan)
-    trusted[edges] = kept.trusted
-    return kept.arrays() | {"trusted": trusted}
+    return kept.of_edges(edges, graph.num_edges)
 
 
 def restore(arrays: Arrays, options: EstimatorOptions) -> ContentState:
@@ -179,9 +177,8 @@ def _kept_labels(arrays: Arrays, graph: ViewGraph, queued: NDArray[np.bool_]) ->
     if not arrays:
         return None
     entered = np.flatnonzero(~queued)
-    return KeptLabels.of_arrays(
-        graph.select_edges(torch.from_numpy(entered)), arrays | {"trusted": arrays["trusted"][entered]}
-    )
+    now = arrays | {name: arrays[name][..., entered] for name in ("trusted", "places")}
+    return KeptLabels.of_arrays(graph.select_edges(torch.from_numpy(entered)), now)
 
 
 def _graph(arrays: Arrays, header: dict[str, Any]) -> GrowingViewGraph:

@@ -10,34 +10,46 @@ import numpy as np
 
 from rotavg_ros.view_graph import ViewGraph
 
+_NAMES = ("trusted", "noise", "bias", "places", "pose_noise")
+# What each tick sends from the solver's process to the node's is worth a millisecond.
+_TYPES = {"places": np.float32}
+
 
 @dataclass(frozen=True)
 class KeptLabels:
     """In the place of a memory they lead at once to about what the solve said that they are of.
 
+    What is of edges is NaN where nobody has looked.
+
     Attributes:
         graph: whose first M edges they are of.
-        trusted: ``(M,)`` 1 for good closures and sound odometry, 0 for others, NaN where nobody has looked.
-        noise: ``(n,)`` parameters of the noise, in the solver's order.
+        trusted: ``(M,)`` 1 for good closures and sound odometry, 0 for others.
+        noise: ``(n,)`` parameters of rotations' noise, in the solver's order.
         bias: ``(3,)`` rad per step that was taken out of the odometry, ``(0,)`` if none was.
-        by_places: whether translations had a say.
+        places: ``(R, M)`` float32 chances of what closures' places may be, and their weights, in the solver's order.
+        pose_noise: ``(m,)`` parameters of the noise of poses, likewise; ``(0,)`` if translations had no say.
     """
 
     graph: ViewGraph
     trusted: np.ndarray
     noise: np.ndarray
     bias: np.ndarray
-    by_places: bool
+    places: np.ndarray
+    pose_noise: np.ndarray
 
     @property
     def labels(self) -> KeptLabels:
         """Themselves, as a memory has them."""
         return self
 
+    @property
+    def by_places(self) -> bool:
+        """Whether translations had a say."""
+        return len(self.pose_noise) > 0
+
     def arrays(self) -> dict[str, np.ndarray]:
         """All but the graph."""
-        by_places = np.array(self.by_places)
-        return {"trusted": self.trusted, "noise": self.noise, "bias": self.bias, "by_places": by_places}
+        return {name: getattr(self, name) for name in _NAMES}
 
     @classmethod
     def of_arrays(cls, graph: ViewGraph, arrays: Mapping[str, Any]) -> KeptLabels:
@@ -47,11 +59,21 @@ class KeptLabels:
             KeyError: an array is missing.
             ValueError: they have no such shapes or values.
         """
-        trusted, noise, bias = (np.asarray(arrays[name], dtype=float) for name in ("trusted", "noise", "bias"))
-        if trusted.ndim != 1 or len(trusted) > graph.num_edges or noise.ndim != 1 or bias.shape not in {(0,), (3,)}:
+        found = cls(graph, *(np.asarray(arrays[name], _TYPES.get(name, np.float64)) for name in _NAMES))
+        trusted, noise, places = found.trusted, (found.noise, found.pose_noise), found.places
+        is_flat = trusted.ndim == noise[0].ndim == noise[1].ndim == 1 and found.bias.shape in {(0,), (3,)}
+        if not is_flat or len(trusted) > graph.num_edges or places.ndim != 2 or places.shape[1] != len(trusted):
             raise ValueError("labels that fit no graph")
-        if ((trusted < 0) | (trusted > 1)).any() or not (np.isfinite(noise) & (noise >= 0)).all():
-            raise ValueError("labels beyond 0 to 1, or noise below 0")
-        if not np.isfinite(bias).all():
-            raise ValueError("a bias that is no number")
-        return cls(graph, trusted, noise, bias, bool(arrays["by_places"]))
+        if ((trusted < 0) | (trusted > 1)).any() or ((places < 0) | np.isinf(places)).any():
+            raise ValueError("labels beyond 0 to 1")
+        numbers = np.concatenate(noise)
+        if not (np.isfinite(numbers) & (numbers >= 0)).all() or not np.isfinite(found.bias).all():
+            raise ValueError("noise below 0, or a bias that is no number")
+        return found
+
+    def of_edges(self, edges: np.ndarray, num_edges: int) -> dict[str, np.ndarray]:
+        """Arrays of a graph of so many edges, of which the first M here are ``edges`` ``(M,)``."""
+        trusted = np.full(num_edges, np.nan)
+        places = np.full((len(self.places), num_edges), np.nan, _TYPES["places"])
+        trusted[edges], places[:, edges] = self.trusted, self.places
+        return self.arrays() | {"trusted": trusted, "places": places}

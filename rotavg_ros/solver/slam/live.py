@@ -27,7 +27,7 @@ from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.options import SlamStages
-from rotavg_ros.solver.slam.poses.solve import has_places, poses_of_labels, poses_of_update
+from rotavg_ros.solver.slam.poses.solve import has_places, poses_of_kept, poses_of_labels, poses_of_update
 from rotavg_ros.solver.slam.posterior.state import Noise
 from rotavg_ros.solver.slam.solve import whole
 from rotavg_ros.solver.slam.update.columns import Columns
@@ -100,7 +100,7 @@ def resume_slam(graph: ViewGraph, labels: KeptLabels, run: Run) -> Estimate | No
         if len(joints):
             estimate = replace(estimate, memory=memory.with_all_unexplained())
         if labels.by_places:
-            estimate = with_poses(graph, estimate, poses_of_labels(memory.unbiased(graph), found.mode))
+            estimate = with_poses(graph, estimate, poses_of_kept(memory.unbiased(graph), found.mode, labels))
     return replace(estimate, warnings=memory.notes, is_anew=False)
 
 

@@ -92,8 +92,11 @@ def test_closures_that_waited_wait_again(tmp_path: Path) -> None:
     queue.waits[closures[-10:]] = True
     queue.order = order
     kept = online._content.state.memory.labels
-    online._content.state.memory = KeptLabels(
-        kept.graph.select_edges(torch.from_numpy(order)), kept.trusted[order], kept.noise, kept.bias, kept.by_places
+    online._content.state.memory = replace(
+        kept,
+        graph=kept.graph.select_edges(torch.from_numpy(order)),
+        trusted=kept.trusted[order],
+        places=kept.places[:, order],
     )
     online.save(path)
     again = loaded(path)
@@ -135,10 +138,12 @@ def test_other_options_other_answers(tmp_path: Path) -> None:
     ("name", "values"),
     [
         *((name, np.zeros((3, 3))) for name in ("labels_trusted", "labels_noise", "labels_bias", "component")),
+        *((name, np.zeros((3, 3))) for name in ("labels_places", "labels_pose_noise")),
         ("labels_trusted", np.full(100, 2.0)),
         ("labels_noise", np.full(10, np.nan)),
         ("labels_noise", np.full(10, -1.0)),
         ("labels_bias", np.full(3, np.inf)),
+        ("labels_pose_noise", np.full(7, -1.0)),
         ("component", np.full(30, 10**12)),
         ("component", np.arange(30)[::-1]),
         ("component", np.zeros(30)),

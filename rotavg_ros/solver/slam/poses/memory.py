@@ -104,6 +104,13 @@ class PoseMemory:
         column[self.edge] = np.arange(len(self.edge))
         return PoseStart(state, column[closures], self.places)
 
+    def kept(self, num_edges: int) -> np.ndarray:
+        """``(R, M)`` float32 what :meth:`PoseStart.kept` needs of these edges, NaN where there is nothing."""
+        known = np.vstack((self.places.chance, self.places.weight, self.places.rotation_weight))
+        places = np.full((len(known), num_edges), np.nan, np.float32)
+        places[:, self.edge] = known
+        return places
+
     @property
     def step_variance(self) -> float:
         """rad², of one step of odometry, the mean over components and steps."""

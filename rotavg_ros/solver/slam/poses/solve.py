@@ -6,8 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from rotavg_ros.solver.running.kept_labels import KeptLabels
 from rotavg_ros.solver.slam.poses.answer import answer
 from rotavg_ros.solver.slam.poses.em.estimate import estimate_poses
+from rotavg_ros.solver.slam.poses.em.start import PoseStart
 from rotavg_ros.solver.slam.poses.memory import PoseMemory
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.search.rivals import rival_poses
@@ -56,6 +58,13 @@ def poses_of_update(graph: ViewGraph, mode: Mode, memory: PoseMemory) -> PoseMem
 def poses_of_labels(graph: ViewGraph, mode: Mode) -> PoseMemory:
     """Of a graph without its bias, with the labels of its rotations, from nothing else."""
     pose = estimate_poses(PoseProblem(graph, _translations(graph), mode))
+    return PoseMemory.of(pose, answer([pose], np.ones(1))[0])
+
+
+def poses_of_kept(graph: ViewGraph, mode: Mode, kept: KeptLabels) -> PoseMemory:
+    """Of a graph without its bias, with the labels of its rotations, from what is known of its closures' places."""
+    problem = PoseProblem(graph, _translations(graph), mode)
+    pose = estimate_poses(problem, start=PoseStart.kept(problem, kept.places, kept.pose_noise))
     return PoseMemory.of(pose, answer([pose], np.ones(1))[0])
 
 

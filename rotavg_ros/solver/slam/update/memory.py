@@ -145,10 +145,13 @@ class SlamMemory:
     @property
     def labels(self) -> KeptLabels | None:
         """What :meth:`of_labels` needs; None where odometry is held to have jumped, of which labels say nothing."""
-        if self.poses is not None and self.poses.pose.problem.jump is not None:
-            return None
-        bias = np.zeros(0) if self.bias is None else self.bias
-        return KeptLabels(self.graph, self.trusted, np.array(astuple(self.noise)), bias, self.poses is not None)
+        poses, bias = self.poses, np.zeros(0) if self.bias is None else self.bias
+        places, noise = np.zeros((0, len(self.trusted)), np.float32), np.zeros(0)
+        if poses is not None:
+            if poses.pose.problem.jump is not None:
+                return None
+            places, noise = poses.kept(len(self.trusted)), np.array(astuple(poses.noise))
+        return KeptLabels(self.graph, self.trusted, np.array(astuple(self.noise)), bias, places, noise)
 
     @property
     def is_due(self) -> bool:

@@ -83,21 +83,21 @@ def test_what_does_not_fit_is_solved_from_nothing() -> None:
     assert goes_on(labels)
     others = replace(graph, target_from_source=rotations.inverse(graph.target_from_source))
     assert not goes_on(replace(labels, graph=others))
-    assert not goes_on(replace(labels, by_places=True))
+    assert not goes_on(replace(labels, pose_noise=np.ones(7)))
     assert not goes_on(replace(labels, noise=labels.noise[:-1]))  # of another version of the solver
     label = graph.label.clone()
     label[-1] = EdgeLabel.REJECTED
     assert not goes_on(labels, replace(graph, label=label))
 
 
-@pytest.mark.parametrize("name", ["trusted", "noise", "bias", "by_places"])
+@pytest.mark.parametrize("name", ["trusted", "noise", "bias", "places", "pose_noise"])
 def test_arrays_that_are_none_of_theirs(name: str) -> None:
     graph = drawn("building: 15 closures", 1).graph
-    labels = KeptLabels(graph, np.ones(graph.num_edges), np.ones(10), np.zeros(0), False)
+    count = graph.num_edges
+    labels = KeptLabels(graph, np.ones(count), np.ones(10), np.zeros(0), np.ones((5, count)), np.ones(7))
     arrays = labels.arrays()
     assert KeptLabels.of_arrays(graph, arrays).arrays().keys() == arrays.keys()
     with pytest.raises(KeyError):
         KeptLabels.of_arrays(graph, {key: value for key, value in arrays.items() if key != name})
-    if name != "by_places":
-        with pytest.raises(ValueError, match="fit no graph"):
-            KeptLabels.of_arrays(graph, arrays | {name: np.ones((graph.num_edges + 1, 2))})
+    with pytest.raises(ValueError, match="fit no graph"):
+        KeptLabels.of_arrays(graph, arrays | {name: np.ones((count + 1, 2))})

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from rotavg_ros.solver.slam.poses.closures import NOTHING, REPEATS, Places
+from rotavg_ros.solver.slam.poses.places.classes import CLASSES
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.solved import PoseMode
-from rotavg_ros.solver.slam.poses.state import PoseState
+from rotavg_ros.solver.slam.poses.state import PoseNoise, PoseState
 
 # Solves from a start, at most. An update goes no further: closures that are new pull from its second solve on, and the
 # next one goes on from there.
@@ -72,6 +73,29 @@ class PoseStart:
         chance[REPEATS, closures] = 1.0
         weight[closures] *= NOTHING
         return replace(cls.at(pose), places=replace(places, chance=chance, weight=weight))
+
+    @classmethod
+    def kept(cls, problem: PoseProblem, kept: np.ndarray, noise: np.ndarray) -> PoseStart | None:
+        """Of labels that are known, and of what is known of places; None if another version of the solver kept it.
+
+        Positions are those of odometry along what rotations say; one solve leads to where closures want them.
+
+        Args:
+            problem: the labelling, and translations.
+            kept: ``(R, M)`` chances of classes and weights, of the view-graph's first M edges; NaN where not known.
+            noise: ``(7,)`` variances.
+        """
+        if len(kept) != CLASSES + 2 or len(noise) != len(fields(PoseNoise)) or not (noise > 0).all():
+            return None
+        edge = problem.closures
+        is_known = edge < kept.shape[1]
+        is_known[is_known] &= ~np.isnan(kept[:, edge[is_known]]).any(axis=0)
+        chance, (weight, rotation_weight) = np.split(kept[:, edge[is_known]].astype(np.float64), [CLASSES])
+        none, nothing = np.zeros_like(chance), np.zeros(3)
+        places = Places(chance, weight, rotation_weight, nothing, nothing, np.zeros(len(weight)), none, none)
+        column = np.where(is_known, np.cumsum(is_known) - 1, -1)
+        state = replace(along_odometry(problem), noise=PoseNoise(*noise.tolist()))
+        return cls(state, column, places, MAX_SOLVES)
 
     def over(self, places: Places) -> Places:
         """These, and others' ``places`` of what is new."""
