@@ -198,6 +198,8 @@ def _run(job: _Job, run: Run) -> Estimate:
             estimate = update_slam(job.graph, memory, run)
         elif isinstance(memory, KeptLabels):
             estimate = resume_slam(job.graph, memory, run)
+            if estimate is None:  # nor is the start one that a search should begin with
+                run = replace(run, warm_start=None)
     if estimate is not None:
         return _with_warnings(job.graph, estimate)
     if run.anew:  # nothing can be gone on from, and nothing is to be begun with

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,8 +59,42 @@ def test_a_robot_that_was_switched_off_and_on_is_joined_at_once(kind: str, with_
     # The older part has not turned.
     np.testing.assert_allclose(joined.world_from_body[0], apart.world_from_body[0], atol=1e-12)
     # Which of the joints are good is gone into beside the next answers.
+    assert is_due(online)
+
+
+def is_due(online: OnlineEstimator) -> bool:
     memory = online._content.memory
-    assert memory.is_due or memory.ahead is not None
+    return memory.is_due or memory.ahead is not None
+
+
+def test_the_search_that_a_join_asks_for_outlives_the_process(tmp_path: Path) -> None:
+    """Saved before the tick that joins, after it, and while the search is under way."""
+    case = next(one for one in KINDS if one.name == "building: 30 % random").drawn(1)
+    half = case.graph.num_nodes // 2
+    own, joints = restarted(case.graph, half)
+    online, path = OnlineEstimator(OPTIONS), tmp_path / "state.npz"
+    feed = Feed(own, online)
+    feed.until(half + 55)
+    online.tick()
+    assert not is_due(online)
+
+    def again() -> OnlineEstimator:
+        online.save(path)
+        other = OnlineEstimator(OPTIONS)
+        other.load(path)
+        answer = other.tick()
+        assert answer is not None and set(answer.stage_seconds) == {"update"}
+        return other
+
+    assert not is_due(again())
+    Feed(joints, online).until(half + 55)
+    assert is_due(again())
+    online.tick()
+    assert is_due(online) and is_due(again())
+    feed.until(half + 60)
+    online.tick()
+    online.go_on(work=1.0)
+    assert online._content.memory.ahead is not None and is_due(again())
 
 
 def test_without_labels_it_is_a_solve_from_nothing() -> None:

@@ -63,7 +63,8 @@ def joins_components(previous: Tensor, current: Tensor) -> bool:
 def joined(body_from_world: Tensor, component: Tensor, graph: ViewGraph) -> Tensor:
     """Orientations of all nodes in one gauge for each component of the graph, where closures have joined some.
 
-    Each component is turned as the one closure to those before it says that most others agree with.
+    Each component is turned as the one closure to those before it says that most others agree with; where somebody has
+    accepted some, of these.
 
     Args:
         body_from_world: ``(n, 4)`` of the first n nodes, in the gauges of components that were apart.
@@ -78,7 +79,8 @@ def joined(body_from_world: Tensor, component: Tensor, graph: ViewGraph) -> Tens
     apart = _components_by_odometry(component, graph)
     is_joint = (apart[graph.source] != apart[graph.target]) & ~odometry & (graph.label != EdgeLabel.REJECTED)
     joints = graph.select_edges(is_joint)
-    ends = torch.stack((apart[joints.source], apart[joints.target])).numpy()
+    ends, is_sure = torch.stack((apart[joints.source], apart[joints.target])).numpy(), joints.label.numpy()
+    is_sure = is_sure == EdgeLabel.ACCEPTED
     placed = np.zeros(int(apart.max()) + 1, dtype=bool)
     for seed in range(len(placed)):
         placed[seed] = True
@@ -86,7 +88,10 @@ def joined(body_from_world: Tensor, component: Tensor, graph: ViewGraph) -> Tens
             edges = np.flatnonzero(reaching)
             beyond = np.where(placed[ends[0, edges]], ends[1, edges], ends[0, edges])
             nearest = int(np.bincount(beyond).argmax())
-            turn = _most_agreed(_turns(start, joints, edges[beyond == nearest], placed[ends[0]]))
+            edges = edges[beyond == nearest]
+            if is_sure[edges].any():
+                edges = edges[is_sure[edges]]
+            turn = _most_agreed(_turns(start, joints, edges, placed[ends[0]]))
             is_turned = apart == nearest
             start[is_turned] = rotations.normalize(rotations.multiply(start[is_turned], turn))
             placed[nearest] = True

@@ -119,7 +119,10 @@ class SolverProcess:
             solution = Solution(**from_arrays(outcome))
             if not remembers:
                 return solution
-            kept = None if labels is None else KeptLabels.of_arrays(graph, labels)
+            kept = None
+            if labels is not None:
+                with suppress(ValueError):  # the answer is as good without them
+                    kept = KeptLabels.of_arrays(graph, labels)
             return replace(solution, memory=_Remembered(request.number, kept))
 
     def advance(self, memory: object | None, work: float) -> float:

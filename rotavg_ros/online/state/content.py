@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -139,9 +140,10 @@ def _restore(arrays: Arrays, header: dict[str, Any], options: EstimatorOptions) 
     component = torch.from_numpy(arrays["component"])
     if len(component) not in {0, len(answered)} or not is_numbered_by_first_node(component):
         raise ValueError("components of other keyframes")
-    last = LastAnswer(
-        answered if len(answered) else None, component if len(component) else None, arrays["outlier"], queued
-    )
+    memory = _kept_labels(_with_prefix(_LABELS, arrays), graph.snapshot().graph, queued)
+    # Without labels the next answer begins with nothing, and not with the last one.
+    known = component if len(component) and memory is not None else None
+    last = LastAnswer(answered if len(answered) else None, known, arrays["outlier"], queued)
     growth = Growth(
         options,
         last,
@@ -168,17 +170,16 @@ def _restore(arrays: Arrays, header: dict[str, Any], options: EstimatorOptions) 
         world_from_odometry = {robot: (x, y, z, w) for robot, (x, y, z, w) in known.items()}
     else:
         world_from_odometry = {} if last.body_from_world is None else corrections(builder, last.body_from_world)
-    memory = _kept_labels(_with_prefix(_LABELS, arrays), graph.snapshot().graph, queued)
     return ContentState(growth, last, header["version"], header["ticked_revision"], world_from_odometry, memory)
 
 
 def _kept_labels(arrays: Arrays, graph: ViewGraph, queued: NDArray[np.bool_]) -> KeptLabels | None:
-    """In the order in which edges enter now."""
-    if not arrays:
-        return None
+    """In the order in which edges enter now; None, and a whole search comes first, where they are no labels."""
     entered = np.flatnonzero(~queued)
-    now = arrays | {name: arrays[name][..., entered] for name in ("trusted", "places")}
-    return KeptLabels.of_arrays(graph.select_edges(torch.from_numpy(entered)), now)
+    with suppress(KeyError, ValueError, IndexError):
+        now = arrays | {name: arrays[name][..., entered] for name in ("trusted", "places")}
+        return KeptLabels.of_arrays(graph.select_edges(torch.from_numpy(entered)), now)
+    return None
 
 
 def _graph(arrays: Arrays, header: dict[str, Any]) -> GrowingViewGraph:

@@ -10,7 +10,7 @@ import numpy as np
 
 from rotavg_ros.view_graph import ViewGraph
 
-_NAMES = ("trusted", "noise", "bias", "places", "pose_noise")
+_NAMES = ("trusted", "noise", "bias", "places", "pose_noise", "search")
 # What each tick sends from the solver's process to the node's is worth a millisecond.
 _TYPES = {"places": np.float32}
 
@@ -28,6 +28,8 @@ class KeptLabels:
         bias: ``(3,)`` rad per step that was taken out of the odometry, ``(0,)`` if none was.
         places: ``(R, M)`` float32 chances of what closures' places may be, and their weights, in the solver's order.
         pose_noise: ``(m,)`` parameters of the noise of poses, likewise; ``(0,)`` if translations had no say.
+        search: ``(3,)`` closures that the last whole search had, those not explained since, and 1 if another answer was
+            nearly as likely, else 0: what tells when the next one is due.
     """
 
     graph: ViewGraph
@@ -36,6 +38,7 @@ class KeptLabels:
     bias: np.ndarray
     places: np.ndarray
     pose_noise: np.ndarray
+    search: np.ndarray
 
     @property
     def labels(self) -> KeptLabels:
@@ -46,6 +49,10 @@ class KeptLabels:
     def by_places(self) -> bool:
         """Whether translations had a say."""
         return len(self.pose_noise) > 0
+
+    def are_known(self, num_edges: int) -> np.ndarray:
+        """``(M',)`` bool, of a graph of so many edges, which somebody has looked at."""
+        return np.append(~np.isnan(self.trusted), np.zeros(num_edges - len(self.trusted), dtype=bool))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All but the graph."""
@@ -60,9 +67,15 @@ class KeptLabels:
             ValueError: they have no such shapes or values.
         """
         found = cls(graph, *(np.asarray(arrays[name], _TYPES.get(name, np.float64)) for name in _NAMES))
-        trusted, noise, places = found.trusted, (found.noise, found.pose_noise), found.places
-        is_flat = trusted.ndim == noise[0].ndim == noise[1].ndim == 1 and found.bias.shape in {(0,), (3,)}
-        if not is_flat or len(trusted) > graph.num_edges or places.ndim != 2 or places.shape[1] != len(trusted):
+        trusted, noise, places = found.trusted, (found.noise, found.pose_noise, found.search), found.places
+        is_flat = all(numbers.ndim == 1 for numbers in (trusted, *noise)) and found.bias.shape in {(0,), (3,)}
+        if (
+            not is_flat
+            or len(found.search) != 3
+            or len(trusted) > graph.num_edges
+            or places.ndim != 2
+            or places.shape[1] != len(trusted)
+        ):
             raise ValueError("labels that fit no graph")
         if ((trusted < 0) | (trusted > 1)).any() or ((places < 0) | np.isinf(places)).any():
             raise ValueError("labels beyond 0 to 1")

@@ -93,7 +93,7 @@ def resume_slam(graph: ViewGraph, labels: KeptLabels, run: Run) -> Estimate | No
         return None
     with run.watch.stage("update"):
         start = run.warm_start.double()
-        joints = _joints(graph, len(labels.trusted))
+        joints = _joints(graph, labels.are_known(graph.num_edges))
         found = SlamMemory.of_labels(labels, graph, _networks(run), start, _far_from(graph, joints, start))
         estimate, memory = found.estimate, found.estimate.memory
         assert isinstance(memory, SlamMemory)
@@ -104,11 +104,10 @@ def resume_slam(graph: ViewGraph, labels: KeptLabels, run: Run) -> Estimate | No
     return replace(estimate, warnings=memory.notes, is_anew=False)
 
 
-def _joints(graph: ViewGraph, known: int) -> np.ndarray:
-    """``(n,)`` closures after the first ``known`` edges that join what these and odometry leave apart."""
-    is_later = torch.arange(graph.num_edges) >= known
-    apart = graph.select_edges(~is_later | graph.is_odometry).components()
-    return torch.nonzero(is_later & (apart[graph.source] != apart[graph.target]))[:, 0].numpy()
+def _joints(graph: ViewGraph, is_known: np.ndarray) -> np.ndarray:
+    """``(n,)`` closures that join what edges that are known ``(M,)``, and odometry, leave apart."""
+    apart = graph.select_edges(torch.from_numpy(is_known) | graph.is_odometry).components()
+    return torch.nonzero(apart[graph.source] != apart[graph.target])[:, 0].numpy()
 
 
 def _far_from(graph: ViewGraph, edges: np.ndarray, start: torch.Tensor) -> np.ndarray:

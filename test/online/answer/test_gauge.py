@@ -77,6 +77,21 @@ def test_a_rejected_closure_says_nothing_and_nothing_given_is_changed() -> None:
     assert off_deg(found[12:], before[12:]) < 1e-9  # still apart
 
 
+def test_what_somebody_has_accepted_counts_alone() -> None:
+    random = np.random.default_rng(3)
+    graph, truth = chains(random, [(0, 7), (3, 8), (5, 10), (12, 1)], false=(0,))
+    false = graph.target_from_source[-4].clone()
+    for edge, (source, target) in zip((-3, -2), ((3, 8), (5, 10)), strict=True):  # all false ones agree
+        seen = rotations.multiply(truth[target], rotations.inverse(truth[7]))
+        back = rotations.multiply(truth[0], rotations.inverse(truth[source]))
+        graph.target_from_source[edge] = rotations.multiply(rotations.multiply(seen, false), back)
+    before, component = apart(truth, random)
+    assert off_deg(joined(before, component, graph)[:12], truth[:12]) > 5
+    graph.label[-2] = EdgeLabel.ACCEPTED
+    graph.target_from_source[-2] = rotations.multiply(truth[10], rotations.inverse(truth[5]))
+    assert off_deg(joined(before, component, graph)[:12], truth[:12]) < 1e-5
+
+
 @pytest.mark.parametrize("count", [1, 500])
 def test_many_closures_are_no_trouble(count: int) -> None:
     random = np.random.default_rng(1)

@@ -134,38 +134,41 @@ def test_other_options_other_answers(tmp_path: Path) -> None:
     assert not is_without_a_search(answer) and answer.position is None
 
 
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [
-        *((name, np.zeros((3, 3))) for name in ("labels_trusted", "labels_noise", "labels_bias", "component")),
-        *((name, np.zeros((3, 3))) for name in ("labels_places", "labels_pose_noise")),
-        ("labels_trusted", np.full(100, 2.0)),
-        ("labels_noise", np.full(10, np.nan)),
-        ("labels_noise", np.full(10, -1.0)),
-        ("labels_bias", np.full(3, np.inf)),
-        ("labels_pose_noise", np.full(7, -1.0)),
-        ("component", np.full(30, 10**12)),
-        ("component", np.arange(30)[::-1]),
-        ("component", np.zeros(30)),
-    ],
-)
-def test_a_file_whose_labels_fit_nothing_is_refused(name: str, values: np.ndarray, tmp_path: Path) -> None:
-    graph, path = drawn(False), tmp_path / "state.npz"
+def saved(path: Path) -> None:
+    graph = drawn(False)
     online = OnlineEstimator(OPTIONS)
     Feed(graph, online).until(30)
     online.tick()
     online.save(path)
-    arrays = state_file.read(path)
-    state_file.write(path, arrays | {name: values})
+
+
+@pytest.mark.parametrize("values", [np.zeros((3, 3)), np.full(30, 10**12), np.arange(30)[::-1], np.zeros(30)])
+def test_a_file_whose_components_are_none_is_refused(values: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "state.npz"
+    saved(path)
+    state_file.write(path, state_file.read(path) | {"component": values})
     with pytest.raises(state_file.StateFileError, match="inconsistent"):
         loaded(path)
 
 
-def test_noise_of_a_file_that_cannot_be_begins_nothing(tmp_path: Path) -> None:
-    graph, path = drawn(False), tmp_path / "state.npz"
-    online = OnlineEstimator(OPTIONS)
-    Feed(graph, online).until(30)
-    online.tick()
-    online.save(path)
-    state_file.write(path, state_file.read(path) | {"labels_noise": np.zeros(10)})
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        *((f"labels_{name}", np.zeros((3, 3))) for name in ("trusted", "noise", "bias", "places", "pose_noise")),
+        ("labels_trusted", np.full(100, 2.0)),
+        ("labels_noise", np.full(10, np.nan)),
+        ("labels_noise", np.full(10, -1.0)),
+        ("labels_noise", np.zeros(10)),
+        ("labels_noise", np.ones(3)),
+        ("labels_bias", np.full(3, np.inf)),
+        ("labels_pose_noise", np.full(7, -1.0)),
+        ("labels_search", np.zeros(2)),
+    ],
+)
+def test_labels_that_are_none_are_done_without(name: str, values: np.ndarray, tmp_path: Path) -> None:
+    """The map is worth more than the time of a search."""
+    path = tmp_path / "state.npz"
+    saved(path)
+    assert is_without_a_search(answered(loaded(path)))
+    state_file.write(path, state_file.read(path) | {name: values})
     assert not is_without_a_search(answered(loaded(path)))

@@ -138,8 +138,11 @@ class SlamMemory:
         found = solved_from(Labelled(trusted, noise, bias, labels.by_places), graph, networks, body_from_world)
         estimate = estimate_of(found.published)
         told = estimate.body_from_world, estimate.outlier_score, estimate.variance
-        searched = int((~graph.is_odometry).sum())
-        memory = cls(graph, found.trusted, found.noise, found.mode, bias, *told, searched, notes=of_slips(found.mode))
+        searched, unexplained, is_divided = map(int, labels.search)
+        is_new = ~labels.are_known(graph.num_edges) & ~graph.is_odometry.numpy()
+        unexplained += int((estimate.outlier_score.numpy()[is_new] > _FLAGGED).sum())
+        search = searched, bool(is_divided), unexplained
+        memory = cls(graph, found.trusted, found.noise, found.mode, bias, *told, *search, of_slips(found.mode))
         return SearchedOn(replace(estimate, memory=memory), found.mode)
 
     @property
@@ -151,7 +154,10 @@ class SlamMemory:
             if poses.pose.problem.jump is not None:
                 return None
             places, noise = poses.kept(len(self.trusted)), np.array(astuple(poses.noise))
-        return KeptLabels(self.graph, self.trusted, np.array(astuple(self.noise)), bias, places, noise)
+        # A search that was due, or under way, is due wherever they are gone on from.
+        unexplained = self.unexplained if self.ahead is None else self.with_all_unexplained().unexplained
+        search = np.array([self.searched, unexplained, self.is_divided], dtype=np.float64)
+        return KeptLabels(self.graph, self.trusted, np.array(astuple(self.noise)), bias, places, noise, search)
 
     @property
     def is_due(self) -> bool:

@@ -90,11 +90,11 @@ def test_what_does_not_fit_is_solved_from_nothing() -> None:
     assert not goes_on(labels, replace(graph, label=label))
 
 
-@pytest.mark.parametrize("name", ["trusted", "noise", "bias", "places", "pose_noise"])
+@pytest.mark.parametrize("name", ["trusted", "noise", "bias", "places", "pose_noise", "search"])
 def test_arrays_that_are_none_of_theirs(name: str) -> None:
     graph = drawn("building: 15 closures", 1).graph
     count = graph.num_edges
-    labels = KeptLabels(graph, np.ones(count), np.ones(10), np.zeros(0), np.ones((5, count)), np.ones(7))
+    labels = KeptLabels(graph, np.ones(count), np.ones(10), np.zeros(0), np.ones((5, count)), np.ones(7), np.ones(3))
     arrays = labels.arrays()
     assert KeptLabels.of_arrays(graph, arrays).arrays().keys() == arrays.keys()
     with pytest.raises(KeyError):
