@@ -70,9 +70,12 @@ def collect(content: ContentState) -> State:
     arrays: Arrays = {name: getattr(snapshot, name) for name in _KEYFRAME_COLUMNS}
     arrays |= {name: getattr(snapshot.graph, name).numpy() for name in _GRAPH_COLUMNS}
     arrays["answered"] = np.empty((0, 4)) if last.body_from_world is None else last.body_from_world.numpy()
-    arrays["component"] = np.empty(0, dtype=np.int64) if last.component is None else last.component.numpy()
+    labels = _labels(content)
+    # Without labels the next answer begins with nothing, and not with the last one.
+    known = last.component if labels else None
+    arrays["component"] = np.empty(0, dtype=np.int64) if known is None else known.numpy()
     arrays["outlier"], arrays["queued"] = last.outlier, np.flatnonzero(last.queue.waits)
-    arrays |= _prefixed(_LABELS, _labels(content))
+    arrays |= _prefixed(_LABELS, labels)
     arrays |= _prefixed(_FINGERPRINTS, growth.fingerprints.arrays())
     arrays |= _prefixed(_MARGINALIZED, marginalized.keyframes.arrays())
     for index, track in enumerate(growth.tracks.values()):
@@ -141,7 +144,6 @@ def _restore(arrays: Arrays, header: dict[str, Any], options: EstimatorOptions) 
     if len(component) not in {0, len(answered)} or not is_numbered_by_first_node(component):
         raise ValueError("components of other keyframes")
     memory = _kept_labels(_with_prefix(_LABELS, arrays), graph.snapshot().graph, queued)
-    # Without labels the next answer begins with nothing, and not with the last one.
     known = component if len(component) and memory is not None else None
     last = LastAnswer(answered if len(answered) else None, known, arrays["outlier"], queued)
     growth = Growth(
