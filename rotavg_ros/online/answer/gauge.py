@@ -7,8 +7,6 @@ from collections import deque
 
 import numpy as np
 import torch
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from rotavg_ros import rotations
@@ -100,6 +98,9 @@ def joined(body_from_world: Tensor, component: Tensor, graph: ViewGraph) -> Tens
 
 def _components_by_odometry(component: Tensor, graph: ViewGraph) -> Tensor:
     """``(N,)`` numbered by first node: those of the first n nodes, with odometry since and no closures."""
+    from scipy.sparse import coo_array  # only where something joins: a node has no other use for it
+    from scipy.sparse.csgraph import connected_components
+
     to_root = torch.stack((component_roots(component)[component], torch.arange(len(component))))
     odometry = torch.stack((graph.source, graph.target))[:, graph.is_odometry]
     links = torch.cat((to_root, odometry), dim=1).numpy()
