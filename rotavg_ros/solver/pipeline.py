@@ -66,8 +66,8 @@ def solve(
         warm_start: ``(N, 4)`` body_from_world of an earlier solution to start from.
         memory: that of the earlier solution by the same method, if the graph has only grown since, or its ``labels``,
             the part of it that can be written down; with it a warm start of a SLAM graph judges the new edges and goes
-            on from all other verdicts. Where many closures are not
-            explained by these, everything is judged anew beside it.
+            on from all other verdicts. Where many closures are not explained by these, everything is judged anew beside
+            it.
         work: units (:attr:`~rotavg_ros.solver.solution.Solution.work`) that such a solve may spend. Where it takes
             more, the answer is what is known with what has come laid on, and :func:`advance` goes on with the rest.
             The same on every machine. Default: all that it takes.
