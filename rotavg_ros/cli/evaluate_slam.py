@@ -28,6 +28,7 @@ from rotavg_ros.evaluation.slam import (
     uncertainty,
 )
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS, ROSTER, ROWS
+from rotavg_ros.evaluation.slam.same_data import SameData
 from rotavg_ros.evaluation.slam.search_or_model import Diagnosis, diagnose
 from rotavg_ros.evaluation.slam.stress_calibration import Calibration
 from rotavg_ros.solver.methods import SWITCHES, without
@@ -74,8 +75,8 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
     chosen = contenders(names, ROSTER, keep=arguments.keep)
     with working("warming up"):
         warm_up(contenders(names, ROSTER).values(), ROSTER)
-    calibration = Calibration()
-    chosen[OURS] = calibration.watching(chosen[OURS])
+    calibration, same_data = Calibration(), SameData()
+    chosen[OURS] = same_data.watching(calibration.watching(chosen[OURS]))
 
     scores = score_all(drawings(kinds, seeds), chosen, _watch(len(kinds) * len(seeds) * len(chosen)))
     diagnoses: list[Diagnosis] = []
@@ -88,7 +89,7 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
         with suppress(KeyboardInterrupt):
             cases_again = progress(drawings(kinds, seeds), total=len(kinds) * len(seeds), description="other priors")
             priors.extend([*sensitivity.answers(case)] for case in cases_again)
-    findings = stress_report.Findings(calibration, diagnoses, priors)
+    findings = stress_report.Findings(calibration, same_data, diagnoses, priors)
     with working("writing the report"):
         return stress_report.report(arguments.output, scores, findings, arguments.command_line)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +11,9 @@ import numpy as np
 from rotavg_ros.evaluation.common.score_tables import VERDICT_FIGURES, Figure, per_case
 from rotavg_ros.evaluation.common.scoring import Scores, geometric_mean
 from rotavg_ros.evaluation.common.tables import Cell, Column, Report, Table
-from rotavg_ros.evaluation.slam import search_or_model, sensitivity, stress_calibration
+from rotavg_ros.evaluation.slam import same_data, search_or_model, sensitivity, stress_calibration
 from rotavg_ros.evaluation.slam.contenders import ORACLE, OURS, ROSTER, ROWS
+from rotavg_ros.evaluation.slam.same_data import SameData
 from rotavg_ros.evaluation.slam.search_or_model import Diagnosis
 from rotavg_ros.evaluation.slam.stress_calibration import Calibration
 
@@ -53,11 +54,13 @@ class Findings:
 
     Attributes:
         calibration: of ours.
+        same_data: of ours, likewise, of lone slips that may be false closures.
         diagnoses: of the posterior's answers.
         priors: answers under other priors, of every case.
     """
 
     calibration: Calibration
+    same_data: SameData = field(default_factory=SameData)
     diagnoses: Sequence[Diagnosis] = ()
     priors: Sequence[Sequence[sensitivity.Answer]] = ()
 
@@ -88,6 +91,8 @@ def report(
     of_kinds, title = findings.calibration.of_kinds(scores.cases), f"Calibration of {ROWS[OURS].replace('**', '')}"
     tables["stress-calibration"] = stress_calibration.table(title, of_kinds, every_kind=False)
     long["stress-calibration-kinds"] = stress_calibration.table(title, of_kinds, every_kind=True)
+    if either := findings.same_data.of_kinds(scores.cases):
+        tables["stress-same-data"] = same_data.table("A slip, or false closures: the same data", either)
     if diagnoses := findings.diagnoses:
         tables["stress-causes"] = search_or_model.shares("Why the posterior's answers are wrong", diagnoses)
         tables["stress-failures"] = search_or_model.failures("Wrong answers that are not divided", diagnoses)

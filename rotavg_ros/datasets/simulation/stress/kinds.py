@@ -86,6 +86,8 @@ _CLEAN_TRACK = SlamSimulationConfig(
     world=World.LAPS, num_keyframes=400, laps=4.0, odometry_noise_deg=0.2, closures_per_keyframe=0.3, false_share=0.0
 )
 _WITNESSES = (3, 5, 10, 20)
+# In the names of kinds whose slip is the same data as a false group.
+ONE_PAIR = "one pair of places"
 
 
 def _drive(all_noisy: bool, rng: np.random.Generator) -> DrawnGraph:
@@ -150,7 +152,7 @@ def _lone_slips() -> Iterator[StressKind]:
         spatial = replace(_CLEAN_TRACK, dimensions=3, terrain_tilt_deg=10.0, sway_deg=3.0)
         for from_one_pair in (True, False):
             config = spatial if (number + from_one_pair) % 2 else _CLEAN_TRACK
-            places = "one pair of places" if from_one_pair else "three pairs of places"
+            places = ONE_PAIR if from_one_pair else "three pairs of places"
             change = partial(slips.lone_slip, witnesses, from_one_pair)
             yield StressKind("lone slip", f"{witnesses} witnesses, {places}", partial(_changed, config, change))
 
