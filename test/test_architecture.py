@@ -31,7 +31,7 @@ INWARD: dict[str, set[str]] = {
         *("rotations", "solver", "training", "version", "view_graph"),
     },
     "training": {"datasets", "errors", "metrics", "results", "rotations", "solver", "version", "view_graph"},
-    "online": {"errors", "hamilton", "option", "rotations", "solver", "view_graph"},
+    "online": {"errors", "hamilton", "option", "rotations", "solver", "startup", "view_graph"},
     "inputs": {"online", "view_graph"},
     "settings": {"inputs", "online", "option", "view_graph"},
 }

@@ -6,6 +6,8 @@ import os
 import pickle
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -138,10 +140,12 @@ def test_an_answer_that_nobody_takes_any_more_ends_it_without_a_word(monkeypatch
     """Whoever asked has gone, and the thread that listens has not heard of it yet."""
     ours, theirs = socket.socketpair()
     request = Request(1, to_arrays(graph(20)), None, None, OPTIONS)
-    server = server_module._Server(Connection(theirs.detach()))
+    server = server_module.Server(Connection(theirs.detach()))
     server._requests.put(pickle.dumps(request))
     monkeypatch.setattr(server, "_listen", lambda: None)
-    ours.close()
+    asking = Connection(ours.detach())
+    asking.send_bytes(b"1")  # threads
+    asking.close()
     server.run()
 
 
@@ -158,6 +162,52 @@ def test_ctrl_c_is_not_for_it(process):
     for _ in range(3):
         os.kill(process.pid, signal.SIGINT)
         assert process(graph(30), **OPTIONS).method == "neurora"
+
+
+# In a process of its own, which has no threads yet.
+_WITH_A_COPY = """\
+import os, signal, sys, time
+import torch
+from rotavg_ros.online.solver_process.process import Forked
+copy = Forked()
+from rotavg_ros.errors import UserError
+from rotavg_ros.online.solver_process.client import SolverProcess
+from rotavg_ros.view_graph import ViewGraph
+graph = ViewGraph.create([0, 1, 0], [1, 2, 2], [[0.0, 0.0, 0.0, 1.0]] * 3, kind=[0, 0, 1])
+solver = SolverProcess(1, copy)
+os.kill(solver.pid, signal.SIGINT)
+assert solver(graph).method == "neurora" and solver.pid == copy.pid
+"""
+
+
+def test_a_copy_that_dies_is_followed_by_another_interpreter():
+    code = """\
+os.kill(copy.pid, signal.SIGKILL)
+try:
+    solver(graph)
+except UserError as error:
+    print(error)
+assert solver(graph).method == "neurora" and solver.pid != copy.pid
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", _WITH_A_COPY + code], capture_output=True, text=True, check=True, timeout=120
+    )
+    # Whether its end is told by a solve or seen before one is a matter of microseconds.
+    assert ended.stdout in (
+        "",
+        "the solver's process has died (exit code -9; -9 is what a lack of memory looks like); it is started again\n",
+    )
+
+
+@pytest.mark.parametrize("end", ["solver.close()", "os._exit(0)", "os.kill(os.getpid(), signal.SIGKILL)", ""])
+def test_no_copy_outlives_whoever_made_it(end: str):
+    code = f"print(solver.pid, flush=True)\n{end}\n"
+    ended = subprocess.run([sys.executable, "-c", _WITH_A_COPY + code], capture_output=True, text=True, timeout=120)
+    (pid,) = ended.stdout.split()
+    deadline = time.monotonic() + 30
+    while Path(f"/proc/{pid}").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def test_modules_of_the_folder_where_it_is_started_are_none_of_its(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import atexit
 import pickle
-import socket
-import subprocess
-import sys
 import threading
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
 from typing import Any
 
 from torch import Tensor
 
 from rotavg_ros.errors import UserError
+from rotavg_ros.online.solver_process.process import ServerProcess, Spawned
 from rotavg_ros.online.solver_process.wire import ABANDON, Advance, Request, from_arrays, to_arrays
 from rotavg_ros.solver import Abandoned, KeptLabels, Solution, stop_if_abandoned
 from rotavg_ros.view_graph import ViewGraph
@@ -23,15 +20,6 @@ from rotavg_ros.view_graph import ViewGraph
 # So often a solve that is waited for is asked whether anybody still wants it.
 _PATIENCE_S = 0.02
 _EXIT_TIMEOUT_S = 5.0
-# With -c and -m Python looks for modules in the folder where it is started, first of all: a user's queue.py, say.
-_SERVER = """\
-import sys
-sys.path[:] = [folder for folder in sys.path if folder]
-from rotavg_ros.startup import loading
-with loading():
-    from rotavg_ros.online.solver_process.server import main
-main()
-"""
 
 
 @dataclass(frozen=True)
@@ -56,32 +44,28 @@ class SolverProcess:
     another, which goes on from these.
     """
 
-    def __init__(self, threads: int) -> None:
-        """Start the process, which takes a second or two to be ready; the first solve waits for it.
+    def __init__(self, threads: int, process: ServerProcess | None = None) -> None:
+        """Begin with a process that takes a second or two to be ready; the first solve waits for it.
 
         Args:
             threads: of torch.
+            process: that serves; default: another interpreter.
         """
         self._threads = threads
         self._lock = threading.Lock()
         self._solves = self._first = 0
-        self._start()
+        self._begin(process or Spawned())
         atexit.register(self.close)
 
-    def _start(self) -> None:
-        ours, theirs = socket.socketpair()
-        with theirs:
-            given = str(theirs.fileno()), str(self._threads)
-            server = [sys.executable, "-c", _SERVER, *given]
-            # Ctrl-C is for the node, which ends this process itself.
-            command = ["/bin/sh", "-c", 'trap "" INT; exec "$@"', "sh", *server]
-            self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()])
-        self._connection = Connection(ours.detach())
+    def _begin(self, process: ServerProcess) -> None:
+        self._process = process
+        with suppress(OSError):  # it has died, which the first solve tells
+            process.connection.send_bytes(str(self._threads).encode())
 
     @property
     def is_alive(self) -> bool:
         """Whether the process has not ended, as far as this side knows; to be asked between solves."""
-        return not self._connection.poll(0)  # nothing was asked: what comes is its end
+        return not self._process.connection.poll(0)  # nothing was asked: what comes is its end
 
     @property
     def pid(self) -> int:
@@ -104,7 +88,7 @@ class SolverProcess:
         with self._lock:
             if not self.is_alive:
                 self.close()
-                self._start()
+                self._begin(Spawned())
                 self._first = self._solves + 1
             self._solves += 1
             request = Request(self._solves, to_arrays(graph), None, None, options)
@@ -141,31 +125,26 @@ class SolverProcess:
         try:
             return self._answer(request)
         except (EOFError, OSError) as error:
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(_EXIT_TIMEOUT_S)
-            how = self._process.returncode
+            how = self._process.exit_code(_EXIT_TIMEOUT_S)
             raise UserError(
                 f"the solver's process has died (exit code {how}; -9 is what a lack of memory looks like); it is "
                 "started again"
             ) from error
 
     def _answer(self, request: Request | Advance) -> Any:
-        self._connection.send_bytes(pickle.dumps(request, protocol=5))
-        while not self._connection.poll(_PATIENCE_S):
+        self._process.connection.send_bytes(pickle.dumps(request, protocol=5))
+        while not self._process.connection.poll(_PATIENCE_S):
             try:
                 stop_if_abandoned()
             except Abandoned:
-                self._connection.send_bytes(ABANDON)
-                self._connection.recv_bytes()  # it may have been ready just now; nobody wants it
+                self._process.connection.send_bytes(ABANDON)
+                self._process.connection.recv_bytes()  # it may have been ready just now; nobody wants it
                 raise
-        outcome = pickle.loads(self._connection.recv_bytes())  # noqa: S301 - of our own process
+        outcome = pickle.loads(self._process.connection.recv_bytes())  # noqa: S301 - of our own process
         if isinstance(outcome, BaseException):
             raise outcome
         return outcome
 
     def close(self) -> None:
         """End the process, in the middle of a solve as well."""
-        with suppress(OSError):
-            self._connection.close()
-        self._process.kill()
-        self._process.wait()
+        self._process.close()

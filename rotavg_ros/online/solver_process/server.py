@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pickle
 import queue
-import sys
 import threading
 from multiprocessing.connection import Connection
 
@@ -18,7 +17,9 @@ from rotavg_ros.solver import Abandoned, KeptLabels, abandonable, advance, solve
 from rotavg_ros.view_graph import ViewGraph
 
 
-class _Server:
+class Server:
+    """Solves what is asked for on a connection; the first message is the number of torch's threads."""
+
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         self._requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
@@ -27,7 +28,12 @@ class _Server:
         self._after_work = free_memory.AfterWork()
 
     def run(self) -> None:
-        """Solve until the other side has gone."""
+        """Solve until the other side has gone.
+
+        Raises:
+            EOFError: it has gone before it asked for anything.
+        """
+        torch.set_num_threads(int(self._connection.recv_bytes()))
         threading.Thread(target=self._listen, name="listener", daemon=True).start()
         while True:
             request: Request | Advance = pickle.loads(self._requests.get())  # noqa: S301 - of the process that started this one
@@ -83,10 +89,3 @@ class _Server:
             return memory if number == request.remembered else None
         arrays, graph = request.labels
         return KeptLabels.of_arrays(ViewGraph(**from_arrays(graph)), arrays)
-
-
-def main() -> None:
-    """Serve the process that has started this one."""
-    descriptor, threads = (int(word) for word in sys.argv[1:])
-    torch.set_num_threads(threads)
-    _Server(Connection(descriptor)).run()

@@ -17,6 +17,7 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.online import Discarded, OnlineEstimator
 from rotavg_ros.online.compaction import thinning
 from rotavg_ros.online.odometry.time_jumps import KEEPS_TIME_LINE
+from rotavg_ros.online.solver_process.process import ServerProcess
 from rotavg_ros.ros.node import parameter_server
 from rotavg_ros.ros.node.diagnostics import TIME_WENT_BACK, Reporter
 from rotavg_ros.ros.node.health import Health
@@ -43,13 +44,19 @@ class RotavgNode(parameter_server.ParameterNode):
         UserError: parameters that cannot be; the message is one line for the user.
     """
 
-    def __init__(self, executor: Executor) -> None:
+    def __init__(self, executor: Executor, process: ServerProcess | None = None) -> None:
+        """Declare parameters, begin with the solver and listen.
+
+        Args:
+            executor: calls workers back.
+            process: that solves; default: another interpreter, if parameters ask for one.
+        """
         try:
             super().__init__(NODE_NAME)
         except Exception as error:  # rclpy has a type of its own for each of its own parameters
             raise UserError(" ".join(str(error).split())) from error
         self._settings = parameters = parameter_server.declare(self)
-        self._solver = Solver(parameters)
+        self._solver = Solver(parameters, process)
         device = self._solver.warm_up(parameters.estimator)
         self._estimator = OnlineEstimator(
             parameters.estimator, self._solver.solve, self._on_discard, self._solver.advance

@@ -7,9 +7,13 @@ import signal
 import sys
 import traceback
 from types import FrameType
+from typing import TYPE_CHECKING
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.startup import loading
+
+if TYPE_CHECKING:
+    from rotavg_ros.online.solver_process.process import ServerProcess
 
 # A wait of the executor is not interrupted by a signal, so it must be short.
 _LONGEST_WAIT_S = 0.1
@@ -35,11 +39,12 @@ def main() -> int:
         arguments = remove_ros_args(sys.argv)[1:]
         if arguments:
             return _answer_arguments(arguments)
+        process = _solver_process()
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy has no common type for bad arguments and parameter files
         return _fail(" ".join(str(error).split()))
     try:
-        return _run(stop)
+        return _run(stop, process)
     finally:
         try_shutdown()
 
@@ -67,7 +72,16 @@ class _StopSignal:
         self.requested = True
 
 
-def _run(stop: _StopSignal) -> int:
+def _solver_process() -> ServerProcess:
+    """A copy of this process that solves, made while there are no threads: both share torch."""
+    with loading():
+        import torch  # noqa: F401 - before there are two
+
+        from rotavg_ros.online.solver_process.process import Forked
+    return Forked()
+
+
+def _run(stop: _StopSignal, process: ServerProcess) -> int:
     try:
         with loading():
             from rclpy.executors import SingleThreadedExecutor
@@ -78,7 +92,7 @@ def _run(stop: _StopSignal) -> int:
     executor = SingleThreadedExecutor()
     stop.has_started()  # the node locks its state file, which must not be left behind
     try:
-        node = RotavgNode(executor)
+        node = RotavgNode(executor, process)
     except UserError as error:
         return _fail(str(error))
     executor.add_node(node)

@@ -8,6 +8,7 @@ from rotavg_ros.online import EstimatorOptions
 from rotavg_ros.online.estimator import Advance
 from rotavg_ros.online.estimator import Solver as Solve
 from rotavg_ros.online.solver_process.client import SolverProcess
+from rotavg_ros.online.solver_process.process import ServerProcess
 from rotavg_ros.settings.parameters import NodeParameters
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
 
@@ -20,9 +21,16 @@ class Solver:
         advance: as :func:`rotavg_ros.solver.advance`.
     """
 
-    def __init__(self, parameters: NodeParameters) -> None:
+    def __init__(self, parameters: NodeParameters, process: ServerProcess | None = None) -> None:
+        """Begin with a process of its own, if parameters ask for one.
+
+        Args:
+            process: that serves; default: another interpreter, where one is needed.
+        """
         threads = parameters.solver_threads or max(1, torch.get_num_threads() - 1)
-        self._process = SolverProcess(threads) if parameters.solver_process else None
+        self._process = SolverProcess(threads, process) if parameters.solver_process else None
+        if self._process is None and process is not None:
+            process.close()
         self.solve: Solve
         self.advance: Advance
         if self._process is not None:
