@@ -64,7 +64,7 @@ def tiny_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two of the ten rows, of small graphs."""
     trained, tested = Configuration(20, 50, 10, 5, True), Configuration(30, 50, 10, 5, False)
     for name in ("planar", "in-space"):
-        row = robustness.SETTINGS[name]._replace(trained=trained, tested=tested)
+        row = robustness.SETTINGS[name]._replace(varied=name, trained=trained, tested=tested)
         monkeypatch.setitem(robustness.SETTINGS, name, row)
     monkeypatch.setattr(robustness_training, "_MOST_GRAPHS", 2)
 
@@ -114,6 +114,37 @@ def test_the_page_of_robustness_is_there_after_every_row(tmp_path: Path, monkeyp
     assert main([*command, "--output", str(tmp_path), "--settings", "in-space", "planar", "in-space"]) == 0
     assert len(drawn) == 2
     assert (tmp_path / "robustness.md").read_text().count("| not run |") == 27
+
+
+@pytest.mark.usefixtures("tiny_rows")
+def test_the_page_of_robustness_keeps_what_other_runs_have_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each row takes an hour."""
+    command = ["evaluate", "robustness", "--minutes", "0.001", "--threads", "1", "--output", str(tmp_path)]
+    command += ["--settings"]
+
+    def page(*words: str) -> dict[str, list[list[str]]]:
+        assert main([*command, *words]) == 0
+        found = {}
+        for name in ("", "-training", "-curves"):
+            with (tmp_path / f"robustness{name}.csv").open() as file:
+                found[name] = list(csv.reader(file))[1:]
+        return found
+
+    first = page("in-space", "--graphs", "1")
+    other = Configuration(20, 60, 10, 5, True)
+    monkeypatch.setitem(robustness.SETTINGS, "planar", robustness.SETTINGS["planar"]._replace(trained=other))
+    second = page("planar", "--graphs", "2")
+    assert second[""][24:27] == first[""][24:27]
+    assert [row[-1] for row in second[""]] == [*["not run"] * 24, *["1"] * 3, *["2"] * 3]
+    for name in ("-training", "-curves"):
+        assert second[name][: len(first[name])] == first[name]
+        assert len(second[name]) == 2 * len(first[name])
+    # And what is run again is what is shown.
+    third = page("in-space", "--graphs", "3")
+    assert [row[-1] for row in third[""]][24:] == [*["3"] * 3, *["2"] * 3]
+    assert len(third["-training"]) == 2 and len(third["-curves"]) == 4
 
 
 def test_real(tmp_path: Path) -> None:

@@ -60,17 +60,16 @@ def draw_training(path: Path, logs: Sequence[Path]) -> None:
     figure.savefig(path)
 
 
-def draw_together(path: Path, logs: Mapping[str, Mapping[str, Path]]) -> None:
+def draw_together(path: Path, runs_of: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]) -> None:
     """A panel for each kind of network, with a curve for each run of it, over the share of its epochs.
 
     Args:
-        logs: by what is said of the run, by the panel's title.
+        runs_of: epochs ``(E,)`` from 1 and objectives ``(E,)``, by what is said of the run, by the panel's title.
     """
-    figure = Figure(figsize=(4.6 * len(logs), 3.6), dpi=110, facecolor="white", layout="constrained")
-    panels = figure.subplots(1, len(logs), squeeze=False)[0]
-    for axes, (title, runs) in zip(panels, logs.items(), strict=True):
-        for colour, (label, log) in zip(PALETTE, runs.items(), strict=False):
-            epochs, objective = read_log(log)
+    figure = Figure(figsize=(4.6 * len(runs_of), 3.6), dpi=110, facecolor="white", layout="constrained")
+    panels = figure.subplots(1, len(runs_of), squeeze=False)[0]
+    for axes, (title, runs) in zip(panels, runs_of.items(), strict=True):
+        for colour, (label, (epochs, objective)) in zip(PALETTE, runs.items(), strict=False):
             best, share = int(objective.argmin()), epochs / epochs[-1]
             axes.plot(share, objective, color=colour, linewidth=1.0, label=label)
             axes.plot(share[best], objective[best], "o", color=colour, markersize=4)

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 from rotavg_ros.evaluation.common.scoring import Scores
 from rotavg_ros.evaluation.common.tables import Cell, Column, Report, Table
 from rotavg_ros.evaluation.common.training_plot import draw_together, read_log
 from rotavg_ros.evaluation.sfm.published import Configuration, Published, Robustness
 from rotavg_ros.evaluation.sfm.robustness import CHATTERJEE, METHODS, PAPER, PIPELINE, SETTINGS
+from rotavg_ros.evaluation.sfm.robustness_earlier import EarlierRows, with_earlier
 from rotavg_ros.evaluation.sfm.robustness_training import Trained
 from rotavg_ros.evaluation.sfm.synthetic import ROWS
 from rotavg_ros.solver.networks import PaperCleanNet, PaperFineNet
@@ -29,6 +32,7 @@ _NOTES = (
     "5° and what the row states; a random chain joins the cameras, which adds up to one edge for each (at 2.5 % of "
     "the pairs of 1000 cameras the share becomes 2.7 %). Its graphs may be easier or harder; compare ratios rather "
     "than degrees.",
+    "The command ran the last rows that were run; others are of runs before it.",
 )
 _TRAINING_NOTE = (
     "Minutes on the CPU, both networks together. Losses and edge dropout (25 %) are the paper's; its learning rate "
@@ -40,6 +44,8 @@ _TRAINING_NOTE = (
 def write(folder: Path, scores: Mapping[str, Scores], trained: Mapping[Configuration, Trained], command: str) -> Path:
     """Write the page, its tables and the picture of training; returns the Markdown file.
 
+    Rows that a page in the folder has of other settings stay, and so do trainings of other configurations.
+
     Args:
         scores: by setting; what is missing was not run.
         trained: the networks of their configurations.
@@ -48,24 +54,30 @@ def write(folder: Path, scores: Mapping[str, Scores], trained: Mapping[Configura
         f"`{command}`: the ten rows of the paper's robustness check ([its table 3](published.md#table-3-robustness)), "
         "the paper's NeuRoRA trained on one kind of graph and tested on another. Degrees as in the synthetic table."
     )
-    rows = [row for name, setting in SETTINGS.items() for row in _rows(setting, scores.get(name, Scores()))]
     headings = (
         *map(Column, ("what varies", "trained on", "tested on", "method")),
         *(Column(heading, ".2f") for heading in _HEADINGS),
         *(Column(f"paper: {heading}", ".1f") for heading in _HEADINGS),
         Column("graphs", "d"),
     )
+    of_row = (0, 1, 2, 3)
+    earlier = EarlierRows.of(folder, "robustness", headings).by(*of_row)
+    rows: list[tuple[Cell, ...]] = []
+    for name, setting in SETTINGS.items():
+        scored = scores.get(name, Scores(interrupted=True))
+        found = _rows(setting, scored)
+        rows += [earlier.get(row[: len(of_row)], row) for row in found] if scored.interrupted else found
     tables = {
         "robustness": Table("Robustness", headings, tuple(rows), _NOTES),
-        "robustness-training": _training(trained),
+        "robustness-training": with_earlier(folder, "robustness-training", _training(trained), 0),
     }
-    logs = {_NETWORKS[name]: {str(of): each.log(name) for of, each in trained.items()} for name in _NETWORKS}
-    draw_together(folder / "robustness-training.png", logs)
+    curves = with_earlier(folder, "robustness-curves", _curves(trained), 0, 1)
+    draw_together(folder / "robustness-training.png", _by_network(curves))
     pictures = {
         "robustness-training.png": "Validation over the course of training; a dot is the epoch whose weights are kept."
     }
-    curves = {"robustness-curves": _curves(trained)}
-    return Report("robustness", "Robustness", introduction, tables, pictures, curves).write(folder)
+    long = {"robustness-curves": curves}
+    return Report("robustness", "Robustness", introduction, tables, pictures, long).write(folder)
 
 
 def _rows(setting: Robustness, scores: Scores) -> list[tuple[Cell, ...]]:
@@ -106,3 +118,11 @@ def _curves(trained: Mapping[Configuration, Trained]) -> Table:
         for epoch, objective in zip(*read_log(each.log(network)), strict=True)
     )
     return Table("", tuple(map(Column, ("trained on", "network", "epoch", "validation"))), rows)
+
+
+def _by_network(curves: Table) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Epochs and validations of each run, by the network's title and what it was trained on."""
+    found: dict[str, dict[str, list[tuple[float, float]]]] = {title: {} for title in _NETWORKS.values()}
+    for of, network, epoch, validation in curves.rows:
+        found[_NETWORKS[str(network)]].setdefault(str(of), []).append((float(epoch or 0), float(validation or 0)))
+    return {title: {of: tuple(np.array(run).T) for of, run in runs.items()} for title, runs in found.items()}

@@ -1,0 +1,58 @@
+"""Rows of the robustness page that earlier runs have made: each takes an hour, so a run of some keeps all others."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from rotavg_ros.evaluation.common.tables import Cell, Column, Table
+
+
+@dataclass(frozen=True)
+class EarlierRows:
+    """Of one table of a folder, as its CSV file has them.
+
+    Attributes:
+        rows: in the file's order; none where there is no file, or where it has other columns.
+    """
+
+    rows: tuple[tuple[Cell, ...], ...]
+
+    @classmethod
+    def of(cls, folder: Path, stem: str, columns: Sequence[Column]) -> EarlierRows:
+        """Read them."""
+        with suppress(OSError, UnicodeDecodeError, csv.Error):
+            with (folder / f"{stem}.csv").open(encoding="utf-8", newline="") as file:
+                header, *rows = csv.reader(file)
+            if header == [column.heading for column in columns] and all(len(row) == len(header) for row in rows):
+                return cls(tuple(tuple(map(_cell, row)) for row in rows))
+        return cls(())
+
+    def by(self, *columns: int) -> dict[tuple[Cell, ...], tuple[Cell, ...]]:
+        """Rows by what some columns say."""
+        return {tuple(row[column] for column in columns): row for row in self.rows}
+
+    def beside(self, rows: Sequence[tuple[Cell, ...]], *columns: int) -> tuple[tuple[Cell, ...], ...]:
+        """Those that say something else in some columns than all of the given ones, and then these."""
+        given = {tuple(row[column] for column in columns) for row in rows}
+        others = (row for row in self.rows if tuple(row[column] for column in columns) not in given)
+        return (*others, *rows)
+
+
+def with_earlier(folder: Path, stem: str, table: Table, *columns: int) -> Table:
+    """A table with rows of the folder's one that say something else in some columns than all of its own."""
+    earlier = EarlierRows.of(folder, stem, table.columns)
+    return Table(table.title, table.columns, earlier.beside(table.rows, *columns), table.notes)
+
+
+def _cell(text: str) -> Cell:
+    if text == "":
+        return None
+    with suppress(ValueError):
+        return int(text)
+    with suppress(ValueError):
+        return float(text)
+    return text
