@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -107,6 +108,13 @@ def test_statements() -> None:
     assert (found.within_one, found.within_two) == (2 * (number - 1), 3 * (number - 1))
     (row,) = table("Calibration", {"hills": found}, every_kind=False).rows
     assert row[3:] == pytest.approx((0.25, 2 / 3, 1))
+    # Slips that may as well be false closures count by themselves, too.
+    either = statements(case, replace(answer, outlier_score=torch.full_like(case.noise, 0.5)))
+    of_kinds = {"hills": found, "lone slip: 3 witnesses, one pair of places": either}
+    everything, known, *kinds = table("Calibration", of_kinds, every_kind=True).rows
+    assert everything[1] == 2 * found.num_judged
+    assert (known[0], known[1:]) == ("all but those of one pair of places", row[1:])
+    assert [kind[0] for kind in kinds] == [*of_kinds]
 
 
 def test_planar_errors_are_those_of_the_yaw() -> None:
