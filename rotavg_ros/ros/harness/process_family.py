@@ -33,6 +33,20 @@ def peak_memory_mb(pid: int) -> float:
     return 1024e-6 * int(kilobytes)
 
 
+def memory_mb(pid: int) -> float:
+    """What the process and its children have resident, 10⁶ bytes; what several share counts once."""
+    return sum(map(_proportional_mb, (pid, *children(pid))))
+
+
+def _proportional_mb(pid: int) -> float:
+    """Resident, 10⁶ bytes, of which what n processes share counts for an n-th part; 0 if it has ended."""
+    try:
+        rolled_up = (_PROC / str(pid) / "smaps_rollup").read_text(encoding="utf-8")
+    except OSError:
+        return 0.0
+    return 1024e-6 * int(next(line.split()[1] for line in rolled_up.splitlines() if line.startswith("Pss:")))
+
+
 def _pids() -> Iterator[int]:
     return (int(folder.name) for folder in _PROC.iterdir() if folder.name.isdigit())
 

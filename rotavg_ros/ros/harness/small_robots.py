@@ -46,6 +46,7 @@ def table(rows: Sequence[soak.SoakRow]) -> Table:
         Column("cores"),
         Column("node, peak MB", ".0f"),
         Column("solver, peak MB", ".0f"),
+        Column("both at the end MB", ".0f"),
         Column("cores busy", ".2f"),
         Column("first solve ms", ".0f"),
         Column("ticks"),
@@ -57,7 +58,7 @@ def table(rows: Sequence[soak.SoakRow]) -> Table:
         Column("lost"),
     )
     names = (
-        *("keyframes", "edges", "cores", "node_mb", "solver_mb", "cpu_share", "start_max_ms", "ticks"),
+        *("keyframes", "edges", "cores", "node_mb", "solver_mb", "both_mb", "cpu_share", "start_max_ms", "ticks"),
         *("tick_p50_ms", "tick_p95_ms", "tick_max_ms", "callback_p95_ms", "latency_p95_ms", "lost"),
     )
     return Table(

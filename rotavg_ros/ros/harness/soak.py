@@ -59,7 +59,8 @@ class SoakRow:
     """What the node reported at one rate: milliseconds and counts; and what it took.
 
     Ticks are those after the graph was solved; ``start_max_ms`` is the longest of those until then. ``cpu_share`` is
-    of a core, the solver's process included; ``node_mb`` and ``solver_mb`` are the peaks of either process, 10⁶ bytes.
+    of a core, the solver's process included; ``node_mb`` and ``solver_mb`` are the peaks of either process, 10⁶ bytes,
+    in which what both share counts twice; ``both_mb`` is what they have at the end, in which it counts once.
     """
 
     rate_hz: float
@@ -77,6 +78,7 @@ class SoakRow:
     lost: int
     node_mb: float
     solver_mb: float
+    both_mb: float
     cores: int
 
 
@@ -98,6 +100,7 @@ def table(rows: Sequence[SoakRow]) -> Table:
         Column("lost"),
         Column("node MB", ".0f"),
         Column("solver MB", ".0f"),
+        Column("both at the end MB", ".0f"),
     )
     return Table("Ticks and callbacks", columns, tuple(tuple(vars(row).values())[: len(columns)] for row in rows))
 
@@ -163,6 +166,7 @@ def _soak(graph: ViewGraph, load: Load) -> SoakRow:
             cpu_share = (process_family.cpu_seconds(node.pid) - cpu_start) / (time.monotonic() - start)
             solvers_mb = sum(map(process_family.peak_memory_mb, process_family.children(node.pid)))
             node_mb = process_family.peak_memory_mb(node.pid)
+            both_mb = process_family.memory_mb(node.pid)
             known = len(recorder.reports)
             report = _wait(recorder, node, lambda _: len(recorder.reports) > known, "fell silent")
             ticks_ms = [float(tick) for one in recorder.reports for tick in one["latest ticks ms"].split()]
@@ -185,6 +189,7 @@ def _soak(graph: ViewGraph, load: Load) -> SoakRow:
         int(report["lost messages"]),
         node_mb,
         solvers_mb,
+        both_mb,
         load.cores,
     )
 

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("rclpy")  # the folder's __init__ is ROS's
 
-from rotavg_ros.ros.harness.process_family import children, cpu_seconds, peak_memory_mb
+from rotavg_ros.ros.harness.process_family import children, cpu_seconds, memory_mb, peak_memory_mb
 
 _CHILD = """
 import sys, time
@@ -31,5 +31,7 @@ def test_a_child_counts_as_it_counts_itself() -> None:
         assert child.pid in children(os.getpid())
         assert cpu_seconds(child.pid) == pytest.approx(seconds, abs=0.05)
         assert 50 < peak_memory_mb(child.pid) < 100  # what it holds, and an interpreter
+        assert memory_mb(child.pid) < peak_memory_mb(child.pid) + 1  # libraries are others', too
+        assert memory_mb(os.getpid()) > memory_mb(child.pid) > 50
         assert cpu_seconds(os.getpid()) > before + 0.4
-    assert peak_memory_mb(child.pid) == 0.0 and child.pid not in children(os.getpid())
+    assert peak_memory_mb(child.pid) == memory_mb(child.pid) == 0.0 and child.pid not in children(os.getpid())

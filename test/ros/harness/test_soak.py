@@ -27,6 +27,7 @@ def test_a_node_on_one_core_and_on_two() -> None:
     for row in rows:
         assert row.cpu_share < row.cores + 0.1
         assert row.node_mb > 50 and row.solver_mb > 50  # each has torch loaded
+        assert 100 < row.both_mb < 0.9 * (row.node_mb + row.solver_mb)  # and it is the same one
     assert small_robots.table(rows).to_markdown().count("\n| 8") == 2
 
 
