@@ -48,9 +48,9 @@ _SMALL_INTRODUCTION = """\
 The installed node over DDS on one core and on two of this machine (taskset), in processes of its own: it and the one
 that it solves in. It holds a simulated city with as many loop closures as keyframes, four keyframes a second go on
 coming, and odometry arrives at 50 Hz. Memory is the peak of each process, with libraries and what both share, and what
-both have at the end, in which that counts once; cores busy is of both. The first solve is the longest tick before all of the graph was solved. Ticks count from then on, milliseconds as the
-node reports them. A slower clock was not tried. The load average was {load} before the run, and what sends the odometry
-runs beside the node.
+both have at the end, in which that counts once; cores busy is of both. The first solve is the longest tick before all
+of the graph was solved. Ticks count from then on, milliseconds as the node reports them. A slower clock was not tried.
+The load average was {load} before the run, and what sends the odometry runs beside the node.
 
 `{command}`
 """
