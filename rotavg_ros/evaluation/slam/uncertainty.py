@@ -120,13 +120,18 @@ def table(title: str, checks: Sequence[UncertaintyCheck]) -> Table:
 def _noisy(
     graph: ViewGraph, truth: torch.Tensor, sigma: np.ndarray, components: int, rng: np.random.Generator
 ) -> ViewGraph:
-    """The same edges, measured with noise of ``sigma`` ``(M,)`` rad per component (the last only, or all three)."""
+    """The same edges, measured with noise of ``sigma`` ``(M,)`` rad per component (the last only, or all three).
+
+    Their translations, which were measured with other rotations, are left out.
+    """
     vector = np.zeros((graph.num_edges, 3))
     vector[:, 3 - components :] = sigma[:, None] * rng.normal(size=(graph.num_edges, components))
     relative = rotations.multiply(truth[graph.target], rotations.inverse(truth[graph.source]))
     measured = Rotation.from_rotvec(vector) * Rotation.from_quat(relative.numpy())
     quaternions = torch.from_numpy(measured.as_quat(canonical=True))
-    return replace(graph, target_from_source=quaternions, precision=torch.full_like(graph.precision, torch.nan))
+    return replace(
+        graph, target_from_source=quaternions, precision=torch.full_like(graph.precision, torch.nan), translation=None
+    )
 
 
 def _is_first(component: torch.Tensor) -> np.ndarray:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from scipy.stats import norm
 
-from rotavg_ros import Solution, ViewGraph, rotations
+from rotavg_ros import Solution, ViewGraph, rotations, solve
 from rotavg_ros.baselines.least_squares import least_squares
 from rotavg_ros.evaluation.slam import uncertainty
 
@@ -33,3 +35,18 @@ def test_normalized_error_is_error_over_stated(factor: float) -> None:
     for check in checks:
         assert check.normalized_error == pytest.approx(factor, rel=0.06)
         assert check.within_one == pytest.approx(2 * norm.cdf(1 / factor) - 1, abs=0.03)
+
+
+def test_translations_that_were_measured_with_other_rotations_are_left_out() -> None:
+    graph_file = laps()
+    graph = graph_file.graph
+    translation = torch.ones(graph.num_edges, 3, dtype=torch.float64)
+    seen: list[ViewGraph] = []
+
+    def solver(noisy: ViewGraph) -> Solution:
+        seen.append(noisy)
+        return solve(replace(noisy, translation=None))
+
+    with_translations = replace(graph_file, graph=replace(graph, translation=translation))
+    assert list(uncertainty.check("laps", with_translations, 1, seed=0, solver=solver))
+    assert all(noisy.translation is None for noisy in seen)
