@@ -50,7 +50,23 @@ class UsageError(UserError):
 
 
 class _Parser(argparse.ArgumentParser):
-    """Reports mistakes in the one line that every mistake gets."""
+    """Reports mistakes in the one line that every mistake gets, and takes a last word that may be left out anywhere.
+
+    Before Python 3.13 such a word is held to have been left out where the first option comes before it.
+    """
+
+    _between_options = False
+
+    def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
+        """As :class:`argparse.ArgumentParser` has it."""
+        may_be_left_out = any(action.nargs == "?" and not action.option_strings for action in self._actions)
+        if self._between_options or not may_be_left_out:
+            return super().parse_known_args(args, namespace)
+        self._between_options = True
+        try:
+            return self.parse_known_intermixed_args(args, namespace)
+        finally:
+            self._between_options = False
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message}; see {self.prog} --help")

@@ -48,3 +48,19 @@ def test_spelled_again_it_means_the_same(words: str, spelled: str | None) -> Non
     needed = ["--output", "out"] if arguments.command == "solve" else []
     again = parse([*shlex.split(arguments.command_line)[1:], *needed])
     assert meaning(again) == meaning(arguments)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "train clean-net c.yaml --output w",
+        "train clean-net --output w c.yaml",
+        "train --output w clean-net c.yaml",
+        "train --threads 1 clean-net --output w c.yaml",
+    ],
+)
+def test_a_word_that_may_be_left_out_stands_anywhere(words: str) -> None:
+    parsed = parse(shlex.split(words))
+    assert (parsed.network, parsed.config, str(parsed.output)) == ("clean-net", "c.yaml", "w")
+    left_out = parse(shlex.split(words.replace(" c.yaml", "")))
+    assert (left_out.network, left_out.config) == ("clean-net", None)
