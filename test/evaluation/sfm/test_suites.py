@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,8 @@ def test_no_scene_is_tested_by_networks_that_saw_it(shared_data: Path) -> None:
 
 def test_madrid_agreement(shared_data: Path) -> None:
     case = real.madrid_case(shared_data)
+    few = (case.graph.source < 120) & (case.graph.target < 120)  # all of them take a minute
+    case = replace(case, graph=replace(case.graph.select_edges(few), num_nodes=120), truth=case.truth[:120])
     found = real.agreement(case, contenders(("spt", "chatterjee", "neurora"), ROSTER))
     np.testing.assert_allclose(np.diag(found.difference_deg), 0, atol=1e-4)
     assert found.difference_deg[1, 2] < found.difference_deg[0, 1]
