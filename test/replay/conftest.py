@@ -13,7 +13,7 @@ from rotavg_ros.datasets.simulation.robot_run import RobotRun
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, simulate_slam_graph
 
 # Few ticks: their number is not what these tests are about.
-SELDOM = ["-p", "solve_period_s:=10.0"]
+SELDOM = ["-p", "solve_period_s:=40.0"]
 
 
 @pytest.fixture(scope="session")
