@@ -73,6 +73,8 @@ def test_a_trajectory_has_every_stamp_once(once: Path, twice: Path) -> None:
 def test_with_reset_only_the_last_turn_is_left(looped: Path, once: Path, tmp_path: Path) -> None:
     """As the bag's own replay, but for the closures that came before odometry had shown the jump."""
     output = tmp_path / "answer"
-    assert main(["replay", str(looped), "--output", str(output), "--no-report", *SELDOM, "-p", "on_time_jump:=reset"]) == 0
+    assert (
+        main(["replay", str(looped), "--output", str(output), "--no-report", *SELDOM, "-p", "on_time_jump:=reset"]) == 0
+    )
     assert summary(output)["keyframes"] == summary(once)["keyframes"]
     assert not list(output.glob("*time_line*"))

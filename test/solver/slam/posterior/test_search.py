@@ -76,7 +76,7 @@ def test_odometry_that_is_off_by_some_degrees_now_and_then_has_wide_tails(seed: 
     assert error < 0.85 * before
 
 
-@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("seed", [4, 14, 15])
 def test_false_closures_of_a_while_are_false_together(seed: int) -> None:
     """Whatever run each is of: one by one they would cost more than bending the odometry to them."""
     kind = "building: 30 % near misses in groups"
