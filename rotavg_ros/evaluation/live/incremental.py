@@ -90,7 +90,9 @@ def play(
         edges = answer.edge_id.astype(np.int64)
         closures = edges[is_closure[edges]]
         before = flags.copy()
-        flags[edges] = answer.outlier
+        # Where rotations alone are known to be right or wrong, what is said of places does not count.
+        rotation_score = answer.rotation_score if case.poses is None else None
+        flags[edges] = answer.outlier if rotation_score is None else rotation_score > options.outlier_threshold
         is_old = arrival[closures] < len(orientations)
         rows.append(
             (

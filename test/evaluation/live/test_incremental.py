@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from rotavg_ros.evaluation.common.scoring import score
 from rotavg_ros.evaluation.live import incremental
+from rotavg_ros.evaluation.slam import pose_cases
 
 from ..laps import NUM_NODES, answer_of, spoiled
 
@@ -20,3 +24,14 @@ def test_incremental_run_ends_like_the_batch_solve() -> None:
     batch = score(case, "neurora", answer_of("neurora", case))
     assert run.error_deg[-1] == pytest.approx(batch.mean_deg, abs=0.1)
     assert np.isnan(run.worst_excess_deg)  # a short run settles nothing
+
+
+def test_a_right_rotation_is_not_flagged_for_the_wrong_place_that_it_joins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a case whose rotations alone are judged."""
+    monkeypatch.setattr(incremental, "KEYFRAMES_PER_TICK", 250)
+    kind, *_ = pose_cases.kinds(Path, ["sparse building: 30 % parallel corridors"])
+    case = kind.draw(0)
+    assert case is not None and case.poses is not None
+    by_places, by_rotations = incremental.play(case), incremental.play(replace(case, poses=None))
+    assert by_places.false_flagged[-1] > 0.8 * by_places.false_seen[-1] > 8
+    assert by_rotations.good_flagged[-1] < 0.3 * by_places.false_flagged[-1]
