@@ -41,6 +41,8 @@ def main() -> int:
             return _answer_arguments(arguments)
         process = _solver_process()
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    except ModuleNotFoundError as error:
+        return _fail_without(error)
     except Exception as error:  # rclpy has no common type for bad arguments and parameter files
         return _fail(" ".join(str(error).split()))
     try:

@@ -365,8 +365,8 @@ def test_a_clean_end_during_a_long_solve(live_node) -> None:
     assert "Traceback" not in live_node.process.output
 
 
-@pytest.mark.parametrize("package", ["rclpy", "rotavg_msgs"])
-def test_without_ros_it_is_one_line(package: str) -> None:
+@pytest.mark.parametrize("package", ["rclpy", "rotavg_msgs", "torch"])
+def test_without_a_package_it_is_one_line(package: str) -> None:
     hidden = f"import sys; sys.modules[{package!r}] = None; from rotavg_ros.ros.node.main import main; sys.exit(main())"
     ended = subprocess.run([sys.executable, "-c", hidden], capture_output=True, text=True, timeout=300, check=False)
     assert (ended.returncode, ended.stdout) == (2, "")
