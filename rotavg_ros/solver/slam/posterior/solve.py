@@ -7,16 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.special import expit
 from torch import Tensor
 
-from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
+from rotavg_ros.solver.slam.noise.turns import squared_turns
 from rotavg_ros.solver.slam.posterior.bias import Bias
-from rotavg_ros.solver.slam.posterior.densities import log_normal
 from rotavg_ros.solver.slam.posterior.inference import Search
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
@@ -61,7 +59,7 @@ class Drawn:
         cleaned = clean(network, prepared, graph.label)
         spend(_EDGE * graph.num_edges)
         of_bias = None if bias is None else Bias.of(corrected, prepared, bias)
-        turned = _turned(corrected, prepared)
+        turned = squared_turns(corrected, prepared.forest, prepared.noise.step_variance)
         problem = Problem.of(
             prepared, cleaned.network_log_odds, priors=priors, without=without, bias=of_bias, turned=turned
         )
@@ -154,35 +152,6 @@ def _with_better_bias(
     goes_on.move_on()
     better = Found(again, goes_on.modes)
     return None if better.cost > found.cost - _LEAST_GAIN else better
-
-
-def _turned(graph: ViewGraph, prepared: Prepared) -> np.ndarray:
-    """``(N,)`` rad², squares of odometry's turns from each node's root on.
-
-    What is measured of a step's turn has its noise in it, and the steps that err by most would seem to be those that
-    turn by most. So a step counts as its neighbours turn, but for the probability that it turns by something else:
-    that its turn is any up to half a turn, not theirs with the noise of all, with even odds beforehand.
-    """
-    forest = prepared.forest
-    is_step = forest.parent_edge >= 0
-    is_step[is_step] = graph.is_odometry.numpy()[forest.parent_edge[is_step]]
-    square = np.zeros(len(is_step))
-    square[is_step] = (rotations.log(graph.target_from_source) ** 2).sum(dim=1).numpy()[forest.parent_edge[is_step]]
-    # By the nodes that steps lead to, away from the root.
-    step = np.flatnonzero(is_step)
-    step = step[is_step[forest.parent[step]]]
-    before = forest.parent[step]
-    total, count = np.zeros_like(square), np.zeros_like(square)
-    total[step], count[step] = square[before], 1.0
-    np.add.at(total, before, square[step])
-    np.add.at(count, before, 1.0)
-    has_neighbours = count > 0
-    beside = total[has_neighbours] / count[has_neighbours]
-    off = (np.sqrt(square[has_neighbours]) - np.sqrt(beside)) ** 2
-    log_alike = log_normal(off, prepared.noise.step_variance * (1 + 1 / count[has_neighbours]), 1)
-    own = expit(-np.log(np.pi) - log_alike)
-    square[has_neighbours] = own * square[has_neighbours] + (1 - own) * beside
-    return accumulate_to_root(forest, square)
 
 
 def _travelled(graph: ViewGraph, prepared: Prepared) -> np.ndarray | None:

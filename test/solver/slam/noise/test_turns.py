@@ -13,7 +13,7 @@ from rotavg_ros import rotations, solve
 from rotavg_ros.baselines.least_squares import least_squares
 from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.metrics import orientation_errors
-from rotavg_ros.solver.slam.posterior.solve import _turned
+from rotavg_ros.solver.slam.noise.turns import squared_turns
 from rotavg_ros.solver.slam.preparation import prepare_as_it_is
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
 
@@ -32,12 +32,8 @@ def drive(turns_deg: np.ndarray) -> ViewGraph:
 def counted_deg(turns_deg: np.ndarray, noise_deg: float) -> np.ndarray:
     """By how much each step counts as turning."""
     graph = drive(turns_deg)
-    prepared = prepare_as_it_is(graph)
-    variance = float(np.radians(noise_deg) ** 2)
-    prepared = replace(prepared, noise=replace(prepared.noise, step_variance=variance))
-    passed = _turned(graph, prepared)
-    nodes = np.arange(len(turns_deg) + 1)
-    return np.degrees(np.sqrt(np.abs(np.diff(passed[nodes]))))
+    passed = squared_turns(graph, prepare_as_it_is(graph).forest, float(np.radians(noise_deg) ** 2))
+    return np.degrees(np.sqrt(np.abs(np.diff(passed))))
 
 
 def test_a_step_that_errs_by_more_does_not_seem_to_turn_by_more() -> None:
