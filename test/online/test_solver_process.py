@@ -199,6 +199,12 @@ assert solver(graph).method == "neurora" and solver.pid != copy.pid
     )
 
 
+def test_a_copy_outlives_the_terminal_where_whoever_made_it_does():
+    ignoring = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+    code = "os.kill(solver.pid, signal.SIGHUP)\nassert solver(graph).method == 'neurora' and solver.pid == copy.pid\n"
+    subprocess.run([sys.executable, "-c", ignoring + _WITH_A_COPY + code], check=True, timeout=120)
+
+
 @pytest.mark.parametrize("end", ["solver.close()", "os._exit(0)", "os.kill(os.getpid(), signal.SIGKILL)", ""])
 def test_no_copy_outlives_whoever_made_it(end: str):
     code = f"print(solver.pid, flush=True)\n{end}\n"

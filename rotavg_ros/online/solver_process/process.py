@@ -100,7 +100,8 @@ def _serve_as_copy(ours: socket.socket, theirs: socket.socket) -> None:
     ours.close()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that this is a copy of
     for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_DFL)
+        if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has it
+            signal.signal(number, signal.SIG_DFL)
     serve(theirs.detach())
 
 
