@@ -26,14 +26,12 @@ def squared_turns(graph: ViewGraph, forest: SpanningForest, step_variance: float
     is_step[is_step] = graph.is_odometry.numpy()[forest.parent_edge[is_step]]
     square = np.zeros(len(is_step))
     square[is_step] = (rotations.log(graph.target_from_source) ** 2).sum(dim=1).numpy()[forest.parent_edge[is_step]]
-    # By the nodes that steps lead to, away from the root.
-    step = np.flatnonzero(is_step)
-    step = step[is_step[forest.parent[step]]]
-    before = forest.parent[step]
-    total, count = np.zeros_like(square), np.zeros_like(square)
-    total[step], count[step] = square[before], 1.0
-    np.add.at(total, before, square[step])
-    np.add.at(count, before, 1.0)
+    # Of the steps at either end of each, wherever the root is.
+    total, count = square.copy(), is_step.astype(np.float64)
+    np.add.at(total, forest.parent[is_step], square[is_step])
+    np.add.at(count, forest.parent[is_step], 1.0)
+    total = np.maximum(total[forest.parent] + total - 2 * square, 0.0)
+    count = np.where(is_step, count[forest.parent] + count - 2, 0.0)
     beside = np.divide(total, count, out=square.copy(), where=count > 0)
     variance = step_variance * (1 + 1 / np.maximum(count, 1.0))
     off = np.sqrt(square) - np.sqrt(beside)

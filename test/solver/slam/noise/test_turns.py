@@ -13,6 +13,7 @@ from rotavg_ros import rotations, solve
 from rotavg_ros.baselines.least_squares import least_squares
 from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.metrics import orientation_errors
+from rotavg_ros.solver.algebra.spanning_forest import SpanningForest
 from rotavg_ros.solver.slam.noise.turns import squared_turns
 from rotavg_ros.solver.slam.preparation import prepare_as_it_is
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
@@ -51,6 +52,18 @@ def test_a_turn_of_one_step_is_its_own(sign: float) -> None:
     counted = counted_deg(turns, 0.3)
     assert counted[10] == pytest.approx(90.0, rel=1e-3)
     assert counted[[9, 11]].max() < 1.0
+
+
+@pytest.mark.parametrize("root", [7, 19])
+def test_it_does_not_depend_on_the_root(root: int) -> None:
+    turns = np.random.default_rng(0).normal(0.0, 5.0, 20)
+    node = np.arange(21)
+    parent = np.where(node < root, node + 1, np.where(node > root, node - 1, root))
+    parent_edge = np.where(node < root, node, np.where(node > root, node - 1, -1))
+    forest = SpanningForest(parent, parent_edge, np.zeros(21, dtype=np.int64))
+    passed = squared_turns(drive(turns), forest, float(np.radians(1.0) ** 2))
+    counted = np.degrees(np.sqrt(np.abs(np.diff(passed))))
+    np.testing.assert_allclose(counted, counted_deg(turns, 1.0), rtol=1e-9)
 
 
 @pytest.mark.parametrize("seed", [0, 5])
