@@ -13,7 +13,7 @@ from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
-from rotavg_ros.evaluation.common.cases import Kind
+from rotavg_ros.evaluation.common.cases import Case, Kind
 from rotavg_ros.evaluation.common.named_peers import is_available
 from rotavg_ros.evaluation.common.training_plot import read_log
 from rotavg_ros.evaluation.sfm import robustness, robustness_training, synthetic
@@ -117,6 +117,31 @@ def test_the_page_of_robustness_is_there_after_every_row(tmp_path: Path, monkeyp
 
 
 @pytest.mark.usefixtures("tiny_rows")
+def test_what_was_solved_of_a_row_that_was_interrupted_is_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though the page has said before that the row was not run."""
+    kind = robustness.kind
+
+    def of_one_graph(configuration: Configuration, seed: int) -> Kind:
+        whole = kind(configuration, seed)
+
+        def draw(number: int) -> Case | None:
+            if number > 0:
+                raise KeyboardInterrupt
+            return whole.draw(number)
+
+        return Kind(whole.name, draw)
+
+    command = ["evaluate", "robustness", "--minutes", "0.001", "--threads", "1", "--output", str(tmp_path)]
+    assert main([*command, "--graphs", "1", "--settings", "in-space"]) == 0
+    monkeypatch.setattr(robustness, "kind", of_one_graph)
+    assert main([*command, "--graphs", "2", "--settings", "planar"]) == 0
+    with (tmp_path / "robustness.csv").open() as file:
+        assert [row["graphs"] for row in csv.DictReader(file)][24:] == ["1"] * 6
+
+
+@pytest.mark.usefixtures("tiny_rows")
 def test_the_page_of_robustness_keeps_what_other_runs_have_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -141,6 +166,13 @@ def test_the_page_of_robustness_keeps_what_other_runs_have_made(
     for name in ("-training", "-curves"):
         assert second[name][: len(first[name])] == first[name]
         assert len(second[name]) == 2 * len(first[name])
+    # A file that is empty, or none of ours, is no row.
+    for name, text in (("", ""), ("-training", "nonsense"), ("-curves", "\0")):
+        (tmp_path / f"robustness{name}.csv").write_text(text)
+    again = page("in-space", "--graphs", "1")
+    assert [row[-1] for row in again[""]] == [*["not run"] * 24, *["1"] * 3, *["not run"] * 3]
+    assert len(again["-training"]) == 1
+    page("planar", "--graphs", "2")
     # And what is run again is what is shown.
     third = page("in-space", "--graphs", "3")
     assert [row[-1] for row in third[""]][24:] == [*["3"] * 3, *["2"] * 3]

@@ -24,7 +24,7 @@ class EarlierRows:
     @classmethod
     def of(cls, folder: Path, stem: str, columns: Sequence[Column]) -> EarlierRows:
         """Read them."""
-        with suppress(OSError, UnicodeDecodeError, csv.Error):
+        with suppress(OSError, ValueError, csv.Error):  # missing, empty, or no text
             with (folder / f"{stem}.csv").open(encoding="utf-8", newline="") as file:
                 header, *rows = csv.reader(file)
             if header == [column.heading for column in columns] and all(len(row) == len(header) for row in rows):

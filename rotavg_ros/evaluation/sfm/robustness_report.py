@@ -23,6 +23,7 @@ _TITLES = {
     PIPELINE: "full pipeline, the package's networks",
 }
 _NETWORKS = {PaperCleanNet.NAME: "CleanNet: loss", PaperFineNet.NAME: "FineNet: mean + median error °"}
+_NOT_RUN = "not run"
 _FIGURES = ("mean_deg", "median_deg", "cpu_seconds")
 _HEADINGS = ("mean °", "median °", "CPU s")
 _NOTES = (
@@ -62,6 +63,7 @@ def write(folder: Path, scores: Mapping[str, Scores], trained: Mapping[Configura
     )
     of_row = (0, 1, 2, 3)
     earlier = EarlierRows.of(folder, "robustness", headings).by(*of_row)
+    earlier = {key: row for key, row in earlier.items() if row[-1] != _NOT_RUN}
     rows: list[tuple[Cell, ...]] = []
     for name, setting in SETTINGS.items():
         scored = scores.get(name, Scores(interrupted=True))
@@ -84,7 +86,7 @@ def _rows(setting: Robustness, scores: Scores) -> list[tuple[Cell, ...]]:
     published: dict[str, Published | None] = {PAPER: setting.neurora, CHATTERJEE: setting.chatterjee}
     rows: list[tuple[Cell, ...]] = []
     for name in METHODS:
-        count: Cell = len(scores.of(name)) if scores.rows else "not run"
+        count: Cell = len(scores.of(name)) if scores.rows else _NOT_RUN
         figures = (scores.mean(name, figure) for figure in _FIGURES)
         theirs = published.get(name) or (None,) * len(_FIGURES)
         rows.append(
@@ -124,5 +126,7 @@ def _by_network(curves: Table) -> dict[str, dict[str, tuple[np.ndarray, np.ndarr
     """Epochs and validations of each run, by the network's title and what it was trained on."""
     found: dict[str, dict[str, list[tuple[float, float]]]] = {title: {} for title in _NETWORKS.values()}
     for of, network, epoch, validation in curves.rows:
+        if network not in _NETWORKS:  # of somebody's own in the folder's file
+            continue
         found[_NETWORKS[str(network)]].setdefault(str(of), []).append((float(epoch or 0), float(validation or 0)))
     return {title: {of: tuple(np.array(run).T) for of, run in runs.items()} for title, runs in found.items()}
