@@ -6,17 +6,15 @@ uncertainty should cover both truths.
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 import torch
 
 from rotavg_ros.datasets.simulation.stress.kinds import ONE_PAIR
 from rotavg_ros.evaluation.common.answers import Answer
-from rotavg_ros.evaluation.common.cases import Case, CaseKey
-from rotavg_ros.evaluation.common.contenders import Contender
+from rotavg_ros.evaluation.common.cases import Case
 from rotavg_ros.evaluation.common.tables import Cell, Column, Table
-from rotavg_ros.evaluation.slam.stress_calibration import UNSURE, Statements, statements
+from rotavg_ros.evaluation.slam.stress_calibration import UNSURE, Statements, Watcher, statements
 from rotavg_ros.metrics import CalibrationBins
 from rotavg_ros.rotations import inverse, multiply
 
@@ -88,31 +86,19 @@ class Mixture:
         self.if_false.extend(other.if_false)
 
 
-class SameData:
-    """Looks over a contender's shoulder: counts what it states of lone slips that one pair of places tells of."""
+class SameData(Watcher[Mixture]):
+    """Counts what is stated of lone slips that one pair of places tells of."""
 
     def __init__(self) -> None:
-        self._of_case: dict[CaseKey, Mixture] = {}
+        super().__init__(Mixture, _mixture)
 
-    def watching(self, contender: Contender) -> Contender:
-        """The same contender, whose answers are counted."""
 
-        def watched(case: Case) -> Answer | None:
-            answer = contender(case)
-            if answer is not None and answer.outlier_score is not None and ONE_PAIR in case.key.kind:
-                self._of_case[case.key] = mixture = Mixture()
-                mixture.add(case, answer)
-            return answer
-
-        return watched
-
-    def of_kinds(self, cases: Collection[CaseKey]) -> dict[str, Mixture]:
-        """By kind, of these cases."""
-        found: dict[str, Mixture] = {}
-        for key in cases:
-            if key in self._of_case:
-                found.setdefault(key.kind, Mixture()).extend(self._of_case[key])
-        return found
+def _mixture(case: Case, answer: Answer) -> Mixture | None:
+    if ONE_PAIR not in case.key.kind or answer.outlier_score is None:
+        return None
+    mixture = Mixture()
+    mixture.add(case, answer)
+    return mixture
 
 
 def table(title: str, of_kinds: dict[str, Mixture]) -> Table:

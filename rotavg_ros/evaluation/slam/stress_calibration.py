@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -49,30 +50,51 @@ class Statements:
         self.within_two += other.within_two
 
 
-class Calibration:
-    """Looks over a contender's shoulder: counts what every answer states."""
+class _Counted(Protocol):
+    def extend(self, other: Any) -> None:
+        """Take in what another has counted."""
 
-    def __init__(self) -> None:
-        self._of_case: dict[CaseKey, Statements] = {}
+
+CountedT = TypeVar("CountedT", bound=_Counted)
+
+
+class Watcher(Generic[CountedT]):
+    """Looks over a contender's shoulder, and counts something of its answers, case by case.
+
+    Args:
+        nothing: makes what has counted nothing yet.
+        look: what an answer to a case counts for; None: not at all.
+    """
+
+    def __init__(self, nothing: Callable[[], CountedT], look: Callable[[Case, Answer], CountedT | None]) -> None:
+        self._nothing, self._look = nothing, look
+        self._of_case: dict[CaseKey, CountedT] = {}
 
     def watching(self, contender: Contender) -> Contender:
         """The same contender, whose answers are counted."""
 
         def watched(case: Case) -> Answer | None:
             answer = contender(case)
-            if answer is not None:
-                self._of_case[case.key] = statements(case, answer)
+            if answer is not None and (found := self._look(case, answer)) is not None:
+                self._of_case[case.key] = found
             return answer
 
         return watched
 
-    def of_kinds(self, cases: Collection[CaseKey]) -> dict[str, Statements]:
+    def of_kinds(self, cases: Collection[CaseKey]) -> dict[str, CountedT]:
         """By kind, of these cases."""
-        found: dict[str, Statements] = {}
+        found: dict[str, CountedT] = {}
         for key in cases:
             if key in self._of_case:
-                found.setdefault(key.kind, Statements()).extend(self._of_case[key])
+                found.setdefault(key.kind, self._nothing()).extend(self._of_case[key])
         return found
+
+
+class Calibration(Watcher[Statements]):
+    """Counts what every answer states."""
+
+    def __init__(self) -> None:
+        super().__init__(Statements, statements)
 
 
 def statements(case: Case, answer: Answer) -> Statements:
