@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -74,7 +74,7 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
     names = _methods(arguments, ROSTER, ROWS)
     chosen = contenders(names, ROSTER, keep=arguments.keep)
     with working("warming up"):
-        warm_up(contenders(names, ROSTER).values(), ROSTER)
+        _warm_up(names, with_translations=arguments.translations)
     calibration, same_data = Calibration(), SameData()
     chosen[OURS] = same_data.watching(calibration.watching(chosen[OURS]))
 
@@ -105,7 +105,7 @@ def _run_recorded(arguments: argparse.Namespace) -> Path:
     more = [_uncertainty_file(name) for name in _UNCERTAINTY_GRAPHS] if arguments.uncertainty else []
     data = data_folder(arguments, ("slam", *more))
     with working("warming up"):
-        warm_up(contenders(names, ROSTER).values(), ROSTER)
+        _warm_up(names, with_translations=True)
 
     kinds = cases.kinds(data, arguments.graphs, arguments.shares, arguments.hard)
     scores = score_all(drawings(kinds, seeds), chosen, _watch(num_drawings(kinds, seeds) * len(chosen)))
@@ -149,6 +149,14 @@ def _methods(arguments: argparse.Namespace, roster: Roster, default: Iterable[st
     if not arguments.peers:
         names = [name for name in names if not roster.is_peer(name)]
     return list(dict.fromkeys((OURS, *names, ORACLE)))
+
+
+def _warm_up(names: Sequence[str], *, with_translations: bool) -> None:
+    """Let every contender pay its one-time costs, before anything is timed."""
+    chosen = contenders(names, ROSTER).values()
+    warm_up(chosen, ROSTER)
+    if with_translations:
+        warm_up(chosen, ROSTER, pose_cases.tiny_case())
 
 
 def _watch(solves: int) -> Callable[[Iterable[Step]], Iterable[Step]]:

@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise TrainCommandError("slam fine-tunes on your runs and needs --from GRAPH…; other networks take none")
     if arguments.network == "slam":
         return train_on_robot.run(arguments)
-    name = arguments.config or arguments.network
+    name = _config_name(arguments)
     config = load_config(name)
     trainer = make_trainer(
         arguments.network,
@@ -55,13 +55,27 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _config_name(arguments: argparse.Namespace) -> str:
+    """The configuration that is named, or that of the network's name."""
+    network: str = arguments.network
+    if arguments.config is None and network not in _shipped():
+        several = ", ".join(name for name in _shipped() if network in name and not name.startswith("slam"))
+        raise TrainCommandError(f"{network} has no configuration of its name; give a YAML file or one of {several}")
+    return arguments.config or network
+
+
+def _shipped() -> dict[str, Path]:
+    """The package's configurations by name."""
+    return {path.stem: path for path in sorted(_CONFIGS.glob("*.yaml"))}
+
+
 def load_config(name: str) -> TrainingConfig:
     """A configuration by path or, without a file of that name, by the name of a shipped one.
 
     Raises:
         TrainingConfigError: neither, or a file that makes no configuration.
     """
-    shipped = {path.stem: path for path in sorted(_CONFIGS.glob("*.yaml"))}
+    shipped = _shipped()
     path = Path(name)
     with asking_about(path, TrainingConfigError):
         exists = path.exists()

@@ -80,6 +80,7 @@ def test_training_goes_on_from_given_weights(config: Path, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (["clean-net"], "clean-net has no configuration of its name; give a YAML file or one of paper-clean-net"),
         (["clean-net", "nothing"], "nothing: no such file; the package's own are paper-clean-net"),
         (["fine-net", "slam-clean-net"], "FineNet of robots' graphs needs `recipe: robots`"),
         (["clean-net", "slam-clean-net", "--device", "cuda"], "on the CPU"),

@@ -98,7 +98,7 @@ class FineSample:
         turn = quaternion_rows.log(quaternion_rows.multiply(quaternion_rows.inverse(state.correction), aligned)).T
         return cls(
             fine_features(evidence),
-            told(evidence),
+            told(evidence, problem.priors),
             system,
             torch.from_numpy(residuals(problem, state)),
             torch.from_numpy(1 / evidence.weight),

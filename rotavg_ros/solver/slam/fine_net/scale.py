@@ -17,8 +17,6 @@ from torch import Tensor
 _ROUNDS = 4
 # A Newton step changes the logarithm by no more.
 _LONGEST = 1.5
-# Precision of the prior on the logarithm of σ², as of a factor of e^1.2 in σ.
-_PRIOR = 1 / (4 * 1.2**2)
 
 
 @dataclass(frozen=True)
@@ -30,6 +28,7 @@ class Told:
         good: ``(E,)`` 1 for good edges, else 0.
         square, predicted: ``(E,)`` rad², ‖μ‖² and p.
         components: k.
+        noise_spread: standard deviation of the logarithm of either kind's σ, beforehand.
     """
 
     is_odometry: Tensor
@@ -37,16 +36,18 @@ class Told:
     square: Tensor
     predicted: Tensor
     components: int
+    noise_spread: float
 
     def log_scale(self, before: Tensor, after: Tensor) -> Tensor:
         """``(2,)`` of the variances of closures and of odometry, when ``before`` ``(E,)`` rad² becomes ``after``."""
         scale = after.new_zeros(2)
+        prior = 1 / (2 * self.noise_spread) ** 2
         squares, freedom = self._sums(before)
         offset = squares - freedom
         for _ in range(_ROUNDS):
             squares, freedom = self._sums(after * scale.exp()[self.is_odometry.long()])
-            slope = (squares - freedom - offset) / 2 - _PRIOR * scale
-            scale = scale + (slope / ((squares + freedom) / 4 + _PRIOR)).clamp(-_LONGEST, _LONGEST)
+            slope = (squares - freedom - offset) / 2 - prior * scale
+            scale = scale + (slope / ((squares + freedom) / 4 + prior)).clamp(-_LONGEST, _LONGEST)
         return scale
 
     def _sums(self, variance: Tensor) -> tuple[Tensor, Tensor]:

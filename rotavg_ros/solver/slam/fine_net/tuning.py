@@ -16,6 +16,7 @@ from rotavg_ros.solver.slam.fine_net.scale import Told
 from rotavg_ros.solver.slam.posterior.em import step
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.objective import Evaluation
+from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.rows import residuals
 from rotavg_ros.solver.slam.posterior.state import Noise, State
@@ -80,7 +81,7 @@ def applied(network: SlamFineNet, before: Tuned) -> Tuned:
     spend(_EDGE * len(before.state.trusted))
     log_noise = network(features).double()
     used = torch.from_numpy(1 / evidence.weight)
-    edges = told(evidence)
+    edges = told(evidence, before.problem.priors)
     variance = used * (believed(evidence, edges, used, log_noise) * log_noise).exp()
     scale = edges.log_scale(used, variance)
     usual = evidence.own * np.exp(-evidence.log_relative)
@@ -112,14 +113,15 @@ def believed(evidence: Evidence, edges: Told, used: Tensor, log_noise: Tensor) -
     return ((nats - _CHANCE) / _SURE).clamp(0.0, 1.0)[kind]
 
 
-def told(evidence: Evidence) -> Told:
-    """What others say of edges."""
+def told(evidence: Evidence, priors: SlamPriors) -> Told:
+    """What others say of edges, and what was believed of their noise."""
     return Told(
         torch.from_numpy(evidence.is_odometry),
         torch.from_numpy(evidence.is_good.astype(np.float64)),
         torch.from_numpy(evidence.square),
         torch.from_numpy(evidence.predicted),
         evidence.components,
+        priors.noise_spread,
     )
 
 
