@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 
 import numpy as np
 from torch import Tensor
 
-from rotavg_ros.solver.slam.posterior.em import polish, settle, step
+from rotavg_ros.solver.slam.posterior.em import polish, step
 from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 from rotavg_ros.solver.slam.posterior.moves import noise, slips
 from rotavg_ros.solver.slam.posterior.moves.flips import flipped
 from rotavg_ros.solver.slam.posterior.moves.runs import propose_rejected_runs
+from rotavg_ros.solver.slam.posterior.moves.settling import propose_settling
 from rotavg_ros.solver.slam.posterior.moves.splits import propose_splits
 from rotavg_ros.solver.slam.posterior.moves.starts import starts, turned_further, turned_parts
 from rotavg_ros.solver.slam.posterior.moves.tails import hides_slips, propose_tails
@@ -169,10 +169,9 @@ def _has_slipped(mode: Mode) -> bool:
 
 def proposals(mode: Mode) -> Iterator[Proposal]:
     """Of all moves that are switched on."""
-    problem, without = mode.problem, mode.problem.without
+    without = mode.problem.without
     if "settling" not in without:
-        # Labels as probabilities come past what stops single flips; what it gives is not known before.
-        yield Proposal("settle", 0.0, partial(settle, problem, mode.state), problem.limits.slack)
+        yield from propose_settling(mode)
         yield from noise.propose_worse_odometry(mode)
     if "rejected-runs" not in without:
         yield from propose_rejected_runs(mode)
