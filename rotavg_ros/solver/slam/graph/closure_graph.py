@@ -32,7 +32,7 @@ class ClosureGraph:
 
     Attributes:
         nodes: ``(K,)`` view-graph nodes, ascending.
-        position: ``(K,)`` odometry steps from the root of the node's chain; chains lie far apart from each other.
+        position: ``(K,)`` odometry steps along the node's chain from one of its ends; chains lie far from each other.
         roots: ``(components,)`` key nodes whose correction stays the identity.
         source, target: ``(E,)`` key nodes.
         residual: ``(E, 4)`` float64 e⁰; the identity on segments.
@@ -182,7 +182,7 @@ def contract(graph: ViewGraph, forest: SpanningForest) -> ClosureGraph:
     _, chain_number = np.unique(paths.chain, return_inverse=True)
     return ClosureGraph(
         nodes=nodes,
-        position=(depth + 4.0 * max(num_nodes, depth.max(initial=0.0)) * chain_number)[nodes],
+        position=(paths.position + 4.0 * max(num_nodes, paths.position.max(initial=0.0)) * chain_number)[nodes],
         roots=key_of_node[forest.roots],
         source=key_of_node[np.concatenate((segment_start, source[other]))],
         target=key_of_node[np.concatenate((segment_end, target[other]))],

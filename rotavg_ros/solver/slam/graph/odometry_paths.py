@@ -28,6 +28,8 @@ class OdometryPaths:
         depth: ``(N,)`` odometry steps from the root.
         level: ``(N,)`` edges from the root.
         chain: ``(N,)`` a number, equal where odometry alone connects two nodes along the forest.
+        position: ``(N,)`` odometry steps along the chain from that of its ends whose number is lowest. The root may lie
+            anywhere in it, as where a closure joins it to another one: two nodes before and after that have one depth.
         outside: ``(F,)`` edges, sorted by their ends: the answer must not depend on the order in which they arrived.
         residual: ``(F, 4)`` of these, under R⁰.
         path_steps: ``(F,)`` odometry steps between their ends along the forest; inf where a closure is passed.
@@ -39,6 +41,7 @@ class OdometryPaths:
     depth: np.ndarray
     level: np.ndarray
     chain: np.ndarray
+    position: np.ndarray
     outside: np.ndarray
     residual: Tensor
     path_steps: np.ndarray
@@ -56,6 +59,7 @@ class OdometryPaths:
         depth = accumulate_to_root(forest, np.where(hangs_on_odometry, steps, 0.0))
         level = accumulate_to_root(forest, np.ones(num_nodes)).astype(np.int64)
         chain = follow(np.where(hangs_on_odometry, parent, np.arange(num_nodes)))
+        position = _position(forest.parent, depth, level, chain)
         outside = np.flatnonzero(~on_tree)
         outside = outside[_canonical_order(graph, outside)]
         source, target = graph.source[outside], graph.target[outside]
@@ -64,7 +68,8 @@ class OdometryPaths:
         length = _path_length(forest.parent, depth, level, *between)
         path_steps = np.where(chain[between[0]] == chain[between[1]], length, np.inf)
         canonical = rotations.canonical(residual)
-        return cls(forest, orientation, hangs_on_odometry, depth, level, chain, outside, canonical, path_steps)
+        along = depth, level, chain, position
+        return cls(forest, orientation, hangs_on_odometry, *along, outside, canonical, path_steps)
 
 
 @dataclass(frozen=True)
@@ -140,6 +145,21 @@ def _canonical_order(graph: ViewGraph, edges: np.ndarray) -> np.ndarray:
     source, target = graph.source.numpy()[edges], graph.target.numpy()[edges]
     cosine = graph.target_from_source[:, 3].numpy()[edges]
     return np.lexsort((cosine, np.maximum(source, target), np.minimum(source, target)))
+
+
+def _position(parent: np.ndarray, depth: np.ndarray, level: np.ndarray, chain: np.ndarray) -> np.ndarray:
+    """``(N,)`` steps from an end of each node's chain; of a chain that branches, branches go on side by side."""
+    node = np.arange(len(parent))
+    hangs = chain != node
+    neighbours = hangs + np.bincount(parent[hangs], minlength=len(node))
+    is_end = neighbours <= 1
+    first = np.full(len(node), len(node))
+    np.minimum.at(first, chain[is_end], node[is_end])
+    first = first[chain]
+    position = depth - depth[chain]
+    (other,) = np.nonzero(first != chain)
+    position[other] = _path_length(parent, depth, level, first[other], other)
+    return np.asarray(position)
 
 
 def _path_length(parent: np.ndarray, depth: np.ndarray, level: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:

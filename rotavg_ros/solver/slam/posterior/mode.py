@@ -98,7 +98,8 @@ class Mode:
         """Edges of odometry that slipped, along the path."""
         graph = self.problem.graph
         edges = np.flatnonzero(graph.is_odometry & ~self.state.is_good)
-        return np.asarray(edges[np.argsort(graph.position[graph.source[edges]], kind="stable")])
+        start = np.minimum(graph.position[graph.source[edges]], graph.position[graph.target[edges]])
+        return np.asarray(edges[np.argsort(start, kind="stable")])
 
 
 @dataclass(frozen=True)

@@ -129,3 +129,27 @@ def test_nodes_that_hang_otherwise_do_not_grow() -> None:
     assert Growth.of(graph, np.array([19]), 20) is not None
     assert Growth.of(graph, np.array([19]), 19) is None  # a node has no edge
     assert Growth.of(graph, np.array([18, 19]), 20) is None  # another way along odometry
+
+
+@given(st.lists(st.integers(1, 30), min_size=1, max_size=4), st.booleans(), st.integers(0, 10**6))
+def test_positions_are_those_along_each_robot_s_path(lengths: list[int], is_renumbered: bool, seed: int) -> None:
+    """Wherever closures enter it, and wherever the first keyframe lies; ascending where numbers do."""
+    rng = np.random.default_rng(seed)
+    first = np.concatenate(([0], np.cumsum(lengths)))
+    robot = np.repeat(np.arange(len(lengths)), lengths)
+    follows = np.flatnonzero(np.diff(robot) == 0)
+    joints = [
+        (int(rng.integers(first[before], first[before + 1])), int(rng.integers(first[before + 1], first[before + 2])))
+        for before in range(len(lengths) - 1)
+    ]
+    ends = np.array([*zip(follows, follows + 1, strict=True), *joints], dtype=np.int64).reshape(-1, 2)
+    renumbered = rng.permutation(first[-1]) if is_renumbered else np.arange(first[-1])
+    kind = np.repeat([EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE], [len(follows), len(joints)])
+    identity = np.tile([0.0, 0.0, 0.0, 1.0], (len(ends), 1))
+    graph = ViewGraph.create(*renumbered[ends].T, identity, num_nodes=int(first[-1]), kind=kind)
+    paths = _contract(graph).paths
+    for member in range(len(lengths)):
+        position = paths.position[renumbered[robot == member]]
+        ascends = position[0] == 0
+        assert ascends or is_renumbered
+        np.testing.assert_array_equal(position if ascends else position[::-1], np.arange(lengths[member]))
