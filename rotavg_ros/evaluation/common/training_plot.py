@@ -76,5 +76,11 @@ def draw_together(path: Path, runs_of: Mapping[str, Mapping[str, tuple[np.ndarra
         axes.set_yscale("log")
         style(axes, title)
         axes.set_xlabel("share of the epochs", fontsize=9, color=MUTED)
-        axes.legend(frameon=False, fontsize=7)
+    # Below, where no curve is; a run has the same colour in all panels.
+    lines = {line.get_label(): line for axes in panels for line in axes.lines if line.get_label() in _labels(runs_of)}
+    figure.legend(lines.values(), lines, loc="outside lower center", ncols=len(panels), frameon=False, fontsize=7)
     figure.savefig(path)
+
+
+def _labels(runs_of: Mapping[str, Mapping[str, object]]) -> set[str]:
+    return {label for runs in runs_of.values() for label in runs}
