@@ -158,7 +158,8 @@ def _position(parent: np.ndarray, depth: np.ndarray, level: np.ndarray, chain: n
     first = first[chain]
     position = depth - depth[chain]
     (other,) = np.nonzero(first != chain)
-    position[other] = _path_length(parent, depth, level, first[other], other)
+    if len(other):
+        position[other] = _path_length(parent, depth, level, first[other], other)
     return np.asarray(position)
 
 
