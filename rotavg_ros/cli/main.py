@@ -12,6 +12,7 @@ from contextlib import nullcontext
 from typing import NamedTuple, NoReturn
 
 from rotavg_ros.cli.command_line import command_line
+from rotavg_ros.cli.interruption import Interruption
 from rotavg_ros.cli.progress import working
 from rotavg_ros.errors import UserError
 from rotavg_ros.startup import leave_to_the_system, loading
@@ -83,9 +84,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: the words after ``rotavg``; default: those of this process.
 
     Returns:
-        The exit code: 0, or 2 for a mistake in what the user gave (one line on stderr), or 130 after Ctrl-C.
+        The exit code: 0, or 2 for a mistake in what the user gave (one line on stderr), or 130 after Ctrl-C (143 after
+        SIGTERM, 129 after SIGHUP), whether or not what was done by then is written.
     """
     is_own_process = arguments is None
+    interruption = Interruption(is_own_process)
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a terminal without UTF-8, a file name without encoding
@@ -94,14 +97,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         module = next(command.module for command in COMMANDS if command.name == parsed.command)
         with working("loading"), loading() if is_own_process else nullcontext():
             run = importlib.import_module(module).run
+        interruption.has_loaded()
         exit_code: int = run(parsed)
-        return exit_code
+        return exit_code or interruption.exit_code
     except UserError as error:
         print_error(error)
         return EXIT_USER_ERROR
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        if not _is_interruption(error):
+            raise
         print("rotavg: interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        return interruption.exit_code or EXIT_INTERRUPTED
     except BrokenPipeError:
         # Whoever read our output (`| head`) has seen enough. Python would complain again when it closes stdout.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -109,6 +115,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     finally:
         if is_own_process:
             leave_to_the_system()
+
+
+def _is_interruption(error: BaseException | None) -> bool:
+    """Where compiled code has its result when Ctrl-C comes, Python makes a SystemError of it, and of that another."""
+    while isinstance(error, SystemError):
+        error = error.__cause__
+    return isinstance(error, KeyboardInterrupt)
 
 
 def print_error(error: UserError) -> None:

@@ -11,7 +11,7 @@ from types import FrameType
 from typing import Any
 
 from rotavg_ros.bags.reader import BagReader
-from rotavg_ros.cli.main import print_warning
+from rotavg_ros.cli.main import EXIT_INTERRUPTED, print_warning
 from rotavg_ros.cli.progress import seconds_bar, working
 from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.replay.options import read_parameter_file, read_settings
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         print_warning(f"{arguments.bag}: {warning}")
     if summary["damage"] is not None:
         print_warning(f"{summary['damage']}; what could be made of it is in {arguments.output}")
-    return 0
+    return EXIT_INTERRUPTED if _is_cut_short(summary) else 0
 
 
 def _check_inputs(bag: Path, plan: Plan, output: Path) -> None:
@@ -75,8 +75,8 @@ def _replay(bag: BagReader, plan: Plan, window: Window, arguments: argparse.Name
 
     seconds = min(bag.duration_s - window.start_s, window.duration_s or bag.duration_s)
     period_ns = round(1e9 * seconds / arguments.answers) if arguments.answers else 0
-    with output_folder(arguments.output, overwrite=arguments.overwrite) as folder:
-        with _asked_to_stop() as stop, seconds_bar("replaying", seconds) as progress:
+    with output_folder(arguments.output, overwrite=arguments.overwrite) as (folder, replaces):
+        with _asked_to_stop(not replaces) as stop, seconds_bar("replaying", seconds) as progress:
             outcome = replay(bag, plan, window, folder / RECORDING, period_ns, Onlooker(progress, stop))
         with working("writing the report"):
             record = assemble(bag, plan, outcome)
@@ -87,20 +87,30 @@ def _replay(bag: BagReader, plan: Plan, window: Window, arguments: argparse.Name
 
 
 @contextmanager
-def _asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """The first Ctrl-C only asks for the end, so that what is done can be written; the second one ends at once."""
-    asked = False
+def _asked_to_stop(may_end_early: bool) -> Iterator[Callable[[], bool]]:
+    """The first Ctrl-C only asks for the end, so that what is done can be written; the second one ends at once.
+
+    Args:
+        may_end_early: or else the first one ends at once: a part of an answer must not replace a whole one.
+    """
+    if not may_end_early:
+        yield lambda: False
+        return
+    times = 0
 
     def ask(_number: int, _frame: FrameType | None) -> None:
-        nonlocal asked
-        asked = True
-        signal.signal(signal.SIGINT, before)
+        nonlocal times
+        times += 1
+        if times > 1:
+            raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGINT, ask)
     try:
-        yield lambda: asked
+        yield lambda: times > 0
     finally:
         signal.signal(signal.SIGINT, before)
+    if times > 1:  # raised where Python only complains of exceptions, as in the callback of a weak reference
+        raise KeyboardInterrupt
 
 
 def _described(plan: Plan) -> str:
@@ -117,9 +127,14 @@ def _described(plan: Plan) -> str:
     )
 
 
+def _is_cut_short(summary: dict[str, Any]) -> bool:
+    """Whether the user did not let it end."""
+    return bool(summary["interrupted"]) and summary["damage"] is None
+
+
 def _told(summary: dict[str, Any], output: Path) -> str:
     lines = []
-    if summary["interrupted"] and summary["damage"] is None:
+    if _is_cut_short(summary):
         lines.append(f"interrupted after {summary['duration_s']:.1f} s of the bag; what is done is written")
     if not summary["loop_closures"]:
         which = "no loop closure of this bag could be used" if summary["waiting"] else "no loop closures in this bag"

@@ -26,42 +26,62 @@ from rotavg_ros.replay.summary import summarize
 RECORDING = "run.mcap"
 SUMMARY = "summary.json"
 
+_UNFINISHED = ".unfinished."  # and the number of the process
+
 
 class OutputError(UserError):
     """An output folder that is there already, or cannot be written."""
 
 
 @contextmanager
-def output_folder(folder: Path, *, overwrite: bool) -> Iterator[Path]:
+def output_folder(folder: Path, *, overwrite: bool) -> Iterator[tuple[Path, bool]]:
     """A workplace inside the output folder; what was written there takes its place when the block ends well.
 
-    An older replay's files go then; whatever else is in the folder stays.
+    An older replay's files go then, and the workplaces of replays that were killed; whatever else is in the folder
+    stays. Yields the workplace, and whether an older replay's answer is to be replaced.
 
     Raises:
         OutputError: the folder has something in it (without ``overwrite``), or cannot be written.
     """
     with asking_about(folder, OutputError):
         is_new, is_folder = not folder.exists(), folder.is_dir()
-        has_content = is_folder and any(folder.iterdir())
+        left_over = [path for path in folder.iterdir() if _is_left_over(path)] if is_folder else []
+        has_content = is_folder and any(path not in left_over for path in folder.iterdir())
     if not is_new and not is_folder:
         raise OutputError(f"{folder} is not a folder; choose another --output")
     if has_content and not overwrite:
         raise OutputError(f"{folder}: exists already; choose another --output or give --overwrite")
-    workplace = folder / f".unfinished.{os.getpid()}"
+    workplace = folder / f"{_UNFINISHED}{os.getpid()}"
     try:
         workplace.mkdir(parents=True)
-        yield workplace
+        yield workplace, (folder / SUMMARY).exists()
         names = sorted(path.name for path in workplace.iterdir())
         for name in set(_files_of(folder)) - set(names):
             (folder / name).unlink(missing_ok=True)
         for name in names:
             os.replace(workplace / name, folder / name)
+        for path in left_over:
+            shutil.rmtree(path, ignore_errors=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from None
     finally:
         shutil.rmtree(workplace, ignore_errors=True)
         if is_new and folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
+
+
+def _is_left_over(path: Path) -> bool:
+    """Whether a process worked there that is no more."""
+    number = path.name.removeprefix(_UNFINISHED)
+    if number == path.name or not number.isdecimal():
+        return False
+    try:
+        os.kill(int(number), 0)
+    except ProcessLookupError:
+        return True
+    except (PermissionError, OverflowError):  # another user's; no number that a process has
+        return False
+    return int(number) == os.getpid()
 
 
 def _files_of(folder: Path) -> list[str]:

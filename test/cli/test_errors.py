@@ -233,13 +233,49 @@ def test_paths_that_cannot_be_looked_at(
         assert "permission denied; check the" in refused(capsys, *command)
 
 
-def test_interrupt(graph_path: Path, tmp_path: Path) -> None:
-    """Ctrl-C while a graph is being read."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_interrupt(graph_path: Path, tmp_path: Path, number: signal.Signals) -> None:
+    """While a graph is being read."""
     stuck = "import os, signal, time; from rotavg_ros.datasets.files import g2o"
-    press = "g2o.read = lambda path: (os.kill(os.getpid(), signal.SIGINT), time.sleep(60))"
+    press = f"g2o.read = lambda path: (os.kill(os.getpid(), {number:d}), time.sleep(60))"
     result = python(f"{stuck}; {press}; {ROTAVG}", "solve", graph_path, "--output", tmp_path / "out")
-    assert (result.returncode, result.stdout, result.stderr) == (128 + signal.SIGINT, "", "rotavg: interrupted\n")
+    assert (result.returncode, result.stdout, result.stderr) == (128 + number, "", "rotavg: interrupted\n")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_while_loading(graph_path: Path, tmp_path: Path, number: signal.Signals) -> None:
+    """Numpy takes an exception that comes out of an import of its own for a fault of the installation."""
+    press = f"import os; importlib.import_module = lambda name: os.kill(os.getpid(), {number:d}) or time.sleep(60)"
+    result = python(f"import importlib, time; {press}; {ROTAVG}", "solve", graph_path, "--output", tmp_path / "out")
+    assert (result.returncode, result.stdout, result.stderr) == (128 + number, "", "rotavg: interrupted\n")
+
+
+def test_interrupt_in_compiled_code(graph_path: Path, tmp_path: Path) -> None:
+    """Python makes a SystemError of Ctrl-C where a function in C has its result just then; others are faults."""
+    raising = """
+from rotavg_ros.datasets.files import g2o
+def read(path):
+    try:
+        raise SystemError from {}()
+    except SystemError as error:
+        raise SystemError("fault") from error
+g2o.read = read
+"""
+    solve = "solve", graph_path, "--output", tmp_path / "out"
+    result = python(f"{raising.format('KeyboardInterrupt')}\n{ROTAVG}", *solve)
+    assert (result.returncode, result.stderr) == (130, "rotavg: interrupted\n")
+    assert "SystemError: fault" in python(f"{raising.format('ValueError')}\n{ROTAVG}", *solve).stderr
+
+
+def test_ignored_signals_stay_ignored(graph_path: Path, tmp_path: Path) -> None:
+    """As ``nohup`` has it."""
+    ignored = (
+        "import os, signal; signal.signal(signal.SIGHUP, signal.SIG_IGN); from rotavg_ros.datasets.files import g2o"
+    )
+    press = "read = g2o.read; g2o.read = lambda path: os.kill(os.getpid(), signal.SIGHUP) or read(path)"
+    result = python(f"{ignored}; {press}; {ROTAVG}", "solve", graph_path, "--output", tmp_path / "out")
+    assert (result.returncode, result.stderr) == (0, "")
 
 
 def test_terminal_without_unicode(graph_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -242,19 +243,49 @@ def test_no_space_left(tmp_path: Path, small: Path, monkeypatch: pytest.MonkeyPa
     assert not (tmp_path / "out").exists()
 
 
-def test_ctrl_c_keeps_what_is_done(tmp_path: Path, small: Path) -> None:
-    output = tmp_path / "out"
-    command = [*ROTAVG, "replay", str(small), "--output", str(output), "--rate", "0.05", "--no-report"]
+def interrupt_replay(bag: Path, output: Path, number: signal.Signals, *options: str) -> tuple[int, str, str]:
+    """Begin to replay, and send a signal in the middle; the exit code and what was told."""
+    command = [*ROTAVG, "replay", str(bag), "--output", str(output), "--rate", "0.05", "--no-report", *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
-    while not list(output.glob(".unfinished*/.run.unfinished")):  # the recording has begun
+    while not list(output.glob(f".unfinished.{process.pid}/.run.unfinished")):  # the recording has begun
         assert process.poll() is None, process.stderr
         assert time.monotonic() < deadline
         time.sleep(0.1)
     time.sleep(3)  # the first message makes the first keyframe
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     told, complaints = process.communicate(timeout=300)
-    assert process.returncode == 0, complaints
+    return process.returncode, told, complaints
+
+
+def test_ctrl_c_keeps_what_is_done(tmp_path: Path, small: Path) -> None:
+    output = tmp_path / "out"
+    code, told, complaints = interrupt_replay(small, output, signal.SIGINT)
+    assert (code, complaints) == (130, "")
     assert "interrupted after" in told
     assert {path.name for path in output.iterdir()} >= {"run.mcap", "summary.json", "trajectory.tum"}
     assert not list(output.glob(".unfinished*"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_replay_leaves_the_older_answer_alone(
+    tmp_path: Path, small: Path, number: signal.Signals
+) -> None:
+    output = tmp_path / "out"
+    assert main(["replay", str(small), "--output", str(output), "--no-report"]) == 0
+    before = {path: path.read_bytes() for path in output.iterdir()}
+    code, _, complaints = interrupt_replay(small, output, number, "--overwrite")
+    assert (code, complaints) == (128 + number, "rotavg: interrupted\n")
+    assert {path: path.read_bytes() for path in output.iterdir()} == before
+
+
+def test_the_workplace_of_a_killed_replay_is_in_nobodys_way(tmp_path: Path, small: Path) -> None:
+    output = tmp_path / "out"
+    assert interrupt_replay(small, output, signal.SIGKILL)[0] == -signal.SIGKILL
+    others = output / f".unfinished.{os.getppid()}"
+    assert list(output.glob(".unfinished.*"))
+    others.mkdir()  # of a replay that goes on
+    assert main(["replay", str(small), "--output", str(output), "--no-report"]) == 2
+    others.rmdir()
+    assert main(["replay", str(small), "--output", str(output), "--no-report"]) == 0
+    assert not list(output.glob(".unfinished.*"))

@@ -35,7 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "config",
         nargs="?",
         metavar="CONFIG",
-        help="YAML file, or the name of one of the package's (default: the one of that network's name)",
+        help="YAML file, or the name of one of the package's (default: the one of the network's name; clean-net and "
+        "fine-net have none)",
     )
     parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for weights and checkpoint")
     parser.add_argument(

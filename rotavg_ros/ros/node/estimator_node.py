@@ -102,8 +102,7 @@ class RotavgNode(parameter_server.ParameterNode):
         """Save if that is wanted, and stop working; False if a save still runs after the timeout, or a solve does."""
         if self._settings.autosave_period_s > 0:
             self._saver.submit(lambda: self._solving.autosave_quietly(at_the_end=True))
-        else:
-            self._solving.tell_what_is_lost()
+        self._saver.submit(self._solving.tell_what_is_lost)
         is_saved = self._saver.stop(timeout_s, finish=True)
         if is_saved:
             self._solving.let_go()

@@ -66,6 +66,7 @@ class Solving:
         if state_file is not None:
             self._resume(state_file)
         self._saved = self._content()
+        self._saved_keyframes = estimator.counts().keyframes
 
     def tick(self, force_cold: bool = False) -> Answer | None:
         """Solve if there is anything new, and publish the answer; None if there is none."""
@@ -116,18 +117,18 @@ class Solving:
         return "paused: inputs are kept, nothing is solved" if paused else "running"
 
     def save(self) -> str:
-        state_file, content = self._own_state_file(), self._content()
+        state_file, content, keyframes = self._own_state_file(), self._content(), self._estimator.counts().keyframes
         self._estimator.save(state_file)
-        self._saved = content
+        self._saved, self._saved_keyframes = content, keyframes
         self._health.saved()
         return f"saved to {state_file}"
 
     def load(self) -> str:
         state_file = self._own_state_file(to_write=False)
         self._estimator.load(state_file)
-        self._saved = self._content()
+        self._saved, self._saved_keyframes = self._content(), self._estimator.counts().keyframes
         self._forget_answer()
-        return f"loaded {self._estimator.counts().keyframes} keyframes from {state_file}"
+        return f"loaded {self._saved_keyframes} keyframes from {state_file}"
 
     def tick_quietly(self) -> None:
         """As :meth:`tick`; what goes wrong is logged."""
@@ -151,11 +152,17 @@ class Solving:
             self._health.saved(failure=str(error))
 
     def tell_what_is_lost(self) -> None:
-        """At the end, where nothing saves by itself: that keyframes were not saved, if any were not."""
+        """At the end, after the last save if there is one: what was not saved, if anything was not."""
         keyframes = self._estimator.counts().keyframes
-        if keyframes > 0 and self._content() != self._saved:
-            how = "set autosave_period_s" if self._state_file is not None else "set state_file and autosave_period_s"
-            self._node.get_logger().warning(f"{keyframes} keyframes are lost that were not saved; {how} to keep them")
+        if keyframes == 0 or self._content() == self._saved:
+            return
+        what = f"{keyframes} keyframes are lost that were not saved"
+        if self._saved_keyframes:
+            what = f"what came after the last save is lost; {self._saved_keyframes} keyframes are in {self._state_file}"
+        how = "set autosave_period_s" if self._state_file is not None else "set state_file and autosave_period_s"
+        if self._health.save_failure is not None:
+            how = "make the state file's folder writable"
+        self._node.get_logger().warning(f"{what}; {how} to keep all")
 
     def back_up_quietly(self, discarded: Discarded) -> None:
         """Keep what was forgotten or replaced beside the state file; the diagnostics tell of it, or why it failed."""

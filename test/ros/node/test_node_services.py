@@ -237,15 +237,29 @@ def test_parameters_change_live_all_or_none(live_node) -> None:
     assert descriptor.description and descriptor.floating_point_range[0].to_value == 1.0
 
 
-def test_keyframes_that_nobody_saved_are_told_of_at_the_end(live_node, tmp_path) -> None:
-    live_node.start(*EVERY_MESSAGE, f"state_file:={tmp_path / 'state.npz'}")
+def test_what_nobody_saved_is_told_of_at_the_end(live_node, tmp_path) -> None:
+    path = tmp_path / "states" / "state.npz"
+    path.parent.mkdir()
+
+    def feed_and_stop(begin: int, end: int) -> str:
+        feed(live_node, begin, end)
+        live_node.wait_for_silence()
+        assert live_node.stop(signal.SIGTERM) == 0
+        return "\n".join(line for line in live_node.process.output.splitlines() if " lost" in line)
+
+    live_node.start(*EVERY_MESSAGE, f"state_file:={path}")
     feed(live_node, 0, 10)
     live_node.wait_for_silence()
     assert live_node.call("save").success
     assert live_node.stop(signal.SIGTERM) == 0
     assert "lost" not in live_node.process.output
+    live_node.start(*EVERY_MESSAGE, f"state_file:={path}")
+    told = feed_and_stop(10, 12)
+    assert f"after the last save is lost; 10 keyframes are in {path}; set autosave_period_s to keep all" in told
     live_node.start(*EVERY_MESSAGE)
-    feed(live_node, 0, 10)
-    live_node.wait_for_silence()
-    assert live_node.stop(signal.SIGTERM) == 0
-    assert "10 keyframes are lost that were not saved; set state_file and autosave_period_s" in live_node.process.output
+    told = feed_and_stop(0, 10)
+    assert "10 keyframes are lost that were not saved; set state_file and autosave_period_s to keep all" in told
+    live_node.start(*EVERY_MESSAGE, f"state_file:={tmp_path / 'states' / 'new.npz'}", "autosave_period_s:=0.2")
+    path.parent.rename(tmp_path / "gone")
+    told = feed_and_stop(0, 10)
+    assert "10 keyframes are lost that were not saved; make the state file's folder writable to keep all" in told
