@@ -1,4 +1,4 @@
-"""The one exception family whose message is meant for a user, and what makes it of the system's own."""
+"""The one exception family whose message is meant for a user, what makes it of the system's own, and Ctrl-C."""
 
 from __future__ import annotations
 
@@ -23,3 +23,20 @@ def asking_about(path: Path, error: type[UserError]) -> Iterator[None]:
         raise error(f"{path}: {(problem.strerror or str(problem)).lower()}; check the path and its rights") from None
     except RuntimeError:  # pathlib's word for it up to Python 3.12
         raise error(f"{path}: its symbolic links lead in a circle; check the path") from None
+
+
+def is_interruption(error: BaseException | None) -> bool:
+    """Where compiled code has its result when Ctrl-C comes, Python makes a SystemError of it, and of that another."""
+    while isinstance(error, SystemError):
+        error = error.__cause__
+    return isinstance(error, KeyboardInterrupt)
+
+
+@contextmanager
+def until_interrupted() -> Iterator[None]:
+    """Ctrl-C ends the block, and nothing else: what is done by then is made use of."""
+    try:
+        yield
+    except (KeyboardInterrupt, SystemError) as error:
+        if not is_interruption(error):
+            raise

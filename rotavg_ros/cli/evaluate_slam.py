@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from pathlib import Path
 
 from rotavg_ros.cli.data_folder import data_folder
 from rotavg_ros.cli.progress import progress, working
 from rotavg_ros.datasets.files.formats import read_graph
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, until_interrupted
 from rotavg_ros.evaluation.common.cases import drawings, num_drawings
 from rotavg_ros.evaluation.common.contenders import Roster, contenders, warm_up
 from rotavg_ros.evaluation.common.scoring import Step, score_all
@@ -81,12 +80,12 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
     scores = score_all(drawings(kinds, seeds), chosen, _watch(len(kinds) * len(seeds) * len(chosen)))
     diagnoses: list[Diagnosis] = []
     if arguments.search_or_model and not scores.interrupted:
-        with suppress(KeyboardInterrupt):  # what is done is written
+        with until_interrupted():  # what is done is written
             cases_again = progress(drawings(kinds, seeds), total=len(kinds) * len(seeds), description="from the truth")
             diagnoses.extend(map(diagnose, cases_again))
     priors: list[list[sensitivity.Answer]] = []
     if arguments.sensitivity and not scores.interrupted:
-        with suppress(KeyboardInterrupt):
+        with until_interrupted():
             cases_again = progress(drawings(kinds, seeds), total=len(kinds) * len(seeds), description="other priors")
             priors.extend([*sensitivity.answers(case)] for case in cases_again)
     findings = stress_report.Findings(calibration, same_data, diagnoses, priors)

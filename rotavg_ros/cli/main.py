@@ -14,7 +14,7 @@ from typing import NamedTuple, NoReturn
 from rotavg_ros.cli.command_line import command_line
 from rotavg_ros.cli.interruption import Interruption
 from rotavg_ros.cli.progress import working
-from rotavg_ros.errors import UserError
+from rotavg_ros.errors import UserError, is_interruption
 from rotavg_ros.startup import leave_to_the_system, loading
 from rotavg_ros.version import __version__
 
@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print_error(error)
         return EXIT_USER_ERROR
     except (KeyboardInterrupt, SystemError) as error:
-        if not _is_interruption(error):
+        if not is_interruption(error):
             raise
         print("rotavg: interrupted", file=sys.stderr)
         return interruption.exit_code or EXIT_INTERRUPTED
@@ -115,13 +115,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     finally:
         if is_own_process:
             leave_to_the_system()
-
-
-def _is_interruption(error: BaseException | None) -> bool:
-    """Where compiled code has its result when Ctrl-C comes, Python makes a SystemError of it, and of that another."""
-    while isinstance(error, SystemError):
-        error = error.__cause__
-    return isinstance(error, KeyboardInterrupt)
 
 
 def print_error(error: UserError) -> None:

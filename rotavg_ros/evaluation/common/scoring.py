@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from operator import attrgetter
 
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 from scipy.stats import gmean
 
+from rotavg_ros.errors import until_interrupted
 from rotavg_ros.evaluation.common.answers import Answer
 from rotavg_ros.evaluation.common.cases import Case, CaseKey
 from rotavg_ros.evaluation.common.contenders import Contender
@@ -173,7 +173,7 @@ def score_all(
     """
     scores = Scores(calibration={name: CalibrationBins() for name in chosen}, interrupted=True)
     of_case = Scores()
-    with suppress(KeyboardInterrupt):
+    with until_interrupted():
         for number, (case, name, contender) in enumerate(watch(_steps(cases, chosen)), 1):
             answer = contender(case)
             if answer is not None:
