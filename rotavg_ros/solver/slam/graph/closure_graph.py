@@ -32,7 +32,8 @@ class ClosureGraph:
 
     Attributes:
         nodes: ``(K,)`` view-graph nodes, ascending.
-        position: ``(K,)`` odometry steps along the node's chain from one of its ends; chains lie far from each other.
+        position: ``(K,)`` odometry steps along the node's chain from its lowest end; chains lie far from each other, in
+            the order of these ends.
         roots: ``(components,)`` key nodes whose correction stays the identity.
         source, target: ``(E,)`` key nodes.
         residual: ``(E, 4)`` float64 e⁰; the identity on segments.
@@ -84,6 +85,12 @@ class ClosureGraph:
     @property
     def is_closure(self) -> np.ndarray:
         return ~self.is_odometry
+
+    @property
+    def is_forward(self) -> np.ndarray:
+        """``(E,)`` bool, whether edges are stated from the older to the newer end; of those alike, the lower one."""
+        older, newer = self.position[self.source], self.position[self.target]
+        return np.where(older == newer, self.source < self.target, older < newer)
 
     def orientations(self, correction: Tensor) -> Tensor:
         """Corrections of the key nodes ``(K, 4)`` → orientations of all nodes, body_from_world ``(N, 4)``."""

@@ -27,9 +27,9 @@ class OdometryPaths:
         hangs_on_odometry: ``(N,)`` bool, whether a node's parent edge is odometry.
         depth: ``(N,)`` odometry steps from the root.
         level: ``(N,)`` edges from the root.
-        chain: ``(N,)`` a number, equal where odometry alone connects two nodes along the forest.
-        position: ``(N,)`` odometry steps along the chain from that of its ends whose number is lowest. The root may lie
-            anywhere in it, as where a closure joins it to another one: two nodes before and after that have one depth.
+        chain: ``(N,)`` the lowest end of each node's chain; equal where odometry alone connects two along the forest.
+        position: ``(N,)`` odometry steps along the chain from that end. The root may lie anywhere in it, as where a
+            closure joins it to another one: two nodes before and after that have one depth.
         outside: ``(F,)`` edges, sorted by their ends: the answer must not depend on the order in which they arrived.
         residual: ``(F, 4)`` of these, under R⁰.
         path_steps: ``(F,)`` odometry steps between their ends along the forest; inf where a closure is passed.
@@ -58,8 +58,9 @@ class OdometryPaths:
         orientation = compose_orientations(forest, graph)
         depth = accumulate_to_root(forest, np.where(hangs_on_odometry, steps, 0.0))
         level = accumulate_to_root(forest, np.ones(num_nodes)).astype(np.int64)
-        chain = follow(np.where(hangs_on_odometry, parent, np.arange(num_nodes)))
-        position = _position(forest.parent, depth, level, chain)
+        top = follow(np.where(hangs_on_odometry, parent, np.arange(num_nodes)))
+        chain = _lowest_ends(parent, top)
+        position = _position(parent, depth, level, top, chain)
         outside = np.flatnonzero(~on_tree)
         outside = outside[_canonical_order(graph, outside)]
         source, target = graph.source[outside], graph.target[outside]
@@ -147,19 +148,24 @@ def _canonical_order(graph: ViewGraph, edges: np.ndarray) -> np.ndarray:
     return np.lexsort((cosine, np.maximum(source, target), np.minimum(source, target)))
 
 
-def _position(parent: np.ndarray, depth: np.ndarray, level: np.ndarray, chain: np.ndarray) -> np.ndarray:
-    """``(N,)`` steps from an end of each node's chain; of a chain that branches, branches go on side by side."""
+def _lowest_ends(parent: np.ndarray, top: np.ndarray) -> np.ndarray:
+    """``(N,)`` of each node's chain, whose top is where it hangs on the forest."""
     node = np.arange(len(parent))
-    hangs = chain != node
-    neighbours = hangs + np.bincount(parent[hangs], minlength=len(node))
-    is_end = neighbours <= 1
-    first = np.full(len(node), len(node))
-    np.minimum.at(first, chain[is_end], node[is_end])
-    first = first[chain]
-    position = depth - depth[chain]
-    (other,) = np.nonzero(first != chain)
+    hangs = top != node
+    is_end = hangs + np.bincount(parent[hangs], minlength=len(node)) <= 1
+    lowest = np.full(len(node), len(node))
+    np.minimum.at(lowest, top[is_end], node[is_end])
+    return np.asarray(lowest[top])
+
+
+def _position(
+    parent: np.ndarray, depth: np.ndarray, level: np.ndarray, top: np.ndarray, lowest: np.ndarray
+) -> np.ndarray:
+    """``(N,)`` steps from the lowest end of each node's chain; of one that branches, branches go on side by side."""
+    position = depth - depth[top]
+    (other,) = np.nonzero(lowest != top)
     if len(other):
-        position[other] = _path_length(parent, depth, level, first[other], other)
+        position[other] = _path_length(parent, depth, level, lowest[other], other)
     return np.asarray(position)
 
 

@@ -60,9 +60,12 @@ def estimate_bias(
         return BiasEstimate(np.zeros(3), 0.0)
     nodes = closure_graph.nodes
     drift = drift_per_bias(graph, forest, closure_graph)
+    # From the older end on, from whichever it is stated: what is left is linear in the bias to first order alone.
+    is_forward = closure_graph.is_forward[closure, None]
     ends = nodes[closure_graph.source[closure]], nodes[closure_graph.target[closure]]
-    design = drift[ends[0]] - drift[ends[1]]
+    design = np.where(is_forward, 1.0, -1.0)[:, :, None] * (drift[ends[0]] - drift[ends[1]])
     measured = closure_graph.residual.numpy()[closure]
+    measured = np.where(is_forward, measured, measured * [-1, -1, -1, 1])
     measured_rows = np.ascontiguousarray(measured.T)
     steps = np.maximum(closure_graph.path_steps[closure], 1.0)
     variance = steps * noise.step_variance + noise.closure_variance
@@ -110,15 +113,20 @@ def _squared_angles(design: np.ndarray, measured: np.ndarray, biases: np.ndarray
 def without_bias(graph: ViewGraph, bias: np.ndarray) -> ViewGraph:
     """The graph with ``bias`` ``(3,)`` rad per step taken out of its odometry, whichever way an edge runs.
 
-    An edge of several steps is taken for one about the same axis throughout.
+    An edge of several steps is taken for one about the same axis throughout. Translations stay as older ends see them.
     """
     turn = rotations.exp(-graph.steps[:, None] * torch.from_numpy(bias))
     measured = graph.target_from_source
     forwards = rotations.multiply(measured, turn)
     backwards = rotations.multiply(rotations.inverse(turn), measured)
-    corrected = torch.where((graph.source < graph.target)[:, None], forwards, backwards)
-    corrected = torch.where(graph.is_odometry[:, None], corrected, measured)
-    return replace(graph, target_from_source=rotations.canonical(rotations.normalize(corrected)))
+    is_forward = (graph.source < graph.target)[:, None]
+    corrected = torch.where(graph.is_odometry[:, None], torch.where(is_forward, forwards, backwards), measured)
+    unbiased = replace(graph, target_from_source=rotations.canonical(rotations.normalize(corrected)))
+    if graph.translation is None:
+        return unbiased
+    seen = rotations.rotate(rotations.inverse(corrected), rotations.rotate(measured, graph.translation))
+    is_turned = graph.is_odometry[:, None] & ~is_forward
+    return replace(unbiased, translation=torch.where(is_turned, seen, graph.translation))
 
 
 def drift_per_bias(graph: ViewGraph, forest: SpanningForest, closure_graph: ClosureGraph) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Translations along the odometry, drawn together as its rotations are.
 
-A segment says  p_b − p_a = Σ W_i t_i , W_i world_from_body where step i was measured. Orientations within it follow
-those of its ends (interpolated) and a Brownian bridge between them, so that with small turns δ of the world frame
+A segment says  p_b − p_a = Σ W_i t_i , W_i world_from_body where step i begins, which is at its older end: an edge that
+is stated the other way round says the same, and errs in the same frame. Orientations within it follow those of its ends
+(interpolated) and a Brownian bridge between them, so that with small turns δ of the world frame
 
     r = Σ W_i t_i − (p_b − p_a)   changes by   − δ_a × A − δ_b × B − (δp_b − δp_a),     A + B = Σ W_i t_i ,
 
@@ -16,7 +17,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
+from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed, typical_length
 from rotavg_ros.solver.algebra.quaternion_rows import turned_back
@@ -54,9 +57,9 @@ class _Steps(NamedTuple):
     Attributes:
         first: ``(S + 1,)`` where each segment begins.
         node: ``(P,)`` where each step ends.
-        is_forward: ``(P,)`` bool, whether its translation was measured where it begins; else where it ends.
+        is_forward: ``(P,)`` bool, whether its older end is where it begins, from the segment's start on.
         is_last: ``(P,)`` bool, whether it ends at a key node.
-        measured_at: ``(P,)`` where along its segment that was.
+        measured_at: ``(P,)`` where along its segment its older end is.
         variance: ``(P,)`` of its turn, in that of one step.
     """
 
@@ -89,20 +92,21 @@ class DrawnSteps:
         self._node, self._segment = node[order], segment[order]
         self._edge, parent = forest.parent_edge[self._node], forest.parent[self._node]
         self._first = np.searchsorted(self._segment, np.arange(self._num_segments))
-        self._is_forward = graph.source.numpy()[self._edge] == parent
+        self._is_forward = drawn.paths.position[parent] <= drawn.paths.position[self._node]
         self._is_last = drawn.nodes[drawn.target[self._segment]] == self._node
         of_parent = drawn.fraction[parent]
         of_node = np.where(self._is_last, 1.0, drawn.fraction[self._node])
         self.share = np.ones(graph.num_edges)
         self.share[self._edge] = of_node - of_parent
-        # Where along its segment a step's translation was measured.
         measured_at = np.where(self._is_forward, of_parent, of_node)
-        along = np.where(self._is_forward, 1.0, -1.0)[:, None] * translation[self._edge]
         first, variance = np.append(self._first, len(self._node)), steps[self._segment] * (of_node - of_parent)
         self._steps = _Steps(first, self._node, self._is_forward, self._is_last, measured_at, variance)
-        source, outside = graph.source.numpy(), drawn.view_graph_edge
-        self._measured = source[self._edge], along
-        self._measured_outside = source[outside], np.ascontiguousarray(translation[outside])
+        older, outside = np.where(self._is_forward, parent, self._node), drawn.view_graph_edge
+        downwards = np.where(graph.source.numpy()[self._edge] == parent, 1.0, -1.0)[:, None]
+        self._measured = older, downwards * _ways(graph, translation, self._edge, older)
+        self._outside_is_forward = drawn.is_forward[self._num_segments :, None]
+        older = np.where(self._outside_is_forward[:, 0], graph.source.numpy()[outside], graph.target.numpy()[outside])
+        self._measured_outside = older, _ways(graph, translation, outside, older)
         typical = typical_length(translation, graph.steps.numpy(), graph.is_odometry.numpy())
         length = lengths_passed(translation, graph.steps.numpy(), typical)
         passed = self._so_far(length[self._edge, None])
@@ -116,7 +120,8 @@ class DrawnSteps:
         at_source, at_target, bridge = np.empty((count, 3)), np.zeros((count, 3)), np.zeros((count, 3, 3))
         lever, way = np.zeros((self._num_nodes, 3)), np.zeros((self._num_nodes, 3))
         _walk(turned_back(body_from_world, *self._measured), self._steps, (at_source, at_target, bridge), (lever, way))
-        at_source[self._num_segments :] = outside
+        at_source[self._num_segments :] = np.where(self._outside_is_forward, outside, 0.0)
+        at_target[self._num_segments :] = np.where(self._outside_is_forward, 0.0, outside)
         return Displacements(
             at_source + at_target, at_source, at_target, bridge, self._length, lever, self._passed, way
         )
@@ -142,6 +147,13 @@ class DrawnSteps:
         out = np.zeros((self._num_nodes, value.shape[1]))
         out[self._node] = np.where(self._is_last[:, None], 0.0, value)
         return out
+
+
+def _ways(graph: ViewGraph, translation: np.ndarray, edge: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """``(n, 3)`` metres from source to target of edges ``(n,)``, by the axes of one of their ends ``at`` ``(n,)``."""
+    stated = translation[edge]
+    turned = rotations.rotate(graph.target_from_source[edge], torch.from_numpy(stated)).numpy()
+    return np.where((graph.source.numpy()[edge] == at)[:, None], stated, turned)
 
 
 @compiled

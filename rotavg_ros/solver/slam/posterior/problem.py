@@ -107,9 +107,7 @@ class Problem:
     @cached_property
     def sign(self) -> np.ndarray:
         """``(C,)`` +1 where a closure runs from its older to its newer end, else −1."""
-        position = self.graph.position
-        is_forward = position[self.graph.source] <= position[self.graph.target]
-        return np.asarray(np.where(is_forward, 1.0, -1.0)[self.closure])
+        return np.asarray(np.where(self.graph.is_forward, 1.0, -1.0)[self.closure])
 
     @cached_property
     def measured(self) -> np.ndarray:

@@ -54,28 +54,24 @@ class MapTurns:
         closure, (turns, shifts), drawn = problem.mode.problem.closure, problem.bases, problem.drawn
         k, m = turns.shape[1], shifts.shape[1]
         is_forward = problem.told.sign > 0
-        source, target = position[drawn.source[closure]], position[drawn.target[closure]]
         # A correction turns bodies from the world, the map the other way.
-        forward = quaternion_rows.exp(-turns @ predictions.mean[:, :k].T)
+        turn = quaternion_rows.exp(-turns @ predictions.mean[:, :k].T)
         shift = predictions.mean[:, k:] @ shifts.T
-        # Where the newer end is the source: the inverse, F⁻¹ x = Fᵀ (x − target − ε) + target.
-        inverse = quaternion_rows.inverse(forward)
-        back = quaternion_rows.matrices(inverse)
-        seen = np.matmul(back, (source - target - shift)[:, :, None])[:, :, 0]
         change = np.zeros((len(closure), k + m, k + m))
         change[:, :k, :k], change[:, k:, k:] = -np.eye(k), np.eye(m)
+        # Where the newer end is the source: the other way round, F⁻¹. Translations are the older end's in any case.
         is_back = np.flatnonzero(~is_forward)
-        back = back[is_back]
-        change[is_back, :k, :k] = turns.T @ back @ turns
-        change[is_back, k:, :k] = -shifts.T @ _crossed(seen[is_back]) @ back @ turns
-        change[is_back, k:, k:] = -shifts.T @ back @ shifts
+        inverse = quaternion_rows.inverse(turn[:, is_back])
+        turn[:, is_back], shift[is_back] = inverse, -shift[is_back]
+        change[is_back, :k, :k] = turns.T @ quaternion_rows.matrices(inverse) @ turns
+        change[is_back, k:, k:] *= -1
         own = np.repeat(np.stack((problem.told.rotation_variance, closure_variance), axis=1), (k, m), axis=1)
         noise = own[:, :, None] * np.eye(k + m)
         back_turned = change.transpose(0, 2, 1)
         return cls(
-            np.where(is_forward, forward, inverse),
-            np.where(is_forward[:, None], shift, seen + target - source),
-            np.where(is_forward[:, None], target, source),
+            turn,
+            shift,
+            position[np.where(is_forward, drawn.target[closure], drawn.source[closure])],
             change @ (predictions.covariance + noise) @ back_turned,
             change @ noise @ back_turned,
             problem.bases,
@@ -120,13 +116,3 @@ class MapTurns:
     @property
     def _axes(self) -> Axes:
         return Axes(*(np.ascontiguousarray(basis) for basis in self.bases))
-
-
-def _crossed(vector: np.ndarray) -> np.ndarray:
-    """``(n, 3, 3)`` of v ×."""
-    x, y, z = vector.T
-    rows = np.zeros((len(vector), 3, 3))
-    rows[:, 0, 1], rows[:, 1, 0] = -z, z
-    rows[:, 0, 2], rows[:, 2, 0] = y, -y
-    rows[:, 1, 2], rows[:, 2, 1] = -x, x
-    return rows
