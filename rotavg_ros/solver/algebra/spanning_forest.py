@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, dijkstra, minimum_spanning_tree
 from torch import Tensor
@@ -85,8 +86,12 @@ def shortest_path_forest(
     return SpanningForest(parent, parent_edge, labels)
 
 
-def minimum_spanning_forest(graph: ViewGraph, cost: Tensor) -> SpanningForest:
-    """Forest of least total ``cost`` ``(M,)``, rooted at each component's first node."""
+def minimum_spanning_forest(graph: ViewGraph, cost: Tensor, is_root: NDArray[np.bool_] | None = None) -> SpanningForest:
+    """Forest of least total ``cost`` ``(M,)``, rooted at each component's first node.
+
+    Args:
+        is_root: ``(N,)`` which nodes may be roots, if a component has any; default: all.
+    """
     best = _cheapest_parallel_edges(graph, cost)
     # scipy drops explicit zeros, so costs must be positive.
     positive = np.maximum(best.cost, np.finfo(np.float64).tiny)
@@ -96,7 +101,7 @@ def minimum_spanning_forest(graph: ViewGraph, cost: Tensor) -> SpanningForest:
     ends = np.concatenate((tree.row, tree.col)), np.concatenate((tree.col, tree.row))
     adjacency = csr_array(coo_array((np.ones(2 * len(tree.row)), ends), shape=(graph.num_nodes, graph.num_nodes)))
     component = graph.components().cpu().numpy()
-    roots = _first_per_component(component, np.zeros(graph.num_nodes))
+    roots = _first_per_component(component, np.zeros(graph.num_nodes) if is_root is None else ~is_root)
     return _forest(_breadth_first_parents(adjacency, roots), best, component, graph.num_nodes)
 
 

@@ -12,6 +12,7 @@ from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, minimum_sp
 from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs, agreement_pairs
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph, contract
+from rotavg_ros.solver.slam.graph.odometry_paths import odometry_ends
 from rotavg_ros.solver.slam.noise.gyro_bias import estimate_bias, without_bias
 from rotavg_ros.solver.slam.noise.model import (
     NoiseModel,
@@ -120,5 +121,5 @@ def draw_together(graph: ViewGraph) -> tuple[ClosureGraph, SpanningForest]:
     usable = graph.label != EdgeLabel.REJECTED
     cost = torch.where(graph.is_odometry, 1.0, _CLOSURE_COST)
     # A rejected edge may only be used where nothing else connects.
-    forest = minimum_spanning_forest(graph, torch.where(usable, cost, _CLOSURE_COST**2))
+    forest = minimum_spanning_forest(graph, torch.where(usable, cost, _CLOSURE_COST**2), is_root=odometry_ends(graph))
     return contract(graph, forest), forest

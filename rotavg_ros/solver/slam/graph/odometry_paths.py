@@ -13,7 +13,12 @@ from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.pointer_jumping import doublings, follow
 from rotavg_ros.solver.algebra.quaternion_loops import canonical, inverse, product, unit
 from rotavg_ros.solver.algebra.residuals import edge_residual
-from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root, compose_orientations
+from rotavg_ros.solver.algebra.spanning_forest import (
+    SpanningForest,
+    accumulate_to_root,
+    compose_orientations,
+    minimum_spanning_forest,
+)
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -71,6 +76,29 @@ class OdometryPaths:
         canonical = rotations.canonical(residual)
         along = depth, level, chain, position
         return cls(forest, orientation, hangs_on_odometry, *along, outside, canonical, path_steps)
+
+
+def runs_forward(graph: ViewGraph) -> np.ndarray:
+    """``(M,)`` bool, whether edges run from the older to the newer end by the odometry, closures by their numbers."""
+    source, target = graph.source.numpy(), graph.target.numpy()
+    by_number = source < target
+    steps = graph.is_odometry.numpy()
+    ends = np.stack((source[steps], target[steps]))
+    is_monotonic = all(np.bincount(end, minlength=1).max() <= 1 for end in (ends.min(axis=0), ends.max(axis=0)))
+    if is_monotonic:
+        return by_number
+    odometry = graph.select_edges(graph.is_odometry)
+    forest = minimum_spanning_forest(odometry, torch.ones(odometry.num_edges), is_root=odometry_ends(odometry))
+    position = OdometryPaths.along(odometry, forest).position
+    is_told = steps & (position[source] != position[target])
+    return np.where(is_told, position[source] < position[target], by_number)
+
+
+def odometry_ends(graph: ViewGraph) -> np.ndarray:
+    """``(N,)`` bool, the nodes that no more than one step of odometry touches: where the tree may hang from."""
+    steps = graph.is_odometry
+    touched = torch.cat((graph.source[steps], graph.target[steps]))
+    return (torch.bincount(touched, minlength=graph.num_nodes) <= 1).numpy()
 
 
 @dataclass(frozen=True)

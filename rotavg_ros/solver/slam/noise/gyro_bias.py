@@ -19,6 +19,7 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
+from rotavg_ros.solver.slam.graph.odometry_paths import runs_forward
 from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
 from rotavg_ros.solver.slam.noise.model import NoiseModel
 from rotavg_ros.view_graph import ViewGraph
@@ -119,7 +120,7 @@ def without_bias(graph: ViewGraph, bias: np.ndarray) -> ViewGraph:
     measured = graph.target_from_source
     forwards = rotations.multiply(measured, turn)
     backwards = rotations.multiply(rotations.inverse(turn), measured)
-    is_forward = (graph.source < graph.target)[:, None]
+    is_forward = torch.from_numpy(runs_forward(graph))[:, None]
     corrected = torch.where(graph.is_odometry[:, None], torch.where(is_forward, forwards, backwards), measured)
     unbiased = replace(graph, target_from_source=rotations.canonical(rotations.normalize(corrected)))
     if graph.translation is None:
@@ -135,7 +136,7 @@ def drift_per_bias(graph: ViewGraph, forest: SpanningForest, closure_graph: Clos
     edge = forest.parent_edge[child]
     source, target = graph.source.numpy()[edge], graph.target.numpy()[edge]
     # A step turns about the body of its earlier node; forwards along the tree or backwards.
-    earlier = np.minimum(source, target)
+    earlier = np.where(runs_forward(graph)[edge], source, target)
     steps = (graph.steps * graph.is_odometry).numpy()[edge]
     sign = np.where(earlier == child, -1.0, 1.0) * steps
     world_from_body = rotations.to_matrix(rotations.inverse(closure_graph.odometry_orientation)).numpy()
