@@ -161,7 +161,12 @@ class _System:
             translation = graph.translation[edge]
             is_known = torch.isfinite(translation).all(dim=1).numpy()
             translation = translation.nan_to_num()
-            displacement = rotations.rotate(rotations.inverse(body_from_world[source]), translation).numpy()
+            # As the older end sees it.
+            is_back = source > target
+            seen = rotations.rotate(graph.target_from_source[edge], translation)
+            older = torch.where(is_back, target, source)
+            way_between = torch.where(is_back[:, None], seen, translation)
+            displacement = rotations.rotate(rotations.inverse(body_from_world[older]), way_between).numpy()
             shift = displacement - (position[target.numpy()] - position[source.numpy()])
             shift *= is_known[:, None]
             square = (translation**2).sum(dim=1).numpy()
@@ -196,7 +201,9 @@ class _System:
         source, target = self.source[which], self.target[which]
         count = len(source)
         blocks, values = [], []
-        for node, sign, lever in ((target, 1.0, 0.0), (source, -1.0, self.displacement[which])):
+        is_back = (source > target)[:, None]
+        at_target, at_source = (np.where(at, self.displacement[which], 0.0) for at in (is_back, ~is_back))
+        for node, sign, lever in ((target, 1.0, at_target), (source, -1.0, at_source)):
             anchor = self.anchor[node]
             value = np.zeros((count, d, d))
             value[:, :k, :k] = sign * np.eye(k)
