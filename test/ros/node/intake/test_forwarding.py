@@ -127,9 +127,10 @@ def test_arrays_and_a_delay(live_node) -> None:
     live_node.arrays.publish(RelativeRotationArray(header=header, edges=sent))
     live_node.spin_until(lambda: bool(live_node.flags) and {*range(10)} <= {*live_node.flags[-1].edge_ids})
     assert not passed and live_node.status["held back"] in ("0", "10")
-    live_node.spin_until(lambda: bool(passed))
-    assert passed[0].header == header
-    assert passed[0].edges == [edge for edge in sent if edge.id not in FALSE]
+    # What passes together: on a busy machine an answer comes between two parts of an array.
+    live_node.spin_until(lambda: sum(len(each.edges) for each in passed) >= len(sent) - len(FALSE))
+    assert all(each.header == header for each in passed)
+    assert [edge for each in passed for edge in each.edges] == [edge for edge in sent if edge.id not in FALSE]
 
 
 def test_closures_that_share_an_id_are_told_of(live_node) -> None:
