@@ -241,6 +241,7 @@ def test_a_full_graph_goes_on_and_what_is_left_is_right(live_node) -> None:
         live_node.odometry.publish(odometry(index))
         if index % 10 == 9:
             live_node.edges.publish(closure(index, index - 9, index))
+    live_node.spin_until(lambda: live_node.status.get("odometry messages") == "100")
     answer = live_node.wait_for_silence()
     ids = list(answer.keyframe_ids)
     assert len(ids) <= 30 and ids[0] == 0 and ids[-1] == 99
