@@ -136,7 +136,8 @@ def drift_per_bias(graph: ViewGraph, forest: SpanningForest, closure_graph: Clos
     edge = forest.parent_edge[child]
     source, target = graph.source.numpy()[edge], graph.target.numpy()[edge]
     # A step turns about the body of its earlier node; forwards along the tree or backwards.
-    earlier = np.where(runs_forward(graph)[edge], source, target)
+    position = closure_graph.paths.position
+    earlier = np.where(position[source] < position[target], source, target)
     steps = (graph.steps * graph.is_odometry).numpy()[edge]
     sign = np.where(earlier == child, -1.0, 1.0) * steps
     world_from_body = rotations.to_matrix(rotations.inverse(closure_graph.odometry_orientation)).numpy()

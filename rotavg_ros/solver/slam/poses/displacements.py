@@ -103,10 +103,10 @@ class DrawnSteps:
         self._steps = _Steps(first, self._node, self._is_forward, self._is_last, measured_at, variance)
         older, outside = np.where(self._is_forward, parent, self._node), drawn.view_graph_edge
         downwards = np.where(graph.source.numpy()[self._edge] == parent, 1.0, -1.0)[:, None]
-        self._measured = older, downwards * _ways(graph, translation, self._edge, older)
+        self._measured = older, downwards * ways_by(graph, self._edge, translation[self._edge], older)
         self._outside_is_forward = drawn.is_forward[self._num_segments :, None]
         older = np.where(self._outside_is_forward[:, 0], graph.source.numpy()[outside], graph.target.numpy()[outside])
-        self._measured_outside = older, _ways(graph, translation, outside, older)
+        self._measured_outside = older, ways_by(graph, outside, translation[outside], older)
         typical = typical_length(translation, graph.steps.numpy(), graph.is_odometry.numpy())
         length = lengths_passed(translation, graph.steps.numpy(), typical)
         passed = self._so_far(length[self._edge, None])
@@ -149,11 +149,17 @@ class DrawnSteps:
         return out
 
 
-def _ways(graph: ViewGraph, translation: np.ndarray, edge: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """``(n, 3)`` metres from source to target of edges ``(n,)``, by the axes of one of their ends ``at`` ``(n,)``."""
-    stated = translation[edge]
-    turned = rotations.rotate(graph.target_from_source[edge], torch.from_numpy(stated)).numpy()
-    return np.where((graph.source.numpy()[edge] == at)[:, None], stated, turned)
+def ways_by(graph: ViewGraph, edge: np.ndarray, translation: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """``(n, 3)`` metres from source to target of edges ``(n,)``, by the axes of one of their ends.
+
+    Args:
+        graph: whose edges.
+        edge: ``(n,)`` their numbers.
+        translation: ``(n, 3)`` metres, as they are stated.
+        at: ``(n,)`` that end.
+    """
+    turned = rotations.rotate(graph.target_from_source[edge].double(), torch.from_numpy(translation)).numpy()
+    return np.where((graph.source.numpy()[edge] == at)[:, None], translation, turned)
 
 
 @compiled

@@ -18,8 +18,10 @@ from scipy.special import expit
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.products import product
+from rotavg_ros.solver.algebra.quaternion_rows import turned_back
 from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
+from rotavg_ros.solver.slam.poses.displacements import ways_by
 from rotavg_ros.solver.slam.poses.memory import ACROSS, WALK
 from rotavg_ros.solver.slam.posterior.densities import log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
@@ -113,6 +115,7 @@ class _System:
     """Rows of n new closures.
 
     Attributes:
+        older: ``(n,)`` the end of each by whose axes its translation counts.
         anchor: ``(N',)`` node of the last solve that each node moves with, its own among these.
         way: ``(N', 3)`` metres from there.
         along: ``(2, N')`` rad², m², by which odometry from there errs.
@@ -125,6 +128,7 @@ class _System:
     laid: LaidOn
     source: np.ndarray
     target: np.ndarray
+    older: np.ndarray
     anchor: np.ndarray
     way: np.ndarray
     along: np.ndarray
@@ -153,28 +157,35 @@ class _System:
         body_from_world = laid.body_from_world
         expected = rotations.multiply(graph.target_from_source[edge].double(), body_from_world[source])
         turn = rotations.log(rotations.multiply(rotations.inverse(body_from_world[target]), expected)).numpy()
+        older = torch.minimum(source, target).numpy()
         displacement, square = np.zeros((len(edge), 3)), np.zeros(len(edge))
         is_known = np.zeros(len(edge), dtype=bool)
         if linear.turns is None or linear.shifts is None or graph.translation is None:
             residual = turn[:, None, :]
         else:
-            translation = graph.translation[edge]
-            is_known = torch.isfinite(translation).all(dim=1).numpy()
-            translation = translation.nan_to_num()
-            # As the older end sees it.
-            is_back = source > target
-            seen = rotations.rotate(graph.target_from_source[edge], translation)
-            older = torch.where(is_back, target, source)
-            way_between = torch.where(is_back[:, None], seen, translation)
-            displacement = rotations.rotate(rotations.inverse(body_from_world[older]), way_between).numpy()
+            translation = graph.translation[edge].double().numpy()
+            is_known = np.isfinite(translation).all(axis=1)
+            translation = np.nan_to_num(translation)
+            displacement = turned_back(body_from_world.numpy(), older, ways_by(graph, edge, translation, older))
             shift = displacement - (position[target.numpy()] - position[source.numpy()])
             shift *= is_known[:, None]
-            square = (translation**2).sum(dim=1).numpy()
+            square = (translation**2).sum(axis=1)
             residual = np.concatenate((turn @ linear.turns, shift @ linear.shifts), axis=1)[:, :, None]
         own_shift = np.where(is_known, noise.of_closures(square), linear.extent / _NOTHING)
         own = np.stack((np.full(len(edge), noise.closure_turn), own_shift))
         return cls(
-            linear, laid, source.numpy(), target.numpy(), anchor, way, along, residual, displacement, own, is_known
+            linear,
+            laid,
+            source.numpy(),
+            target.numpy(),
+            older,
+            anchor,
+            way,
+            along,
+            residual,
+            displacement,
+            own,
+            is_known,
         )
 
     @property
@@ -201,9 +212,8 @@ class _System:
         source, target = self.source[which], self.target[which]
         count = len(source)
         blocks, values = [], []
-        is_back = (source > target)[:, None]
-        at_target, at_source = (np.where(at, self.displacement[which], 0.0) for at in (is_back, ~is_back))
-        for node, sign, lever in ((target, 1.0, at_target), (source, -1.0, at_source)):
+        for node, sign in ((target, 1.0), (source, -1.0)):
+            lever = np.where((node == self.older[which])[:, None], self.displacement[which], 0.0)
             anchor = self.anchor[node]
             value = np.zeros((count, d, d))
             value[:, :k, :k] = sign * np.eye(k)
