@@ -73,6 +73,8 @@ class ViewGraph:
         information: ``(M, 3, 3)`` float64 rad⁻², symmetric positive definite: inverse covariance of the rotation vector
             e in ``target_from_source = exp(e) R_target R_source⁻¹``, an error in the target's frame; NaN where unknown.
             None where no edge has one. Only the SfM profile reads it.
+        route: ``(M, 29)`` float64 :attr:`~rotavg_ros.odometry_route.Routes.columns`, what odometry did between the ends
+            of an edge that several steps were drawn together into; NaN elsewhere, and None where there are none.
     """
 
     num_nodes: int
@@ -85,6 +87,7 @@ class ViewGraph:
     steps: Tensor
     translation: Tensor | None = None
     information: Tensor | None = None
+    route: Tensor | None = None
 
     @classmethod
     def create(

@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed, typical_length
+from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed, typical_length, ways_passed
 from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianPattern
 
 # A closure is worth as much as this many typical steps of odometry in a row.
@@ -82,8 +82,9 @@ def fit_positions(
     component, roots = _components(num_nodes, source, target)
     step = Rotation.from_quat(world_from_body[source]).apply(edges.translation) if len(source) else np.empty((0, 3))
     counts = is_odometry if is_odometry.any() else np.ones(len(source), dtype=bool)
-    typical = typical_length(step, steps, counts)
-    weight = np.where(is_odometry, typical / lengths_passed(step, steps, typical), edges.trust / _CLOSURE_STEPS)
+    way = ways_passed(step, None)
+    typical = typical_length(way, steps, counts)
+    weight = np.where(is_odometry, typical / lengths_passed(way, steps, typical), edges.trust / _CLOSURE_STEPS)
 
     pattern = LaplacianPattern(num_nodes, source, target, roots)
 

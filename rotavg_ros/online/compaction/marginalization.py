@@ -2,12 +2,14 @@
 
 A keyframe v between two odometry edges u → v → x and without a loop closure can be integrated out: rotations are
 composed, ``R_xu = R_xv R_vu``, variances are added. That is what :mod:`rotavg_ros.solver.slam.graph.closure_graph` does
-for every solve anyway, so the solution at all other keyframes stays what it was. Long runs of such keyframes vanish in
-a few vectorised rounds, each of which takes an independent set out of what is left (Luby 1986).
+for every solve anyway, so the solution at all other keyframes stays what it was. What else is asked of the steps, how
+far each turned and where it led, an edge keeps as sums (:mod:`rotavg_ros.odometry_route`). Long runs of such keyframes
+vanish in a few vectorised rounds, each of which takes an independent set out of what is left (Luby 1986).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from rotavg_ros import rotations
+from rotavg_ros.odometry_route import Routes, joined
 from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedKeyframes
 from rotavg_ros.online.measurements import OWN_EDGE_ID
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
@@ -190,6 +193,8 @@ class _Work:
             self._write_riders(*columns)
         self._write_riders(self.row_of_node[nodes], survivor, v_from_u, v_in_u, steps_before)
 
+        parts = (before, v_from_u, v_in_u), (after, x_from_v, x_in_v)
+        in_order = (ends[:, 0] < nodes) & (nodes < ends[:, 1])
         with np.errstate(divide="ignore"):
             precision = 1 / (1 / edges["precision"][pair]).sum(axis=1)
         self.merged_into[pair.min(axis=1)] = survivor
@@ -200,6 +205,7 @@ class _Work:
             "translation": x_in_u.numpy(),
             "precision": precision,
             "steps": steps,
+            "route": _joined(edges, parts, in_order),
             "edge_id": np.uint64(OWN_EDGE_ID),
         }
         for name, value in values.items():
@@ -252,6 +258,24 @@ def _directed(
         torch.where(onwards, rotation, rotations.inverse(rotation)),
         torch.where(onwards, translation, -rotations.rotate(rotation, translation)),
     )
+
+
+def _joined(
+    edges: Columns,
+    parts: Sequence[tuple[NDArray[np.int64], torch.Tensor, torch.Tensor]],
+    in_order: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """``(n, 29)`` what odometry did along pairs of edges; NaN where the nodes are not in the order of time."""
+    routes, steps, displacements, turns = [], [], [], []
+    for edge, farther_from_nearer, place in parts:
+        count, displacement = edges["steps"][edge], place.numpy()
+        angle = torch.linalg.vector_norm(rotations.log(farther_from_nearer), dim=1).numpy()
+        routes.append(Routes.known(edges["route"][edge], Routes.even(angle, displacement, count)))
+        steps.append(count)
+        displacements.append(displacement)
+        turns.append(rotations.to_matrix(rotations.inverse(farther_from_nearer)).numpy())
+    columns = joined(routes, steps, displacements, turns[0]).columns
+    return np.where(in_order[:, None], columns, np.nan)
 
 
 def _place(frame_from_world: torch.Tensor, origin: torch.Tensor, position: torch.Tensor) -> torch.Tensor:

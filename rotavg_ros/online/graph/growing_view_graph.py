@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rotavg_ros.odometry_route import ROUTE_COLUMNS
 from rotavg_ros.online.compaction.marginalization import Columns, marginalize
 from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedIndex, MarginalizedKeyframes
 from rotavg_ros.online.compaction.renumbering import Renumbering
@@ -30,6 +31,7 @@ _EDGE_COLUMNS = {
     "label": (np.int64, None),
     "translation": (np.float64, 3),
     "steps": (np.float64, None),
+    "route": (np.float64, ROUTE_COLUMNS),
 }
 _SOLVED_COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
 # Of all keyframes, the share that are the robots' latest and stay whatever happens.
@@ -205,6 +207,8 @@ class GrowingViewGraph:
         columns = {name: self._edge[name].view for name in _SOLVED_COLUMNS}
         columns["label"] = columns["label"].copy()
         columns["translation"] = self._edge["translation"].view
+        if (columns["steps"] != 1).any():
+            columns["route"] = self._edge["route"].view
         return GraphSnapshot(
             graph=ViewGraph(self.num_keyframes, **{name: torch.from_numpy(values) for name, values in columns.items()}),
             robots=tuple(self.robots),
@@ -239,6 +243,9 @@ class GrowingViewGraph:
         growing._edge["translation"].extend(snapshot.translation)
         for name in _SOLVED_COLUMNS:
             growing._edge[name].extend(getattr(snapshot.graph, name).numpy())
+        route = snapshot.graph.route
+        unknown = np.full((snapshot.graph.num_edges, ROUTE_COLUMNS), np.nan)
+        growing._edge["route"].extend(unknown if route is None else route.numpy())
         marginalized = snapshot.marginalized.keyframes
         _check_rows(growing._keyframe, len(snapshot.robots), "robot")
         _check_rows(growing._edge, growing.num_keyframes, "source", "target")

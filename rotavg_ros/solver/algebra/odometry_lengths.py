@@ -9,27 +9,36 @@ from numpy.typing import NDArray
 _SHORTEST_STEP = 0.05
 
 
-def typical_length(
-    translation: NDArray[np.float64], steps: NDArray[np.float64], is_odometry: NDArray[np.bool_]
-) -> float:
-    """Median length of a step of the odometry that goes anywhere, metres; 1 where none does.
+def ways_passed(translation: NDArray[np.float64], route: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """``(M,)`` metres from end to end of edges, or along the steps that they were drawn together from, where known.
 
     Args:
         translation: ``(M, 3)`` metres.
+        route: ``(M, 29)``, see :attr:`~rotavg_ros.view_graph.ViewGraph.route`.
+    """
+    straight = np.linalg.norm(translation, axis=1)
+    return np.asarray(straight if route is None else np.fmax(straight, route[:, 1]))
+
+
+def typical_length(way: NDArray[np.float64], steps: NDArray[np.float64], is_odometry: NDArray[np.bool_]) -> float:
+    """Median length of a step of the odometry that goes anywhere, metres; 1 where none does.
+
+    Args:
+        way: ``(M,)`` metres.
         steps: ``(M,)`` odometry steps that each edge stands for.
         is_odometry: ``(M,)`` which count.
     """
-    length = np.linalg.norm(translation[is_odometry], axis=1) / steps[is_odometry]
+    length = way[is_odometry] / steps[is_odometry]
     moving = length[length > 0]
     return float(np.median(moving)) if len(moving) else 1.0
 
 
-def lengths_passed(translation: NDArray[np.float64], steps: NDArray[np.float64], typical: float) -> NDArray[np.float64]:
+def lengths_passed(way: NDArray[np.float64], steps: NDArray[np.float64], typical: float) -> NDArray[np.float64]:
     """``(M,)`` metres that each edge's variance goes with.
 
     Args:
-        translation: ``(M, 3)`` metres.
+        way: ``(M,)`` metres.
         steps: ``(M,)`` odometry steps that each edge stands for.
         typical: :func:`typical_length` of the graph's odometry.
     """
-    return np.asarray(np.maximum(np.linalg.norm(translation, axis=1), _SHORTEST_STEP * typical * steps))
+    return np.asarray(np.maximum(way, _SHORTEST_STEP * typical * steps))

@@ -16,10 +16,12 @@ import torch
 from scipy.special import expit
 
 from rotavg_ros import rotations
+from rotavg_ros.odometry_route import Routes
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.graph.odometry_paths import runs_forward
+from rotavg_ros.solver.slam.graph.routes import routes_of
 from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
 from rotavg_ros.solver.slam.noise.model import NoiseModel
 from rotavg_ros.view_graph import ViewGraph
@@ -114,20 +116,46 @@ def _squared_angles(design: np.ndarray, measured: np.ndarray, biases: np.ndarray
 def without_bias(graph: ViewGraph, bias: np.ndarray) -> ViewGraph:
     """The graph with ``bias`` ``(3,)`` rad per step taken out of its odometry, whichever way an edge runs.
 
-    An edge of several steps is taken for one about the same axis throughout. Translations stay as older ends see them.
+    Translations stay as older ends see them, but for those of several steps: the later ones follow what the earlier
+    ones turned.
     """
-    turn = rotations.exp(-graph.steps[:, None] * torch.from_numpy(bias))
+    is_forward = torch.from_numpy(runs_forward(graph))[:, None]
+    by_bias, shift = graph.steps[:, None] * torch.from_numpy(bias), torch.zeros((graph.num_edges, 3)).double()
+    several = np.flatnonzero((graph.is_odometry & (graph.steps > 1)).numpy())
+    if len(several):
+        older = torch.where(is_forward[:, 0], graph.source, graph.target).numpy()[several]
+        of_several = _routes(graph, several, older)
+        by_bias[several], shift[several] = (
+            torch.from_numpy(matrix @ bias) for matrix in (of_several.by_bias, of_several.shift_by_bias)
+        )
+    turn = rotations.exp(-by_bias)
     measured = graph.target_from_source
     forwards = rotations.multiply(measured, turn)
     backwards = rotations.multiply(rotations.inverse(turn), measured)
-    is_forward = torch.from_numpy(runs_forward(graph))[:, None]
     corrected = torch.where(graph.is_odometry[:, None], torch.where(is_forward, forwards, backwards), measured)
     unbiased = replace(graph, target_from_source=rotations.canonical(rotations.normalize(corrected)))
+    if graph.route is not None:
+        onwards = torch.where(is_forward, measured, rotations.inverse(measured))
+        mean = by_bias / graph.steps[:, None]
+        less = (by_bias * mean - 2 * mean * rotations.log(onwards)).sum(dim=1)
+        turned = (graph.route[:, 0] + less).clamp_min(0)
+        unbiased = replace(unbiased, route=torch.cat((turned[:, None], graph.route[:, 1:]), dim=1))
     if graph.translation is None:
         return unbiased
-    seen = rotations.rotate(rotations.inverse(corrected), rotations.rotate(measured, graph.translation))
-    is_turned = graph.is_odometry[:, None] & ~is_forward
-    return replace(unbiased, translation=torch.where(is_turned, seen, graph.translation))
+    by_older = torch.where(is_forward, graph.translation, rotations.rotate(measured, graph.translation))
+    by_older = by_older + torch.where(is_forward, shift, -shift)
+    seen = torch.where(is_forward, by_older, rotations.rotate(rotations.inverse(corrected), by_older))
+    return replace(unbiased, translation=torch.where(graph.is_odometry[:, None], seen, graph.translation))
+
+
+def _routes(graph: ViewGraph, edge: np.ndarray, older: np.ndarray) -> Routes:
+    """Of edges ``(n,)`` that several steps were drawn together into, whose older ends are ``(n,)``."""
+    displacement = np.zeros((len(edge), 3))
+    if graph.translation is not None:
+        translation, measured = graph.translation[edge].double(), graph.target_from_source[edge].double()
+        from_source = (graph.source.numpy()[edge] == older)[:, None]
+        displacement = np.where(from_source, translation.numpy(), -rotations.rotate(measured, translation).numpy())
+    return routes_of(graph, edge, older, displacement)
 
 
 def drift_per_bias(graph: ViewGraph, forest: SpanningForest, closure_graph: ClosureGraph) -> np.ndarray:
@@ -139,8 +167,13 @@ def drift_per_bias(graph: ViewGraph, forest: SpanningForest, closure_graph: Clos
     position = closure_graph.paths.position
     earlier = np.where(position[source] < position[target], source, target)
     steps = (graph.steps * graph.is_odometry).numpy()[edge]
-    sign = np.where(earlier == child, -1.0, 1.0) * steps
+    sign = np.where(earlier == child, -1.0, 1.0)
     world_from_body = rotations.to_matrix(rotations.inverse(closure_graph.odometry_orientation)).numpy()
+    by_bias = steps[:, None, None] * world_from_body[earlier]
+    several = np.flatnonzero(steps > 1)
+    if len(several):
+        routes = _routes(graph, edge[several], earlier[several])
+        by_bias[several] = world_from_body[earlier[several]] @ routes.by_bias
     step = np.zeros((graph.num_nodes, 9))
-    step[child] = (sign[:, None, None] * world_from_body[earlier]).reshape(-1, 9)
+    step[child] = (sign[:, None, None] * by_bias).reshape(-1, 9)
     return accumulate_to_root(forest, step).reshape(-1, 3, 3)

@@ -24,8 +24,10 @@ def squared_turns(graph: ViewGraph, forest: SpanningForest, step_variance: float
     """
     is_step = forest.parent_edge >= 0
     is_step[is_step] = graph.is_odometry.numpy()[forest.parent_edge[is_step]]
-    square = np.zeros(len(is_step))
-    square[is_step] = (rotations.log(graph.target_from_source) ** 2).sum(dim=1).numpy()[forest.parent_edge[is_step]]
+    edge = forest.parent_edge[is_step]
+    steps, square = np.zeros(len(is_step)), np.zeros(len(is_step))
+    steps[is_step] = graph.steps.numpy()[edge]
+    square[is_step] = _of_edges(graph)[edge] / steps[is_step]
     # Of the steps at either end of each, wherever the root is.
     total, count = square.copy(), is_step.astype(np.float64)
     np.add.at(total, forest.parent[is_step], square[is_step])
@@ -37,4 +39,13 @@ def squared_turns(graph: ViewGraph, forest: SpanningForest, step_variance: float
     off = np.sqrt(square) - np.sqrt(beside)
     log_alike = -(off**2) / (2 * variance) - np.log(2 * np.pi * variance) / 2
     own = expit(-np.log(np.pi) - log_alike)
-    return accumulate_to_root(forest, own * square + (1 - own) * beside)
+    return accumulate_to_root(forest, steps * (own * square + (1 - own) * beside))
+
+
+def _of_edges(graph: ViewGraph) -> np.ndarray:
+    """``(M,)`` rad², sums over the steps that each edge stands for; as if all turned alike where it does not say."""
+    even = ((rotations.log(graph.target_from_source) ** 2).sum(dim=1) / graph.steps).numpy()
+    if graph.route is None:
+        return np.asarray(even)
+    known = graph.route[:, 0].numpy()
+    return np.where(np.isnan(known), even, known)

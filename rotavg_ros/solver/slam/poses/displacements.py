@@ -8,7 +8,8 @@ is stated the other way round says the same, and errs in the same frame. Orienta
 
 and errs by what the bridge turns: with d(q) what of the way is left at q, less its mean B, the covariance of that is
 σ² ∫ (‖d‖² I − d dᵀ) dq where all axes err alike. That is the lever arm of odometry's turns: exact to first order, and
-sums alone.
+sums alone, so that an edge that several steps were drawn together into keeps theirs (``odometry_route.py``): its lag
+goes from A to B, and what its steps' ends spread about their mean adds to d dᵀ.
 """
 
 from __future__ import annotations
@@ -20,10 +21,11 @@ import numpy as np
 import torch
 
 from rotavg_ros import rotations
+from rotavg_ros.odometry_route import Routes
 from rotavg_ros.solver.algebra.compiled import compiled
-from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed, typical_length
 from rotavg_ros.solver.algebra.quaternion_rows import turned_back
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
+from rotavg_ros.solver.slam.graph.routes import routes_of
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -60,6 +62,7 @@ class _Steps(NamedTuple):
         is_forward: ``(P,)`` bool, whether its older end is where it begins, from the segment's start on.
         is_last: ``(P,)`` bool, whether it ends at a key node.
         measured_at: ``(P,)`` where along its segment its older end is.
+        share: ``(P,)`` how much of its segment's variance it has.
         variance: ``(P,)`` of its turn, in that of one step.
     """
 
@@ -68,7 +71,48 @@ class _Steps(NamedTuple):
     is_forward: np.ndarray
     is_last: np.ndarray
     measured_at: np.ndarray
+    share: np.ndarray
     variance: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Several:
+    """Edges (n) that several steps were drawn together into.
+
+    Attributes:
+        older, newer: ``(n,)`` their ends.
+        newer_from_older: ``(n, 4)`` as measured.
+        routes: what odometry did there.
+    """
+
+    older: np.ndarray
+    newer: np.ndarray
+    newer_from_older: torch.Tensor
+    routes: Routes
+
+    @classmethod
+    def of(cls, graph: ViewGraph, edge: np.ndarray, older: np.ndarray, displacement: np.ndarray) -> _Several:
+        """Of edges ``(n,)``; their older ends ``(n,)``, and by their axes ``(n, 3)`` metres to the newer ones."""
+        source, target = graph.source.numpy()[edge], graph.target.numpy()[edge]
+        measured = graph.target_from_source[edge].double()
+        from_source = source == older
+        onwards = torch.where(torch.from_numpy(from_source)[:, None], measured, rotations.inverse(measured))
+        newer = np.where(from_source, target, source)
+        return cls(older, newer, onwards, routes_of(graph, edge, older, displacement))
+
+    def at(self, body_from_world: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Lags ``(n, 3)`` and spreads ``(n, 3, 3)`` by the world's axes, at orientations ``(N, 4)``.
+
+        And how much farther the newer end lies, ``(n, 3)`` metres, since what an edge's turn is off by turns its steps
+        by and by: to first order, that × lag.
+        """
+        world_from_older = rotations.inverse(torch.from_numpy(body_from_world[self.older]))
+        world_from_newer = rotations.inverse(torch.from_numpy(body_from_world[self.newer]))
+        along = rotations.multiply(world_from_older, rotations.inverse(self.newer_from_older))
+        off = rotations.log(rotations.multiply(world_from_newer, rotations.inverse(along))).numpy()
+        turn = rotations.to_matrix(world_from_older).numpy()
+        lag = np.einsum("nij,nj->ni", turn, self.routes.lag)
+        return lag, turn @ self.routes.spread @ np.swapaxes(turn, 1, 2), np.cross(off, lag)
 
 
 class DrawnSteps:
@@ -77,6 +121,7 @@ class DrawnSteps:
     Args:
         graph: of N nodes and M edges.
         translation: ``(M, 3)`` position of the target in the source's frame, metres.
+        length: ``(M,)`` metres that each edge's variance goes with.
         drawn: the same graph, drawn together into S segments.
         steps: ``(S,)`` their variance, in that of one step.
 
@@ -84,7 +129,9 @@ class DrawnSteps:
         share: ``(M,)`` how much of its segment's variance each edge has; 1 of edges that are part of none.
     """
 
-    def __init__(self, graph: ViewGraph, translation: np.ndarray, drawn: ClosureGraph, steps: np.ndarray) -> None:
+    def __init__(
+        self, graph: ViewGraph, translation: np.ndarray, length: np.ndarray, drawn: ClosureGraph, steps: np.ndarray
+    ) -> None:
         forest, self._num_nodes, self._num_segments = drawn.paths.forest, graph.num_nodes, drawn.num_segments
         node = np.flatnonzero(drawn.paths.hangs_on_odometry)
         segment = drawn.segment_of_edge[forest.parent_edge[node]]
@@ -99,16 +146,20 @@ class DrawnSteps:
         self.share = np.ones(graph.num_edges)
         self.share[self._edge] = of_node - of_parent
         measured_at = np.where(self._is_forward, of_parent, of_node)
-        first, variance = np.append(self._first, len(self._node)), steps[self._segment] * (of_node - of_parent)
-        self._steps = _Steps(first, self._node, self._is_forward, self._is_last, measured_at, variance)
+        first, share = np.append(self._first, len(self._node)), of_node - of_parent
+        variance = steps[self._segment] * share
+        self._steps = _Steps(first, self._node, self._is_forward, self._is_last, measured_at, share, variance)
         older, outside = np.where(self._is_forward, parent, self._node), drawn.view_graph_edge
-        downwards = np.where(graph.source.numpy()[self._edge] == parent, 1.0, -1.0)[:, None]
-        self._measured = older, downwards * ways_by(graph, self._edge, translation[self._edge], older)
+        from_source = graph.source.numpy()[self._edge]
+        stated = ways_by(graph, self._edge, translation[self._edge], older)
+        self._measured = older, np.where(from_source == parent, 1.0, -1.0)[:, None] * stated
+        several = np.flatnonzero(graph.steps.numpy()[self._edge] > 1)
+        onwards = np.where(from_source == older, 1.0, -1.0)[several, None] * stated[several]
+        self._several = _Several.of(graph, self._edge[several], older[several], onwards) if len(several) else None
+        self._where_several = several
         self._outside_is_forward = drawn.is_forward[self._num_segments :, None]
         older = np.where(self._outside_is_forward[:, 0], graph.source.numpy()[outside], graph.target.numpy()[outside])
         self._measured_outside = older, ways_by(graph, outside, translation[outside], older)
-        typical = typical_length(translation, graph.steps.numpy(), graph.is_odometry.numpy())
-        length = lengths_passed(translation, graph.steps.numpy(), typical)
         passed = self._so_far(length[self._edge, None])
         self._passed = self._at_nodes(passed)[:, 0]
         self._length = np.concatenate((self._whole(length[self._edge, None])[:, 0], length[outside]))
@@ -119,7 +170,14 @@ class DrawnSteps:
         count = self._num_segments + len(outside)
         at_source, at_target, bridge = np.empty((count, 3)), np.zeros((count, 3)), np.zeros((count, 3, 3))
         lever, way = np.zeros((self._num_nodes, 3)), np.zeros((self._num_nodes, 3))
-        _walk(turned_back(body_from_world, *self._measured), self._steps, (at_source, at_target, bridge), (lever, way))
+        world = turned_back(body_from_world, *self._measured)
+        lag, spread = np.empty((0, 3)), np.empty((0, 3, 3))
+        if self._several is not None:
+            lag, spread = np.zeros((len(world), 3)), np.zeros((len(world), 3, 3))
+            where = self._where_several
+            lag[where], spread[where], bent = self._several.at(body_from_world)
+            world[where] += np.where(self._is_forward[where, None], bent, -bent)
+        _walk(world, lag, spread, self._steps, (at_source, at_target, bridge), (lever, way))
         at_source[self._num_segments :] = np.where(self._outside_is_forward, outside, 0.0)
         at_target[self._num_segments :] = np.where(self._outside_is_forward, 0.0, outside)
         return Displacements(
@@ -165,6 +223,8 @@ def ways_by(graph: ViewGraph, edge: np.ndarray, translation: np.ndarray, at: np.
 @compiled
 def _walk(
     world: np.ndarray,
+    lag: np.ndarray,
+    spread: np.ndarray,
     steps: _Steps,
     of_segments: tuple[np.ndarray, np.ndarray, np.ndarray],
     at_nodes: tuple[np.ndarray, np.ndarray],
@@ -173,6 +233,7 @@ def _walk(
 
     Args:
         world: ``(P, 3)`` metres, the steps.
+        lag, spread: ``(P, 3)`` and ``(P, 3, 3)`` of those that are several; empty where none is.
         steps: where they stand.
         of_segments: ``(S, 3)`` A and B, ``(S, 3, 3)`` bridges; longer ones are left as they are from there on.
         at_nodes: ``(N, 3)`` levers and ways; those of key nodes are left as they are.
@@ -180,6 +241,7 @@ def _walk(
     at_source, at_target, bridge = of_segments
     lever, way = at_nodes
     passed, arm, d = np.empty(3), np.empty(3), np.empty(3)
+    are_several = len(lag) > 0
     for s in range(len(steps.first) - 1):
         begin, end = steps.first[s], steps.first[s + 1]
         own = at_source[s]
@@ -188,6 +250,9 @@ def _walk(
             for i in range(3):
                 own[i] += (1 - steps.measured_at[p]) * world[p, i]
                 at_target[s, i] += steps.measured_at[p] * world[p, i]
+                if are_several:
+                    own[i] -= steps.share[p] * lag[p, i]
+                    at_target[s, i] += steps.share[p] * lag[p, i]
         passed[:] = 0.0
         arm[:] = 0.0
         for p in range(begin, end):
@@ -196,12 +261,17 @@ def _walk(
                 passed[i] += world[p, i]
                 # What of the way is left where the step was measured.
                 d[i] = own[i] - (passed[i] if steps.is_forward[p] else before)
+                if are_several:
+                    d[i] += lag[p, i]
                 arm[i] += steps.variance[p] * d[i]
             square = d[0] ** 2 + d[1] ** 2 + d[2] ** 2
             for i in range(3):
                 bridge[s, i, i] += steps.variance[p] * square
                 for j in range(3):
                     bridge[s, i, j] -= steps.variance[p] * d[i] * d[j]
+                    if are_several:
+                        bridge[s, i, i] += steps.variance[p] * spread[p, j, j]
+                        bridge[s, i, j] -= steps.variance[p] * spread[p, i, j]
             if not steps.is_last[p]:
                 lever[steps.node[p]] = arm
                 way[steps.node[p]] = passed

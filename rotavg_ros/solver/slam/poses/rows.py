@@ -9,7 +9,7 @@ import torch
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
-from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed, typical_length
+from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed, typical_length, ways_passed
 from rotavg_ros.solver.algebra.small_matrices import inverse_root
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.algebra.sparse.block_system import BlockEquations
@@ -72,14 +72,19 @@ class PoseProblem:
         return np.where(is_odometry[:, None], lengths, np.clip(lengths, -farthest, farthest))
 
     @cached_property
+    def way(self) -> np.ndarray:
+        """``(M,)`` metres, passed along each edge's steps."""
+        return ways_passed(self.lengths, None if self.graph.route is None else self.graph.route.numpy())
+
+    @cached_property
     def typical(self) -> float:
         """Metres, of a step of odometry."""
-        return typical_length(self.lengths, self.graph.steps.numpy(), self.graph.is_odometry.numpy())
+        return typical_length(self.way, self.graph.steps.numpy(), self.graph.is_odometry.numpy())
 
     @cached_property
     def lengths_passed(self) -> np.ndarray:
         """``(M,)`` metres that each edge's variance goes with."""
-        return lengths_passed(self.lengths, self.graph.steps.numpy(), self.typical)
+        return lengths_passed(self.way, self.graph.steps.numpy(), self.typical)
 
     @cached_property
     def bases(self) -> tuple[np.ndarray, np.ndarray]:
@@ -192,8 +197,8 @@ class PoseProblem:
     @cached_property
     def _step_reports(self) -> np.ndarray:
         """``(M,)`` metres, what one step of each edge may have reported: of several, what is left beside usual ones."""
-        length, steps = np.linalg.norm(self.lengths, axis=1), self.graph.steps.numpy()
-        return np.asarray(np.maximum(length - (steps - 1) * self.typical, length / steps))
+        steps = self.graph.steps.numpy()
+        return np.asarray(np.maximum(self.way - (steps - 1) * self.typical, self.way / steps))
 
     @cached_property
     def longest_steps(self) -> np.ndarray:
@@ -309,7 +314,7 @@ class PoseProblem:
     @cached_property
     def drawn_steps(self) -> DrawnSteps:
         """Odometry's, in the order of the segments."""
-        return DrawnSteps(self.graph, self.lengths, self.drawn, self.steps)
+        return DrawnSteps(self.graph, self.lengths, self.lengths_passed, self.drawn, self.steps)
 
     def displacements(self, body_from_world: np.ndarray) -> Displacements:
         """At orientations ``(N, 4)``."""

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rotavg_ros.solver.algebra.odometry_lengths import ways_passed
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.network import SlamCleanNet
@@ -158,7 +159,8 @@ def _travelled(graph: ViewGraph, prepared: Prepared) -> np.ndarray | None:
     """``(N,)`` metres of odometry from each node's root on; None unless all of it is known."""
     if graph.translation is None:
         return None
-    length = torch.linalg.vector_norm(graph.translation, dim=1)
+    route = None if graph.route is None else graph.route.numpy()
+    length = torch.from_numpy(ways_passed(graph.translation.double().numpy(), route))
     if not bool(torch.isfinite(length[graph.is_odometry]).all()):
         return None
     return _from_root(torch.where(graph.is_odometry, length, 0.0), prepared)
