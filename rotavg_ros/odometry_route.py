@@ -4,11 +4,11 @@ Keyframes that no closure touches are marginalised: an edge then says where all 
 ``steps`` how many they were. How they got there matters as well: odometry that errs in turns errs by the squares of all
 turns, not by that of their sum; and a step's translation turns with all that is corrected before it. So an edge keeps
 sums of its steps. With the older end's axes, d_i the i-th step's displacement, P_i = d_1 + … + d_i where it ends, and
-g_i the share of the steps' variance before it,
+g_i the share of the variance before it, where all steps err alike and where they err by the squares of their turns,
 
     lag = Σ g_i d_i ,    spread = the covariance of all P_i, whose mean is  D − lag ,  D = P_n .
 
-and, with W_i the older end's axes seen from the body where step i begins, J_i = W_1 + … + W_{i-1},
+and, with W_i what turns the axes of where step i begins into the older end's, J_i = W_1 + … + W_{i-1},
 
     by_bias = Σ W_i ,    shift_by_bias = Σ [J_i ·] × d_i ,
 
@@ -19,16 +19,38 @@ first order.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 _SYMMETRIC = np.triu_indices(3)
-#: Numbers of an edge: turned, way, lag (3), the upper triangle of spread (6), by_bias (9), shift_by_bias (9).
-ROUTE_COLUMNS = 29
+#: Numbers of an edge: turned, way, by steps and by turns a lag (3) and the upper triangle of its spread (6), by_bias
+#: (9), shift_by_bias (9).
+ROUTE_COLUMNS = 38
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Bend:
+    """How M edges bend and widen where their turns are off, some measure telling where along them that happens.
+
+    Attributes:
+        lag: ``(M, 3)`` metres, Σ g_i d_i; 0 of a single step, which is measured where it begins.
+        spread: ``(M, 3, 3)`` m², the covariance of where the steps end; 0 of a single step.
+    """
+
+    lag: Array
+    spread: Array
+
+    def mixed(self, other: Bend, share: Array) -> Bend:
+        """Where ``(M,)`` of the variance is by another measure."""
+        one, rest = share[:, None], 1 - share[:, None]
+        spread = rest[:, :, None] * self.spread + one[:, :, None] * other.spread
+        return Bend(
+            rest * self.lag + one * other.lag, spread + (one * rest)[:, :, None] * _square(self.lag - other.lag)
+        )
 
 
 @dataclass(frozen=True)
@@ -38,16 +60,16 @@ class Routes:
     Attributes:
         turned: ``(M,)`` rad², the sum of the squares of the steps' turns.
         way: ``(M,)`` metres, the sum of the steps' lengths.
-        lag: ``(M, 3)`` metres, Σ g_i d_i; 0 of a single step, which is measured where it begins.
-        spread: ``(M, 3, 3)`` m², the covariance of where the steps end; 0 of a single step.
+        by_steps: where all steps err alike.
+        by_turns: where they err by the squares of their turns.
         by_bias: ``(M, 3, 3)`` rad per rad a step, how far a bias turned the newer end.
         shift_by_bias: ``(M, 3, 3)`` metres per rad a step, how far it moved it; 0 of a single step.
     """
 
     turned: Array
     way: Array
-    lag: Array
-    spread: Array
+    by_steps: Bend
+    by_turns: Bend
     by_bias: Array
     shift_by_bias: Array
 
@@ -60,59 +82,82 @@ class Routes:
             displacement: ``(M, 3)`` metres, by the older end's axes.
             steps: ``(M,)`` how many they stand for.
         """
-        outer = displacement[:, :, None] * displacement[:, None, :]
         lag = displacement * ((steps - 1) / (2 * steps))[:, None]
-        return cls(
-            turn**2 / steps,
-            np.linalg.norm(displacement, axis=1),
-            lag,
-            outer * np.maximum((steps**2 - 1) / (12 * steps**2), 0.0)[:, None, None],
-            steps[:, None, None] * np.eye(3),
-            -steps[:, None, None] * _cross(lag),
-        )
+        share = np.maximum((steps**2 - 1) / (12 * steps**2), 0.0)
+        bend = Bend(lag, share[:, None, None] * _square(displacement))
+        by_bias = steps[:, None, None] * np.eye(3)
+        shift = -steps[:, None, None] * _cross(lag)
+        return cls(turn**2 / steps, np.linalg.norm(displacement, axis=1), bend, bend, by_bias, shift)
 
     @classmethod
     def known(cls, columns: Array, otherwise: Routes) -> Routes:
-        """As :attr:`columns` ``(M, 29)`` have them, NaN where unknown: there as others."""
-        spread = np.empty((len(columns), 3, 3))
-        spread[:, _SYMMETRIC[0], _SYMMETRIC[1]] = spread[:, _SYMMETRIC[1], _SYMMETRIC[0]] = columns[:, 5:11]
-        by_bias, shift_by_bias = (columns[:, part].reshape(-1, 3, 3) for part in (slice(11, 20), slice(20, 29)))
-        stated = (columns[:, 0], columns[:, 1], columns[:, 2:5], spread, by_bias, shift_by_bias)
-        given = (getattr(otherwise, each.name) for each in fields(otherwise))
-        return cls(*(np.where(np.isnan(own), other, own) for own, other in zip(stated, given, strict=True)))
+        """As :attr:`columns` ``(M, 38)`` have them, NaN where unknown: there as others."""
+        values = np.where(np.isnan(columns), otherwise.columns, columns)
+        by_steps, by_turns = (_bend_of(values[:, part]) for part in (slice(2, 11), slice(11, 20)))
+        by_bias, shift_by_bias = (values[:, part].reshape(-1, 3, 3) for part in (slice(20, 29), slice(29, 38)))
+        return cls(values[:, 0], values[:, 1], by_steps, by_turns, by_bias, shift_by_bias)
+
+    def bent(self, by_turns: Array) -> Bend:
+        """Where ``(M,)`` of the variance goes by the squares of turns."""
+        return self.by_steps.mixed(self.by_turns, by_turns)
 
     @property
     def columns(self) -> Array:
-        """``(M, 29)``."""
-        triangle = self.spread[:, _SYMMETRIC[0], _SYMMETRIC[1]]
+        """``(M, 38)``."""
+        bends = [
+            column
+            for bend in (self.by_steps, self.by_turns)
+            for column in (bend.lag, bend.spread[:, _SYMMETRIC[0], _SYMMETRIC[1]])
+        ]
         of_bias = self.by_bias.reshape(-1, 9), self.shift_by_bias.reshape(-1, 9)
-        return np.column_stack((self.turned, self.way, self.lag, triangle, *of_bias))
+        return np.column_stack((self.turned, self.way, *bends, *of_bias))
 
 
-def joined(parts: Sequence[Routes], steps: Sequence[Array], displacement: Sequence[Array], turn: Array) -> Routes:
+def joined(parts: Sequence[Routes], steps: Sequence[Array], displacement: Array, turn: Array) -> Routes:
     """Of edges of which each goes on where another one ends.
 
     Args:
         parts: of the first and the second.
         steps: ``(M,)`` of each.
-        displacement: ``(M, 3)`` metres of each, by its own older end's axes.
+        displacement: ``(M, 3)`` metres, of the second, by its own older end's axes.
         turn: ``(M, 3, 3)`` from the second's axes to the first's.
     """
-    (first, second), (before, after) = parts, displacement
-    share = steps[0] / (steps[0] + steps[1])
-    lag, after = (np.einsum("mij,mj->mi", turn, vector) for vector in (second.lag, after))
-    apart = before - first.lag - (before + after - lag)
-    one, other = share[:, None], 1 - share[:, None]
-    outer = apart[:, :, None] * apart[:, None, :]
-    spread = one[:, :, None] * first.spread + other[:, :, None] * (turn @ second.spread @ np.swapaxes(turn, 1, 2))
+    first, second = parts
+    after = _turned(turn, displacement)
+
+    def bend(one: Bend, other: Bend, share: Array) -> Bend:
+        """Of which ``(M,)`` of the variance is the first's."""
+        lag = _turned(turn, other.lag)
+        spread = turn @ other.spread @ np.swapaxes(turn, 1, 2)
+        # Both as seen from the first's older end, with what the first's variance does to what comes after it.
+        return Bend(one.lag + after, one.spread).mixed(Bend(lag, spread), 1 - share)
+
+    by_number = steps[0] / (steps[0] + steps[1])
+    turned = first.turned + second.turned
+    by_square = np.divide(first.turned, turned, out=by_number.copy(), where=turned > 0)
     return Routes(
-        first.turned + second.turned,
+        turned,
         first.way + second.way,
-        one * (first.lag + after) + other * lag,
-        spread + (one * other)[:, :, None] * outer,
+        bend(first.by_steps, second.by_steps, by_number),
+        bend(first.by_turns, second.by_turns, by_square),
         first.by_bias + turn @ second.by_bias,
         first.shift_by_bias - _cross(after) @ first.by_bias + turn @ second.shift_by_bias,
     )
+
+
+def _bend_of(columns: Array) -> Bend:
+    """Of ``(M, 9)``."""
+    spread = np.empty((len(columns), 3, 3))
+    spread[:, _SYMMETRIC[0], _SYMMETRIC[1]] = spread[:, _SYMMETRIC[1], _SYMMETRIC[0]] = columns[:, 3:]
+    return Bend(columns[:, :3], spread)
+
+
+def _turned(turn: Array, vector: Array) -> Array:
+    return np.asarray(np.einsum("mij,mj->mi", turn, vector))
+
+
+def _square(vector: Array) -> Array:
+    return np.asarray(vector[:, :, None] * vector[:, None, :])
 
 
 def _cross(vector: Array) -> Array:

@@ -73,8 +73,9 @@ class ViewGraph:
         information: ``(M, 3, 3)`` float64 rad⁻², symmetric positive definite: inverse covariance of the rotation vector
             e in ``target_from_source = exp(e) R_target R_source⁻¹``, an error in the target's frame; NaN where unknown.
             None where no edge has one. Only the SfM profile reads it.
-        route: ``(M, 29)`` float64 :attr:`~rotavg_ros.odometry_route.Routes.columns`, what odometry did between the ends
-            of an edge that several steps were drawn together into; NaN elsewhere, and None where there are none.
+        route: ``(M,)`` int64, the row of ``routes`` that says what odometry did between the ends of an edge that
+            several steps were drawn together into; -1 of others, and None where there are none.
+        routes: ``(R, 38)`` float64, :attr:`~rotavg_ros.odometry_route.Routes.columns`.
     """
 
     num_nodes: int
@@ -88,6 +89,7 @@ class ViewGraph:
     translation: Tensor | None = None
     information: Tensor | None = None
     route: Tensor | None = None
+    routes: Tensor | None = None
 
     @classmethod
     def create(
@@ -173,7 +175,8 @@ class ViewGraph:
         """The same graph on another device; itself if it is there."""
         if self.device == torch.device(device):
             return self
-        return replace(self, **{name: column.to(device) for name, column in self._columns.items()})
+        columns: dict[str, Any] = {name: column.to(device) for name, column in self._columns.items()}
+        return replace(self, routes=None if self.routes is None else self.routes.to(device), **columns)
 
     def select_edges(self, edges: Tensor) -> ViewGraph:
         """The graph of all nodes and the edges chosen by a mask or by indices, in that order."""
@@ -205,10 +208,18 @@ class ViewGraph:
         )
         return replace(self, source=source, target=target, target_from_source=stated, **turned)
 
+    def of_routes(self, part: int | slice) -> Tensor | None:
+        """``(M,)`` or ``(M, …)``, a column of ``routes``, or some, of each edge; NaN where unknown, None if of all."""
+        if self.route is None or self.routes is None or len(self.routes) == 0:
+            return None
+        known = self.route >= 0
+        rows = self.routes[self.route.clamp_min(0), part]
+        return torch.where(known if rows.ndim == 1 else known[:, None], rows, torch.nan)
+
     @property
     def _columns(self) -> dict[str, Any]:
         """What there is of each edge, by name."""
-        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "num_nodes"}
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in {"num_nodes", "routes"}}
         return {name: column for name, column in values.items() if column is not None}
 
     def components(self, edges: Tensor | None = None) -> Tensor:

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros.odometry_route import ROUTE_COLUMNS, Routes, joined
+from rotavg_ros.odometry_route import ROUTE_COLUMNS, Bend, Routes, joined
 
 
 class Way:
@@ -23,16 +23,21 @@ class Way:
         moved = np.array([world[step].apply(displacement[step]) for step in range(count)])
         place = np.cumsum(moved, axis=0)
         self.displacement = place[-1:]
-        lag = np.arange(count) / count @ moved
-        spread = np.cov(place.T, bias=True) if count > 1 else np.zeros((3, 3))
+        square = turn.magnitude() ** 2
+        bends = [_bend(moved, place, weight / weight.sum()) for weight in (np.ones(count), square)]
         by_bias = [np.zeros((3, 3))]
         for step in range(count):
             by_bias.append(by_bias[-1] + world[step].as_matrix())
         shift = sum(-_cross(moved[step]) @ by_bias[step] for step in range(count))
-        turned, way = (turn.magnitude() ** 2).sum(), np.linalg.norm(displacement, axis=1).sum()
-        self.routes = Routes(
-            np.array([turned]), np.array([way]), lag[None], spread[None], by_bias[-1][None], shift[None]
-        )
+        turned, way = square.sum(), np.linalg.norm(displacement, axis=1).sum()
+        self.routes = Routes(np.array([turned]), np.array([way]), *bends, by_bias[-1][None], shift[None])
+
+
+def _bend(moved: np.ndarray, place: np.ndarray, share: np.ndarray) -> Bend:
+    """Of the variance of steps each has a share."""
+    before = np.cumsum(share) - share
+    spread = np.cov(place.T, aweights=share, bias=True) if len(place) > 1 else np.zeros((3, 3))
+    return Bend((before @ moved)[None], spread[None])
 
 
 def _cross(vector: np.ndarray) -> np.ndarray:
@@ -53,7 +58,7 @@ def test_joined_edges_hold_the_sums_of_all_their_steps(seed, first, second):
     found = joined(
         (one.routes, other.routes),
         (one.steps, other.steps),
-        (one.displacement, other.displacement),
+        other.displacement,
         one.end.as_matrix()[None],
     )
     np.testing.assert_allclose(found.columns, whole.routes.columns, atol=1e-9)
@@ -63,7 +68,7 @@ def test_joined_edges_hold_the_sums_of_all_their_steps(seed, first, second):
 def test_steps_that_are_all_alike_are_even(seed, count):
     rng = np.random.default_rng(seed)
     step, angle = rng.normal(size=3), rng.uniform(0.0, 0.3)
-    straight = Way(Rotation.identity(count), np.tile(step, (count, 1)))
+    straight = Way(Rotation.from_rotvec(np.full((count, 3), 1e-12)), np.tile(step, (count, 1)))
     even = Routes.even(np.array([count * angle]), straight.displacement, straight.steps)
     np.testing.assert_allclose(even.columns[:, 1:], straight.routes.columns[:, 1:], atol=1e-9)
     np.testing.assert_allclose(even.turned, count * angle**2)

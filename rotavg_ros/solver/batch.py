@@ -61,7 +61,8 @@ def solve_batch(
 
 def _union(graphs: Sequence[ViewGraph]) -> ViewGraph:
     """All graphs side by side, but for translations and routes, which the SfM profile does not read."""
-    names = [f.name for f in fields(ViewGraph) if f.name not in {"num_nodes", "translation", "information", "route"}]
+    unread = {"num_nodes", "translation", "information", "route", "routes"}
+    names = [f.name for f in fields(ViewGraph) if f.name not in unread]
     columns = {name: [getattr(graph, name) for graph in graphs] for name in names}
     if any(graph.information is not None for graph in graphs):
         columns["information"] = [_information_of(graph) for graph in graphs]

@@ -22,6 +22,7 @@ import torch
 from rotavg_ros import solve
 from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 from rotavg_ros.errors import UserError
+from rotavg_ros.odometry_route import Routes
 from rotavg_ros.online import EstimatorOptions, OnlineEstimator
 from rotavg_ros.online.solver_process import server as server_module
 from rotavg_ros.online.solver_process.client import SolverProcess
@@ -66,6 +67,22 @@ def test_solutions_are_those_of_this_process(process):
         here.device,
         here.warnings,
     )
+
+
+def test_routes_are_told_once_and_again_when_they_change(process, monkeypatch):
+    whole = graph(60)
+    route = torch.full((whole.num_edges,), -1)
+    route[0] = 0
+    even = Routes.even(np.array([0.5]), np.zeros((1, 3)), np.array([3.0])).columns
+    told = []
+    dumps = pickle.dumps
+    monkeypatch.setattr(pickle, "dumps", lambda request, **how: told.append(request.graph) or dumps(request, **how))
+    tables = [torch.from_numpy(even), torch.from_numpy(4 * even)]
+    for table in (tables[0], tables[0], tables[1]):
+        several = replace(whole, route=route, routes=table, steps=torch.where(route >= 0, 3.0, 1.0).double())
+        here, there = solve(several, **OPTIONS), process(several, **OPTIONS)
+        torch.testing.assert_close(here.uncertainty, there.uncertainty, rtol=0, atol=0)
+    assert [isinstance(fields["routes"], str) for fields in told] == [False, True, False]
 
 
 def test_it_remembers_its_last_solution_and_no_other(process):

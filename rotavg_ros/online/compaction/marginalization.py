@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from rotavg_ros import rotations
-from rotavg_ros.odometry_route import Routes, joined
+from rotavg_ros.odometry_route import ROUTE_COLUMNS, Routes, joined
 from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedKeyframes
 from rotavg_ros.online.measurements import OWN_EDGE_ID
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
@@ -52,6 +52,7 @@ class Contraction:
     Attributes:
         kept: ``(N',)`` the nodes that are left, ascending.
         edges: the edges that are left; ends are new nodes.
+        routes: ``(R', 38)`` of some of them.
         last: ``(M',)`` ascending, the last of the edges that each consists of.
         edge_of: ``(M,)`` which edge each has gone into.
         marginalized: those there were, then the new ones.
@@ -59,13 +60,18 @@ class Contraction:
 
     kept: NDArray[np.int64]
     edges: Columns
+    routes: NDArray[np.float64]
     last: NDArray[np.int64]
     edge_of: NDArray[np.int64]
     marginalized: MarginalizedKeyframes
 
 
 def marginalize(
-    keyframes: Columns, edges: Columns, remove: NDArray[np.bool_], marginalized: MarginalizedKeyframes
+    keyframes: Columns,
+    edges: Columns,
+    routes: NDArray[np.float64],
+    remove: NDArray[np.bool_],
+    marginalized: MarginalizedKeyframes,
 ) -> Contraction:
     """Take the nodes of a mask ``(N,)`` out, each of which :func:`are_between` steps and has no other edge.
 
@@ -74,10 +80,11 @@ def marginalize(
     Args:
         keyframes: robot, keyframe_id, stamp_ns, time_line.
         edges: see :data:`Columns`.
+        routes: ``(R, 38)`` of some of them.
         remove: ``(N,)``.
         marginalized: those there are; their edges are renumbered, their poses kept.
     """
-    work = _Work.begin(keyframes, edges, remove, marginalized)
+    work = _Work.begin(keyframes, edges, routes, remove, marginalized)
     while work.round():
         pass
     return work.result()
@@ -88,6 +95,7 @@ class _Work:
     """A contraction under way; edges keep their rows until the end, merged ones live on in the later row."""
 
     edges: Columns
+    routes: NDArray[np.float64]
     riders: Columns
     row_of_node: NDArray[np.int64]
     remove: NDArray[np.bool_]
@@ -101,7 +109,12 @@ class _Work:
 
     @classmethod
     def begin(
-        cls, keyframes: Columns, edges: Columns, remove: NDArray[np.bool_], marginalized: MarginalizedKeyframes
+        cls,
+        keyframes: Columns,
+        edges: Columns,
+        routes: NDArray[np.float64],
+        remove: NDArray[np.bool_],
+        marginalized: MarginalizedKeyframes,
     ) -> _Work:
         nodes = np.flatnonzero(remove)
         new = MarginalizedKeyframes(
@@ -124,6 +137,7 @@ class _Work:
         incident[nodes] = half_edges.reshape(-1, 2) % max(num_edges, 1)
         return cls(
             {name: values.copy() for name, values in edges.items()},
+            routes,
             marginalized.followed_by(new).arrays(),
             row_of_node,
             remove.copy(),
@@ -205,9 +219,10 @@ class _Work:
             "translation": x_in_u.numpy(),
             "precision": precision,
             "steps": steps,
-            "route": _joined(edges, parts, in_order),
+            "route": np.where(in_order, len(self.routes) + np.arange(len(nodes)), -1),
             "edge_id": np.uint64(OWN_EDGE_ID),
         }
+        self.routes = np.concatenate((self.routes, _joined(edges, self.routes, parts)))
         for name, value in values.items():
             edges[name][survivor] = value
 
@@ -241,10 +256,12 @@ class _Work:
         new_node = np.cumsum(~self.remove) - 1
         edges = {name: values[last] for name, values in self.edges.items()}
         edges["source"], edges["target"] = new_node[edges["source"]], new_node[edges["target"]]
+        used, row = np.unique(edges["route"], return_inverse=True)
+        edges["route"] = row - int(len(used) and used[0] < 0)
         riders = MarginalizedKeyframes(**self.riders)
         riders = riders.select(riders.edge >= 0)
         riders.edge[:] = new_edge[edge_of[riders.edge]]
-        return Contraction(kept, edges, last, new_edge[edge_of], riders)
+        return Contraction(kept, edges, self.routes[used[used >= 0]], last, new_edge[edge_of], riders)
 
 
 def _directed(
@@ -261,21 +278,26 @@ def _directed(
 
 
 def _joined(
-    edges: Columns,
-    parts: Sequence[tuple[NDArray[np.int64], torch.Tensor, torch.Tensor]],
-    in_order: NDArray[np.bool_],
+    edges: Columns, known: NDArray[np.float64], parts: Sequence[tuple[NDArray[np.int64], torch.Tensor, torch.Tensor]]
 ) -> NDArray[np.float64]:
-    """``(n, 29)`` what odometry did along pairs of edges; NaN where the nodes are not in the order of time."""
-    routes, steps, displacements, turns = [], [], [], []
+    """``(n, 38)`` what odometry did along pairs of edges, in the order of time.
+
+    Args:
+        edges: all there are.
+        known: ``(R, 38)`` routes.
+        parts: the edges, how their farther ends are turned from their nearer ones, and where these see them.
+    """
+    routes, turns = [], []
     for edge, farther_from_nearer, place in parts:
-        count, displacement = edges["steps"][edge], place.numpy()
         angle = torch.linalg.vector_norm(rotations.log(farther_from_nearer), dim=1).numpy()
-        routes.append(Routes.known(edges["route"][edge], Routes.even(angle, displacement, count)))
-        steps.append(count)
-        displacements.append(displacement)
+        even = Routes.even(angle, place.numpy(), edges["steps"][edge])
+        row = edges["route"][edge]
+        columns = np.full((len(edge), ROUTE_COLUMNS), np.nan)
+        columns[row >= 0] = known[row[row >= 0]]
+        routes.append(Routes.known(columns, even))
         turns.append(rotations.to_matrix(rotations.inverse(farther_from_nearer)).numpy())
-    columns = joined(routes, steps, displacements, turns[0]).columns
-    return np.where(in_order[:, None], columns, np.nan)
+    steps = [edges["steps"][edge] for edge, _, _ in parts]
+    return joined(routes, steps, parts[1][2].numpy(), turns[0]).columns
 
 
 def _place(frame_from_world: torch.Tensor, origin: torch.Tensor, position: torch.Tensor) -> torch.Tensor:

@@ -31,7 +31,7 @@ _EDGE_COLUMNS = {
     "label": (np.int64, None),
     "translation": (np.float64, 3),
     "steps": (np.float64, None),
-    "route": (np.float64, ROUTE_COLUMNS),
+    "route": (np.int64, None),
 }
 _SOLVED_COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
 # Of all keyframes, the share that are the robots' latest and stay whatever happens.
@@ -52,6 +52,7 @@ class GrowingViewGraph:
         self._index: list[KeyframeIndex] = []  # by robot
         self._keyframe = {name: GrowingArray(dtype) for name, dtype in _KEYFRAME_COLUMNS.items()}
         self._edge = {name: GrowingArray(*column) for name, column in _EDGE_COLUMNS.items()}
+        self._routes = np.empty((0, ROUTE_COLUMNS))
 
     @property
     def num_keyframes(self) -> int:
@@ -187,9 +188,9 @@ class GrowingViewGraph:
         place = np.cumsum(~thinning.edges) - 1
         riders = self.marginalized.keyframes
         riders = MarginalizedKeyframes(**(riders.arrays() | {"edge": place[riders.edge]}))
-        contraction = marginalize(
-            keyframes, {name: values[stays] for name, values in edges.items()}, thinning.nodes, riders
-        )
+        left = {name: values[stays] for name, values in edges.items()}
+        contraction = marginalize(keyframes, left, self._routes, thinning.nodes, riders)
+        self._routes = contraction.routes
         for name, keyframe_column in self._keyframe.items():
             keyframe_column.replace(keyframes[name][contraction.kept])
         for name, edge_column in self._edge.items():
@@ -207,8 +208,8 @@ class GrowingViewGraph:
         columns = {name: self._edge[name].view for name in _SOLVED_COLUMNS}
         columns["label"] = columns["label"].copy()
         columns["translation"] = self._edge["translation"].view
-        if (columns["steps"] != 1).any():
-            columns["route"] = self._edge["route"].view
+        if len(self._routes):
+            columns["route"], columns["routes"] = self._edge["route"].view, self._routes
         return GraphSnapshot(
             graph=ViewGraph(self.num_keyframes, **{name: torch.from_numpy(values) for name, values in columns.items()}),
             robots=tuple(self.robots),
@@ -243,14 +244,19 @@ class GrowingViewGraph:
         growing._edge["translation"].extend(snapshot.translation)
         for name in _SOLVED_COLUMNS:
             growing._edge[name].extend(getattr(snapshot.graph, name).numpy())
-        route = snapshot.graph.route
-        unknown = np.full((snapshot.graph.num_edges, ROUTE_COLUMNS), np.nan)
-        growing._edge["route"].extend(unknown if route is None else route.numpy())
+        graph = snapshot.graph
+        unknown = torch.full((graph.num_edges,), -1)
+        growing._edge["route"].extend((unknown if graph.route is None else graph.route).numpy())
+        if graph.routes is not None:
+            growing._routes = graph.routes.numpy()
         marginalized = snapshot.marginalized.keyframes
         _check_rows(growing._keyframe, len(snapshot.robots), "robot")
         _check_rows(growing._edge, growing.num_keyframes, "source", "target")
         if not ((marginalized.edge >= 0) & (marginalized.edge < growing.num_edges)).all():
             raise ValueError("a keyframe on an edge that is not there")
+        route = growing._edge["route"].view
+        if growing._routes.shape[1:] != (ROUTE_COLUMNS,) or not ((route >= -1) & (route < len(growing._routes))).all():
+            raise ValueError("a route that is not there")
         growing._index_anew()
         growing.marginalized = snapshot.marginalized
         growing.revision = snapshot.revision

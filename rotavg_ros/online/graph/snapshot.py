@@ -8,13 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rotavg_ros.odometry_route import ROUTE_COLUMNS
 from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedIndex
 from rotavg_ros.online.measurements import OWN_EDGE_ID
 from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion, Vector
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
-
-UNKNOWN_ROUTE = (math.nan,) * ROUTE_COLUMNS
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +26,7 @@ class GraphEdge:
         precision: rad⁻², NaN unknown.
         translation: of the target in the source's frame, metres; NaN unknown.
         steps: odometry steps that it stands for.
-        route: what they did, :attr:`~rotavg_ros.odometry_route.Routes.columns`; NaN of a single one.
+        route: row of the graph's routes; -1 of a single one.
     """
 
     source: int
@@ -41,7 +38,7 @@ class GraphEdge:
     precision: float = math.nan
     translation: Vector = UNKNOWN_VECTOR
     steps: float = 1.0
-    route: tuple[float, ...] = UNKNOWN_ROUTE
+    route: int = -1
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.online.solver_process.process import ServerProcess, Spawned
-from rotavg_ros.online.solver_process.wire import ABANDON, Advance, Request, from_arrays, to_arrays
+from rotavg_ros.online.solver_process.wire import ABANDON, KNOWN, Advance, Request, from_arrays, to_arrays
 from rotavg_ros.solver import Abandoned, KeptLabels, Solution, stop_if_abandoned
 from rotavg_ros.view_graph import ViewGraph
 
@@ -54,6 +54,7 @@ class SolverProcess:
         self._threads = threads
         self._lock = threading.Lock()
         self._solves = self._first = 0
+        self._routes: Tensor | None = None
         self._begin(process or Spawned())
         atexit.register(self.close)
 
@@ -90,8 +91,9 @@ class SolverProcess:
                 self.close()
                 self._begin(Spawned())
                 self._first = self._solves + 1
+                self._routes = None
             self._solves += 1
-            request = Request(self._solves, to_arrays(graph), None, None, options)
+            request = Request(self._solves, self._told(graph), None, None, options)
             if isinstance(memory, _Remembered) and memory.number >= self._first:
                 request.remembered = memory.number
             elif isinstance(memory, _Remembered | KeptLabels) and (kept := memory.labels) is not None:
@@ -108,6 +110,15 @@ class SolverProcess:
                 with suppress(ValueError):  # the answer is as good without them
                     kept = KeptLabels.of_arrays(graph, labels)
             return replace(solution, memory=_Remembered(request.number, kept))
+
+    def _told(self, graph: ViewGraph) -> dict[str, Any]:
+        """A graph's fields; routes, which change with every thinning only, are told once."""
+        fields = to_arrays(graph)
+        if graph.routes is not None:
+            before, self._routes = self._routes, graph.routes  # kept, so that no other one comes to lie there
+            if before is not None and before.data_ptr() == graph.routes.data_ptr() and len(before) == len(graph.routes):
+                fields["routes"] = KNOWN
+        return fields
 
     def advance(self, memory: object | None, work: float) -> float:
         """See :func:`rotavg_ros.solver.advance`.

@@ -7,12 +7,13 @@ import pickle
 import queue
 import threading
 from multiprocessing.connection import Connection
+from typing import Any
 
 import torch
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import free_memory
-from rotavg_ros.online.solver_process.wire import ABANDON, Advance, Request, from_arrays, to_arrays
+from rotavg_ros.online.solver_process.wire import ABANDON, KNOWN, Advance, Request, from_arrays, to_arrays
 from rotavg_ros.solver import Abandoned, KeptLabels, abandonable, advance, solve
 from rotavg_ros.view_graph import ViewGraph
 
@@ -25,6 +26,7 @@ class Server:
         self._requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._is_abandoned = False
         self._memory: tuple[int, object | None] = (0, None)
+        self._routes: torch.Tensor | None = None
         self._after_work = free_memory.AfterWork()
 
     def run(self) -> None:
@@ -72,7 +74,7 @@ class Server:
     def _solve(self, request: Request) -> dict[str, object]:
         with abandonable(lambda: self._is_abandoned):
             solution = solve(
-                ViewGraph(**from_arrays(request.graph)),
+                self._graph(request.graph),
                 warm_start=None if request.warm_start is None else torch.from_numpy(request.warm_start),
                 memory=self._memory_for(request),
                 **request.options,
@@ -82,6 +84,14 @@ class Server:
         labels: KeptLabels | None = getattr(solution.memory, "labels", None)
         told = {"labels": None if labels is None else labels.arrays(), "remembers": solution.memory is not None}
         return to_arrays(solution) | {"memory": None} | told
+
+    def _graph(self, told: dict[str, Any]) -> ViewGraph:
+        graph = from_arrays(told)
+        if isinstance(graph["routes"], torch.Tensor):
+            self._routes = graph["routes"]
+        elif graph["routes"] == KNOWN:
+            graph["routes"] = self._routes
+        return ViewGraph(**graph)
 
     def _memory_for(self, request: Request) -> object | None:
         number, memory = self._memory

@@ -11,6 +11,8 @@ from torch import Tensor
 
 # In the place of a request: the running solve is not wanted any more.
 ABANDON = b""
+# In the place of a graph's routes: those of the request before.
+KNOWN = "known"
 
 
 @dataclass
@@ -19,7 +21,7 @@ class Request:
 
     Attributes:
         number: counts them.
-        graph: a :class:`ViewGraph`'s fields.
+        graph: a :class:`ViewGraph`'s fields, or :data:`KNOWN` for its routes.
         warm_start: ``(N, 4)``.
         remembered: number of the solve whose memory may be gone on from.
         options: of :func:`rotavg_ros.solve`.

@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.odometry_route import ROUTE_COLUMNS
 from rotavg_ros.online.answer.anchoring import corrections
 from rotavg_ros.online.answer.gauge import is_numbered_by_first_node
 from rotavg_ros.online.answer.last_answer import LastAnswer
@@ -70,8 +69,8 @@ def collect(content: ContentState) -> State:
     marginalized = snapshot.marginalized
     arrays: Arrays = {name: getattr(snapshot, name) for name in _KEYFRAME_COLUMNS}
     arrays |= {name: getattr(snapshot.graph, name).numpy() for name in _GRAPH_COLUMNS}
-    if snapshot.graph.route is not None:
-        arrays["route"] = snapshot.graph.route.numpy()
+    if snapshot.graph.route is not None and snapshot.graph.routes is not None:
+        arrays |= {"route": snapshot.graph.route.numpy(), "routes": snapshot.graph.routes.numpy()}
     arrays["answered"] = np.empty((0, 4)) if last.body_from_world is None else last.body_from_world.numpy()
     labels = _labels(content)
     # Without labels the next answer begins with nothing, and not with the last one.
@@ -191,12 +190,10 @@ def _graph(arrays: Arrays, header: dict[str, Any]) -> GrowingViewGraph:
     columns: dict[str, Any] = {name: arrays[name] for name in _GRAPH_COLUMNS}
     checked = ViewGraph.create(num_nodes=len(arrays["keyframe_id"]), **columns)
     as_saved = torch.from_numpy(arrays["target_from_source"])  # the check may have rounded it
-    route = torch.from_numpy(arrays["route"]) if "route" in arrays else None
-    if route is not None and route.shape != (checked.num_edges, ROUTE_COLUMNS):
-        raise ValueError("a route of another number of edges")
+    routes: dict[str, Any] = {name: torch.from_numpy(arrays[name]) for name in ("route", "routes") if name in arrays}
     return GrowingViewGraph.from_snapshot(
         GraphSnapshot(
-            graph=replace(checked, target_from_source=as_saved, route=route),
+            graph=replace(checked, target_from_source=as_saved, **routes),
             robots=tuple(header["robots"]),
             marginalized=MarginalizedIndex.of(
                 MarginalizedKeyframes(**_with_prefix(_MARGINALIZED, arrays)), dict(header["forgotten_up_to"])

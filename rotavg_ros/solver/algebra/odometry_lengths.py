@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 _SHORTEST_STEP = 0.05
 
 
-def ways_passed(translation: NDArray[np.float64], route: NDArray[np.float64] | None) -> NDArray[np.float64]:
+def ways_passed(translation: NDArray[np.float64], along: NDArray[np.float64] | None) -> NDArray[np.float64]:
     """``(M,)`` metres from end to end of edges, or along the steps that they were drawn together from, where known.
 
     Args:
         translation: ``(M, 3)`` metres.
-        route: ``(M, 29)``, see :attr:`~rotavg_ros.view_graph.ViewGraph.route`.
+        along: ``(M,)`` metres along the steps, NaN where unknown.
     """
     straight = np.linalg.norm(translation, axis=1)
-    return np.asarray(straight if route is None else np.fmax(straight, route[:, 1]))
+    return np.asarray(straight if along is None else np.fmax(straight, along))
 
 
 def typical_length(way: NDArray[np.float64], steps: NDArray[np.float64], is_odometry: NDArray[np.bool_]) -> float:

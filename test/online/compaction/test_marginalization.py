@@ -21,6 +21,7 @@ from rotavg_ros.online.compaction.marginalized_keyframes import MarginalizedInde
 from rotavg_ros.solver import solve
 from rotavg_ros.view_graph import ViewGraph
 
+NO_ROUTES = np.empty((0, ROUTE_COLUMNS))
 COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
 
 
@@ -29,7 +30,7 @@ def columns_of(graph: ViewGraph) -> Columns:
     return edges | {
         "edge_id": np.arange(graph.num_edges, dtype=np.uint64),
         "translation": np.zeros((graph.num_edges, 3)) if graph.translation is None else graph.translation.numpy(),
-        "route": np.full((graph.num_edges, ROUTE_COLUMNS), np.nan),
+        "route": np.full(graph.num_edges, -1),
     }
 
 
@@ -91,11 +92,11 @@ def test_what_is_left_is_the_schur_complement_and_true_to_the_poses(drive, seed)
     rng = np.random.default_rng(seed)
     count = len(position)
     full, nodes = laplacian(count, edges), np.arange(count)
-    ids, riders = keyframes_of(count), MarginalizedKeyframes.none()
+    ids, routes, riders = keyframes_of(count), NO_ROUTES, MarginalizedKeyframes.none()
     for _ in range(2):  # the second time there are marginalised keyframes already
         free = can_be_marginalized(len(nodes), edges)
-        done = marginalize(ids, edges, free & (rng.random(len(nodes)) < 0.7), riders)
-        nodes, edges, riders = nodes[done.kept], done.edges, done.marginalized
+        done = marginalize(ids, edges, routes, free & (rng.random(len(nodes)) < 0.7), riders)
+        nodes, edges, routes, riders = nodes[done.kept], done.edges, done.routes, done.marginalized
         ids = {name: values[done.kept] for name, values in ids.items()}
     gone = np.setdiff1d(np.arange(count), nodes)
     schur = full[np.ix_(nodes, nodes)]
@@ -134,9 +135,9 @@ def test_the_solver_says_the_same_of_those_that_are_left(method, relative, score
     edges = columns_of(graph)
     remove = can_be_marginalized(600, edges)
     assert remove.sum() > 300
-    done = marginalize(keyframes_of(600), edges, remove, MarginalizedKeyframes.none())
+    done = marginalize(keyframes_of(600), edges, NO_ROUTES, remove, MarginalizedKeyframes.none())
     left = ViewGraph.create(**{name: done.edges[name] for name in COLUMNS}, num_nodes=len(done.kept))
-    left = replace(left, route=torch.from_numpy(done.edges["route"]))
+    left = replace(left, route=torch.from_numpy(done.edges["route"]), routes=torch.from_numpy(done.routes))
     full, small = solve(graph, method=method), solve(left, method=method)
     turned = Rotation.from_quat(small.body_from_world) * Rotation.from_quat(full.body_from_world[done.kept]).inv()
     assert np.degrees(turned.magnitude().max()) < 1e-5
@@ -150,11 +151,11 @@ def contracted(graph: ViewGraph) -> tuple[ViewGraph, np.ndarray]:
     """Without the keyframes that no closure touches; and which are left."""
     edges = columns_of(graph)
     remove = can_be_marginalized(graph.num_nodes, edges)
-    done = marginalize(keyframes_of(graph.num_nodes), edges, remove, MarginalizedKeyframes.none())
+    done = marginalize(keyframes_of(graph.num_nodes), edges, NO_ROUTES, remove, MarginalizedKeyframes.none())
     left = ViewGraph.create(
         **{name: done.edges[name] for name in COLUMNS}, translation=done.edges["translation"], num_nodes=len(done.kept)
     )
-    return replace(left, route=torch.from_numpy(done.edges["route"])), done.kept
+    return replace(left, route=torch.from_numpy(done.edges["route"]), routes=torch.from_numpy(done.routes)), done.kept
 
 
 @pytest.mark.parametrize(

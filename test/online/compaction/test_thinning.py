@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros import rotations
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, SlamSimulationConfig, simulate_slam_graph
+from rotavg_ros.datasets.simulation.stress.kinds import KINDS
 from rotavg_ros.datasets.simulation.trajectories import World
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
 from rotavg_ros.online.graph import room
@@ -221,6 +222,43 @@ def test_a_long_drive_with_a_limit_is_hardly_less_accurate():
     drift = Rotation.from_quat(run.odometry_world_from_body) * truth.inv()
     drifted = np.degrees((drift[kept] * drift[0].inv()).magnitude().mean())
     assert limited < 1.5 * free + 0.2 and limited < 0.2 * drifted
+
+
+def test_keyframes_that_no_closure_touches_are_not_missed(tmp_path):
+    """With translations, and odometry that errs in turns; nor once the state was saved and loaded."""
+    drawn = next(kind for kind in KINDS if kind.name == "hills: odometry worse in turns").drawn(3)
+    graph, place = drawn.graph, drawn.edge_translation
+    source, target = graph.source.numpy(), graph.target.numpy()
+    is_odometry = graph.is_odometry.numpy()
+    # The rotations that odometry's own rounding leaves, in messages of poses.
+    pose = [Rotation.identity()]
+    position = [np.zeros(3)]
+    for edge in np.flatnonzero(is_odometry):
+        assert target[edge] == source[edge] + 1 == len(pose)
+        position.append(position[-1] + pose[-1].apply(place[edge]))
+        pose.append(pose[-1] * Rotation.from_quat(graph.target_from_source[edge].numpy()).inv())
+    estimator = OnlineEstimator(EVERY_MESSAGE)
+    for index, orientation in enumerate(pose):
+        estimator.add_odometry("r", index * SECOND, orientation.as_quat().tolist(), position[index])
+    for edge in np.flatnonzero(~is_odometry).tolist():
+        ends = (KeyframeReference("r", int(end[edge])) for end in (source, target))
+        measured = graph.target_from_source[edge].tolist()
+        assert (
+            estimator.add_edge(EdgeMeasurement(edge, *ends, measured, translation=tuple(place[edge].tolist()))) is None
+        )
+    all_of_them = estimator.tick(force_cold=True)
+    estimator.set_options(replace(EVERY_MESSAGE, max_keyframes=350))
+    estimator.add_odometry("r", len(pose) * SECOND, pose[-1].as_quat().tolist(), position[-1])
+    counts = estimator.counts()
+    assert counts.marginalized > 100 and counts.dropped_closures == 0
+    estimator.save(tmp_path / "state")
+    estimator = OnlineEstimator(replace(EVERY_MESSAGE, max_keyframes=350))
+    estimator.load(tmp_path / "state")
+    few = estimator.tick(force_cold=True)
+    known = few.keyframe_id < len(pose)
+    at = few.keyframe_id[known].astype(int)
+    off = Rotation.from_quat(few.world_from_body[known]) * Rotation.from_quat(all_of_them.world_from_body[at]).inv()
+    assert (off.magnitude()[1:] / all_of_them.uncertainty[at][1:]).max() < 0.15
 
 
 def test_fingerprints_hold_the_newest_and_forget_the_oldest():

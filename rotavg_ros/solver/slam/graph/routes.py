@@ -22,7 +22,23 @@ def routes_of(graph: ViewGraph, edge: np.ndarray, older: np.ndarray, displacemen
     some = torch.from_numpy(edge)
     turn = torch.linalg.vector_norm(rotations.log(graph.target_from_source[some]), dim=1).double()
     even = Routes.even(turn.numpy(), displacement, graph.steps[some].numpy())
-    if graph.route is None:
+    stated = graph.select_edges(some).of_routes(slice(None))
+    if stated is None:
         return even
     is_lower = older == torch.minimum(graph.source[some], graph.target[some]).numpy()
-    return Routes.known(np.where(is_lower[:, None], graph.route[some].numpy(), np.nan), even)
+    return Routes.known(np.where(is_lower[:, None], stated.numpy(), np.nan), even)
+
+
+def turned_along(graph: ViewGraph) -> np.ndarray | None:
+    """``(M,)`` rad², sums of the squares of the steps' turns; NaN where unknown."""
+    return _column(graph, 0)
+
+
+def way_along(graph: ViewGraph) -> np.ndarray | None:
+    """``(M,)`` metres, along the steps; NaN where unknown."""
+    return _column(graph, 1)
+
+
+def _column(graph: ViewGraph, number: int) -> np.ndarray | None:
+    column = graph.of_routes(number)
+    return None if column is None else np.asarray(column.numpy())

@@ -134,18 +134,26 @@ def without_bias(graph: ViewGraph, bias: np.ndarray) -> ViewGraph:
     backwards = rotations.multiply(rotations.inverse(turn), measured)
     corrected = torch.where(graph.is_odometry[:, None], torch.where(is_forward, forwards, backwards), measured)
     unbiased = replace(graph, target_from_source=rotations.canonical(rotations.normalize(corrected)))
-    if graph.route is not None:
+    if graph.routes is not None:
         onwards = torch.where(is_forward, measured, rotations.inverse(measured))
-        mean = by_bias / graph.steps[:, None]
-        less = (by_bias * mean - 2 * mean * rotations.log(onwards)).sum(dim=1)
-        turned = (graph.route[:, 0] + less).clamp_min(0)
-        unbiased = replace(unbiased, route=torch.cat((turned[:, None], graph.route[:, 1:]), dim=1))
+        unbiased = replace(unbiased, routes=_turning_less(graph, onwards, by_bias))
     if graph.translation is None:
         return unbiased
     by_older = torch.where(is_forward, graph.translation, rotations.rotate(measured, graph.translation))
     by_older = by_older + torch.where(is_forward, shift, -shift)
     seen = torch.where(is_forward, by_older, rotations.rotate(rotations.inverse(corrected), by_older))
     return replace(unbiased, translation=torch.where(graph.is_odometry[:, None], seen, graph.translation))
+
+
+def _turning_less(graph: ViewGraph, onwards: torch.Tensor, by_bias: torch.Tensor) -> torch.Tensor:
+    """Routes ``(R, 38)`` of edges whose turns, from older to newer ends ``(M, 4)``, ``(M, 3)`` rad is taken out of."""
+    assert graph.route is not None and graph.routes is not None
+    known = torch.nonzero(graph.route >= 0).squeeze(1)
+    by_bias, mean = by_bias[known], by_bias[known] / graph.steps[known, None]
+    less = (by_bias * mean - 2 * mean * rotations.log(onwards[known])).sum(dim=1)
+    routes, row = graph.routes.clone(), graph.route[known]
+    routes[row, 0] = (routes[row, 0] + less).clamp_min(0)
+    return routes
 
 
 def _routes(graph: ViewGraph, edge: np.ndarray, older: np.ndarray) -> Routes:

@@ -7,6 +7,7 @@ from scipy.special import expit
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root
+from rotavg_ros.solver.slam.graph.routes import turned_along
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -45,7 +46,5 @@ def squared_turns(graph: ViewGraph, forest: SpanningForest, step_variance: float
 def _of_edges(graph: ViewGraph) -> np.ndarray:
     """``(M,)`` rad², sums over the steps that each edge stands for; as if all turned alike where it does not say."""
     even = ((rotations.log(graph.target_from_source) ** 2).sum(dim=1) / graph.steps).numpy()
-    if graph.route is None:
-        return np.asarray(even)
-    known = graph.route[:, 0].numpy()
-    return np.where(np.isnan(known), even, known)
+    known = turned_along(graph)
+    return np.asarray(even if known is None else np.where(np.isnan(known), even, known))

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from rotavg_ros import rotations
-from rotavg_ros.odometry_route import Routes
+from rotavg_ros.odometry_route import Bend
 from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.quaternion_rows import turned_back
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
@@ -82,23 +82,23 @@ class _Several:
     Attributes:
         older, newer: ``(n,)`` their ends.
         newer_from_older: ``(n, 4)`` as measured.
-        routes: what odometry did there.
+        bend: by the older ends' axes.
     """
 
     older: np.ndarray
     newer: np.ndarray
     newer_from_older: torch.Tensor
-    routes: Routes
+    bend: Bend
 
     @classmethod
-    def of(cls, graph: ViewGraph, edge: np.ndarray, older: np.ndarray, displacement: np.ndarray) -> _Several:
-        """Of edges ``(n,)``; their older ends ``(n,)``, and by their axes ``(n, 3)`` metres to the newer ones."""
+    def of(cls, graph: ViewGraph, edge: np.ndarray, older: np.ndarray, bend: Bend) -> _Several:
+        """Of edges ``(n,)`` with their older ends ``(n,)``."""
         source, target = graph.source.numpy()[edge], graph.target.numpy()[edge]
         measured = graph.target_from_source[edge].double()
         from_source = source == older
         onwards = torch.where(torch.from_numpy(from_source)[:, None], measured, rotations.inverse(measured))
         newer = np.where(from_source, target, source)
-        return cls(older, newer, onwards, routes_of(graph, edge, older, displacement))
+        return cls(older, newer, onwards, bend)
 
     def at(self, body_from_world: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Lags ``(n, 3)`` and spreads ``(n, 3, 3)`` by the world's axes, at orientations ``(N, 4)``.
@@ -111,8 +111,8 @@ class _Several:
         along = rotations.multiply(world_from_older, rotations.inverse(self.newer_from_older))
         off = rotations.log(rotations.multiply(world_from_newer, rotations.inverse(along))).numpy()
         turn = rotations.to_matrix(world_from_older).numpy()
-        lag = np.einsum("nij,nj->ni", turn, self.routes.lag)
-        return lag, turn @ self.routes.spread @ np.swapaxes(turn, 1, 2), np.cross(off, lag)
+        lag = np.einsum("nij,nj->ni", turn, self.bend.lag)
+        return lag, turn @ self.bend.spread @ np.swapaxes(turn, 1, 2), np.cross(off, lag)
 
 
 class DrawnSteps:
@@ -124,13 +124,20 @@ class DrawnSteps:
         length: ``(M,)`` metres that each edge's variance goes with.
         drawn: the same graph, drawn together into S segments.
         steps: ``(S,)`` their variance, in that of one step.
+        by_turns: ``(M,)`` how much of each edge's variance goes by the squares of its turns.
 
     Attributes:
         share: ``(M,)`` how much of its segment's variance each edge has; 1 of edges that are part of none.
     """
 
     def __init__(
-        self, graph: ViewGraph, translation: np.ndarray, length: np.ndarray, drawn: ClosureGraph, steps: np.ndarray
+        self,
+        graph: ViewGraph,
+        translation: np.ndarray,
+        length: np.ndarray,
+        drawn: ClosureGraph,
+        steps: np.ndarray,
+        by_turns: np.ndarray,
     ) -> None:
         forest, self._num_nodes, self._num_segments = drawn.paths.forest, graph.num_nodes, drawn.num_segments
         node = np.flatnonzero(drawn.paths.hangs_on_odometry)
@@ -155,8 +162,11 @@ class DrawnSteps:
         self._measured = older, np.where(from_source == parent, 1.0, -1.0)[:, None] * stated
         several = np.flatnonzero(graph.steps.numpy()[self._edge] > 1)
         onwards = np.where(from_source == older, 1.0, -1.0)[several, None] * stated[several]
-        self._several = _Several.of(graph, self._edge[several], older[several], onwards) if len(several) else None
-        self._where_several = several
+        self._where_several, self._several = several, None
+        if len(several):
+            edge = self._edge[several]
+            bend = routes_of(graph, edge, older[several], onwards).bent(by_turns[edge])
+            self._several = _Several.of(graph, edge, older[several], bend)
         self._outside_is_forward = drawn.is_forward[self._num_segments :, None]
         older = np.where(self._outside_is_forward[:, 0], graph.source.numpy()[outside], graph.target.numpy()[outside])
         self._measured_outside = older, ways_by(graph, outside, translation[outside], older)

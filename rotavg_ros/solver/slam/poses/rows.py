@@ -15,6 +15,7 @@ from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.algebra.sparse.block_system import BlockEquations
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
+from rotavg_ros.solver.slam.graph.routes import way_along
 from rotavg_ros.solver.slam.poses.closures import ANYHOW, NOTHING, Told
 from rotavg_ros.solver.slam.poses.displacements import Displacements, DrawnSteps
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
@@ -74,7 +75,7 @@ class PoseProblem:
     @cached_property
     def way(self) -> np.ndarray:
         """``(M,)`` metres, passed along each edge's steps."""
-        return ways_passed(self.lengths, None if self.graph.route is None else self.graph.route.numpy())
+        return ways_passed(self.lengths, way_along(self.graph))
 
     @cached_property
     def typical(self) -> float:
@@ -314,7 +315,8 @@ class PoseProblem:
     @cached_property
     def drawn_steps(self) -> DrawnSteps:
         """Odometry's, in the order of the segments."""
-        return DrawnSteps(self.graph, self.lengths, self.lengths_passed, self.drawn, self.steps)
+        by_turns = self.mode.problem.by_turns(self.mode.state.noise)
+        return DrawnSteps(self.graph, self.lengths, self.lengths_passed, self.drawn, self.steps, by_turns)
 
     def displacements(self, body_from_world: np.ndarray) -> Displacements:
         """At orientations ``(N, 4)``."""

@@ -238,6 +238,18 @@ class Problem:
         drawn = self.graph if noise.turn_share == 0 else self.graph.passing(steps + noise.turn_share * (turns - steps))
         return drawn if self.relative is None else drawn.varying(self.relative)
 
+    def by_turns(self, noise: Noise) -> np.ndarray:
+        """``(M,)`` how much of the variance of odometry's edges goes by the squares of their turns under ``noise``."""
+        forest, share = self.graph.paths.forest, noise.turn_share
+        out = np.zeros(len(self.graph.segment_of_edge))
+        if share == 0:
+            return out
+        child = np.flatnonzero(forest.parent_edge >= 0)
+        steps, turns = self._passed[:2, child] - self._passed[:2, forest.parent[child]]
+        total = (1 - share) * steps + share * turns
+        out[forest.parent_edge[child]] = np.divide(share * turns, total, out=np.zeros_like(total), where=total > 0)
+        return out
+
     @cached_property
     def turns_vary(self) -> bool:
         """Whether some odometry turns more than other."""

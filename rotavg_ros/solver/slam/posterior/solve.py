@@ -12,6 +12,7 @@ from torch import Tensor
 from rotavg_ros.solver.algebra.odometry_lengths import ways_passed
 from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.running.work import spend
+from rotavg_ros.solver.slam.graph.routes import way_along
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.noise.turns import squared_turns
@@ -159,8 +160,7 @@ def _travelled(graph: ViewGraph, prepared: Prepared) -> np.ndarray | None:
     """``(N,)`` metres of odometry from each node's root on; None unless all of it is known."""
     if graph.translation is None:
         return None
-    route = None if graph.route is None else graph.route.numpy()
-    length = torch.from_numpy(ways_passed(graph.translation.double().numpy(), route))
+    length = torch.from_numpy(ways_passed(graph.translation.double().numpy(), way_along(graph)))
     if not bool(torch.isfinite(length[graph.is_odometry]).all()):
         return None
     return _from_root(torch.where(graph.is_odometry, length, 0.0), prepared)
