@@ -16,7 +16,8 @@ def ways_passed(translation: NDArray[np.float64], along: NDArray[np.float64] | N
         translation: ``(M, 3)`` metres.
         along: ``(M,)`` metres along the steps, NaN where unknown.
     """
-    straight = np.linalg.norm(translation, axis=1)
+    with np.errstate(over="ignore"):  # a closure may state anything
+        straight = np.linalg.norm(translation, axis=1)
     return np.asarray(straight if along is None else np.fmax(straight, along))
 
 
