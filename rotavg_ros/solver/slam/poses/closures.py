@@ -162,12 +162,14 @@ class Scale:
         own: ``(C,)`` what of that it does not share with its run.
         floor_share: ``(C,)`` the share of its own which does not go with its length.
         extent: how far two places of the map are apart.
+        anywhere: ``(C,)`` how far a wrong one leads: to any place of the map, or as far as it states.
     """
 
     good: np.ndarray
     own: np.ndarray
     floor_share: np.ndarray
     extent: float
+    anywhere: np.ndarray
 
     @cached_property
     def closure(self) -> float:

@@ -289,7 +289,8 @@ class _System:
         rotation = told + good_turn - false_turn
         if m == 0:
             return rotation, rotation
-        anywhere = covariance[:, k:, k:] + linear.extent * np.eye(m)
+        extent = np.maximum(linear.extent, (self.displacement[which] ** 2).sum(axis=1) / m)
+        anywhere = covariance[:, k:, k:] + extent[:, None, None] * np.eye(m)
         false_place = _log_normal(mean[:, k:], anywhere, 1)
         both = told + _log_normal(mean, covariance, 1) - false_turn - false_place
         return np.where(self.is_known[which], both, rotation), rotation

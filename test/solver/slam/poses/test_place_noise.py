@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from rotavg_ros import ViewGraph, solve
+from rotavg_ros import ViewGraph, rotations, solve
+from rotavg_ros.evaluation.common.cases import drawings
+from rotavg_ros.evaluation.slam import stress
 from rotavg_ros.solver.slam.poses.closures import Scale
 from rotavg_ros.solver.slam.poses.places.judge import Judge
 from rotavg_ros.solver.slam.poses.repeats.neighbours import wrong_share
@@ -42,6 +44,32 @@ def test_one_absurd_closure_is_flagged_and_no_other(metres: float) -> None:
     assert torch.equal(flagged, expected)
     assert answer.rotation_score is not None and answer.rotation_score[good] < 0.5
     assert errors(run, answer)[1] < 0.3
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [("building: 30 % random", 3), ("building: 15 closures", 4), ("drive: 26 closures, 16 agree with noise", 3)],
+)
+def test_a_false_closure_moves_nothing_however_far_it_leads(kind: str, seed: int) -> None:
+    graph = next(drawings(stress.kinds((kind,), translations=True), [seed])).graph
+    assert graph.translation is not None
+    without = solve(graph)
+    ends = torch.tensor([graph.num_nodes // 5]), torch.tensor([4 * graph.num_nodes // 5])
+    rotation = rotations.exp(torch.tensor([[0.0, 0.0, 1.2]], dtype=torch.float64))
+    for metres in (50.0, 1e3, 1e6):
+        more = ViewGraph.create(
+            torch.cat((graph.source, ends[0])),
+            torch.cat((graph.target, ends[1])),
+            torch.cat((graph.target_from_source, rotation)),
+            num_nodes=graph.num_nodes,
+            kind=torch.cat((graph.kind, torch.tensor([1]))),
+            precision=torch.cat((graph.precision, torch.tensor([torch.nan], dtype=torch.float64))),
+            translation=torch.cat((graph.translation, torch.tensor([[metres, 0.0, 0.0]], dtype=torch.float64))),
+        )
+        answer = solve(more)
+        assert answer.outlier_score[-1] > 0.99
+        off = rotations.angle_between(answer.body_from_world, without.body_from_world)
+        assert (off[1:] / without.uncertainty[1:]).max() < 0.02
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -101,7 +129,7 @@ def test_before_any_solve_as_many_places_may_be_wrong_as_is_believed_beforehand(
     problem = pose_mode(graph_of(simulated(1))).problem
     count = len(problem.closures)
     judge = Judge(problem.told, problem.turns, problem.priors)
-    scale = Scale(np.ones(count), np.ones(count), np.ones(count), 100.0)
+    scale = Scale(np.ones(count), np.ones(count), np.ones(count), 100.0, np.full(count, 100.0))
     places = judge.nothing_known(np.ones(count, dtype=bool), np.zeros(count), scale)
     wrong = problem.priors.wrong_place / problem.priors.counted
     np.testing.assert_allclose(wrong_share(places.chance, problem.told, problem.priors), wrong)

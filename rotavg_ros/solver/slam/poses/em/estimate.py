@@ -187,7 +187,10 @@ def _nothing_known(problem: PoseProblem, state: PoseState, judge: Judge) -> Plac
 def _scale(problem: PoseProblem, state: PoseState) -> Scale:
     spread = float(np.var(state.position @ problem.bases[1], axis=0).mean())
     good, own = problem.closure_variance(state.noise), problem.own_variance(state.noise)
-    return Scale(good, own, state.noise.closure / own, 2 * spread + (_LEAST_EXTENT * problem.typical) ** 2)
+    extent = 2 * spread + (_LEAST_EXTENT * problem.typical) ** 2
+    # What a closure states may be absurd: no Gaussian of the map's extent would tell its classes from each other.
+    stated = (problem.lengths[problem.closures] ** 2).sum(axis=1) / problem.shifts
+    return Scale(good, own, state.noise.closure / own, extent, np.maximum(extent, stated))
 
 
 def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.ndarray) -> Predictions:

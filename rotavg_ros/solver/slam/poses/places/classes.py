@@ -79,7 +79,7 @@ class Said:
     def log_anywhere(self) -> np.ndarray:
         """``(C,)`` nats, of shifts that lead anywhere on the map."""
         along, spread = self.anywhere
-        return log_normal(along, spread + self.scale.extent)
+        return log_normal(along, spread + self.scale.anywhere[:, None])
 
     @cached_property
     def log_in_place(self) -> np.ndarray:
@@ -96,19 +96,18 @@ class Said:
             np.concatenate((of_classes, anywhere[None]))
             for of_classes, anywhere in zip((self.along, self.spread), self.anywhere, strict=True)
         )
-        extent = np.full((1, along.shape[1]), self.scale.extent)
-        variance = np.concatenate((self.variance, extent))[:, :, None]
+        variance = np.concatenate((self.variance, self.scale.anywhere[None]))[:, :, None]
         total = spread + variance
         mean, shrunk = variance * along / total, variance * spread / total
         return np.sqrt(over_components(mean**2)), over_components(shrunk) / shrunk.shape[2]
 
 
 def _variances(scale: Scale, priors: PlacePriors) -> np.ndarray:
-    """``(J, C)`` m² per component: of wrong places from the least that they are off by to the map's extent."""
+    """``(J, C)`` m² per component: of wrong places from the least that they are off by to the farthest."""
     good = scale.own * np.array([[1.0], [priors.tail_ratio]])
     least = min(priors.least_wrong**2 * scale.closure, scale.extent)
-    wrong = scale.extent * (least / scale.extent) ** np.linspace(1.0, 0.0, WRONG)
-    return np.concatenate((good, np.broadcast_to(np.append(wrong, scale.extent)[:, None], (ELSEWHERE, good.shape[1]))))
+    wrong = scale.anywhere * (least / scale.anywhere) ** np.linspace(1.0, 0.0, WRONG)[:, None]
+    return np.concatenate((good, wrong, scale.anywhere[None]))
 
 
 def log_normal(off: np.ndarray, variance: np.ndarray) -> np.ndarray:
