@@ -162,11 +162,7 @@ def contracted(graph: ViewGraph) -> tuple[ViewGraph, np.ndarray]:
     ("kind", "translations", "sigmas"),
     [
         ("grid: odometry worse in turns", False, 0.15),
-        ("hills: odometry worse in turns", False, 0.15),
-        ("drive: 26 closures, 16 agree with noise", False, 0.02),
         ("drive: 26 closures, 16 agree with noise", True, 0.03),
-        ("hills: 30 % random", True, 0.02),
-        ("hills: gyroscope bias, 30 % random", False, 0.02),
         ("hills: gyroscope bias, 30 % random", True, 0.05),
         ("building: odometry worse in turns", True, 0.3),
     ],

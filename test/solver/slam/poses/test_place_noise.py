@@ -46,17 +46,14 @@ def test_one_absurd_closure_is_flagged_and_no_other(metres: float) -> None:
     assert errors(run, answer)[1] < 0.3
 
 
-@pytest.mark.parametrize(
-    ("kind", "seed"),
-    [("building: 30 % random", 3), ("building: 15 closures", 4), ("drive: 26 closures, 16 agree with noise", 3)],
-)
+@pytest.mark.parametrize(("kind", "seed"), [("building: 30 % random", 3), ("building: 15 closures", 4)])
 def test_a_false_closure_moves_nothing_however_far_it_leads(kind: str, seed: int) -> None:
     graph = next(drawings(stress.kinds((kind,), translations=True), [seed])).graph
     assert graph.translation is not None
     without = solve(graph)
     ends = torch.tensor([graph.num_nodes // 5]), torch.tensor([4 * graph.num_nodes // 5])
     rotation = rotations.exp(torch.tensor([[0.0, 0.0, 1.2]], dtype=torch.float64))
-    for metres in (50.0, 1e3, 1e6):
+    for metres in (50.0, 1e6):
         more = ViewGraph.create(
             torch.cat((graph.source, ends[0])),
             torch.cat((graph.target, ends[1])),
