@@ -16,7 +16,8 @@ def squared_turns(graph: ViewGraph, forest: SpanningForest, step_variance: float
 
     What is measured of a step's turn has its noise in it, and the steps that err by most would seem to be those that
     turn by most. So a step counts as its neighbours turn, but for the probability that it turns by something else:
-    that its turn is any up to half a turn, not theirs with the noise of all, with even odds beforehand.
+    that its turn is any up to half a turn, not theirs with the noise of all, with even odds beforehand. Of an
+    edge that several were drawn together into, all are alike.
 
     Args:
         graph: N nodes.
