@@ -76,7 +76,9 @@ def test_silence_refusals_and_contradictions_are_warned_of_and_pass(live_node) -
 def test_a_solver_that_fails_or_hangs_stops_nothing_else(live_node, tmp_path: Path) -> None:
     order = tmp_path / "order"
     order.write_text("work")
-    live_node.start(*EVERY_MESSAGE, "solver_process:=false", command=[sys.executable, "-c", SABOTAGED, order])
+    # A period that no solve exceeds on a busy machine, which would be warned of for a minute.
+    options = (*EVERY_MESSAGE, "solver_process:=false", "solve_period_s:=2.0")
+    live_node.start(*options, command=[sys.executable, "-c", SABOTAGED, order])
     live_node.turn(0, 10)
     live_node.wait_for_silence()
     order.write_text("fail")
