@@ -82,7 +82,7 @@ def fit_positions(
     component, roots = _components(num_nodes, source, target)
     step = Rotation.from_quat(world_from_body[source]).apply(edges.translation) if len(source) else np.empty((0, 3))
     counts = is_odometry if is_odometry.any() else np.ones(len(source), dtype=bool)
-    way = ways_passed(step, None)
+    way = ways_passed(step)
     typical = typical_length(way, steps, counts)
     weight = np.where(is_odometry, typical / lengths_passed(way, steps, typical), edges.trust / _CLOSURE_STEPS)
 

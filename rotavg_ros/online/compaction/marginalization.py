@@ -222,7 +222,8 @@ class _Work:
             "route": np.where(in_order, len(self.routes) + np.arange(len(nodes)), -1),
             "edge_id": np.uint64(OWN_EDGE_ID),
         }
-        self.routes = np.concatenate((self.routes, _joined(edges, self.routes, parts)))
+        with np.errstate(over="ignore", invalid="ignore"):  # a step may state anything
+            self.routes = np.concatenate((self.routes, _joined(edges, self.routes, parts)))
         for name, value in values.items():
             edges[name][survivor] = value
 
@@ -280,7 +281,7 @@ def _directed(
 def _joined(
     edges: Columns, known: NDArray[np.float64], parts: Sequence[tuple[NDArray[np.int64], torch.Tensor, torch.Tensor]]
 ) -> NDArray[np.float64]:
-    """``(n, 38)`` what odometry did along pairs of edges, in the order of time.
+    """``(n, 38)`` what odometry did along pairs of edges, in the order of time; NaN where that is absurd.
 
     Args:
         edges: all there are.
@@ -297,7 +298,8 @@ def _joined(
         routes.append(Routes.known(columns, even))
         turns.append(rotations.to_matrix(rotations.inverse(farther_from_nearer)).numpy())
     steps = [edges["steps"][edge] for edge, _, _ in parts]
-    return joined(routes, steps, parts[1][2].numpy(), turns[0]).columns
+    columns = joined(routes, steps, parts[1][2].numpy(), turns[0]).columns
+    return np.where(np.isfinite(columns), columns, np.nan)
 
 
 def _place(frame_from_world: torch.Tensor, origin: torch.Tensor, position: torch.Tensor) -> torch.Tensor:

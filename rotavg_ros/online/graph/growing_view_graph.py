@@ -257,6 +257,8 @@ class GrowingViewGraph:
         route = growing._edge["route"].view
         if growing._routes.shape[1:] != (ROUTE_COLUMNS,) or not ((route >= -1) & (route < len(growing._routes))).all():
             raise ValueError("a route that is not there")
+        if np.isinf(growing._routes).any():
+            raise ValueError("a route without end")
         growing._index_anew()
         growing.marginalized = snapshot.marginalized
         growing.revision = snapshot.revision

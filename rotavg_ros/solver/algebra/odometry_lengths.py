@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 _SHORTEST_STEP = 0.05
 
 
-def ways_passed(translation: NDArray[np.float64], along: NDArray[np.float64] | None) -> NDArray[np.float64]:
+def ways_passed(translation: NDArray[np.float64], along: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """``(M,)`` metres from end to end of edges, or along the steps that they were drawn together from, where known.
 
     Args:

@@ -176,3 +176,17 @@ def test_nor_does_it_of_odometry_that_errs_in_turns_or_whose_translations_count(
     turned = Rotation.from_quat(small.body_from_world) * Rotation.from_quat(full.body_from_world[kept]).inv()
     assert (turned.magnitude()[1:] / full.uncertainty[kept].numpy()[1:]).max() < sigmas
     np.testing.assert_allclose(small.uncertainty[1:], full.uncertainty[kept][1:], rtol=0.05)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_steps_without_place_and_absurd_ones_break_nothing():
+    graph = next(drawings(stress.kinds(("hills: gyroscope bias, 30 % random",)), [3])).graph
+    assert graph.translation is None
+    unknown = contracted(replace(graph, translation=torch.full((graph.num_edges, 3), torch.nan, dtype=torch.float64)))
+    absurd = contracted(replace(graph, translation=torch.full((graph.num_edges, 3), 1e300, dtype=torch.float64)))
+    full = solve(graph)
+    for left, kept in (unknown, absurd):
+        assert left.routes is not None and not torch.isinf(left.routes).any()
+        small = solve(replace(left, translation=None))
+        turned = Rotation.from_quat(small.body_from_world) * Rotation.from_quat(full.body_from_world[kept]).inv()
+        assert (turned.magnitude()[1:] / full.uncertainty[kept].numpy()[1:]).max() < 0.02

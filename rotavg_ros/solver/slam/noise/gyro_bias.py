@@ -16,7 +16,6 @@ import torch
 from scipy.special import expit
 
 from rotavg_ros import rotations
-from rotavg_ros.odometry_route import Routes
 from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, accumulate_to_root
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
@@ -124,7 +123,7 @@ def without_bias(graph: ViewGraph, bias: np.ndarray) -> ViewGraph:
     several = np.flatnonzero((graph.is_odometry & (graph.steps > 1)).numpy())
     if len(several):
         older = torch.where(is_forward[:, 0], graph.source, graph.target).numpy()[several]
-        of_several = _routes(graph, several, older)
+        of_several = routes_of(graph, several, older)
         by_bias[several], shift[several] = (
             torch.from_numpy(matrix @ bias) for matrix in (of_several.by_bias, of_several.shift_by_bias)
         )
@@ -156,16 +155,6 @@ def _turning_less(graph: ViewGraph, onwards: torch.Tensor, by_bias: torch.Tensor
     return routes
 
 
-def _routes(graph: ViewGraph, edge: np.ndarray, older: np.ndarray) -> Routes:
-    """Of edges ``(n,)`` that several steps were drawn together into, whose older ends are ``(n,)``."""
-    displacement = np.zeros((len(edge), 3))
-    if graph.translation is not None:
-        translation, measured = graph.translation[edge].double(), graph.target_from_source[edge].double()
-        from_source = (graph.source.numpy()[edge] == older)[:, None]
-        displacement = np.where(from_source, translation.numpy(), -rotations.rotate(measured, translation).numpy())
-    return routes_of(graph, edge, older, displacement)
-
-
 def drift_per_bias(graph: ViewGraph, forest: SpanningForest, closure_graph: ClosureGraph) -> np.ndarray:
     """``(N, 3, 3)``: world-frame rotation vector of each node's odometry error per bias, from its root on."""
     child = np.flatnonzero(forest.parent_edge >= 0)
@@ -180,7 +169,7 @@ def drift_per_bias(graph: ViewGraph, forest: SpanningForest, closure_graph: Clos
     by_bias = steps[:, None, None] * world_from_body[earlier]
     several = np.flatnonzero(steps > 1)
     if len(several):
-        routes = _routes(graph, edge[several], earlier[several])
+        routes = routes_of(graph, edge[several], earlier[several])
         by_bias[several] = world_from_body[earlier[several]] @ routes.by_bias
     step = np.zeros((graph.num_nodes, 9))
     step[child] = (sign[:, None, None] * by_bias).reshape(-1, 9)

@@ -25,7 +25,7 @@ from rotavg_ros.odometry_route import Bend
 from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.quaternion_rows import turned_back
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
-from rotavg_ros.solver.slam.graph.routes import routes_of
+from rotavg_ros.solver.slam.graph.routes import routes_of, ways_by
 from rotavg_ros.view_graph import ViewGraph
 
 
@@ -161,11 +161,10 @@ class DrawnSteps:
         stated = ways_by(graph, self._edge, translation[self._edge], older)
         self._measured = older, np.where(from_source == parent, 1.0, -1.0)[:, None] * stated
         several = np.flatnonzero(graph.steps.numpy()[self._edge] > 1)
-        onwards = np.where(from_source == older, 1.0, -1.0)[several, None] * stated[several]
         self._where_several, self._several = several, None
         if len(several):
             edge = self._edge[several]
-            bend = routes_of(graph, edge, older[several], onwards).bent(by_turns[edge])
+            bend = routes_of(graph, edge, older[several]).bent(by_turns[edge])
             self._several = _Several.of(graph, edge, older[several], bend)
         self._outside_is_forward = drawn.is_forward[self._num_segments :, None]
         older = np.where(self._outside_is_forward[:, 0], graph.source.numpy()[outside], graph.target.numpy()[outside])
@@ -215,19 +214,6 @@ class DrawnSteps:
         out = np.zeros((self._num_nodes, value.shape[1]))
         out[self._node] = np.where(self._is_last[:, None], 0.0, value)
         return out
-
-
-def ways_by(graph: ViewGraph, edge: np.ndarray, translation: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """``(n, 3)`` metres from source to target of edges ``(n,)``, by the axes of one of their ends.
-
-    Args:
-        graph: whose edges.
-        edge: ``(n,)`` their numbers.
-        translation: ``(n, 3)`` metres, as they are stated.
-        at: ``(n,)`` that end.
-    """
-    turned = rotations.rotate(graph.target_from_source[edge].double(), torch.from_numpy(translation)).numpy()
-    return np.where((graph.source.numpy()[edge] == at)[:, None], translation, turned)
 
 
 @compiled

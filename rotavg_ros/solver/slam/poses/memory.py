@@ -127,7 +127,7 @@ class PoseMemory:
         assert graph.translation is not None
         steps = graph.steps.numpy()
         step = np.nan_to_num(graph.translation[new].numpy())
-        passed = lengths_passed(ways_passed(step, None), steps[new], self.pose.problem.typical)
+        passed = lengths_passed(ways_passed(step), steps[new], self.pose.problem.typical)
         # Beyond its anchor a node's way turns with the anchor's heading, and with its own steps'.
         way = np.linalg.norm(position[self.num_nodes :] - position[growth.anchor], axis=1)
         turned = self.step_variance * growth.along(steps[growth.edge])

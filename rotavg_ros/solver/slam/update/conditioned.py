@@ -21,7 +21,7 @@ from rotavg_ros.solver.algebra.products import product
 from rotavg_ros.solver.algebra.quaternion_rows import turned_back
 from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
-from rotavg_ros.solver.slam.poses.displacements import ways_by
+from rotavg_ros.solver.slam.graph.routes import ways_by
 from rotavg_ros.solver.slam.poses.memory import ACROSS, WALK
 from rotavg_ros.solver.slam.posterior.densities import log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
