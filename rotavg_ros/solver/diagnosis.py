@@ -73,8 +73,8 @@ def compare_with_truth(
     published = publish(problem, modes)
 
     truthful = from_truth(found.drawn, body_from_world, is_wrong)
-    if problem.bias is not None:
-        # The odometry may as well be without a bias.
+    if problem.calibrated is not None:
+        # All measurements may as well be as they should.
         as_it_is = from_truth(Drawn.of(graph, network, without), body_from_world, is_wrong)
         truthful = min(truthful, as_it_is, key=lambda either: either.cost)
     truth = truthful.modes[0]

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from rotavg_ros.errors import UserError
 
 FORMAT = "rotavg online state"
-FORMAT_VERSION = 6
-_READABLE = (2, 3, 4, 5, FORMAT_VERSION)
+FORMAT_VERSION = 7
+_READABLE = (2, 3, 4, 5, 6, FORMAT_VERSION)
 _TEMPORARY = ".tmp"
 
 Arrays = dict[str, NDArray[Any]]

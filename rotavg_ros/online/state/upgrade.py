@@ -17,6 +17,8 @@ _FIRST_WITH_TIME_LINES = 4
 _FIRST_WITH_QUEUE = 5
 # Before it, the first answer after a load was a cold one.
 _FIRST_WITH_LABELS = 6
+# Before it, of what all measurements of a kind have wrong alike a gyroscope's bias alone was known.
+_FIRST_WITH_CALIBRATION = 7
 
 
 def upgraded(arrays: Arrays, header: dict[str, Any]) -> tuple[Arrays, dict[str, Any]]:
@@ -35,6 +37,9 @@ def upgraded(arrays: Arrays, header: dict[str, Any]) -> tuple[Arrays, dict[str, 
         arrays = arrays | {"queued": np.zeros(0, dtype=np.int64)}
     if header["format_version"] < _FIRST_WITH_LABELS:
         arrays = arrays | {"component": np.zeros(0, dtype=np.int64)}
+    if header["format_version"] < _FIRST_WITH_CALIBRATION and "labels_bias" in arrays:
+        bias = arrays["labels_bias"]
+        arrays = arrays | {"labels_calibration": np.append(bias, np.zeros(len(bias)))}
     return arrays, header
 
 

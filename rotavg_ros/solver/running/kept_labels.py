@@ -10,7 +10,7 @@ import numpy as np
 
 from rotavg_ros.view_graph import ViewGraph
 
-_NAMES = ("trusted", "noise", "bias", "places", "pose_noise", "search")
+_NAMES = ("trusted", "noise", "calibration", "places", "pose_noise", "search")
 # What each tick sends from the solver's process to the node's is worth a millisecond.
 _TYPES = {"places": np.float32}
 
@@ -25,7 +25,8 @@ class KeptLabels:
         graph: whose first M edges they are of.
         trusted: ``(M,)`` 1 for good closures and sound odometry, 0 for others.
         noise: ``(n,)`` parameters of rotations' noise, in the solver's order.
-        bias: ``(3,)`` rad per step that was taken out of the odometry, ``(0,)`` if none was.
+        calibration: ``(6,)`` rad per step that was taken out of the odometry, and rad out of the closures; ``(0,)`` if
+            nothing was.
         places: ``(R, M)`` float32 chances of what closures' places may be, and their weights, in the solver's order.
         pose_noise: ``(m,)`` parameters of the noise of poses, likewise; ``(0,)`` if translations had no say.
         search: ``(3,)`` closures that the last whole search had, those not explained since, and 1 if another answer was
@@ -35,7 +36,7 @@ class KeptLabels:
     graph: ViewGraph
     trusted: np.ndarray
     noise: np.ndarray
-    bias: np.ndarray
+    calibration: np.ndarray
     places: np.ndarray
     pose_noise: np.ndarray
     search: np.ndarray
@@ -68,7 +69,7 @@ class KeptLabels:
         """
         found = cls(graph, *(np.asarray(arrays[name], _TYPES.get(name, np.float64)) for name in _NAMES))
         trusted, noise, places = found.trusted, (found.noise, found.pose_noise, found.search), found.places
-        is_flat = all(numbers.ndim == 1 for numbers in (trusted, *noise)) and found.bias.shape in {(0,), (3,)}
+        is_flat = all(numbers.ndim == 1 for numbers in (trusted, *noise)) and found.calibration.shape in {(0,), (6,)}
         if (
             not is_flat
             or len(found.search) != 3
@@ -80,8 +81,8 @@ class KeptLabels:
         if ((trusted < 0) | (trusted > 1)).any() or ((places < 0) | np.isinf(places)).any():
             raise ValueError("labels beyond 0 to 1")
         numbers = np.concatenate(noise)
-        if not (np.isfinite(numbers) & (numbers >= 0)).all() or not np.isfinite(found.bias).all():
-            raise ValueError("noise below 0, or a bias that is no number")
+        if not (np.isfinite(numbers) & (numbers >= 0)).all() or not np.isfinite(found.calibration).all():
+            raise ValueError("noise below 0, or a calibration that is no number")
         return found
 
     def of_edges(self, edges: np.ndarray, num_edges: int) -> dict[str, np.ndarray]:

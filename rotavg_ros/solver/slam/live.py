@@ -100,7 +100,7 @@ def resume_slam(graph: ViewGraph, labels: KeptLabels, run: Run) -> Estimate | No
         if len(joints):
             estimate = replace(estimate, memory=memory.with_all_unexplained())
         if labels.by_places:
-            estimate = with_poses(graph, estimate, poses_of_kept(memory.unbiased(graph), found.mode, labels))
+            estimate = with_poses(graph, estimate, poses_of_kept(memory.calibrated(graph), found.mode, labels))
     return replace(estimate, warnings=memory.notes, is_anew=False)
 
 
@@ -201,7 +201,7 @@ def _thinned_out(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory |
     found = before.updated(graph, _networks(run), run.warm_start.double())
     estimate = found.estimate
     if memory.poses is not None:
-        estimate = with_poses(graph, estimate, poses_of_labels(before.unbiased(graph), found.mode))
+        estimate = with_poses(graph, estimate, poses_of_labels(before.calibrated(graph), found.mode))
     assert isinstance(estimate.memory, SlamMemory)
     return estimate.memory
 
@@ -213,21 +213,21 @@ def _networks(run: Run) -> tuple[SlamCleanNet, SlamFineNet]:
 def _growth(graph: ViewGraph, known: SlamMemory, since: ViewGraph | Linear) -> Growth | None:
     """How nodes that are new since then hang on those before by odometry; None where they do not."""
     new = np.arange(since.num_edges, graph.num_edges)
-    return Growth.of(known.unbiased(graph), new[graph.is_odometry[new].numpy()], since.num_nodes)
+    return Growth.of(known.calibrated(graph), new[graph.is_odometry[new].numpy()], since.num_nodes)
 
 
 def _updated(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | None:
     """What is known once the graph is solved from the labelling before, closures that are new judged by it."""
     assert run.warm_start is not None
     before = memory.poses
-    unbiased = memory.unbiased(graph)
-    start = run.warm_start.double() if before is None else before.start_alone(unbiased)
+    measured = memory.calibrated(graph)
+    start = run.warm_start.double() if before is None else before.start_alone(measured)
     if start is None or (before is None) is has_places(graph):
         return None
     found = memory.updated(graph, _networks(run), start)
     estimate = found.estimate
     if before is not None:
-        poses = poses_of_update(unbiased, found.mode, before)
+        poses = poses_of_update(measured, found.mode, before)
         if poses is None:
             return None
         estimate = with_poses(graph, estimate, poses)
@@ -258,7 +258,7 @@ def _laid_on(graph: ViewGraph, known: SlamMemory, ration: float) -> Estimate | N
     if places is not None:
         variance[1] = places.variance.numpy()
     laid = LaidOn(
-        known.unbiased(graph),
+        known.calibrated(graph),
         estimate.body_from_world,
         None if places is None else places.position.numpy(),
         variance,

@@ -21,6 +21,7 @@ SWITCHES: dict[str, str] = {
     "stated-precisions": "all closures are alike, whatever they state",
     "slips": "odometry does not slip",
     "bias": "no gyroscope has a bias",
+    "mounting": "the sensor of closures is mounted as it is said to be",
     "turns": "odometry errs alike however far it turns",
     "settling": "labels are flipped as they are, never gone on from as probabilities",
     "rejected-runs": "good closures of a run that hold each other good are rejected one by one alone",

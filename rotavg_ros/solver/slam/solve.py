@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,12 +17,13 @@ from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.fine_net.tuning import fine_tuned
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
 from rotavg_ros.solver.slam.network import SlamCleanNet
-from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
+from rotavg_ros.solver.slam.noise.calibration import calibrated
 from rotavg_ros.solver.slam.options import SlamStages
 from rotavg_ros.solver.slam.poses.search.jumps import of_jumps
 from rotavg_ros.solver.slam.poses.solve import has_places, median_poses
 from rotavg_ros.solver.slam.posterior.mode import Mode
-from rotavg_ros.solver.slam.posterior.publishing.modes import of_slips, publish
+from rotavg_ros.solver.slam.posterior.publishing.modes import publish
+from rotavg_ros.solver.slam.posterior.publishing.notes import notes_of
 from rotavg_ros.solver.slam.posterior.solve import search
 from rotavg_ros.solver.slam.preparation import Prepared, prepare
 from rotavg_ros.solver.slam.update.memory import SlamMemory, estimate_of, with_poses
@@ -70,7 +70,7 @@ def _solve_by_tree(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
 def whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     """By one posterior: the search from all starts, FineNet, what is published of the labellings, and their poses.
 
-    The graph is drawn together and cleaned as often as odometry may be biased.
+    The graph is drawn together and cleaned as often as something may be wrong with all measurements of a kind.
     """
     with metered() as meter:
         estimate = _whole(graph, stages, run)
@@ -89,14 +89,15 @@ def _whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
         estimate, mode, poses = estimate_of(published), found.modes[published.chosen], None
     if "translations" not in stages.without and has_places(graph):
         with run.watch.stage("poses"):
-            poses, mode = median_poses(_unbiased(graph, found.bias), found.modes, tune)
+            poses, mode = median_poses(calibrated(graph, found.calibration), found.modes, tune)
     is_divided = bool(published.warnings) if poses is None else poses.poses.is_divided
     # The posterior's warning is of answers that rotations alone do not tell apart.
     told = estimate.warnings if is_divided else ()
     jumps = () if poses is None else of_jumps(poses.pose)
-    estimate = replace(estimate, warnings=(*told, *of_slips(mode), *jumps))
+    estimate = replace(estimate, warnings=(*told, *notes_of(mode), *jumps))
     if stages == SlamStages():
-        estimate = replace(estimate, memory=SlamMemory.of(graph, found.bias, mode, estimate, is_divided))
+        memory = SlamMemory.of(graph, found.calibration, mode, estimate, is_divided)
+        estimate = replace(estimate, memory=memory)
     return estimate if poses is None else with_poses(graph, estimate, poses)
 
 
@@ -118,8 +119,3 @@ def _begin(stages: SlamStages, run: Run, prepared: Prepared, cleaned: slam_stage
     if "tree" in stages.without:
         return rotations.identity(prepared.closure_graph.num_nodes)
     return slam_stages.bootstrap(prepared, cleaned)
-
-
-def _unbiased(graph: ViewGraph, bias: np.ndarray | None) -> ViewGraph:
-    """The graph without a gyroscope's bias, rad per step, if one was taken out of its odometry."""
-    return graph if bias is None else without_bias(graph, bias)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -154,13 +155,13 @@ def test_a_file_whose_components_are_none_is_refused(values: np.ndarray, tmp_pat
 @pytest.mark.parametrize(
     ("name", "values"),
     [
-        *((f"labels_{name}", np.zeros((3, 3))) for name in ("trusted", "noise", "bias", "places", "pose_noise")),
+        *((f"labels_{name}", np.zeros((3, 3))) for name in ("trusted", "noise", "calibration", "places", "pose_noise")),
         ("labels_trusted", np.full(100, 2.0)),
         ("labels_noise", np.full(10, np.nan)),
         ("labels_noise", np.full(10, -1.0)),
         ("labels_noise", np.zeros(10)),
         ("labels_noise", np.ones(3)),
-        ("labels_bias", np.full(3, np.inf)),
+        ("labels_calibration", np.full(6, np.inf)),
         ("labels_pose_noise", np.full(7, -1.0)),
         ("labels_search", np.zeros(2)),
     ],
@@ -172,3 +173,20 @@ def test_labels_that_are_none_are_done_without(name: str, values: np.ndarray, tm
     assert is_without_a_search(answered(loaded(path)))
     state_file.write(path, state_file.read(path) | {name: values})
     assert not is_without_a_search(answered(loaded(path)))
+
+
+@pytest.mark.parametrize("bias", [np.zeros(0), np.array([0.001, -0.002, 0.0005])])
+def test_a_bias_that_version_6_kept_is_a_calibration(bias: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "state.npz"
+    saved(path)
+    arrays = state_file.read(path)
+    header = json.loads(arrays["header"].tobytes()) | {"format_version": 6}
+    del arrays["labels_calibration"]
+    header_bytes = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    state_file.write(path, arrays | {"labels_bias": bias, "header": header_bytes})
+    online = loaded(path)
+    assert is_without_a_search(answered(online))
+    online.save(path)
+    kept = state_file.read(path)["labels_calibration"]
+    np.testing.assert_array_equal(kept[:3], bias)
+    assert not kept[3:].any()

@@ -85,7 +85,7 @@ class PoseMemory:
         """Where the joint solve of a graph that has grown from this one begins; None: from nothing.
 
         Args:
-            graph: whose odometry was drawn together, without its bias.
+            graph: whose odometry was drawn together, calibrated.
             problem: the same.
         """
         drawn, closures = problem.drawn, problem.closures

@@ -36,7 +36,7 @@ def median_poses(
     """Poses, and the labelling that they are of, the median of those that both make likely.
 
     Args:
-        graph: without its bias, with translations.
+        graph: calibrated, with translations.
         modes: labellings of its rotations, the likeliest first.
         tuned: a labelling with the noise of each edge as FineNet has it.
     """
@@ -46,7 +46,7 @@ def median_poses(
 
 
 def poses_of_update(graph: ViewGraph, mode: Mode, memory: PoseMemory) -> PoseMemory | None:
-    """Of a graph without its bias that has grown, with the labels of its rotations; None if all is due."""
+    """Of a graph calibrated that has grown, with the labels of its rotations; None if all is due."""
     problem = memory.problem(graph, _translations(graph), mode)
     start = memory.start(graph, problem)
     if start is None:
@@ -56,13 +56,13 @@ def poses_of_update(graph: ViewGraph, mode: Mode, memory: PoseMemory) -> PoseMem
 
 
 def poses_of_labels(graph: ViewGraph, mode: Mode) -> PoseMemory:
-    """Of a graph without its bias, with the labels of its rotations, from nothing else."""
+    """Of a graph calibrated, with the labels of its rotations, from nothing else."""
     pose = estimate_poses(PoseProblem(graph, _translations(graph), mode))
     return PoseMemory.of(pose, answer([pose], np.ones(1))[0])
 
 
 def poses_of_kept(graph: ViewGraph, mode: Mode, kept: KeptLabels) -> PoseMemory:
-    """Of a graph without its bias, with the labels of its rotations, from what is known of its closures' places."""
+    """Of a graph calibrated, with the labels of its rotations, from what is known of its closures' places."""
     problem = PoseProblem(graph, _translations(graph), mode)
     pose = estimate_poses(problem, start=PoseStart.kept(problem, kept.places, kept.pose_noise))
     return PoseMemory.of(pose, answer([pose], np.ones(1))[0])

@@ -7,8 +7,9 @@ With r_e the residuals at the best corrections Ĉ and H the Hessian there,
 
 d is the number of unknowns: key nodes but for the roots, and runs' common errors b. That is exact where densities are
 normal; those with tails are integrated by expectation propagation
-(:class:`rotavg_ros.solver.slam.posterior.densities.Sites`). Where a gyroscope's bias was taken out, − log p of it is
-added (:mod:`rotavg_ros.solver.slam.posterior.bias`). Two labellings are compared by F and by nothing else.
+(:class:`rotavg_ros.solver.slam.posterior.densities.Sites`). Where a gyroscope's bias or a sensor's mounting was taken
+out, − log p of it is added (:mod:`rotavg_ros.solver.slam.posterior.calibration`). Two labellings are compared by F and
+by nothing else.
 """
 
 from __future__ import annotations
@@ -104,9 +105,9 @@ def evaluate(problem: Problem, state: State, *, is_moving: bool = False) -> Eval
         "noise": -log_noise_prior(state.noise, priors),
         "orientations": k / 2 * (factorised.log_det - unknowns * np.log(2 * np.pi)),
     }
-    if problem.bias is not None:
-        information, _ = problem.bias.information(graph.source, state, residual, factorised, priors)
-        terms["bias"] = problem.bias.cost(information, priors)
+    if problem.calibrated is not None:
+        information, _ = problem.calibrated.information(graph.source, state, residual, factorised, priors)
+        terms["calibration"] = problem.calibrated.cost(information, priors)
     return Evaluation(terms, residual, weight, factorised, told.others, is_moving)
 
 

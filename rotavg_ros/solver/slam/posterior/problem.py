@@ -14,7 +14,7 @@ from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs, closure_ends
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.noise.vertical import Vertical
-from rotavg_ros.solver.slam.posterior.bias import Bias
+from rotavg_ros.solver.slam.posterior.calibration import Calibrated
 from rotavg_ros.solver.slam.posterior.priors import SearchLimits, SlamPriors
 from rotavg_ros.solver.slam.posterior.state import RUN_STEPS, Noise
 from rotavg_ros.solver.slam.posterior.system import NormalEquations
@@ -39,7 +39,7 @@ class Problem:
         priors: all that is believed beforehand.
         limits: of the search.
         without: names of terms and moves that are switched off (:data:`rotavg_ros.solver.slam.options.SWITCHES`).
-        bias: what was taken out of all odometry beforehand, if anything.
+        calibrated: what was taken out of all odometry, or all closures, beforehand, if anything.
         turned: ``(N,)`` rad², squares of the turns of odometry's steps from each node's root on; None if unknown.
         travelled: ``(N,)`` metres of odometry from each node's root on; None if unknown.
         relative: ``(E,)`` each edge's own variance over what noise makes of it, as FineNet has it; None: 1.
@@ -53,7 +53,7 @@ class Problem:
     priors: SlamPriors
     limits: SearchLimits = field(default_factory=SearchLimits)
     without: frozenset[str] = frozenset()
-    bias: Bias | None = None
+    calibrated: Calibrated | None = None
     turned: np.ndarray | None = None
     travelled: np.ndarray | None = None
     relative: np.ndarray | None = None
@@ -67,7 +67,7 @@ class Problem:
         *,
         priors: SlamPriors | None = None,
         without: Collection[str] = (),
-        bias: Bias | None = None,
+        calibrated: Calibrated | None = None,
         turned: np.ndarray | None = None,
     ) -> Problem:
         """Find the chains of closures that follow each other closely.
@@ -90,7 +90,15 @@ class Problem:
             told[graph.is_odometry] = np.inf
         follows = _predecessors(graph, pairs, priors)
         return cls(
-            graph, components, told, chain, follows, priors, without=frozenset(without), bias=bias, turned=turned
+            graph,
+            components,
+            told,
+            chain,
+            follows,
+            priors,
+            without=frozenset(without),
+            calibrated=calibrated,
+            turned=turned,
         )
 
     def with_relative(self, relative: np.ndarray) -> Problem:

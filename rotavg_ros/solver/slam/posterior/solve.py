@@ -1,9 +1,10 @@
-"""A robot's graph by its posterior: starts and moves, with a gyroscope's bias or without, and what is published."""
+"""A robot's graph by its posterior: starts and moves, with what all measurements have wrong alike or without it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,9 +15,10 @@ from rotavg_ros.solver.algebra.spanning_forest import accumulate_to_root
 from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.routes import way_along
 from rotavg_ros.solver.slam.network import SlamCleanNet
-from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
+from rotavg_ros.solver.slam.noise.calibration import PARTS, Calibration, calibrated
+from rotavg_ros.solver.slam.noise.mounting import estimate_mountings
 from rotavg_ros.solver.slam.noise.turns import squared_turns
-from rotavg_ros.solver.slam.posterior.bias import Bias
+from rotavg_ros.solver.slam.posterior.calibration import Calibrated
 from rotavg_ros.solver.slam.posterior.inference import Search
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
@@ -26,8 +28,8 @@ from rotavg_ros.solver.slam.preparation import Prepared, likely_bias, prepare_as
 from rotavg_ros.solver.slam.stages import CleanedClosures, clean
 from rotavg_ros.view_graph import ViewGraph
 
-# A bias is made better so many times at most, as long as F falls by more than this, nats.
-_BIAS_ROUNDS, _LEAST_GAIN = 3, 0.5
+# A part of the calibration is made better so many times at most, as long as F falls by more than this, nats.
+_ROUNDS, _LEAST_GAIN = 8, 0.5
 # Units of work for each edge of what a problem is told beforehand.
 _EDGE = 0.002
 
@@ -37,7 +39,7 @@ class Drawn:
     """A graph drawn together, and its problem.
 
     Attributes:
-        prepared: without the bias, if there is one.
+        prepared: without what all measurements have wrong alike, if anything.
         cleaned: what CleanNet says of its closures.
         problem: the posterior's view of it.
     """
@@ -52,18 +54,20 @@ class Drawn:
         graph: ViewGraph,
         network: SlamCleanNet | None,
         without: Collection[str] = (),
-        bias: np.ndarray | None = None,
+        calibration: Calibration | None = None,
         priors: SlamPriors | None = None,
     ) -> Drawn:
-        """After ``bias`` ``(3,)`` rad per step is taken out of the odometry."""
-        corrected = graph if bias is None else without_bias(graph, bias)
+        """After what all have wrong alike is taken out of the measurements, if that is anything."""
+        corrected = calibrated(graph, calibration)
         prepared = prepare_as_it_is(corrected)
         cleaned = clean(network, prepared, graph.label)
         spend(_EDGE * graph.num_edges)
-        of_bias = None if bias is None else Bias.of(corrected, prepared, bias)
+        taken_out = None
+        if calibration is not None:
+            taken_out = Calibrated.of(corrected, prepared, calibration, calibration.parts)
         turned = squared_turns(corrected, prepared.forest, prepared.noise.step_variance)
         problem = Problem.of(
-            prepared, cleaned.network_log_odds, priors=priors, without=without, bias=of_bias, turned=turned
+            prepared, cleaned.network_log_odds, priors=priors, without=without, calibrated=taken_out, turned=turned
         )
         problem = replace(problem, travelled=_travelled(graph, prepared))
         return cls(prepared, cleaned, problem)
@@ -86,10 +90,10 @@ class Found:
         return self.modes[0].cost
 
     @property
-    def bias(self) -> np.ndarray | None:
-        """``(3,)`` rad per step that was taken out of the odometry, if any was."""
-        bias = self.drawn.problem.bias
-        return None if bias is None else bias.vector
+    def calibration(self) -> Calibration | None:
+        """What was taken out of all measurements of a kind, if anything was."""
+        taken_out = self.drawn.problem.calibrated
+        return None if taken_out is None else taken_out.calibration
 
 
 Begin = Callable[[Prepared, CleanedClosures], Tensor]
@@ -111,49 +115,95 @@ def search(
         without: terms and moves that are switched off.
         priors: other ones than usual.
     """
-
-    def from_starts(drawn: Drawn) -> Found:
-        correction = begin(drawn.prepared, drawn.cleaned)
-        begun = Search(drawn.problem)
-        begun.run(drawn.prepared, drawn.cleaned, correction)
-        return Found(drawn, begun.modes)
-
-    found = from_starts(Drawn.of(graph, network, without, None, priors))
-    if "bias" in without:
-        return found
-    if (bias := likely_bias(graph, found.drawn.prepared)) is not None:
-        biased = from_starts(Drawn.of(graph, network, without, bias, priors))
-        found = min(found, biased, key=lambda either: either.cost)
-    for _ in range(_BIAS_ROUNDS):
-        better = _with_better_bias(graph, network, found, without)
-        if better is None:
-            break
-        found = better
+    solver = _Solver(graph, network, begin, without, priors)
+    found = solver.from_starts(None)
+    # What one part explains, another may, too: the one that explains more comes first.
+    parts = sorted(set(PARTS) - set(without), key=lambda part: (solver.predicted(found, part).cost, part))
+    for part in parts:
+        found = solver.calibrated(found, part)
+    if found.calibration is not None and parts[0] not in found.calibration.parts:
+        found = solver.calibrated(found, parts[0])
     return found
 
 
-def _with_better_bias(
-    graph: ViewGraph, network: SlamCleanNet | None, found: Found, without: Collection[str]
-) -> Found | None:
-    """What is found from the best mode with Newton's step on the bias; None if F does not fall by it."""
-    best, drawn = found.modes[0], found.drawn
-    problem, evaluation = best.problem, best.evaluation
-    bias = problem.bias or Bias.of(graph, drawn.prepared, np.zeros(3))
-    information, change = bias.information(
-        problem.graph.source, best.state, evaluation.residual, evaluation.factorised, problem.priors
-    )
-    predicted = -float(change @ information @ change) / 2
-    if problem.bias is None:
-        predicted += bias.cost(information, problem.priors)
-    if predicted > -_LEAST_GAIN:
-        return None
-    again = Drawn.of(graph, network, without, bias.vector + change @ bias.axes, problem.priors)
-    moved = _moved(best, drawn, again)
-    goes_on = Search(again.problem)
-    goes_on.keep(goes_on.flipped(goes_on.polished(moved, "bias")))
-    goes_on.move_on()
-    better = Found(again, goes_on.modes)
-    return None if better.cost > found.cost - _LEAST_GAIN else better
+class _Predicted(NamedTuple):
+    """By how many nats F changes with another calibration, as far as a Newton step tells."""
+
+    cost: float
+    calibration: Calibration
+
+
+class _Solver(NamedTuple):
+    """What :func:`search` is given."""
+
+    graph: ViewGraph
+    network: SlamCleanNet | None
+    begin: Begin
+    without: Collection[str]
+    priors: SlamPriors | None
+
+    def from_starts(self, calibration: Calibration | None) -> Found:
+        """What is found from all starts after a calibration is taken out."""
+        drawn = Drawn.of(self.graph, self.network, self.without, calibration, self.priors)
+        begun = Search(drawn.problem)
+        begun.run(drawn.prepared, drawn.cleaned, self.begin(drawn.prepared, drawn.cleaned))
+        return Found(drawn, begun.modes)
+
+    def calibrated(self, found: Found, part: str) -> Found:
+        """What is found with one more part of the calibration, from what closures speak of and by Newton's steps."""
+        before = found.calibration or Calibration.none()
+        if part not in before.parts:
+            likely = _likely(part, before.taken_out_of(self.graph), found.drawn.prepared)
+            others = [self.from_starts(replace(before, **{part: value})) for value in likely]
+            found = min(found, *others, key=_rank) if others else found
+        for _ in range(_ROUNDS):
+            better = self._better(found, part)
+            if better is None:
+                break
+            found = better
+        return found
+
+    def predicted(self, found: Found, part: str) -> _Predicted:
+        """Newton's step from the best mode, on what is calibrated and one part more."""
+        best, before = found.modes[0], found.calibration or Calibration.none()
+        problem, evaluation = best.problem, best.evaluation
+        prepared, parts = found.drawn.prepared, {part, *before.parts}
+        tried = Calibrated.of(before.taken_out_of(self.graph), prepared, before, parts)
+        information, change = tried.information(
+            problem.graph.source, best.state, evaluation.residual, evaluation.factorised, problem.priors
+        )
+        cost = tried.cost(information, problem.priors) - evaluation.terms.get("calibration", 0.0)
+        return _Predicted(cost - float(change @ information @ change) / 2, before.moved(change @ tried.axes))
+
+    def _better(self, found: Found, part: str) -> Found | None:
+        """What is found from the best mode after that step, if F falls."""
+        cost, calibration = self.predicted(found, part)
+        if cost > -_LEAST_GAIN:
+            return None
+        best, drawn = found.modes[0], found.drawn
+        again = Drawn.of(self.graph, self.network, self.without, calibration, best.problem.priors)
+        if again.problem.components < best.problem.components:
+            return self.from_starts(calibration)
+        goes_on = Search(again.problem)
+        goes_on.keep(goes_on.flipped(goes_on.polished(_moved(best, drawn, again), "calibration")))
+        goes_on.move_on()
+        better = Found(again, goes_on.modes)
+        return better if better.cost < found.cost - _LEAST_GAIN else None
+
+
+def _likely(part: str, graph: ViewGraph, prepared: Prepared) -> list[np.ndarray]:
+    """``(3,)`` each, what closures beside odometry make of a part that nothing was taken out of yet."""
+    if part == "mounting":
+        # Where all that is measured turns about one axis, an upside-down sensor is what inverted closures look like.
+        is_planar = prepared.noise.components == 1
+        return [] if is_planar else estimate_mountings(graph, prepared.closure_graph, prepared.noise)
+    bias = likely_bias(graph, prepared)
+    return [] if bias is None else [bias]
+
+
+def _rank(found: Found) -> tuple[int, float]:
+    """F, but that all turns about one axis have an F of their own, over fewer numbers: chance makes none so."""
+    return found.drawn.problem.components, found.cost
 
 
 def _travelled(graph: ViewGraph, prepared: Prepared) -> np.ndarray | None:

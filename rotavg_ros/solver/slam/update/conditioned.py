@@ -46,7 +46,7 @@ class LaidOn:
     """A graph of N' ≥ N nodes, those that came since a solve along odometry from its answer.
 
     Attributes:
-        graph: without its bias.
+        graph: calibrated.
         body_from_world: ``(N', 4)``.
         position: ``(N', 3)`` metres; None by rotations alone.
         variance: ``(2, N')`` rad², m² per component.

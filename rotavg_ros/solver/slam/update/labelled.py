@@ -12,6 +12,7 @@ from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.fine_net.tuning import fine_tuned
 from rotavg_ros.solver.slam.network import SlamCleanNet
+from rotavg_ros.solver.slam.noise.calibration import Calibration
 from rotavg_ros.solver.slam.posterior.inference import Search
 from rotavg_ros.solver.slam.posterior.left_out import relabelled
 from rotavg_ros.solver.slam.posterior.mode import Mode
@@ -33,13 +34,13 @@ class Labelled(NamedTuple):
     Attributes:
         trusted: ``(m,)`` of its first edges, 1 for good closures and sound odometry, 0 for others, :data:`UNKNOWN`.
         noise: of that labelling, to begin with.
-        bias: ``(3,)`` rad per step to take out of the odometry, if any.
+        calibration: what to take out of all measurements of a kind, if anything.
         by_places: whether translations have told the labels, which rotations alone must not change then.
     """
 
     trusted: np.ndarray
     noise: Noise
-    bias: np.ndarray | None
+    calibration: Calibration | None
     by_places: bool
 
 
@@ -70,7 +71,7 @@ def solved_from(
         networks: CleanNet and FineNet, which is applied once.
         body_from_world: ``(N, 4)`` start, by which closures whose labels are not known are judged.
     """
-    drawn = Drawn.of(graph, networks[0], bias=labelled.bias)
+    drawn = Drawn.of(graph, networks[0], calibration=labelled.calibration)
     problem = drawn.problem
     spend(_EDGE * graph.num_edges)
     before = carried_over(labelled.trusted, problem.graph, UNKNOWN)

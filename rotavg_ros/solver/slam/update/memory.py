@@ -1,8 +1,8 @@
 """What a solve by the posterior remembers for the next one of the same graph, grown by a few edges.
 
-The labelling that was found, its noise and its bias are where the next solve begins and, but for labels of single
-closures, where it ends. The whole search is due again once enough closures have come that this labelling does not
-explain: others only make it likelier. Odometry that no closure judges yet says nothing of what was there.
+The labelling that was found, its noise and its calibration are where the next solve begins and, but for labels of
+single closures, where it ends. The whole search is due again once enough closures have come that this labelling does
+not explain: others only make it likelier. Odometry that no closure judges yet says nothing of what was there.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.graph.odometry_paths import Growth
 from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each, repeats_since
 from rotavg_ros.solver.slam.network import SlamCleanNet
-from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
+from rotavg_ros.solver.slam.noise.calibration import Calibration, calibrated
 from rotavg_ros.solver.slam.poses.memory import PoseMemory
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
-from rotavg_ros.solver.slam.posterior.publishing.modes import Published, of_slips
+from rotavg_ros.solver.slam.posterior.publishing.modes import Published
+from rotavg_ros.solver.slam.posterior.publishing.notes import notes_of
 from rotavg_ros.solver.slam.posterior.state import Noise
 from rotavg_ros.solver.slam.stages import outlier_scores
 from rotavg_ros.solver.slam.update.columns import Columns
@@ -57,7 +58,7 @@ class SlamMemory:
         trusted: ``(M,)`` 1 for good closures and sound odometry, 0 for others; all of a segment have its label.
         noise: of that labelling.
         mode: that labelling, as of the last solve; odometry alone has come since.
-        bias: ``(3,)`` rad per step that was taken out of the odometry; None if none was.
+        calibration: what was taken out of all measurements of a kind; None if nothing was.
         body_from_world: ``(N, 4)`` that was found, in its own gauge.
         outlier_score: ``(M,)`` that was published.
         variance: ``(N,)`` rad², likewise.
@@ -78,7 +79,7 @@ class SlamMemory:
     trusted: np.ndarray
     noise: Noise
     mode: Mode
-    bias: np.ndarray | None
+    calibration: Calibration | None
     body_from_world: Tensor
     outlier_score: Tensor
     variance: Tensor
@@ -96,13 +97,13 @@ class SlamMemory:
 
     @classmethod
     def of(
-        cls, graph: ViewGraph, bias: np.ndarray | None, mode: Mode, estimate: Estimate, is_divided: bool
+        cls, graph: ViewGraph, calibration: Calibration | None, mode: Mode, estimate: Estimate, is_divided: bool
     ) -> SlamMemory:
         """After a whole search.
 
         Args:
             graph: that was solved.
-            bias: ``(3,)`` rad per step that was taken out of its odometry, if any.
+            calibration: what was taken out of its measurements, if anything.
             mode: the labelling to go on from.
             estimate: what was published, by rotations alone.
             is_divided: whether another answer is nearly as likely.
@@ -111,7 +112,7 @@ class SlamMemory:
         trusted = problem.graph.edge_values(state.trusted)
         told = estimate.body_from_world, estimate.outlier_score, estimate.variance
         notes = estimate.warnings
-        return cls(graph, trusted, state.noise, mode, bias, *told, len(problem.closure), is_divided, notes=notes)
+        return cls(graph, trusted, state.noise, mode, calibration, *told, len(problem.closure), is_divided, notes=notes)
 
     @classmethod
     def of_labels(
@@ -134,21 +135,23 @@ class SlamMemory:
         trusted = np.append(labels.trusted, np.full(graph.num_edges - len(labels.trusted), np.nan))
         trusted = np.where(np.isnan(trusted), UNKNOWN, trusted)
         trusted[contradicting] = 0.0
-        noise, bias = Noise(*labels.noise.tolist()), labels.bias if len(labels.bias) else None
-        found = solved_from(Labelled(trusted, noise, bias, labels.by_places), graph, networks, body_from_world)
+        noise = Noise(*labels.noise.tolist())
+        calibration = Calibration.of(labels.calibration) if len(labels.calibration) else None
+        found = solved_from(Labelled(trusted, noise, calibration, labels.by_places), graph, networks, body_from_world)
         estimate = estimate_of(found.published)
         told = estimate.body_from_world, estimate.outlier_score, estimate.variance
         searched, unexplained, is_divided = map(int, labels.search)
         is_new = ~labels.are_known(graph.num_edges) & ~graph.is_odometry.numpy()
         unexplained += int((estimate.outlier_score.numpy()[is_new] > _FLAGGED).sum())
         search = searched, bool(is_divided), unexplained
-        memory = cls(graph, found.trusted, found.noise, found.mode, bias, *told, *search, of_slips(found.mode))
+        notes = notes_of(found.mode)
+        memory = cls(graph, found.trusted, found.noise, found.mode, calibration, *told, *search, notes)
         return SearchedOn(replace(estimate, memory=memory), found.mode)
 
     @property
     def labels(self) -> KeptLabels | None:
         """What :meth:`of_labels` needs; None where odometry is held to have jumped, of which labels say nothing."""
-        poses, bias = self.poses, np.zeros(0) if self.bias is None else self.bias
+        poses, calibration = self.poses, np.zeros(0) if self.calibration is None else self.calibration.vector
         places, noise = np.zeros((0, len(self.trusted)), np.float32), np.zeros(0)
         if poses is not None:
             if poses.pose.problem.jump is not None:
@@ -157,7 +160,7 @@ class SlamMemory:
         # A search that was due, or under way, is due wherever they are gone on from.
         unexplained = self.unexplained if self.ahead is None else self.with_all_unexplained().unexplained
         search = np.array([self.searched, unexplained, self.is_divided], dtype=np.float64)
-        return KeptLabels(self.graph, self.trusted, np.array(astuple(self.noise)), bias, places, noise, search)
+        return KeptLabels(self.graph, self.trusted, np.array(astuple(self.noise)), calibration, places, noise, search)
 
     @property
     def is_due(self) -> bool:
@@ -226,7 +229,7 @@ class SlamMemory:
             networks: CleanNet and FineNet, which is applied once.
             body_from_world: ``(N, 4)`` start, where a closure is new.
         """
-        labelled = Labelled(self.trusted, self.noise, self.bias, self.poses is not None)
+        labelled = Labelled(self.trusted, self.noise, self.calibration, self.poses is not None)
         found = solved_from(labelled, graph, networks, body_from_world)
         estimate = estimate_of(found.published)
         memory = replace(
@@ -251,7 +254,7 @@ class SlamMemory:
             new: its new nodes.
         """
         edge = np.arange(self.graph.num_edges, graph.num_edges)
-        poses = None if self.poses is None else self.poses.extended(self.unbiased(graph), new)
+        poses = None if self.poses is None else self.poses.extended(self.calibrated(graph), new)
         if poses is None and self.poses is not None:
             return None
         steps = graph.steps.numpy()
@@ -278,9 +281,9 @@ class SlamMemory:
         )
         return estimate if poses is None else with_poses(graph, estimate, poses)
 
-    def unbiased(self, graph: ViewGraph) -> ViewGraph:
-        """The graph without a gyroscope's bias, if one was taken out of its odometry."""
-        return graph if self.bias is None else without_bias(graph, self.bias)
+    def calibrated(self, graph: ViewGraph) -> ViewGraph:
+        """The graph without what its measurements have wrong alike, as far as that was taken out."""
+        return calibrated(graph, self.calibration)
 
 
 def estimate_of(published: Published) -> Estimate:

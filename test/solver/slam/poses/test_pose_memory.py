@@ -159,7 +159,7 @@ def test_a_biased_gyroscopes_poses_are_gone_on_from(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr("rotavg_ros.solver.slam.poses.solve.estimate_poses", recording)
     before = solve(up_to(graph, 390))
-    assert isinstance(before.memory, SlamMemory) and before.memory.bias is not None and not begun
+    assert isinstance(before.memory, SlamMemory) and before.memory.calibration is not None and not begun
     found = go_on(up_to(graph, 400), before)
     assert len(begun) == 1 and begun[0] is not None and "refine" not in found.stage_seconds
     turned, moved = apart(found, solve(up_to(graph, 400)))

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import multivariate_normal
 
-from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
-from rotavg_ros.solver.slam.posterior.bias import Bias
+from rotavg_ros.solver.slam.noise.calibration import Calibration
+from rotavg_ros.solver.slam.posterior.calibration import Calibrated
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.state import RUN_STEPS, Noise, Others, State
@@ -49,13 +49,13 @@ def problem_of(
     graph: ViewGraph, priors: SlamPriors = GAUSSIAN_PRIORS, without: Collection[str] = (), rate: float | None = None
 ) -> Problem:
     """A problem whose network has no opinion, after a bias of ``rate`` about z, rad per step, was taken out."""
-    vector = np.array([0.0, 0.0, rate or 0.0])
-    corrected = without_bias(graph, vector)
+    calibration = Calibration(np.array([0.0, 0.0, rate or 0.0]), np.zeros(3))
+    corrected = calibration.taken_out_of(graph)
     prepared = prepare_as_it_is(corrected)
-    bias = None if rate is None else Bias.of(corrected, prepared, vector)
+    taken_out = None if rate is None else Calibrated.of(corrected, prepared, calibration, {"bias"})
     turned = np.arange(graph.num_nodes) ** 2.0
     no_opinion = np.zeros(len(prepared.closure_graph.source))
-    return Problem.of(prepared, no_opinion, priors=priors, without=without, bias=bias, turned=turned)
+    return Problem.of(prepared, no_opinion, priors=priors, without=without, calibrated=taken_out, turned=turned)
 
 
 def state_of(problem: Problem, is_false: np.ndarray) -> State:

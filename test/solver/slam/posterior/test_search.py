@@ -204,8 +204,8 @@ def test_a_bias_is_taken_out_and_told_better_than_without_it(world: str) -> None
     with torch.no_grad():
         found = search(case.graph, Networks("cpu").load(SlamCleanNet), bootstrap)
         as_it_is = search(case.graph, Networks("cpu").load(SlamCleanNet), bootstrap, without={"bias"})
-    assert found.drawn.problem.bias is not None
-    assert np.degrees(np.linalg.norm(found.drawn.problem.bias.vector)) > 0.1
+    assert found.calibration is not None
+    assert np.degrees(np.linalg.norm(found.calibration.bias)) > 0.1
     orientations = of_mode(found.modes[0]).body_from_world
     solution = replace(solved(f"{world}: gyroscope bias, 30 % random", 0), body_from_world=orientations)
     assert error_deg(case.graph, solution, case.body_from_world) < 0.6
@@ -312,8 +312,8 @@ STRUCTURAL = {
     | {"_OF_RUN", "_BEFORE", "_LOOKED_AT"},
     "left_out": {"CERTAIN"},
     "publishing/gravity": {"_COMPONENTS", "_SOLVES", "_CONVERGED"},
-    "publishing/modes": {"_FAR", "_FAR_NOISE", "LIKELY", "FAR_TURN", "FAR_SLIP", "_SURELY_FALSE", "_ROUNDS"}
-    | {"_SCORED"},
+    "publishing/modes": {"_FAR", "_FAR_NOISE", "LIKELY", "FAR_TURN", "_SURELY_FALSE", "_ROUNDS"} | {"_SCORED"},
+    "publishing/notes": {"_FAR_SLIP", "_WORTH_A_WORD"},
     "moves/flips": {"_PART", "_DECIDED", "_HOPE", "_LEAST_GAIN"},
     "mode": {"OTHER_NOISE", "_SAME", "_MAX_DENSE"},
     "moves/jumps": {"_MAX_ROUNDS", "_MAX_CANDIDATES", "_MIN_GAIN", "_MIN_CARRIED"},
@@ -338,7 +338,7 @@ STRUCTURAL = {
     "objective": {"_UNKNOWN"},
     "problem": {"_NONE", "_SAME_TURNS"},
     "rows": {"_NOTHING", "_MAX_TURN", "_LEAST_REST", "_LONGEST_STRETCH"},
-    "solve": {"Begin", "_BIAS_ROUNDS", "_LEAST_GAIN", "_EDGE"},
+    "solve": {"Begin", "_ROUNDS", "_LEAST_GAIN", "_EDGE"},
     "state": {"EXPONENTS", "COMMON_SHARES", "RUN_STEPS", "TURN_SHARES", "TAIL_SHARES", "STEP_TAIL_RATIOS"},
     "system": {"_MAX_LEVERAGE", "_NO_WEIGHT", "_MAX_PATTERNS", "_LACKING", "_MORE"},
 }

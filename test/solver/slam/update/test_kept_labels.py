@@ -90,7 +90,7 @@ def test_what_does_not_fit_is_solved_from_nothing() -> None:
     assert not goes_on(labels, replace(graph, label=label))
 
 
-@pytest.mark.parametrize("name", ["trusted", "noise", "bias", "places", "pose_noise", "search"])
+@pytest.mark.parametrize("name", ["trusted", "noise", "calibration", "places", "pose_noise", "search"])
 def test_arrays_that_are_none_of_theirs(name: str) -> None:
     graph = drawn("building: 15 closures", 1).graph
     count = graph.num_edges

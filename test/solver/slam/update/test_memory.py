@@ -12,8 +12,9 @@ from rotavg_ros import rotations
 from rotavg_ros.datasets.simulation.stress.drawn import DrawnGraph
 from rotavg_ros.datasets.simulation.stress.kinds import KINDS
 from rotavg_ros.metrics import orientation_errors
-from rotavg_ros.solver import Solution, solve
+from rotavg_ros.solver import KeptLabels, Solution, solve
 from rotavg_ros.solver.methods import DEFAULT_METHOD, without
+from rotavg_ros.solver.slam.noise.mounting import without_mounting
 from rotavg_ros.solver.slam.update.memory import SlamMemory
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
@@ -62,6 +63,32 @@ def test_updates_end_where_the_whole_search_does(kind: str) -> None:
     assert errors[0] < 1.2 * errors[1] + 0.1
     flagged = (solution.outlier_score > 0.5) != (cold.outlier_score > 0.5)
     assert int(flagged.sum()) <= 1
+
+
+@pytest.mark.parametrize("degrees", [6.0, 100.0])
+def test_closures_that_come_are_turned_back_as_those_before(degrees: float) -> None:
+    """With translations: by updates, from labels alone, and by the tangent before an update has ended."""
+    case = drawn("hills: 30 % random", 1)
+    graph = replace(case.graph, translation=torch.from_numpy(case.edge_translation))
+    mounting = np.radians(degrees) * np.array([0.6, -0.64, 0.48])
+    graph = without_mounting(graph, -mounting)
+    first = until(graph, graph.num_nodes - 30)
+    solution = solve(first, profile="slam")
+    assert isinstance(solution.memory, SlamMemory) and solution.memory.calibration is not None
+    assert np.linalg.norm(solution.memory.calibration.mounting - mounting) < np.radians(3.0)
+    whole = solve(graph, profile="slam")
+    kept = solution.memory.labels
+    assert kept is not None
+    memories = (solution.memory, KeptLabels.of_arrays(first, kept.arrays()))
+    later = until(graph, graph.num_nodes)
+    flagged = solve(later, profile="slam").outlier_score > 0.5
+    for memory, work in ((memories[0], None), (memories[1], None), (memories[0], 1e-9)):
+        start = grown(later, solution)
+        after = solve(later, profile="slam", warm_start=start, memory=memory, work=work)
+        assert set(after.stage_seconds) == {"update"}
+        assert ((after.outlier_score > 0.5) != flagged).sum() <= 1
+        errors = [error_deg(later, one.body_from_world, case.body_from_world) for one in (after, whole)]
+        assert errors[0] < 1.2 * errors[1] + 0.1
 
 
 def test_what_has_not_grown_is_solved_anew() -> None:

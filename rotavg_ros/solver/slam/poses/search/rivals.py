@@ -49,7 +49,7 @@ def rival_poses(
     """Poses of labellings that translations do not rule out.
 
     Args:
-        graph: whose odometry was drawn together, without its bias.
+        graph: whose odometry was drawn together, calibrated.
         translation: ``(M, 3)`` metres.
         modes: labellings of its rotations, the likeliest first.
         tuned: the same labelling with the noise of each edge as FineNet has it, for its poses.

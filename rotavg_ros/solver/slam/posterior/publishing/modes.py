@@ -13,7 +13,7 @@ from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.posterior.em import step
-from rotavg_ros.solver.slam.posterior.left_out import leave_one_out, scores, slipped_or_tailed
+from rotavg_ros.solver.slam.posterior.left_out import leave_one_out, scores
 from rotavg_ros.solver.slam.posterior.mode import OTHER_NOISE, Mode
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.publishing.gravity import held_by_gravity
@@ -23,8 +23,6 @@ from rotavg_ros.solver.slam.posterior.state import Noise
 _FAR, _FAR_NOISE = 5.0, 2.0
 # Rivals as likely as this that turn a node by more than this, rad, are worth a warning.
 LIKELY, FAR_TURN = 0.05, np.radians(5.0)
-# Odometry that slipped by more than this, rad, is.
-FAR_SLIP = np.radians(10.0)
 # What is less likely good than this does not pull at all.
 _SURELY_FALSE = 0.05
 _ROUNDS = 2
@@ -122,24 +120,6 @@ def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: li
         f"Other answers are nearly as likely ({100 * share[others].sum():.0f} %): they disagree about {closures} "
         f"closures and {steps} stretches of odometry, and turn parts of the map by up to {turned:.0f}°. What is "
         "published is their median; see its uncertainty, and label the closures that you know.",
-    )
-
-
-def of_slips(mode: Mode) -> tuple[str, ...]:
-    """What is to be known of a labelling by which odometry is off by far somewhere: a sentence, or none."""
-    graph, off = mode.problem.graph, slipped_or_tailed(mode.problem, mode.state, mode.left_out)
-    turned = np.sqrt((mode.evaluation.residual[off] ** 2).sum(axis=1))
-    far = off[turned > FAR_SLIP]
-    if len(far) == 0:
-        return ()
-    largest = off[int(turned.argmax())]
-    first, last = sorted((int(graph.nodes[graph.source[largest]]), int(graph.nodes[graph.target[largest]])))
-    times = "once" if len(far) == 1 else f"{len(far)} times"
-    return (
-        f"Odometry is held to have slipped {times}, the farthest by {np.degrees(turned.max()):.0f}° between nodes "
-        f"{first} and {last}, because closures agree that it has. In a building that looks alike turned false closures "
-        "agree so, too: if no step of the odometry can be off by that much, solve without slips (neurora~slips), or "
-        "label the closures that you know.",
     )
 
 

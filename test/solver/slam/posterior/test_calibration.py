@@ -22,13 +22,13 @@ def test_a_bias_has_the_evidence_of_a_dense_integral(seed: int, planted_deg: flo
     for _ in range(3):
         problem = problem_of(graph, rate=rate)
         state, after = polish(problem, state_of(problem, good), hold_noise=True)
-        assert problem.bias is not None
-        information, change = problem.bias.information(
+        assert problem.calibrated is not None
+        information, change = problem.calibrated.information(
             problem.graph.source, state, after.residual, after.factorised, GAUSSIAN_PRIORS
         )
         # What F falls by until the likeliest bias is known from wherever it is looked for.
         totals.append(after.total - float(change @ information @ change) / 2)
-        rate += float((change @ problem.bias.axes)[2])
+        rate += float((change @ problem.calibrated.axes)[2])
     densely = log_evidence(plain, good, GAUSSIAN_PRIORS.bias_deg) - log_evidence(plain, good)
     assert before.total - totals[-1] == pytest.approx(densely, abs=0.02)
     np.testing.assert_allclose(totals, totals[-1], atol=0.02)

@@ -1,0 +1,158 @@
+"""A sensor of loop closures that is not mounted as it is said to be.
+
+Closures that a camera measures are turned into the body's frame by its mounting, the odometry is the body's own. If the
+mounting is off by a rotation C = exp(c), c in the body's frame, every closure states
+
+    M = C R C⁻¹ = R exp((R⁻¹ − I) c) + O(c²),       t = C t_body
+
+instead of R and t_body. A closure that turns by nothing does not tell; one between poses in opposite headings is off by
+twice the part of c that is level. About an axis that all turns share nothing tells c, and nothing depends on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.special import expit
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
+from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
+from rotavg_ros.solver.slam.noise.model import NoiseModel
+from rotavg_ros.view_graph import ViewGraph
+
+# Proposals come from closures that turn by more than this, rad, those that span the least odometry first: so many, each
+# with the next that turns about an axis farther from its own than this, rad, if there is one.
+_LEAST_TURN, _LEAST_APART, _MAX_PROPOSALS = np.radians(20.0), np.radians(20.0), 60
+# More closures than this say no more of three numbers.
+_MAX_CLOSURES = 1500
+_EM_ITERATIONS = 10
+# Two mountings are others if they differ by more than this, rad.
+_FAR = np.radians(60.0)
+# A mounting is worth a search if it makes closures, as if they were independent, likelier by so many nats than the one
+# that is said, and by so many each, and is not so many behind another: less costs more time than it is worth, and of a
+# mounting that is not far off the posterior tells by itself.
+_WORTH, _WORTH_EACH = 10.0, 0.05
+# So short is no axis.
+_NO_TURN = 1e-6
+# A sensor may be mounted anyhow: the variance of a component of the rotation vector of a random turn, rad².
+ANY_TURN = (np.pi**2 / 3 + 2) / 3
+
+
+def without_mounting(graph: ViewGraph, mounting: np.ndarray) -> ViewGraph:
+    """The graph with ``mounting`` ``(3,)``, c in rad, taken out of its closures; C R C⁻¹ → R, t → C⁻¹ t."""
+    closures = torch.nonzero(~graph.is_odometry).squeeze(1)
+    body_from_sensor = rotations.exp(torch.from_numpy(-mounting)).expand(len(closures), 4)
+    measured = rotations.multiply(body_from_sensor, graph.target_from_source[closures])
+    measured = rotations.multiply(measured, rotations.inverse(body_from_sensor))
+    measured = rotations.canonical(rotations.normalize(measured))
+    turned = replace(graph, target_from_source=_with(graph.target_from_source, closures, measured))
+    if graph.translation is None:
+        return turned
+    seen = rotations.rotate(body_from_sensor, graph.translation[closures])
+    return replace(turned, translation=_with(graph.translation, closures, seen))
+
+
+def estimate_mountings(graph: ViewGraph, closure_graph: ClosureGraph, noise: NoiseModel) -> list[np.ndarray]:
+    """The mountings that the closures may speak of, beside odometry, however far they are from what is said.
+
+    With quaternions (v, w) of M and of the odometry's R, v_M = C v_R. Few closures propose a C. The one that makes all
+    likeliest is refined by expectation–maximisation (Wahba's problem, by Kabsch's method), and so is the likeliest of
+    those far from it: where all turns are small, or half a turn, a sensor that is upside down would see about the same.
+
+    Args:
+        graph: the view-graph.
+        closure_graph: of it, drawn together.
+        noise: of steps and closures.
+
+    Returns:
+        c ``(3,)`` rad of each that is worth a search, the likeliest first.
+    """
+    closure = np.flatnonzero(closure_graph.is_closure & np.isfinite(closure_graph.path_steps))
+    closure = closure[:: max(1, len(closure) // _MAX_CLOSURES)]
+    ends = (closure_graph.nodes[each[closure]] for each in (closure_graph.source, closure_graph.target))
+    source, target = (closure_graph.odometry_orientation[torch.from_numpy(each)] for each in ends)
+    turned = rotations.canonical(rotations.multiply(target, rotations.inverse(source))).numpy()
+    edge = closure_graph.view_graph_edge[closure - closure_graph.num_segments]
+    measured = rotations.canonical(graph.target_from_source[edge]).numpy()
+    variance = np.maximum(closure_graph.path_steps[closure], 1.0) * noise.step_variance + noise.closure_variance
+    highest = noise.prior_log_odds - noise.components / 2 * np.log(2 * np.pi * variance)
+
+    def log_odds(sensor_from_body: np.ndarray) -> np.ndarray:
+        cosine = np.abs(_conjugated(sensor_from_body, turned) * measured).sum(axis=-1)
+        angle = 2 * np.arccos(np.minimum(cosine, 1.0))
+        uniform = log_uniform_density(angle.ravel(), noise.components).reshape(angle.shape)
+        return np.asarray(highest - angle**2 / (2 * variance) - uniform)
+
+    def log_likelihood(sensor_from_body: np.ndarray) -> np.ndarray:
+        from_said = _angle(sensor_from_body) ** 2 / (2 * ANY_TURN)
+        return np.asarray(np.logaddexp(0, log_odds(sensor_from_body)).sum(axis=1) - from_said)
+
+    proposals = _proposals(turned, measured, variance)
+    proposals = proposals[np.argsort(-log_likelihood(proposals), kind="stable")]
+    far = _angle(np.swapaxes(proposals[:1], 1, 2) @ proposals) > _FAR
+    refined = np.concatenate((proposals[:1], proposals[far][:1]))
+    for _ in range(_EM_ITERATIONS):
+        sign = np.sign((_conjugated(refined, turned) * measured).sum(axis=-1))
+        weight = sign * expit(log_odds(refined)) / variance
+        refined = _nearest_rotation(np.einsum("pc,ci,cj->pij", weight, measured[:, :3], turned[:, :3]))
+    is_other = _angle(np.swapaxes(refined[:1], 1, 2) @ refined) > _FAR
+    refined = refined[is_other | (np.arange(len(refined)) == 0)]
+    likelihood = log_likelihood(refined)
+    worth = likelihood > log_likelihood(np.eye(3)[None]) + max(_WORTH, _WORTH_EACH * len(closure))
+    worth &= likelihood > likelihood.max(initial=-np.inf) - _WORTH
+    return list(rotations.log(rotations.from_matrix(torch.from_numpy(refined[worth]))).numpy())
+
+
+def _proposals(turned: np.ndarray, measured: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """``(P, 3, 3)`` C that take one closure's axis, or those of two, from odometry's ``(C, 4)`` to what is stated."""
+    tells = np.flatnonzero(2 * np.arccos(np.minimum(turned[:, 3], 1.0)) > _LEAST_TURN)
+    tells = tells[np.argsort(variance[tells], kind="stable")][:_MAX_PROPOSALS]
+    if len(tells) == 0:
+        return np.zeros((0, 3, 3))
+    of_body, of_sensor = (_axes(rows[tells]) for rows in (turned, measured))
+    following = np.add.outer(np.arange(len(tells)), np.arange(len(tells))) % len(tells)
+    is_apart = (np.abs(of_body @ of_body.T) < np.cos(_LEAST_APART))[following[:, :1], following]
+    other = np.take_along_axis(following, is_apart.argmax(axis=1)[:, None], axis=1)[:, 0]
+    pairs = of_sensor[:, :, None] * of_body[:, None]
+    pairs = pairs + is_apart.any(axis=1)[:, None, None] * pairs[other]
+    return _nearest_rotation(pairs)
+
+
+def _angle(matrices: np.ndarray) -> np.ndarray:
+    """``(…)`` rad, of rotations ``(…, 3, 3)``."""
+    return np.asarray(np.arccos(((np.trace(matrices, axis1=-2, axis2=-1) - 1) / 2).clip(-1, 1)))
+
+
+def _axes(quaternions: np.ndarray) -> np.ndarray:
+    """``(n, 3)`` of rotations ``(n, 4)``, of length one."""
+    vectors = quaternions[:, :3]
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True).clip(_NO_TURN))
+
+
+def _nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """Of matrices ``(…, 3, 3)``, Σ b aᵀ: the rotations that take the a nearest to the b, and else turn the least."""
+    size = np.linalg.norm(matrix, axis=(-2, -1))[..., None, None]
+    left, _, right = np.linalg.svd(matrix + _NO_TURN * size * np.eye(3))
+    left[..., 2] *= (np.linalg.det(left) * np.linalg.det(right))[..., None]
+    return np.asarray(left @ right)
+
+
+def _conjugated(sensor_from_body: np.ndarray, turned: np.ndarray) -> np.ndarray:
+    """``(P, C, 4)``: C R C⁻¹ of each C ``(P, 3, 3)`` and R ``(C, 4)``."""
+    vector = np.einsum("pij,cj->pci", sensor_from_body, turned[:, :3])
+    return np.concatenate((vector, np.broadcast_to(turned[:, 3:], (*vector.shape[:2], 1))), axis=-1)
+
+
+def turned_per_mounting(target_from_source: Tensor) -> np.ndarray:
+    """``(n, 3, 3)``: by how much closures ``(n, 4)`` are off for each c, in the source's frame: M⁻¹ − I."""
+    return np.asarray(rotations.to_matrix(rotations.inverse(target_from_source)).numpy() - np.eye(3))
+
+
+def _with(values: Tensor, rows: Tensor, of_rows: Tensor) -> Tensor:
+    changed = values.clone()
+    changed[rows] = of_rows
+    return changed
