@@ -33,8 +33,8 @@ _EM_ITERATIONS = 10
 # Two mountings are others if they differ by more than this, rad.
 _FAR = np.radians(60.0)
 # A mounting is worth a search if it makes closures, as if they were independent, likelier by so many nats than the one
-# that is said, and by so many each, and is not so many behind another: less costs more time than it is worth, and of a
-# mounting that is not far off the posterior tells by itself.
+# that is said, and by so many each: less costs more time than it is worth, and of a mounting that is not far off the
+# posterior tells by itself. Noise is held for what it is with the mounting that is said, so F decides between two.
 _WORTH, _WORTH_EACH = 10.0, 0.05
 # So short is no axis.
 _NO_TURN = 1e-6
@@ -59,9 +59,9 @@ def without_mounting(graph: ViewGraph, mounting: np.ndarray) -> ViewGraph:
 def estimate_mountings(graph: ViewGraph, closure_graph: ClosureGraph, noise: NoiseModel) -> list[np.ndarray]:
     """The mountings that the closures may speak of, beside odometry, however far they are from what is said.
 
-    With quaternions (v, w) of M and of the odometry's R, v_M = C v_R. Few closures propose a C. The one that makes all
-    likeliest is refined by expectation–maximisation (Wahba's problem, by Kabsch's method), and so is the likeliest of
-    those far from it: where all turns are small, or half a turn, a sensor that is upside down would see about the same.
+    With quaternions (v, w) of M and of the odometry's R, v_M = C v_R. Few closures propose a C, which is refined by
+    expectation–maximisation (Wahba's problem, by Kabsch's method). Besides the likeliest, the likeliest of those far
+    from it: where all turns are small, or half a turn, a sensor that is upside down would see about the same.
 
     Args:
         graph: the view-graph.
@@ -91,20 +91,17 @@ def estimate_mountings(graph: ViewGraph, closure_graph: ClosureGraph, noise: Noi
         from_said = _angle(sensor_from_body) ** 2 / (2 * ANY_TURN)
         return np.asarray(np.logaddexp(0, log_odds(sensor_from_body)).sum(axis=1) - from_said)
 
-    proposals = _proposals(turned, measured, variance)
-    proposals = proposals[np.argsort(-log_likelihood(proposals), kind="stable")]
-    far = _angle(np.swapaxes(proposals[:1], 1, 2) @ proposals) > _FAR
-    refined = np.concatenate((proposals[:1], proposals[far][:1]))
+    proposed = _proposals(turned, measured, variance)
     for _ in range(_EM_ITERATIONS):
-        sign = np.sign((_conjugated(refined, turned) * measured).sum(axis=-1))
-        weight = sign * expit(log_odds(refined)) / variance
-        refined = _nearest_rotation(np.einsum("pc,ci,cj->pij", weight, measured[:, :3], turned[:, :3]))
-    is_other = _angle(np.swapaxes(refined[:1], 1, 2) @ refined) > _FAR
-    refined = refined[is_other | (np.arange(len(refined)) == 0)]
-    likelihood = log_likelihood(refined)
+        sign = np.sign((_conjugated(proposed, turned) * measured).sum(axis=-1))
+        weight = sign * expit(log_odds(proposed)) / variance
+        proposed = _nearest_rotation(np.einsum("pc,ci,cj->pij", weight, measured[:, :3], turned[:, :3]))
+    proposed = proposed[np.argsort(-log_likelihood(proposed), kind="stable")]
+    is_other = _angle(np.swapaxes(proposed[:1], 1, 2) @ proposed) > _FAR
+    found = np.concatenate((proposed[:1], proposed[is_other][:1]))
+    likelihood = log_likelihood(found)
     worth = likelihood > log_likelihood(np.eye(3)[None]) + max(_WORTH, _WORTH_EACH * len(closure))
-    worth &= likelihood > likelihood.max(initial=-np.inf) - _WORTH
-    return list(rotations.log(rotations.from_matrix(torch.from_numpy(refined[worth]))).numpy())
+    return list(rotations.log(rotations.from_matrix(torch.from_numpy(found[worth]))).numpy())
 
 
 def _proposals(turned: np.ndarray, measured: np.ndarray, variance: np.ndarray) -> np.ndarray:
