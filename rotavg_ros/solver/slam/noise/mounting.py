@@ -104,6 +104,23 @@ def estimate_mountings(graph: ViewGraph, closure_graph: ClosureGraph, noise: Noi
     return list(rotations.log(rotations.from_matrix(torch.from_numpy(found[worth]))).numpy())
 
 
+def between_axes(graph: ViewGraph) -> list[np.ndarray]:
+    """Where odometry turns about one axis alone and closures about another: c ``(3,)`` rad, either way round.
+
+    So it is with a robot in the plane whose closures are of a planar sensor that sits tilted; nothing else looks so.
+    """
+    axes = []
+    for edges in (graph.is_odometry, ~graph.is_odometry):
+        alone = graph.select_edges(torch.nonzero(edges).squeeze(1))
+        if alone.num_edges == 0 or alone.rotation_components != 1:
+            return []
+        turns = rotations.log(alone.target_from_source)
+        axes.append(torch.linalg.eigh(turns.T @ turns)[1][:, -1].numpy())
+    pairs = np.outer(axes[1], axes[0])
+    turned = _nearest_rotation(np.stack((pairs, -pairs)))
+    return list(rotations.log(rotations.from_matrix(torch.from_numpy(turned))).numpy())
+
+
 def _proposals(turned: np.ndarray, measured: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """``(P, 3, 3)`` C that take one closure's axis, or those of two, from odometry's ``(C, 4)`` to what is stated."""
     tells = np.flatnonzero(2 * np.arccos(np.minimum(turned[:, 3], 1.0)) > _LEAST_TURN)

@@ -16,7 +16,7 @@ from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.routes import way_along
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.calibration import PARTS, Calibration, calibrated
-from rotavg_ros.solver.slam.noise.mounting import estimate_mountings
+from rotavg_ros.solver.slam.noise.mounting import between_axes, estimate_mountings
 from rotavg_ros.solver.slam.noise.turns import squared_turns
 from rotavg_ros.solver.slam.posterior.calibration import Calibrated
 from rotavg_ros.solver.slam.posterior.inference import Search
@@ -116,13 +116,13 @@ def search(
         priors: other ones than usual.
     """
     solver = _Solver(graph, network, begin, without, priors)
-    found = solver.from_starts(None)
-    # What one part explains, another may, too: the one that explains more comes first.
-    parts = sorted(set(PARTS) - set(without), key=lambda part: (solver.predicted(found, part).cost, part))
-    for part in parts:
-        found = solver.calibrated(found, part)
-    if found.calibration is not None and parts[0] not in found.calibration.parts:
-        found = solver.calibrated(found, parts[0])
+    parts = set(PARTS) - set(without)
+    as_said = solver.from_starts(None)
+    begun = min([as_said, *(each for part in sorted(parts) for each in solver.likely(as_said, part))], key=_rank)
+    found = solver.one_by_one(begun, parts)
+    if begun is not as_said and found.calibration is not None and found.calibration.parts == parts:
+        # What one part explains, another may, too.
+        found = min(found, solver.one_by_one(as_said, parts), key=_rank)
     return found
 
 
@@ -149,13 +149,28 @@ class _Solver(NamedTuple):
         begun.run(drawn.prepared, drawn.cleaned, self.begin(drawn.prepared, drawn.cleaned))
         return Found(drawn, begun.modes)
 
-    def calibrated(self, found: Found, part: str) -> Found:
-        """What is found with one more part of the calibration, from what closures speak of and by Newton's steps."""
+    def likely(self, found: Found, part: str) -> list[Found]:
+        """What is found from all starts with one more part of the calibration, which closures beside odometry tell."""
         before = found.calibration or Calibration.none()
-        if part not in before.parts:
-            likely = _likely(part, before.taken_out_of(self.graph), found.drawn.prepared)
-            others = [self.from_starts(replace(before, **{part: value})) for value in likely]
-            found = min(found, *others, key=_rank) if others else found
+        values = _likely(part, before.taken_out_of(self.graph), found.drawn.prepared)
+        return [self.from_starts(replace(before, **{part: value})) for value in values]
+
+    def one_by_one(self, found: Found, parts: Collection[str]) -> Found:
+        """What is found by Newton's steps on more and more parts, the one that promises more first."""
+        ordered = sorted(parts, key=lambda part: (self.predicted(found, part).cost, part))
+        for part in ordered:
+            found = self.calibrated(found, part)
+        if found.calibration is not None and ordered[0] not in found.calibration.parts:
+            found = self.calibrated(found, ordered[0])
+        return found
+
+    def calibrated(self, found: Found, part: str) -> Found:
+        """What is found with one more part of the calibration by Newton's steps.
+
+        Closures that another part was taken out of may speak of this one otherwise than before.
+        """
+        if found.calibration is not None and part not in found.calibration.parts:
+            found = min([found, *self.likely(found, part)], key=_rank)
         for _ in range(_ROUNDS):
             better = self._better(found, part)
             if better is None:
@@ -195,8 +210,9 @@ def _likely(part: str, graph: ViewGraph, prepared: Prepared) -> list[np.ndarray]
     """``(3,)`` each, what closures beside odometry make of a part that nothing was taken out of yet."""
     if part == "mounting":
         # Where all that is measured turns about one axis, an upside-down sensor is what inverted closures look like.
-        is_planar = prepared.noise.components == 1
-        return [] if is_planar else estimate_mountings(graph, prepared.closure_graph, prepared.noise)
+        if prepared.noise.components == 1:
+            return []
+        return between_axes(graph) or estimate_mountings(graph, prepared.closure_graph, prepared.noise)
     bias = likely_bias(graph, prepared)
     return [] if bias is None else [bias]
 
