@@ -3,8 +3,9 @@
 A gyroscope's bias β turns every step of odometry too far, a sensor that is mounted otherwise than said by c every
 closure (:mod:`rotavg_ros.solver.slam.noise.gyro_bias`, :mod:`rotavg_ros.solver.slam.noise.mounting`). Both are taken
 out of what was measured before the graph is drawn together. What is left of p = (β, c) turns the residual of an edge by
-D p in the world's frame, so p is a further unknown of the normal equations, with N(0, Σ) as its prior: β of some rate,
-c of any mounting. Eliminating the corrections leaves
+D p in the world's frame, so p is a further unknown of the normal equations, with N(0, Σ) as its prior. A sensor is
+either mounted about as it is said to be, known as closures are, or anyhow; what is likelier of the two at c counts, so
+that what closures do not tell of a small c stays small. Eliminating the corrections leaves
 
     S = Dᵀ W (D − J H⁻¹ Jᵀ W D) + Σ⁻¹,       −log p = ½ pᵀ Σ⁻¹ p + ½ log det Σ + ½ log det S
 
@@ -68,7 +69,9 @@ class Calibrated:
     def precision(self, priors: SlamPriors) -> np.ndarray:
         """``(d,)`` diagonal of Σ⁻¹."""
         is_bias = self.axes[:, :3].any(axis=1)
-        return np.asarray(np.where(is_bias, np.radians(priors.bias_deg) ** -2, 1 / ANY_TURN))
+        near, square = np.radians(priors.closure_deg) ** -2, (self.calibration.mounting**2).sum()
+        is_near = square * (near - 1 / ANY_TURN) < 3 * np.log(near * ANY_TURN)
+        return np.asarray(np.where(is_bias, np.radians(priors.bias_deg) ** -2, near if is_near else 1 / ANY_TURN))
 
     def information(
         self, source: np.ndarray, state: State, residual: np.ndarray, factorised: Factorised, priors: SlamPriors
@@ -99,7 +102,8 @@ class Calibrated:
         """−log p, nats, the rest of S integrated."""
         precision = self.precision(priors)
         occam = (np.linalg.slogdet(information)[1] - np.log(precision).sum()) / 2
-        return float((precision * self.value**2).sum() / 2 + occam)
+        either = np.log(2) * bool(self.axes[:, 3:].any())
+        return float((precision * self.value**2).sum() / 2 + occam + either)
 
 
 def _of_bias(graph: ViewGraph, prepared: Prepared, is_planar: bool) -> tuple[np.ndarray, np.ndarray]:

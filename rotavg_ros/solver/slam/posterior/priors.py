@@ -14,7 +14,7 @@ class SlamPriors:
 
     Attributes:
         step_deg: median of the standard deviation of one step of odometry.
-        closure_deg: the same of a good closure.
+        closure_deg: the same of a good closure; and the standard deviation of how their sensor is said to be mounted.
         noise_spread: standard deviation of the logarithm of both.
         tails: probability that some of the sound segments err by far more than others; and that good closures do;
             all shares that are summed over are as likely (:mod:`rotavg_ros.solver.slam.posterior.state`), …
