@@ -27,6 +27,8 @@ from rotavg_ros.view_graph import ViewGraph
 # Proposals come from closures that turn by more than this, rad, those that span the least odometry first: so many, each
 # with the next that turns about an axis farther from its own than this, rad, if there is one.
 _LEAST_TURN, _LEAST_APART, _MAX_PROPOSALS = np.radians(20.0), np.radians(20.0), 60
+# Of fewer that turn nothing is made.
+_LEAST_TURNED = 3
 # More closures than this say no more of three numbers.
 _MAX_CLOSURES = 1500
 _EM_ITERATIONS = 10
@@ -102,6 +104,12 @@ def estimate_mountings(graph: ViewGraph, closure_graph: ClosureGraph, noise: Noi
     likelihood = log_likelihood(found)
     worth = likelihood > log_likelihood(np.eye(3)[None]) + max(_WORTH, _WORTH_EACH * len(closure))
     return list(rotations.log(rotations.from_matrix(torch.from_numpy(found[worth]))).numpy())
+
+
+def may_be_told(graph: ViewGraph) -> bool:
+    """Whether as many closures turn as c has components; the axis of one alone is any."""
+    turned = rotations.angle(graph.target_from_source[~graph.is_odometry])
+    return int((turned > _LEAST_TURN).sum()) >= _LEAST_TURNED
 
 
 def between_axes(graph: ViewGraph) -> list[np.ndarray]:

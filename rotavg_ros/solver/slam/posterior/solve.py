@@ -16,7 +16,7 @@ from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.routes import way_along
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.calibration import PARTS, Calibration, calibrated
-from rotavg_ros.solver.slam.noise.mounting import between_axes, estimate_mountings
+from rotavg_ros.solver.slam.noise.mounting import between_axes, estimate_mountings, may_be_told
 from rotavg_ros.solver.slam.noise.turns import squared_turns
 from rotavg_ros.solver.slam.posterior.calibration import Calibrated
 from rotavg_ros.solver.slam.posterior.inference import Search
@@ -116,7 +116,7 @@ def search(
         priors: other ones than usual.
     """
     solver = _Solver(graph, network, begin, without, priors)
-    parts = set(PARTS) - set(without)
+    parts = set(PARTS) - set(without) - (set() if may_be_told(graph) else {"mounting"})
     as_said = solver.from_starts(None)
     begun = min([as_said, *(each for part in sorted(parts) for each in solver.likely(as_said, part))], key=_rank)
     found = solver.one_by_one(begun, parts)

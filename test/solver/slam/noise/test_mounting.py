@@ -213,3 +213,23 @@ def test_inverted_closures_in_the_plane_are_no_mounting() -> None:
     solution = solve(replace(graph, target_from_source=inverted), profile="slam")
     assert not mounting_of(solution).any()
     assert any("inverted" in text for text in solution.warnings)
+
+
+def test_one_closure_that_turns_tells_no_mounting() -> None:
+    """False, about another axis than odometry's; the others see a place again from where it was seen before."""
+    count = 60
+    yaw = np.radians(12.0 * np.arange(count) + np.cumsum(np.random.default_rng(8).normal(0, 1, count)))
+    world_from_body = Rotation.from_rotvec(yaw[:, None] * [0, 0, 1])
+    older, newer = np.arange(0, 30, 3), np.arange(30, 60, 3)
+    steps = (world_from_body[:-1].inv() * world_from_body[1:]).inv().as_quat()
+    same, false = np.tile([0.0, 0.0, 0.0, 1.0], (len(older), 1)), Rotation.from_rotvec([[0, 1.5, 0]]).as_quat()
+    graph = ViewGraph.create(
+        np.concatenate((np.arange(count - 1), older, [20])),
+        np.concatenate((np.arange(1, count), newer, [58])),
+        np.concatenate((steps, same, false)),
+        num_nodes=count,
+        kind=[0] * (count - 1) + [1] * 11,
+    )
+    solution = solve(graph, profile="slam")
+    assert not mounting_of(solution).any()
+    assert (solution.outlier_score > 0.5).nonzero()[:, 0].tolist() == [graph.num_edges - 1]
