@@ -220,14 +220,14 @@ def _updated(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | Non
     """What is known once the graph is solved from the labelling before, closures that are new judged by it."""
     assert run.warm_start is not None
     before = memory.poses
-    measured = memory.calibrated(graph)
-    start = run.warm_start.double() if before is None else before.start_alone(measured)
+    calibrated = memory.calibrated(graph)
+    start = run.warm_start.double() if before is None else before.start_alone(calibrated)
     if start is None or (before is None) is has_places(graph):
         return None
     found = memory.updated(graph, _networks(run), start)
     estimate = found.estimate
     if before is not None:
-        poses = poses_of_update(measured, found.mode, before)
+        poses = poses_of_update(calibrated, found.mode, before)
         if poses is None:
             return None
         estimate = with_poses(graph, estimate, poses)

@@ -78,15 +78,15 @@ def prepare(graph: ViewGraph) -> Prepared:
     return unbiased if is_better else prepared
 
 
-def prepare_as_it_is(graph: ViewGraph) -> Prepared:
-    """The same whatever the odometry's bias."""
+def prepare_as_it_is(graph: ViewGraph, components: int | None = None) -> Prepared:
+    """The same whatever the odometry's bias; with noise of so many components, by default as many as rotations have."""
     closure_graph, forest = draw_together(graph)
     spend(_CLOSURE * int(closure_graph.is_closure.sum()))
     closure = closure_graph.is_closure
     squared_angle = (rotations.log(closure_graph.residual) ** 2).sum(dim=1).numpy()[closure]
     path_steps = closure_graph.path_steps[closure]
     pairs = agreement_pairs(closure_graph)
-    noise = estimate_noise(discrepancies(squared_angle, path_steps, pairs), graph.rotation_components)
+    noise = estimate_noise(discrepancies(squared_angle, path_steps, pairs), components or graph.rotation_components)
     return Prepared(closure_graph, squared_angle, path_steps, pairs, noise, forest)
 
 

@@ -22,15 +22,14 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
 from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
 from rotavg_ros.solver.slam.noise.model import NoiseModel
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # Proposals come from closures that turn by more than this, rad, those that span the least odometry first: so many, each
 # with the next that turns about an axis farther from its own than this, rad, if there is one.
 _LEAST_TURN, _LEAST_APART, _MAX_PROPOSALS = np.radians(20.0), np.radians(20.0), 60
-# Of fewer that turn nothing is made.
-_LEAST_TURNED = 3
 # More closures than this say no more of three numbers.
 _MAX_CLOSURES = 1500
+_COMPONENTS = 3
 _EM_ITERATIONS = 10
 # Two mountings are others if they differ by more than this, rad.
 _FAR = np.radians(60.0)
@@ -73,12 +72,14 @@ def estimate_mountings(graph: ViewGraph, closure_graph: ClosureGraph, noise: Noi
     Returns:
         c ``(3,)`` rad of each that is worth a search, the likeliest first.
     """
-    closure = np.flatnonzero(closure_graph.is_closure & np.isfinite(closure_graph.path_steps))
+    segments = closure_graph.num_segments
+    may_tell = np.append(np.zeros(segments, dtype=bool), _may_tell(graph).numpy()[closure_graph.view_graph_edge])
+    closure = np.flatnonzero(may_tell & np.isfinite(closure_graph.path_steps))
     closure = closure[:: max(1, len(closure) // _MAX_CLOSURES)]
     ends = (closure_graph.nodes[each[closure]] for each in (closure_graph.source, closure_graph.target))
     source, target = (closure_graph.odometry_orientation[torch.from_numpy(each)] for each in ends)
     turned = rotations.canonical(rotations.multiply(target, rotations.inverse(source))).numpy()
-    edge = closure_graph.view_graph_edge[closure - closure_graph.num_segments]
+    edge = closure_graph.view_graph_edge[closure - segments]
     measured = rotations.canonical(graph.target_from_source[edge]).numpy()
     variance = np.maximum(closure_graph.path_steps[closure], 1.0) * noise.step_variance + noise.closure_variance
     highest = noise.prior_log_odds - noise.components / 2 * np.log(2 * np.pi * variance)
@@ -107,9 +108,9 @@ def estimate_mountings(graph: ViewGraph, closure_graph: ClosureGraph, noise: Noi
 
 
 def may_be_told(graph: ViewGraph) -> bool:
-    """Whether as many closures turn as c has components; the axis of one alone is any."""
-    turned = rotations.angle(graph.target_from_source[~graph.is_odometry])
-    return int((turned > _LEAST_TURN).sum()) >= _LEAST_TURNED
+    """Whether as many closures turn as c has components: one false one is about some axis, and makes no sensor's."""
+    turned = rotations.angle(graph.target_from_source[_may_tell(graph)])
+    return int((turned > _LEAST_TURN).sum()) >= _COMPONENTS
 
 
 def between_axes(graph: ViewGraph) -> list[np.ndarray]:
@@ -118,7 +119,7 @@ def between_axes(graph: ViewGraph) -> list[np.ndarray]:
     So it is with a robot in the plane whose closures are of a planar sensor that sits tilted; nothing else looks so.
     """
     axes = []
-    for edges in (graph.is_odometry, ~graph.is_odometry):
+    for edges in (graph.is_odometry, _may_tell(graph)):
         alone = graph.select_edges(torch.nonzero(edges).squeeze(1))
         if alone.num_edges == 0 or alone.rotation_components != 1:
             return []
@@ -127,6 +128,11 @@ def between_axes(graph: ViewGraph) -> list[np.ndarray]:
     pairs = np.outer(axes[1], axes[0])
     turned = _nearest_rotation(np.stack((pairs, -pairs)))
     return list(rotations.log(rotations.from_matrix(torch.from_numpy(turned))).numpy())
+
+
+def _may_tell(graph: ViewGraph) -> Tensor:
+    """``(M,)`` closures that nobody has rejected."""
+    return ~graph.is_odometry & (graph.label != EdgeLabel.REJECTED)
 
 
 def _proposals(turned: np.ndarray, measured: np.ndarray, variance: np.ndarray) -> np.ndarray:

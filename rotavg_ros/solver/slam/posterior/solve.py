@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -56,10 +57,14 @@ class Drawn:
         without: Collection[str] = (),
         calibration: Calibration | None = None,
         priors: SlamPriors | None = None,
+        components: int | None = None,
     ) -> Drawn:
-        """After what all have wrong alike is taken out of the measurements, if that is anything."""
+        """After what all have wrong alike is taken out of the measurements, if that is anything.
+
+        Components: k, if it is to be another than that of the rotations that are left.
+        """
         corrected = calibrated(graph, calibration)
-        prepared = prepare_as_it_is(corrected)
+        prepared = prepare_as_it_is(corrected, components)
         cleaned = clean(network, prepared, graph.label)
         spend(_EDGE * graph.num_edges)
         taken_out = None
@@ -116,13 +121,19 @@ def search(
         priors: other ones than usual.
     """
     solver = _Solver(graph, network, begin, without, priors)
-    parts = set(PARTS) - set(without) - (set() if may_be_told(graph) else {"mounting"})
+    parts = set(PARTS) - set(without)
     as_said = solver.from_starts(None)
-    begun = min([as_said, *(each for part in sorted(parts) for each in solver.likely(as_said, part))], key=_rank)
+    begun = min(
+        [as_said, *(each for part in sorted(parts) for each in solver.likely(as_said, part))], key=attrgetter("cost")
+    )
     found = solver.one_by_one(begun, parts)
     if begun is not as_said and found.calibration is not None and found.calibration.parts == parts:
         # What one part explains, another may, too.
-        found = min(found, solver.one_by_one(as_said, parts), key=_rank)
+        found = min(found, solver.one_by_one(as_said, parts), key=attrgetter("cost"))
+    left = calibrated(graph, found.calibration)
+    if left.rotation_components < graph.rotation_components:
+        # What is left turns about one axis, and so it errs.
+        found = solver.from_starts(found.calibration, left.rotation_components)
     return found
 
 
@@ -142,9 +153,9 @@ class _Solver(NamedTuple):
     without: Collection[str]
     priors: SlamPriors | None
 
-    def from_starts(self, calibration: Calibration | None) -> Found:
-        """What is found from all starts after a calibration is taken out."""
-        drawn = Drawn.of(self.graph, self.network, self.without, calibration, self.priors)
+    def from_starts(self, calibration: Calibration | None, components: int | None = None) -> Found:
+        """What is found from all starts after a calibration is taken out; k is the graph's, if nothing else is said."""
+        drawn = self._drawn(calibration, components)
         begun = Search(drawn.problem)
         begun.run(drawn.prepared, drawn.cleaned, self.begin(drawn.prepared, drawn.cleaned))
         return Found(drawn, begun.modes)
@@ -159,18 +170,18 @@ class _Solver(NamedTuple):
         """What is found by Newton's steps on more and more parts, the one that promises more first."""
         ordered = sorted(parts, key=lambda part: (self.predicted(found, part).cost, part))
         for part in ordered:
-            found = self.calibrated(found, part)
+            found = self.with_part(found, part)
         if found.calibration is not None and ordered[0] not in found.calibration.parts:
-            found = self.calibrated(found, ordered[0])
+            found = self.with_part(found, ordered[0])
         return found
 
-    def calibrated(self, found: Found, part: str) -> Found:
+    def with_part(self, found: Found, part: str) -> Found:
         """What is found with one more part of the calibration by Newton's steps.
 
         Closures that another part was taken out of may speak of this one otherwise than before.
         """
         if found.calibration is not None and part not in found.calibration.parts:
-            found = min([found, *self.likely(found, part)], key=_rank)
+            found = min([found, *self.likely(found, part)], key=attrgetter("cost"))
         for _ in range(_ROUNDS):
             better = self._better(found, part)
             if better is None:
@@ -196,30 +207,28 @@ class _Solver(NamedTuple):
         if cost > -_LEAST_GAIN:
             return None
         best, drawn = found.modes[0], found.drawn
-        again = Drawn.of(self.graph, self.network, self.without, calibration, best.problem.priors)
-        if again.problem.components < best.problem.components:
-            return self.from_starts(calibration)
+        again = self._drawn(calibration)
         goes_on = Search(again.problem)
         goes_on.keep(goes_on.flipped(goes_on.polished(_moved(best, drawn, again), "calibration")))
         goes_on.move_on()
         better = Found(again, goes_on.modes)
         return better if better.cost < found.cost - _LEAST_GAIN else None
 
+    def _drawn(self, calibration: Calibration | None, components: int | None = None) -> Drawn:
+        """F is compared with what is found without, so that k stays whatever C leaves."""
+        k = components or self.graph.rotation_components
+        return Drawn.of(self.graph, self.network, self.without, calibration, self.priors, k)
+
 
 def _likely(part: str, graph: ViewGraph, prepared: Prepared) -> list[np.ndarray]:
     """``(3,)`` each, what closures beside odometry make of a part that nothing was taken out of yet."""
     if part == "mounting":
         # Where all that is measured turns about one axis, an upside-down sensor is what inverted closures look like.
-        if prepared.noise.components == 1:
+        if prepared.noise.components == 1 or not may_be_told(graph):
             return []
         return between_axes(graph) or estimate_mountings(graph, prepared.closure_graph, prepared.noise)
     bias = likely_bias(graph, prepared)
     return [] if bias is None else [bias]
-
-
-def _rank(found: Found) -> tuple[int, float]:
-    """F, but that all turns about one axis have an F of their own, over fewer numbers: chance makes none so."""
-    return found.drawn.problem.components, found.cost
 
 
 def _travelled(graph: ViewGraph, prepared: Prepared) -> np.ndarray | None:

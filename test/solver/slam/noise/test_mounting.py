@@ -23,7 +23,7 @@ from rotavg_ros.solver.slam.noise.mounting import between_axes, estimate_mountin
 from rotavg_ros.solver.slam.posterior.calibration import Calibrated
 from rotavg_ros.solver.slam.preparation import prepare_as_it_is
 from rotavg_ros.solver.slam.update.memory import SlamMemory
-from rotavg_ros.view_graph import ViewGraph
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # x right, y down, z forward, seen from a body whose x is forward and z up.
 OPTICAL = Rotation.from_matrix([[0, -1, 0], [0, 0, -1], [1, 0, 0]]).as_rotvec()
@@ -233,3 +233,10 @@ def test_one_closure_that_turns_tells_no_mounting() -> None:
     solution = solve(graph, profile="slam")
     assert not mounting_of(solution).any()
     assert (solution.outlier_score > 0.5).nonzero()[:, 0].tolist() == [graph.num_edges - 1]
+
+
+def test_rejected_closures_tell_nothing() -> None:
+    graph = mounted(drawn("hills: 30 % random").graph, np.radians([20.0, -30.0, 10.0]))
+    label = torch.where(graph.is_odometry, graph.label, torch.full_like(graph.label, int(EdgeLabel.REJECTED)))
+    solution = solve(replace(graph, label=label), profile="slam")
+    assert not mounting_of(solution).any() and not any("mounted" in text for text in solution.warnings)

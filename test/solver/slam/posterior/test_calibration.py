@@ -1,12 +1,19 @@
-"""A bias's share of F against the dense integral."""
+"""What a bias and a mounting are worth to F: against the dense integral, and against F once they are taken out."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from rotavg_ros.datasets.simulation.stress.kinds import KINDS
+from rotavg_ros.solver.slam.noise.calibration import Calibration
 from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
+from rotavg_ros.solver.slam.noise.mounting import without_mounting
+from rotavg_ros.solver.slam.posterior.calibration import Calibrated
 from rotavg_ros.solver.slam.posterior.em import polish
+from rotavg_ros.solver.slam.posterior.objective import Evaluation
+from rotavg_ros.solver.slam.posterior.solve import Drawn
+from rotavg_ros.solver.slam.posterior.state import State
 
 from .planar import GAUSSIAN_PRIORS, log_evidence, planar, problem_of, state_of
 
@@ -34,3 +41,27 @@ def test_a_bias_has_the_evidence_of_a_dense_integral(seed: int, planted_deg: flo
     np.testing.assert_allclose(totals, totals[-1], atol=0.02)
     # Forty steps of 1° tell it to 0.16°.
     assert abs(np.degrees(rate) - planted_deg) < 0.5
+
+
+@pytest.mark.parametrize("kind", ["hills: 30 % random", "sphere: 30 % random"])
+@pytest.mark.parametrize("degrees", [0.0, 4.0])
+def test_f_falls_by_what_a_step_on_the_mounting_promises(kind: str, degrees: float) -> None:
+    """Labels and noise held, from a map that was fitted without; its normal equations are those that are left."""
+    case = next(one for one in KINDS if one.name == kind).drawn(1)
+    graph = without_mounting(case.graph, np.radians(degrees) * np.array([0.6, -0.64, 0.48]))
+
+    def polished(calibration: Calibration | None) -> tuple[Drawn, State, Evaluation]:
+        drawn = Drawn.of(graph, None, (), calibration, GAUSSIAN_PRIORS)
+        problem = drawn.problem
+        edge = problem.graph.view_graph_edge[problem.closure - problem.graph.num_segments]
+        return drawn, *polish(problem, state_of(problem, case.is_false[edge]), hold_noise=True)
+
+    drawn, state, before = polished(None)
+    tried = Calibrated.of(graph, drawn.prepared, Calibration.none(), {"mounting"})
+    ends = drawn.problem.graph.source, state, before.residual, before.factorised
+    information, change = tried.information(*ends, GAUSSIAN_PRIORS)
+    promised = tried.cost(information, GAUSSIAN_PRIORS) - float(change @ information @ change) / 2
+    _, _, after = polished(Calibration.none().moved(change @ tried.axes))
+    assert after.total - before.total == pytest.approx(promised, rel=0.05, abs=0.3)
+    # Without it the step would cost what is not known of it, and with it gains more the farther it is off.
+    assert promised > 0 if degrees == 0 else promised < -5

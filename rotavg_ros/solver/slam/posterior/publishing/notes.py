@@ -52,6 +52,6 @@ def _of_mounting(mode: Mode) -> tuple[str, ...]:
     return (
         f"Closures agree once their sensor is held to be mounted {degrees:.0f}° otherwise than said: its orientation "
         f"in the body's frame is x, y, z, w = {quaternion}{unknown}. The answer is as if edges had been turned so; if "
-        "that is how the sensor sits, set edge_sensor_orientations to it, or mend the transform or the edges. If it is "
-        "not, solve without (neurora~mounting).",
+        "that is how the sensor sits, set edge_sensor_orientations to it, times what it is now, or mend the transform "
+        "or the edges. If it is not, solve without (neurora~mounting).",
     )
