@@ -94,7 +94,7 @@ def _whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     # The posterior's warning is of answers that rotations alone do not tell apart.
     told = estimate.warnings if is_divided else ()
     jumps = () if poses is None else of_jumps(poses.pose)
-    estimate = replace(estimate, warnings=(*told, *notes_of(mode), *jumps))
+    estimate = replace(estimate, warnings=(*told, *notes_of(mode, found.suspected), *jumps))
     if stages == SlamStages():
         memory = SlamMemory.of(graph, found.calibration, mode, estimate, is_divided)
         estimate = replace(estimate, memory=memory)

@@ -7,6 +7,9 @@ mounting is off by a rotation C = exp(c), c in the body's frame, every closure s
 
 instead of R and t_body. A closure that turns by nothing does not tell; one between poses in opposite headings is off by
 twice the part of c that is level. About an axis that all turns share nothing tells c, and nothing depends on it.
+
+Closures say no more than that they and odometry turn about other axes. Where these are far apart a frame was mistaken,
+and odometry's is the body's. A few degrees may as well be odometry's fault: so it is with visual odometry of KITTI.
 """
 
 from __future__ import annotations
@@ -57,6 +60,12 @@ def without_mounting(graph: ViewGraph, mounting: np.ndarray) -> ViewGraph:
     return replace(turned, translation=_with(graph.translation, closures, seen))
 
 
+def is_about_as_said(mounting: np.ndarray, spread: float) -> bool:
+    """Whether c ``(3,)`` rad is likelier to be an inaccuracy of standard deviation ``spread``, rad, than a mistake."""
+    near = spread**-2
+    return bool((mounting**2).sum() * (near - 1 / ANY_TURN) < 3 * np.log(near * ANY_TURN))
+
+
 def estimate_mountings(graph: ViewGraph, closure_graph: ClosureGraph, noise: NoiseModel) -> list[np.ndarray]:
     """The mountings that the closures may speak of, beside odometry, however far they are from what is said.
 
@@ -104,7 +113,7 @@ def estimate_mountings(graph: ViewGraph, closure_graph: ClosureGraph, noise: Noi
     found = np.concatenate((proposed[:1], proposed[is_other][:1]))
     likelihood = log_likelihood(found)
     worth = likelihood > log_likelihood(np.eye(3)[None]) + max(_WORTH, _WORTH_EACH * len(closure))
-    return list(rotations.log(rotations.from_matrix(torch.from_numpy(found[worth]))).numpy())
+    return _vectors(found[worth])
 
 
 def may_be_told(graph: ViewGraph) -> bool:
@@ -126,8 +135,12 @@ def between_axes(graph: ViewGraph) -> list[np.ndarray]:
         turns = rotations.log(alone.target_from_source)
         axes.append(torch.linalg.eigh(turns.T @ turns)[1][:, -1].numpy())
     pairs = np.outer(axes[1], axes[0])
-    turned = _nearest_rotation(np.stack((pairs, -pairs)))
-    return list(rotations.log(rotations.from_matrix(torch.from_numpy(turned))).numpy())
+    return _vectors(_nearest_rotation(np.stack((pairs, -pairs))))
+
+
+def _vectors(sensor_from_body: np.ndarray) -> list[np.ndarray]:
+    """``(3,)`` rad each, of rotations ``(P, 3, 3)``."""
+    return list(rotations.log(rotations.from_matrix(torch.from_numpy(sensor_from_body))).numpy())
 
 
 def _may_tell(graph: ViewGraph) -> Tensor:

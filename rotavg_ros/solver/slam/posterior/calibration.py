@@ -23,7 +23,7 @@ import torch
 from rotavg_ros import rotations
 from rotavg_ros.solver.slam.noise.calibration import Calibration
 from rotavg_ros.solver.slam.noise.gyro_bias import drift_per_bias
-from rotavg_ros.solver.slam.noise.mounting import ANY_TURN, turned_per_mounting
+from rotavg_ros.solver.slam.noise.mounting import ANY_TURN, is_about_as_said, turned_per_mounting
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.state import State
 from rotavg_ros.solver.slam.posterior.system import Factorised
@@ -69,9 +69,9 @@ class Calibrated:
     def precision(self, priors: SlamPriors) -> np.ndarray:
         """``(d,)`` diagonal of Σ⁻¹."""
         is_bias = self.axes[:, :3].any(axis=1)
-        near, square = np.radians(priors.closure_deg) ** -2, (self.calibration.mounting**2).sum()
-        is_near = square * (near - 1 / ANY_TURN) < 3 * np.log(near * ANY_TURN)
-        return np.asarray(np.where(is_bias, np.radians(priors.bias_deg) ** -2, near if is_near else 1 / ANY_TURN))
+        near = np.radians(priors.closure_deg)
+        of_mounting = near**-2 if is_about_as_said(self.calibration.mounting, near) else 1 / ANY_TURN
+        return np.asarray(np.where(is_bias, np.radians(priors.bias_deg) ** -2, of_mounting))
 
     def information(
         self, source: np.ndarray, state: State, residual: np.ndarray, factorised: Factorised, priors: SlamPriors

@@ -17,7 +17,7 @@ from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.routes import way_along
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.calibration import PARTS, Calibration, calibrated
-from rotavg_ros.solver.slam.noise.mounting import between_axes, estimate_mountings, may_be_told
+from rotavg_ros.solver.slam.noise.mounting import between_axes, estimate_mountings, is_about_as_said, may_be_told
 from rotavg_ros.solver.slam.noise.turns import squared_turns
 from rotavg_ros.solver.slam.posterior.calibration import Calibrated
 from rotavg_ros.solver.slam.posterior.inference import Search
@@ -31,6 +31,8 @@ from rotavg_ros.view_graph import ViewGraph
 
 # A part of the calibration is made better so many times at most, as long as F falls by more than this, nats.
 _ROUNDS, _LEAST_GAIN = 8, 0.5
+# A mounting that makes all likelier by so many nats is worth a word.
+_SUSPICIOUS = 5.0
 # Units of work for each edge of what a problem is told beforehand.
 _EDGE = 0.002
 
@@ -84,10 +86,17 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Found:
-    """What the search found, the least F first."""
+    """What the search found, the least F first.
+
+    Attributes:
+        drawn: without what was taken out of all measurements of a kind, if anything was.
+        modes: of it.
+        suspected: ``(3,)`` rad, by which closures and odometry seem to have other axes, if either may be why.
+    """
 
     drawn: Drawn
     modes: list[Mode]
+    suspected: np.ndarray | None = None
 
     @property
     def cost(self) -> float:
@@ -99,6 +108,20 @@ class Found:
         """What was taken out of all measurements of a kind, if anything was."""
         taken_out = self.drawn.problem.calibrated
         return None if taken_out is None else taken_out.calibration
+
+    @property
+    def mounting(self) -> np.ndarray:
+        """``(3,)`` rad that was taken out of closures."""
+        return np.zeros(3) if self.calibration is None else self.calibration.mounting
+
+    @property
+    def is_mounted_nearby(self) -> bool:
+        """Whether what was taken out of closures may as well be odometry's fault."""
+        return bool(self.mounting.any()) and self.is_nearby(self.mounting)
+
+    def is_nearby(self, mounting: np.ndarray) -> bool:
+        """Whether c ``(3,)`` rad is likelier to be an inaccuracy than a mistake."""
+        return is_about_as_said(mounting, np.radians(self.drawn.problem.priors.closure_deg))
 
 
 Begin = Callable[[Prepared, CleanedClosures], Tensor]
@@ -121,20 +144,15 @@ def search(
         priors: other ones than usual.
     """
     solver = _Solver(graph, network, begin, without, priors)
-    parts = set(PARTS) - set(without)
     as_said = solver.from_starts(None)
-    begun = min(
-        [as_said, *(each for part in sorted(parts) for each in solver.likely(as_said, part))], key=attrgetter("cost")
-    )
-    found = solver.one_by_one(begun, parts)
-    if begun is not as_said and found.calibration is not None and found.calibration.parts == parts:
-        # What one part explains, another may, too.
-        found = min(found, solver.one_by_one(as_said, parts), key=attrgetter("cost"))
+    likely = {part: solver.likely(as_said, part) for part in PARTS if part not in without}
+    found = solver.with_parts(as_said, likely)
+    suspected = solver.suspected(found) if "mounting" in likely else None
     left = calibrated(graph, found.calibration)
     if left.rotation_components < graph.rotation_components:
         # What is left turns about one axis, and so it errs.
         found = solver.from_starts(found.calibration, left.rotation_components)
-    return found
+    return replace(found, suspected=suspected)
 
 
 class _Predicted(NamedTuple):
@@ -165,6 +183,34 @@ class _Solver(NamedTuple):
         before = found.calibration or Calibration.none()
         values = _likely(part, before.taken_out_of(self.graph), found.drawn.prepared)
         return [self.from_starts(replace(before, **{part: value})) for value in values]
+
+    def with_parts(self, as_said: Found, likely: dict[str, list[Found]]) -> Found:
+        """What is found with some parts of the calibration or without them, from what is likely of each on.
+
+        A mounting that is about as said may as well be odometry's fault: if none is likelier, nothing is taken out.
+        """
+        if not likely:
+            return as_said
+        without_mounting = {part: each for part, each in likely.items() if part != "mounting"}
+        begun = min([as_said, *(each for of_part in likely.values() for each in of_part)], key=attrgetter("cost"))
+        if begun.mounting.any() and (begun.is_mounted_nearby or begun.cost > self._nearby(as_said).cost):
+            return self.with_parts(as_said, without_mounting)
+        found = self.one_by_one(begun, likely)
+        if begun is not as_said and found.calibration is not None and found.calibration.parts == set(likely):
+            # What one part explains, another may, too.
+            found = min(found, self.one_by_one(as_said, likely), key=attrgetter("cost"))
+        return self.with_parts(as_said, without_mounting) if found.is_mounted_nearby else found
+
+    def suspected(self, found: Found) -> np.ndarray | None:
+        """``(3,)`` rad: a mounting about as said that is likelier than just as said, and that was not taken out."""
+        nearby = self._nearby(found)
+        return nearby.calibration.mounting if nearby.cost < found.cost - _SUSPICIOUS else None
+
+    def _nearby(self, found: Found) -> _Predicted:
+        """F with the mounting about as said that a Newton step tells; infinite if that step leads far away."""
+        predicted = self.predicted(found, "mounting")
+        is_near = not found.mounting.any() and found.is_nearby(predicted.calibration.mounting)
+        return predicted._replace(cost=found.cost + predicted.cost if is_near else np.inf)
 
     def one_by_one(self, found: Found, parts: Collection[str]) -> Found:
         """What is found by Newton's steps on more and more parts, the one that promises more first."""
@@ -204,7 +250,8 @@ class _Solver(NamedTuple):
     def _better(self, found: Found, part: str) -> Found | None:
         """What is found from the best mode after that step, if F falls."""
         cost, calibration = self.predicted(found, part)
-        if cost > -_LEAST_GAIN:
+        is_nearby = part == "mounting" and not found.mounting.any() and found.is_nearby(calibration.mounting)
+        if cost > -_LEAST_GAIN or is_nearby:
             return None
         best, drawn = found.modes[0], found.drawn
         again = self._drawn(calibration)

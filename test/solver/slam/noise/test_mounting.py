@@ -135,7 +135,7 @@ def test_between_two_axes_it_is_exact(vector: np.ndarray) -> None:
     assert min(apart) < 1e-5 < max(apart)
 
 
-@pytest.mark.parametrize("vector", [np.radians([3.0, -3.5, 2.0]), np.radians([10.0, 5.0, -25.0]), OPTICAL])
+@pytest.mark.parametrize("vector", [np.radians([8.0, -9.0, 6.0]), np.radians([10.0, 5.0, -25.0]), OPTICAL])
 @pytest.mark.parametrize("kind", ["hills: 30 % random", "sphere: 30 % random", "hills: gyroscope bias, 30 % random"])
 def test_the_answer_is_what_it_would_be(kind: str, vector: np.ndarray) -> None:
     case, as_said = drawn(kind, 1 if kind.startswith("hills: g") else 0), solved(kind, 1 if "gyro" in kind else 0)
@@ -194,14 +194,17 @@ def test_none_is_invented(kind: str) -> None:
 
 def test_the_bodys_axes_do_not_matter() -> None:
     """All bodies turned alike: so is the mounting."""
-    graph, turn = mounted(drawn("hills: 30 % random").graph, np.radians([4.0, 2.0, -3.0])), np.radians([40.0, 70.0, 10])
+    graph, turn = (
+        mounted(drawn("hills: 30 % random").graph, np.radians([14.0, 8.0, -13.0])),
+        np.radians([40.0, 70.0, 10]),
+    )
     frame = rotations.exp(torch.from_numpy(turn)).expand(graph.num_edges, 4)
     turned = rotations.multiply(rotations.multiply(frame, graph.target_from_source), rotations.inverse(frame))
     one, other = (
         mounting_of(solve(each, profile="slam", method=DEFAULT_METHOD))
         for each in (graph, replace(graph, target_from_source=turned))
     )
-    np.testing.assert_allclose(Rotation.from_rotvec(turn).apply(one), other, atol=np.radians(0.05))
+    np.testing.assert_allclose(Rotation.from_rotvec(turn).apply(one), other, atol=np.radians(0.5))
 
 
 def test_inverted_closures_in_the_plane_are_no_mounting() -> None:
@@ -240,3 +243,20 @@ def test_rejected_closures_tell_nothing() -> None:
     label = torch.where(graph.is_odometry, graph.label, torch.full_like(graph.label, int(EdgeLabel.REJECTED)))
     solution = solve(replace(graph, label=label), profile="slam")
     assert not mounting_of(solution).any() and not any("mounted" in text for text in solution.warnings)
+
+
+@pytest.mark.parametrize("kind", ["hills: 30 % random", "sphere: 30 % random", "grid: 30 % random"])
+def test_a_few_degrees_are_told_and_nothing_is_turned(kind: str) -> None:
+    """Odometry's axes may be at fault as well; what the note says to set is right if they are not."""
+    case, vector = drawn(kind), np.radians([3.0, -3.5, 2.0])
+    graph = mounted(case.graph, vector)
+    solution = solve(graph, profile="slam")
+    assert not mounting_of(solution).any()
+    blind = solve(graph, profile="slam", method=without("mounting"))
+    assert torch.equal(solution.body_from_world, blind.body_from_world)
+    (note,) = (text for text in solution.warnings if "axes that differ" in text)
+    assert not any("axes that differ" in text for text in (*blind.warnings, *solved(kind).warnings))
+    stated = [float(word) for word in note.split("x, y, z, w = ")[1].split(":")[0].split(", ")]
+    told = without_mounting(graph, -Rotation.from_quat(stated).as_rotvec())
+    assert error_deg(case, solve(told, profile="slam")) < 1.1 * error_deg(case, solved(kind)) + 0.05
+    assert error_deg(case, solution) > 1.3 * error_deg(case, solved(kind))

@@ -11,13 +11,18 @@ from rotavg_ros.solver.slam.posterior.mode import Mode
 
 # Odometry that slipped by more than this, rad, is worth a word.
 _FAR_SLIP = np.radians(10.0)
-# A mounting that differs by less, rad, is worth no word.
+# Axes that differ by less, rad, are worth no word.
 _WORTH_A_WORD = np.radians(1.0)
 
 
-def notes_of(mode: Mode) -> tuple[str, ...]:
-    """Slips of the odometry by far, and a sensor that is mounted otherwise than said."""
-    return (*_of_slips(mode), *_of_mounting(mode))
+def notes_of(mode: Mode, suspected: np.ndarray | None = None) -> tuple[str, ...]:
+    """Slips of the odometry by far, and a sensor that is, or may be, mounted otherwise than said.
+
+    Args:
+        mode: the labelling.
+        suspected: ``(3,)`` rad, by which closures and odometry seem to have other axes, where nothing was made of it.
+    """
+    return (*_of_slips(mode), *_of_mounting(mode), *_of_suspected(suspected))
 
 
 def _of_slips(mode: Mode) -> tuple[str, ...]:
@@ -42,16 +47,32 @@ def _of_mounting(mode: Mode) -> tuple[str, ...]:
     """How closures' sensor is held to be mounted otherwise than said: a sentence, or none."""
     calibrated = mode.problem.calibrated
     mounting = np.zeros(3) if calibrated is None else calibrated.calibration.mounting
-    degrees = float(np.degrees(np.linalg.norm(mounting)))
-    if np.radians(degrees) < _WORTH_A_WORD:
+    if not mounting.any():
         return ()
-    body_from_sensor = rotations.exp(torch.from_numpy(-mounting)).tolist()
-    quaternion = ", ".join(f"{component:.4f}" for component in body_from_sensor)
     about_one = mode.problem.components == 1
     unknown = " (and by any turn about the axis of all turns, which none of them tells)" if about_one else ""
     return (
-        f"Closures agree once their sensor is held to be mounted {degrees:.0f}° otherwise than said: its orientation "
-        f"in the body's frame is x, y, z, w = {quaternion}{unknown}. The answer is as if edges had been turned so; if "
-        "that is how the sensor sits, set edge_sensor_orientations to it, times what it is now, or mend the transform "
-        "or the edges. If it is not, solve without (neurora~mounting).",
+        f"Closures agree once their sensor is held to be mounted {np.degrees(np.linalg.norm(mounting)):.0f}° otherwise "
+        f"than said: its orientation in the body's frame is {_in_body(mounting)}{unknown}. The answer is as if edges "
+        "had been turned so; if that is how the sensor sits, set edge_sensor_orientations to it, times what it is now, "
+        "or mend the transform or the edges. If it is not, solve without (neurora~mounting).",
     )
+
+
+def _of_suspected(mounting: np.ndarray | None) -> tuple[str, ...]:
+    """By how much closures and odometry turn about other axes, without anything having been made of it."""
+    degrees = 0.0 if mounting is None else float(np.degrees(np.linalg.norm(mounting)))
+    if mounting is None or np.radians(degrees) < _WORTH_A_WORD:
+        return ()
+    return (
+        f"Closures and odometry seem to turn about axes that differ by {degrees:.0f}°. If the closures' sensor is "
+        f"mounted otherwise than said, its orientation in the body's frame is {_in_body(mounting)}: set "
+        "edge_sensor_orientations to it, times what it is now, or mend the transform or the edges. It may as well be "
+        "odometry's own axes, so nothing was turned.",
+    )
+
+
+def _in_body(mounting: np.ndarray) -> str:
+    """The sensor's orientation in the body's frame, in words."""
+    quaternion = rotations.exp(torch.from_numpy(-mounting)).tolist()
+    return "x, y, z, w = " + ", ".join(f"{component:.4f}" for component in quaternion)
