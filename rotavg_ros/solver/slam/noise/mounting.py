@@ -40,6 +40,8 @@ _FAR = np.radians(60.0)
 # that is said, and by so many each: less costs more time than it is worth, and of a mounting that is not far off the
 # posterior tells by itself. Noise is held for what it is with the mounting that is said, so F decides between two.
 _WORTH, _WORTH_EACH = 10.0, 0.05
+# Axes that differ by less, rad, are worth neither a search nor a word.
+ALIKE = np.radians(1.0)
 # So short is no axis.
 _NO_TURN = 1e-6
 # A sensor may be mounted anyhow: the variance of a component of the rotation vector of a random turn, rad².

@@ -17,7 +17,7 @@ from rotavg_ros.solver.running.work import spend
 from rotavg_ros.solver.slam.graph.routes import way_along
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.calibration import PARTS, Calibration, calibrated
-from rotavg_ros.solver.slam.noise.mounting import between_axes, estimate_mountings, is_about_as_said, may_be_told
+from rotavg_ros.solver.slam.noise.mounting import ALIKE, between_axes, estimate_mountings, is_about_as_said, may_be_told
 from rotavg_ros.solver.slam.noise.turns import squared_turns
 from rotavg_ros.solver.slam.posterior.calibration import Calibrated
 from rotavg_ros.solver.slam.posterior.inference import Search
@@ -117,11 +117,8 @@ class Found:
     @property
     def is_mounted_nearby(self) -> bool:
         """Whether what was taken out of closures may as well be odometry's fault."""
-        return bool(self.mounting.any()) and self.is_nearby(self.mounting)
-
-    def is_nearby(self, mounting: np.ndarray) -> bool:
-        """Whether c ``(3,)`` rad is likelier to be an inaccuracy than a mistake."""
-        return is_about_as_said(mounting, np.radians(self.drawn.problem.priors.closure_deg))
+        near = np.radians(self.drawn.problem.priors.closure_deg)
+        return bool(self.mounting.any()) and is_about_as_said(self.mounting, near)
 
 
 Begin = Callable[[Prepared, CleanedClosures], Tensor]
@@ -146,8 +143,13 @@ def search(
     solver = _Solver(graph, network, begin, without, priors)
     as_said = solver.from_starts(None)
     likely = {part: solver.likely(as_said, part) for part in PARTS if part not in without}
-    found = solver.with_parts(as_said, likely)
-    suspected = solver.suspected(found) if "mounting" in likely else None
+    found, suspected = solver.with_parts(as_said, likely), None
+    if found.is_mounted_nearby:
+        # It may as well be odometry's fault.
+        mounted = found
+        found = solver.with_parts(as_said, {part: each for part, each in likely.items() if part != "mounting"})
+        if mounted.cost < found.cost - _SUSPICIOUS and np.linalg.norm(mounted.mounting) > ALIKE:
+            suspected = mounted.mounting
     left = calibrated(graph, found.calibration)
     if left.rotation_components < graph.rotation_components:
         # What is left turns about one axis, and so it errs.
@@ -185,32 +187,15 @@ class _Solver(NamedTuple):
         return [self.from_starts(replace(before, **{part: value})) for value in values]
 
     def with_parts(self, as_said: Found, likely: dict[str, list[Found]]) -> Found:
-        """What is found with some parts of the calibration or without them, from what is likely of each on.
-
-        A mounting that is about as said may as well be odometry's fault: if none is likelier, nothing is taken out.
-        """
+        """What is found with some parts of the calibration or without them, from what is likely of each on."""
         if not likely:
             return as_said
-        without_mounting = {part: each for part, each in likely.items() if part != "mounting"}
         begun = min([as_said, *(each for of_part in likely.values() for each in of_part)], key=attrgetter("cost"))
-        if begun.mounting.any() and (begun.is_mounted_nearby or begun.cost > self._nearby(as_said).cost):
-            return self.with_parts(as_said, without_mounting)
         found = self.one_by_one(begun, likely)
         if begun is not as_said and found.calibration is not None and found.calibration.parts == set(likely):
             # What one part explains, another may, too.
             found = min(found, self.one_by_one(as_said, likely), key=attrgetter("cost"))
-        return self.with_parts(as_said, without_mounting) if found.is_mounted_nearby else found
-
-    def suspected(self, found: Found) -> np.ndarray | None:
-        """``(3,)`` rad: a mounting about as said that is likelier than just as said, and that was not taken out."""
-        nearby = self._nearby(found)
-        return nearby.calibration.mounting if nearby.cost < found.cost - _SUSPICIOUS else None
-
-    def _nearby(self, found: Found) -> _Predicted:
-        """F with the mounting about as said that a Newton step tells; infinite if that step leads far away."""
-        predicted = self.predicted(found, "mounting")
-        is_near = not found.mounting.any() and found.is_nearby(predicted.calibration.mounting)
-        return predicted._replace(cost=found.cost + predicted.cost if is_near else np.inf)
+        return found
 
     def one_by_one(self, found: Found, parts: Collection[str]) -> Found:
         """What is found by Newton's steps on more and more parts, the one that promises more first."""
@@ -250,8 +235,7 @@ class _Solver(NamedTuple):
     def _better(self, found: Found, part: str) -> Found | None:
         """What is found from the best mode after that step, if F falls."""
         cost, calibration = self.predicted(found, part)
-        is_nearby = part == "mounting" and not found.mounting.any() and found.is_nearby(calibration.mounting)
-        if cost > -_LEAST_GAIN or is_nearby:
+        if cost > -_LEAST_GAIN or (part == "mounting" and np.linalg.norm(calibration.mounting) < ALIKE):
             return None
         best, drawn = found.modes[0], found.drawn
         again = self._drawn(calibration)

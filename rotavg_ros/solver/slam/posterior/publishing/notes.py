@@ -11,8 +11,6 @@ from rotavg_ros.solver.slam.posterior.mode import Mode
 
 # Odometry that slipped by more than this, rad, is worth a word.
 _FAR_SLIP = np.radians(10.0)
-# Axes that differ by less, rad, are worth no word.
-_WORTH_A_WORD = np.radians(1.0)
 
 
 def notes_of(mode: Mode, suspected: np.ndarray | None = None) -> tuple[str, ...]:
@@ -61,9 +59,9 @@ def _of_mounting(mode: Mode) -> tuple[str, ...]:
 
 def _of_suspected(mounting: np.ndarray | None) -> tuple[str, ...]:
     """By how much closures and odometry turn about other axes, without anything having been made of it."""
-    degrees = 0.0 if mounting is None else float(np.degrees(np.linalg.norm(mounting)))
-    if mounting is None or np.radians(degrees) < _WORTH_A_WORD:
+    if mounting is None:
         return ()
+    degrees = np.degrees(np.linalg.norm(mounting))
     return (
         f"Closures and odometry seem to turn about axes that differ by {degrees:.0f}°. If the closures' sensor is "
         f"mounted otherwise than said, its orientation in the body's frame is {_in_body(mounting)}: set "
