@@ -10,6 +10,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from rotavg_ros.solver.algebra import quaternion_rows
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs, closure_ends
 from rotavg_ros.solver.slam.graph.closure_graph import ClosureGraph
@@ -121,6 +122,15 @@ class Problem:
     def measured(self) -> np.ndarray:
         """``(4, E)`` measured residuals under the odometry's orientations."""
         return np.ascontiguousarray(self.graph.residual.numpy().T)
+
+    def body_from_world(self, correction: np.ndarray) -> np.ndarray:
+        """``(K, 3, 3)``, of key nodes under corrections ``(4, K)``."""
+        return quaternion_rows.matrices(quaternion_rows.multiply(self._body_from_world, correction))
+
+    @cached_property
+    def _body_from_world(self) -> np.ndarray:
+        """``(4, K)`` of key nodes by odometry."""
+        return np.ascontiguousarray(self.graph.odometry_orientation.numpy()[self.graph.nodes].T)
 
     @cached_property
     def ends(self) -> np.ndarray:
