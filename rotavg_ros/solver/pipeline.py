@@ -48,7 +48,10 @@ def solve(
     anew: bool = False,
     weights: Path | None = None,
 ) -> Solution:
-    """Absolute orientations and outlier scores of a view-graph; every connected component by itself.
+    """Absolute orientations and outlier scores of a view-graph.
+
+    Every connected component has a frame of its own. Of a photo collection each is solved by itself; robots of one
+    graph are taken to err alike, so that one's noise, mounting and share of false closures tell of the others'.
 
     Args:
         graph: N nodes, M edges; or what has it as its ``graph``, as the result of ``read_graph`` does.

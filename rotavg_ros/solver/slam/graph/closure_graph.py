@@ -16,6 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from rotavg_ros import rotations
@@ -123,6 +125,15 @@ class ClosureGraph:
         nodes = torch.from_numpy(self.nodes)
         relative = rotations.multiply(rotations.inverse(self.odometry_orientation[nodes]), body_from_world[nodes])
         return rotations.normalize(relative)
+
+    def from_roots(self, correction: Tensor) -> Tensor:
+        """Corrections ``(K, 4)`` of the same answer, those of roots the identity."""
+        links = coo_array((np.ones(len(self.source)), (self.source, self.target)), shape=(len(self.nodes),) * 2)
+        component = connected_components(links, directed=False)[1]
+        root = np.empty(len(self.roots), dtype=np.int64)
+        root[component[self.roots]] = self.roots
+        back = rotations.inverse(correction[torch.from_numpy(root[component])])
+        return rotations.normalize(rotations.multiply(correction, back))
 
     def edge_values(self, value: np.ndarray) -> np.ndarray:
         """Values of this graph's edges ``(E,)`` → values of the view-graph's edges ``(M,)``."""

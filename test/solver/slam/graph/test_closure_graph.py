@@ -97,6 +97,28 @@ def test_corrections_invert_orientations_at_key_nodes() -> None:
     assert float(rotations.angle_between(recovered, correction).max()) < 1e-7
 
 
+def test_corrections_counted_from_roots_say_the_same() -> None:
+    """Of two components: residuals are as long as before, and both roots stay where they are."""
+    one, other = _slam_graph(40, 6, 1), _slam_graph(30, 5, 2)
+    both = ViewGraph.create(
+        torch.cat((one.source, other.source + 40)),
+        torch.cat((one.target, other.target + 40)),
+        torch.cat((one.target_from_source, other.target_from_source)),
+        kind=torch.cat((one.kind, other.kind)),
+    )
+    contracted = _contract(both)
+    correction = rotations.random(contracted.num_nodes, generator=torch.Generator().manual_seed(0))
+    counted = contracted.from_roots(correction)
+    identity = rotations.identity(len(contracted.roots))
+    assert len(contracted.roots) == 2
+    assert float(rotations.angle_between(counted[torch.from_numpy(contracted.roots)], identity).max()) < 1e-7
+    before, after = (
+        rotations.angle(edge_residual(contracted.orientations(each), both.target_from_source, both.source, both.target))
+        for each in (correction, counted)
+    )
+    torch.testing.assert_close(after, before, atol=1e-7, rtol=0)
+
+
 def test_graphs_without_closures_or_without_odometry() -> None:
     chain = _contract(_slam_graph(30, 0, 0))
     assert chain.num_nodes == 2 and chain.num_segments == 1 and chain.own_steps.tolist() == [29]

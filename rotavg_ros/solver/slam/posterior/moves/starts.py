@@ -177,7 +177,8 @@ def _turned_parts(
         if number == 0 and anneal:
             correction = cost.anneal(correction)
         correction = jump_to_optimum(cost, correction, pairs, is_agreed)
-    return correction
+    # A part may have been turned with its root, even a whole component that nothing ties to others.
+    return graph.from_roots(correction)
 
 
 def _labelled(problem: Problem, state: State) -> State:
