@@ -13,7 +13,7 @@ from rotavg_ros.solver.neurora.network_store import Networks
 from rotavg_ros.solver.slam import stages
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.fine_net.robot_noise import RobotNoise, held_back, robot_noise
-from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
+from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each, without_repeats
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.solver.slam.posterior.solve import search
@@ -44,7 +44,7 @@ class RobotRun:
             body_from_world: ``(N, 4)`` true orientations, all known.
         """
         repeats = first_of_each(graph)
-        graph = graph if repeats is None else graph.select_edges(torch.from_numpy(repeats[0]))
+        graph = graph if repeats is None else without_repeats(graph, *repeats)
         mode = search(graph, Networks("cpu").load(SlamCleanNet), stages.bootstrap).modes[0]
         if body_from_world is None:
             return cls(mode, None)

@@ -15,7 +15,7 @@ from rotavg_ros.solver.running.work import metered
 from rotavg_ros.solver.slam import stages as slam_stages
 from rotavg_ros.solver.slam.fine_net.network import SlamFineNet
 from rotavg_ros.solver.slam.fine_net.tuning import fine_tuned
-from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each
+from rotavg_ros.solver.slam.graph.repeated_edges import first_of_each, without_repeats
 from rotavg_ros.solver.slam.network import SlamCleanNet
 from rotavg_ros.solver.slam.noise.calibration import calibrated
 from rotavg_ros.solver.slam.options import SlamStages
@@ -38,8 +38,8 @@ def solve_slam(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
     repeats = first_of_each(graph)
     if repeats is None:
         return _solve_once(graph, stages, run)
-    first, says_as = (torch.from_numpy(edges) for edges in repeats)
-    estimate = _solve_once(graph.select_edges(first), stages, run)
+    says_as = torch.from_numpy(repeats[1])
+    estimate = _solve_once(without_repeats(graph, *repeats), stages, run)
     places = estimate.places
     if places is not None:
         places = replace(places, rotation_score=places.rotation_score[says_as], precision=places.precision[says_as])

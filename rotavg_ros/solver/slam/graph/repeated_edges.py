@@ -7,6 +7,8 @@ other.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -63,6 +65,14 @@ def first_of_each(graph: ViewGraph) -> tuple[np.ndarray, np.ndarray] | None:
     if is_first.all():
         return None
     return np.flatnonzero(is_first), (np.cumsum(is_first) - 1)[says_as]
+
+
+def without_repeats(graph: ViewGraph, first: np.ndarray, says_as: np.ndarray) -> ViewGraph:
+    """The edges of :func:`first_of_each`, each with the highest precision that any of its copies states."""
+    stated = graph.precision.nan_to_num(nan=0.0)
+    highest = stated.new_zeros(len(first)).scatter_reduce(0, torch.from_numpy(says_as), stated, "amax")
+    once = graph.select_edges(torch.from_numpy(first))
+    return replace(once, precision=torch.where(highest > 0, highest, torch.nan))
 
 
 def repeats_since(graph: ViewGraph, count: int) -> bool:

@@ -42,6 +42,23 @@ def test_repetitions_change_nothing(seed: int) -> None:
     torch.testing.assert_close(often.outlier_score, once.outlier_score[copies], atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_of_copies_that_state_other_precisions_the_highest_counts(seed: int) -> None:
+    """Whichever comes first; one that states none says nothing of it."""
+    graph, rng = _noisy_graph(60, 30, seed), np.random.default_rng(seed)
+    count = graph.num_edges
+    stated = torch.from_numpy(rng.lognormal(4.0, 1.0, (3, count)))
+    stated[2] = torch.nan
+    highest = replace(graph, precision=stated[:2].amax(dim=0))
+    once = solve(highest)
+    for order in ((0, 1, 2), (2, 1, 0)):
+        copies = torch.arange(count).repeat(3)
+        repeated = replace(graph.select_edges(copies), precision=stated[list(order)].flatten())
+        often = solve(repeated)
+        assert float(rotations.angle_between(once.body_from_world, often.body_from_world).max()) < 1e-6
+        torch.testing.assert_close(often.outlier_score, once.outlier_score[copies], atol=1e-6, rtol=0)
+
+
 def test_measurements_that_differ_are_all_kept() -> None:
     graph = _noisy_graph(20, 10, 0)
     twice = torch.arange(graph.num_edges).repeat(2)
