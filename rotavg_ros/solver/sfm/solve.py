@@ -29,6 +29,8 @@ from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.solver.sfm.uncertainty import References, variances
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
+# Of cameras with fewer edges, in the mean, a second start costs little, and few edges check each other.
+_SPARSE_DEGREE = 32
 # A graph of more edges is worth measuring what tiles this machine likes.
 _TUNING_PAYS = 200_000
 
@@ -77,6 +79,9 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             priors = PRIORS if stages.shaped else ROUND
             refinement = partial(refine, graph, max_steps=steps, structure=structure, priors=priors)
             orientations = refinement(orientations, weights=weights)
+            if stages.clean and stages.weighted and _is_sparse(graph):
+                unweighted = refinement(_begun_without(graph, component), weights=EdgeWeights(allowed, allowed))
+                orientations = _likelier(graph, component, allowed, orientations, unweighted)
             if stages.stated:
                 noise = StatedNoise.of(graph, structure, priors, stages.stated_shapes)
                 orientations, weights = noise.refined(orientations, weights, refinement)
@@ -105,6 +110,25 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             variance = variance if stated is None else form.of_nodes(stated)
     score = score.index_select(0, form.edge)
     return Estimate(form.orientations(orientations), score, variance, warnings=warnings)
+
+
+def _is_sparse(graph: ViewGraph) -> bool:
+    """Whether so few edges check each other that CleanNet may lead into another valley."""
+    return 2 * graph.num_edges < _SPARSE_DEGREE * graph.num_nodes
+
+
+def _begun_without(graph: ViewGraph, component: Tensor) -> Tensor:
+    """``(N, 4)`` along the tree of edges that are trusted alike."""
+    return bootstrap(apply_labels(trust_all(graph), graph.label), component).body_from_world
+
+
+def _likelier(graph: ViewGraph, component: Tensor, weight: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    """``(N, 4)``: of each component the orientations of the lower Σ w ‖r‖^½, as shaped steps count residuals."""
+    of_edge, costs = component[graph.source], []
+    for orientations in (one, other):
+        angle = EdgeResiduals(graph, orientations.float()).angles().double()
+        costs.append(weight.new_zeros(int(component.max()) + 1).index_add(0, of_edge, weight * angle.sqrt()))
+    return torch.where((costs[1] < costs[0])[component, None], other, one)
 
 
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:
