@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -76,7 +77,7 @@ class OdometryRecord:
     Attributes:
         stamp_ns: nanoseconds.
         world_from_body: xyzw, not checked.
-        position: metres, of the sensor; None where the message carries none.
+        position: metres, of the sensor, not checked; None where the message carries none.
         frame_id, child_frame_id: of the odometry and of what moves in it; empty where the message does not say.
         body_from_sensor: xyzw, of what the message says the pose of.
     """
@@ -92,6 +93,11 @@ class OdometryRecord:
     def world_from_sensor(self) -> Quaternion:
         """xyzw, as the message says."""
         return multiply(self.world_from_body, self.body_from_sensor)
+
+    @property
+    def known_position(self) -> Vector | None:
+        """The position; None, too, where the source has lost it (NaN, infinite)."""
+        return self.position if self.position is not None and all(map(math.isfinite, self.position)) else None
 
 
 class EdgeConverter(Protocol):

@@ -37,6 +37,7 @@ class Counts:
         marginalized, dropped_closures: how many keyframes and closures a full graph has done without so far.
         is_full: whether nothing more can be spared, and there are no new keyframes.
         robots: that have keyframes.
+        odometry_robots: whose odometry has come.
         pending_by_robot: how many edges wait for each robot.
         longest_pending: the end that the edge waits for that has waited the longest; None if none waits.
         longest_pending_s: how long it has, seconds of the data's time.
@@ -53,6 +54,7 @@ class Counts:
     dropped_closures: int = 0
     is_full: bool = False
     robots: tuple[str, ...] = ()
+    odometry_robots: tuple[str, ...] = ()
     pending_by_robot: Mapping[str, int] = field(default_factory=dict)
     longest_pending: KeyframeReference | None = None
     longest_pending_s: float = 0.0
@@ -261,6 +263,7 @@ class Content:
             dropped_closures=growth.room.dropped_closures,
             is_full=growth.room.is_full(growth.graph, growth.options.max_keyframes),
             robots=tuple(growth.graph.robots),
+            odometry_robots=tuple(growth.tracks),
             pending_by_robot=dict(growth.pending.by_robot),
             longest_pending=None if longest is None else longest[0],
             longest_pending_s=0.0 if longest is None else longest[1] / NANOSECONDS,

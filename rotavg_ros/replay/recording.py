@@ -46,8 +46,7 @@ class Recording:
         self._next_answer_ns = self._next_diagnostics_ns = 0
         self._tick_seconds: deque[float] = deque(maxlen=_RECENT_TICKS)
         self._answer: Answer | None = None
-        several = len(parameters.robots) > 1
-        self._prefix = {robot: f"/{robot}/" if several else "/" for robot in parameters.robots}
+        self._prefix = {robot: f"/{prefix}" for robot, prefix in parameters.prefixes().items()}
 
     def __enter__(self) -> Recording:
         self._bag.__enter__()

@@ -177,6 +177,15 @@ class NodeParameters:
         pairs = (entry.partition(":") for entry in self.forward_topics if entry)
         return {topic: output for topic, _, output in pairs}
 
+    def prefixes(self) -> dict[str, str]:
+        """What stands before the topics of each robot: nothing where there is but one, else its name.
+
+        No part of a topic's name may begin with a digit, so a number follows ``robot_``. Not checked otherwise.
+        """
+        if len(self.robots) == 1:
+            return {self.robots[0]: ""}
+        return {robot: f"robot_{robot}/" if robot.isdecimal() else f"{robot}/" for robot in self.robots}
+
     def odometry_sensors(self) -> list[Quaternion]:
         """body_from_sensor of every odometry topic."""
         return _orientations(self.odometry_sensor_orientations, len(self.odometry_topics))

@@ -64,6 +64,14 @@ def test_two_robots_share_one_world(bag: Path, tmp_path: Path) -> None:
     assert (output / "report.html").exists()
 
 
+def test_names_that_no_topic_can_have(bag: Path, tmp_path: Path) -> None:
+    """The node refuses them, since it publishes; a replay writes files."""
+    robots = ["-p", "robots:=['my robot', '1']", "-p", "odometry_topics:=['/red/odom', '/blue/odom']"]
+    assert main(["replay", str(bag), "--output", str(tmp_path / "out"), "--no-report", *robots]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert set(summary["robots"]) == {"my robot", "1"}
+
+
 def test_each_robots_odometry_is_that_of_the_graph(bag: Path, tmp_path: Path) -> None:
     """Formats without kinds take edges between consecutive ids for odometry: each robot's own steps, and no closure."""
     topics = ["--odometry", "/red/odom", "--odometry", "/blue/odom"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Collection
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
@@ -28,6 +29,7 @@ TIME_WENT_BACK = {
 }
 KEPT = "what was forgotten or replaced is kept in"
 NOT_KEPT = "what was forgotten or replaced could not be backed up:"
+OTHER_ROBOTS = "the state file is of robots that are not named in robots"
 # Refusals that a healthy system produces: a sender that repeats itself.
 _HARMLESS = {"duplicate_edge", "marginalized_keyframe"}
 
@@ -76,6 +78,18 @@ class Reporter:
             hardware_id=values["device"],
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
+
+
+def of_other_robots(known: Collection[str], parameters: NodeParameters) -> str | None:
+    """What to say of a state file in which these robots have odometry; None where all are named."""
+    others = [robot for robot in known if robot not in parameters.robots]
+    if not others:
+        return None
+    names = ", ".join(repr(robot) for robot in others[:_MOST_NAMES])
+    return (
+        f"{OTHER_ROBOTS} ({names}): if it is another robot's, give this node a state_file of its own, else name them "
+        "in robots and odometry_topics"
+    )
 
 
 def _errors(health: Health, parameters: NodeParameters, paused: bool, now: float) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, JumpThreshold, TimeJump
@@ -66,14 +65,13 @@ class RotavgNode(parameter_server.ParameterNode):
         self._worker = Worker(executor, "rotavg_worker")
         self._saver = Worker(executor, "rotavg_saver")
         self._outputs = Outputs(self, parameters, self._estimator)
-        state_file = Path(parameters.state_file) if parameters.state_file else None
         given = frozenset(parameter_server.given(self))
         # An orientation that was given settles how sensors sit.
         from_tf = parameters.edge_frames_from_tf and "edge_sensor_orientations" not in given
         listened = replace(parameters, edge_frames_from_tf=from_tf)
         listening = Subscriptions(self, listened, self._estimator, self._health, self._outputs, self._on_time_jump)
         self._listening, self._forwarding = listening, listening.forwarding
-        self._solving = Solving(self, self._estimator, self._health, self._outputs, self._forwarding, state_file)
+        self._solving = Solving(self, self._estimator, self._health, self._outputs, self._forwarding, parameters)
         self._solving.tick_budget_s = parameters.tick_budget_s
         workers = Workers(solver=self._worker, saver=self._saver)
         Services(self, self._estimator, self._solving, workers, parameters.robots[0])

@@ -20,11 +20,12 @@ from rotavg_ros.online.answer.joins import joins
 from rotavg_ros.online.estimator import TICK_WORK, WORK_AFTER, TickAbandonedError
 from rotavg_ros.online.state.file import StateFileError, StateFileInUseError, check_kind, remove_leftovers
 from rotavg_ros.online.state.lock import StateFileLock
-from rotavg_ros.ros.node.diagnostics import KEPT, NOT_KEPT
+from rotavg_ros.ros.node.diagnostics import KEPT, NOT_KEPT, of_other_robots
 from rotavg_ros.ros.node.health import Health
 from rotavg_ros.ros.node.intake.forwarding import Forwarding
 from rotavg_ros.ros.node.output.outputs import Outputs
 from rotavg_ros.ros.node.tick_budget import TickBudget
+from rotavg_ros.settings.parameters import NodeParameters
 
 _LOG_PERIOD_S = 5.0
 # Of a tick's budget, before its answer.
@@ -51,14 +52,15 @@ class Solving:
         health: Health,
         outputs: Outputs,
         forwarding: Forwarding,
-        state_file: Path | None,
+        parameters: NodeParameters,
     ) -> None:
         self._node = node
         self._estimator = estimator
         self._health = health
         self._outputs = outputs
         self._forwarding = forwarding
-        self._state_file = state_file
+        self._parameters = parameters
+        self._state_file = state_file = Path(parameters.state_file) if parameters.state_file else None
         self._budget = TickBudget()
         self.tick_budget_s = math.inf
         self._publishing = threading.Lock()  # an answer goes out before it is forgotten, or not at all
@@ -114,7 +116,7 @@ class Solving:
     def pause(self, paused: bool) -> str:
         self._estimator.pause(paused)
         self._health.waits_for_nothing()
-        return "paused: inputs are kept, nothing is solved" if paused else "running"
+        return "paused: inputs are kept, nothing is solved but by ~/solve_now" if paused else "running"
 
     def save(self) -> str:
         state_file, content, keyframes = self._own_state_file(), self._content(), self._estimator.counts().keyframes
@@ -128,6 +130,7 @@ class Solving:
         self._estimator.load(state_file)
         self._saved, self._saved_keyframes = self._content(), self._estimator.counts().keyframes
         self._forget_answer()
+        self._tell_of_other_robots()
         return f"loaded {self._saved_keyframes} keyframes from {state_file}"
 
     def tick_quietly(self) -> None:
@@ -240,6 +243,14 @@ class Solving:
             self.let_go()
             raise
         remove_leftovers(state_file)
+        self._tell_of_other_robots()
+
+    def _tell_of_other_robots(self) -> None:
+        """Of a state file that has been read: it may be another robot's, copied with the parameters."""
+        notice = of_other_robots(self._estimator.counts().odometry_robots, self._parameters)
+        if notice is not None:
+            self._node.get_logger().warning(notice)
+            self._health.note(notice)
 
     def _own_state_file(self, *, to_write: bool = True) -> Path:
         """The state file, which is this node's alone.

@@ -1,8 +1,9 @@
-"""Quality of service, and mistakes about topics in one line."""
+"""Quality of service, robots' names in topics', and mistakes about topics in one line."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 from rclpy.node import Node
@@ -13,6 +14,28 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rotavg_ros.errors import UserError
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+# What ROS allows in front of a topic's name.
+_PREFIX = re.compile(r"/?([A-Za-z_][A-Za-z0-9_]*/)+")
+
+
+def checked_prefixes(prefixes: Mapping[str, str]) -> Mapping[str, str]:
+    """What stands before the topics of each robot, as :meth:`NodeParameters.prefixes` has it.
+
+    Raises:
+        UserError: a name cannot be part of a topic's, or two robots would have the same topics.
+    """
+    robot_of: dict[str, str] = {}
+    for robot, prefix in prefixes.items():
+        if prefix and not _PREFIX.fullmatch(prefix):
+            raise UserError(
+                f"robots names {robot!r}, which cannot be part of a topic's name: use letters, digits and _, and no "
+                "digit first but in a number"
+            )
+        other = robot_of.setdefault(prefix, robot)
+        if other != robot:
+            raise UserError(f"robots names {other!r} and {robot!r}, whose topics would both begin with {prefix}")
+    return prefixes
 
 
 def overrides() -> QoSOverridingOptions:

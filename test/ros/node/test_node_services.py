@@ -81,10 +81,14 @@ def test_solve_now_answers_with_its_solution_and_only_if_something_is_new(live_n
 def test_reset_forgets_and_latches_an_empty_answer(live_node) -> None:
     live_node.start(*EVERY_MESSAGE)
     feed(live_node, 0, 20)
+    feed(live_node, 19, 20)  # the same stamp again
+    wait_for(live_node, "dropped", 1)
     live_node.wait_for_silence()
     assert live_node.call("reset").success
     live_node.spin_until(lambda: len(live_node.answers[-1].keyframe_ids) == 0)
     wait_for(live_node, "keyframes", 0)
+    # What was counted of the graph is forgotten with it, what was counted of messages is not.
+    assert (live_node.status["dropped"], live_node.status["odometry messages"]) == ("0", "21")
     feed(live_node, 0, 10)  # the same stamps again: a bag that is played anew
     assert list(live_node.wait_for_silence().keyframe_ids) == list(range(10))
     assert live_node.status["dropped"] == "0"
@@ -98,8 +102,13 @@ def test_pause_keeps_what_comes_and_resume_solves_it(live_node) -> None:
     live_node.spin_for(0.5)
     assert not live_node.answers and live_node.status["paused"] == "true"
     assert len(live_node.orientations) == 20
+    assert live_node.call("solve_now").success  # who asks for an answer gets it
+    live_node.spin_until(lambda: bool(live_node.answers))
+    feed(live_node, 20, 30)
+    wait_for(live_node, "keyframes", 30)
+    assert len(live_node.answers) == 1
     assert live_node.call("pause", SetBool, data=False).success
-    assert len(live_node.wait_for_silence().keyframe_ids) == 20
+    assert len(live_node.wait_for_silence().keyframe_ids) == 30
 
 
 def test_label_edge_decides_until_it_is_handed_back(live_node) -> None:
@@ -166,6 +175,26 @@ def test_a_robot_that_was_switched_off_and_on_begins_a_component(live_node, tmp_
     )
     assert live_node.stop() == 0
     assert len(np.load(tmp_path / "state.npz")["keyframe_id"]) == 35
+
+
+def test_a_state_file_of_another_robot_is_told_of(live_node, tmp_path) -> None:
+    path = tmp_path / "state.npz"
+    told = (
+        "the state file is of robots that are not named in robots ('alice'): if it is another robot's, give this node "
+        "a state_file of its own, else name them in robots and odometry_topics"
+    )
+    live_node.start(*EVERY_MESSAGE, f"state_file:={path}", "robots:=['alice']")
+    feed(live_node, 0, 10)
+    live_node.wait_for_silence()
+    assert live_node.call("save").success and live_node.call("load").success
+    assert live_node.stop() == 0
+    assert "state file is of" not in live_node.process.output
+    live_node.start(*EVERY_MESSAGE, f"state_file:={path}", "robots:=['bob']")
+    live_node.spin_until(lambda: told in live_node.status["message"])
+    assert live_node.status["level"] == "1" and live_node.status["keyframes"] == "10"
+    assert live_node.process.output.count(told) == 1
+    assert live_node.call("load").success
+    assert live_node.process.output.count(told) == 2
 
 
 def test_load_goes_back_and_refuses_a_broken_file(live_node, tmp_path) -> None:

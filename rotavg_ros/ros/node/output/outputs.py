@@ -20,7 +20,7 @@ from rotavg_ros.online.answer.trajectory import Trajectory
 from rotavg_ros.ros.node.output.conversions import flags_message, orientations_message, to_quaternion_message
 from rotavg_ros.ros.node.output.robot_poses import RobotPoses
 from rotavg_ros.ros.node.output.visualization import markers_message, no_markers, no_path, path_message
-from rotavg_ros.ros.node.topics import LATCHED, publisher
+from rotavg_ros.ros.node.topics import LATCHED, checked_prefixes, publisher
 from rotavg_ros.settings.parameters import NodeParameters
 
 # After a drawing the worker does other things for so many times as long: at 10 000 keyframes one takes half a second.
@@ -31,7 +31,8 @@ class Outputs:
     """All publishers but that of the diagnostics.
 
     Raises:
-        UserError: a topic's ``qos_overrides`` cannot be, or ``publish_tf`` without tf2_msgs.
+        UserError: a robot's name cannot be part of a topic's, a topic's ``qos_overrides`` cannot be, or ``publish_tf``
+            without tf2_msgs.
     """
 
     def __init__(self, node: Node, parameters: NodeParameters, estimator: OnlineEstimator) -> None:
@@ -43,7 +44,7 @@ class Outputs:
         self._orientations = latched(AbsoluteOrientations, "abs_orientations")
         self._flags = latched(OutlierFlags, "outlier_flags")
         self._markers = latched(MarkerArray, "~/markers")
-        prefix = {robot: f"{robot}/" if len(self._robots) > 1 else "" for robot in self._robots}
+        prefix = checked_prefixes(parameters.prefixes())
         self._paths = {robot: latched(Path, f"{prefix[robot]}corrected_path") for robot in self._robots}
         self._orientation = {
             robot: publisher(node, QuaternionStamped, f"{prefix[robot]}orientation", QoSProfile(depth=10))

@@ -73,7 +73,7 @@ class RobotPoses:
         return [] if self._tf is None else self._tf.warnings()
 
     def publish(self, robot: str, topic: str, message: Any, record: OdometryRecord) -> None:
-        """The robot's pose, and its odometry's, at the moment of its newest odometry message.
+        """The robot's pose, and its odometry's, at the moment of its newest odometry message, if that has a position.
 
         Args:
             robot: whose.
@@ -81,18 +81,19 @@ class RobotPoses:
             message: of odometry.
             record: what it says.
         """
-        placed = self._estimator.odometry_frame(robot) if record.position is not None else None
+        position = record.known_position
+        placed = self._estimator.odometry_frame(robot) if position is not None else None
         is_asked_for = self._publishers[robot].get_subscription_count() > 0
-        if placed is None or record.position is None or not (is_asked_for or self._tf is not None):
+        if placed is None or position is None or not (is_asked_for or self._tf is not None):
             return
         exact, steps = placed
-        frame = self._gradual_frame(robot).follow(exact, record.stamp_ns, record.position)
+        frame = self._gradual_frame(robot).follow(exact, record.stamp_ns, position)
         if self._tf is not None:
             self._tf.publish(robot, topic, message.header, frame)
         if is_asked_for:
-            pose = _odometry_message(message, record, frame)
+            pose = _odometry_message(message, record, frame, position)
             pose.header.frame_id = self._frame_id
-            pose.pose.covariance = covariance(exact, steps, record.position)
+            pose.pose.covariance = covariance(exact, steps, position)
             self._publishers[robot].publish(pose)
 
     def _gradual_frame(self, robot: str) -> GradualFrame:
@@ -107,12 +108,11 @@ def _rates(parameters: NodeParameters) -> CorrectionRates:
     return CorrectionRates(math.radians(parameters.correction_rate_deg_s), parameters.correction_rate_m_s)
 
 
-def _odometry_message(message: Any, record: OdometryRecord, frame: OdometryFrame) -> Odometry:
+def _odometry_message(message: Any, record: OdometryRecord, frame: OdometryFrame, position: Vector) -> Odometry:
     """The message with its pose in the world; its velocity is in the frame that moves, and stays as it is if known."""
     odometry = Odometry(child_frame_id=record.child_frame_id)
     odometry.header.stamp = message.header.stamp
-    assert record.position is not None
-    x, y, z = frame.place(record.position)
+    x, y, z = frame.place(position)
     odometry.pose.pose.position = Point(x=x, y=y, z=z)
     orientation = quaternion.normalize(quaternion.multiply(frame.orientation, record.world_from_sensor))
     odometry.pose.pose.orientation = to_quaternion_message(orientation)
