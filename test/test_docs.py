@@ -149,6 +149,8 @@ def belongings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (recording,) = (folder / "my_bag").glob("*.mcap")
     (folder / "half.mcap").write_bytes(recording.read_bytes()[:60_000])
     (folder / "empty.mcap").touch()
+    for name in ("killed.db3", "killed.db3-wal"):
+        (folder / name).write_text("what a recorder leaves when it is killed")
     (folder / "my-robot.yaml").write_text(TINY_TRAINING)
     return folder
 

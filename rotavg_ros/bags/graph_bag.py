@@ -7,6 +7,7 @@ from pathlib import Path
 from rotavg_ros.bags.graph_from_bag import read_graph_bag
 from rotavg_ros.bags.graph_to_bag import write_graph_bag
 from rotavg_ros.datasets.files.graph_file import GraphFile
+from rotavg_ros.view_graph import EdgeLabel
 
 
 def read_graph(path: str | Path) -> GraphFile:
@@ -29,5 +30,11 @@ def write_graph(path: str | Path, graph_file: GraphFile) -> None:
 
 def not_stored(path: str | Path, graph_file: GraphFile) -> list[str]:
     """What of this graph a bag has no room for, in words."""
-    lost = graph_file.edge_information is not None or graph_file.graph.information is not None
-    return ["information matrices beyond the rotation's precision"] if lost else []
+    graph = graph_file.graph
+    lost = {
+        "information matrices beyond the rotation's precision": graph_file.edge_information is not None
+        or graph.information is not None,
+        "labels": bool((graph.label != EdgeLabel.AUTOMATIC).any()),
+        "how many steps odometry edges stand for": bool((graph.steps[graph.is_odometry] != 1).any()),
+    }
+    return [name for name, is_lost in lost.items() if is_lost] + graph_file.in_no_file

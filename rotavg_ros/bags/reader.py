@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from types import TracebackType
 from typing import Any
 
+import yaml
 from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.interfaces import Connection, QosDurability
 from rosbags.rosbag1 import ReaderError as Rosbag1Error
@@ -22,6 +24,7 @@ from rotavg_ros.errors import UserError, asking_about
 
 # Files that are bags by themselves.
 RECORDING_SUFFIXES = (".mcap", ".db3", ".bag")
+_METADATA = "metadata.yaml"
 
 
 class BagReadError(UserError):
@@ -52,8 +55,8 @@ class BagReader:
         salvage: read of a damaged bag what can be read, and tell of the rest in :attr:`damage`.
 
     Raises:
-        BagReadError: no such bag, a truncated or foreign file, an unknown compression; with ``salvage`` only if nothing
-            can be read.
+        BagReadError: no such bag, a truncated or foreign file, an unknown compression, an sqlite file whose last
+            messages are in a log beside it; with ``salvage`` a truncated one only if nothing can be read.
     """
 
     def __init__(self, path: str | Path, *, salvage: bool = False) -> None:
@@ -297,19 +300,52 @@ class _Passed:
 
 
 def _bag_of(path: Path, salvage: bool) -> Path:
-    """The bag that a path means: itself, or the rosbag2 folder around a recording."""
+    """The bag that a path means: itself, or the rosbag2 folder that a recording is part of."""
     with asking_about(path, BagReadError):
         exists, is_folder = path.exists(), path.is_dir()
-        has_metadata = ((path if is_folder else path.parent) / "metadata.yaml").exists()
+        has_metadata = ((path if is_folder else path.parent) / _METADATA).exists()
     if not exists:
         raise BagReadError(f"{path}: no such bag; check the path")
-    if is_folder:
-        if not has_metadata and not (salvage and _recordings(path)):
-            raise BagReadError(f"{path}: is no rosbag2 folder (it has no metadata.yaml); give a bag")
-        return path
-    if path.suffix not in RECORDING_SUFFIXES:
+    if not is_folder and path.suffix not in RECORDING_SUFFIXES:
         raise BagReadError(f"{path}: give a rosbag2 folder, or a file with suffix {', '.join(RECORDING_SUFFIXES)}")
-    return path.parent if has_metadata else path
+    listed = _listed(path if is_folder else path.parent) if has_metadata else []
+    bag = path.parent if path.name in listed else path
+    with asking_about(path, BagReadError):
+        if is_folder and not listed:
+            listed = [each.name for each in sorted(path.iterdir()) if each.suffix in RECORDING_SUFFIXES]
+        for recording in [bag] if not bag.is_dir() else [bag / name for name in listed]:
+            _check_log(recording)
+    if is_folder and not has_metadata and not (salvage and _recordings(path)):
+        if not listed:
+            raise BagReadError(f"{path}: is no rosbag2 folder (it has no {_METADATA}); give a bag")
+        raise BagReadError(
+            f"{path}: has no {_METADATA}; name the recording in it ({', '.join(listed)}), or make one with "
+            f"`ros2 bag reindex {shlex.quote(str(path))}`"
+        )
+    return bag
+
+
+def _listed(folder: Path) -> list[str]:
+    """Names of the recordings that a rosbag2 folder's metadata tells of; none where that cannot be read."""
+    try:
+        metadata = yaml.safe_load((folder / _METADATA).read_text(encoding="utf-8"))
+        return [PurePath(each).name for each in metadata["rosbag2_bagfile_information"]["relative_file_paths"]]
+    except Exception:  # whatever a broken file makes the parser stumble over
+        return []
+
+
+def _check_log(recording: Path) -> None:
+    """Refuse an sqlite file whose last messages are in the log beside it: rosbags reads the file alone.
+
+    Raises:
+        BagReadError: there is such a log.
+    """
+    log = recording.with_name(f"{recording.name}-wal")
+    if recording.suffix == ".db3" and log.exists() and log.stat().st_size > 0:
+        raise BagReadError(
+            f"{recording}: its last messages are still in {log.name} beside it, as when a recorder is killed; fold "
+            f"them in with `sqlite3 {shlex.quote(str(recording))} 'PRAGMA wal_checkpoint(TRUNCATE)'`"
+        )
 
 
 def _recordings(bag: Path) -> list[Path]:

@@ -1,12 +1,18 @@
 from __future__ import annotations
 
+import re
+import shlex
 import shutil
-from contextlib import suppress
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -161,6 +167,9 @@ def test_paths_that_are_no_bags(tmp_path: Path) -> None:
         BagReader(tmp_path / "nothing")
     with pytest.raises(BagReadError, match=r"metadata\.yaml"):
         BagReader(tmp_path)
+    (tmp_path / "thesis.tex").write_text("")
+    with pytest.raises(BagReadError, match="give a bag"):
+        BagReader(tmp_path, salvage=True)
     (tmp_path / "graph.g2o").write_text("")
     with pytest.raises(BagReadError, match="suffix"):
         BagReader(tmp_path / "graph.g2o")
@@ -197,6 +206,108 @@ def test_a_single_recording_is_a_bag(tmp_path: Path) -> None:
     with BagReader(tmp_path / "alone.mcap") as bag:
         assert len(list(bag.decoded(["/odom"]))) == 5
         assert bag.is_ros2
+
+
+def test_a_recording_beside_a_bag_is_no_part_of_it(tmp_path: Path) -> None:
+    write_odometry(tmp_path / "run", 5)
+    write_odometry(tmp_path / "more", 3)
+    other = tmp_path / "run" / "other.mcap"
+    shutil.move(tmp_path / "more" / "more.mcap", other)
+    for path, count, is_alone in (
+        (other, 3, True),
+        (tmp_path / "run" / "run.mcap", 5, False),
+        (tmp_path / "run", 5, False),
+    ):
+        with BagReader(path) as bag:
+            assert (bag.num_messages(), bag.path) == (count, other if is_alone else tmp_path / "run")
+    (tmp_path / "run" / "metadata.yaml").write_text("nonsense")  # tells nothing of any file
+    with BagReader(other) as bag:
+        assert bag.num_messages() == 3
+
+
+def write_sqlite(folder: Path, count: int = 5) -> Path:
+    """A bag in an sqlite file, as rosbags writes one; returns the file."""
+    writer = Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3)
+    with writer:
+        connection = writer.add_connection("/odom", ODOMETRY, typestore=typestore())
+        for index in range(count):
+            message = odometry_message(START_NS + index, np.zeros(3), np.array([0, 0, 0, 1.0]), "odom")
+            writer.write(connection, START_NS + index, bytes(typestore().serialize_cdr(message, ODOMETRY)))
+    (recording,) = folder.glob("*.db3")
+    return recording
+
+
+@pytest.mark.parametrize("is_folder", [True, False])
+@pytest.mark.parametrize("salvage", [True, False])
+def test_a_log_that_a_killed_recorder_has_left(tmp_path: Path, is_folder: bool, salvage: bool) -> None:
+    recording = write_sqlite(tmp_path / "my run")
+    recorder = (
+        "import os, sqlite3, sys; file = sqlite3.connect(sys.argv[1]); file.execute('PRAGMA journal_mode=WAL'); "
+        "file.execute('INSERT INTO messages (topic_id, timestamp, data) SELECT topic_id, timestamp + 5, data FROM "
+        "messages'); file.commit(); os._exit(1)"
+    )
+    subprocess.run([sys.executable, "-c", recorder, recording], check=False)
+    log = recording.with_name(f"{recording.name}-wal")
+    assert log.stat().st_size > 0
+    path = recording.parent if is_folder else recording
+    with pytest.raises(BagReadError) as caught:
+        BagReader(path, salvage=salvage)
+    message = str(caught.value)
+    assert (
+        message.startswith(f"{recording}: its last messages are still in {log.name} beside it") and "\n" not in message
+    )
+    # What it says to do does it; Python's module is the same library as the program.
+    program, file, statement = shlex.split(re.findall("`(.*)`", message)[0])
+    assert program == "sqlite3"
+    with closing(sqlite3.connect(file)) as database:
+        database.execute(statement)
+    with BagReader(recording) as bag:  # the metadata does not know of them
+        assert len(list(bag.messages())) == 10
+    log.touch()  # an empty one has nothing
+    BagReader(path, salvage=salvage)
+
+
+@pytest.mark.parametrize("part", [0.3, 0.7, 0.95])
+def test_cut_files_that_other_tools_have_to_repair(tmp_path: Path, part: float) -> None:
+    """As the troubleshooting page says: of them nothing is read, though salvage is asked for."""
+    sqlite_file, ros1_file = write_sqlite(tmp_path / "run", 200), tmp_path / "old.bag"
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Rosbag1Writer(ros1_file) as writer:
+        connection = writer.add_connection("/text", "std_msgs/msg/String", typestore=store)
+        text = store.serialize_ros1(store.types["std_msgs/msg/String"](data="x" * 1000), "std_msgs/msg/String")
+        for index in range(200):
+            writer.write(connection, START_NS + index, text)
+    for path in (sqlite_file, ros1_file):
+        whole = path.read_bytes()
+        path.write_bytes(whole[: int(part * len(whole))])
+        with pytest.raises(BagReadError, match="truncated"), BagReader(path, salvage=True):
+            pass
+
+
+def test_a_log_of_a_recording_that_is_not_meant(tmp_path: Path) -> None:
+    recording = write_sqlite(tmp_path / "run")
+    (tmp_path / "run" / "other.db3-wal").write_text("anything")
+    (tmp_path / "run" / "other.db3").write_text("anything")
+    for path in (recording, recording.parent):
+        with BagReader(path) as bag:
+            assert bag.num_messages() == 5
+
+
+def test_a_folder_without_metadata_names_its_recording(tmp_path: Path) -> None:
+    recording = write_sqlite(tmp_path / "my run")
+    (recording.parent / "metadata.yaml").unlink()
+    expected = (
+        rf"has no metadata\.yaml; name the recording in it \({recording.name}\), or .*`ros2 bag reindex '.*my run'`"
+    )
+    for salvage in (True, False):
+        with pytest.raises(BagReadError, match=expected):
+            BagReader(recording.parent, salvage=salvage)
+    with BagReader(recording) as bag:
+        assert bag.num_messages() == 5
+    write_odometry(tmp_path / "run")
+    (tmp_path / "run" / "metadata.yaml").unlink()
+    with pytest.raises(BagReadError, match=r"name the recording in it \(run\.mcap\)"):
+        BagReader(tmp_path / "run")
 
 
 @pytest.mark.parametrize("mode", [CompressionMode.NONE, CompressionMode.MESSAGE, CompressionMode.FILE])
