@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.rotations import canonical, from_matrix, inverse, log, rotate, turn_form
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
+_Column = TypeVar("_Column", Tensor, np.ndarray)
 
 # A robot's loop closure is false if its rotation errs by more degrees than this, or its translation by more metres.
 FALSE_CLOSURE_DEG, FALSE_CLOSURE_M = 10.0, 2.0
@@ -24,6 +25,8 @@ FALSE_CLOSURE_DEG, FALSE_CLOSURE_M = 10.0, 2.0
 UNIT_NORM_TOLERANCE = 1e-3
 # No robot drives farther between two keyframes, in whatever unit; the squares of far longer ways overflow.
 MAX_TRANSLATION = 1e9
+# An odometry edge's variance in units of one step's: no more are drawn together, and far more or less overflows.
+STEPS = (1e-9, 1e9)
 # scipy's graph routines count nodes in 32 bits.
 _MAX_NODES = 2**31 - 1
 # Nodes without an edge that the largest index alone may imply: more are ids taken for indices, or `num_nodes` says that
@@ -124,7 +127,7 @@ class ViewGraph:
             precision: rad⁻². Values that are not positive and finite count as unknown; these, and the default, are one
                 over the mean variance that ``information`` implies, where there is one.
             label: :class:`EdgeLabel` codes; default: automatic.
-            steps: default: 1.
+            steps: between 10⁻⁹ and 10⁹; default: 1.
             translation: ``(M, 3)`` metres, position of the target in the source's frame, the same whichever way the
                 rotation is given; default: none is known. Rows that are not finite or longer than 10⁹ count as unknown.
             information: ``(M, 3, 3)`` rad⁻², of the error in the target's frame, the same whichever way the rotation is
@@ -133,9 +136,9 @@ class ViewGraph:
 
         Raises:
             ViewGraphError: none or both of the two rotations, arrays that are not numbers or whose shapes do not fit,
-                an index out of range or far beyond the number of edges, a self-edge, an unknown code, steps that are
-                not positive and finite, a quaternion that is not finite or is farther than 1e-3 from unit length, or a
-                matrix that is no rotation.
+                an index out of range or far beyond the number of edges, a self-edge, an unknown code, steps beyond
+                their bounds, a quaternion that is not finite or is farther than 1e-3 from unit length, or a matrix that
+                is no rotation.
         """
         source = _column("source", source, torch.int64)
         num_edges = len(source)
@@ -150,7 +153,7 @@ class ViewGraph:
         _refuse((kind < 0) | (kind >= len(EdgeKind)), "kind {}; 0 is odometry, 1 a loop closure", kind)
         unknown_label = (label < 0) | (label >= len(EdgeLabel))
         _refuse(unknown_label, "label {}; 0 is automatic, 1 accepted, 2 rejected", label)
-        _refuse(~(torch.isfinite(steps) & (steps > 0)), "{:g} steps; they must be positive and finite", steps)
+        _refuse(~are_steps(steps), f"{{:g}} steps; they must be between {STEPS[0]:g} and {STEPS[1]:g}", steps)
         precision = torch.where(torch.isfinite(precision) & (precision > 0), precision, torch.nan)
         places = None if translation is None else _translations(translation, num_edges)
         matrices = None if information is None else _informations(information, num_edges)
@@ -292,6 +295,11 @@ def _translations(values: ArrayLike, num_edges: int) -> Tensor:
 def where_possible(translation: Tensor) -> Tensor:
     """``(M, 3)``; rows with an entry that is not finite or above :data:`MAX_TRANSLATION` become NaN."""
     return torch.where((translation.abs() <= MAX_TRANSLATION).all(dim=1, keepdim=True), translation, torch.nan)
+
+
+def are_steps(steps: _Column) -> _Column:
+    """``(M,)`` bool, which of ``(M,)`` are within :data:`STEPS`."""
+    return (steps >= STEPS[0]) & (steps <= STEPS[1])
 
 
 def mean_precision(information: Tensor) -> Tensor:

@@ -27,8 +27,10 @@ def solve_batch(
 ) -> list[Solution]:
     """What :func:`~rotavg_ros.solver.solve` says of every graph, to 10⁻⁵ rad; the arguments are the same.
 
-    SfM graphs are solved together as one graph of that many components, and ``stage_seconds`` are those of all.
-    SLAM graphs, and methods that are not ours, go one by one.
+    SfM graphs are solved together as one graph of that many components, and ``stage_seconds`` are those of all. Their
+    ``warnings`` are those about edges that state nothing and about graphs that are mostly flagged; that edges which
+    contradict each other agree among themselves is told only of a graph that is solved alone. SLAM graphs, and methods
+    that are not ours, go one by one.
 
     Returns:
         a solution per graph, in their order.

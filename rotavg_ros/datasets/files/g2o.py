@@ -70,7 +70,7 @@ def read(path: Path) -> GraphFile:
 
     Landmarks, priors, parameters and self-edges are skipped and counted. Precision is Iθθ, or the mean of the
     three angular diagonal entries; information is the 3 × 3 block, of spatial edges that are not equally exact about
-    all axes.
+    all axes. There are no translations where none is known.
 
     Raises:
         GraphFileError: naming the line that is at fault.
@@ -117,7 +117,7 @@ def read(path: Path) -> GraphFile:
         kind=np.where(consecutive, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE),
         precision=every.precision,
         planar=planar,
-        edge_translation=every.translation,
+        edge_translation=None if np.isnan(every.translation).all() else every.translation,
         edge_information=every.information,
         information=None if planar else rotation_of(every.information),
         skipped=dict(skipped),
@@ -193,7 +193,8 @@ def write(
 ) -> None:
     """Write EDGE_SE2 or EDGE_SE3:QUAT lines, after VERTEX lines that chain the edges' translations.
 
-    The format knows no unknown precision (written as 1) and no edge kind (consecutive ids are odometry).
+    The format knows no unknown precision (written as 1) and no edge kind (consecutive ids are odometry). Translations
+    that are not known are zeros, with as good as no information.
 
     Args:
         body_from_world: ``(N, 4)`` xyzw orientations of the vertices; default: those a breadth-first tree of

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from rotavg_ros.errors import UserError
-from rotavg_ros.view_graph import ViewGraph, where_possible
+from rotavg_ros.view_graph import EdgeLabel, ViewGraph, where_possible
 
 # Ids are non-negative so that they fit the unsigned 64-bit ids of the messages and of gtsam's keys.
 MAX_NODE_ID = np.iinfo(np.int64).max
@@ -51,7 +51,8 @@ class GraphFile:
         graph: the edges; nodes are indices into ``node_ids``.
         node_ids: ``(N,)`` int64, ascending, non-negative: index → id in the file.
         planar: every rotation is about z (an SE(2) graph).
-        edge_translation: ``(M, 3)`` position of the target in the source frame, metres (SfM: of unknown scale).
+        edge_translation: ``(M, 3)`` position of the target in the source frame, metres (SfM: of unknown scale); NaN
+            where unknown. Default: the graph's.
         edge_information: ``(M, 21)`` upper triangle, row by row, of the 6 × 6 information matrix of x, y, z and the
             rotation, as stated by formats that have one. Planar edges have zeros for z, roll and pitch. What solvers
             read of it is the graph's ``information``.
@@ -76,8 +77,10 @@ class GraphFile:
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """The graph has the translations, too: a solver sees nothing else."""
-        if self.edge_translation is not None:
+        """The graph has the translations, too: a solver sees nothing else. Formats see what is here alone."""
+        if self.edge_translation is None and self.graph.translation is not None:
+            object.__setattr__(self, "edge_translation", self.graph.translation.cpu().numpy())
+        elif self.edge_translation is not None:
             translation = torch.as_tensor(self.edge_translation, dtype=torch.float64)
             object.__setattr__(self, "graph", replace(self.graph, translation=where_possible(translation)))
 
@@ -89,13 +92,21 @@ class GraphFile:
 
     @property
     def extras(self) -> list[str]:
-        """What is known of the nodes besides their ids, in words."""
+        """What only npz has room for, in words, and what no format has."""
+        graph = self.graph
         known = {
-            "stamps": self.stamps_ns,
-            "ground-truth orientations": self.body_from_world_gt,
-            "ground-truth positions": self.position_gt,
+            "labels": bool((graph.label != EdgeLabel.AUTOMATIC).any()),
+            "how many steps odometry edges stand for": bool((graph.steps[graph.is_odometry] != 1).any()),
+            "stamps": self.stamps_ns is not None,
+            "ground-truth orientations": self.body_from_world_gt is not None,
+            "ground-truth positions": self.position_gt is not None,
         }
-        return [name for name, values in known.items() if values is not None]
+        return [name for name, is_known in known.items() if is_known] + self.in_no_file
+
+    @property
+    def in_no_file(self) -> list[str]:
+        """What no format has room for, in words; the rest of it is found by reading."""
+        return [] if self.graph.route is None else ["which ways odometry went along edges drawn together"]
 
     @classmethod
     def from_ids(
@@ -107,6 +118,7 @@ class GraphFile:
         lone_ids: np.ndarray | None = None,
         kind: np.ndarray | None = None,
         precision: np.ndarray | None = None,
+        label: np.ndarray | None = None,
         planar: bool = False,
         edge_translation: np.ndarray | None = None,
         edge_information: np.ndarray | None = None,
@@ -134,6 +146,7 @@ class GraphFile:
             num_nodes=len(node_ids),
             kind=kind,
             precision=precision,
+            label=label,
             steps=steps,
             information=information,
         )

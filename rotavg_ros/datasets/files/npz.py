@@ -1,8 +1,9 @@
 """View-graphs as npz archives of plain arrays.
 
 Required: ``source``, ``target`` ``(M,)`` integer ids and ``target_from_source`` ``(M, 4)`` xyzw.
-Optional: ``kind`` ``(M,)`` (0 odometry, 1 loop closure), ``precision`` ``(M,)`` rad⁻², ``information`` ``(M, 3, 3)``
-rad⁻² of the rotation's error in the target's frame, ``edge_translation`` ``(M, 3)``, ``edge_information`` ``(M, 21)``,
+Optional: ``kind`` ``(M,)`` (0 odometry, 1 loop closure), ``precision`` ``(M,)`` rad⁻², ``label`` ``(M,)`` (0 automatic,
+1 accepted, 2 rejected), ``steps`` ``(M,)`` of odometry that an edge stands for, ``information`` ``(M, 3, 3)`` rad⁻² of
+the rotation's error in the target's frame, ``edge_translation`` ``(M, 3)``, ``edge_information`` ``(M, 21)``,
 ``node_ids`` ``(N,)`` (names nodes without an edge too), ``planar``; and per node, ascending by id:
 ``body_from_world_gt`` ``(N, 4)`` with NaN where unknown, ``stamps_ns`` ``(N,)``, ``position_gt`` ``(N, 3)``. Other
 arrays are ignored.
@@ -20,7 +21,7 @@ import numpy as np
 from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, reading, writing
 from rotavg_ros.datasets.files.text_rows import refuse, unit_quaternions
 from rotavg_ros.datasets.planar import are_about_z
-from rotavg_ros.view_graph import MAX_TRANSLATION, EdgeKind
+from rotavg_ros.view_graph import MAX_TRANSLATION, STEPS, EdgeKind, EdgeLabel, are_steps
 
 _SHAPES: dict[str, tuple[int, ...]] = {  # of one row
     "source": (),
@@ -28,6 +29,8 @@ _SHAPES: dict[str, tuple[int, ...]] = {  # of one row
     "target_from_source": (4,),
     "kind": (),
     "precision": (),
+    "label": (),
+    "steps": (),
     "information": (3, 3),
     "edge_translation": (3,),
     "edge_information": (21,),
@@ -37,7 +40,8 @@ _SHAPES: dict[str, tuple[int, ...]] = {  # of one row
     "position_gt": (3,),
 }
 _REQUIRED = ("source", "target", "target_from_source")
-_INTEGER = ("source", "target", "kind", "node_ids", "stamps_ns")
+_INTEGER = ("source", "target", "kind", "label", "node_ids", "stamps_ns")
+_OF_EDGES = ("precision", "label", "steps", "information")  # as the graph has them
 _EDGE_EXTRAS = ("edge_translation", "edge_information")
 _PER_NODE = ("body_from_world_gt", "stamps_ns", "position_gt")
 
@@ -51,7 +55,7 @@ def read(path: Path) -> GraphFile:
     arrays, planar = _load(path)
     source, target = arrays["source"], arrays["target"]
     num_edges = len(source)
-    for name in ("target", "target_from_source", "kind", "precision", "information", *_EDGE_EXTRAS):
+    for name in ("target", "target_from_source", "kind", *_OF_EDGES, *_EDGE_EXTRAS):
         if name in arrays and len(arrays[name]) != num_edges:
             what = f"{name} has {len(arrays[name])} rows, source has {num_edges}; they must agree"
             raise GraphFileError.at(path, None, what)
@@ -66,6 +70,11 @@ def read(path: Path) -> GraphFile:
         refuse(path, None, too_long, f"a translation of more than {MAX_TRANSLATION:g} m; write NaN where it is unknown")
     kind = arrays.get("kind", np.full(num_edges, EdgeKind.LOOP_CLOSURE, dtype=np.int64))
     refuse(path, None, ~np.isin(kind, list(EdgeKind)), "an unknown kind; 0 is odometry, 1 a loop closure")
+    if "label" in arrays:
+        is_unknown = ~np.isin(arrays["label"], list(EdgeLabel))
+        refuse(path, None, is_unknown, "an unknown label; 0 is automatic, 1 accepted, 2 rejected")
+    if "steps" in arrays:
+        refuse(path, None, ~are_steps(arrays["steps"]), f"steps that are not between {STEPS[0]:g} and {STEPS[1]:g}")
     proper = source != target
     if not proper.any():
         raise GraphFileError.at(path, None, "no edges between nodes; there is nothing to solve")
@@ -78,10 +87,8 @@ def read(path: Path) -> GraphFile:
         quaternions[proper],
         lone_ids=np.concatenate((source[~proper], arrays.get("node_ids", source[:0]))),
         kind=kind[proper],
-        precision=arrays["precision"][proper] if "precision" in arrays else None,
-        information=arrays["information"][proper] if "information" in arrays else None,
         planar=turns_about_z if planar is None else planar,
-        **{name: arrays[name][proper] for name in _EDGE_EXTRAS if name in arrays},
+        **{name: arrays[name][proper] for name in (*_OF_EDGES, *_EDGE_EXTRAS) if name in arrays},
         skipped={} if proper.all() else {"self-edge": int((~proper).sum())},
     )
     rows: dict[str, Any] = {
@@ -93,19 +100,20 @@ def read(path: Path) -> GraphFile:
 
 
 def write(path: Path, graph_file: GraphFile) -> None:
-    """Write everything a :class:`GraphFile` holds, except what was skipped."""
+    """Write everything a :class:`GraphFile` holds, except what reading found and :attr:`GraphFile.in_no_file`."""
     graph, ids = graph_file.graph, graph_file.node_ids
     arrays: dict[str, Any] = {
         "source": ids[graph.source.cpu().numpy()],
         "target": ids[graph.target.cpu().numpy()],
         "target_from_source": graph.target_from_source.cpu().numpy(),
         "kind": graph.kind.cpu().numpy(),
-        "precision": graph.precision.cpu().numpy(),
         "node_ids": ids,
         "planar": np.array(graph_file.planar),
     }
-    if graph.information is not None:
-        arrays["information"] = graph.information.cpu().numpy()
+    for name in _OF_EDGES:
+        column = getattr(graph, name)
+        if column is not None:
+            arrays[name] = column.cpu().numpy()
     for name in (*_EDGE_EXTRAS, *_PER_NODE):
         values = getattr(graph_file, name)
         if values is not None:
@@ -116,8 +124,8 @@ def write(path: Path, graph_file: GraphFile) -> None:
 
 
 def not_stored(graph_file: GraphFile) -> list[str]:
-    """Nothing: the format has room for all of a :class:`GraphFile`."""
-    return []
+    """What of this graph the format has no room for, in words."""
+    return graph_file.in_no_file
 
 
 def _load(path: Path) -> tuple[dict[str, np.ndarray], bool | None]:

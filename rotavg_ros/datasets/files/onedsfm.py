@@ -72,7 +72,7 @@ def not_stored(graph_file: GraphFile) -> list[str]:
         "which edges are odometry": bool(graph.is_odometry.any()),
         "precisions": not bool(graph.precision.isnan().all()),
         "nodes without an edge": len(joined) < graph.num_nodes,
-        "which translations are unknown (written as 0)": graph.translation is not None
-        and not bool(graph.translation.isfinite().all()),
+        "which translations are unknown (written as 0)": graph.translation is None
+        or not bool(graph.translation.isfinite().all()),
     }
     return [name for name, is_lost in lost.items() if is_lost] + graph_file.extras

@@ -59,7 +59,7 @@ def lay_out(
     graph, ids = graph_file.graph, graph_file.node_ids
     translation = graph_file.edge_translation
     if translation is None:
-        translation = np.zeros((graph.num_edges, 3))
+        translation = np.full((graph.num_edges, 3), np.nan)
     is_known = np.isfinite(translation).all(axis=1, keepdims=True)
     translation = np.asarray(np.where(is_known, translation, 0.0))
     information = _information(graph_file)
@@ -118,7 +118,7 @@ def rotation_information(graph: ViewGraph, precision: np.ndarray) -> np.ndarray:
 
 
 def _information(graph_file: GraphFile) -> np.ndarray:
-    """``(M, 21)`` as stated; where nothing is, 1 for positions and what the graph has for rotations."""
+    """``(M, 21)`` as stated; where nothing is, 1 for positions, known or not, and what the graph has for rotations."""
     precision = np.nan_to_num(graph_file.graph.precision.cpu().numpy(), nan=1.0)
     information = rotation_information(graph_file.graph, precision)
     information[:, POSITION_DIAGONAL] = 1

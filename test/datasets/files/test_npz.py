@@ -36,6 +36,8 @@ def test_minimal(tmp_path: Path) -> None:
     assert graph_file.node_ids.tolist() == [10, 20, 40]
     assert not graph_file.graph.is_odometry.any()
     assert bool(graph_file.graph.precision.isnan().all())
+    assert graph_file.graph.label.tolist() == [0, 0]
+    assert graph_file.graph.steps.tolist() == [1, 1]
     assert graph_file.body_from_world_gt is None
 
 
@@ -63,8 +65,9 @@ def test_rows_follow_node_ids(tmp_path: Path) -> None:
 
 
 def test_self_edges_are_skipped(tmp_path: Path) -> None:
-    graph_file = read_graph(saved(tmp_path, target=[20, 20]))
+    graph_file = read_graph(saved(tmp_path, target=[20, 20], label=[2, 1], steps=[3, 4]))
     assert graph_file.graph.num_edges == 1
+    assert (graph_file.graph.label.tolist(), graph_file.graph.steps.tolist()) == ([2], [3])
     assert graph_file.skipped == {"self-edge": 1}
 
 
@@ -89,6 +92,11 @@ def test_rgbd_scene(shared_data: Path) -> None:
         ({"target": [10, 20]}, "no edges between nodes"),
         ({"source": np.empty(0, int), "target": np.empty(0, int), "target_from_source": np.empty((0, 4))}, "no edges"),
         ({"kind": [0, 7]}, "unknown kind"),
+        ({"label": [0, 3]}, "edge 1 (from 0) has an unknown label; 0 is automatic, 1 accepted, 2 rejected"),
+        ({"label": [0.0, 1.0]}, "label holds float64; it must hold integers"),
+        ({"label": [0]}, "label has 1 rows, source has 2"),
+        ({"steps": [1, 1e40]}, "edge 1 (from 0) has steps that are not between 1e-09 and 1e+09"),
+        ({"steps": [np.nan, 1]}, "edge 0 (from 0) has steps that are not between"),
         ({"kind": np.array(["a", "b"])}, "kind holds <U1"),
         ({"precision": np.array([1, None], dtype=object)}, "not a readable npz archive"),
         ({"body_from_world_gt": [IDENTITY]}, "1 rows for 3 nodes"),

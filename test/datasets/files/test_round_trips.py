@@ -20,6 +20,7 @@ from rotavg_ros.datasets.files import g2o
 from rotavg_ros.datasets.files.formats import not_stored, read_graph, write_graph
 from rotavg_ros.datasets.files.graph_file import MAX_NODE_ID, GraphFile, GraphFileError
 from rotavg_ros.datasets.planar import quaternion_of_heading
+from rotavg_ros.view_graph import ViewGraph
 
 
 @st.composite
@@ -140,18 +141,22 @@ def test_npz_keeps_everything(graph_file: GraphFile, seed: int) -> None:
     num_nodes = len(graph_file.node_ids)
     truth = rotations.random(num_nodes).numpy()
     truth[rng.random(num_nodes) < 0.3] = np.nan
+    num_edges = graph_file.graph.num_edges
+    label, steps = torch.from_numpy(rng.integers(0, 3, num_edges)), torch.from_numpy(rng.uniform(0.5, 9, num_edges))
     full = replace(
         graph_file,
+        graph=replace(graph_file.graph, label=label, steps=steps),
         body_from_world_gt=truth,
         stamps_ns=rng.integers(0, 2**62, num_nodes),
         position_gt=rng.normal(size=(num_nodes, 3)),
-        edge_information=rng.normal(size=(graph_file.graph.num_edges, 21)),
+        edge_information=rng.normal(size=(num_edges, 21)),
     )
     read = through(".npz", full)
     assert_same_edges(read, full)
     assert read.planar == full.planar
     assert torch.equal(read.graph.kind, full.graph.kind)
-    assert torch.equal(read.graph.precision, full.graph.precision)
+    for name in ("precision", "label", "steps"):
+        assert torch.equal(getattr(read.graph, name), getattr(full.graph, name))
     for name in ("node_ids", "stamps_ns", "position_gt", "edge_translation", "edge_information"):
         np.testing.assert_array_equal(getattr(read, name), getattr(full, name))
     np.testing.assert_allclose(read.body_from_world_gt, full.body_from_world_gt, atol=1e-12)
@@ -258,7 +263,28 @@ def test_what_a_format_cannot_store_is_named(graph_file: GraphFile) -> None:
     assert "stamps" in not_stored("x.txt", full)
     assert "precisions" in not_stored("x.txt", full)
     kinds_survive = torch.equal(through(".g2o", full).graph.kind, full.graph.kind)
-    assert kinds_survive != any("odometry" in what for what in not_stored("x.g2o", full))
+    assert kinds_survive != any("which edges are odometry" in what for what in not_stored("x.g2o", full))
+
+
+@pytest.mark.parametrize("suffix", [".g2o", ".toro", ".isam", ".txt"])
+def test_labels_and_steps_are_lost_but_in_npz(suffix: str) -> None:
+    label, steps = "labels", "how many steps odometry edges stand for"
+    graph_file = GraphFile.from_ids(
+        np.array([0, 1]), np.array([1, 2]), np.array([[0.0, 0, 0, 1]] * 2), kind=np.array([0, 1]), planar=True
+    )
+    plain = graph_file.graph
+    assert not {label, steps} & set(not_stored(f"x{suffix}", graph_file))
+    for changes, lost in (
+        ({"label": torch.tensor([0, 2])}, {label}),
+        ({"steps": torch.tensor([2.0, 1.0]).double()}, {steps}),
+        ({"steps": torch.tensor([1.0, 2.0]).double()}, set()),  # of a closure, without meaning
+    ):
+        changed = replace(graph_file, graph=replace(plain, **changes))
+        assert {label, steps} & set(not_stored(f"x{suffix}", changed)) == lost
+        assert not_stored("x.npz", changed) == []
+    along = replace(graph_file, graph=replace(plain, route=torch.tensor([0, -1]), routes=torch.zeros(1, 38).double()))
+    for path in (f"x{suffix}", "x.npz"):
+        assert "which ways odometry went along edges drawn together" in not_stored(path, along)
 
 
 def test_unknown_suffix(tmp_path: Path) -> None:
@@ -301,6 +327,35 @@ def test_translations_that_are_not_known(tmp_path: Path, suffix: str) -> None:
     else:
         np.testing.assert_allclose(again.edge_translation, translation, atol=1e-12)
         assert not any("translations" in what for what in not_stored(path, graph_file))
+
+
+@pytest.mark.parametrize("suffix", [".g2o", ".toro", ".isam", ".npz", ".txt"])
+def test_translations_that_only_the_graph_has(suffix: str) -> None:
+    translation = [[1.0, 2.0, 0.0], [-3.0, 0.5, 0.0]]
+    graph = ViewGraph.create([0, 1], [1, 2], [[0, 0, 0.6, 0.8]] * 2, kind=[0, 0], translation=translation)
+    read = through(suffix, GraphFile(graph, np.array([4, 5, 6]), planar=True))
+    assert read.graph.translation is not None
+    np.testing.assert_allclose(read.graph.translation, translation, atol=1e-12)
+
+
+@pytest.mark.parametrize("suffix", [".g2o", ".toro", ".isam", ".npz", ".txt"])
+@pytest.mark.parametrize("planar", [True, False])
+def test_no_translations_at_all(suffix: str, planar: bool) -> None:
+    """None comes back, and again none of that; 1DSfM says that it has no word for it."""
+    if suffix == ".isam" and not planar:
+        pytest.skip("a format of the plane")
+    graph_file = GraphFile.from_ids(
+        np.array([0, 1]), np.array([1, 2]), np.array([[0.0, 0, 0.6, 0.8]] * 2), planar=planar, precision=np.ones(2)
+    )
+    if suffix == ".txt":
+        assert "which translations are unknown (written as 0)" in not_stored(f"x{suffix}", graph_file)
+        return
+    assert not any("translations" in what for what in not_stored(f"x{suffix}", graph_file))
+    once = through(suffix, graph_file)
+    for read in (once, through(suffix, once)):
+        assert read.graph.translation is None
+        assert read.edge_translation is None
+        torch.testing.assert_close(read.graph.precision, graph_file.graph.precision)
 
 
 def _with_information(rng: np.random.Generator) -> GraphFile:
