@@ -7,6 +7,8 @@ All functions broadcast over leading dimensions, keep dtype and device, and are 
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -14,6 +16,8 @@ from rotavg_ros.hamilton import hamilton_product
 
 # Below this squared angle (rad²) the series of sin(x)/x is exact to double precision.
 _SMALL_ANGLE_SQUARED = 1e-8
+# Rad², of a component of the rotation vector of a turn drawn from all alike: a third of the mean of θ² (1 − cos θ) / π.
+RANDOM_VARIANCE = (math.pi**2 / 3 + 2) / 3
 
 
 def identity(*shape: int, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> Tensor:

@@ -36,12 +36,14 @@ class EdgesInSeries(NamedTuple):
         group: ``(K,)`` the class of each.
         num_groups: G.
         blame: ``(K,)`` float64, probability that it is this one, if one of its class is wrong; begun as equal.
+        bridge: ``(B,)`` edges that are on no cycle, so that nothing at all checks them.
     """
 
     edge: Tensor
     group: Tensor
     num_groups: int
     blame: Tensor
+    bridge: Tensor
 
     @classmethod
     def of(cls, graph: ViewGraph, parent: Tensor, parent_edge: Tensor) -> EdgesInSeries:
@@ -75,11 +77,11 @@ class EdgesInSeries(NamedTuple):
         edge = torch.cat((parent_edge[is_child], others[likely]))
         flows = torch.cat((forest_flow, flow[likely]))
         _, group, size = torch.unique(flows, return_inverse=True, return_counts=True)
-        # Bridges have no flow; nothing at all checks them.
         checked = torch.cat((forest_flow != 0, likely.new_ones(int(likely.sum()))))
         chosen = (checked & (size[group] > 1)).nonzero().squeeze(1)
         _, group, size = torch.unique(group[chosen], return_inverse=True, return_counts=True)
-        return cls(edge[chosen], group, len(size), 1 / size.double()[group])
+        bridge = parent_edge[is_child][forest_flow == 0]
+        return cls(edge[chosen], group, len(size), 1 / size.double()[group], bridge)
 
     def blamed(self, log_odds: Tensor) -> EdgesInSeries:
         """With the blame that log-odds ``(K,)`` to be wrong give."""
@@ -94,6 +96,23 @@ class EdgesInSeries(NamedTuple):
         """
         together, spread = self.sums(angle.double()), self.sums(uncertainty.double().square()).sqrt()
         return self.blame * residual_probability(together, spread, outlier_angle)[self.group]
+
+    def bridge_score(self, score: Tensor, of_edge: Tensor) -> Tensor:
+        """Probability ``(B,)`` that a bridge is wrong: the share of what its component checks, with one good edge more.
+
+        Orientations follow a bridge, so that its residual says nothing of it.
+
+        Args:
+            score: ``(M,)`` of the edges that others check.
+            of_edge: ``(M,)`` each edge's component.
+        """
+        checked = torch.ones_like(score)
+        checked[self.bridge] = 0
+        wrong, count = (
+            score.new_zeros(int(of_edge.max()) + 1).index_add_(0, of_edge, value)
+            for value in (checked * score, checked)
+        )
+        return (wrong / (count + 1))[of_edge[self.bridge]]
 
     def sums(self, value: Tensor) -> Tensor:
         """Sums ``(G,)`` of values ``(K,)`` by class."""

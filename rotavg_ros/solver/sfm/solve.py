@@ -104,9 +104,10 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
         score = residual_probability(angle, spread, NUMBERS.outlier_angle)
         series = structure.series
         score[series.edge] = series.score(angle[series.edge], spread[series.edge], NUMBERS.outlier_angle)
+        score[series.bridge] = series.bridge_score(score, component[graph.source])
         if steps > 0:
             with watch.stage("uncertainty"):
-                stated = variances(graph, angle, score, References(component, form.first_nodes()))
+                stated = variances(graph, angle, score, series.bridge, References(component, form.first_nodes()))
             variance = variance if stated is None else form.of_nodes(stated)
     score = score.index_select(0, form.edge)
     return Estimate(form.orientations(orientations), score, variance, warnings=warnings)

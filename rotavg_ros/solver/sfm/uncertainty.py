@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianSystem
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.solver.sfm.probes import probe_signs
@@ -25,6 +26,8 @@ _SAMPLES = 64
 # Of edges that are surely wrong: they hold the graph together.
 _LEAST_WEIGHT = 1e-3
 _FLAGGED = 0.5
+# Rad²: of graphs without any noise.
+_LEAST_NOISE = 1e-12
 
 
 class References(NamedTuple):
@@ -39,7 +42,7 @@ class References(NamedTuple):
     node: Tensor
 
 
-def variances(graph: ViewGraph, angle: Tensor, score: Tensor, to: References) -> Tensor | None:
+def variances(graph: ViewGraph, angle: Tensor, score: Tensor, bridge: Tensor, to: References) -> Tensor | None:
     """Variance ``(N,)`` rad² of each component of a node's error relative to its component's reference.
 
     NaN in components that are well knit, and in trees, where nothing checks anything; None if there are no others.
@@ -47,6 +50,7 @@ def variances(graph: ViewGraph, angle: Tensor, score: Tensor, to: References) ->
     Args:
         angle: ``(M,)`` rad, residuals.
         score: ``(M,)`` probability that an edge is an outlier.
+        bridge: ``(B,)`` edges that nothing checks: as likely as their scores say, what is behind them is turned anyhow.
     """
     count = len(to.node)
     size = torch.bincount(to.component, minlength=count)
@@ -65,6 +69,10 @@ def variances(graph: ViewGraph, angle: Tensor, score: Tensor, to: References) ->
     # Edges beyond a spanning tree that are believed, at least one.
     checks = (sums((score[kept] < _FLAGGED).to(weight)) - size + 1).clamp(min=1)
     noise = sums(weight * angle[kept].to(weight).square()) / (3 * checks)
+    turned = torch.zeros_like(score)
+    turned[bridge] = score[bridge] * rotations.RANDOM_VARIANCE
+    turned = turned[kept] / noise[to.component[source]].clamp(min=_LEAST_NOISE)
+    weight = 1 / (1 / weight + turned)
     # What is not asked for is held fixed as the references are.
     fixed = ~loose
     fixed[to.node] = True

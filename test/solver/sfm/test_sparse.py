@@ -59,3 +59,31 @@ def test_each_component_has_the_better_of_two() -> None:
     assert _is_sparse(both)
     pairs = torch.combinations(torch.arange(40))
     assert not _is_sparse(ViewGraph.create(pairs[:, 0], pairs[:, 1], exact[:1].repeat(len(pairs), 1)))
+
+
+def test_a_bridge_is_as_certain_as_the_edges_that_others_check() -> None:
+    """It leaves no residual, whatever it states; what is behind it is as uncertain as that may be wrong."""
+    scores, is_wrong, deviations = [], [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        ends = np.array([(i, (i + k) % 13) for i in range(13) for k in (1, 2, 3)] + [(0, 13)])
+        false = rng.random(len(ends)) < 0.2
+        noise = Rotation.from_rotvec(np.radians(1.0) * rng.normal(size=(len(ends), 3))).as_quat()
+        noise = Rotation.from_quat(np.where(false[:, None], Rotation.random(len(ends), rng).as_quat(), noise))
+        truth = Rotation.from_rotvec(rng.normal(0, 0.4, (14, 3)))
+        solution = solve(measured(truth, *np.sort(ends, axis=1).T, noise))
+        scores.append(float(solution.outlier_score[-1]))
+        deviations.append(float(solution.uncertainty[13]) / float(solution.uncertainty[1:13].max()))
+        is_wrong.append(bool(false[-1]))
+    assert np.mean(scores) == pytest.approx(np.mean(is_wrong), abs=0.1)
+    assert min(scores) > 0.05 and max(scores) < 0.5
+    assert min(deviations) > 3
+
+
+def test_bridges_are_found_and_a_tree_has_nothing_to_tell_by() -> None:
+    truth = random_truth(9, 1)
+    source, target = np.array([0, 1, 2, 2, 3, 4, 5, 7]), np.array([1, 2, 0, 3, 4, 5, 3, 8])
+    solution = solve(measured(truth, source, target))
+    assert (solution.outlier_score < 1e-3).all()
+    tree = solve(measured(truth, np.arange(8), np.arange(1, 9)))
+    assert (tree.outlier_score == 0).all()

@@ -45,7 +45,7 @@ ALIKE = np.radians(1.0)
 # So short is no axis.
 _NO_TURN = 1e-6
 # A sensor may be mounted anyhow: the variance of a component of the rotation vector of a random turn, rad².
-ANY_TURN = (np.pi**2 / 3 + 2) / 3
+ANY_TURN = rotations.RANDOM_VARIANCE
 
 
 def without_mounting(graph: ViewGraph, mounting: np.ndarray) -> ViewGraph:
