@@ -97,7 +97,7 @@ class EdgesInSeries(NamedTuple):
         together, spread = self.sums(angle.double()), self.sums(uncertainty.double().square()).sqrt()
         return self.blame * residual_probability(together, spread, outlier_angle)[self.group]
 
-    def bridge_score(self, score: Tensor, of_edge: Tensor) -> Tensor:
+    def bridge_score(self, score: Tensor, of_edge: Tensor, num_components: int) -> Tensor:
         """Probability ``(B,)`` that a bridge is wrong: the share of what its component checks, with one good edge more.
 
         Orientations follow a bridge, so that its residual says nothing of it.
@@ -105,12 +105,12 @@ class EdgesInSeries(NamedTuple):
         Args:
             score: ``(M,)`` of the edges that others check.
             of_edge: ``(M,)`` each edge's component.
+            num_components: of all.
         """
         checked = torch.ones_like(score)
         checked[self.bridge] = 0
         wrong, count = (
-            score.new_zeros(int(of_edge.max()) + 1).index_add_(0, of_edge, value)
-            for value in (checked * score, checked)
+            score.new_zeros(num_components).index_add_(0, of_edge, value) for value in (checked * score, checked)
         )
         return (wrong / (count + 1))[of_edge[self.bridge]]
 

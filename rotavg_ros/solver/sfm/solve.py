@@ -30,7 +30,9 @@ from rotavg_ros.solver.sfm.uncertainty import References, variances
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # Of cameras with fewer edges, in the mean, a second start costs little, and few edges check each other.
-_SPARSE_DEGREE = 32
+_SPARSE_DEGREE = 20
+# Answers whose costs are as near as this, of the cost, lie in one valley but for where refinements stop.
+_SAME_VALLEY = 5e-3
 # A graph of more edges is worth measuring what tiles this machine likes.
 _TUNING_PAYS = 200_000
 
@@ -81,7 +83,7 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             orientations = refinement(orientations, weights=weights)
             if stages.clean and stages.weighted and _is_sparse(graph):
                 unweighted = refinement(_begun_without(graph, component), weights=EdgeWeights(allowed, allowed))
-                orientations = _likelier(graph, component, allowed, orientations, unweighted)
+                orientations = _likelier(graph, References(component, begun.roots), allowed, orientations, unweighted)
             if stages.stated:
                 noise = StatedNoise.of(graph, structure, priors, stages.stated_shapes)
                 orientations, weights = noise.refined(orientations, weights, refinement)
@@ -104,7 +106,7 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
         score = residual_probability(angle, spread, NUMBERS.outlier_angle)
         series = structure.series
         score[series.edge] = series.score(angle[series.edge], spread[series.edge], NUMBERS.outlier_angle)
-        score[series.bridge] = series.bridge_score(score, component[graph.source])
+        score[series.bridge] = series.bridge_score(score, component[graph.source], len(begun.roots))
         if steps > 0:
             with watch.stage("uncertainty"):
                 stated = variances(graph, angle, score, series.bridge, References(component, form.first_nodes()))
@@ -123,13 +125,13 @@ def _begun_without(graph: ViewGraph, component: Tensor) -> Tensor:
     return bootstrap(apply_labels(trust_all(graph), graph.label), component).body_from_world
 
 
-def _likelier(graph: ViewGraph, component: Tensor, weight: Tensor, one: Tensor, other: Tensor) -> Tensor:
-    """``(N, 4)``: of each component the orientations of the lower Σ w ‖r‖^½, as shaped steps count residuals."""
-    of_edge, costs = component[graph.source], []
+def _likelier(graph: ViewGraph, to: References, weight: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    """``(N, 4)``: of each component ``one``, or ``other`` where Σ w ‖r‖^½, as shaped steps count, is clearly lower."""
+    of_edge, costs = to.component[graph.source], []
     for orientations in (one, other):
         angle = EdgeResiduals(graph, orientations.float()).angles().double()
-        costs.append(weight.new_zeros(int(component.max()) + 1).index_add(0, of_edge, weight * angle.sqrt()))
-    return torch.where((costs[1] < costs[0])[component, None], other, one)
+        costs.append(weight.new_zeros(len(to.node)).index_add(0, of_edge, weight * angle.sqrt()))
+    return torch.where((costs[1] < (1 - _SAME_VALLEY) * costs[0])[to.component, None], other, one)
 
 
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:

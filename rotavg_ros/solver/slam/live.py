@@ -43,8 +43,6 @@ _UPDATES, _COLUMNS = 0.5, 0.8
 # No more closures than this are reckoned in by the tangent: as many as come while two updates of a large map run. Their
 # covariance is inverted once or twice a tick, 12 ms with translations.
 _MOST = 200
-# What labels keep of the noise has grown by the last number, which is 1 by default.
-_NUMBERS_OF_NOISE = (len(fields(Noise)) - 1, len(fields(Noise)))
 _FLAGGED = 0.5
 # Closures that join what was apart and are this far from how they are held to do so, rad, are false to begin with.
 _FAR = math.radians(30)
@@ -90,7 +88,7 @@ def resume_slam(graph: ViewGraph, labels: KeptLabels, run: Run) -> Estimate | No
     """
     if run.warm_start is None or labels.by_places is not has_places(graph) or first_of_each(graph) is not None:
         return None
-    is_known = len(labels.noise) in _NUMBERS_OF_NOISE and Noise(*labels.noise.tolist()).is_possible
+    is_known = len(labels.noise) == len(fields(Noise)) and Noise(*labels.noise.tolist()).is_possible
     if not is_known or not begins_with(graph, labels.graph, len(labels.trusted)):
         return None
     with run.watch.stage("update"):

@@ -175,18 +175,6 @@ def test_labels_that_are_none_are_done_without(name: str, values: np.ndarray, tm
     assert not is_without_a_search(answered(loaded(path)))
 
 
-def test_noise_that_older_files_kept_without_the_closures_axes_is_known(tmp_path: Path) -> None:
-    path = tmp_path / "state.npz"
-    saved(path)
-    arrays = state_file.read(path)
-    assert len(arrays["labels_noise"]) == 11
-    state_file.write(path, arrays | {"labels_noise": arrays["labels_noise"][:-1]})
-    online = loaded(path)
-    assert is_without_a_search(answered(online))
-    online.save(path)
-    assert len(state_file.read(path)["labels_noise"]) == 11
-
-
 @pytest.mark.parametrize("bias", [np.zeros(0), np.array([0.001, -0.002, 0.0005])])
 def test_a_bias_that_version_6_kept_is_a_calibration(bias: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "state.npz"

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros import ViewGraph, solve
 from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver.sfm.solve import _is_sparse, _likelier
+from rotavg_ros.solver.sfm.uncertainty import References
 from test.solver.graphs import as_quaternions, measured, random_truth
 
 
@@ -54,7 +55,7 @@ def test_each_component_has_the_better_of_two() -> None:
     weight = torch.ones(both.num_edges, dtype=torch.float64)
     component = torch.arange(40) // 20
     one, other = torch.cat((exact, wrong)), torch.cat((wrong, exact))
-    chosen = _likelier(both, component, weight, one, other)
+    chosen = _likelier(both, References(component, torch.tensor([0, 20])), weight, one, other)
     torch.testing.assert_close(chosen, torch.cat((exact, exact)))
     assert _is_sparse(both)
     pairs = torch.combinations(torch.arange(40))

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit
 
+from rotavg_ros.solver.slam.noise.vertical import Vertical
 from rotavg_ros.solver.slam.posterior.left_out import leave_one_out
 from rotavg_ros.solver.slam.posterior.objective import Evaluation, evaluate
 from rotavg_ros.solver.slam.posterior.problem import Problem
@@ -166,16 +167,16 @@ def estimate_noise(problem: Problem, state: State, factorised: Factorised) -> No
         noise,
         step_variance=likeliest(is_step, noise.step_variance, priors.step_deg),
         closure_variance=likeliest(~is_step, noise.closure_variance, priors.closure_deg),
-        **_told(problem, state, factorised.weight, residual),
+        step_told=_step_told(problem, state, factorised.weight, residual),
     )
 
 
-def _told(problem: Problem, state: State, weight: np.ndarray, residual: np.ndarray) -> dict[str, float]:
-    """Of odometry, and of good closures: how many of the components that they err in tell of their tails, of all k.
+def _step_told(problem: Problem, state: State, weight: np.ndarray, residual: np.ndarray) -> float:
+    """How many of the components that odometry errs in tell of its tails, of all k: k_eff / k.
 
-    Where gravity holds roll and pitch, or a sensor sees turns about one axis of its body worse than those about others,
-    the squares of what they err by are those of about one normal component, not of three that are smaller; these seem
-    to have tails. A sum of squares of normal components with shares q of the variance is about χ² with k_eff = 1 / Σ q²
+    Where gravity holds roll and pitch, or odometry sees turns about one axis of the body worse than those about others,
+    the squares of what it errs by are those of about one normal component, not of three that are smaller; these seem to
+    have tails. A sum of squares of normal components with shares q of the variance is about χ² with k_eff = 1 / Σ q²
     degrees of freedom (Satterthwaite 1946).
 
     Args:
@@ -184,30 +185,22 @@ def _told(problem: Problem, state: State, weight: np.ndarray, residual: np.ndarr
         weight: ``(E + R,)`` rad⁻² in that.
         residual: ``(E + R, 3)`` rad after it.
     """
-    if problem.components == 1 or "tilt" in problem.without:
-        return {"step_told": 1.0, "closure_told": 1.0}
-    graph, bodies = problem.graph, problem.body_from_world(state.correction)
-    told = {}
-    for name, of_kind in (("step_told", graph.is_odometry), ("closure_told", graph.is_closure)):
-        good = np.flatnonzero(of_kind & state.is_good)
-        heavy, left = weight[good], residual[good]
-        # As if one edge more erred alike about all axes.
-        square = np.eye(3)
-        for end in (graph.source, graph.target):
-            at_end = np.einsum("eij,ej->ei", bodies[end[good]], left)
-            square += (heavy * at_end.T) @ at_end / 2
-        told[name] = float(square.trace() ** 2 / (square**2).sum() / 3)
-    told["step_told"] = min(told["step_told"], _told_upright(problem, state, weight, residual))
-    return told
-
-
-def _told_upright(problem: Problem, state: State, weight: np.ndarray, residual: np.ndarray) -> float:
-    """The same of odometry about the vertical and about other axes, 1 where the robot knows none."""
-    vertical = problem.upright
-    sound = np.flatnonzero(problem.graph.is_odometry & state.is_good)
-    if vertical is None or len(sound) == 0:
+    graph = problem.graph
+    sound = np.flatnonzero(graph.is_odometry & state.is_good)
+    if problem.components == 1 or "tilt" in problem.without or len(sound) == 0:
         return 1.0
-    weight, residual = weight[sound], residual[sound]
+    bodies, heavy, left = problem.body_from_world(state.correction), weight[sound], residual[sound]
+    # As if one edge more erred alike about all axes.
+    square = np.eye(3)
+    for end in (graph.source, graph.target):
+        at_end = np.einsum("eij,ej->ei", bodies[end[sound]], left)
+        square += (heavy * at_end.T) @ at_end / 2
+    told = float(square.trace() ** 2 / (square**2).sum() / 3)
+    return told if problem.upright is None else min(told, _told_upright(problem.upright, heavy, left))
+
+
+def _told_upright(vertical: Vertical, weight: np.ndarray, residual: np.ndarray) -> float:
+    """The same about the vertical and about other axes, of ``(n,)`` weights and ``(n, 3)`` residuals in the world."""
     axis = vertical.sharpened(residual, 1 / weight)
     # About others no more than about the vertical.
     about = 1 + float(weight @ (residual @ axis) ** 2)

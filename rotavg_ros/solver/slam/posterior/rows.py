@@ -46,7 +46,7 @@ def tails(problem: Problem, noise: Noise) -> Tails:
     return Tails(
         np.where(is_odometry, noise.step_tails, noise.closure_tails),
         np.where(is_odometry, 1 + (noise.step_tail_ratio - 1) * share, problem.priors.tail_ratio),
-        np.where(is_odometry, noise.step_told, noise.closure_told),
+        np.where(is_odometry, noise.step_told, 1.0),
     )
 
 

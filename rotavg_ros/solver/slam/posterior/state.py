@@ -32,9 +32,8 @@ class Noise:
         turn_share: share of odometry's variance that goes with the squares of the turns of its steps, not their number.
         step_tails, closure_tails: share of sound segments, and of good closures, that err by far more than others.
         step_tail_ratio: τ, how many times the variance of other segments those have.
+        step_told: φ, k_eff / k of odometry, 1 where it errs alike about all axes (estimated with the variances).
         run_steps: no run is longer at its older end, in steps of odometry; 0 where closures err independently.
-        step_told, closure_told: φ, k_eff / k of either, 1 where they err alike about all axes (estimated with the
-            variances).
     """
 
     step_variance: float
@@ -47,19 +46,18 @@ class Noise:
     closure_tails: float = TAIL_SHARES[0]
     step_tail_ratio: float = STEP_TAIL_RATIOS[0]
     step_told: float = 1.0
-    closure_told: float = 1.0
 
     @property
     def is_possible(self) -> bool:
         """Whether it is one, where it comes from a file."""
-        variances = self.step_variance, self.closure_variance, self.step_tail_ratio, self.step_told, self.closure_told
+        variances = self.step_variance, self.closure_variance, self.step_tail_ratio, self.step_told
         shares = self.common_share, self.turn_share, self.step_tails, self.closure_tails
         return min(variances) > 0 and max(shares) < 1
 
     def chosen_as(self, other: Noise) -> Noise:
         """What residuals told of the one with what another one has chosen from grids."""
-        told = ("step_variance", "closure_variance", "step_told", "closure_told")
-        return replace(other, **{name: getattr(self, name) for name in told})
+        told = {name: getattr(self, name) for name in ("step_variance", "closure_variance", "step_told")}
+        return replace(other, **told)
 
     @property
     def log_ratio(self) -> float:

@@ -68,7 +68,7 @@ def test_what_errs_about_one_axis_has_no_tails_for_that(seed: int) -> None:
     run = simulated(seed, **HILLS, closures_per_keyframe=0.3, false_share=0.2)
     held, free = (pose_mode(graph).problem.mode.state.noise for graph in (made_held(run, 0.3, seed), graph_of(run)))
     assert held.step_tails == 0
-    assert held.step_told < 0.75 < 0.95 < free.step_told
+    assert held.step_told < 0.75 < 0.9 < free.step_told
 
 
 @pytest.mark.parametrize("change", ["axes of the body", "order and direction"])
