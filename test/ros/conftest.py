@@ -211,15 +211,19 @@ class LiveNode:
         while time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.05)
 
-    def wait_for_silence(self) -> AbsoluteOrientations:
+    def wait_for_silence(self, closures: int | None = None) -> AbsoluteOrientations:
         """Wait for the cold answer after which nothing more comes; returns it.
 
-        A report may be on its way that knows nothing of what was sent last, so the second one from now counts.
+        A report may be on its way that knows nothing of what was sent last, so the second one from now counts. On a
+        busy machine a node may even be silent before the last of many messages reach it: where the number of closures
+        in the graph is known, they are waited for.
         """
         reports = self.reports
 
         def silent() -> bool:
             if self.reports < reports + 2 or not self.answers or self.status["answer cold"] != "true":
+                return False
+            if closures is not None and int(self.status["loop closures"]) != closures:
                 return False
             complete = len(self.answers[-1].keyframe_ids) == int(self.status["keyframes"])
             return complete and float(self.status["answer age s"]) > 1
