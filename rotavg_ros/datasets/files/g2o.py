@@ -1,8 +1,9 @@
-"""g2o pose graphs and their TORO and iSAM dialects.
+"""g2o pose graphs and their TORO, iSAM and Vertigo dialects.
 
 An edge line stores the pose of the target in the source frame, so its rotation is the inverse of
 ``target_from_source``. Edges between consecutive ids, in either direction, are odometry; of keyframes that are numbered
-with gaps, those between neighbours.
+with gaps, those between neighbours. Edges that some optimiser may switch off (Sünderhauf & Protzel, IROS 2012; RTAB-Map
+writes them, too) are closures whatever their ids: nobody switches odometry off.
 """
 
 from __future__ import annotations
@@ -36,12 +37,13 @@ _PLANAR_ENTRIES = (0, 1, 5, 6, 10, 20)
 
 @dataclass(frozen=True)
 class EdgeTag:
-    """How the numbers after an edge's two ids are laid out."""
+    """How the numbers after an edge's two ids, and those of its switch, are laid out."""
 
     translation: int  # how many numbers: x y, or x y z
     rotation: int  # θ, roll pitch yaw, or qx qy qz qw
     information: tuple[int, ...]  # which of the 21 entries of the upper triangle, row by row, each number is
     is_square_root: bool = False
+    switch: int = 0  # how many numbers of an optimiser's own come before: a switch's id, or a weight
 
     @property
     def planar(self) -> bool:
@@ -54,19 +56,31 @@ EDGE_TAGS = {
     b"ODOMETRY": EdgeTag(2, 1, _PLANAR_ENTRIES, is_square_root=True),  # iSAM
     b"EDGE_SE3:QUAT": EdgeTag(3, 4, tuple(range(21))),
     b"EDGE3": EdgeTag(3, 3, tuple(range(21))),  # TORO
+    b"EDGE_SE2_SWITCHABLE": EdgeTag(2, 1, _PLANAR_ENTRIES, switch=1),  # Vertigo and RTAB-Map
+    b"EDGE_SE2_MAXMIX": EdgeTag(2, 1, _PLANAR_ENTRIES, switch=1),  # Vertigo
+    b"EDGE_SE3_SWITCHABLE": EdgeTag(3, 4, tuple(range(21)), switch=1),  # RTAB-Map and Vertigo's later versions
+    b"EDGE_SE3:QUAT_SWITCHABLE": EdgeTag(3, 4, tuple(range(21)), switch=1),  # Vertigo's first
 }
 # Numbers after the id. Only the id counts: poses in a file are somebody's estimate, not a measurement.
 VERTEX_TAGS = {b"VERTEX_SE2": 3, b"VERTEX2": 3, b"VERTEX_SE3:QUAT": 7, b"VERTEX3": 6}
-# What tells nothing about relative rotations between poses.
+# What tells nothing about relative rotations between poses: landmarks, priors, an optimiser's switches, planes.
 SKIPPED_TAGS = frozenset(
-    b"FIX LANDMARK VERTEX_XY VERTEX_XYZ VERTEX_TRACKXYZ VERTEX_POINT_XYZ VERTEX_TAG "
+    b"FIX LANDMARK VERTEX_XY VERTEX_XYZ VERTEX_TRACKXYZ VERTEX_POINT_XYZ VERTEX_TAG VERTEX_PLANE VERTEX_SWITCH "
     b"EDGE_XY EDGE_SE2_XY EDGE_SE2_XY_CALIB EDGE_BEARING_SE2_XY EDGE_SE3_XYZ EDGE_SE3_TRACKXYZ EDGE_POINT_XYZ "
-    b"EDGE_PRIOR_SE2 EDGE_PRIOR_SE2_XY EDGE_SE2_PRIOR EDGE_PRIOR_SE3 EDGE_SE3_PRIOR ROBOTLASER1 RAWLASER1".split()
+    b"EDGE_PRIOR_SE2 EDGE_PRIOR_SE2_XY EDGE_SE2_PRIOR EDGE_PRIOR_SE3 EDGE_SE3_PRIOR EDGE_SWITCH_PRIOR "
+    b"EDGE_POINTXY_PRIOR EDGE_POINTXYZ_PRIOR EDGE_XY_PRIOR EDGE_XYZ_PRIOR "
+    b"EDGE_SE3_PRIORXY EDGE_SE3_PRIORXYZ EDGE_SE3_PRIORVEC EDGE_SE3_PRIORQUAT EDGE_SE3_PLANE "
+    b"EDGE_PLANE_PRIOR_NORMAL EDGE_PLANE_PRIOR_DISTANCE EDGE_PLANE_IDENTITY EDGE_PLANE_PARALLEL "
+    b"EDGE_PLANE_PERPENDICULAR ROBOTLASER1 RAWLASER1".split()
 )
+# Beyond this, rad, a double tells angles apart by 1e-7 at best: no measurement, but something else in its column.
+_MAX_ANGLE = 1e9
+# TORO's word for two vertices that are one.
+_SAME_PLACE = b"EQUIV"
 
 
 def read(path: Path) -> GraphFile:
-    """Read a pose graph of EDGE_SE2, EDGE_SE3:QUAT, TORO's EDGE2 and EDGE3 and iSAM's ODOMETRY edges.
+    """Read a pose graph of EDGE_SE2, EDGE_SE3:QUAT, TORO's, iSAM's and Vertigo's edges.
 
     Landmarks, priors, parameters and self-edges are skipped and counted. Precision is Iθθ, or the mean of the
     three angular diagonal entries; information is the 3 × 3 block, of spatial edges that are not equally exact about
@@ -94,9 +108,7 @@ def read(path: Path) -> GraphFile:
             elif tag in SKIPPED_TAGS or tag.startswith(b"PARAMS"):
                 skipped[tag.decode()] += len(lines)
             else:
-                known = ", ".join(sorted(known.decode() for known in EDGE_TAGS))
-                what = f"unknown tag {shown(tag)}; is this a g2o file? Edges may be {known}"
-                raise GraphFileError.at(path, lines[0], what)
+                raise GraphFileError.at(path, lines[0], _unknown(tag))
     if not edges:
         raise GraphFileError.at(path, None, "no edges between poses; there is nothing to solve")
     every = _Edges.concatenate(edges)
@@ -114,7 +126,7 @@ def read(path: Path) -> GraphFile:
         every.ids[:, 1],
         inverse(torch.from_numpy(every.source_from_target)).numpy(),
         lone_ids=np.concatenate(lone_ids) if lone_ids else None,
-        kind=np.where(consecutive, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE),
+        kind=np.where(consecutive & ~every.has_switch, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE),
         precision=every.precision,
         planar=planar,
         edge_translation=None if np.isnan(every.translation).all() else every.translation,
@@ -134,6 +146,7 @@ class _Edges:
     translation: np.ndarray
     information: np.ndarray
     precision: np.ndarray
+    has_switch: np.ndarray
 
     @classmethod
     def concatenate(cls, parts: list[_Edges]) -> _Edges:
@@ -145,10 +158,21 @@ class _Edges:
         return _Edges(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
+def _unknown(tag: bytes) -> str:
+    """What is wrong with a line of that tag, and what to do."""
+    if tag == _SAME_PLACE:
+        return "EQUIV, two vertices that are one, is not read; remove it or state an edge of no turn between them"
+    known = ", ".join(sorted(known.decode() for known in EDGE_TAGS))
+    return f"unknown tag {shown(tag)}; is this a g2o file? Edges may be {known}"
+
+
 def _parse_edges(path: Path, tag: EdgeTag, lines: list[int], rows: list[Row]) -> _Edges:
     num_pose = tag.translation + tag.rotation
-    ids, numbers = parse_rows(path, lines, rows, 2, num_pose + len(tag.information))
-    translation, rotation, stated = np.split(numbers, [tag.translation, num_pose], axis=1)
+    ids, numbers = parse_rows(path, lines, rows, 2, tag.switch + num_pose + len(tag.information))
+    translation, rotation, stated = np.split(numbers[:, tag.switch :], [tag.translation, num_pose], axis=1)
+    if tag.rotation != 4:
+        too_large = (np.abs(rotation) > _MAX_ANGLE).any(axis=1)
+        refuse(path, lines, too_large, f"an angle of more than {_MAX_ANGLE:g} rad; remove the line")
     if tag.planar:
         source_from_target = quaternion_of_heading(rotation[:, 0])
         translation = np.pad(translation, ((0, 0), (0, 1)))
@@ -163,7 +187,8 @@ def _parse_edges(path: Path, tag: EdgeTag, lines: list[int], rows: list[Row]) ->
         information[:, tag.information] = _squared(stated) if tag.is_square_root else stated
         precision = information[:, 20] if tag.planar else information[:, ANGULAR_DIAGONAL].mean(axis=1)
     translation[without_position(translation, information)] = np.nan
-    return _Edges(np.array(lines), ids, source_from_target, translation, information, precision)
+    has_switch = np.full(len(rows), tag.switch > 0)
+    return _Edges(np.array(lines), ids, source_from_target, translation, information, precision, has_switch)
 
 
 def _squared(root: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -66,6 +67,55 @@ def test_isam_odometry_states_a_square_root(tmp_path: Path) -> None:
     graph_file = read_text(tmp_path, f"ODOMETRY 0 1 1 2 0.5 {entries}\nLANDMARK 0 1 1 2 3 4 5")
     assert graph_file.graph.precision.tolist() == [(root.T @ root)[2, 2]]
     assert graph_file.skipped == {"LANDMARK": 1}
+
+
+PLANAR_SWITCHABLE = """VERTEX_SE2 0 0 0 0
+VERTEX_SE2 1 1 0 0
+VERTEX_SE2 2 2 0 0
+VERTEX_SWITCH 3 1
+EDGE_SWITCH_PRIOR 3 1 1.0
+EDGE_SE2 0 1 1 2 0.3 10 0 0 20 0 30
+{tag} 2 0 {switch} 1 2 0.5 11 12 13 14 15 44
+{tag} 1 2 {switch} 1 2 0.5 11 12 13 14 15 44
+"""
+
+
+@pytest.mark.parametrize(("tag", "switch"), [("EDGE_SE2_SWITCHABLE", "3"), ("EDGE_SE2_MAXMIX", "0.01")])
+def test_planar_edges_that_may_be_switched_off_are_closures(tmp_path: Path, tag: str, switch: str) -> None:
+    graph_file = read_text(tmp_path, PLANAR_SWITCHABLE.format(tag=tag, switch=switch))
+    graph = graph_file.graph
+    turns = rotations.log(graph.target_from_source).numpy()
+    np.testing.assert_allclose(turns, [[0, 0, -0.3], [0, 0, -0.5], [0, 0, -0.5]], atol=1e-12)
+    assert graph.precision.tolist() == [30, 44, 44]
+    assert graph.is_odometry.tolist() == [True, False, False], "consecutive ids, but who would switch odometry off?"
+    assert graph_file.skipped == {"VERTEX_SWITCH": 1, "EDGE_SWITCH_PRIOR": 1}
+    assert graph_file.node_ids.tolist() == [0, 1, 2], "a switch is no pose"
+
+
+@pytest.mark.parametrize("tag", ["EDGE_SE3_SWITCHABLE", "EDGE_SE3:QUAT_SWITCHABLE"])
+def test_spatial_edges_that_may_be_switched_off_are_closures(tmp_path: Path, tag: str) -> None:
+    plain = SE3.format(0, 1, "0.6 0 0 0.8")
+    switchable = plain.replace("EDGE_SE3:QUAT 0 1", f"{tag} 0 1 7")
+    graph = read_text(tmp_path, f"{plain}\n{switchable}").graph
+    assert torch.equal(graph.target_from_source[0], graph.target_from_source[1])
+    assert torch.equal(graph.translation[0], graph.translation[1])
+    assert graph.precision.tolist() == [30, 30]
+    assert graph.is_odometry.tolist() == [True, False]
+
+
+def test_what_rtab_map_and_hdl_graph_slam_write_beside_edges_is_skipped(tmp_path: Path) -> None:
+    beside = """PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1
+EDGE_POINTXYZ_PRIOR 1 4 5 6 1 0 0 1 0 1
+EDGE_SE3_PRIOR 1 0 0 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1
+VERTEX_PLANE 9 0 0 1 0
+EDGE_SE3_PLANE 1 9 0 0 1 0 1 0 0 1 0 1
+EDGE_SE3_PRIORXYZ 1 4 5 6 1 0 0 1 0 1
+EDGE_SE3_PRIORQUAT 1 0 0 0 1 1 0 0 1 0 1
+"""
+    graph_file = read_text(tmp_path, beside + SE3.format(0, 1, "0 0 0 1"))
+    assert graph_file.graph.num_edges == 1
+    assert graph_file.node_ids.tolist() == [0, 1]
+    assert sum(graph_file.skipped.values()) == len(beside.splitlines())
 
 
 def test_consecutive_ids_are_odometry_in_either_direction(tmp_path: Path) -> None:
@@ -160,6 +210,9 @@ GOOD = SE2.format(0, 1, 0.1, 1)
         ("VERTEX_SE2 1 2", "2 numbers where 4 belong"),
         ("VERTEX_SE2 one 0 0 0", "'one' is not an integer id"),
         ("EDGE_SE9 1 2 0.1", "unknown tag 'EDGE_SE9'"),
+        ("EQUIV 1 2", "two vertices that are one, is not read; remove it or state an edge of no turn"),
+        (SE2.format(0, 1, 1e300, 1), "an angle of more than 1e+09 rad"),
+        (PLANAR_SWITCHABLE.format(tag="EDGE_SE2_SWITCHABLE", switch="").splitlines()[-1], "11 numbers where 12 belong"),
         ("\x00\x01\x02\x03", "unknown tag"),
     ],
 )
