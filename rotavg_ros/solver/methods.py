@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from rotavg_ros.errors import UserError
@@ -91,7 +92,7 @@ def check_choices(method: str, profile: str, device: str) -> None:
     """
     for name in method.split("+"):
         if not is_method(name):
-            _check_choice("method", name, METHODS)
+            raise UserError(unknown_method(name, METHODS))
     _check_choice("profile", profile, PROFILES)
     _check_choice("device", device, DEVICES)
 
@@ -99,6 +100,21 @@ def check_choices(method: str, profile: str, device: str) -> None:
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise UserError(f"unknown {name} {value!r}; choose from {', '.join(choices)}")
+
+
+def unknown_method(name: str, choices: Sequence[str]) -> str:
+    """What is to be said of a name that is no method's: the parts that there are to leave out, or all ``choices``."""
+    whole, *parts = name.split(_WITHOUT)
+    known = {DEFAULT_METHOD: sorted(SWITCHES), PAPER: sorted(PAPER_PARTS)}.get(whole, [])
+    if known and len(parts) > 1:
+        return f"{whole}{_WITHOUT} takes its parts after one {_WITHOUT}, with {_AND!r} between them"
+    if known and parts:
+        unknown = next(part for part in parts[0].split(_AND) if part not in known)
+        return f"{whole}{_WITHOUT} knows no part {unknown!r}; choose from {', '.join(known)}"
+    return (
+        f"unknown method {name!r}; choose from {', '.join(choices)}, combine: A+B, or leave parts out: "
+        f"{DEFAULT_METHOD}{_WITHOUT}A{_AND}B"
+    )
 
 
 def is_method(name: str) -> bool:

@@ -17,7 +17,7 @@ from rotavg_ros.evaluation.common.cases import Case, Family, warm_up_case
 from rotavg_ros.evaluation.common.kept_answers import KeptAnswers
 from rotavg_ros.evaluation.common.named_peers import is_available, is_installed, missing, peer_solver
 from rotavg_ros.solver import METHODS, solve
-from rotavg_ros.solver.methods import is_method
+from rotavg_ros.solver.methods import is_method, unknown_method
 from rotavg_ros.view_graph import ViewGraph
 
 # None: the case is too large for it, or it gives up.
@@ -111,8 +111,8 @@ def _contender(name: str, roster: Roster, weights: Path | None, keep: KeptAnswer
         return _own(name, roster, keep)
     unknown = [part for part in name.split("+") if not is_method(part)]
     if unknown:
-        choices = ", ".join((*METHODS, *roster.peers, *roster.references, *roster.own))
-        raise ContenderError(f"unknown method {unknown[0]!r}; choose from {choices}, or combine: A+B")
+        others = (*roster.peers, *roster.references, *roster.own)
+        raise ContenderError(unknown_method(unknown[0], (*METHODS, *others)))
     run = partial(_run_method, name, weights)
     # Networks of a folder are those of one run, and nobody asks for their answers again.
     return run if keep is None or weights is not None else keep.keeping(run, name, (__name__,))

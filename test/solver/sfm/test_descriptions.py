@@ -242,5 +242,5 @@ def test_the_papers_parts_are_switched_one_by_one() -> None:
     torch.testing.assert_close(_solved(graph, f"neurora-paper~{all_parts}").body_from_world, ours)
     for part in PAPER_PARTS:
         assert _furthest_deg(_solved(graph, f"neurora-paper~{part}").body_from_world, papers) > 0.01
-    with pytest.raises(UserError, match="unknown method 'neurora-paper~losses'"):
+    with pytest.raises(UserError, match="neurora-paper~ knows no part 'losses'"):
         _solved(graph, "neurora-paper~losses")

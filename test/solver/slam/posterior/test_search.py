@@ -253,8 +253,14 @@ def test_it_begins_where_it_is_told_or_does_not_search() -> None:
 
 
 def test_a_switch_that_does_not_exist_is_an_error() -> None:
-    for method in ("neurora~nothing", "neurora-v2~slips", "neurora~slips~repeats"):
-        with pytest.raises(UserError, match="unknown method"):
+    messages = {
+        "neurora~nothing": "neurora~ knows no part 'nothing'; choose from .*slips",
+        "neurora~slips,": "neurora~ knows no part ''; choose from",
+        "neurora-v2~slips": "unknown method 'neurora-v2~slips'.* leave parts out: neurora~A,B",
+        "neurora~slips~repeats": "neurora~ takes its parts after one ~",
+    }
+    for method, message in messages.items():
+        with pytest.raises(UserError, match=message):
             solve(drawn("building: 15 closures", 0).graph, method=method)
 
 

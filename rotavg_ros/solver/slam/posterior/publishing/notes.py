@@ -33,9 +33,14 @@ def _of_slips(mode: Mode) -> tuple[str, ...]:
     largest = off[int(turned.argmax())]
     first, last = sorted((int(graph.nodes[graph.source[largest]]), int(graph.nodes[graph.target[largest]])))
     times = "once" if len(far) == 1 else f"{len(far)} times"
-    return (
+    slipped = (
         f"Odometry is held to have slipped {times}, the farthest by {np.degrees(turned.max()):.0f}° between nodes "
-        f"{first} and {last}, because closures agree that it has. In a building that looks alike turned false closures "
+        f"{first} and {last}"
+    )
+    if bool(graph.is_odometry.all()):
+        return (f"{slipped}, because other odometry between the same nodes says so: one of the two is wrong there.",)
+    return (
+        f"{slipped}, because closures agree that it has. In a building that looks alike turned false closures "
         "agree so, too: if no step of the odometry can be off by that much, solve without slips (neurora~slips), or "
         "label the closures that you know.",
     )
