@@ -20,7 +20,7 @@ class Method:
 
 
 def _without_refinement(clean: bool, fine_tunings: int) -> Method:
-    return Method(SfmStages(clean, fine_tunings, refine=False), SlamStages(clean, refine=False))
+    return Method(SfmStages(clean, fine_tunings, refine=False, cycles=clean), SlamStages(clean, refine=False))
 
 
 def _as_written(clean: bool, fine_tunings: int, but_for: frozenset[str] = frozenset()) -> Method:
@@ -51,6 +51,7 @@ NETWORK_METHODS = {
     "neurora-without-finenet": Method(sfm=SfmStages(fine_tunings=0)),
     "neurora-without-cleannet": Method(SfmStages(clean=False), SlamStages(clean=False)),
     "neurora-without-both": Method(SfmStages(clean=False, fine_tunings=0), SlamStages(clean=False)),
+    "neurora-without-cycles": Method(sfm=SfmStages(cycles=False)),
     "neurora-round": Method(sfm=SfmStages(shaped=False)),
     "neurora-equal-precisions": Method(sfm=SfmStages(stated=False)),
     "neurora-scalar-precisions": Method(sfm=SfmStages(stated_shapes=False)),

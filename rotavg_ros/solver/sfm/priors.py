@@ -34,7 +34,7 @@ class NoiseShapePriors:
 
 @dataclass(frozen=True)
 class PrecisionPriors:
-    """How far stated precisions are believed (``stated_precision.py``).
+    """How far stated precisions are believed (``stated/precision.py``).
 
     Chosen before any graph with precisions was solved, after those of robots' graphs; none was tuned.
 
@@ -59,6 +59,41 @@ class PrecisionPriors:
     max_sample: int = 8_000
     least_residual: float = 0.01
     least_angle: float = float(np.radians(1e-4))
+
+
+@dataclass(frozen=True)
+class CyclePriors:
+    """What triangles say of edges (``cycles/evidence.py``).
+
+    Attributes:
+        few_paths, paths_per_edge, most_paths: paths of two edges that are looked at for a third one, evenly spread over
+            all of a component: all of a small one; of others so many for each edge, but no more than the last. Of a
+            graph that is knit so well that this leaves out many, refinement finds its way anyhow.
+        freedom: degrees of freedom of Student's t, the density by which triangles of good edges close.
+        first_scale, scale_triangles: rad; of that density beforehand, and how many triangles tell as much.
+        least_scale: rad; edges that repeat each other would have it vanish.
+        rounds: of messages.
+        full_trust: CleanNet counts in full where it explains so large a share of what triangles explain of others. On
+            recipes that it was trained on it explains 0.4 to 1.1 of it, on cameras turned anyhow 0.00 to 0.03.
+        by_chance: nats that may be explained by chance.
+        shells: rad; densities of closing angles are constant between these.
+        density_rounds: of estimating them.
+    """
+
+    few_paths: int = 60_000
+    paths_per_edge: int = 2
+    most_paths: int = 400_000
+    freedom: float = 3.0
+    first_scale: float = float(np.radians(8.0))
+    scale_triangles: float = 1.0
+    least_scale: float = float(np.radians(0.3))
+    rounds: int = 8
+    full_trust: float = 0.25
+    by_chance: float = 10.0
+    shells: tuple[float, ...] = tuple(
+        float(np.radians(degrees)) for degrees in (0, 5, 10, 15, 20, 30, 45, 60, 90, 120, 150, 180)
+    )
+    density_rounds: int = 6
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ happens to fit is not exact. With r the residual, p the edge's prior weight and 
 since the fourth root is concave and its tangents bound it (majorise and minimise). A step towards the bound's minimum
 lowers the bound up to twice its length.
 
-Where edges state about which axes they are exact, and are believed (``stated_shape.py``), T r takes the place of r in
+Where edges state about which axes they are exact, and are believed (``stated/shape.py``), T r takes the place of r in
 shaped steps, with a matrix T for each edge.
 
 A step's length λ is in standard errors of the answer: λ² = xᵀ L x / (φ N), of N nodes. It depends neither on the frames

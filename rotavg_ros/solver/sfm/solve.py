@@ -21,10 +21,11 @@ from rotavg_ros.solver.neurora.stages import apply_labels, clean, fine_tune, tru
 from rotavg_ros.solver.neurora.tiled.tuning import tune
 from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap, breadth_first
 from rotavg_ros.solver.sfm.consensus.search import CONSENSUS, consensus
+from rotavg_ros.solver.sfm.cycles.evidence import with_triangles
 from rotavg_ros.solver.sfm.options import SfmStages
 from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
 from rotavg_ros.solver.sfm.series import EdgesInSeries
-from rotavg_ros.solver.sfm.stated_noise import StatedNoise
+from rotavg_ros.solver.sfm.stated.noise import StatedNoise
 from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.solver.sfm.uncertainty import References, variances
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
@@ -53,6 +54,9 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
         kind = PaperCleanNet if "cleannet" in stages.as_written else CleanNet
         cleaned = clean(networks.load(kind), graph) if stages.clean else trust_all(graph)
         cleaned = apply_labels(cleaned, graph.label)
+    if stages.cycles and "cycles" not in stages.as_written:
+        with watch.stage("cycles"):
+            cleaned = with_triangles(cleaned, component, stages.clean)
     with watch.stage("bootstrap"):
         begun = (breadth_first if "tree" in stages.as_written else bootstrap)(cleaned, component)
         cleaned, orientations = begun.cleaned, begun.body_from_world

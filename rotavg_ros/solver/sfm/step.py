@@ -68,7 +68,7 @@ class Measure(NamedTuple):
         weigh: expected squared residuals → robust weights.
         dtype: how exactly residuals and systems are computed.
         source_share: ``(M,)`` probability of each edge that its noise is in its source's frame; None: as residuals say.
-        unit: ``(6, M)`` entries of T in the world's frame: residuals r count as T r (``stated_shape.py``), and the
+        unit: ``(6, M)`` entries of T in the world's frame: residuals r count as T r (``stated/shape.py``), and the
             noise's shape is that of T r; None: T = 1.
     """
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros import ViewGraph, solve
 from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
-from rotavg_ros.solver.sfm.stated_precision import Residuals, relative_variance
+from rotavg_ros.solver.sfm.stated.precision import Residuals, relative_variance
 
 
 def _uneven(seed: int, num_nodes: int = 60) -> tuple[ViewGraph, torch.Tensor, np.ndarray]:

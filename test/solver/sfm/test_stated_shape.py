@@ -20,7 +20,7 @@ from rotavg_ros.solver.batch import solve_batch
 from rotavg_ros.solver.sfm.block_laplacian import Arrivals, factorised
 from rotavg_ros.solver.sfm.edge_laplacian import EdgeLaplacian, MatrixWeights
 from rotavg_ros.solver.sfm.priors import NoiseShapePriors
-from rotavg_ros.solver.sfm.stated_shape import FramedResiduals, believed_units
+from rotavg_ros.solver.sfm.stated.shape import FramedResiduals, believed_units
 from rotavg_ros.solver.sfm.symmetric_rows import distinct_entries
 
 SHAPE = NoiseShapePriors()

@@ -19,7 +19,7 @@ from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.algebra.spanning_forest import compose_orientations, minimum_spanning_forest
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.consensus.density import Edges, Fitted, fitted
-from rotavg_ros.solver.sfm.consensus.triangles import Triangles
+from rotavg_ros.solver.sfm.cycles.triangles import Triangles
 from rotavg_ros.solver.sfm.priors import ConsensusPriors
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 

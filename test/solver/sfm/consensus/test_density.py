@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros.solver.sfm.consensus.density import Density, Edges, fitted
 from rotavg_ros.solver.sfm.consensus.search import CONSENSUS
-from rotavg_ros.solver.sfm.consensus.triangles import Triangles
+from rotavg_ros.solver.sfm.cycles.triangles import Triangles
 from rotavg_ros.view_graph import ViewGraph
 
 

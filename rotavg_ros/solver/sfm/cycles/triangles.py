@@ -28,13 +28,16 @@ class Triangles:
     angle: Tensor
 
     @classmethod
-    def of(cls, graph: ViewGraph, most: int, among: Tensor | None = None) -> Triangles:
+    def of(
+        cls, graph: ViewGraph, most: int | Tensor, among: Tensor | None = None, component: Tensor | None = None
+    ) -> Triangles:
         """Of a graph whose edges run from lower to higher nodes.
 
         Args:
             graph: M edges.
             most: triangles at most; so many paths of two edges are looked at, evenly spread over all.
             among: ``(M,)`` bool: triangles that have one of these edges alone; default: all.
+            component: ``(N,)`` of every node; then ``most`` is ``(C,)``, of each.
         """
         key, source, target, order = graph.source * graph.num_nodes + graph.target, graph.source, graph.target, None
         if not bool((key[1:] >= key[:-1]).all()):  # a canonical form is sorted, and copies of a large one cost memory
@@ -45,7 +48,11 @@ class Triangles:
         count = (first[1:] - first[:-1])[target]
         up_to = count.cumsum(0)
         paths = int(up_to[-1]) if graph.num_edges else 0
-        path = torch.arange(0, paths, max(1, -(-paths // most)), device=graph.device)
+        of_each = torch.as_tensor(most).reshape(-1)
+        if len(of_each) == 1 or component is None:
+            path = torch.arange(0, paths, max(1, -(-paths // int(of_each[0]))), device=graph.device)
+        else:
+            path = _spread(count, up_to, component[source], of_each.to(graph.device))
         parts = slices(len(path), _SLICE_PATHS, path.device)
         found = [(path.new_empty(3, 0), path.new_empty(0, dtype=torch.float64)) for _ in parts]
 
@@ -92,3 +99,25 @@ class Triangles:
         )
         by_chance = near.double() / 27
         return (nearest - by_chance) / (by_chance + 1).sqrt()
+
+
+def _spread(count: Tensor, up_to: Tensor, group: Tensor, most: Tensor) -> Tensor:
+    """Paths, ``most`` of each group at most, evenly spread over its own whatever others there are.
+
+    Args:
+        count: ``(M,)`` paths that begin with each edge.
+        up_to: ``(M,)`` the same summed up: paths are numbered so.
+        group: ``(M,)`` of each edge.
+        most: ``(C,)``.
+    """
+    by_group = group.argsort(stable=True)
+    ends = count[by_group].cumsum(0)  # of the paths, had they been numbered group by group
+    paths = torch.bincount(group, weights=count.double(), minlength=len(most)).long()
+    stride = (-(-paths // most)).clamp(min=1)
+    taken = -(-paths // stride)
+    which = torch.arange(len(taken), device=count.device).repeat_interleave(taken)
+    rank = torch.arange(len(which), device=count.device) - (taken.cumsum(0) - taken)[which]
+    numbered = (paths.cumsum(0) - paths)[which] + rank * stride[which]
+    place = torch.searchsorted(ends, numbered, right=True)
+    edge = by_group[place]
+    return up_to[edge] - count[edge] + numbered - (ends[place] - count[edge])

@@ -1,7 +1,7 @@
 """Refinement that believes what edges state of their noise, size and shape, as far as residuals bear it out.
 
 1. The residuals of an answer that took all edges to be alike tell the two exponents, α
-   (:mod:`rotavg_ros.solver.sfm.stated_precision`) and β (:mod:`rotavg_ros.solver.sfm.stated_shape`).
+   (:mod:`rotavg_ros.solver.sfm.stated.precision`) and β (:mod:`rotavg_ros.solver.sfm.stated.shape`).
 2. Components in which one is not 0 are refined anew.
 3. Where β is not 0, both are estimated once more, from the residuals of the new answer, whose own errors are smaller
    and hide less of the noise, and shaped steps go on from there. Coarse steps, which know no shapes, would leave it.
@@ -20,8 +20,8 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.solver.sfm.refinement import EdgeWeights
-from rotavg_ros.solver.sfm.stated_precision import Residuals, relative_variance, stated_sizes
-from rotavg_ros.solver.sfm.stated_shape import FramedResiduals, believed_units
+from rotavg_ros.solver.sfm.stated.precision import Residuals, relative_variance, stated_sizes
+from rotavg_ros.solver.sfm.stated.shape import FramedResiduals, believed_units
 from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.view_graph import ViewGraph
 

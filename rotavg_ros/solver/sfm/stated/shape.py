@@ -1,7 +1,7 @@
 """About which axes each edge states to be exact, and how far that is believed: as far as residuals bear it out.
 
 A stated information has a size, one over the mean variance, and a shape, its covariance Σ_e scaled to a mean variance
-of one. :mod:`rotavg_ros.solver.sfm.stated_precision` has the size. An edge's noise is assumed to have the shape
+of one. :mod:`rotavg_ros.solver.sfm.stated.precision` has the size. An edge's noise is assumed to have the shape
 
     Σ_e^β, scaled to a mean variance of one,     0 ≤ β ≤ 1,
 
@@ -29,7 +29,7 @@ from torch import Tensor
 from rotavg_ros.solver.algebra.canonical_form import evenly_spread
 from rotavg_ros.solver.sfm.noise_shape import as_far_as_supported, scatter
 from rotavg_ros.solver.sfm.priors import NoiseShapePriors, PrecisionPriors
-from rotavg_ros.solver.sfm.stated_precision import PRECISION_PRIORS, Residuals, is_telling, posterior_mean
+from rotavg_ros.solver.sfm.stated.precision import PRECISION_PRIORS, Residuals, is_telling, posterior_mean
 
 # Of the common shape's fixed point, from nothing and from the β before. A β is not to gain by what is left of it: with
 # 10 and 3, as in the refinement, the Sphinx's likelihood gains 10 nats.

@@ -1,0 +1,1 @@
+"""Triangles of a view-graph, and what they say of its edges."""

@@ -1,0 +1,219 @@
+"""What triangles say of every edge, where they do not bear out CleanNet.
+
+**Of an edge.** Three good rotations of a triangle compose to none but for their noise; with a false one among them they
+compose to anything. Let g = 1 for a good edge, and λ the density of a triangle's closing angle where all three are good
+(Student's t of scale s in three dimensions) over that of even rotations. The triangle of edges e, c and d says of e
+
+    P(angle | g_e = 1) / P(angle | g_e = 0) = 1 − q + q λ,     q = P(g_c = 1) P(g_d = 1).
+
+Two triangles of an edge have no other edge in common, so their logarithms add up, to E_e. P(g_c) is what all but this
+triangle say of c: messages that go back and forth (sum-product, Pearl 1988; with loops of view-graphs Zach, Klopschitz
+and Pollefeys, CVPR 2010), a few rounds of them, though triangles of four cameras share edges. Beforehand all edges are
+alike, with log-odds b of being false; b and s are estimated with the g (expectation and maximisation).
+
+**Of CleanNet.** It knows cameras like those that it was trained on, and of others next to nothing. With the probability
+π that all edges of a triangle are good, by its word or by anybody's, closing angles have the density
+
+    π f₁(angle) + (1 − π) f₀(angle),     f₁, f₀: any, constant in shells,
+
+and G is by how many nats this makes them likelier than one density for all. Half of the triangles say E,
+and the other half has G of both. CleanNet counts by a, triangles by 1 − a:
+
+    logit P(g_e = 0) = a ℓ_e + (1 − a) (b − E_e),     a = min(1, G_CleanNet / (¼ G_triangles)),     ℓ: CleanNet's.
+
+It counts in full from a quarter on, since it judges something else: whether an edge's own noise exceeds 20°, of which
+triangles of noisy edges know less than of what they close by.
+
+Closing angles depend on no choice of axes. All is estimated for each component by itself.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rotavg_ros.solver.neurora.cleaned import Cleaned
+from rotavg_ros.solver.neurora.numbers import NUMBERS
+from rotavg_ros.solver.sfm.cycles.triangles import Triangles
+from rotavg_ros.solver.sfm.priors import CyclePriors
+from rotavg_ros.view_graph import EdgeLabel
+
+CYCLES = CyclePriors()
+# Probabilities are at least this, numerical; those of messages, in single precision, are less than one by the other.
+_LEAST, _SURE = 1e-12, 1e-6
+
+
+def with_triangles(
+    cleaned: Cleaned, component: Tensor, is_judged: bool = True, priors: CyclePriors = CYCLES
+) -> Cleaned:
+    """The same with the outlier probabilities that CleanNet and triangles together come to.
+
+    Labels stand, as CleanNet's probabilities do where there are no triangles.
+
+    Args:
+        cleaned: a graph whose edges run from lower to higher nodes.
+        component: ``(N,)`` of every node.
+        is_judged: whether CleanNet has said anything.
+    """
+    graph = cleaned.measured
+    edges = _Edges(component.index_select(0, graph.source), int(component.max()) + 1, graph.label)
+    looked_at = priors.paths_per_edge * torch.bincount(edges.component, minlength=edges.count)
+    triangles = Triangles.of(graph, looked_at.clamp(priors.few_paths, priors.most_paths), component=component)
+    if len(triangles.angle) == 0:
+        return cleaned
+    said = cleaned.outlier_probability.double().logit(_LEAST).clamp(-NUMBERS.max_logit, NUMBERS.max_logit)
+    trust = said.new_zeros(edges.count)
+    if is_judged:
+        trust = _trust(said, triangles, edges, priors)
+    if bool((trust == 1).all()):
+        return cleaned
+    trusted = _of_each(trust, edges.component)
+    logit = trusted * said + (1 - trusted) * _by_triangles(triangles, edges, priors)
+    probability = torch.sigmoid(logit.clamp(-NUMBERS.max_logit, NUMBERS.max_logit))
+    probability = torch.where(edges.label == EdgeLabel.AUTOMATIC, probability, cleaned.outlier_probability)
+    return replace(cleaned, outlier_probability=probability.to(cleaned.outlier_probability))
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """M edges of C components.
+
+    Attributes:
+        component: ``(M,)``.
+        count: C.
+        label: ``(M,)`` verdicts from outside.
+    """
+
+    component: Tensor
+    count: int
+    label: Tensor
+
+    def labelled(self, logit: Tensor) -> Tensor:
+        """``(M,)`` log-odds of being false, ``(C,)`` of each component but for what labels say."""
+        logit = _of_each(logit, self.component).expand(len(self.label))
+        logit = torch.where(self.label == EdgeLabel.ACCEPTED, -NUMBERS.max_logit, logit)
+        return torch.where(self.label == EdgeLabel.REJECTED, NUMBERS.max_logit, logit)
+
+    def share(self, outlier: Tensor) -> Tensor:
+        """``(C,)`` log-odds of the share of false edges, ``outlier`` ``(M,)`` being their probabilities."""
+        is_free = (self.label == EdgeLabel.AUTOMATIC).to(outlier)
+        false, good = (_sums(is_free * value, self.component, self.count) for value in (outlier, 1 - outlier))
+        return ((false + 1) / (good + 1)).log()
+
+
+def _by_triangles(triangles: Triangles, edges: _Edges, priors: CyclePriors) -> Tensor:
+    """``(M,)`` b − E: log-odds of being false by triangles alone."""
+    edge = triangles.edge
+    closing = _Closing(triangles.angle.float() ** 2, edges.component[edge[0]], edges.count, priors)
+    base = triangles.angle.new_zeros(edges.count)
+    message = closing.square.new_zeros(edge.shape)
+    logit = edges.labelled(base)
+    for number in range(priors.rounds):
+        good = torch.sigmoid(-logit.float()[edge] - message)
+        ratio = closing.ratio()
+        others = torch.stack((good[1] * good[2], good[0] * good[2], good[0] * good[1]))
+        new = torch.log1p((ratio - 1) * others.clamp(max=1 - _SURE))
+        message = new if number == 0 else (message + new) / 2  # undamped messages may alternate
+        evidence = torch.zeros_like(logit).index_add_(0, edge.ravel(), message.ravel().to(logit))
+        base = edges.share(torch.sigmoid(edges.labelled(base) - evidence))
+        logit = edges.labelled(base) - evidence
+        closing.fit(good.prod(dim=0), ratio)
+    return logit
+
+
+@dataclass
+class _Closing:
+    """By which angles triangles of good edges close (T triangles of C components).
+
+    Attributes:
+        square: ``(T,)`` rad², float32: of their angles.
+        component: ``(T,)``.
+        count: C.
+    """
+
+    square: Tensor
+    component: Tensor
+    count: int
+    priors: CyclePriors
+
+    def __post_init__(self) -> None:
+        self._scale_square = self.square.new_full((self.count,), self.priors.first_scale**2)
+        # Density of even rotations over rotation vectors, and the constant of Student's t.
+        even = 2 * torch.sinc(self.square.sqrt() / (2 * math.pi)).log() - math.log(8 * math.pi**2)
+        freedom = self.priors.freedom
+        half = math.lgamma((freedom + 3) / 2) - math.lgamma(freedom / 2)
+        self._constant = half - 1.5 * math.log(freedom * math.pi) - even
+
+    def ratio(self) -> Tensor:
+        """``(T,)`` λ: how much denser each angle is where three edges are good than where rotations are even."""
+        scale_square = _of_each(self._scale_square, self.component)
+        freedom = self.priors.freedom
+        tail = (freedom + 3) / 2 * torch.log1p(self.square / scale_square / freedom)
+        return torch.exp(self._constant - 1.5 * scale_square.log() - tail)
+
+    def fit(self, good: Tensor, ratio: Tensor) -> None:
+        """A step of the scale towards the likeliest, ``good`` ``(T,)`` being P(all three edges are), but for angles."""
+        closes = good * ratio / (1 - good + good * ratio).clamp(min=_LEAST)
+        freedom = self.priors.freedom
+        # Student's t is a mixture of normal densities: an angle that is far off tells less.
+        weight = closes * (freedom + 3) / (freedom + self.square / _of_each(self._scale_square, self.component))
+        total, known = (_sums(value, self.component, self.count) for value in (weight * self.square, closes))
+        worth = self.priors.scale_triangles
+        scale_square = (total / 3 + worth * self.priors.first_scale**2) / (known + worth)
+        self._scale_square = scale_square.clamp(min=self.priors.least_scale**2)
+
+
+def _trust(said: Tensor, triangles: Triangles, edges: _Edges, priors: CyclePriors) -> Tensor:
+    """``(C,)`` a: how far ``said`` ``(M,)``, CleanNet's log-odds, counts beside triangles."""
+    saying, held_back = (Triangles(triangles.edge[:, k::2], triangles.angle[k::2].contiguous()) for k in (0, 1))
+    if len(held_back.angle) == 0:
+        return said.new_ones(edges.count)
+    gained, possible = (
+        _gain(logit, held_back, edges, priors) for logit in (said, _by_triangles(saying, edges, priors))
+    )
+    # What a few triangles tell by chance tells nothing of CleanNet.
+    return ((gained + priors.by_chance) / (priors.full_trust * possible + priors.by_chance)).clamp(max=1)
+
+
+def _gain(logit: Tensor, triangles: Triangles, edges: _Edges, priors: CyclePriors) -> Tensor:
+    """``(C,)`` G, nats, of log-odds ``(M,)`` of being false."""
+    bounds = torch.tensor(priors.shells, device=logit.device, dtype=torch.float64)
+    shells = len(bounds) - 1
+    # Share of even rotations in each shell, which counts as one triangle.
+    volume = ((bounds - bounds.sin()) / math.pi).diff().repeat(edges.count)
+    component = edges.component[triangles.edge[0]]
+    shell = component * shells + torch.bucketize(triangles.angle, bounds[1:-1])
+
+    def density(weight: Tensor) -> Tensor:
+        """``(T,)`` in units of the even one."""
+        inside = volume.new_zeros(len(volume)).index_add_(0, shell, weight) + volume
+        total = inside.reshape(edges.count, shells).sum(dim=1)
+        return (inside / volume / total.repeat_interleave(shells))[shell]
+
+    def mean_angle(weight: Tensor) -> Tensor:
+        total, count = (_sums(value, component, edges.count) for value in (weight * triangles.angle, weight))
+        return total / count
+
+    beforehand = torch.sigmoid(-logit)[triangles.edge].prod(dim=0).clamp(_LEAST, 1 - _LEAST)
+    good, likelihood = beforehand, beforehand
+    for _ in range(priors.density_rounds):
+        of_good = beforehand * density(good)
+        likelihood = of_good + (1 - beforehand) * density(1 - good)
+        good = of_good / likelihood
+    one_density = density(torch.ones_like(good))
+    gain = _sums((likelihood / one_density).log(), component, edges.count)
+    # A word by which good triangles close by more than others is no word about good edges.
+    return torch.where(mean_angle(good) < mean_angle(1 - good), gain.clamp(min=0), 0.0)
+
+
+def _of_each(value: Tensor, group: Tensor) -> Tensor:
+    """What each of a group has of ``value`` ``(C,)``; one value for all where there is one group."""
+    return value if len(value) == 1 else value[group]
+
+
+def _sums(value: Tensor, group: Tensor, count: int) -> Tensor:
+    """``(count,)`` sums by group."""
+    return value.sum()[None] if count == 1 else value.new_zeros(count).index_add_(0, group, value)

@@ -1,0 +1,1 @@
+"""What edges state of their own noise, believed as far as residuals bear it out."""

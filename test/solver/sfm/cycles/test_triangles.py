@@ -1,0 +1,38 @@
+"""Which triangles are looked at where there are many."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from rotavg_ros import ViewGraph
+from rotavg_ros.solver.sfm.cycles.triangles import Triangles
+from test.solver.graphs import measured, random_truth
+
+
+def complete(cameras: int, seed: int) -> ViewGraph:
+    return measured(random_truth(cameras, seed), *np.triu_indices(cameras, k=1))
+
+
+def test_each_component_has_its_own_however_nodes_are_mixed() -> None:
+    """Evenly spread over its own paths, as if it were alone; nodes of both follow each other in turn."""
+    sizes, most = (20, 30), torch.tensor([150, 400])
+    alone = [complete(size, seed) for seed, size in enumerate(sizes)]
+    number = [2 * torch.arange(20), torch.cat((2 * torch.arange(20) + 1, torch.arange(40, 50)))]
+    source, target = (
+        torch.cat([of[getattr(graph, end)] for of, graph in zip(number, alone, strict=True)])
+        for end in ("source", "target")
+    )
+    order = torch.argsort(source * 50 + target)
+    measurements = torch.cat([graph.target_from_source for graph in alone])
+    together = ViewGraph.create(source[order], target[order], measurements[order])
+    component = torch.zeros(50, dtype=torch.int64)
+    component[number[1]] = 1
+    found = Triangles.of(together, most, component=component)
+    for which, (graph, of) in enumerate(zip(alone, number, strict=True)):
+        mine = component[together.source[found.edge[0]]] == which
+        ends = torch.stack((together.source[found.edge[:, mine]], together.target[found.edge[:, mine]]))
+        expected = Triangles.of(graph, int(most[which]))
+        assert 0 < len(expected.angle) <= most[which]
+        expected_ends = torch.stack((of[graph.source[expected.edge]], of[graph.target[expected.edge]]))
+        assert sorted(ends.flatten(0, 1).T.tolist()) == sorted(expected_ends.flatten(0, 1).T.tolist())
