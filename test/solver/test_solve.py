@@ -171,9 +171,11 @@ def test_stages_follow_the_method() -> None:
     for without_search in ({"refinement_steps": 0}, {"method": "cleannet-spt"}):
         assert list(solve(graph, **without_search).stage_seconds) == ["contract", "clean", "bootstrap", "expand"]
     paper = solve(graph, profile="sfm", method="neurora-v1").stage_seconds
-    assert list(paper) == ["order", "clean", "bootstrap", "fine-tune"]
+    assert list(paper) == ["order", "clean", "cycles", "bootstrap", "fine-tune"]
     whole = solve(graph, profile="sfm").stage_seconds
-    assert list(whole) == ["order", "clean", "bootstrap", "fine-tune", "refine", "consensus", "uncertainty"]
+    assert list(whole) == ["order", "clean", "cycles", "bootstrap", "fine-tune", "refine", "consensus", "uncertainty"]
+    for without_cycles in ("spt", "neurora-paper", "neurora-without-cycles"):
+        assert "cycles" not in solve(graph, profile="sfm", method=without_cycles).stage_seconds
 
 
 @pytest.mark.parametrize("profile", ["slam", "sfm"])

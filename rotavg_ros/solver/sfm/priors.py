@@ -66,9 +66,10 @@ class CyclePriors:
     """What triangles say of edges (``cycles/evidence.py``).
 
     Attributes:
-        few_paths, paths_per_edge, most_paths: paths of two edges that are looked at for a third one, evenly spread over
-            all of a component: all of a small one; of others so many for each edge, but no more than the last. Of a
-            graph that is knit so well that this leaves out many, refinement finds its way anyhow.
+        few_paths: paths of two edges of a component that are looked at for a third one, evenly spread over all: so many
+            tell whether CleanNet knows its cameras.
+        paths_per_edge, least_paths, most_paths: where it does not, so many for each edge are looked at, if that is
+            between the other two.
         freedom: degrees of freedom of Student's t, the density by which triangles of good edges close.
         first_scale, scale_triangles: rad; of that density beforehand, and how many triangles tell as much.
         least_scale: rad; edges that repeat each other would have it vanish.
@@ -80,8 +81,9 @@ class CyclePriors:
         density_rounds: of estimating them.
     """
 
-    few_paths: int = 60_000
+    few_paths: int = 40_000
     paths_per_edge: int = 2
+    least_paths: int = 100_000
     most_paths: int = 400_000
     freedom: float = 3.0
     first_scale: float = float(np.radians(8.0))

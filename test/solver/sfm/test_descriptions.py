@@ -228,7 +228,7 @@ def test_all_methods_that_photos_have_are_tried() -> None:
         f"neurora-{name}"
         for name in (
             *("unweighted", "equal-precisions", "scalar-precisions", "without-consensus"),
-            *("without-finenet", "without-cleannet", "without-both"),
+            *("without-finenet", "without-cleannet", "without-both", "without-cycles"),
         )
     }
     assert set(METHODS) == {*NETWORK_METHODS, *AS_WRITTEN, *BASELINES, *ablations}

@@ -37,12 +37,13 @@ from torch import Tensor
 
 from rotavg_ros.solver.neurora.cleaned import Cleaned
 from rotavg_ros.solver.neurora.numbers import NUMBERS
+from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.sfm.cycles.triangles import Triangles
 from rotavg_ros.solver.sfm.priors import CyclePriors
 from rotavg_ros.view_graph import EdgeLabel
 
 CYCLES = CyclePriors()
-# Probabilities are at least this, numerical; those of messages, in single precision, are less than one by the other.
+# Probabilities are at least, and those of messages are less than one by this, numerical.
 _LEAST, _SURE = 1e-12, 1e-6
 
 
@@ -60,21 +61,21 @@ def with_triangles(
     """
     graph = cleaned.measured
     edges = _Edges(component.index_select(0, graph.source), int(component.max()) + 1, graph.label)
-    looked_at = priors.paths_per_edge * torch.bincount(edges.component, minlength=edges.count)
-    triangles = Triangles.of(graph, looked_at.clamp(priors.few_paths, priors.most_paths), component=component)
+    few = torch.full((edges.count,), priors.few_paths, device=graph.device)
+    triangles = Triangles.of(graph, few, component=component)
     if len(triangles.angle) == 0:
         return cleaned
-    said = cleaned.outlier_probability.double().logit(_LEAST).clamp(-NUMBERS.max_logit, NUMBERS.max_logit)
-    trust = said.new_zeros(edges.count)
-    if is_judged:
-        trust = _trust(said, triangles, edges, priors)
+    said = cleaned.outlier_probability.logit(_LEAST).clamp(-NUMBERS.max_logit, NUMBERS.max_logit)
+    trust = _trust(said, triangles, edges, priors) if is_judged else said.new_zeros(edges.count)
     if bool((trust == 1).all()):
         return cleaned
-    trusted = _of_each(trust, edges.component)
-    logit = trusted * said + (1 - trusted) * _by_triangles(triangles, edges, priors)
+    more = priors.paths_per_edge * torch.bincount(edges.component, minlength=edges.count)
+    triangles = Triangles.of(graph, more.clamp(priors.least_paths, priors.most_paths), component=component)
+    trust = _of_each(trust, edges.component)
+    logit = trust * said + (1 - trust) * _by_triangles(triangles, edges, priors)
     probability = torch.sigmoid(logit.clamp(-NUMBERS.max_logit, NUMBERS.max_logit))
-    probability = torch.where(edges.label == EdgeLabel.AUTOMATIC, probability, cleaned.outlier_probability)
-    return replace(cleaned, outlier_probability=probability.to(cleaned.outlier_probability))
+    is_free = (edges.label == EdgeLabel.AUTOMATIC) & (trust < 1)
+    return replace(cleaned, outlier_probability=torch.where(is_free, probability, cleaned.outlier_probability))
 
 
 @dataclass(frozen=True)
@@ -91,33 +92,41 @@ class _Edges:
     count: int
     label: Tensor
 
+    @cached_property
+    def is_free(self) -> Tensor | None:
+        """``(M,)`` bool: without a label; None where none has one."""
+        is_free = self.label == EdgeLabel.AUTOMATIC
+        return None if bool(is_free.all()) else is_free
+
     def labelled(self, logit: Tensor) -> Tensor:
         """``(M,)`` log-odds of being false, ``(C,)`` of each component but for what labels say."""
         logit = _of_each(logit, self.component).expand(len(self.label))
+        if self.is_free is None:
+            return logit
         logit = torch.where(self.label == EdgeLabel.ACCEPTED, -NUMBERS.max_logit, logit)
         return torch.where(self.label == EdgeLabel.REJECTED, NUMBERS.max_logit, logit)
 
     def share(self, outlier: Tensor) -> Tensor:
         """``(C,)`` log-odds of the share of false edges, ``outlier`` ``(M,)`` being their probabilities."""
-        is_free = (self.label == EdgeLabel.AUTOMATIC).to(outlier)
-        false, good = (_sums(is_free * value, self.component, self.count) for value in (outlier, 1 - outlier))
-        return ((false + 1) / (good + 1)).log()
+        is_free = torch.ones_like(outlier) if self.is_free is None else self.is_free.to(outlier)
+        false, free = (_sums(value, self.component, self.count) for value in (is_free * outlier, is_free))
+        return ((false + 1) / (free - false + 1)).log()
 
 
 def _by_triangles(triangles: Triangles, edges: _Edges, priors: CyclePriors) -> Tensor:
     """``(M,)`` b − E: log-odds of being false by triangles alone."""
     edge = triangles.edge
     closing = _Closing(triangles.angle.float() ** 2, edges.component[edge[0]], edges.count, priors)
-    base = triangles.angle.new_zeros(edges.count)
+    base = closing.square.new_zeros(edges.count)
     message = closing.square.new_zeros(edge.shape)
     logit = edges.labelled(base)
     for number in range(priors.rounds):
-        good = torch.sigmoid(-logit.float()[edge] - message)
+        good = torch.sigmoid(-logit[edge] - message)
         ratio = closing.ratio()
         others = torch.stack((good[1] * good[2], good[0] * good[2], good[0] * good[1]))
-        new = torch.log1p((ratio - 1) * others.clamp(max=1 - _SURE))
+        new = torch.log1p((ratio - 1) * others.clamp_(max=1 - _SURE))
         message = new if number == 0 else (message + new) / 2  # undamped messages may alternate
-        evidence = torch.zeros_like(logit).index_add_(0, edge.ravel(), message.ravel().to(logit))
+        evidence = message.new_zeros(len(edges.label)).index_add_(0, edge.ravel(), message.ravel())
         base = edges.share(torch.sigmoid(edges.labelled(base) - evidence))
         logit = edges.labelled(base) - evidence
         closing.fit(good.prod(dim=0), ratio)
@@ -190,14 +199,14 @@ def _gain(logit: Tensor, triangles: Triangles, edges: _Edges, priors: CyclePrior
     def density(weight: Tensor) -> Tensor:
         """``(T,)`` in units of the even one."""
         inside = volume.new_zeros(len(volume)).index_add_(0, shell, weight) + volume
-        total = inside.reshape(edges.count, shells).sum(dim=1)
-        return (inside / volume / total.repeat_interleave(shells))[shell]
+        total = inside.reshape(edges.count, shells).sum(dim=1, keepdim=True)
+        return ((inside / volume).reshape(edges.count, shells) / total).ravel()[shell]
 
     def mean_angle(weight: Tensor) -> Tensor:
         total, count = (_sums(value, component, edges.count) for value in (weight * triangles.angle, weight))
         return total / count
 
-    beforehand = torch.sigmoid(-logit)[triangles.edge].prod(dim=0).clamp(_LEAST, 1 - _LEAST)
+    beforehand = torch.sigmoid(-logit.double())[triangles.edge].prod(dim=0).clamp(_LEAST, 1 - _LEAST)
     good, likelihood = beforehand, beforehand
     for _ in range(priors.density_rounds):
         of_good = beforehand * density(good)
