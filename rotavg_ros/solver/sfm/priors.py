@@ -66,13 +66,14 @@ class CyclePriors:
     """What triangles say of edges (``cycles/evidence.py``).
 
     Attributes:
-        few_paths: paths of two edges of a component that are looked at for a third one, evenly spread over all: so many
-            tell whether CleanNet knows its cameras.
+        few_paths, run: paths of two edges of a component that are looked at for a third one: so many, in runs of so
+            many that begin with few edges, tell whether CleanNet knows its cameras.
         paths_per_edge, least_paths, most_paths: where it does not, so many for each edge are looked at, if that is
             between the other two.
         freedom: degrees of freedom of Student's t, the density by which triangles of good edges close.
         first_scale, scale_triangles: rad; of that density beforehand, and how many triangles tell as much.
         least_scale: rad; edges that repeat each other would have it vanish.
+        base_spread, slope_spread: standard deviations beforehand of b and k, about 0.
         rounds: of messages.
         full_trust: CleanNet counts in full where it explains so large a share of what triangles explain of others. On
             recipes that it was trained on it explains 0.4 to 1.1 of it, on cameras turned anyhow 0.00 to 0.03.
@@ -82,6 +83,7 @@ class CyclePriors:
     """
 
     few_paths: int = 40_000
+    run: int = 500
     paths_per_edge: int = 2
     least_paths: int = 100_000
     most_paths: int = 400_000
@@ -89,6 +91,8 @@ class CyclePriors:
     first_scale: float = float(np.radians(8.0))
     scale_triangles: float = 1.0
     least_scale: float = float(np.radians(0.3))
+    base_spread: float = 3.0
+    slope_spread: float = 0.5
     rounds: int = 8
     full_trust: float = 0.25
     by_chance: float = 10.0

@@ -8,18 +8,21 @@ compose to anything. Let g = 1 for a good edge, and λ the density of a triangle
 
 Two triangles of an edge have no other edge in common, so their logarithms add up, to E_e. P(g_c) is what all but this
 triangle say of c: messages that go back and forth (sum-product, Pearl 1988; with loops of view-graphs Zach, Klopschitz
-and Pollefeys, CVPR 2010), a few rounds of them, though triangles of four cameras share edges. Beforehand all edges are
-alike, with log-odds b of being false; b and s are estimated with the g (expectation and maximisation).
+and Pollefeys, CVPR 2010), a few rounds of them, though triangles of four cameras share edges. Beforehand
+
+    logit P(g_e = 0) = b + k ℓ_e,     ℓ: CleanNet's log-odds;
+
+b, k and s are estimated with the g (expectation and maximisation).
 
 **Of CleanNet.** It knows cameras like those that it was trained on, and of others next to nothing. With the probability
 π that all edges of a triangle are good, by its word or by anybody's, closing angles have the density
 
     π f₁(angle) + (1 − π) f₀(angle),     f₁, f₀: any, constant in shells,
 
-and G is by how many nats this makes them likelier than one density for all. Half of the triangles say E,
-and the other half has G of both. CleanNet counts by a, triangles by 1 − a:
+and G is by how many nats this makes them likelier than one density for all. Half of the triangles say E, without
+CleanNet, and the other half has G of both. CleanNet's word counts by a, the posterior of triangles by 1 − a:
 
-    logit P(g_e = 0) = a ℓ_e + (1 − a) (b − E_e),     a = min(1, G_CleanNet / (¼ G_triangles)),     ℓ: CleanNet's.
+    logit P(g_e = 0) = a ℓ_e + (1 − a) (b + k ℓ_e − E_e),     a = min(1, G_CleanNet / (¼ G_triangles)).
 
 It counts in full from a quarter on, since it judges something else: whether an edge's own noise exceeds 20°, of which
 triangles of noisy edges know less than of what they close by.
@@ -62,7 +65,7 @@ def with_triangles(
     graph = cleaned.measured
     edges = _Edges(component.index_select(0, graph.source), int(component.max()) + 1, graph.label)
     few = torch.full((edges.count,), priors.few_paths, device=graph.device)
-    triangles = Triangles.of(graph, few, component=component)
+    triangles = Triangles.of(graph, few, component=component, run=priors.run)
     if len(triangles.angle) == 0:
         return cleaned
     said = cleaned.outlier_probability.logit(_LEAST).clamp(-NUMBERS.max_logit, NUMBERS.max_logit)
@@ -72,7 +75,8 @@ def with_triangles(
     more = priors.paths_per_edge * torch.bincount(edges.component, minlength=edges.count)
     triangles = Triangles.of(graph, more.clamp(priors.least_paths, priors.most_paths), component=component)
     trust = _of_each(trust, edges.component)
-    logit = trust * said + (1 - trust) * _by_triangles(triangles, edges, priors)
+    beforehand = _Beforehand(edges, said if is_judged else torch.zeros_like(said), priors)
+    logit = trust * said + (1 - trust) * _by_triangles(triangles, beforehand)
     probability = torch.sigmoid(logit.clamp(-NUMBERS.max_logit, NUMBERS.max_logit))
     is_free = (edges.label == EdgeLabel.AUTOMATIC) & (trust < 1)
     return replace(cleaned, outlier_probability=torch.where(is_free, probability, cleaned.outlier_probability))
@@ -99,36 +103,58 @@ class _Edges:
         return None if bool(is_free.all()) else is_free
 
     def labelled(self, logit: Tensor) -> Tensor:
-        """``(M,)`` log-odds of being false, ``(C,)`` of each component but for what labels say."""
-        logit = _of_each(logit, self.component).expand(len(self.label))
+        """``(M,)`` log-odds of being false but for what labels say."""
         if self.is_free is None:
             return logit
         logit = torch.where(self.label == EdgeLabel.ACCEPTED, -NUMBERS.max_logit, logit)
         return torch.where(self.label == EdgeLabel.REJECTED, NUMBERS.max_logit, logit)
 
-    def share(self, outlier: Tensor) -> Tensor:
-        """``(C,)`` log-odds of the share of false edges, ``outlier`` ``(M,)`` being their probabilities."""
-        is_free = torch.ones_like(outlier) if self.is_free is None else self.is_free.to(outlier)
-        false, free = (_sums(value, self.component, self.count) for value in (is_free * outlier, is_free))
-        return ((false + 1) / (free - false + 1)).log()
+
+class _Beforehand:
+    """Log-odds b + k ℓ of edges to be false before triangles are looked at, with ℓ ``(M,)`` of somebody."""
+
+    def __init__(self, edges: _Edges, said: Tensor, priors: CyclePriors) -> None:
+        self.edges, self.priors = edges, priors
+        self._said, self._free = said, torch.ones_like(said) if edges.is_free is None else edges.is_free.to(said)
+        self._base, self._slope = said.new_zeros(edges.count), said.new_zeros(edges.count)
+        # What bounds the curvature of log(1 + exp(b + k ℓ)), summed over edges: it is ¼ at most (Böhning 1992).
+        base, cross, slope = (self._sums(self._free * said**power / 4) for power in (0, 1, 2))
+        base, slope = base + priors.base_spread**-2, slope + priors.slope_spread**-2
+        self._bound = base, cross, slope, slope * base - cross**2
+
+    def logit(self) -> Tensor:
+        """``(M,)``, or what labels say."""
+        base, slope = (_of_each(value, self.edges.component) for value in (self._base, self._slope))
+        return self.edges.labelled(base + slope * self._said)
+
+    def fit(self, outlier: Tensor) -> None:
+        """A step of b and k towards the likeliest, ``outlier`` ``(M,)`` being what is known of the edges now."""
+        base, cross, slope, determinant = self._bound
+        off = self._free * (outlier - torch.sigmoid(self.logit()))
+        by_base = self._sums(off) - self._base * self.priors.base_spread**-2
+        by_slope = self._sums(off * self._said) - self._slope * self.priors.slope_spread**-2
+        self._base = self._base + (slope * by_base - cross * by_slope) / determinant
+        self._slope = self._slope + (base * by_slope - cross * by_base) / determinant
+
+    def _sums(self, value: Tensor) -> Tensor:
+        return _sums(value, self.edges.component, self.edges.count)
 
 
-def _by_triangles(triangles: Triangles, edges: _Edges, priors: CyclePriors) -> Tensor:
-    """``(M,)`` b − E: log-odds of being false by triangles alone."""
-    edge = triangles.edge
+def _by_triangles(triangles: Triangles, beforehand: _Beforehand) -> Tensor:
+    """``(M,)`` b + k ℓ − E: log-odds of being false; ``beforehand`` is fitted."""
+    edges, priors, edge = beforehand.edges, beforehand.priors, triangles.edge
     closing = _Closing(triangles.angle.float() ** 2, edges.component[edge[0]], edges.count, priors)
-    base = closing.square.new_zeros(edges.count)
     message = closing.square.new_zeros(edge.shape)
-    logit = edges.labelled(base)
+    logit = beforehand.logit()
     for number in range(priors.rounds):
         good = torch.sigmoid(-logit[edge] - message)
         ratio = closing.ratio()
         others = torch.stack((good[1] * good[2], good[0] * good[2], good[0] * good[1]))
         new = torch.log1p((ratio - 1) * others.clamp_(max=1 - _SURE))
         message = new if number == 0 else (message + new) / 2  # undamped messages may alternate
-        evidence = message.new_zeros(len(edges.label)).index_add_(0, edge.ravel(), message.ravel())
-        base = edges.share(torch.sigmoid(edges.labelled(base) - evidence))
-        logit = edges.labelled(base) - evidence
+        evidence = message.new_zeros(len(logit)).index_add_(0, edge.ravel(), message.ravel())
+        beforehand.fit(torch.sigmoid(beforehand.logit() - evidence))
+        logit = beforehand.logit() - evidence
         closing.fit(good.prod(dim=0), ratio)
     return logit
 
@@ -180,9 +206,8 @@ def _trust(said: Tensor, triangles: Triangles, edges: _Edges, priors: CyclePrior
     saying, held_back = (Triangles(triangles.edge[:, k::2], triangles.angle[k::2].contiguous()) for k in (0, 1))
     if len(held_back.angle) == 0:
         return said.new_ones(edges.count)
-    gained, possible = (
-        _gain(logit, held_back, edges, priors) for logit in (said, _by_triangles(saying, edges, priors))
-    )
+    by_triangles = _by_triangles(saying, _Beforehand(edges, torch.zeros_like(said), priors))
+    gained, possible = (_gain(logit, held_back, edges, priors) for logit in (said, by_triangles))
     # What a few triangles tell by chance tells nothing of CleanNet.
     return ((gained + priors.by_chance) / (priors.full_trust * possible + priors.by_chance)).clamp(max=1)
 

@@ -29,7 +29,12 @@ class Triangles:
 
     @classmethod
     def of(
-        cls, graph: ViewGraph, most: int | Tensor, among: Tensor | None = None, component: Tensor | None = None
+        cls,
+        graph: ViewGraph,
+        most: int | Tensor,
+        among: Tensor | None = None,
+        component: Tensor | None = None,
+        run: int = 1,
     ) -> Triangles:
         """Of a graph whose edges run from lower to higher nodes.
 
@@ -38,6 +43,8 @@ class Triangles:
             most: triangles at most; so many paths of two edges are looked at, evenly spread over all.
             among: ``(M,)`` bool: triangles that have one of these edges alone; default: all.
             component: ``(N,)`` of every node; then ``most`` is ``(C,)``, of each.
+            run: so many paths that follow each other are looked at together, the last of these perhaps beyond ``most``:
+                of a few edges many triangles, not of many few.
         """
         key, source, target, order = graph.source * graph.num_nodes + graph.target, graph.source, graph.target, None
         if not bool((key[1:] >= key[:-1]).all()):  # a canonical form is sorted, and copies of a large one cost memory
@@ -50,9 +57,12 @@ class Triangles:
         paths = int(up_to[-1]) if graph.num_edges else 0
         of_each = torch.as_tensor(most).reshape(-1)
         if len(of_each) == 1 or component is None:
-            path = torch.arange(0, paths, max(1, -(-paths // int(of_each[0]))), device=graph.device)
+            stride = run * max(1, -(-paths // int(of_each[0])))
+            begin = torch.arange(0, paths, stride, device=graph.device)
+            path = (begin[:, None] + torch.arange(run, device=graph.device)).ravel()
+            path = path if run == 1 else path[path < paths]
         else:
-            path = _spread(count, up_to, component[source], of_each.to(graph.device))
+            path = _spread(count, up_to, component[source], of_each.to(graph.device), run)
         parts = slices(len(path), _SLICE_PATHS, path.device)
         found = [(path.new_empty(3, 0), path.new_empty(0, dtype=torch.float64)) for _ in parts]
 
@@ -101,7 +111,7 @@ class Triangles:
         return (nearest - by_chance) / (by_chance + 1).sqrt()
 
 
-def _spread(count: Tensor, up_to: Tensor, group: Tensor, most: Tensor) -> Tensor:
+def _spread(count: Tensor, up_to: Tensor, group: Tensor, most: Tensor, run: int) -> Tensor:
     """Paths, ``most`` of each group at most, evenly spread over its own whatever others there are.
 
     Args:
@@ -109,15 +119,18 @@ def _spread(count: Tensor, up_to: Tensor, group: Tensor, most: Tensor) -> Tensor
         up_to: ``(M,)`` the same summed up: paths are numbered so.
         group: ``(M,)`` of each edge.
         most: ``(C,)``.
+        run: so many follow each other.
     """
     by_group = group.argsort(stable=True)
     ends = count[by_group].cumsum(0)  # of the paths, had they been numbered group by group
     paths = torch.bincount(group, weights=count.double(), minlength=len(most)).long()
-    stride = (-(-paths // most)).clamp(min=1)
-    taken = -(-paths // stride)
+    stride = run * (-(-paths // most)).clamp(min=1)
+    taken = -(-paths // stride) * run
     which = torch.arange(len(taken), device=count.device).repeat_interleave(taken)
     rank = torch.arange(len(which), device=count.device) - (taken.cumsum(0) - taken)[which]
-    numbered = (paths.cumsum(0) - paths)[which] + rank * stride[which]
+    number = rank // run * stride[which] + rank % run
+    is_one = number < paths[which]
+    numbered = ((paths.cumsum(0) - paths)[which] + number)[is_one]
     place = torch.searchsorted(ends, numbered, right=True)
     edge = by_group[place]
     return up_to[edge] - count[edge] + numbered - (ends[place] - count[edge])

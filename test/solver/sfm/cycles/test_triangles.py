@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from rotavg_ros import ViewGraph
@@ -14,7 +15,8 @@ def complete(cameras: int, seed: int) -> ViewGraph:
     return measured(random_truth(cameras, seed), *np.triu_indices(cameras, k=1))
 
 
-def test_each_component_has_its_own_however_nodes_are_mixed() -> None:
+@pytest.mark.parametrize("run", [1, 40])
+def test_each_component_has_its_own_however_nodes_are_mixed(run: int) -> None:
     """Evenly spread over its own paths, as if it were alone; nodes of both follow each other in turn."""
     sizes, most = (20, 30), torch.tensor([150, 400])
     alone = [complete(size, seed) for seed, size in enumerate(sizes)]
@@ -28,11 +30,21 @@ def test_each_component_has_its_own_however_nodes_are_mixed() -> None:
     together = ViewGraph.create(source[order], target[order], measurements[order])
     component = torch.zeros(50, dtype=torch.int64)
     component[number[1]] = 1
-    found = Triangles.of(together, most, component=component)
+    found = Triangles.of(together, most, component=component, run=run)
     for which, (graph, of) in enumerate(zip(alone, number, strict=True)):
         mine = component[together.source[found.edge[0]]] == which
         ends = torch.stack((together.source[found.edge[:, mine]], together.target[found.edge[:, mine]]))
-        expected = Triangles.of(graph, int(most[which]))
-        assert 0 < len(expected.angle) <= most[which]
+        expected = Triangles.of(graph, int(most[which]), run=run)
+        assert 0 < len(expected.angle) <= most[which] + run
         expected_ends = torch.stack((of[graph.source[expected.edge]], of[graph.target[expected.edge]]))
         assert sorted(ends.flatten(0, 1).T.tolist()) == sorted(expected_ends.flatten(0, 1).T.tolist())
+
+
+def test_runs_have_many_triangles_of_few_edges() -> None:
+    graph = complete(60, 3)
+    spread, runs = (Triangles.of(graph, 2000, run=run) for run in (1, 200))
+    assert len(runs.angle) <= 2000 and len(spread.angle) <= 2000
+    # A path goes on from its first edge.
+    assert len(runs.edge[0].unique()) < 0.2 * len(spread.edge[0].unique())
+    for run in (1, 7, 10**9):
+        assert len(Triangles.of(graph, 10**6, run=run).angle) == 60 * 59 * 58 / 6
