@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from rotavg_ros.datasets.files.formats import read_graph
-from rotavg_ros.datasets.simulation.synthetic import ReleasedRecipe
+from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 from rotavg_ros.datasets.simulation.topology import read_topology
 from rotavg_ros.evaluation.common.answers import Answer
 from rotavg_ros.evaluation.common.cases import Case, CaseKey, Kind
@@ -34,6 +34,7 @@ METHODS = (
     "neurora-v1",
     "neurora-v2",
     "neurora",
+    "neurora-without-cycles",
     "geman-mcclure",
     "colmap",
     "shonan",
@@ -41,8 +42,15 @@ METHODS = (
 # Minutes a graph of 2500 cameras.
 SLOW_ON_TOPOLOGIES = ("weiszfeld", "arrigoni", "wang", "shonan")
 LUND, MADRID, TOPOLOGIES = "sfm/lund_sphinx.mat", "sfm/madrid_metropolis/EGs.txt", "sfm/topology"
-# Noise on the real topologies: the released recipe's, and as little as real measurements have.
-NOISE = {"the released recipe": ReleasedRecipe(), "σ 0.5–3°": ReleasedRecipe(noise_deg=(0.5, 3.0))}
+# Noise on the real topologies: the released recipe's, as little as real measurements have, and edges of any rotation
+# between cameras that look every way, of which no network of the package has seen any.
+NOISE: dict[str, ReleasedRecipe | PaperRecipe] = {
+    "the released recipe": ReleasedRecipe(),
+    "σ 0.5–3°": ReleasedRecipe(noise_deg=(0.5, 3.0)),
+    "σ 2–5° and 20–50 % any rotation, cameras that look every way": PaperRecipe(
+        noise_deg=(2.0, 5.0), outlier_share=(0.2, 0.5), planar=False
+    ),
+}
 _STREAM = 0x70B0
 
 

@@ -21,7 +21,7 @@ from rotavg_ros.solver.neurora.stages import apply_labels, clean, fine_tune, tru
 from rotavg_ros.solver.neurora.tiled.tuning import tune
 from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap, breadth_first
 from rotavg_ros.solver.sfm.consensus.search import CONSENSUS, consensus
-from rotavg_ros.solver.sfm.cycles.evidence import with_triangles
+from rotavg_ros.solver.sfm.cycles.evidence import by_triangles, with_triangles
 from rotavg_ros.solver.sfm.options import SfmStages
 from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
 from rotavg_ros.solver.sfm.series import EdgesInSeries
@@ -30,7 +30,7 @@ from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.solver.sfm.uncertainty import References, variances
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-# Of cameras with fewer edges, in the mean, a second start costs little, and few edges check each other.
+# Of cameras with fewer edges, in the mean, other starts cost little, and few edges check each other.
 _SPARSE_DEGREE = 20
 # Answers whose costs are as near as this, of the cost, lie in one valley but for where refinements stop.
 _SAME_VALLEY = 5e-3
@@ -53,10 +53,11 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     with watch.stage("clean"):
         kind = PaperCleanNet if "cleannet" in stages.as_written else CleanNet
         cleaned = clean(networks.load(kind), graph) if stages.clean else trust_all(graph)
-        cleaned = apply_labels(cleaned, graph.label)
+        judged = cleaned = apply_labels(cleaned, graph.label)
+    is_believed = False
     if stages.cycles and "cycles" not in stages.as_written:
         with watch.stage("cycles"):
-            cleaned = with_triangles(cleaned, component, stages.clean)
+            cleaned, is_believed = with_triangles(judged, component, stages.clean)
     with watch.stage("bootstrap"):
         begun = (breadth_first if "tree" in stages.as_written else bootstrap)(cleaned, component)
         cleaned, orientations = begun.cleaned, begun.body_from_world
@@ -86,8 +87,13 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             refinement = partial(refine, graph, max_steps=steps, structure=structure, priors=priors)
             orientations = refinement(orientations, weights=weights)
             if stages.clean and stages.weighted and _is_sparse(graph):
-                unweighted = refinement(_begun_without(graph, component), weights=EdgeWeights(allowed, allowed))
-                orientations = _likelier(graph, References(component, begun.roots), allowed, orientations, unweighted)
+                verdicts = [apply_labels(trust_all(graph), graph.label)]
+                if is_believed:
+                    verdicts.append(by_triangles(judged, component))
+                for verdict in verdicts:
+                    believed = EdgeWeights(allowed, allowed * (1 - verdict.outlier_probability))
+                    refined = refinement(bootstrap(verdict, component).body_from_world, weights=believed)
+                    orientations = _likelier(graph, References(component, begun.roots), allowed, orientations, refined)
             if stages.stated:
                 noise = StatedNoise.of(graph, structure, priors, stages.stated_shapes)
                 orientations, weights = noise.refined(orientations, weights, refinement)
@@ -122,11 +128,6 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
 def _is_sparse(graph: ViewGraph) -> bool:
     """Whether so few edges check each other that CleanNet may lead into another valley."""
     return 2 * graph.num_edges < _SPARSE_DEGREE * graph.num_nodes
-
-
-def _begun_without(graph: ViewGraph, component: Tensor) -> Tensor:
-    """``(N, 4)`` along the tree of edges that are trusted alike."""
-    return bootstrap(apply_labels(trust_all(graph), graph.label), component).body_from_world
 
 
 def _likelier(graph: ViewGraph, to: References, weight: Tensor, one: Tensor, other: Tensor) -> Tensor:

@@ -34,6 +34,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -50,10 +51,22 @@ CYCLES = CyclePriors()
 _LEAST, _SURE = 1e-12, 1e-6
 
 
+class Checked(NamedTuple):
+    """What CleanNet and triangles say together.
+
+    Attributes:
+        cleaned: with their probabilities.
+        is_believed: whether CleanNet's word counts for more than that of triangles somewhere.
+    """
+
+    cleaned: Cleaned
+    is_believed: bool
+
+
 def with_triangles(
     cleaned: Cleaned, component: Tensor, is_judged: bool = True, priors: CyclePriors = CYCLES
-) -> Cleaned:
-    """The same with the outlier probabilities that CleanNet and triangles together come to.
+) -> Checked:
+    """The outlier probabilities that CleanNet and triangles come to, as far as triangles bear out CleanNet.
 
     Labels stand, as CleanNet's probabilities do where there are no triangles.
 
@@ -62,23 +75,47 @@ def with_triangles(
         component: ``(N,)`` of every node.
         is_judged: whether CleanNet has said anything.
     """
-    graph = cleaned.measured
-    edges = _Edges(component.index_select(0, graph.source), int(component.max()) + 1, graph.label)
-    few = torch.full((edges.count,), priors.few_paths, device=graph.device)
-    triangles = Triangles.of(graph, few, component=component, run=priors.run)
+    edges, said = _Edges.of(cleaned, component), _said(cleaned, is_judged)
+    few = torch.full((edges.count,), priors.few_paths, device=component.device)
+    triangles = Triangles.of(cleaned.measured, few, component=component, run=priors.run)
     if len(triangles.angle) == 0:
-        return cleaned
-    said = cleaned.outlier_probability.logit(_LEAST).clamp(-NUMBERS.max_logit, NUMBERS.max_logit)
+        return Checked(cleaned, is_judged)
     trust = _trust(said, triangles, edges, priors) if is_judged else said.new_zeros(edges.count)
     if bool((trust == 1).all()):
-        return cleaned
-    more = priors.paths_per_edge * torch.bincount(edges.component, minlength=edges.count)
-    triangles = Triangles.of(graph, more.clamp(priors.least_paths, priors.most_paths), component=component)
-    trust = _of_each(trust, edges.component)
-    beforehand = _Beforehand(edges, said if is_judged else torch.zeros_like(said), priors)
-    logit = trust * said + (1 - trust) * _by_triangles(triangles, beforehand)
+        return Checked(cleaned, True)
+    logit = _logit_by_triangles(cleaned, component, edges, said, priors)
+    trust = _of_each(trust, edges.component).expand_as(said)
+    blended = _with_logit(cleaned, trust * said + (1 - trust) * logit)
+    probability = torch.where(trust == 1, cleaned.outlier_probability, blended.outlier_probability)
+    return Checked(replace(cleaned, outlier_probability=probability), bool((trust > 0.5).any()))
+
+
+def by_triangles(cleaned: Cleaned, component: Tensor, priors: CyclePriors = CYCLES) -> Cleaned:
+    """The same by what triangles say, whatever CleanNet's word is worth: with a = 0. Arguments as above."""
+    edges, said = _Edges.of(cleaned, component), _said(cleaned, True)
+    return _with_logit(cleaned, _logit_by_triangles(cleaned, component, edges, said, priors))
+
+
+def _said(cleaned: Cleaned, is_judged: bool) -> Tensor:
+    """``(M,)`` CleanNet's log-odds."""
+    said = cleaned.outlier_probability.logit(_LEAST).clamp(-NUMBERS.max_logit, NUMBERS.max_logit)
+    return said if is_judged else torch.zeros_like(said)
+
+
+def _logit_by_triangles(
+    cleaned: Cleaned, component: Tensor, edges: _Edges, said: Tensor, priors: CyclePriors
+) -> Tensor:
+    """``(M,)`` b + k ℓ − E of many triangles."""
+    most = priors.paths_per_edge * torch.bincount(edges.component, minlength=edges.count)
+    most = most.clamp(priors.least_paths, priors.most_paths)
+    triangles = Triangles.of(cleaned.measured, most, component=component)
+    return _by_triangles(triangles, _Beforehand(edges, said, priors))
+
+
+def _with_logit(cleaned: Cleaned, logit: Tensor) -> Cleaned:
+    """The same with other probabilities where there is no label."""
     probability = torch.sigmoid(logit.clamp(-NUMBERS.max_logit, NUMBERS.max_logit))
-    is_free = (edges.label == EdgeLabel.AUTOMATIC) & (trust < 1)
+    is_free = cleaned.measured.label == EdgeLabel.AUTOMATIC
     return replace(cleaned, outlier_probability=torch.where(is_free, probability, cleaned.outlier_probability))
 
 
@@ -95,6 +132,11 @@ class _Edges:
     component: Tensor
     count: int
     label: Tensor
+
+    @classmethod
+    def of(cls, cleaned: Cleaned, component: Tensor) -> _Edges:
+        graph = cleaned.measured
+        return cls(component.index_select(0, graph.source), int(component.max()) + 1, graph.label)
 
     @cached_property
     def is_free(self) -> Tensor | None:

@@ -29,13 +29,13 @@ HELD = replace(CYCLES, first_scale=float(np.radians(4.0)), scale_triangles=1e9, 
 
 def judged(graph: ViewGraph, outlier_probability: Tensor, component: Tensor | None = None) -> Cleaned:
     component = graph.components() if component is None else component
-    return with_triangles(replace(trust_all(graph), outlier_probability=outlier_probability), component)
+    return with_triangles(replace(trust_all(graph), outlier_probability=outlier_probability), component).cleaned
 
 
 def by_triangles(graph: ViewGraph, **priors: object) -> Tensor:
     """Probabilities of being false."""
     told = replace(HELD, **priors)  # type: ignore[arg-type]
-    return with_triangles(trust_all(graph), graph.components(), False, told).outlier_probability
+    return with_triangles(trust_all(graph), graph.components(), False, told).cleaned.outlier_probability
 
 
 def nearby(seed: int, cameras: int, reach: int, false_share: float) -> tuple[ViewGraph, Rotation, np.ndarray]:
@@ -104,7 +104,9 @@ def test_cleannet_has_the_word_on_what_it_was_trained_on(recipe: ReleasedRecipe 
         graph = recipe.sample(np.random.default_rng((seed, 5))).graph
         form = CanonicalForm.of(graph, graph.components())
         cleaned = clean(network, form.graph)
-        assert torch.equal(with_triangles(cleaned, form.component).outlier_probability, cleaned.outlier_probability)
+        checked = with_triangles(cleaned, form.component)
+        assert checked.is_believed
+        assert torch.equal(checked.cleaned.outlier_probability, cleaned.outlier_probability)
 
 
 def test_labels_stand_and_tell_of_other_edges() -> None:
