@@ -38,7 +38,9 @@ def by_triangles(graph: ViewGraph, **priors: object) -> Tensor:
     return with_triangles(trust_all(graph), graph.components(), False, told).cleaned.outlier_probability
 
 
-def nearby(seed: int, cameras: int, reach: int, false_share: float) -> tuple[ViewGraph, Rotation, np.ndarray]:
+def nearby(
+    seed: int, cameras: int, reach: int, false_share: float, upright: bool = False
+) -> tuple[ViewGraph, Rotation, np.ndarray]:
     """Each camera, turned anyhow, joined to those next to it: noise of 3°, false edges of any rotation."""
     rng = np.random.default_rng(seed)
     source = np.repeat(np.arange(cameras), reach)
@@ -46,7 +48,7 @@ def nearby(seed: int, cameras: int, reach: int, false_share: float) -> tuple[Vie
     is_false = rng.random(len(source)) < false_share
     noise = Rotation.from_rotvec(np.radians(3.0) * rng.normal(size=(len(source), 3))).as_quat()
     noise = np.where(is_false[:, None], Rotation.random(len(source), rng).as_quat(), noise)
-    truth = random_truth(cameras, seed)
+    truth = random_truth(cameras, seed, planar=upright)
     return measured(truth, *ends, Rotation.from_quat(noise)), truth, is_false
 
 
@@ -170,3 +172,12 @@ def test_networks_alone_find_cameras_that_look_every_way() -> None:
     for false_share in (0.1, 0.5):
         graph, truth, _ = nearby(0, 150, 15, false_share)
         assert error_deg(graph, truth, "neurora-v2") < 2.5 * error_deg(graph, truth, "chatterjee")
+
+
+def test_where_cleannet_has_the_word_triangles_have_a_start() -> None:
+    """Upright cameras: CleanNet tells edges of any rotation by their axes, but one ring in five was folded for all that."""
+    graphs = [nearby(seed, 100, 5, 0.5, upright=True)[:2] for seed in range(8)]
+    ours, without = (
+        [error_deg(graph, truth, method) for graph, truth in graphs] for method in ("neurora", "neurora-without-cycles")
+    )
+    assert max(ours) < 0.8 * max(without)
