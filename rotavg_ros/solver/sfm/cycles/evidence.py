@@ -114,7 +114,7 @@ def _logit_by_triangles(
 
 def _with_logit(cleaned: Cleaned, logit: Tensor) -> Cleaned:
     """The same with other probabilities where there is no label."""
-    probability = torch.sigmoid(logit.clamp(-NUMBERS.max_logit, NUMBERS.max_logit))
+    probability = torch.sigmoid(logit.clamp(-NUMBERS.max_logit, NUMBERS.max_logit)).to(cleaned.outlier_probability)
     is_free = cleaned.measured.label == EdgeLabel.AUTOMATIC
     return replace(cleaned, outlier_probability=torch.where(is_free, probability, cleaned.outlier_probability))
 
@@ -158,16 +158,17 @@ class _Beforehand:
     def __init__(self, edges: _Edges, said: Tensor, priors: CyclePriors) -> None:
         self.edges, self.priors = edges, priors
         self._said, self._free = said, torch.ones_like(said) if edges.is_free is None else edges.is_free.to(said)
-        self._base, self._slope = said.new_zeros(edges.count), said.new_zeros(edges.count)
+        # In double precision: where the same is said of all edges, next to nothing is left of the determinant.
+        self._base, self._slope = (said.new_zeros(edges.count, dtype=torch.float64) for _ in range(2))
         # What bounds the curvature of log(1 + exp(b + k ℓ)), summed over edges: it is ¼ at most (Böhning 1992).
-        base, cross, slope = (self._sums(self._free * said**power / 4) for power in (0, 1, 2))
+        base, cross, slope = (self._sums(self._free * said.double() ** power / 4) for power in (0, 1, 2))
         base, slope = base + priors.base_spread**-2, slope + priors.slope_spread**-2
         self._bound = base, cross, slope, slope * base - cross**2
 
     def logit(self) -> Tensor:
         """``(M,)``, or what labels say."""
         base, slope = (_of_each(value, self.edges.component) for value in (self._base, self._slope))
-        return self.edges.labelled(base + slope * self._said)
+        return self.edges.labelled(base.to(self._said) + slope.to(self._said) * self._said)
 
     def fit(self, outlier: Tensor) -> None:
         """A step of b and k towards the likeliest, ``outlier`` ``(M,)`` being what is known of the edges now."""
@@ -179,7 +180,8 @@ class _Beforehand:
         self._slope = self._slope + (base * by_slope - cross * by_base) / determinant
 
     def _sums(self, value: Tensor) -> Tensor:
-        return _sums(value, self.edges.component, self.edges.count)
+        """``(C,)`` float64."""
+        return _sums(value.double(), self.edges.component, self.edges.count)
 
 
 def _by_triangles(triangles: Triangles, beforehand: _Beforehand) -> Tensor:

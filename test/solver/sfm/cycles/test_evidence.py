@@ -132,6 +132,15 @@ def test_where_no_triangle_is_the_network_has_the_word() -> None:
         assert torch.equal(judged(graph, said).outlier_probability, said)
 
 
+@pytest.mark.parametrize("said", [1e-9, 0.5, 1 - 1e-9])
+def test_a_network_that_says_the_same_of_all_edges_says_nothing(said: float) -> None:
+    graph, _, _ = nearby(1, 80, 6, 0.3)
+    found = judged(graph, torch.full((graph.num_edges,), said)).outlier_probability
+    expected = with_triangles(trust_all(graph), graph.components(), False).cleaned.outlier_probability
+    assert found.dtype == torch.float32 and bool(torch.isfinite(found).all())
+    assert float(((found > 0.5) != (expected > 0.5)).double().mean()) < 0.03
+
+
 def test_each_component_has_its_own() -> None:
     """An answer does not depend on what else is solved beside it."""
     alone = [
