@@ -53,6 +53,7 @@ NETWORK_METHODS = {
     "neurora-without-both": Method(SfmStages(clean=False, fine_tunings=0), SlamStages(clean=False)),
     "neurora-without-cycles": Method(sfm=SfmStages(cycles=False)),
     "neurora-round": Method(sfm=SfmStages(shaped=False)),
+    "neurora-half-norm": Method(sfm=SfmStages(density=False)),
     "neurora-equal-precisions": Method(sfm=SfmStages(stated=False)),
     "neurora-scalar-precisions": Method(sfm=SfmStages(stated_shapes=False)),
     "neurora-without-consensus": Method(sfm=SfmStages(consensus=False)),

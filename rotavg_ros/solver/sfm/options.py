@@ -19,6 +19,7 @@ class SfmStages:
         refine: refinement ends the solve.
         weighted: refinement begins by weighing the edges by CleanNet's scores.
         shaped: the refinement estimates the noise's shape; otherwise noise is taken to be round.
+        density: the last steps go by the density that makes residuals likeliest; otherwise all by that of ℓ½.
         stated: precisions that edges state are believed as far as residuals bear them out; otherwise not at all.
         stated_shapes: and so is the information that they state, about which axes they are exact.
         cycles: triangles tell how far CleanNet's scores are borne out, and what they say of edges themselves counts.
@@ -31,6 +32,7 @@ class SfmStages:
     refine: bool = True
     weighted: bool = True
     shaped: bool = True
+    density: bool = True
     stated: bool = True
     stated_shapes: bool = True
     cycles: bool = True

@@ -148,6 +148,31 @@ class ConsensusPriors:
 
 
 @dataclass(frozen=True)
+class DensityPriors:
+    """Which density of noise the last steps go by (``noise_density.py``).
+
+    Chosen before it was tried on any graph but eight with normal noise; none was tuned.
+
+    Attributes:
+        exponents: β, the first of which is that of the steps before.
+        ahead: nats by which another has to be likelier.
+        good_share: of the edges, to begin with.
+        most_certain: one over the least share of false edges, numerical.
+        rounds: of expectation and maximisation.
+        least_prior: edges of less prior weight are not asked.
+        max_steps: by the density; as many of all steps as are left.
+    """
+
+    exponents: tuple[float, ...] = (0.5, 0.75, 1.0, 1.5, 2.0)
+    ahead: float = 10.0
+    good_share: float = 0.8
+    most_certain: float = 1e3
+    rounds: int = 20
+    least_prior: float = 1e-3
+    max_steps: int = 10
+
+
+@dataclass(frozen=True)
 class RefinementPriors:
     """How the refinement weighs edges and when it ends (``refinement.py``).
 
@@ -182,6 +207,7 @@ class RefinementPriors:
             series apart: it knows graphs in which many edges check each other. Orientations of the synthetic recipes,
             which have thousands, do not depend on it.
         shape: how the noise's shape is estimated.
+        density: which density the last steps go by.
     """
 
     max_steps: int = 30
@@ -204,3 +230,4 @@ class RefinementPriors:
     max_sample: int = 8_000
     half_trusted: float = 20.0
     shape: NoiseShapePriors = NoiseShapePriors()
+    density: DensityPriors = DensityPriors()

@@ -33,6 +33,8 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver.sfm.noise_density import NoiseDensity
+from rotavg_ros.solver.sfm.noise_shape import NoiseShape
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.solver.sfm.step import Measure, Problem, Structure, l1_weight, l_half_weight
 from rotavg_ros.solver.sfm.symmetric_rows import distinct_entries, turned
@@ -91,7 +93,19 @@ def refine(
     problem = Problem(graph, structure, priors)
     coarse_steps = min(priors.max_coarse_steps, max_steps - priors.least_shaped_steps)
     orientations, taken = _coarse(problem, body_from_world.double(), coarse_prior, coarse_steps)
-    return _shaped(problem, orientations, weights._replace(shaped=shaped_prior), max_steps - taken)
+    weights = weights._replace(shaped=shaped_prior)
+    settled = _shaped(problem, orientations, weights, max_steps - taken)
+    further = min(priors.density.max_steps, max_steps - taken - settled.steps)
+    return _by_density(problem, settled, weights, further) if further > 0 else settled.orientations
+
+
+class _Settled(NamedTuple):
+    """Where ℓ½ steps have led: orientations ``(N, 4)``, the noise there, variances ``(N,)``, how many steps it took."""
+
+    orientations: Tensor
+    noise: NoiseShape
+    variance: Tensor
+    steps: int
 
 
 def _coarse(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: int) -> tuple[Tensor, int]:
@@ -109,7 +123,7 @@ def _coarse(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: in
     return orientations, max(max_steps, 0)
 
 
-def _shaped(problem: Problem, orientations: Tensor, weights: EdgeWeights, max_steps: int) -> Tensor:
+def _shaped(problem: Problem, orientations: Tensor, weights: EdgeWeights, max_steps: int) -> _Settled:
     """ℓ½ steps that know the noise's shape and size, until they have converged."""
     priors, prior = problem.priors, weights.shaped
     noise = problem.round
@@ -118,7 +132,7 @@ def _shaped(problem: Problem, orientations: Tensor, weights: EdgeWeights, max_st
     dtype, step = torch.float32, None
     is_open = torch.ones_like(problem.roots, dtype=torch.bool)
     is_held = torch.zeros_like(is_open)
-    for _ in range(max_steps):
+    for number in range(max_steps):
         unit = None if weights.unit is None else _in_world(weights.unit, orientations, problem.graph.target)
         if step is not None and bool(is_held.all()):
             carried = problem.shapes.carried(noise, orientations)
@@ -139,6 +153,37 @@ def _shaped(problem: Problem, orientations: Tensor, weights: EdgeWeights, max_st
         is_held = is_held | ~(length >= priors.held)  # also where there is no noise, and no length
         is_open = is_open & (length >= priors.converged)
         is_open = is_open & (problem.largest(step.turn.norm(dim=0)) >= priors.converged_angle)
+        if not bool(is_open.any()):
+            max_steps = number + 1
+            break
+    return _Settled(orientations, problem.shapes.carried(noise, orientations), variance, max_steps)
+
+
+def _by_density(problem: Problem, settled: _Settled, weights: EdgeWeights, max_steps: int) -> Tensor:
+    """Steps by the density that makes residuals likeliest, in components where that is not the one of ℓ½."""
+    priors, prior = problem.priors, weights.shaped
+    orientations, noise, variance, _ = settled
+    density: NoiseDensity | None = None
+    is_open = torch.ones_like(problem.roots, dtype=torch.bool)
+    for _ in range(max_steps):
+        unit = None if weights.unit is None else _in_world(weights.unit, orientations, problem.graph.target)
+        sample = problem.sample(orientations, unit)
+        noise = problem.shapes.carried(noise, orientations)
+        measure = Measure(noise, variance, l_half_weight, torch.float64, unit=unit)
+        if density is None:
+            density = problem.density(sample, measure, prior)
+            is_open = density.is_other
+            if not bool(is_open.any()):
+                break
+        measure = measure._replace(weigh=density.weigh)
+        pooled = problem.pooled(orientations, measure, prior)
+        dispersion = problem.dispersion(sample, measure, pooled)
+        step = problem.step(orientations, measure, pooled, is_open)
+        of_other = (dispersion[problem.component] / step.weight).clamp(min=priors.least_square / 2)
+        variance = torch.where(density.is_other[problem.component], of_other, variance)
+        orientations = _turned(orientations, step.turn)
+        length = (step.decrement / (dispersion * problem.num_nodes)).sqrt()
+        is_open = is_open & (length >= priors.converged)
         if not bool(is_open.any()):
             break
     return orientations

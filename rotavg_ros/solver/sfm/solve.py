@@ -84,6 +84,8 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             coarse = 1 - cleaned.outlier_probability if stages.weighted else torch.ones_like(allowed)
             weights = EdgeWeights(allowed, allowed * coarse)
             priors = PRIORS if stages.shaped else ROUND
+            if not stages.density:
+                priors = replace(priors, density=replace(priors.density, max_steps=0))
             refinement = partial(refine, graph, max_steps=steps, structure=structure, priors=priors)
             orientations = refinement(orientations, weights=weights)
             if stages.clean and stages.weighted and _is_sparse(graph):

@@ -16,6 +16,7 @@ from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.running.threads import for_each, slices, stretches
 from rotavg_ros.solver.sfm.block_laplacian import Arrivals, BlockLaplacian, Laplacian, SplitWeights, factorised
 from rotavg_ros.solver.sfm.edge_laplacian import EdgeLaplacian, MatrixWeights
+from rotavg_ros.solver.sfm.noise_density import NoiseDensity
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape, ResidualSample, ShapeEstimator, share_of_first
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.solver.sfm.series import EdgesInSeries
@@ -65,7 +66,7 @@ class Measure(NamedTuple):
     Attributes:
         shape: of the noise.
         variance: ``(N,)`` of the nodes, in units of the shape; numerical floors apart.
-        weigh: expected squared residuals → robust weights.
+        weigh: expected squared residuals of edges, and which edges they are → robust weights.
         dtype: how exactly residuals and systems are computed.
         source_share: ``(M,)`` probability of each edge that its noise is in its source's frame; None: as residuals say.
         unit: ``(6, M)`` entries of T in the world's frame: residuals r count as T r (``stated/shape.py``), and the
@@ -74,7 +75,7 @@ class Measure(NamedTuple):
 
     shape: NoiseShape
     variance: Tensor
-    weigh: Callable[[Tensor], Tensor]
+    weigh: Callable[[Tensor, slice | Tensor], Tensor]
     dtype: torch.dtype
     source_share: Tensor | None = None
     unit: Tensor | None = None
@@ -226,17 +227,32 @@ class Problem:
         vector = measure.in_units(vector, series.edge)
         own = Expected.of(vector, *(rows.index_select(1, end) for end in (graph.source, graph.target)))
         together = series.sums(own.square)[series.group]
-        weights = (measure.weigh(square + own.variance) for square in (series.blame * together, own.square))
+        squares = (series.blame * together, own.square)
+        weights = (measure.weigh(square + own.variance, series.edge) for square in squares)
         pooled = prior.clone()
         pooled[series.edge] *= (next(weights) / next(weights)).to(prior)
         return pooled
 
-    def dispersion(self, sample: ResidualSample, measure: Measure, prior: Tensor) -> Tensor:
-        """φ of each component, ``(C,)``, as some residuals, in their units, have it."""
+    def density(self, sample: ResidualSample, measure: Measure, prior: Tensor) -> NoiseDensity:
+        """The density that makes some residuals, in their units, likeliest; edges that weigh nothing tell nothing."""
+        expected = self._expected(sample, measure)
+        square = (expected.square + expected.variance).double()
+        told = prior[self._chosen] > self.priors.density.least_prior
+        shape = measure.shape.information[:, :, self.roots].permute(2, 0, 1).double()
+        component = self.component[self.graph.source]
+        return NoiseDensity.fitted(
+            square[told], self._component_of_some[told], component, shape.logdet() / 2, self.priors.density
+        )
+
+    def _expected(self, sample: ResidualSample, measure: Measure) -> Expected:
         rows = measure.rows(torch.float64)
         ends = (rows.index_select(1, end) for end in (sample.source, sample.target))
-        expected = Expected.of(sample.vector, *ends)
-        weight = measure.weigh(expected.square + expected.variance) * prior[self._chosen]
+        return Expected.of(sample.vector, *ends)
+
+    def dispersion(self, sample: ResidualSample, measure: Measure, prior: Tensor) -> Tensor:
+        """φ of each component, ``(C,)``, as some residuals, in their units, have it."""
+        expected = self._expected(sample, measure)
+        weight = measure.weigh(expected.square + expected.variance, self._chosen) * prior[self._chosen]
         return self._sum_of_some(weight * weight * expected.square) / self._sum_of_some(weight)
 
     def _sum_of_some(self, value: Tensor) -> Tensor:
@@ -287,7 +303,7 @@ class Problem:
                 at_source, at_target = rows.index_select(1, source), rows.index_select(1, target)
                 vector = measure.in_units(residuals.vectors(edges), edges)
                 expected = Expected.of(vector, at_source, at_target, None if held is None else held[edges])
-                robust = measure.weigh(expected.square + expected.variance).mul_(prior[edges])
+                robust = measure.weigh(expected.square + expected.variance, edges).mul_(prior[edges])
                 weights.total[edges] = robust
                 if held is None:
                     weights.source_share[edges] = expected.source_share
@@ -303,12 +319,12 @@ class Problem:
         return Pull(weights, matrix, torch.stack(forces).sum(dim=0))
 
 
-def l1_weight(squared_residual: Tensor) -> Tensor:
+def l1_weight(squared_residual: Tensor, _: slice | Tensor) -> Tensor:
     """Weight of the ℓ1 cost, of squared residuals s = |r|²: s^(−1/2) = |r|⁻¹."""
     return squared_residual.rsqrt()
 
 
-def l_half_weight(squared_residual: Tensor) -> Tensor:
+def l_half_weight(squared_residual: Tensor, _: slice | Tensor) -> Tensor:
     """Weight of the ℓ½ cost, of squared residuals s = |r|²: s^(−3/4) = |r|^(−3/2).
 
     Two roots take a fifth of the time of a power.

@@ -227,7 +227,7 @@ def test_all_methods_that_photos_have_are_tried() -> None:
     ablations = {
         f"neurora-{name}"
         for name in (
-            *("unweighted", "equal-precisions", "scalar-precisions", "without-consensus"),
+            *("unweighted", "half-norm", "equal-precisions", "scalar-precisions", "without-consensus"),
             *("without-finenet", "without-cleannet", "without-both", "without-cycles"),
         )
     }

@@ -1,0 +1,108 @@
+"""How long the noise's tails are: which cost the last steps lower.
+
+The cost |r|^½ is that of noise of density exp(−(r/s)^½), dense near nothing and with long tails, as real measurements
+and the recipes' have it. Normal noise about three axes has exp(−(r/s)²), and loses a fifth of its accuracy by |r|^½. So
+of each component that density is taken which makes its residuals likeliest, false edges having any rotation:
+
+    p(r) = π c_β s⁻³ exp(−(r/s)^β) + (1 − π) / (8 π²),     β of ½, ¾, 1, 1½, 2,     c_β = β / (4π Γ(3/β)).
+
+An edge then weighs w = P(good | r) β r^(β−2) / s^β: with that, least squares step towards the maximum (expectation and
+maximisation). With β = ½, unless another is clearly likelier, all stays as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rotavg_ros.solver.sfm.priors import DensityPriors
+
+# Squared residuals are at least this, in units of the noise's shape, numerical.
+_LEAST_SQUARE = 1e-12
+# An edge that is surely false keeps its ends attached, by this share of what one at the scale weighs.
+_LEAST_WEIGHT = 1e-6
+
+
+@dataclass(frozen=True)
+class NoiseDensity:
+    """Of the noise of C components, in units of its shape.
+
+    Attributes:
+        is_other: ``(C,)`` bool, whether β is not ½.
+        exponent, scale: ``(C,)`` β and s.
+        log_odds: ``(C,)`` of an edge to be good, and less the logarithm of the even density: what P(good | r) begins
+            with.
+        component: ``(M,)`` of every edge.
+    """
+
+    is_other: Tensor
+    exponent: Tensor
+    scale: Tensor
+    log_odds: Tensor
+    component: Tensor
+
+    @classmethod
+    def fitted(
+        cls, square: Tensor, of_some: Tensor, component: Tensor, log_volume: Tensor, priors: DensityPriors
+    ) -> NoiseDensity:
+        """The likeliest.
+
+        Args:
+            square: ``(K,)`` float64, expected squared residuals of some edges, in units of the noise's shape.
+            of_some: ``(K,)`` their components.
+            component: ``(M,)`` of all edges.
+            log_volume: ``(C,)`` logarithm of what the shape makes of a volume.
+        """
+        count = len(log_volume)
+        exponent = square.new_tensor(priors.exponents)[:, None]
+        length = square.clamp(min=_LEAST_SQUARE).sqrt()
+
+        def sums(value: Tensor) -> Tensor:
+            """``(B, C)`` of ``(B, K)``."""
+            return value.new_zeros(len(value), count).index_add_(1, of_some, value)
+
+        number = sums(torch.ones_like(length)[None]).clamp(min=1)
+        power = length**exponent
+        log_scale = (sums(length.log()[None]) / number).repeat(len(exponent), 1)
+        good = torch.full_like(log_scale, priors.good_share)
+        likelihood = torch.zeros_like(log_scale)
+        even = _log_even_density(log_volume)
+        for _ in range(priors.rounds):
+            density = (_log_constant(exponent) - 3 * log_scale)[:, of_some]
+            density = density - power * torch.exp(-exponent * log_scale)[:, of_some]
+            of_good, of_false = good.log()[:, of_some] + density, ((1 - good).log() + even)[:, of_some]
+            each = torch.logaddexp(of_good, of_false)
+            likelihood, share = sums(each), torch.exp(of_good - each)
+            known = sums(share)
+            log_scale = ((exponent * sums(share * power) / (3 * known).clamp(min=_LEAST_SQUARE)).log()) / exponent
+            log_scale = log_scale.clamp(min=math.log(_LEAST_SQUARE) / 2)
+            good = (known / number).clamp(1 / priors.most_certain, 1 - 1 / priors.most_certain)
+        likeliest = likelihood.max(dim=0)
+        is_other = likeliest.values > likelihood[0] + priors.ahead
+        which = torch.where(is_other, likeliest.indices, 0)[None]
+        chosen = [of_all.gather(0, which)[0] for of_all in (log_scale.exp(), good)]
+        return cls(is_other, exponent[which[0], 0], chosen[0], chosen[1].logit() - even, component)
+
+    def weigh(self, square: Tensor, edges: slice | Tensor) -> Tensor:
+        """Weights of some edges, of their expected squared residuals."""
+        of = self.component[edges]
+        square = square.clamp(min=_LEAST_SQUARE)
+        exponent, scale, log_odds = (value.to(square)[of] for value in (self.exponent, self.scale, self.log_odds))
+        relative = square / scale**2
+        power = torch.exp(exponent / 2 * relative.log())
+        constant = (_log_constant(self.exponent) - 3 * self.scale.log()).to(square)[of]
+        good = torch.sigmoid(log_odds + constant - power)
+        return (good * exponent * power / relative + _LEAST_WEIGHT) / scale**2
+
+
+def _log_constant(exponent: Tensor) -> Tensor:
+    """Logarithm of c_β."""
+    return exponent.log() - math.log(4 * math.pi) - torch.lgamma(3 / exponent)
+
+
+def _log_even_density(log_volume: Tensor) -> Tensor:
+    """Of rotations that may be any, near none: farther off they are up to 2.5 times less dense, of no matter here."""
+    return -math.log(8 * math.pi**2) - log_volume
