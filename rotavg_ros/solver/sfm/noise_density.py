@@ -62,24 +62,31 @@ class NoiseDensity:
 
         def sums(value: Tensor) -> Tensor:
             """``(B, C)`` of ``(B, K)``."""
+            if count == 1:
+                return value.sum(dim=1, keepdim=True)
             return value.new_zeros(len(value), count).index_add_(1, of_some, value)
 
+        def of_each(value: Tensor) -> Tensor:
+            """``(B, K)`` of ``(B, C)``."""
+            return value if count == 1 else value[:, of_some]
+
         number = sums(torch.ones_like(length)[None]).clamp(min=1)
-        power = length**exponent
+        power, even = length**exponent, _log_even_density(log_volume)
         log_scale = (sums(length.log()[None]) / number).repeat(len(exponent), 1)
         good = torch.full_like(log_scale, priors.good_share)
-        likelihood = torch.zeros_like(log_scale)
-        even = _log_even_density(log_volume)
-        for _ in range(priors.rounds):
-            density = (_log_constant(exponent) - 3 * log_scale)[:, of_some]
-            density = density - power * torch.exp(-exponent * log_scale)[:, of_some]
-            of_good, of_false = good.log()[:, of_some] + density, ((1 - good).log() + even)[:, of_some]
-            each = torch.logaddexp(of_good, of_false)
-            likelihood, share = sums(each), torch.exp(of_good - each)
-            known = sums(share)
-            log_scale = ((exponent * sums(share * power) / (3 * known).clamp(min=_LEAST_SQUARE)).log()) / exponent
-            log_scale = log_scale.clamp(min=math.log(_LEAST_SQUARE) / 2)
-            good = (known / number).clamp(1 / priors.most_certain, 1 - 1 / priors.most_certain)
+        # Log-odds of each edge to be good.
+        log_odds = torch.zeros_like(power)
+        for number_of_round in range(priors.rounds + 1):
+            if number_of_round > 0:
+                share = torch.sigmoid(log_odds)
+                known = sums(share)
+                scale_power = exponent * sums(share * power) / (3 * known).clamp(min=_LEAST_SQUARE)
+                log_scale = (scale_power.log() / exponent).clamp(min=math.log(_LEAST_SQUARE) / 2)
+                good = (known / number).clamp(1 / priors.most_certain, 1 - 1 / priors.most_certain)
+            beginning = good.logit() + _log_constant(exponent) - 3 * log_scale - even
+            log_odds = torch.addcmul(of_each(beginning), power, of_each(torch.exp(-exponent * log_scale)), value=-1)
+        # log(π p + (1 − π) even) is that of the second term and what the first one adds to it.
+        likelihood = sums(torch.nn.functional.softplus(log_odds)) + number * ((1 - good).log() + even)
         likeliest = likelihood.max(dim=0)
         is_other = likeliest.values > likelihood[0] + priors.ahead
         which = torch.where(is_other, likeliest.indices, 0)[None]
