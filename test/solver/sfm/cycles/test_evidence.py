@@ -111,7 +111,7 @@ def test_cleannet_has_the_word_on_what_it_was_trained_on(recipe: ReleasedRecipe 
         assert torch.equal(checked.cleaned.outlier_probability, cleaned.outlier_probability)
 
 
-def test_labels_stand_and_tell_of_other_edges() -> None:
+def test_labels_stand() -> None:
     graph, _, is_false = nearby(0, 60, 4, 0.3)
     edge = int(np.flatnonzero(~is_false)[7])
     for label, said in ((EdgeLabel.REJECTED, 1.0), (EdgeLabel.ACCEPTED, 0.0)):
