@@ -183,6 +183,9 @@ class RefinementPriors:
     Attributes:
         max_steps: bound on all steps; the tuning graphs take 5–20, some scans more.
         max_coarse_steps: bound on the coarse ones; 1–4 are usual.
+        telling_steps: shaped ones after which starts are compared. With none, the better start is told by the coarse
+            steps, a quarter faster and 1 % worse; with twice as many, 1 % better and a fifth slower
+            (``docs/diary/sfm-refinement.md``).
         least_shaped_steps: of few steps that a user allows, so many at least are shaped.
         coarse_smoothing: radians: shorter residuals weigh as this one in coarse steps (Chatterjee & Govindu 2013).
         coarse_settled: coarse steps end once they turn cameras by less than this share of the typical residual.
@@ -213,6 +216,7 @@ class RefinementPriors:
 
     max_steps: int = 30
     max_coarse_steps: int = 8
+    telling_steps: int = 3
     least_shaped_steps: int = 3
     coarse_smoothing: float = float(np.radians(1.0))
     coarse_settled: float = 0.2

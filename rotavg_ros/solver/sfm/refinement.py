@@ -26,6 +26,7 @@ of world and cameras nor on the noise's size.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -33,6 +34,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.sfm.noise_density import NoiseDensity
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape
 from rotavg_ros.solver.sfm.priors import RefinementPriors
@@ -41,6 +43,8 @@ from rotavg_ros.solver.sfm.symmetric_rows import distinct_entries, turned
 from rotavg_ros.view_graph import ViewGraph
 
 PRIORS = RefinementPriors()
+# Answers whose costs are as near as this, of the cost, lie in one valley but for where refinements stop.
+_SAME_VALLEY = 5e-3
 # What the noise's shape earns: no axis is more exact than another.
 ROUND = replace(PRIORS, shape=replace(PRIORS.shape, least_ratio=1.0))
 
@@ -64,21 +68,36 @@ class EdgeWeights(NamedTuple):
         return self._replace(shaped=self.shaped * shaped, coarse=self.coarse * coarse)
 
 
+class Start(NamedTuple):
+    """Where a refinement may begin.
+
+    Attributes:
+        body_from_world: ``(N, 4)``.
+        coarse: ``(M,)`` positive, multiplied to the robust weights in coarse steps from there, beside those of
+            :class:`EdgeWeights`.
+    """
+
+    body_from_world: Tensor
+    coarse: Tensor
+
+
 def refine(
     graph: ViewGraph,
     body_from_world: Tensor,
-    max_steps: int = PRIORS.max_steps,
     *,
     structure: Structure | None = None,
     weights: EdgeWeights | None = None,
     priors: RefinementPriors = PRIORS,
+    others: Sequence[Start] = (),
 ) -> Tensor:
-    """Reweighted least-squares steps until they have converged, at most ``max_steps``; every component by itself.
+    """Reweighted least-squares steps until they have converged, at most ``max_steps``; each component by itself.
 
     Args:
         body_from_world: ``(N, 4)`` start.
         structure: default: computed.
         weights: default: ones, and no units.
+        others: of each component that start goes on which the cost of a few shaped steps speaks for; those are not
+            counted among all steps.
 
     Returns:
         ``(N, 4)`` float64 orientations.
@@ -91,9 +110,18 @@ def refine(
         weight.float().clamp(min=priors.least_prior) for weight in (weights.shaped, weights.coarse)
     )
     problem = Problem(graph, structure, priors)
+    max_steps = priors.max_steps
     coarse_steps = min(priors.max_coarse_steps, max_steps - priors.least_shaped_steps)
-    orientations, taken = _coarse(problem, body_from_world.double(), coarse_prior, coarse_steps)
     weights = weights._replace(shaped=shaped_prior)
+    orientations, taken = _coarse(problem, body_from_world.double(), coarse_prior, coarse_steps)
+    if others:
+        few = min(priors.telling_steps, max_steps - taken)
+        orientations = _shaped(problem, orientations, weights, few).orientations
+        for other in others:
+            prior = (weights.shaped * other.coarse).float().clamp(min=priors.least_prior)
+            another, steps = _coarse(problem, other.body_from_world.double(), prior, coarse_steps)
+            another = _shaped(problem, another, weights, few).orientations
+            orientations, taken = _likelier(problem, shaped_prior, orientations, another), max(taken, steps)
     settled = _shaped(problem, orientations, weights, max_steps - taken)
     further = min(priors.density.max_steps, max_steps - taken - settled.steps)
     return _by_density(problem, settled, weights, further) if further > 0 else settled.orientations
@@ -121,6 +149,15 @@ def _coarse(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: in
         if not bool(is_open.any()):
             return orientations, number + 1
     return orientations, max(max_steps, 0)
+
+
+def _likelier(problem: Problem, weight: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    """``(N, 4)``: of each component ``one``, or ``other`` where Σ w ‖r‖^½, as shaped steps count, is clearly lower."""
+    of_edge, costs = problem.component[problem.graph.source], []
+    for orientations in (one, other):
+        angle = EdgeResiduals(problem.graph, orientations.float()).angles().double()
+        costs.append(angle.new_zeros(len(problem.roots)).index_add(0, of_edge, weight * angle.sqrt()))
+    return torch.where((costs[1] < (1 - _SAME_VALLEY) * costs[0])[problem.component, None], other, one)
 
 
 def _shaped(problem: Problem, orientations: Tensor, weights: EdgeWeights, max_steps: int) -> _Settled:

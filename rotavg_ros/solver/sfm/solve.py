@@ -21,19 +21,16 @@ from rotavg_ros.solver.neurora.stages import apply_labels, clean, fine_tune, tru
 from rotavg_ros.solver.neurora.tiled.tuning import tune
 from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap, breadth_first
 from rotavg_ros.solver.sfm.consensus.search import CONSENSUS, consensus
-from rotavg_ros.solver.sfm.cycles.evidence import by_triangles, with_triangles
+from rotavg_ros.solver.sfm.cycles.evidence import with_triangles
 from rotavg_ros.solver.sfm.options import SfmStages
 from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
 from rotavg_ros.solver.sfm.series import EdgesInSeries
+from rotavg_ros.solver.sfm.starts.sparse import is_sparse, other_starts
 from rotavg_ros.solver.sfm.stated.noise import StatedNoise
 from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.solver.sfm.uncertainty import References, variances
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-# Of cameras with fewer edges, in the mean, other starts cost little, and few edges check each other.
-_SPARSE_DEGREE = 20
-# Answers whose costs are as near as this, of the cost, lie in one valley but for where refinements stop.
-_SAME_VALLEY = 5e-3
 # A graph of more edges is worth measuring what tiles this machine likes.
 _TUNING_PAYS = 200_000
 
@@ -86,16 +83,12 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             priors = PRIORS if stages.shaped else ROUND
             if not stages.density:
                 priors = replace(priors, density=replace(priors.density, max_steps=0))
-            refinement = partial(refine, graph, max_steps=steps, structure=structure, priors=priors)
-            orientations = refinement(orientations, weights=weights)
-            if stages.clean and stages.weighted and _is_sparse(graph):
-                verdicts = [apply_labels(trust_all(graph), graph.label)]
-                if is_believed:
-                    verdicts.append(by_triangles(judged, component))
-                for verdict in verdicts:
-                    believed = EdgeWeights(allowed, allowed * (1 - verdict.outlier_probability))
-                    refined = refinement(bootstrap(verdict, component).body_from_world, weights=believed)
-                    orientations = _likelier(graph, References(component, begun.roots), allowed, orientations, refined)
+            priors = replace(priors, max_steps=steps)
+            refinement = partial(refine, graph, structure=structure, priors=priors)
+            others = []
+            if stages.clean and stages.weighted and is_sparse(graph):
+                others = other_starts(judged, is_believed, orientations, component)
+            orientations = refinement(orientations, weights=weights, others=others)
             if stages.stated:
                 noise = StatedNoise.of(graph, structure, priors, stages.stated_shapes)
                 orientations, weights = noise.refined(orientations, weights, refinement)
@@ -125,20 +118,6 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
             variance = variance if stated is None else form.of_nodes(stated)
     score = score.index_select(0, form.edge)
     return Estimate(form.orientations(orientations), score, variance, warnings=warnings)
-
-
-def _is_sparse(graph: ViewGraph) -> bool:
-    """Whether so few edges check each other that CleanNet may lead into another valley."""
-    return 2 * graph.num_edges < _SPARSE_DEGREE * graph.num_nodes
-
-
-def _likelier(graph: ViewGraph, to: References, weight: Tensor, one: Tensor, other: Tensor) -> Tensor:
-    """``(N, 4)``: of each component ``one``, or ``other`` where Σ w ‖r‖^½, as shaped steps count, is clearly lower."""
-    of_edge, costs = to.component[graph.source], []
-    for orientations in (one, other):
-        angle = EdgeResiduals(graph, orientations.float()).angles().double()
-        costs.append(weight.new_zeros(len(to.node)).index_add(0, of_edge, weight * angle.sqrt()))
-    return torch.where((costs[1] < (1 - _SAME_VALLEY) * costs[0])[to.component, None], other, one)
 
 
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:

@@ -14,8 +14,8 @@ from rotavg_ros.solver.algebra.relaxed_forest import relaxed_forest
 from rotavg_ros.solver.algebra.residuals import SLICE_EDGES, EdgeResiduals, measured_rows
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.running.threads import for_each, slices, stretches
-from rotavg_ros.solver.sfm.block_laplacian import Arrivals, BlockLaplacian, Laplacian, SplitWeights, factorised
-from rotavg_ros.solver.sfm.edge_laplacian import EdgeLaplacian, MatrixWeights
+from rotavg_ros.solver.sfm.laplacians.block import Arrivals, BlockLaplacian, Laplacian, SplitWeights, factorised
+from rotavg_ros.solver.sfm.laplacians.edge import EdgeLaplacian, MatrixWeights
 from rotavg_ros.solver.sfm.noise_density import NoiseDensity
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape, ResidualSample, ShapeEstimator, share_of_first
 from rotavg_ros.solver.sfm.priors import RefinementPriors

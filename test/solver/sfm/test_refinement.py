@@ -14,7 +14,7 @@ from rotavg_ros.datasets.simulation.synthetic import PaperRecipe
 from rotavg_ros.metrics.orientations import orientation_errors
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.sfm import refinement
-from rotavg_ros.solver.sfm.block_laplacian import Arrivals, BlockLaplacian, SplitWeights, factorised
+from rotavg_ros.solver.sfm.laplacians.block import Arrivals, BlockLaplacian, SplitWeights, factorised
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape, scatter
 from rotavg_ros.view_graph import EdgeLabel
 from test.solver.graphs import as_quaternions, measured, random_truth
@@ -185,6 +185,10 @@ def _root_mean_square_deg(angles: torch.Tensor) -> float:
     return float(torch.rad2deg(angles).square().mean().sqrt())
 
 
+def steps(most: int) -> refinement.RefinementPriors:
+    return replace(refinement.PRIORS, max_steps=most)
+
+
 def _disturbed(truth: torch.Tensor, sd_deg: float, seed: int) -> torch.Tensor:
     noise = np.radians(sd_deg) * np.random.default_rng(seed).standard_normal((len(truth), 3))
     return rotations.multiply(truth, rotations.exp(torch.from_numpy(noise)))
@@ -196,19 +200,19 @@ def test_what_lies_ahead_of_the_last_step_is_little(seed: int) -> None:
     graph, truth = _scan(seed)
     start = _disturbed(truth, 5, seed)
     refined = refinement.refine(graph, start)
-    tight = replace(refinement.PRIORS, converged=1e-3, converged_angle=1e-9)
-    limit = refinement.refine(graph, start, 300, priors=tight)
+    tight = replace(refinement.PRIORS, max_steps=300, converged=1e-3, converged_angle=1e-9)
+    limit = refinement.refine(graph, start, priors=tight)
     error = orientation_errors(limit, truth).median()
     assert float(orientation_errors(refined, limit).median()) < 0.1 * float(error)
-    too_early = refinement.refine(graph, start, 4)  # three shaped steps, as many as there used to be
+    too_early = refinement.refine(graph, start, priors=steps(4))  # three shaped steps, as many as there used to be
     assert float(orientation_errors(too_early, limit).median()) > 0.2 * float(error)
 
 
 def test_steps_are_bounded_and_more_than_needed_are_not_taken() -> None:
     graph, truth = _scan(13)
     start = _disturbed(truth, 5, 13)
-    assert torch.equal(refinement.refine(graph, start, 0), start)
-    answers = [refinement.refine(graph, start, steps) for steps in (1, 2, 3, 60, 120)]
+    assert torch.equal(refinement.refine(graph, start, priors=steps(0)), start)
+    answers = [refinement.refine(graph, start, priors=steps(most)) for most in (1, 2, 3, 60, 120)]
     for number in range(3):
         assert float(rotations.angle_between(answers[number], answers[number + 1]).max()) > 1e-4
     assert torch.equal(answers[3], answers[4])

@@ -9,8 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from rotavg_ros import ViewGraph, solve
 from rotavg_ros.metrics import orientation_errors
-from rotavg_ros.solver.sfm.solve import _is_sparse, _likelier
-from rotavg_ros.solver.sfm.uncertainty import References
+from rotavg_ros.solver.neurora.stages import trust_all
+from rotavg_ros.solver.neurora.tree import bootstrap
+from rotavg_ros.solver.sfm.refinement import Start, refine
+from rotavg_ros.solver.sfm.starts.sparse import is_sparse
+from rotavg_ros.solver.sfm.starts.spectral import spectral
 from test.solver.graphs import as_quaternions, measured, random_truth
 
 
@@ -44,22 +47,72 @@ def test_it_is_no_worse_than_without_cleannet(cameras: int, reach: int, false_sh
     assert ours.max() < 2 * without.max()
 
 
-def test_each_component_has_the_better_of_two() -> None:
-    graph, truth = ring(0, 20, 3, 0.0)
+def test_which_graphs_are_sparse() -> None:
+    graph, truth = ring(0, 40, 3, 0.0)
+    assert is_sparse(graph)
+    pairs = torch.combinations(torch.arange(40))
+    assert not is_sparse(ViewGraph.create(pairs[:, 0], pairs[:, 1], as_quaternions(truth)[:1].repeat(len(pairs), 1)))
+
+
+def anyhow(seed: int, cameras: int, degree: int, false_share: float) -> tuple[ViewGraph, Rotation]:
+    """Pairs of cameras drawn by chance, noise of 2°."""
+    rng = np.random.default_rng(seed)
+    pairs = np.array([(i, j) for i in range(cameras) for j in range(i + 1, cameras)])
+    path = np.stack((np.arange(cameras - 1), np.arange(1, cameras)), axis=1)
+    drawn = pairs[rng.choice(len(pairs), cameras * degree // 2, replace=False)]
+    source, target = np.unique(np.concatenate((path, drawn)), axis=0).T
+    noise = Rotation.from_rotvec(np.radians(2.0) * rng.normal(size=(len(source), 3))).as_quat()
+    is_false = rng.random(len(source)) < false_share
+    noise = Rotation.from_quat(np.where(is_false[:, None], Rotation.random(len(source), rng).as_quat(), noise))
+    truth = random_truth(cameras, seed)
+    return measured(truth, source, target, noise), truth
+
+
+def test_each_component_goes_on_from_the_better_start() -> None:
+    graph, truth = anyhow(0, 100, 11, 0.5)
     both = ViewGraph.create(
-        torch.cat((graph.source, graph.source + 20)),
-        torch.cat((graph.target, graph.target + 20)),
+        torch.cat((graph.source, graph.source + 100)),
+        torch.cat((graph.target, graph.target + 100)),
         graph.target_from_source.repeat(2, 1),
     )
-    exact, wrong = as_quaternions(truth), as_quaternions(random_truth(20, 5))
-    weight = torch.ones(both.num_edges, dtype=torch.float64)
-    component = torch.arange(40) // 20
+    exact, wrong = as_quaternions(truth), as_quaternions(random_truth(100, 5))
+    ones = torch.ones(both.num_edges, dtype=torch.float64)
     one, other = torch.cat((exact, wrong)), torch.cat((wrong, exact))
-    chosen = _likelier(both, References(component, torch.tensor([0, 20])), weight, one, other)
-    torch.testing.assert_close(chosen, torch.cat((exact, exact)))
-    assert _is_sparse(both)
-    pairs = torch.combinations(torch.arange(40))
-    assert not _is_sparse(ViewGraph.create(pairs[:, 0], pairs[:, 1], exact[:1].repeat(len(pairs), 1)))
+
+    def errors_deg(orientations: torch.Tensor) -> list[float]:
+        return [float(torch.rad2deg(orientation_errors(part, exact)).mean()) for part in orientations.split(100)]
+
+    best = max(errors_deg(refine(both, torch.cat((exact, exact)))))
+    assert max(errors_deg(refine(both, one))) > 10 * best
+    for first, second in ((one, other), (other, one)):
+        assert max(errors_deg(refine(both, first, others=[Start(second, ones)]))) < 1.1 * best
+
+
+def test_eigenvectors_know_exact_orientations_whatever_they_begin_with() -> None:
+    """Of two components; beginning nearly anywhere, each in a gauge of its own."""
+    graph, truth = anyhow(1, 60, 14, 0.0)
+    both = ViewGraph.create(
+        torch.cat((graph.source, graph.source + 60)),
+        torch.cat((graph.target, graph.target + 60)),
+        graph.target_from_source.repeat(2, 1),
+    )
+    start = as_quaternions(random_truth(120, 9))
+    found = spectral(both, start, both.components(), torch.ones(both.num_edges, dtype=torch.float64))
+    for part in found.split(60):
+        assert float(torch.rad2deg(orientation_errors(part, as_quaternions(truth))).mean()) < 2.0
+
+
+def test_eigenvectors_are_nearer_than_a_tree_where_cameras_are_few_edges_apart() -> None:
+    """Half of the edges are false: a tree has some of them, eigenvectors their mean."""
+    by_tree, by_eigenvectors = [], []
+    for seed in range(6):
+        graph, truth = anyhow(seed, 200, 14, 0.5)
+        component, exact = graph.components(), as_quaternions(truth)
+        tree = bootstrap(trust_all(graph), component).body_from_world
+        found = spectral(graph, tree, component, torch.ones(graph.num_edges, dtype=torch.float64))
+        for errors, start in ((by_tree, tree), (by_eigenvectors, found)):
+            errors.append(float(torch.rad2deg(orientation_errors(start, exact)).mean()))
+    assert np.mean(by_eigenvectors) < np.mean(by_tree) / 2
 
 
 def test_a_bridge_is_as_certain_as_the_edges_that_others_check() -> None:

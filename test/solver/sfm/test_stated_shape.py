@@ -17,8 +17,8 @@ from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
 from rotavg_ros.solver.algebra.sorted_edges import SortedEdges
 from rotavg_ros.solver.batch import solve_batch
-from rotavg_ros.solver.sfm.block_laplacian import Arrivals, factorised
-from rotavg_ros.solver.sfm.edge_laplacian import EdgeLaplacian, MatrixWeights
+from rotavg_ros.solver.sfm.laplacians.block import Arrivals, factorised
+from rotavg_ros.solver.sfm.laplacians.edge import EdgeLaplacian, MatrixWeights
 from rotavg_ros.solver.sfm.priors import NoiseShapePriors
 from rotavg_ros.solver.sfm.stated.shape import FramedResiduals, believed_units
 from rotavg_ros.solver.sfm.symmetric_rows import distinct_entries

@@ -2,7 +2,7 @@
 
 Residuals are rotations of the world frame. Where noise has the same variance about every axis, an edge's weight is a
 scalar, and the three components of a correction share one scalar Laplacian ``L = Bᵀ W B``, grounded at the roots (one
-per connected component). SfM's shaped steps weigh edges by 3 × 3 matrices: ``sfm/block_laplacian.py``.
+per connected component). SfM's shaped steps weigh edges by 3 × 3 matrices: ``sfm/laplacians/block.py``.
 
 A solve factorises the same pattern with ever new weights, so what depends on the pattern alone is done once: the order
 of elimination, where each weight goes, and Bᵀ.

@@ -1,7 +1,7 @@
 """Laplacian systems in which every edge has a 3 × 3 weight of its own.
 
 Edges that state about which axes they are exact have such weights W, and no matrices of their ends stand for them as
-in :mod:`rotavg_ros.solver.sfm.block_laplacian`. A product takes six products with sparse matrices of scalars, one for
+in :mod:`rotavg_ros.solver.sfm.laplacians.block`. A product takes six products with sparse matrices of scalars, one for
 each entry of W:
 
     (L x)_v = D_v x_v − Σ_u W_uv x_u,     D_v = Σ_u W_uv
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rotavg_ros.solver.sfm.block_laplacian import Arrivals, Laplacian, arriving
+from rotavg_ros.solver.sfm.laplacians.block import Arrivals, Laplacian, arriving
 from rotavg_ros.solver.sfm.symmetric_rows import ENTRIES, full
 
 

@@ -1,0 +1,1 @@
+"""Where refinements of view-graphs begin in which few edges check each other."""
