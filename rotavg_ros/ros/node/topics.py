@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from copy import copy
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -55,8 +56,10 @@ def user_error_about(topic: str) -> Iterator[None]:
 def publisher(node: Node, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
     """A publisher whose quality of service the user may override.
 
+    rclpy writes an override into the profile that it is given, so it gets one of its own.
+
     Raises:
         UserError: the topic's name or its ``qos_overrides`` cannot be.
     """
     with user_error_about(topic):
-        return node.create_publisher(message_type, topic, qos, qos_overriding_options=overrides())
+        return node.create_publisher(message_type, topic, copy(qos), qos_overriding_options=overrides())

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
@@ -42,7 +43,7 @@ class Input:
         type_name: of its messages, ``package/msg/Type``.
         parameter: the parameter that names it, ``odometry_topics`` or ``edge_topics``.
         robot: whose odometry it is; empty for edges.
-        qos: what is asked for.
+        qos: what is asked for. A copy, for rclpy writes what the user overrides into it.
         frames: of the messages so far: of odometry header.frame_id and that of the body, of edges that of the sensor.
         forward: where its believed closures go; None if nowhere.
         placement: of edges: how their sensors sit, by robot and frame.
@@ -58,6 +59,9 @@ class Input:
     forward: Forward | None = None
     placement: dict[tuple[str, str], Placement] = field(default_factory=dict)
     published: float = field(default_factory=time.monotonic)
+
+    def __post_init__(self) -> None:
+        self.qos = copy(self.qos)
 
     @property
     def is_odometry(self) -> bool:
