@@ -78,8 +78,9 @@ class EdgeFrames:
         return len(self._waiting)
 
     def note_transforms(self, message: Any) -> None:
-        """Remember how frames sit in each other, see :meth:`SensorFrames.take`."""
+        """Remember how frames sit in each other, see :meth:`SensorFrames.take`, and look what has waited for it."""
         self._sensors.take(message)
+        self._look()
 
     def note_body(self, robot: str, frame: str, body_from_frame: Quaternion) -> None:
         """Remember in which frame a robot's odometry moves, see :meth:`SensorFrames.note_body`."""
@@ -101,7 +102,8 @@ class EdgeFrames:
         self._waiting.append(waiting)
         if len(self._waiting) > _MOST_WAITING:
             self._give_up(self._waiting.popleft())
-        self._timer.reset()
+        if self._timer.is_canceled():  # set anew for each edge it would never be due while edges flow
+            self._timer.reset()
 
     def forget(self) -> None:
         """Drop the edges that wait."""

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
+rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Quaternion
 from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
 from rotavg_msgs.msg import KeyframeReference, RelativeRotation
-from std_msgs.msg import Header
+from std_msgs.msg import Empty, Header
+
+from rotavg_ros.inputs import EdgeRecord
+from rotavg_ros.online import EdgeMeasurement
+from rotavg_ros.online import KeyframeReference as Reference
+from rotavg_ros.ros.node.intake import edge_frames
+from rotavg_ros.ros.node.intake.wiring import Input
 
 pytestmark = pytest.mark.ros
 
@@ -157,3 +167,57 @@ def test_an_orientation_that_was_given_wins(foreign_packages, live_node, start_p
     # The camera's place is not told, and its lever bends the path a little.
     assert all(residuals(live_node, number)[0] < 1e-2 for number in range(4))
     assert live_node.status["waiting for frames"] == "0"
+
+
+class Intake:
+    """Edges of a camera, without DDS."""
+
+    def __init__(self, executor: SingleThreadedExecutor, wait_s: float) -> None:
+        self.executor, self.handed_on = executor, []
+        node = executor.get_nodes()[0]
+        self.frames = edge_frames.EdgeFrames(node, wait_s, lambda record, _: self.handed_on.append(record))
+        self.frames.note_body("r", "base_link", (0.0, 0.0, 0.0, 1.0))
+        self._topic = Input("/edges", "any", "edge_topics", "", QoSProfile(depth=1))
+
+    def take(self, number: int) -> None:
+        edge = EdgeMeasurement(number, Reference("r", number), Reference("r", number + 1), (0.0, 0.0, 0.0, 1.0))
+        self.frames.take(EdgeRecord(edge, frame_id="camera"), self._topic)
+
+
+@pytest.fixture
+def executor(monkeypatch: pytest.MonkeyPatch) -> Iterator[SingleThreadedExecutor]:
+    """Of a node that listens to transforms, which nobody sends."""
+    monkeypatch.setattr(edge_frames, "_tf_message", lambda: Empty)
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(rclpy.create_node("frames", context=context))
+    yield executor
+    for node in executor.get_nodes():
+        node.destroy_node()
+    executor.shutdown()
+    rclpy.shutdown(context=context)
+
+
+def test_edges_that_flow_do_not_keep_the_first_waiting(executor: SingleThreadedExecutor) -> None:
+    intake = Intake(executor, wait_s=0.0)
+    for number in range(1000):
+        intake.take(number)
+        executor.spin_once(timeout_sec=0.01)
+        if intake.handed_on:
+            break
+    assert intake.handed_on[0].edge.edge_id == 0
+
+
+def test_a_transform_is_the_moment_to_look(executor: SingleThreadedExecutor) -> None:
+    intake = Intake(executor, wait_s=1000.0)
+    intake.take(0)
+    placed = SimpleNamespace(
+        header=SimpleNamespace(frame_id="base_link"),
+        child_frame_id="camera",
+        transform=SimpleNamespace(
+            rotation=SimpleNamespace(x=0.0, y=0.0, z=1.0, w=0.0), translation=SimpleNamespace(x=0.0, y=0.0, z=0.0)
+        ),
+    )
+    intake.frames.note_transforms(SimpleNamespace(transforms=[placed]))
+    assert len(intake.handed_on) == 1 and intake.frames.waiting == 0
