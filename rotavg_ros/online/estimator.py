@@ -166,9 +166,19 @@ class OnlineEstimator:
             elif self.options.on_time_jump == "new_component":
                 self._time_jumps += self._content.builder.clock_went_back(now_ns)
 
-    def add_edge(self, edge: EdgeMeasurement) -> RejectReason | None:
-        """Take a measured edge; returns why it was refused and counted, None if it was taken or may wait."""
+    def add_edge(self, edge: EdgeMeasurement, generation: int | None = None) -> RejectReason | None:
+        """Take a measured edge.
+
+        Args:
+            edge: the edge.
+            generation: of the graph that it is meant for, see :attr:`generation`; it changes nothing in any other.
+
+        Returns:
+            why it was refused and counted; None if it was taken, may wait, or is meant for another graph.
+        """
         with self._lock:
+            if generation not in (None, self._generation):
+                return None
             return self._content.builder.add_edge(edge)
 
     def reject(self, reason: RejectReason) -> None:

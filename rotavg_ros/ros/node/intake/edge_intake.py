@@ -39,6 +39,8 @@ class _WhileThereIsRoom(MutuallyExclusiveCallbackGroup):
 class EdgeIntake:
     """Takes edges in the order in which their messages came. Runs on the executor's thread.
 
+    Another thread may replace the graph at any moment (``~/load``). What is left of messages is dropped then.
+
     Attributes:
         callback_group: for the subscriptions to edges; it holds them back while too many messages are under way.
         frames: takes the edges of sensors into the body's frame.
@@ -86,16 +88,23 @@ class EdgeIntake:
         self._take_some()
 
     def _take_some(self) -> None:
-        deadline = time.perf_counter() + _SLICE_S
+        self._take_a_slice()
+        self._forget_with_the_estimator()
+        if self._under_way:
+            self._timer.reset()
+        else:
+            self._timer.cancel()
+
+    def _take_a_slice(self) -> None:
+        """Take what is under way, until there is nothing left, time is up, or what it is about is forgotten."""
+        generation, deadline = self._generation, time.perf_counter() + _SLICE_S
         while self._under_way:
             topic, counter, records = self._under_way[0]
             for record in records:
                 self._take(record, topic, counter)
-                if time.perf_counter() > deadline:
-                    self._timer.reset()
+                if time.perf_counter() > deadline or self._estimator.generation != generation:
                     return
             self._under_way.popleft()
-        self._timer.cancel()
 
     def _take(self, record: EdgeRecord | EdgeVerdict, topic: Input, counter: TopicCounter) -> None:
         if isinstance(record, EdgeVerdict):
@@ -114,9 +123,10 @@ class EdgeIntake:
             self._forget_with_the_estimator()
             return
         assert not isinstance(record.edge, RejectReason)
-        reason = self._estimator.add_edge(record.edge)
+        # The graph may be replaced right now, by another thread.
+        reason = self._estimator.add_edge(record.edge, self._generation)
         if topic.forward is not None:
-            self._forwarding.taken(topic.forward, record, reason)
+            self._forwarding.taken(topic.forward, record, reason, self._generation)
         if reason is not None and reason is not RejectReason.DUPLICATE_EDGE:
             self._on_refusal(reason)
 

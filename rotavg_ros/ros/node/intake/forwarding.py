@@ -223,12 +223,21 @@ class Forwarding:
         with user_error_about(topic):
             return str(self._node.resolve_topic_name(topic))
 
-    def taken(self, forward: Forward, record: EdgeRecord, refusal: RejectReason | None) -> None:
-        """An edge was handed to the estimator: send it on at once if it is odometry, or let it wait."""
+    def taken(self, forward: Forward, record: EdgeRecord, refusal: RejectReason | None, generation: int) -> None:
+        """An edge was handed to the estimator: send it on at once if it is odometry, or let it wait.
+
+        Args:
+            forward: of its topic.
+            record: with the edge.
+            refusal: what the estimator has said.
+            generation: of the graph that the edge was meant for; if that is forgotten, so is the edge.
+        """
         if isinstance(record.edge, RejectReason) or refusal not in (None, RejectReason.DUPLICATE_EDGE):
             return
         with self._lock:
             self._forget_with_the_estimator()
+            if generation != self._generation:
+                return
             if record.edge.kind == EdgeKind.LOOP_CLOSURE:
                 name = record.edge.source.robot, record.edge.edge_id
                 is_known = forward.filter.knows(name)

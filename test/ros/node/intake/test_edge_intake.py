@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
 import pytest
@@ -13,6 +13,7 @@ from rclpy.qos import QoSProfile
 
 from rotavg_ros.inputs import EdgeRecord
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
+from rotavg_ros.ros.node.intake import edge_intake
 from rotavg_ros.ros.node.intake.edge_intake import EdgeIntake
 from rotavg_ros.ros.node.intake.wiring import Input
 from rotavg_ros.ros.node.message_counting import TopicCounter
@@ -25,10 +26,12 @@ class Chain:
     """Converts a number into a chain of so many odometry edges."""
 
     forgotten = 0
+    before_each: Callable[[int], object] = staticmethod(lambda index: None)
 
     def __call__(self, message: tuple[str, int]) -> Iterator[EdgeRecord]:
         robot, length = message
         for index in range(length):
+            self.before_each(index)
             ends = (KeyframeReference(robot, index), KeyframeReference(robot, index + 1))
             yield EdgeRecord(EdgeMeasurement(index, *ends, IDENTITY, kind=0), robot, index + 1)
 
@@ -74,3 +77,34 @@ def test_a_long_message_lets_others_have_their_turn(executor: SingleThreadedExec
     for _ in range(20):
         executor.spin_once(timeout_sec=0.01)
     assert online.counts().edges == 0 and convert.forgotten == 1
+
+
+@pytest.mark.parametrize("inside", [False, True], ids=["between edges", "at an edge"])
+def test_a_graph_that_is_replaced_gets_nothing_of_the_message_before(
+    executor: SingleThreadedExecutor, monkeypatch: pytest.MonkeyPatch, inside: bool
+) -> None:
+    """Another thread may do it between any two edges, and just before the estimator takes one."""
+    monkeypatch.setattr(edge_intake, "_SLICE_S", 1000.0)
+    online = OnlineEstimator(EstimatorOptions(keyframe_source="edges"), lambda *_, **__: None)
+    generations: list[int] = []
+    forwarding = SimpleNamespace(taken=lambda *those: generations.append(those[-1]))
+    intake = EdgeIntake(executor.get_nodes()[0], online, forwarding, lambda reason: None)
+    convert, counter = Chain(), TopicCounter()
+    intake.add_source(convert)
+    topic = Input("/edges", "any", "edge_topics", "", QoSProfile(depth=1), forward=SimpleNamespace())
+    add_edge = online.add_edge
+
+    def add(edge: EdgeMeasurement, *of: int) -> object:
+        if inside and edge.edge_id == 5:
+            online.reset()
+        return add_edge(edge, *of)
+
+    monkeypatch.setattr(online, "add_edge", add)
+    if not inside:
+        convert.before_each = lambda index: index == 5 and online.reset()
+    intake.take(topic, counter, convert(("r", 10)))
+    assert online.counts().edges == 0 and convert.forgotten == 1
+    assert generations == [0] * (6 if inside else 5)
+    convert.before_each = lambda index: None
+    intake.take(topic, counter, convert(("r", 4)))
+    assert online.counts().edges == 4 and convert.forgotten == 1
