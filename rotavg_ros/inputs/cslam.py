@@ -45,6 +45,9 @@ class KeyframeOdomConverter:
         self._last: _Keyframe | None = None
         self._before: OdometrySample | None = None
 
+    def note_given_up(self, source: KeyframeReference, target: KeyframeReference) -> None:
+        """Odometry is sent once."""
+
     def __call__(self, message: Any) -> Iterator[EdgeRecord]:
         try:
             edge = self._edge_to(message)

@@ -27,6 +27,8 @@ _LARGEST_REFINEMENT = math.radians(10.0)
 class ForeignGraph:
     """Edges by keyframe id; each measurement passes once, however often the sender repeats its graph.
 
+    Once more passes what the estimator has given up, a closure whose keyframe came too late, say.
+
     A repeated closure with another rotation is another measurement of the same pair. A repeated odometry edge may be
     refined a little; with quite another rotation it is refused, because then the sender has begun anew and means other
     places by the same ids.
@@ -37,11 +39,20 @@ class ForeignGraph:
         self._seen = Fingerprints(_MOST_REMEMBERED)
         self._stamp_ns: dict[Key, int] = {}
         self._odometry: dict[tuple[Key, Key], Quaternion] = {}
+        # Numbers of the last losses between two keyframes: what was seen before them is new again.
+        self._loss: dict[tuple[Key, Key], int] = {}
+        self._num_losses = 0
 
     def forget(self) -> None:
         self._seen = Fingerprints(_MOST_REMEMBERED)
         self._stamp_ns.clear()
         self._odometry.clear()
+        self._loss.clear()
+
+    def note_given_up(self, source: KeyframeReference, target: KeyframeReference) -> None:
+        _make_room(self._loss)
+        self._num_losses += 1
+        self._loss[_key(source), _key(target)] = self._num_losses
 
     def _note_stamp(self, key: Key, stamp_ns: int) -> None:
         """Remember when a keyframe was taken; 0 means that the sender does not say."""
@@ -62,7 +73,7 @@ class ForeignGraph:
             precision: rad⁻², 0 unknown.
         """
         source_from_target = to_tuple(rotation)
-        measurement = hash((*ends, kind, source_from_target)) & MAX_ID
+        measurement = hash((*ends, kind, source_from_target, self._loss.get(ends, 0))) & MAX_ID
         if measurement in self._seen:
             return
         try:
@@ -81,6 +92,11 @@ class ForeignGraph:
         # Where on the body the sensor sits is not known: the way of the sensor stands for that of the body.
         position = quaternion.rotate(self._source.body_from_sensor, to_vector(translation))
         yield EdgeRecord(EdgeMeasurement(edge_id, source, target, inside, kind, precision, position))
+
+
+def _key(end: KeyframeReference) -> Key:
+    assert end.keyframe_id is not None
+    return end.robot, end.keyframe_id
 
 
 def _make_room(memory: dict[Any, Any]) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
 
-from rotavg_ros.online import EdgeMeasurement, RejectReason
+from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason
 from rotavg_ros.online.odometry.continuity import ANY_MOTION, ContinuityLimits
 from rotavg_ros.online.quaternion import IDENTITY, Quaternion, Vector, multiply
 from rotavg_ros.view_graph import EdgeLabel
@@ -108,6 +108,9 @@ class EdgeConverter(Protocol):
 
     def forget(self) -> None:
         """Begin anew, as the graph does: everything that is sent again is new."""
+
+    def note_given_up(self, source: KeyframeReference, target: KeyframeReference) -> None:
+        """An edge between these, by id, was lost for want of room or of time: when it is sent again, it is new."""
 
 
 class WholeGraphConverter(EdgeConverter, Protocol):

@@ -33,6 +33,9 @@ class RelativeRotationConverter:
     def forget(self) -> None:
         """Nothing is remembered."""
 
+    def note_given_up(self, source: KeyframeReference, target: KeyframeReference) -> None:
+        """Nothing is remembered."""
+
 
 class RelativeRotationArrayConverter(RelativeRotationConverter):
     """Many edges in a message."""

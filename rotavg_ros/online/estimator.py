@@ -20,6 +20,7 @@ from rotavg_ros.online.graph.snapshot import GraphSnapshot
 from rotavg_ros.online.measurements import (
     MAX_ID,
     EdgeMeasurement,
+    KeyframeReference,
     OdometryMessage,
     RejectReason,
     plain_number,
@@ -180,6 +181,17 @@ class OnlineEstimator:
             if generation not in (None, self._generation):
                 return None
             return self._content.builder.add_edge(edge)
+
+    def pop_given_up(self) -> list[tuple[KeyframeReference, KeyframeReference]]:
+        """Source and target of edges by id that were refused for want of room or of time since the last call.
+
+        They are counted as ``graph_full``, ``pending_overflow`` or ``pending_timeout``, and may be taken when their
+        sender repeats them. Of very many the last are returned.
+        """
+        with self._lock:
+            given_up = list(self._content.state.growth.given_up)
+            self._content.state.growth.given_up.clear()
+            return given_up
 
     def reject(self, reason: RejectReason) -> None:
         """Count an input that could not even be read as a measurement."""

@@ -81,6 +81,9 @@ class Feed:
             self._generation = self._estimator.generation
             for converter in self._edge_converters:
                 converter.forget()
+        for ends in self._estimator.pop_given_up():
+            for converter in self._edge_converters:
+                converter.note_given_up(*ends)
         for record in convert(message):
             if isinstance(record, EdgeVerdict):
                 self._estimator.label_edge(record.source_robot, record.edge_id, record.label)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace as Fields
+
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.inputs import EdgeVerdict, foreign_graph
-from rotavg_ros.online import EdgeMeasurement, RejectReason
+from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, OnlineEstimator, RejectReason
 from rotavg_ros.view_graph import EdgeLabel
 
 from .square import (
@@ -58,6 +60,69 @@ def test_a_senders_verdict_on_a_closure() -> None:
     assert list(convert(pose_graph(1))) == [EdgeVerdict("b", closure.edge_id, EdgeLabel.AUTOMATIC)]
     late = converter("pose_graph_tools_msgs/msg/PoseGraph")
     assert list(late(pose_graph(3)))[-1] == rejected[0]
+
+
+def closures_between(*ends: tuple[int, int]) -> Fields:
+    """The graph of the square, all of whose closures are others."""
+    graph = map_graph()
+    graph.links = [each for each in graph.links if each.type == 0] + [link(*each, 1) for each in ends]
+    return graph
+
+
+class Reader:
+    """Takes whole graphs as the node does; the next odometry comes ``pending_timeout_s`` later."""
+
+    def __init__(self, **options: object) -> None:
+        known = EstimatorOptions(keyframe_source="edges", **options)
+        self.online = OnlineEstimator(known, solver=lambda *_, **__: None)
+        self.convert = converter("rtabmap_msgs/msg/MapGraph")
+        self._seconds = 1000
+
+    def reads(self, graph: Fields) -> int:
+        """How many edges are new to the reader."""
+        for ends in self.online.pop_given_up():
+            self.convert.note_given_up(*ends)
+        records = list(self.convert(graph))
+        for record in records:
+            self.online.add_edge(record.edge)
+        return len(records)
+
+    def time_passes(self) -> None:
+        for _ in range(400):
+            self._seconds += 1
+            self.online.add_odometry("b", self._seconds * 10**9, (0.0, 0.0, 0.0, 1.0))
+
+
+def test_a_closure_whose_keyframe_came_too_late_is_new_when_it_is_sent_again() -> None:
+    """RTAB-Map leaves nodes out when it optimises, and takes them in again."""
+    reader = Reader(pending_timeout_s=300.0)
+    assert reader.reads(closures_between((0, 7))) == 4
+    reader.time_passes()
+    assert reader.online.counts().rejected == {"pending_timeout": 1}
+    whole = closures_between((0, 7))
+    whole.links += [link(3 + step, 4 + step, 0) for step in range(4)]
+    assert [reader.reads(whole) for _ in range(3)] == [5, 0, 0]
+    counts = reader.online.counts()
+    assert counts.edges == 8 and counts.pending == 0 and counts.rejected == {"pending_timeout": 1}
+
+
+def test_a_closure_that_had_to_go_for_others_is_new_when_it_is_sent_again() -> None:
+    reader = Reader(pending_capacity=1)
+    reader.reads(closures_between((0, 7), (1, 8)))
+    assert reader.online.counts().rejected == {"pending_overflow": 1}
+    whole = closures_between((0, 7), (1, 8))
+    whole.links += [link(3 + step, 4 + step, 0) for step in range(5)]
+    assert [reader.reads(whole) for _ in range(2)] == [6, 0]
+    assert reader.online.counts().edges == 10 and reader.online.counts().pending == 0
+
+
+def test_what_a_full_graph_refuses_is_new_when_it_is_sent_again() -> None:
+    reader = Reader(max_edges=3)
+    assert reader.reads(closures_between((0, 2))) == 4
+    assert reader.online.counts().rejected == {"graph_full": 1}
+    reader.online.set_options(EstimatorOptions(keyframe_source="edges"))
+    assert [reader.reads(closures_between((0, 2))) for _ in range(2)] == [1, 0]
+    assert reader.online.counts().edges == 4
 
 
 def test_what_is_remembered_is_bounded(monkeypatch) -> None:

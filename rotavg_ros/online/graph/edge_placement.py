@@ -37,7 +37,7 @@ class EdgePlacement:
                 self._complete_stamps(edge)
                 raise RejectedInputError(RejectReason.DUPLICATE_EDGE)
             if not growth.has_room_for_edge():
-                raise RejectedInputError(RejectReason.GRAPH_FULL)
+                return growth.give_up(edge, RejectReason.GRAPH_FULL)
             if undecided is not None:
                 self._let_wait(edge, undecided, is_undecided=True)
             else:
@@ -168,5 +168,6 @@ class EdgePlacement:
 
     def _let_wait(self, edge: EdgeMeasurement, waits_for: KeyframeReference, is_undecided: bool = False) -> None:
         growth = self._growth
-        if growth.pending.add(edge, waits_for, growth.data_time.now_ns, is_undecided) is not None:
-            growth.refuse(RejectReason.PENDING_OVERFLOW)
+        evicted = growth.pending.add(edge, waits_for, growth.data_time.now_ns, is_undecided)
+        if evicted is not None:
+            growth.give_up(evicted, RejectReason.PENDING_OVERFLOW)

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass, field
 
 from rotavg_ros.online.graph.fingerprints import Fingerprints
 from rotavg_ros.online.graph.growing_view_graph import GrowingViewGraph
 from rotavg_ros.online.graph.pending import PendingEdges
 from rotavg_ros.online.graph.room import GraphsAnswer, Room
-from rotavg_ros.online.measurements import RejectReason
+from rotavg_ros.online.measurements import EdgeMeasurement, KeyframeReference, RejectReason
 from rotavg_ros.online.odometry.data_time import DataTime
 from rotavg_ros.online.odometry.time_jumps import BackwardJumps
 from rotavg_ros.online.odometry.track import OdometryTrack
 from rotavg_ros.online.options import EstimatorOptions
 
+# Where nobody asks what was given up, the oldest are forgotten: some tens of megabytes.
+_MOST_GIVEN_UP = 100_000
+
 
 @dataclass
 class Growth:
-    """The growing graph and its surroundings; a state file holds all of it but the options.
+    """The growing graph and its surroundings; a state file holds all of it but the options and what was given up.
 
     Attributes:
         options: that apply from now on.
@@ -32,6 +35,8 @@ class Growth:
         labels: the users' verdicts, by source robot and edge id.
         room: what was taken out of a full graph.
         data_time: newest stamp of odometry or of keyframes.
+        given_up: ends of edges between keyframes by id that were refused for want of room or of time, since somebody
+            asked.
     """
 
     options: EstimatorOptions
@@ -45,6 +50,9 @@ class Growth:
     labels: dict[tuple[str, int], int] = field(default_factory=dict)
     room: Room = field(default_factory=Room)
     data_time: DataTime = field(default_factory=DataTime)
+    given_up: deque[tuple[KeyframeReference, KeyframeReference]] = field(
+        default_factory=lambda: deque(maxlen=_MOST_GIVEN_UP)
+    )
 
     @classmethod
     def begin(cls, options: EstimatorOptions, answer: GraphsAnswer) -> Growth:
@@ -58,6 +66,12 @@ class Growth:
         if self.rejected[reason.value] <= 0:
             del self.rejected[reason.value]
         return reason
+
+    def give_up(self, edge: EdgeMeasurement, reason: RejectReason) -> RejectReason:
+        """Refuse an edge that may be taken when it comes again; returns the reason."""
+        if edge.source.keyframe_id is not None and edge.target.keyframe_id is not None:
+            self.given_up.append((edge.source, edge.target))
+        return self.refuse(reason)
 
     def has_room_for_keyframe(self) -> bool:
         """Whether one may come, if need be after others have gone."""
@@ -96,4 +110,5 @@ class Growth:
         """Let what has waited for too long go."""
         now_ns = self.data_time.advance(stamp_ns, self.options.continuity_limits.lead_ns)
         if now_ns is not None:
-            self.refuse(RejectReason.PENDING_TIMEOUT, len(self.pending.pop_expired(now_ns)))
+            for edge in self.pending.pop_expired(now_ns):
+                self.give_up(edge, RejectReason.PENDING_TIMEOUT)

@@ -80,6 +80,9 @@ class EdgeIntake:
     def take(self, topic: Input, counter: TopicCounter, records: Iterator[EdgeRecord | EdgeVerdict]) -> None:
         """Take what a message says, now or in a while."""
         self._forget_with_the_estimator()
+        for ends in self._estimator.pop_given_up():
+            for convert in self._converters:
+                convert.note_given_up(*ends)
         self._under_way.append((topic, counter, records))
         self._take_some()
 

@@ -28,6 +28,9 @@ class Chain:
     forgotten = 0
     before_each: Callable[[int], object] = staticmethod(lambda index: None)
 
+    def __init__(self) -> None:
+        self.given_up: list[tuple[KeyframeReference, ...]] = []
+
     def __call__(self, message: tuple[str, int]) -> Iterator[EdgeRecord]:
         robot, length = message
         for index in range(length):
@@ -37,6 +40,9 @@ class Chain:
 
     def forget(self) -> None:
         self.forgotten += 1
+
+    def note_given_up(self, *ends: KeyframeReference) -> None:
+        self.given_up += [ends]
 
 
 @pytest.fixture
@@ -108,3 +114,17 @@ def test_a_graph_that_is_replaced_gets_nothing_of_the_message_before(
     convert.before_each = lambda index: None
     intake.take(topic, counter, convert(("r", 4)))
     assert online.counts().edges == 4 and convert.forgotten == 1
+
+
+def test_converters_are_told_what_was_given_up(executor: SingleThreadedExecutor) -> None:
+    online = OnlineEstimator(EstimatorOptions(keyframe_source="edges", max_edges=2), lambda *_, **__: None)
+    intake = EdgeIntake(executor.get_nodes()[0], online, SimpleNamespace(), lambda reason: None)
+    convert = Chain()
+    intake.add_source(convert)
+    topic = Input("/edges", "any", "edge_topics", "", QoSProfile(depth=1))
+    intake.take(topic, TopicCounter(), convert(("r", 3)))
+    executor.spin_once(timeout_sec=0.1)
+    assert online.counts().rejected == {"graph_full": 1} and convert.given_up == []
+    for _ in range(2):
+        intake.take(topic, TopicCounter(), convert(("r", 0)))
+    assert convert.given_up == [(KeyframeReference("r", 2), KeyframeReference("r", 3))]
