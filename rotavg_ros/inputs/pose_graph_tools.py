@@ -31,6 +31,7 @@ class PoseGraphConverter(ForeignGraph):
     """The sender's verdict on a closure counts, and counts no more as soon as the sender takes it back."""
 
     edges_field = "edges"
+    sends_parts = True
 
     def __init__(self, source: Source) -> None:
         super().__init__(source)

@@ -114,13 +114,15 @@ class EdgeConverter(Protocol):
 
 
 class WholeGraphConverter(EdgeConverter, Protocol):
-    """Of messages that hold a whole graph, which can be sent on without some of its edges.
+    """Of messages that hold a graph, which can be sent on without some of its edges.
 
     Attributes:
         edges_field: the message's field with the edges.
+        sends_parts: whether a message may hold a part of the graph; else each stands for all before it.
     """
 
     edges_field: str
+    sends_parts: bool
 
     def closure_name(self, edge: Any) -> tuple[str, int] | None:
         """Source's robot and id of an element of that field, as in its record; None of what is no closure."""

@@ -27,6 +27,7 @@ class MapGraphConverter(ForeignGraph):
     """The message is about one robot."""
 
     edges_field = "links"
+    sends_parts = False
 
     def closure_name(self, edge: Any) -> tuple[str, int] | None:
         if _KIND.get(edge.type) != EdgeKind.LOOP_CLOSURE:

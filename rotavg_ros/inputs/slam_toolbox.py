@@ -55,6 +55,7 @@ class GraphConverter(_NumberedGraph):
     """``PoseGraph``: odometry first, for it makes the keyframes that closures refer to."""
 
     edges_field = "edges"
+    sends_parts = False
 
     def closure_name(self, edge: Any) -> tuple[str, int] | None:
         if _is_consecutive(edge):

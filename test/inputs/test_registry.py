@@ -52,6 +52,7 @@ def test_the_closures_of_a_whole_graph_have_the_names_of_their_records(type_name
     closures = [(edge.source.robot, edge.edge_id) for edge in edges(convert(message)) if edge.kind]
     names = [convert.closure_name(edge) for edge in getattr(message, convert.edges_field)]
     assert len(closures) == 1 and [name for name in names if name is not None] == closures
+    assert convert.sends_parts == ("pose_graph_tools" in type_name)
 
 
 def test_stamps_of_keyframes() -> None:

@@ -106,14 +106,14 @@ class _Graph:
 class WholeGraphForward(Forward):
     """A graph goes out as it came, but for closures that are not believed; again when that changes.
 
-    A newer graph stands for those whose closures it has. Where senders send parts, a part stays until all of it was
-    sent.
+    Where senders send whole graphs only the newest counts, for their optimisers leave closures out. Where they send
+    parts, a part stays until all of it was sent, or a newer one has its closures.
     """
 
     def __init__(self, topic: str, output: Publisher, converter: WholeGraphConverter) -> None:
         super().__init__(topic, output)
         self._converter = converter
-        self._incoming: deque[_Graph] = deque(maxlen=_MOST_GRAPHS)
+        self._incoming: deque[_Graph] = deque(maxlen=_MOST_GRAPHS if converter.sends_parts else 1)
         self._graphs: list[_Graph] = []
 
     def _new_filter(self) -> ClosureFilter[Any]:
@@ -129,6 +129,8 @@ class WholeGraphForward(Forward):
     def end(self) -> None:
         """Send on what is not as it was sent last."""
         while self._incoming:
+            if not self._converter.sends_parts:
+                self._graphs.clear()
             self._graphs.append(self._incoming.popleft())
         for graph in self._graphs:
             kept = [name is None or self.filter.passes(name) for name in graph.names]
