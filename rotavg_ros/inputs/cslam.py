@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from rotavg_ros.inputs.fields import edge_id_of, target_from_source, to_nanoseconds, to_tuple, to_vector
-from rotavg_ros.inputs.foreign_graph import ForeignGraph, Key
+from rotavg_ros.inputs.fields import Key, edge_id_of, target_from_source, to_nanoseconds, to_tuple, to_vector
+from rotavg_ros.inputs.foreign_graph import ForeignGraph
 from rotavg_ros.inputs.records import EdgeRecord, Source
 from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason, quaternion
 from rotavg_ros.online.measurements import RejectedInputError, checked_rotation
@@ -64,9 +64,10 @@ class KeyframeOdomConverter:
         if keyframe_id <= self._last_id:
             self._last = self._before = None
             raise RejectedInputError(RejectReason.OUT_OF_ORDER_ODOMETRY)
-        edge_id = edge_id_of(self._last_id, keyframe_id, EdgeKind.ODOMETRY)
+        robot = self._source.robot
+        edge_id = edge_id_of((robot, self._last_id), (robot, keyframe_id), EdgeKind.ODOMETRY)
         last, before = self._last, self._before
-        now = _Keyframe(KeyframeReference(self._source.robot, keyframe_id, stamp_ns or None), sample)
+        now = _Keyframe(KeyframeReference(robot, keyframe_id, stamp_ns or None), sample)
         self._last_id, self._last, self._before = keyframe_id, now, last.odometry if last else None
         if last is None:
             return None

@@ -6,6 +6,7 @@ target_from_source.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -14,6 +15,9 @@ from rotavg_ros.online import RejectReason, quaternion
 from rotavg_ros.online.measurements import RejectedInputError, checked_rotation
 from rotavg_ros.online.options import NANOSECONDS
 from rotavg_ros.online.quaternion import Quaternion, Vector
+
+# (robot, keyframe id)
+Key = tuple[str, int]
 
 # The diagonal of the rotation's block in a row-major 6 × 6 matrix over (x, y, z, rotation about x, about y, about z).
 _ROTATION_DIAGONAL = (21, 28, 35)
@@ -69,6 +73,14 @@ def precision_of_covariance(covariance: Sequence[float]) -> float:
     return 3 / total if total and not math.isnan(total) else 0.0
 
 
-def edge_id_of(source_id: int, target_id: int, kind: int) -> int:
-    """A number for an edge whose sender gives it none: kind (1 bit), source's id (31 bits), target's id (32 bits)."""
-    return kind << 63 | (source_id % 2**31) << 32 | target_id % 2**32
+def edge_id_of(source: Key, target: Key, kind: int) -> int:
+    """A number for an edge whose sender gives it none, the same in every run.
+
+    Within a robot: kind (1 bit), source's id (31 bits), target's id (32 bits). Between robots: kind, and a hash of both
+    ends (63 bits), which tells robots apart.
+    """
+    (source_robot, source_id), (target_robot, target_id) = source, target
+    if source_robot == target_robot:
+        return kind << 63 | (source_id % 2**31) << 32 | target_id % 2**32
+    digest = hashlib.blake2b(ascii((source, target)).encode(), digest_size=8).digest()
+    return kind << 63 | int.from_bytes(digest, "little") >> 1

@@ -6,16 +6,13 @@ import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
-from rotavg_ros.inputs.fields import edge_id_of, target_from_source, to_tuple, to_vector
+from rotavg_ros.inputs.fields import Key, edge_id_of, target_from_source, to_tuple, to_vector
 from rotavg_ros.inputs.records import EdgeRecord, Source
 from rotavg_ros.online import EdgeMeasurement, KeyframeReference, RejectReason, quaternion
 from rotavg_ros.online.graph.fingerprints import Fingerprints
 from rotavg_ros.online.measurements import MAX_ID, RejectedInputError
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.view_graph import EdgeKind
-
-# (robot, keyframe id)
-Key = tuple[str, int]
 
 # Beyond so many, what was seen is forgotten, so that nonsense cannot fill the memory; the estimator knows repetitions
 # as well, at a higher price.
@@ -88,7 +85,7 @@ class ForeignGraph:
                 return
         self._seen.add(measurement)
         source, target = (KeyframeReference(*key, self._stamp_ns.get(key)) for key in ends)
-        edge_id = edge_id_of(ends[0][1], ends[1][1], kind)
+        edge_id = edge_id_of(*ends, kind)
         # Where on the body the sensor sits is not known: the way of the sensor stands for that of the body.
         position = quaternion.rotate(self._source.body_from_sensor, to_vector(translation))
         yield EdgeRecord(EdgeMeasurement(edge_id, source, target, inside, kind, precision, position))

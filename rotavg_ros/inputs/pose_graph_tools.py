@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from rotavg_ros.inputs.fields import edge_id_of, precision_of_covariance, to_nanoseconds
-from rotavg_ros.inputs.foreign_graph import ForeignGraph, Key, edges_in_order
+from rotavg_ros.inputs.fields import Key, edge_id_of, precision_of_covariance, to_nanoseconds
+from rotavg_ros.inputs.foreign_graph import ForeignGraph, edges_in_order
 from rotavg_ros.inputs.records import EdgeRecord, EdgeVerdict, Source
 from rotavg_ros.online import RejectReason
 from rotavg_ros.online.measurements import RejectedInputError
@@ -57,20 +57,23 @@ class PoseGraphConverter(ForeignGraph):
         if edge.robot_from < 0 or edge.robot_to < 0:
             yield EdgeRecord(RejectReason.BAD_REFERENCE)
             return
-        ends = self._key(edge.robot_from, edge.key_from), self._key(edge.robot_to, edge.key_to)
+        ends = self._ends(edge)
         kind, precision = _KIND[edge.type], precision_of_covariance(edge.covariance)
         yield from self._edges(ends, edge.pose.orientation, edge.pose.position, kind, precision)
         is_rejected = edge.type == _REJECTED_CLOSURE
         if kind == EdgeKind.LOOP_CLOSURE and is_rejected != (ends in self._rejected):
             (self._rejected.add if is_rejected else self._rejected.discard)(ends)
             label = EdgeLabel.REJECTED if is_rejected else EdgeLabel.AUTOMATIC
-            yield EdgeVerdict(ends[0][0], edge_id_of(ends[0][1], ends[1][1], kind), label)
+            yield EdgeVerdict(ends[0][0], edge_id_of(*ends, kind), label)
 
     def closure_name(self, edge: Any) -> tuple[str, int] | None:
         if _KIND.get(edge.type) != EdgeKind.LOOP_CLOSURE:
             return None
-        robot, source = self._key(edge.robot_from, edge.key_from)
-        return robot, edge_id_of(source, int(edge.key_to), EdgeKind.LOOP_CLOSURE)
+        source, target = self._ends(edge)
+        return source[0], edge_id_of(source, target, EdgeKind.LOOP_CLOSURE)
+
+    def _ends(self, edge: Any) -> tuple[Key, Key]:
+        return self._key(edge.robot_from, edge.key_from), self._key(edge.robot_to, edge.key_to)
 
     def _key(self, robot: int, key: int) -> Key:
         return (self._source.robot_of(int(robot)), int(key))

@@ -32,7 +32,8 @@ class MapGraphConverter(ForeignGraph):
     def closure_name(self, edge: Any) -> tuple[str, int] | None:
         if _KIND.get(edge.type) != EdgeKind.LOOP_CLOSURE:
             return None
-        return self._source.robot, edge_id_of(int(edge.from_id), int(edge.to_id), EdgeKind.LOOP_CLOSURE)
+        robot = self._source.robot
+        return robot, edge_id_of((robot, int(edge.from_id)), (robot, int(edge.to_id)), EdgeKind.LOOP_CLOSURE)
 
     def __call__(self, message: Any) -> Iterator[EdgeRecord]:
         robot = self._source.robot

@@ -60,7 +60,8 @@ class GraphConverter(_NumberedGraph):
     def closure_name(self, edge: Any) -> tuple[str, int] | None:
         if _is_consecutive(edge):
             return None
-        return self._source.robot, edge_id_of(int(edge.source_id), int(edge.target_id), EdgeKind.LOOP_CLOSURE)
+        robot = self._source.robot
+        return robot, edge_id_of((robot, int(edge.source_id)), (robot, int(edge.target_id)), EdgeKind.LOOP_CLOSURE)
 
     def __call__(self, message: Any) -> Iterator[EdgeRecord]:
         for edge in sorted(message.edges, key=lambda edge: not _is_consecutive(edge)):

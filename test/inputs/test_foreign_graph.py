@@ -16,6 +16,7 @@ from .square import (
     link,
     map_graph,
     pose_graph,
+    pose_graph_edge,
     quaternion,
     world_from_sensor,
 )
@@ -67,6 +68,35 @@ def closures_between(*ends: tuple[int, int]) -> Fields:
     graph = map_graph()
     graph.links = [each for each in graph.links if each.type == 0] + [link(*each, 1) for each in ends]
     return graph
+
+
+def test_a_verdict_is_about_the_closure_to_one_robot() -> None:
+    convert = converter("pose_graph_tools_msgs/msg/PoseGraph")
+    online = OnlineEstimator(EstimatorOptions(keyframe_source="edges"), solver=lambda *_, **__: None)
+
+    def robots_graph(*kinds: int) -> Fields:
+        """Every robot drives, and robot a closes a loop with each, at the same keyframes."""
+        graph = pose_graph(1)
+        graph.edges = [pose_graph_edge(key, key + 1, 0) for key in range(3) for _ in range(3)]
+        graph.edges += [pose_graph_edge(3, 0, kind) for kind in kinds]
+        for robot, edge in enumerate(graph.edges):
+            edge.robot_to = robot % 3
+            edge.robot_from = 0 if edge.key_from == 3 else edge.robot_to
+        return graph
+
+    for kinds in ((1, 1, 1), (1, 1, 3)):
+        graph = robots_graph(*kinds)
+        for record in convert(graph):
+            if isinstance(record, EdgeVerdict):
+                assert online.label_edge(record.source_robot, record.edge_id, record.label) == 1
+            else:
+                assert online.add_edge(record.edge) is None
+    snapshot = online.snapshot()
+    robot = snapshot.keyframe_robot[snapshot.graph.target[-3:].numpy()]
+    assert [snapshot.robots[index] for index in robot] == ["a", "b", "c"]
+    assert snapshot.graph.label[-3:].tolist() == [EdgeLabel.AUTOMATIC, EdgeLabel.AUTOMATIC, EdgeLabel.REJECTED]
+    names = [convert.closure_name(edge) for edge in graph.edges[-3:]]
+    assert names == [("a", number) for number in snapshot.edge_id[-3:].tolist()]
 
 
 class Reader:
