@@ -49,7 +49,7 @@ class EdgeRecord:
 
     Attributes:
         edge: the measurement, or why it cannot be read.
-        sender, sequence: who counts, and the count; 0 for senders that do not.
+        sender, sequence: whom the message is about, and its sender's count; 0 for senders that do not.
         frame_id: the sensor frame that the sender says it measured in; empty where it says nothing.
         element: of a message of many edges, the one that this is.
     """

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
-# Beyond so many, the sender that was silent the longest is forgotten: names come from messages, and may be anything.
-_MOST_SENDERS = 1000
+# Beyond so many, the name that was silent the longest is forgotten: names come from messages, and may be anything.
+_MOST_NAMES = 1000
+# The same of counts that are under way, and of gaps in them.
+_MOST_COUNTS = 100
 # A larger step is a sender that restarted or sends nonsense, not that many lost messages.
 _LARGEST_GAP = 1_000_000
 
@@ -17,33 +19,65 @@ _LARGEST_GAP = 1_000_000
 class SequenceGaps:
     """Lost messages of senders that number theirs consecutively.
 
+    Messages do not say who has sent them: a sender may speak of several robots, and several of one. So a number goes
+    on the nearest count below it, whosever that is; how many are missing in all does not depend on it. A number inside
+    a gap shows that the gap was the step from one sender's count to another's: nothing was lost in it.
+
     Attributes:
-        lost: numbers that were left out.
+        lost: numbers that were left out, or fewer: a count that has ended hides losses of one that passes it.
         before_first: numbers below the first that was seen: sent before we listened, or lost while we connected.
     """
 
     def __init__(self) -> None:
         self.lost = 0
         self.before_first = 0
-        self._last: dict[str, int] = {}
+        self._names: dict[str, None] = {}
+        self._counts: list[int] = []  # the last number of each; at the end that of the newest message
+        self._gaps: list[tuple[int, int]] = []  # the numbers before and after
 
-    def observe(self, sender: str, number: int) -> None:
-        """Note a number; one that is not ahead of the last means that the sender started anew.
+    def observe(self, name: str, number: int) -> None:
+        """Note a number; one that goes on no count begins one: its sender is new, or started anew.
 
         Args:
-            sender: whose count it is.
+            name: of what the message is about. The first of a name may well be the first of a sender.
             number: from 1; 0 if the sender does not count.
         """
         if number <= 0:
             return
-        last = self._last.pop(sender, None)  # and back in at the end
-        if last is None:
-            self.before_first += number - 1 if number <= _LARGEST_GAP else 0
-        elif last < number <= last + _LARGEST_GAP:
-            self.lost += number - last - 1
-        self._last[sender] = number
-        if len(self._last) > _MOST_SENDERS:
-            del self._last[next(iter(self._last))]
+        is_new = self._is_new(name)
+        before = max((last for last in self._counts if 0 < number - last <= _LARGEST_GAP), default=0)
+        gap = max(((low, high) for low, high in self._gaps if before < low < number < high), default=None)
+        if gap is not None:
+            self._gaps.remove(gap)
+            self.lost -= _missing(*gap)
+            before = gap[0]
+        elif not before or (is_new and number > before + 1):
+            if is_new:
+                self.before_first += number - 1 if number <= _LARGEST_GAP else 0
+            elif number in self._counts:  # a repetition
+                return
+            before = number - 1
+        else:
+            self._counts.remove(before)
+        self._counts.append(number)
+        if _missing(before, number):
+            self.lost += _missing(before, number)
+            self._gaps.append((before, number))
+        del self._counts[:-_MOST_COUNTS], self._gaps[:-_MOST_COUNTS]
+
+    def _is_new(self, name: str) -> bool:
+        """Whether nothing has come by this name."""
+        is_new = name not in self._names
+        self._names.pop(name, None)
+        self._names[name] = None
+        if len(self._names) > _MOST_NAMES:
+            del self._names[next(iter(self._names))]
+        return is_new
+
+
+def _missing(before: int, after: int) -> int:
+    """How many numbers lie between two."""
+    return after - before - 1
 
 
 class TopicCounter:

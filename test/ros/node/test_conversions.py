@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed; `make setup` installs it")
@@ -121,6 +123,38 @@ def test_sequence_gaps(numbers: list[int], lost: int, before_first: int) -> None
         gaps.observe("a", number)
     gaps.observe("b", 1)
     assert (gaps.lost, gaps.before_first) == (lost, before_first)
+
+
+SENDERS = st.lists(st.tuples(st.sampled_from("ab"), st.integers(1, 40)), min_size=1, max_size=4)
+
+
+@given(senders=SENDERS, turns=st.lists(st.integers(0, 3), max_size=60))
+def test_senders_that_speak_of_the_same_robots_lose_nothing(senders: list[tuple[str, int]], turns: list[int]) -> None:
+    """Each counts for itself, in any order; when all have gone on for a while nothing is taken for lost."""
+    gaps, numbers = SequenceGaps(), [number for _, number in senders]
+    for turn in [*turns, *5 * list(range(len(senders)))]:
+        sender = turn % len(senders)
+        gaps.observe(senders[sender][0], numbers[sender])
+        numbers[sender] += 1
+        assert gaps.lost >= 0
+    assert gaps.lost == 0
+
+
+@given(kept=st.sets(st.integers(3, 60)), about=st.lists(st.sampled_from("ab"), min_size=60, max_size=60))
+def test_a_sender_that_speaks_of_several_robots(kept: set[int], about: list[str]) -> None:
+    gaps, numbers = SequenceGaps(), [1, 2, *sorted(kept)]
+    for robot, number in zip(["a", "b", *about], numbers, strict=False):
+        gaps.observe(robot, number)
+    assert gaps.lost == numbers[-1] - len(numbers)
+
+
+def test_two_front_ends_of_which_both_lose_messages() -> None:
+    gaps = SequenceGaps()
+    for number in range(1, 100):
+        for first, lost in ((0, {20, 30, 31}), (5000, {7})):
+            if number not in lost:
+                gaps.observe("a", first + number)
+    assert gaps.lost == 4
 
 
 def test_the_middlewares_numbers_count_only_for_a_single_publisher() -> None:
