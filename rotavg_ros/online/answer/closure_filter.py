@@ -48,6 +48,9 @@ class ClosureFilter(Generic[_Item]):
 
     A closure passes with the first answer that has it and believes it, once it is old enough; one that is held false
     waits on. Items of type ``_Item`` stand for what is to be sent on.
+
+    Attributes:
+        dropped: how many were forgotten while they waited, since too many did.
     """
 
     def __init__(self, *, newest_counts: bool = False) -> None:
@@ -58,6 +61,7 @@ class ClosureFilter(Generic[_Item]):
                 those before; else all of them have to be believed.
         """
         self._newest_counts = newest_counts
+        self.dropped = 0
         self._waiting: dict[int, _Waiting[_Item]] = {}
         self._believed: dict[int, bool] = {}  # of those that were let pass: whether they still are
 
@@ -74,8 +78,9 @@ class ClosureFilter(Generic[_Item]):
             now: seconds.
         """
         key = _key(name)
-        if len(self._waiting) >= _MOST_WAITING:
+        if key not in self._waiting and len(self._waiting) >= _MOST_WAITING:
             del self._waiting[next(iter(self._waiting))]
+            self.dropped += 1
         self._waiting.setdefault(key, _Waiting(now, [])).items.append(item)
 
     def knows(self, name: EdgeName) -> bool:

@@ -169,6 +169,7 @@ def _values(health: Health, counts: Counts, paused: bool, now: float) -> dict[st
         "queued closures": str(counts.queued),
         "queued closures that agree by chance": str(counts.by_chance),
         "held back": str(health.held_back),
+        "held back dropped": str(health.held_back_dropped),
         "waiting for frames": str(health.waiting_for_frames),
         "answer version": str(0 if answer is None else answer.version),
         "answer age s": "nan" if health.answered is None else f"{now - health.answered:.1f}",

@@ -156,6 +156,7 @@ class RotavgNode(parameter_server.ParameterNode):
         self._health.waiting_for_frames = self._listening.waiting_for_frames
         wiring = self._wiring.warnings(self._settings)
         self._health.held_back = self._forwarding.waiting
+        self._health.held_back_dropped = self._forwarding.dropped
         lines = [*self._mistaken_parameters, *wiring, *self._outputs.warnings(), *self._forwarding.warnings()]
         self._health.noticed(lines)
         status = self._reporter.report(self._health, self._estimator.counts(), self._settings, self._estimator.paused)

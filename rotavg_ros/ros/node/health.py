@@ -25,6 +25,7 @@ class Health:
         mistakes: in the wiring and the parameters, a line each.
         joins: how often components became one.
         held_back: closures that wait to be sent on (``forward_topics``).
+        held_back_dropped: closures that waited and will not be sent on, since too many did.
         unsolved_since: since when the graph has been ahead of the answer; None if it is not.
         solve_failures: how many ticks failed in all; ``failure`` is the last one's message, None after a good tick.
         save_failure: why the last save failed, None if it did not.
@@ -43,6 +44,7 @@ class Health:
     answer: Answer | None = None
     joins: int = 0
     held_back: int = 0
+    held_back_dropped: int = 0
     answered: float | None = None
     unsolved_since: float | None = None
     solve_failures: int = 0

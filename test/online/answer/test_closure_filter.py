@@ -8,6 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rotavg_ros.online.answer import closure_filter
 from rotavg_ros.online.answer.closure_filter import ClosureFilter
 from rotavg_ros.view_graph import EdgeKind
 
@@ -89,6 +90,16 @@ def test_measurements_of_one_name_go_together():
     closures.take(("a", 1), "false", now=0.0)
     assert closures.decide(answer([("a", 1, False), ("a", 1, True)]), 0.0, 0.0).passed == []
     assert closures.decide(answer([("a", 1, False), ("a", 1, False)]), 0.0, 0.0).passed == ["good", "false"]
+
+
+def test_a_full_waiting_room_drops_the_oldest_for_new_names_alone(monkeypatch):
+    monkeypatch.setattr(closure_filter, "_MOST_WAITING", 3)
+    closures: ClosureFilter[str] = ClosureFilter()
+    for edge_id in (1, 2, 3, 2):
+        closures.take(("a", edge_id), str(edge_id), now=0.0)
+    assert len(closures) == 3 and closures.knows(("a", 1)) and closures.dropped == 0
+    closures.take(("a", 4), "4", now=0.0)
+    assert len(closures) == 3 and not closures.knows(("a", 1)) and closures.dropped == 1
 
 
 def test_of_graphs_the_newest_measurement_of_a_closure_counts():

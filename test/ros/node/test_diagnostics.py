@@ -112,6 +112,12 @@ def test_closures_that_wait_to_be_solved(health: Health) -> None:
     assert {pair.key: pair.value for pair in status.values}["queued closures"] == "20"
 
 
+def test_closures_that_will_not_be_sent_on_are_counted(health: Health) -> None:
+    health.held_back, health.held_back_dropped = 4, 3
+    values = {pair.key: pair.value for pair in report(health).values}
+    assert (values["held back"], values["held back dropped"]) == ("4", "3")
+
+
 def test_slow_solves_losses_and_refusals_warn(health: Health) -> None:
     health.ticks.add(20.0)
     assert "longer" in report(health).message

@@ -184,6 +184,12 @@ class Forwarding:
         with self._lock:
             return sum(len(each.filter) for each in self._forwards)
 
+    @property
+    def dropped(self) -> int:
+        """How many were held back and will not go on any more, since too many waited."""
+        with self._lock:
+            return sum(each.filter.dropped for each in self._forwards)
+
     def warnings(self) -> list[str]:
         """What is not as it should be, a line each."""
         return [
