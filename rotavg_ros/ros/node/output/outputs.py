@@ -38,6 +38,7 @@ class Outputs:
     def __init__(self, node: Node, parameters: NodeParameters, estimator: OnlineEstimator) -> None:
         self._estimator = estimator
         self._robots, self._frame_id = parameters.robots, parameters.world_frame
+        # Of each picture the answer that was drawn, by its version, and how many looked; fewer if some have gone since.
         self._drawn: dict[Publisher, tuple[int, int]] = {}
         self._rests_until = 0.0  # on the monotonic clock
         latched = partial(publisher, node, qos=LATCHED)
@@ -45,7 +46,7 @@ class Outputs:
         self._flags = latched(OutlierFlags, "outlier_flags")
         self._markers = latched(MarkerArray, "~/markers")
         prefix = checked_prefixes(parameters.prefixes())
-        self._paths = {robot: latched(Path, f"{prefix[robot]}corrected_path") for robot in self._robots}
+        self._robot_of_path = {latched(Path, f"{prefix[robot]}corrected_path"): robot for robot in self._robots}
         self._orientation = {
             robot: publisher(node, QuaternionStamped, f"{prefix[robot]}orientation", QoSProfile(depth=10))
             for robot in self._robots
@@ -87,18 +88,24 @@ class Outputs:
         started = time.monotonic()
         if started < self._rests_until:
             return
-        missing = [p for p in (*self._paths.values(), self._markers) if self._lacks(p, answer)]
+        watchers = {picture: picture.get_subscription_count() for picture in (*self._robot_of_path, self._markers)}
+        missing = [picture for picture, number in watchers.items() if self._lacks(picture, answer, number)]
         if not missing:
             return
+        try:
+            for picture in missing:
+                picture.publish(self._picture(picture, answer))
+                self._drawn[picture] = answer.version, watchers[picture]
+        finally:
+            ended = time.monotonic()
+            self._rests_until = ended + _REST * (ended - started)
+
+    def _picture(self, picture: Publisher, answer: Answer) -> Path | MarkerArray:
         trajectories = self._trajectories(answer)
-        for robot, path in self._paths.items():
-            if path in missing:
-                drawn = trajectories.get(robot)
-                path.publish(no_path(self._frame_id) if drawn is None else path_message(drawn, self._frame_id))
-        if self._markers in missing:
-            self._markers.publish(markers_message(answer, list(trajectories.values()), self._frame_id))
-        ended = time.monotonic()
-        self._rests_until = ended + _REST * (ended - started)
+        if picture is self._markers:
+            return markers_message(answer, list(trajectories.values()), self._frame_id)
+        drawn = trajectories.get(self._robot_of_path[picture])
+        return no_path(self._frame_id) if drawn is None else path_message(drawn, self._frame_id)
 
     def _erase(self) -> None:
         for picture in self._drawn:
@@ -111,11 +118,11 @@ class Outputs:
             self._placed = answer.version, self._estimator.place(answer)
         return self._placed[1]
 
-    def _lacks(self, picture: Publisher, answer: Answer) -> bool:
-        """Whether somebody looks who has not been sent this answer yet; from now on they have."""
-        watchers = picture.get_subscription_count()
+    def _lacks(self, picture: Publisher, answer: Answer, watchers: int) -> bool:
+        """Whether somebody looks, of so many, who has not been sent this answer yet."""
         version, watchers_then = self._drawn.get(picture, (0, 0))
-        self._drawn[picture] = answer.version, watchers
+        if watchers < watchers_then:
+            self._drawn[picture] = version, watchers
         return watchers > 0 and (version != answer.version or watchers > watchers_then)
 
     def publish_odometry(self, robot: str, topic: str, message: Any, record: OdometryRecord) -> None:
