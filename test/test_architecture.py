@@ -100,7 +100,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "uncertainty": {"priors", "probes"},
         "cycles": {"priors"},
         "consensus": {"cycles", "priors"},
-        "starts": {"cycles", "refinement"},
+        "starts": {"cycles", "refinement", "step"},
         "solve": {
             *("consensus", "cycles", "options", "refinement", "series", "starts", "stated"),
             *("step", "uncertainty"),

@@ -25,9 +25,11 @@ def solve_batch(
     refinement_steps: int | None = None,
     weights: Path | None = None,
 ) -> list[Solution]:
-    """What :func:`~rotavg_ros.solver.solve` says of every graph, to 10⁻⁵ rad; the arguments are the same.
+    """What :func:`~rotavg_ros.solver.solve` says of every graph; the arguments are the same.
 
-    SfM graphs are solved together as one graph of that many components, and ``stage_seconds`` are those of all. Their
+    SfM graphs are solved together as one graph of that many components, and ``stage_seconds`` are those of all. Systems
+    are solved until each component's is, so answers differ by what refinements leave: up to a tenth of a standard error
+    where cameras have few edges, 10⁻⁵ rad and less elsewhere. Their
     ``warnings`` are those about edges that state nothing and about graphs that are mostly flagged; that edges which
     contradict each other agree among themselves is told only of a graph that is solved alone. SLAM graphs, and methods
     that are not ours, go one by one.

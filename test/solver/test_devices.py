@@ -118,8 +118,9 @@ def test_an_accelerators_tree_is_as_short_as_the_cpus(num_nodes: int, num_edges:
     np.testing.assert_allclose(lengths[1], lengths[0], atol=1e-12)
 
 
-@pytest.mark.parametrize("method", ["neurora", "neurora-v1", "chatterjee"])
-def test_a_batch_is_its_graphs(method: str) -> None:
+@pytest.mark.parametrize(("method", "tolerance"), [("neurora", 5e-3), ("neurora-v1", 2e-5), ("chatterjee", 2e-5)])
+def test_a_batch_is_its_graphs(method: str, tolerance: float) -> None:
+    """Of the default to a tenth of a standard error, which is 2° here."""
     lone = ViewGraph.create([0, 2], [1, 3], [[0, 0, 0.1, 0.995], [0, 0, 0, 1]], num_nodes=6)
     source, target, kind = slam_edges(40, 6, 0)
     slam = measured(random_truth(40, 0), source, target, kind=kind)
@@ -128,7 +129,7 @@ def test_a_batch_is_its_graphs(method: str) -> None:
     answers = solve_batch(graphs, method=method, device="cpu")
     assert [answer.profile for answer in answers] == ["sfm", "slam", "sfm", "sfm", "sfm"]
     for graph, answer in zip(graphs, answers, strict=True):
-        assert_same(answer, solve(graph, method=method, device="cpu"), 2e-5)
+        assert_same(answer, solve(graph, method=method, device="cpu"), tolerance)
     assert solve_batch([]) == []
 
 

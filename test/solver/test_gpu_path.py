@@ -34,7 +34,7 @@ def _forget(traffic: Traffic) -> None:
         record.clear()
 
 
-@pytest.mark.parametrize(("method", "waits"), [("neurora", 143), ("neurora-v2", 59), ("neurora-round", 149)])
+@pytest.mark.parametrize(("method", "waits"), [("neurora", 250), ("neurora-v2", 59), ("neurora-round", 250)])
 def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> None:
     graph = _graph()
     with pretended_gpu() as traffic:

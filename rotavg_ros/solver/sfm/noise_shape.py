@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.medians import quantile_by_group
 from rotavg_ros.solver.sfm.priors import NoiseShapePriors
 from rotavg_ros.solver.sfm.symmetric_rows import turned
 
@@ -77,9 +78,24 @@ class ShapeEstimator:
         at_ends = (matrix.flatten(0, 1).index_select(1, end).view(3, 3, -1) for end in (sample.source, sample.target))
         in_cameras = [(at_end * sample.vector).sum(dim=1) for at_end in at_ends]
         group, start = self._component[sample.source], before.covariance
+        typical = self._is_typical(sample.vector, group)
+        in_cameras, group = [vector[:, typical] for vector in in_cameras], group[typical]
         found = scatter((in_cameras[0], in_cameras[1]), group, len(self._redundancy), start, self._priors)
         found = found if start is None else torch.where(is_held[:, None, None], start, found)
         return self._placed(found, matrix)
+
+    def _is_typical(self, vector: Tensor, group: Tensor) -> Tensor:
+        """Which residuals ``(3, K)`` tell the shape, ``(K,)``: those that are no longer than good ones mostly are.
+
+        False edges that turn about one axis, as they do where places look alike and cameras are upright, would be taken
+        for noise that does: by a quarter of them Student's t is swamped.
+        """
+        length = (vector * vector).sum(dim=0).sqrt()
+        # The cost |r|^½ meets as many edges exactly as a spanning tree has, which say nothing of their noise.
+        nodes = torch.bincount(self._component, minlength=len(self._redundancy))
+        share = 1 - (1 - self._priors.lower_share) * self._redundancy / (self._redundancy + nodes - 1).clamp(min=1)
+        lower = quantile_by_group(length, group, share.clamp(0, 1))
+        return (length <= self._priors.typical_lengths * lower[group]).nonzero()[:, 0]
 
     def carried(self, shape: NoiseShape, body_from_world: Tensor) -> NoiseShape:
         """The same in the cameras' frames, where the cameras have turned to ``(N, 4)``."""

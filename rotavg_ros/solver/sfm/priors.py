@@ -22,6 +22,10 @@ class NoiseShapePriors:
             one. Twice: 1–7 % worse means, 6–16 % worse medians, where noise has an exact axis. Half: 2 % better on the
             paper's recipe alone, whose noise has an axis without any; cameras have none such.
         least_deviation: radians, added to every axis, numerical: exact measurements have an inverse covariance, too.
+        lower_share, typical_lengths: residuals tell the shape that are no longer than so many times this quantile. A
+            quarter of normal noise is below 1.1 deviations of an axis, nearly all of it below 5; of 60 % of false
+            edges so many are left out that are longer than 10. With 8 times, medians where a third of the edges is
+            turned about the vertical are 1 to 2 % worse.
         round_residuals: edges beyond a spanning tree that weigh as much as the assumption that noise is round.
     """
 
@@ -29,6 +33,8 @@ class NoiseShapePriors:
     further_iterations: int = 3
     least_ratio: float = 0.1
     least_deviation: float = float(np.radians(1e-4))
+    lower_share: float = 0.25
+    typical_lengths: float = 5.5
     round_residuals: float = 20.0
 
 
@@ -186,6 +192,7 @@ class RefinementPriors:
         telling_steps: shaped ones after which starts are compared. With none, the better start is told by the coarse
             steps, a quarter faster and 1 % worse; with twice as many, 1 % better and a fifth slower
             (``docs/diary/sfm-refinement.md``).
+        same_valley: starts whose costs differ by less, of the cost, lead to one valley, but for where steps stop.
         least_shaped_steps: of few steps that a user allows, so many at least are shaped.
         coarse_smoothing: radians: shorter residuals weigh as this one in coarse steps (Chatterjee & Govindu 2013).
         coarse_settled: coarse steps end once they turn cameras by less than this share of the typical residual.
@@ -214,12 +221,13 @@ class RefinementPriors:
         density: which density the last steps go by.
     """
 
-    max_steps: int = 30
-    max_coarse_steps: int = 8
+    max_steps: int = 50
+    max_coarse_steps: int = 20
     telling_steps: int = 3
+    same_valley: float = 5e-3
     least_shaped_steps: int = 3
     coarse_smoothing: float = float(np.radians(1.0))
-    coarse_settled: float = 0.2
+    coarse_settled: float = 0.03
     relaxation: float = 1.5
     stretched: float = 1.0
     held: float = 0.3

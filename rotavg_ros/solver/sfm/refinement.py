@@ -34,7 +34,6 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.sfm.noise_density import NoiseDensity
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape
 from rotavg_ros.solver.sfm.priors import RefinementPriors
@@ -43,8 +42,6 @@ from rotavg_ros.solver.sfm.symmetric_rows import distinct_entries, turned
 from rotavg_ros.view_graph import ViewGraph
 
 PRIORS = RefinementPriors()
-# Answers whose costs are as near as this, of the cost, lie in one valley but for where refinements stop.
-_SAME_VALLEY = 5e-3
 # What the noise's shape earns: no axis is more exact than another.
 ROUND = replace(PRIORS, shape=replace(PRIORS.shape, least_ratio=1.0))
 
@@ -73,12 +70,29 @@ class Start(NamedTuple):
 
     Attributes:
         body_from_world: ``(N, 4)``.
-        coarse: ``(M,)`` positive, multiplied to the robust weights in coarse steps from there, beside those of
-            :class:`EdgeWeights`.
+        coarse: ``(M,)`` positive, multiplied to the robust weights in coarse steps from there.
+        among: ``(C,)`` bool, components that may begin there; None: all.
+        is_settled: coarse steps by a part of the edges led there; more are taken only if it is better as it is.
     """
 
     body_from_world: Tensor
     coarse: Tensor
+    among: Tensor | None = None
+    is_settled: bool = False
+
+
+class Begun(NamedTuple):
+    """Where coarse steps have led.
+
+    Attributes:
+        body_from_world: ``(N, 4)``.
+        coarse: ``(M,)`` the weights that they went by.
+        steps: how many there were.
+    """
+
+    body_from_world: Tensor
+    coarse: Tensor
+    steps: int
 
 
 def refine(
@@ -88,7 +102,6 @@ def refine(
     structure: Structure | None = None,
     weights: EdgeWeights | None = None,
     priors: RefinementPriors = PRIORS,
-    others: Sequence[Start] = (),
 ) -> Tensor:
     """Reweighted least-squares steps until they have converged, at most ``max_steps``; each component by itself.
 
@@ -96,8 +109,6 @@ def refine(
         body_from_world: ``(N, 4)`` start.
         structure: default: computed.
         weights: default: ones, and no units.
-        others: of each component that start goes on which the cost of a few shaped steps speaks for; those are not
-            counted among all steps.
 
     Returns:
         ``(N, 4)`` float64 orientations.
@@ -106,24 +117,71 @@ def refine(
     if weights is None:
         ones = torch.ones_like(graph.precision)
         weights = EdgeWeights(ones, ones)
-    shaped_prior, coarse_prior = (
-        weight.float().clamp(min=priors.least_prior) for weight in (weights.shaped, weights.coarse)
-    )
+    begun = begin(graph, [Start(body_from_world, weights.coarse)], weights.shaped, structure, priors)
+    return settle(graph, begun, weights, structure, priors)
+
+
+def begin(
+    graph: ViewGraph, starts: Sequence[Start], shaped: Tensor, structure: Structure, priors: RefinementPriors = PRIORS
+) -> Begun:
+    """Coarse steps; of each component from that of several starts where Σ w ‖r‖^½ is clearly lowest after them.
+
+    That is the cost of shaped steps, a few of which are taken to tell starts apart. A likelihood would not do: its
+    scale goes towards nothing where an answer meets as many edges exactly as there are nodes.
+
+    Args:
+        shaped: ``(M,)`` positive, multiplied to the robust weights in shaped steps.
+    """
+    problem, component = Problem(graph, structure, priors), structure.component
+    shaped = shaped.float().clamp(min=priors.least_prior)
+    first, *others = starts
+    orientations, steps = _coarse(problem, first)
+    if not others:
+        return Begun(orientations, first.coarse, steps)
+    # Components in which starts are told apart by further steps, and where they are by the coarse ones alone.
+    is_close = torch.zeros_like(structure.roots, dtype=torch.bool)
+    for other in others:
+        if not other.is_settled:
+            is_close = is_close | (True if other.among is None else other.among)
+
+    def told(orientations: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+        """Orientations after the steps that tell, and their cost ``(C,)``."""
+        if bool(is_close.any()):
+            few = min(priors.telling_steps, priors.max_steps - steps)
+            further = _shaped(problem, orientations, EdgeWeights(shaped, shaped), few).orientations
+            orientations = torch.where(is_close[component, None], further, orientations)
+        return orientations, problem.cost(orientations, shaped)
+
+    orientations, least = told(orientations, steps)
+    coarse, barely = first.coarse, 1 - priors.same_valley
+    for other in others:
+        is_better = torch.ones_like(is_close) if other.among is None else other.among
+        if other.is_settled:
+            is_better = is_better & (problem.cost(other.body_from_world, shaped) < barely * least)
+            if not bool(is_better.any()):
+                continue
+        another, more = _coarse(problem, other)
+        another, cost = told(another, more)
+        is_better = is_better & (cost < barely * least)
+        of_node = is_better[component]
+        orientations = torch.where(of_node[:, None], another, orientations)
+        coarse = torch.where(of_node[graph.source], other.coarse, coarse)
+        least, steps = torch.where(is_better, cost, least), max(steps, more)
+    return Begun(orientations, coarse, steps)
+
+
+def settle(
+    graph: ViewGraph,
+    begun: Begun,
+    weights: EdgeWeights,
+    structure: Structure,
+    priors: RefinementPriors = PRIORS,
+) -> Tensor:
+    """Shaped steps until they have converged, as many as are left, then those by the noise's density, ``(N, 4)``."""
     problem = Problem(graph, structure, priors)
-    max_steps = priors.max_steps
-    coarse_steps = min(priors.max_coarse_steps, max_steps - priors.least_shaped_steps)
-    weights = weights._replace(shaped=shaped_prior)
-    orientations, taken = _coarse(problem, body_from_world.double(), coarse_prior, coarse_steps)
-    if others:
-        few = min(priors.telling_steps, max_steps - taken)
-        orientations = _shaped(problem, orientations, weights, few).orientations
-        for other in others:
-            prior = (weights.shaped * other.coarse).float().clamp(min=priors.least_prior)
-            another, steps = _coarse(problem, other.body_from_world.double(), prior, coarse_steps)
-            another = _shaped(problem, another, weights, few).orientations
-            orientations, taken = _likelier(problem, shaped_prior, orientations, another), max(taken, steps)
-    settled = _shaped(problem, orientations, weights, max_steps - taken)
-    further = min(priors.density.max_steps, max_steps - taken - settled.steps)
+    weights = weights._replace(shaped=weights.shaped.float().clamp(min=priors.least_prior))
+    settled = _shaped(problem, begun.body_from_world, weights, priors.max_steps - begun.steps)
+    further = min(priors.density.max_steps, priors.max_steps - begun.steps - settled.steps)
     return _by_density(problem, settled, weights, further) if further > 0 else settled.orientations
 
 
@@ -136,9 +194,12 @@ class _Settled(NamedTuple):
     steps: int
 
 
-def _coarse(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: int) -> tuple[Tensor, int]:
+def _coarse(problem: Problem, start: Start) -> tuple[Tensor, int]:
     """ℓ1 steps until they are settled; with their number."""
     priors = problem.priors
+    max_steps = min(priors.max_coarse_steps, priors.max_steps - priors.least_shaped_steps)
+    orientations = start.body_from_world.double()
+    prior = start.coarse.float().clamp(min=priors.least_prior)
     measure = Measure(problem.round, problem.evenly(priors.coarse_smoothing**2 / 2), l1_weight, torch.float32)
     is_open = torch.ones_like(problem.roots, dtype=torch.bool)
     for number in range(max_steps):
@@ -149,15 +210,6 @@ def _coarse(problem: Problem, orientations: Tensor, prior: Tensor, max_steps: in
         if not bool(is_open.any()):
             return orientations, number + 1
     return orientations, max(max_steps, 0)
-
-
-def _likelier(problem: Problem, weight: Tensor, one: Tensor, other: Tensor) -> Tensor:
-    """``(N, 4)``: of each component ``one``, or ``other`` where Σ w ‖r‖^½, as shaped steps count, is clearly lower."""
-    of_edge, costs = problem.component[problem.graph.source], []
-    for orientations in (one, other):
-        angle = EdgeResiduals(problem.graph, orientations.float()).angles().double()
-        costs.append(angle.new_zeros(len(problem.roots)).index_add(0, of_edge, weight * angle.sqrt()))
-    return torch.where((costs[1] < (1 - _SAME_VALLEY) * costs[0])[problem.component, None], other, one)
 
 
 def _shaped(problem: Problem, orientations: Tensor, weights: EdgeWeights, max_steps: int) -> _Settled:

@@ -23,9 +23,9 @@ from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap, breadth_firs
 from rotavg_ros.solver.sfm.consensus.search import CONSENSUS, consensus
 from rotavg_ros.solver.sfm.cycles.evidence import with_triangles
 from rotavg_ros.solver.sfm.options import SfmStages
-from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
+from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, Start, begin, refine, settle
 from rotavg_ros.solver.sfm.series import EdgesInSeries
-from rotavg_ros.solver.sfm.starts.sparse import is_sparse, other_starts
+from rotavg_ros.solver.sfm.starts.others import other_starts
 from rotavg_ros.solver.sfm.stated.noise import StatedNoise
 from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.solver.sfm.uncertainty import References, variances
@@ -85,10 +85,12 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
                 priors = replace(priors, density=replace(priors.density, max_steps=0))
             priors = replace(priors, max_steps=steps)
             refinement = partial(refine, graph, structure=structure, priors=priors)
-            others = []
-            if stages.clean and stages.weighted and is_sparse(graph):
-                others = other_starts(judged, is_believed, orientations, component)
-            orientations = refinement(orientations, weights=weights, others=others)
+            starts = [Start(orientations, weights.coarse)]
+            if stages.clean and stages.weighted:
+                starts += other_starts(judged, is_believed, begun.parent_edge, component)
+            settling = begin(graph, starts, weights.shaped, structure, priors)
+            weights = weights._replace(coarse=settling.coarse)
+            orientations = settle(graph, settling, weights, structure, priors)
             if stages.stated:
                 noise = StatedNoise.of(graph, structure, priors, stages.stated_shapes)
                 orientations, weights = noise.refined(orientations, weights, refinement)

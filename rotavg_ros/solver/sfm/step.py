@@ -41,9 +41,10 @@ class Structure:
     series: EdgesInSeries
 
     @classmethod
-    def of(cls, graph: ViewGraph) -> Structure:
+    def of(cls, graph: ViewGraph, component: Tensor | None = None) -> Structure:
         """Computed; a component's root is its first node."""
-        component, edges = graph.components(), SortedEdges.of(graph)
+        component = graph.components() if component is None else component
+        edges = SortedEdges.of(graph)
         nodes = torch.arange(graph.num_nodes, device=graph.device)
         roots = nodes.new_full((int(component.max()) + 1,), graph.num_nodes)
         roots = roots.scatter_reduce(0, component, nodes, "amin")
@@ -213,6 +214,12 @@ class Problem:
         least = self.priors.least_residual
         logarithm = _dot(sample.vector, sample.vector).clamp(min=least**2).log() / 2
         return torch.exp(self._sum_of_some(logarithm) / self._count_of_some)
+
+    def cost(self, orientations: Tensor, weight: Tensor) -> Tensor:
+        """Σ w ‖r‖^½ of each component, ``(C,)``; weights ``(M,)``."""
+        angle = EdgeResiduals(self.graph, orientations.float()).angles()
+        of_edge = self.component.index_select(0, self.graph.source)
+        return weight.new_zeros(len(self.roots)).index_add(0, of_edge, weight * angle.sqrt())
 
     def pooled(self, orientations: Tensor, measure: Measure, prior: Tensor) -> Tensor:
         """Prior weights ``(M,)`` that let edges in series weigh as one expects them to err.

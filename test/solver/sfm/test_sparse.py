@@ -11,9 +11,9 @@ from rotavg_ros import ViewGraph, solve
 from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver.neurora.stages import trust_all
 from rotavg_ros.solver.neurora.tree import bootstrap
-from rotavg_ros.solver.sfm.refinement import Start, refine
-from rotavg_ros.solver.sfm.starts.sparse import is_sparse
+from rotavg_ros.solver.sfm.refinement import EdgeWeights, Start, begin, refine, settle
 from rotavg_ros.solver.sfm.starts.spectral import spectral
+from rotavg_ros.solver.sfm.step import Structure
 from test.solver.graphs import as_quaternions, measured, random_truth
 
 
@@ -47,13 +47,6 @@ def test_it_is_no_worse_than_without_cleannet(cameras: int, reach: int, false_sh
     assert ours.max() < 2 * without.max()
 
 
-def test_which_graphs_are_sparse() -> None:
-    graph, truth = ring(0, 40, 3, 0.0)
-    assert is_sparse(graph)
-    pairs = torch.combinations(torch.arange(40))
-    assert not is_sparse(ViewGraph.create(pairs[:, 0], pairs[:, 1], as_quaternions(truth)[:1].repeat(len(pairs), 1)))
-
-
 def anyhow(seed: int, cameras: int, degree: int, false_share: float) -> tuple[ViewGraph, Rotation]:
     """Pairs of cameras drawn by chance, noise of 2°."""
     rng = np.random.default_rng(seed)
@@ -84,8 +77,10 @@ def test_each_component_goes_on_from_the_better_start() -> None:
 
     best = max(errors_deg(refine(both, torch.cat((exact, exact)))))
     assert max(errors_deg(refine(both, one))) > 10 * best
+    structure, weights = Structure.of(both), EdgeWeights(ones, ones)
     for first, second in ((one, other), (other, one)):
-        assert max(errors_deg(refine(both, first, others=[Start(second, ones)]))) < 1.1 * best
+        begun = begin(both, [Start(first, ones), Start(second, ones)], ones, structure)
+        assert max(errors_deg(settle(both, begun, weights, structure))) < 1.1 * best
 
 
 def test_eigenvectors_know_exact_orientations_whatever_they_begin_with() -> None:

@@ -34,20 +34,23 @@ def spectral(graph: ViewGraph, body_from_world: Tensor, component: Tensor, weigh
         component: ``(N,)`` of every node.
         weight: ``(M,)`` of the edges.
     """
-    source, target, count = graph.source, graph.target, int(component.max()) + 1
-    degree = weight.new_zeros(graph.num_nodes).index_add_(0, source, weight).index_add_(0, target, weight)
+    count, nodes = int(component.max()) + 1, graph.num_nodes
+    leaving, arriving = torch.cat((graph.source, graph.target)), torch.cat((graph.target, graph.source))
+    degree = weight.new_zeros(nodes).index_add_(0, leaving, weight.repeat(2))
     scale = degree.clamp(min=_LEAST).rsqrt()
-    forward = rotations.to_matrix(graph.target_from_source.double())
-    forward = (forward * (weight * scale[source] * scale[target])[:, None, None]).float()
-    backward = forward.mT.contiguous()
-    block = rotations.to_matrix(body_from_world.double()) * degree.sqrt()[:, None, None]
+    # Components in rows, ``(3, 3, 1, 2 M)`` and ``(3, 3, N)``: adding columns up by node is many times as fast.
+    matrix = rotations.to_matrix(graph.target_from_source.double()).permute(1, 2, 0)
+    matrix = torch.cat((matrix, matrix.transpose(0, 1)), dim=2)
+    matrix = (matrix * (weight.repeat(2) * scale[leaving] * scale[arriving])).float()[:, :, None]
+    block = rotations.to_matrix(body_from_world.double()).permute(1, 2, 0) * degree.sqrt()
     for _ in range(_POWERS // _BETWEEN):
-        block = block.float()
+        rows = block.float()
         for _ in range(_BETWEEN):
             # Eigenvalues lie between −1 and 1; with 1 added the largest ones are largest by amount, too.
-            arriving = block.clone().index_add_(0, target, forward @ block[source])
-            block = arriving.index_add_(0, source, backward @ block[target])
-        block = _orthonormal(block.double(), component, count)
+            sent = (matrix * rows.flatten(0, 1).index_select(1, leaving).view(1, 3, 3, -1)).sum(dim=1)
+            rows = rows.flatten(0, 1).index_add(1, arriving, sent.flatten(0, 1)).view(3, 3, nodes)
+        block = _orthonormal(rows.double(), component, count)
+    block = block.permute(2, 0, 1).contiguous()
     # Eigenvectors may be those of a mirrored world.
     handed = block.new_zeros(count).index_add_(0, component, torch.linalg.det(block))
     block[:, :, 2] *= torch.where(handed < 0, -1.0, 1.0)[component, None]
@@ -57,9 +60,9 @@ def spectral(graph: ViewGraph, body_from_world: Tensor, component: Tensor, weigh
 
 
 def _orthonormal(block: Tensor, component: Tensor, count: int) -> Tensor:
-    """Blocks ``(N, 3, 3)`` whose columns, of each component, are orthonormal: the nearest ones, so no axis is first."""
-    gram = block.new_zeros(count, 3, 3).index_add_(0, component, block.mT @ block)
+    """Blocks ``(3, 3, N)`` whose columns, of each component, are orthonormal: the nearest ones, so no axis is first."""
+    products = (block[:, :, None] * block[:, None]).sum(dim=0)
+    gram = block.new_zeros(9, count).index_add_(1, component, products.flatten(0, 1)).t().view(count, 3, 3)
     value, vector = torch.linalg.eigh(gram)
     root = (vector * value.clamp(min=_LEAST).rsqrt()[:, None]) @ vector.mT
-    orthonormal: Tensor = block @ root[component]
-    return orthonormal
+    return torch.einsum("abn,nbc->acn", block, root[component])

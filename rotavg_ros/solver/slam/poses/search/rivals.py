@@ -78,8 +78,13 @@ def rival_poses(
 
 
 def _begun(problem: PoseProblem, others: Sequence[PoseMode]) -> PoseMode:
-    """Poses of a labelling, from nothing, or from those of another one that holds nearly the same closures."""
-    similar = next((pose for pose in others if problem.mode.holds_like(pose.problem.mode.state)), None)
+    """Poses of a labelling, from nothing, or from those of another one that holds nearly the same closures.
+
+    Not where odometry slipped elsewhere: all between the two slips lies elsewhere, and so do its closures' places.
+    """
+    mode = problem.mode
+    slips_alike = (pose for pose in others if np.array_equal(mode.slipped, pose.problem.mode.slipped))
+    similar = next((pose for pose in slips_alike if mode.holds_like(pose.problem.mode.state)), None)
     start = None if similar is None else PoseStart.beside(similar, problem)
     return estimate_poses(problem, start=start)
 
