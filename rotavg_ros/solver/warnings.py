@@ -80,11 +80,15 @@ def mostly_flagged(graph: ViewGraph, outlier_score: Tensor, rotation_score: Tens
             "translation_scale to none; the odometry's position may have jumped somewhere, then leave that edge out; "
             "or the front end may match wrong places",
         )
-    what = "loop closures" if bool(graph.is_odometry.any()) else "edges"
+    if not bool(graph.is_odometry.any()):
+        return (
+            f"{flagged} of {closures} edges are flagged as false; views may look alike that are not of one place, or "
+            "some rotations be stated from target to source: compare some with the pictures by hand",
+        )
     return (
-        f"{flagged} of {closures} {what} are flagged as false; the front end may match wrong places, or all of them "
-        "may have a wrong direction, sensor mounting or clock: check that each edge's rotation is the target's in the "
-        "source's frame, and compare some with the odometry by hand",
+        f"{flagged} of {closures} loop closures are flagged as false; the front end may match wrong places, or all of "
+        "them may have a wrong direction, sensor mounting or clock: check that each edge's rotation is the target's in "
+        "the source's frame, and compare some with the odometry by hand",
     )
 
 

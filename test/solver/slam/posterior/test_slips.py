@@ -67,6 +67,14 @@ def test_slips_and_false_closures_are_told_apart(planar: bool, false_share: floa
     assert np.degrees(float(errors.mean())) > 5
 
 
+def test_what_is_advised_is_not_what_was_done_already() -> None:
+    """Without slips the tails of odometry's noise may hold one of 11°."""
+    graph = laps(planar=False, false_share=0.1, slips={25: 11.0})[0]
+    for method, advice in (("neurora", "(neurora~slips),"), ("neurora~slips", "(neurora~slips,tails),")):
+        warnings = solve(graph, profile="slam", method=method).warnings
+        assert [advice in warning for warning in warnings if "slipped once" in warning] == [True]
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_slips_that_nearly_cancel_do_not_pass_for_drift(seed: int) -> None:
     graph, truth, is_false, is_slip = laps(

@@ -39,10 +39,14 @@ def _of_slips(mode: Mode) -> tuple[str, ...]:
     )
     if bool(graph.is_odometry.all()):
         return (f"{slipped}, because other odometry between the same nodes says so: one of the two is wrong there.",)
+    remedy = "label the closures that you know"
+    if "slips" not in mode.problem.without:
+        remedy = f"solve without slips (neurora~slips), or {remedy}"
+    elif "tails" not in mode.problem.without:
+        remedy = f"solve without tails of its noise, too (neurora~slips,tails), or {remedy}"
     return (
         f"{slipped}, because closures agree that it has. In a building that looks alike turned false closures "
-        "agree so, too: if no step of the odometry can be off by that much, solve without slips (neurora~slips), or "
-        "label the closures that you know.",
+        f"agree so, too: if no step of the odometry can be off by that much, {remedy}.",
     )
 
 
