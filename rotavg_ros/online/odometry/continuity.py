@@ -18,9 +18,11 @@ _SHORTEST_S = 0.2
 # A pose this near to zero is where odometry begins, and one this near to another is the same …
 _ZERO_ANGLE = math.radians(1.0)
 _ZERO_DISTANCE_M = 0.1
-# … and an odometry that has begun anew, if going on as before would have led this far from there.
+# … and an odometry that has begun anew, if going on would have led this far from there.
 _RETURN_ANGLE = math.radians(20.0)
 _RETURN_DISTANCE_M = 1.0
+# Going on is at any of these shares of the last speed: a robot may brake, or stand where it has come home to.
+_SHARES_OF_SPEED = (0.0, 0.5, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,8 +144,11 @@ def has_jumped(
         return True
     if math.isinf(limits.turn_rate) or before is None or last.stamp_ns <= before.stamp_ns or not _is_zero(sample):
         return False
-    angle, metres = _angle_and_metres(_going_on(last, before, sample.stamp_ns), sample)
-    return angle > _RETURN_ANGLE or metres > _RETURN_DISTANCE_M
+    for share in _SHARES_OF_SPEED:
+        angle, metres = _angle_and_metres(_going_on(last, before, sample.stamp_ns, share), sample)
+        if angle <= _RETURN_ANGLE and metres <= _RETURN_DISTANCE_M:
+            return False
+    return True
 
 
 def goes_on(sample: OdometrySample, last: OdometrySample, limits: ContinuityLimits) -> bool:
@@ -185,9 +190,9 @@ def _is_zero(sample: OdometrySample) -> bool:
     return near and quaternion.angle(sample.world_from_body) < _ZERO_ANGLE
 
 
-def _going_on(last: OdometrySample, before: OdometrySample, stamp_ns: int) -> OdometrySample:
-    """Where the last two messages lead at a stamp with constant speed, not farther than as far as they are apart."""
-    steps = min(1.0, (stamp_ns - last.stamp_ns) / (last.stamp_ns - before.stamp_ns))
+def _going_on(last: OdometrySample, before: OdometrySample, stamp_ns: int, share: float) -> OdometrySample:
+    """Where a share of the last two messages' speed leads at a stamp, not farther than as far as they are apart."""
+    steps = share * min(1.0, (stamp_ns - last.stamp_ns) / (last.stamp_ns - before.stamp_ns))
     turn = quaternion.multiply(quaternion.inverse(before.world_from_body), last.world_from_body)
     rotation = quaternion.multiply(last.world_from_body, quaternion.slerp(quaternion.IDENTITY, turn, steps))
     position = last.position

@@ -93,6 +93,21 @@ def test_a_robot_that_comes_home_goes_on():
         assert robot.say(-60 + 30 * index, 0) == "chain 0", index
 
 
+@pytest.mark.parametrize("jitter", [0.0, 0.3, 1.5])
+@pytest.mark.parametrize(
+    "way_home", [[(0, -2.4), (0, -1.2)], [(0, -6), (0, -1.5)], [(-50, 0), (-25, 0)], [(-67, 0), (-22, 0)]]
+)
+def test_a_robot_that_parks_where_its_odometry_began_goes_on(way_home, jitter):
+    """However fast it came, braking or not, within or at the edge of what counts as zero; and it may drive off."""
+    robot, random = Robot(), np.random.default_rng(0)
+    for heading, metres in way_home:
+        assert robot.say(heading, metres, after_s=1.0) == "chain 0"
+    for heading, metres in jitter * random.uniform(-1, 1, size=(60, 2)) * [1.0, 0.1]:
+        assert robot.say(heading, metres, after_s=1.0) == "chain 0"
+    for index in range(1, 5):
+        assert robot.say(0, 0.3 * index, after_s=1.0) == "chain 0"
+
+
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=30)
 def test_motion_within_the_limits_is_one_chain(seed):
