@@ -19,6 +19,7 @@ from rotavg_ros.inputs import (
     OdometryRecord,
 )
 from rotavg_ros.online import EstimatorOptions, OnlineEstimator, RejectReason
+from rotavg_ros.online.growing_array import GrowingArray
 from rotavg_ros.online.measurements import OdometryMessage, RejectedInputError
 from rotavg_ros.online.odometry.time_jumps import KEEPS_TIME_LINE, BackwardJumps
 from rotavg_ros.online.quaternion import IDENTITY, Quaternion
@@ -130,16 +131,17 @@ def _time_lines(records: list[OdometryRecord], options: EstimatorOptions) -> NDA
     time_line = np.zeros(len(records), dtype=np.int64)
     if options.on_time_jump in KEEPS_TIME_LINE:
         return time_line
-    jumps, newest_ns, step_ns = BackwardJumps(), -1, options.odometry_bounds.max_gap_ns
+    jumps, taken_ns = BackwardJumps(), GrowingArray(np.int64)
     for row, record in enumerate(records):
-        if record.stamp_ns <= newest_ns:
+        stamps_ns = [record.stamp_ns]
+        if len(taken_ns) and record.stamp_ns <= taken_ns.view[-1]:
             message = OdometryMessage("reference", record.stamp_ns, record.world_from_body, record.position)
-            since_jump = jumps.late(message, newest_ns, options.time_jump_ns, step_ns)
-            if not since_jump:
+            stamps_ns = [late.stamp_ns for late in jumps.late(message, taken_ns.view, options.time_jump_ns)]
+            if not stamps_ns:
                 continue
-            time_line[row + 1 - len(since_jump) :] += 1
+            time_line[row + 1 - len(stamps_ns) :] += 1
         jumps.on_time("reference")
-        newest_ns = record.stamp_ns
+        taken_ns.extend(np.array(stamps_ns))
     return time_line
 
 

@@ -12,6 +12,8 @@ from rotavg_ros.bags.message_types import typestore
 from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.files.pose_files import read_pose_file
+from rotavg_ros.replay.feed import read_references
+from rotavg_ros.replay.plan import Input, Wishes, make_plan
 
 from .bag_forms import StoragePlugin, Writer
 from .conftest import SELDOM
@@ -59,6 +61,17 @@ def test_both_turns_are_kept_and_compared_with_their_own_reference(once: Path, t
     assert both_robot["reference"] == robot["reference"]
     error, both_error = (each["orientation_error_mean_deg"]["odometry"] for each in (robot, both_robot))
     assert both_error == pytest.approx(error, rel=1e-3)
+
+
+@pytest.mark.parametrize("gap", [0.0, 5.0])
+def test_a_reference_has_both_turns_wherever_edges_are_placed(looped: Path, gap: float) -> None:
+    with BagReader(looped) as reader:
+        plan = make_plan(reader, {"max_odometry_gap_s": gap}, Wishes())
+        inputs = {robot: source for robot, source in plan.references.items() if isinstance(source, Input)}
+        (reference,) = read_references(reader, inputs, plan.parameters, reader.start_ns, reader.end_ns + 1).values()
+    assert reference.time_line is not None
+    first, second = (reference.stamp_ns[reference.time_line == turn].tolist() for turn in range(2))
+    assert first == second and len(reference.stamp_ns) == 2 * len(first)
 
 
 def test_a_trajectory_has_every_stamp_once(once: Path, twice: Path) -> None:

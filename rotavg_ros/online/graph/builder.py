@@ -86,10 +86,8 @@ class GraphBuilder:
 
     def _late(self, message: OdometryMessage, track: OdometryTrack) -> list[OdometryMessage]:
         """Note a message that is out of order; returns those since the robot's clock went back, if that is clear."""
-        assert track.latest is not None
         options, jumps = self.options, self.growth.backward_jumps
-        step_ns = options.odometry_bounds.max_gap_ns
-        since_jump = jumps.late(message, track.latest.stamp_ns, options.time_jump_ns, step_ns)
+        since_jump = jumps.late(message, track.samples.stamps_ns, options.time_jump_ns)
         if not since_jump or options.on_time_jump in KEEPS_TIME_LINE:
             self._edges.decide(message.robot)
         return since_jump

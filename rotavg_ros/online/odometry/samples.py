@@ -107,6 +107,11 @@ class OdometrySamples:
         return self._sample(first - 1), self._sample(first)
 
     @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """Of the messages ``(n,)`` in the order in which they were taken, not copied."""
+        return self._stamp_ns.view
+
+    @property
     def last_chain(self) -> int:
         return int(self._chain.view[-1]) if len(self) else 0
 

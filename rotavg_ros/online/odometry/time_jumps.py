@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rotavg_ros.online.measurements import OdometryMessage
 
 # So many messages in a row must agree before the past is believed: stray ones, however old, change nothing.
 _RUN_LENGTH = 5
+# They follow each other if no step among them is longer than so many of the robot's own: 5 s at 10 Hz. With fewer a
+# pause in the wrong moment costs the messages before it; stray stamps lie so much farther apart that more would do.
+_LONGEST_STEP = 50.0
+# The robot's own step is exceeded by a tenth of its latest: a few pauses do not count, and the pauses between messages
+# that come in bursts do. Of that many messages.
+RECENT = 100
+_USUAL = 0.9
 
 POLICIES = ("new_component", "reset", "ignore", "error")
 # With these a robot's stamps mean what they did before, whatever its clock says.
@@ -21,24 +32,22 @@ class BackwardJumps:
         self._runs: dict[str, list[OdometryMessage]] = {}
         self._told: set[str] = set()
 
-    def late(
-        self, message: OdometryMessage, latest_ns: int, threshold_ns: int, longest_step_ns: int
-    ) -> list[OdometryMessage]:
+    def late(self, message: OdometryMessage, taken_ns: NDArray[np.int64], threshold_ns: int) -> list[OdometryMessage]:
         """Note a message that was refused as out of order.
 
         Args:
             message: what was refused.
-            latest_ns: newest stamp of its robot.
+            taken_ns: ``(n,)`` stamps of its robot's messages that were taken, the newest last, of the latest
+                :data:`RECENT` or more; at least one.
             threshold_ns: going back by no more than this is no jump.
-            longest_step_ns: late messages farther apart do not belong together.
 
         Returns:
             the messages since the jump, in their order, once per jump; empty as long as there is no telling.
         """
         run = self._runs.setdefault(message.robot, [])
-        if run and not 0 < message.stamp_ns - run[-1].stamp_ns <= longest_step_ns:
+        if run and not 0 < message.stamp_ns - run[-1].stamp_ns <= _longest_step_ns(taken_ns[-RECENT:]):
             run.clear()
-        if message.robot not in self._told and latest_ns - message.stamp_ns > threshold_ns:
+        if message.robot not in self._told and int(taken_ns[-1]) - message.stamp_ns > threshold_ns:
             run.append(message)
         if len(run) < _RUN_LENGTH:
             return []
@@ -77,3 +86,10 @@ class BackwardJumps:
     def is_back(self) -> bool:
         """Whether a robot's messages have come from before a jump ever since."""
         return bool(self._told)
+
+
+def _longest_step_ns(taken_ns: NDArray[np.int64]) -> float:
+    """Late messages of a robot with these stamps ``(n,)`` that lie farther apart do not belong together."""
+    steps = np.diff(taken_ns)
+    steps = steps[steps > 0]  # where time went back before, there is a step back
+    return _LONGEST_STEP * float(np.quantile(steps, _USUAL)) if len(steps) else math.inf

@@ -42,6 +42,22 @@ def test_with_reset_a_bag_that_begins_again_leaves_the_graph_of_one_playing() ->
     assert twice.time_jumps == 1 and twice.counts().rejected == {}
 
 
+@pytest.mark.parametrize("max_gap_s", [0.0, 5.0])
+@pytest.mark.parametrize(
+    "steps",
+    [[0.01], [0.1], [1.0], [6.0], [60.0], [0.001, 0.001, 1.0], [*[0.1] * 30, 40.0]],
+    ids=["100 Hz", "10 Hz", "1 Hz", "every 6 s", "every minute", "bursts", "pauses"],
+)
+def test_a_bag_that_begins_again_is_seen_whatever_its_rate(steps: list[float], max_gap_s: float) -> None:
+    """Regular, in bursts, or with pauses; and wherever edges are placed between its messages."""
+    stamps_ns = [5 * SECOND + round(1e9 * seconds) for seconds in np.cumsum(np.resize(steps, 600))]
+    options = EstimatorOptions(max_odometry_gap_s=max_gap_s)
+    online = OnlineEstimator(options, lambda *_, **__: None)
+    said = [online.add_odometry("r", stamp_ns, [0, 0, 0, 1]) for stamp_ns in 2 * stamps_ns]
+    assert said == [None] * 600 + [RejectReason.OUT_OF_ORDER_ODOMETRY] * 4 + [None] * 596
+    assert online.time_jumps == 1 and online.counts().rejected == {}
+
+
 def turn(source: int, target: int) -> list[float]:
     between = Rotation.from_quat(rotation(target)).inv() * Rotation.from_quat(rotation(source))
     return between.as_quat().tolist()
