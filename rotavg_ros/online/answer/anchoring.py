@@ -77,15 +77,14 @@ def corrections(builder: GraphBuilder, body_from_world: Tensor) -> dict[str, Qua
     """
     found = {}
     for robot, track in builder.tracks.items():
-        for node in builder.graph.nodes_newest_first(robot):
+        # Only where the odometry reaches: a front end with another clock has any number of keyframes elsewhere.
+        reach_ns = track.samples.reach()
+        for node in builder.graph.nodes_newest_first(robot, track.samples.last_time_line, *reach_ns):
             if node >= len(body_from_world):
                 continue
-            moment = builder.graph.moment_of(node)
-            if track.samples.chain_at(*moment) != track.chain:
-                break
             try:
-                odometry = track.samples.world_from_body_at(*moment)
-            except RejectedInputError:
+                odometry = track.samples.world_from_body_at(*builder.graph.moment_of(node))
+            except RejectedInputError:  # in a gap
                 continue
             x, y, z, w = body_from_world[node].tolist()
             found[robot] = quaternion.inverse(quaternion.multiply(odometry, (x, y, z, w)))

@@ -121,10 +121,10 @@ class GrowingViewGraph:
         index = self._index_of(robot)
         return None if index is None else index.first(time_line)
 
-    def nodes_newest_first(self, robot: str) -> Iterator[int]:
-        """The robot's nodes with a stamp, the latest moment first."""
+    def nodes_newest_first(self, robot: str, time_line: int, first_ns: int, last_ns: int) -> Iterator[int]:
+        """The nodes of the robot's time line with stamps from the first to the last, the latest moment first."""
         index = self._index_of(robot)
-        return iter(()) if index is None else index.newest_first()
+        return iter(()) if index is None else index.newest_first(time_line, first_ns, last_ns)
 
     def moments(self, robot: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Stamps and time lines of the robot's nodes with a stamp, in the order of the moments."""

@@ -90,6 +90,9 @@ class KeyframeIndex:
         start, stop = self._rows_of(time_line)
         return start, start + int(np.searchsorted(self._stamp_ns.view[start:stop], stamp_ns, "right"))
 
-    def newest_first(self) -> Iterator[int]:
-        """Nodes with a stamp, the latest moment first."""
-        return (int(node) for node in self._node.view[::-1])
+    def newest_first(self, time_line: int, first_ns: int, last_ns: int) -> Iterator[int]:
+        """The time line's nodes with stamps from the first to the last, both included, the latest moment first."""
+        start, stop = self._rows_of(time_line)
+        stamps = self._stamp_ns.view[start:stop]
+        first, behind = int(np.searchsorted(stamps, first_ns)), int(np.searchsorted(stamps, last_ns, "right"))
+        return (int(node) for node in self._node.view[start + first : start + behind][::-1])

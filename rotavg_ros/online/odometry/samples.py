@@ -101,6 +101,16 @@ class OdometrySamples:
             self._sample(int(keyframes[-1])) if len(keyframes) else None,
         )
 
+    def reach(self) -> tuple[int, int]:
+        """First and last stamp at which the last message's chain tells of the body, gaps apart. There must be one.
+
+        The tolerance is included, but not towards another chain of the same time line.
+        """
+        stamps, time_line, tolerance_ns = self._stamp_ns.view, self._time_line.view, self.bounds.tolerance_ns
+        first = int(np.searchsorted(self._chain.view, self.last_chain))
+        begins_time_line = first == 0 or time_line[first - 1] != time_line[first]
+        return int(stamps[first]) - (tolerance_ns if begins_time_line else 0), int(stamps[-1]) + tolerance_ns
+
     def seam(self, chain: int) -> tuple[OdometrySample, OdometrySample]:
         """The last message before a chain, and its first."""
         first = int(np.searchsorted(self._chain.view, chain))

@@ -65,7 +65,10 @@ def test_lookup_by_stamp_when_keyframes_came_out_of_order():
         None, 1, 1, 2, 2, 0, 0,
     ]  # fmt: skip
     assert graph.first_keyframe("r", 0) == 1
-    assert list(graph.nodes_newest_first("r")) == [0, 2, 1]
+    assert [list(graph.nodes_newest_first("r", 0, *reach)) for reach in ((0, 99), (10, 30), (11, 49), (51, 99))] == [
+        [0, 2, 1], [2, 1], [2], [],
+    ]  # fmt: skip
+    assert list(graph.nodes_newest_first("r", 1, 0, 99)) == list(graph.nodes_newest_first("s", 0, 0, 99)) == []
 
 
 def test_a_stamp_may_be_learnt_later_but_not_changed():
