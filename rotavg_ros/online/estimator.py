@@ -110,6 +110,7 @@ class OnlineEstimator:
         discarded = Discarded(self._content.state)
         self._generation += 1
         self._content = Content(state)
+        self._content.builder.set_options(self.options)  # they may have changed while a file was read
         self._abandon_tick("everything was forgotten or replaced meanwhile")
         if self._on_discard is not None and discarded.num_keyframes:
             self._on_discard(discarded)

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from hypothesis import HealthCheck, given, settings
@@ -13,6 +14,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
+from rotavg_ros.online.content import ContentState
+from rotavg_ros.online.state import content as state_content
 from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
 SECOND = 1_000_000_000
@@ -173,6 +176,23 @@ def test_a_cut_anywhere_changes_nothing(solver, tmp_path, drawn, cuts, policy) -
         call(whole), call(parts)
     # What was solved from another start may differ by rounding.
     compare(content(whole, tmp_path / "whole.npz"), content(parts, tmp_path / "parts.npz"), tolerance=1e-12)
+
+
+def test_options_that_change_while_a_file_is_read_count(solver, tmp_path, monkeypatch) -> None:
+    online, restore = OnlineEstimator(OPTIONS, solver), state_content.restore
+    online.add_odometry("a", START, (0.0, 0.0, 0.0, 1.0))
+    online.save(tmp_path / "state.npz")
+
+    def restore_slowly(*arguments: Any) -> ContentState:
+        restored = restore(*arguments)
+        online.set_options(replace(OPTIONS, keyframe_interval_s=1.0))
+        return restored
+
+    monkeypatch.setattr(state_content, "restore", restore_slowly)
+    online.load(tmp_path / "state.npz")
+    for tenths in range(1, 21):
+        online.add_odometry("a", START + tenths * SECOND // 10, (0.0, 0.0, 0.0, 1.0))
+    assert online.counts().keyframes == 3, "one a second"
 
 
 def test_what_the_streams_above_reach(solver, tmp_path) -> None:
