@@ -20,19 +20,40 @@ INWARD: dict[str, set[str]] = {
     "odometry_route": set(),
     "hamilton": set(),
     "startup": set(),
+    "whole_file": set(),
     "rotations": {"hamilton"},
     "baselines": {"errors", "rotations", "solver", "view_graph"},
     "solver": {"baselines", "errors", "hamilton", "odometry_route", "rotations", "view_graph"},
-    "datasets": {"errors", "rotations", "view_graph"},
+    "datasets": {"errors", "rotations", "view_graph", "whole_file"},
     "metrics": {"rotations", "view_graph"},
     "results": {"errors", "version"},
-    "reports": {"errors", "metrics", "online", "replay", "version", "view_graph"},
+    "reports": {"errors", "metrics", "online", "replay", "version", "view_graph", "whole_file"},
     "evaluation": {
         *("baselines", "datasets", "errors", "metrics", "online", "reports", "results"),
         *("rotations", "solver", "training", "version", "view_graph"),
     },
-    "training": {"datasets", "errors", "metrics", "results", "rotations", "solver", "version", "view_graph"},
-    "online": {"errors", "hamilton", "odometry_route", "option", "rotations", "solver", "startup", "view_graph"},
+    "training": {
+        "datasets",
+        "errors",
+        "metrics",
+        "results",
+        "rotations",
+        "solver",
+        "version",
+        "view_graph",
+        "whole_file",
+    },
+    "online": {
+        "errors",
+        "hamilton",
+        "odometry_route",
+        "option",
+        "rotations",
+        "solver",
+        "startup",
+        "view_graph",
+        "whole_file",
+    },
     "inputs": {"online", "view_graph"},
     "settings": {"inputs", "online", "option", "view_graph"},
 }
@@ -241,7 +262,18 @@ FACES = {
 }
 INSIDERS = {"baselines": {"algebra", "neurora"}, "training": {"algebra", "neurora"}}
 # What a robot runs needs no more.
-NODE_MAY_USE = {"errors", "inputs", "online", "option", "settings", "solver", "startup", "version", "view_graph"}
+NODE_MAY_USE = {
+    "errors",
+    "inputs",
+    "online",
+    "option",
+    "settings",
+    "solver",
+    "startup",
+    "version",
+    "view_graph",
+    "whole_file",
+}
 # Others' packages that only one wing may know.
 BORDERS = {"rclpy": "ros", "rosbags": "bags", "mcap": "bags"}
 # Who imports by name what no arrow is about: subcommands, message packages, peers that may not be installed.

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-import os
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -21,6 +19,7 @@ from rotavg_ros.reports.facts import RunFacts
 from rotavg_ros.reports.page import page_of
 from rotavg_ros.reports.theme import DARK, LIGHT, Theme
 from rotavg_ros.version import __version__
+from rotavg_ros.whole_file import replacing
 
 
 class ReportError(UserError):
@@ -155,11 +154,8 @@ def _data_uri(png: bytes) -> str:
 
 
 def _write(path: Path, content: bytes) -> None:
-    temporary = path.with_name(f".{path.name}.partial")
     try:
-        temporary.write_bytes(content)
-        os.replace(temporary, path)
+        with replacing(path) as temporary:
+            temporary.write_bytes(content)
     except OSError as error:
-        with suppress(OSError):
-            temporary.unlink()
         raise ReportError(f"{path}: cannot be written: {error.strerror}") from None

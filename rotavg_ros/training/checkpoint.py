@@ -1,13 +1,12 @@
 """A training run on disk: tensors of network and optimizer with a word on what they belong to, and atomic writes.
 
-Files are written beside their place and renamed into it, so that a run that is killed at any moment leaves whole files
+Files are written beside their place and moved into it, so that a run that is killed at any moment leaves whole files
 behind: the old ones or the new ones.
 """
 
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from rotavg_ros.errors import UserError
+from rotavg_ros.whole_file import replacing
 
 _NETWORK, _OPTIMIZER, _AVERAGE = "network.", "optimizer.", "average."
 
@@ -91,17 +91,15 @@ def load_checkpoint(
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, str]) -> None:
     """Write a safetensors file, whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    # Not safetensors' save_file, which makes a file that only its owner can read.
-    partial.write_bytes(save({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, about))
-    os.replace(partial, path)
+    content = save({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, about)
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def save_text(path: Path, text: str) -> None:
     """Write a text file, whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text)
-    os.replace(partial, path)
+    with replacing(path) as temporary:
+        temporary.write_text(text)
 
 
 def _differences(saved: dict[str, Any], present: dict[str, Any]) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
@@ -19,7 +20,6 @@ from rotavg_ros.solver.networks import NETWORKS
 from rotavg_ros.solver.neurora.clean_net import CleanNet
 from rotavg_ros.solver.neurora.network_store import read_network
 from rotavg_ros.solver.neurora.paper import PaperCleanNet
-from rotavg_ros.training import checkpoint
 from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.paper_tasks import PaperCleanTask, PaperFineTask
 from rotavg_ros.training.sfm_tasks import SfmCleanTask, SfmFineTask
@@ -118,7 +118,7 @@ def test_kill_while_saving_loses_nothing(interrupted: str, tmp_path: Path, monke
     class KilledError(BaseException):
         pass
 
-    os_replace = checkpoint.os.replace
+    os_replace = os.replace
 
     def killed_before(source: Path, target: Path) -> None:
         if Path(target).name == name + interrupted:
@@ -126,7 +126,7 @@ def test_kill_while_saving_loses_nothing(interrupted: str, tmp_path: Path, monke
         os_replace(source, target)
 
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint.os, "replace", killed_before)
+        patch.setattr(os, "replace", killed_before)
         with pytest.raises(KilledError):
             trainer.run()
     read_network(NETWORKS[name], tmp_path / "killed" / f"{name}.safetensors")  # still a whole file

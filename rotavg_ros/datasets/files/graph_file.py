@@ -9,10 +9,9 @@ from __future__ import annotations
 import codecs
 import gzip
 import io
-import os
 import zlib
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -21,6 +20,7 @@ import torch
 
 from rotavg_ros.errors import UserError
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph, where_possible
+from rotavg_ros.whole_file import replacing
 
 # Ids are non-negative so that they fit the unsigned 64-bit ids of the messages and of gtsam's keys.
 MAX_NODE_ID = np.iinfo(np.int64).max
@@ -222,17 +222,13 @@ def reading(path: Path) -> Iterator[None]:
 
 @contextmanager
 def writing(path: Path) -> Iterator[Path]:
-    """A temporary name next to ``path`` that takes its place on success and vanishes on failure.
+    """A file to write that takes the place of ``path`` on success, see :func:`~rotavg_ros.whole_file.replacing`.
 
     Raises:
         GraphFileError: the place cannot be written (missing folder, rights, full disk).
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        yield temporary
-        os.replace(temporary, path)
+        with replacing(path) as temporary:
+            yield temporary
     except OSError as error:
         raise GraphFileError.at(path, None, f"cannot be written: {error.strerror or error}") from None
-    finally:
-        with suppress(OSError):  # below a file there is nothing to remove
-            temporary.unlink()

@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rotavg_ros.online.state.file import Arrays, StateFileError, write
+from rotavg_ros.whole_file import real
 
 # How many there are at most: the newest one, and of the others the largest.
 KEPT = 5
@@ -17,7 +18,8 @@ _NUMBERED = re.compile(r"\.bak-(\d+)$")
 def back_up(state_file: Path, arrays: Arrays) -> Path:
     """Write a state into a new backup beside a state file; backups beyond :data:`KEPT` are deleted.
 
-    Numbers tell which backup is newer: clocks that are set back are what makes backups.
+    Where links lead to the file, it is beside the file itself. Numbers tell which backup is newer: clocks that are set
+    back are what makes backups.
 
     Returns:
         the backup.
@@ -26,6 +28,7 @@ def back_up(state_file: Path, arrays: Arrays) -> Path:
         StateFileError: the disk is full or the folder not writable. Then the state file itself, if there is one,
             has become the backup, so that whatever is saved next does not replace it; the message says so.
     """
+    state_file = real(state_file)
     backup = _next(state_file)
     try:
         write(backup, arrays)
@@ -42,6 +45,7 @@ def back_up(state_file: Path, arrays: Arrays) -> Path:
 
 def backups(state_file: Path) -> list[Path]:
     """The backups of a state file, the newest first."""
+    state_file = real(state_file)
     numbered = {
         int(match.group(1)): path
         for path in state_file.parent.glob("*.bak-*")

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import glob
 import json
 import os
 import stat
-import tempfile
 import zipfile
 import zlib
 from contextlib import suppress
@@ -17,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rotavg_ros.errors import UserError
+from rotavg_ros.whole_file import real, replacing
 
 FORMAT = "rotavg online state"
 FORMAT_VERSION = 7
 _READABLE = (2, 3, 4, 5, 6, FORMAT_VERSION)
-_TEMPORARY = ".tmp"
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -63,25 +61,20 @@ def _open(path: Path) -> BinaryIO:
 
 
 def write(path: Path, arrays: Arrays) -> None:
-    """Write beside the file and move into place, so that the file is always a whole one.
+    """Write it whole, see :func:`~rotavg_ros.whole_file.replacing`, and onto the disk.
 
     Raises:
         StateFileError: the folder is missing or not writable, the disk is full, or something else than a file has
             the path.
     """
     check_kind(path)
-    temporary = None
     try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_TEMPORARY, dir=path.parent)
-        with os.fdopen(handle, "wb") as stream:
+        with replacing(path) as temporary, temporary.open("wb") as stream:
             np.savez(stream, **arrays)  # type: ignore[arg-type]
             stream.flush()
             os.fsync(stream.fileno())
-        os.replace(temporary, path)
-        _synchronise(path.parent)
+        _synchronise(real(path).parent)
     except OSError as error:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
         raise StateFileError(f"cannot write the state file {path}: {error.strerror}") from error
 
 
@@ -92,13 +85,6 @@ def _synchronise(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def remove_leftovers(path: Path) -> None:
-    """Delete what was being written beside a state file when the process was killed."""
-    for leftover in path.parent.glob(f".{glob.escape(path.name)}.*{_TEMPORARY}"):
-        with suppress(OSError):
-            leftover.unlink()
 
 
 def read(path: Path) -> Arrays:

@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rotavg_ros.online.state.file import StateFileError, StateFileInUseError
+from rotavg_ros.whole_file import real
 
 
 class StateFileLock:
@@ -60,8 +61,8 @@ class StateFileLock:
     @property
     def _path(self) -> Path:
         """Beside the file itself, whatever links lead to it."""
-        real = Path(os.path.realpath(self._state_file))
-        return real.with_name(f".{real.name}.lock")
+        place = real(self._state_file)
+        return place.with_name(f".{place.name}.lock")
 
     def _close(self) -> None:
         if self._descriptor is not None:

@@ -18,7 +18,7 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.online import Answer, Discarded, OnlineEstimator
 from rotavg_ros.online.answer.joins import joins
 from rotavg_ros.online.estimator import TICK_WORK, WORK_AFTER, TickAbandonedError
-from rotavg_ros.online.state.file import StateFileError, StateFileInUseError, check_kind, remove_leftovers
+from rotavg_ros.online.state.file import StateFileError, StateFileInUseError, check_kind
 from rotavg_ros.online.state.lock import StateFileLock
 from rotavg_ros.ros.node.diagnostics import KEPT, NOT_KEPT, of_other_robots
 from rotavg_ros.ros.node.health import Health
@@ -26,6 +26,7 @@ from rotavg_ros.ros.node.intake.forwarding import Forwarding
 from rotavg_ros.ros.node.output.outputs import Outputs
 from rotavg_ros.ros.node.tick_budget import TickBudget
 from rotavg_ros.settings.parameters import NodeParameters
+from rotavg_ros.whole_file import remove_leftovers
 
 _LOG_PERIOD_S = 5.0
 # Of a tick's budget, before its answer.

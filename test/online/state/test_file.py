@@ -21,7 +21,10 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import EdgeMeasurement, EstimatorOptions, KeyframeReference, OnlineEstimator
 from rotavg_ros.online.state import file as state_file
+from rotavg_ros.online.state.backups import back_up, backups
+from rotavg_ros.online.state.lock import StateFileLock
 from rotavg_ros.view_graph import EdgeLabel
+from rotavg_ros.whole_file import remove_leftovers
 
 OPTIONS = EstimatorOptions(keyframe_angle=0, keyframe_distance=0, keyframe_interval_s=0.3)
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
@@ -145,6 +148,39 @@ def test_a_failed_save_leaves_the_old_file(filled, tmp_path, monkeypatch):
         filled.save(Path("/nonexistent/folder/state.npz"))
 
 
+def test_a_link_leads_to_the_file_as_before(filled, tmp_path):
+    """A file on another disk: what is saved, backed up and left over lies there, and the lock goes on holding."""
+    disk, link = tmp_path / "disk", tmp_path / "link.npz"
+    disk.mkdir()
+    link.symlink_to(disk / "state.npz")  # of a file that is still to be made
+    lock, other = StateFileLock(link), StateFileLock(disk / "state.npz")
+    lock.acquire()
+    filled.save(link)
+    feed(filled, 44, 60)
+    filled.save(link)
+    assert link.is_symlink() and sorted(os.listdir(disk)) == [".state.npz.lock", "state.npz"]
+    assert state_file.read(disk / "state.npz")["odometry0_stamp_ns"][-1] == 5_900_000_000
+    lock.acquire()
+    with pytest.raises(UserError, match="in use"):
+        other.acquire()
+    lock.release()
+    assert back_up(link, state_file.read(link)) == disk / "state.npz.bak-0001" == backups(link)[0]
+    (disk / ".state.npz.x8_k.tmp").write_bytes(b"half")
+    remove_leftovers(link)
+    assert sorted(os.listdir(disk)) == ["state.npz", "state.npz.bak-0001"]
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o664, 0o444])
+def test_a_file_keeps_its_rights(filled, tmp_path, mode):
+    path = tmp_path / "state.npz"
+    filled.save(path)
+    (tmp_path / "any").touch()
+    assert path.stat().st_mode == (tmp_path / "any").stat().st_mode, "as the umask has it"
+    path.chmod(mode)
+    filled.save(path)
+    assert path.stat().st_mode & 0o777 == mode
+
+
 @pytest.mark.parametrize("kind", ["a folder", "a FIFO", "a socket", "a device"])
 def test_what_is_no_file_is_refused_at_once(filled, tmp_path, kind):
     """A FIFO would keep the node waiting for somebody who writes into it."""
@@ -170,7 +206,7 @@ def test_what_a_killed_process_left_behind_is_removed(filled, tmp_path):
     filled.save(path)
     for name in (".state.npz.x8_k.tmp", ".other.npz.x8_k.tmp", "state.npz.tmp"):
         (tmp_path / name).write_bytes(b"half")
-    state_file.remove_leftovers(path)
+    remove_leftovers(path)
     assert sorted(os.listdir(tmp_path)) == [".other.npz.x8_k.tmp", "state.npz", "state.npz.tmp"]
 
 
