@@ -22,7 +22,7 @@ from rotavg_ros.online.options import NANOSECONDS
 
 # A publisher keeps so many messages to send lost ones again. Fast DDS asks its readers what they miss every 3 s.
 _DEPTH = 10_000
-_ACKNOWLEDGE_TIMEOUT = Duration(seconds=10)
+_ACKNOWLEDGE_TIMEOUT_S = 10.0
 _CLOCK_PERIOD_NS = 10_000_000
 # Subscribers of one process do not appear at once: go on when their number has been the same for so long.
 _SETTLE_SECONDS = 0.5
@@ -75,7 +75,8 @@ def play(
 
     Raises:
         BagReadError: an unreadable bag, or no such topic.
-        PlayError: a ROS 1 bag, an impossible option, a message type that is not installed, or nobody who listens.
+        PlayError: a ROS 1 bag, an impossible option, a message type that is not installed, nobody who listens, or a
+            reliable subscriber that does not get everything.
     """
     _check(options)
     with BagReader(path) as bag:
@@ -89,6 +90,7 @@ def play(
                 player.wait_for_subscribers()
                 start = time.monotonic()
                 player.publish(watch(bag.messages(types), bag.num_messages(types)))
+                player.wait_until_all_is_received()
                 return Playback(player.counts, left_out, time.monotonic() - start)
             finally:
                 player.node.destroy_node()
@@ -145,8 +147,19 @@ class _Player:
                 self._clock.publish(_clock_message(clock_ns))
             self._publishers[message.topic].publish(bytes(message.data))
             self.counts[message.topic] += 1
-        for publisher in self._publishers.values():
-            publisher.wait_for_all_acked(_ACKNOWLEDGE_TIMEOUT)
+
+    def wait_until_all_is_received(self) -> None:
+        deadline = time.monotonic() + _ACKNOWLEDGE_TIMEOUT_S
+        lacking = [
+            topic
+            for topic, publisher in self._publishers.items()
+            if not publisher.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
+        ]
+        if lacking:
+            raise PlayError(
+                f"all was played, but {_ACKNOWLEDGE_TIMEOUT_S:g} s later a reliable subscriber of {', '.join(lacking)} "
+                "has not got everything; see whether it hangs"
+            )
 
 
 def _check(options: PlayOptions) -> None:

@@ -17,8 +17,10 @@ from rosgraph_msgs.msg import Clock
 from rotavg_msgs.msg import RelativeRotation
 
 from rotavg_ros.bags.run_bag import write_run_bag
+from rotavg_ros.cli.main import main
 from rotavg_ros.datasets.simulation.robot_run import RobotRun
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, simulate_slam_graph
+from rotavg_ros.ros.harness import player as harness_player
 
 pytestmark = pytest.mark.ros
 
@@ -99,6 +101,31 @@ def test_nobody_listens(bag: Path, start_process: Callable) -> None:
     assert player.wait() == 2
     assert "nobody subscribed" in player.output
     assert player.output.count("\n") == 1
+
+
+HANGS = """
+import os, signal, rclpy
+from nav_msgs.msg import Odometry
+rclpy.init()
+node, seen = rclpy.create_node("hangs"), []
+def hang(message):
+    seen.append(message)
+    if len(seen) == 20:
+        os.kill(os.getpid(), signal.SIGSTOP)
+node.create_subscription(Odometry, "odom", hang, 10_000)
+rclpy.spin(node)
+"""
+
+
+def test_a_subscriber_that_hangs_is_told_of(
+    bag: Path, start_process: Callable, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(harness_player, "_ACKNOWLEDGE_TIMEOUT_S", 0.5)
+    subscriber = start_process(sys.executable, "-c", HANGS)
+    assert main(["play", str(bag), "--rate", "0", "--wait-for-subscribers", "150"]) == 2
+    said = capsys.readouterr()
+    assert "0.5 s later a reliable subscriber of /odom has not got everything" in said.err and not said.out
+    subscriber.stop(signal.SIGKILL)  # it hears no other
 
 
 def test_plays_to_nobody_when_told_so(bag: Path, start_process: Callable) -> None:
