@@ -28,11 +28,15 @@ class ReplayUsageError(UserError):
 
 def run(arguments: argparse.Namespace) -> int:
     """Replay and write."""
-    values = read_parameter_file(arguments.params) if arguments.params else {}
+    values, notes = read_parameter_file(arguments.params) if arguments.params else ({}, [])
     values |= read_settings(arguments.p)
     wishes = Wishes(arguments.odometry, arguments.edges, arguments.reference, arguments.robots)
     with BagReader(arguments.bag, salvage=True) as bag:
         plan = make_plan(bag, values, wishes)
+        if plan.unused:
+            notes.append(f"a replay has no use for {', '.join(plan.unused)}, which only a running node has")
+        for note in notes:
+            print_warning(note)
         print(_described(plan))
         if arguments.list:
             if bag.damage is not None:

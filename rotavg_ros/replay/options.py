@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +15,25 @@ from rotavg_ros.settings.parameters import NODE_NAME, PARAMETERS
 
 Values = dict[str, Any]
 
+# Names of nodes in parameter files that mean any.
+_ANY_NODE = ("*", "**")
+# How the names of parameters begin that rclpy gives every node.
+_RCLPYS = ("qos_overrides.", "start_type_description_service", "use_sim_time")
+
 
 class ReplayOptionError(UserError):
     """A parameter that the node does not have, or a value that it cannot have."""
 
 
-def read_parameter_file(path: Path) -> Values:
-    """What a file for ``--params-file`` says about the node; ``qos_overrides`` have no meaning here.
+def read_parameter_file(path: Path) -> tuple[Values, list[str]]:
+    """What a file for ``--params-file`` says about the node; what rclpy alone makes use of is passed over.
+
+    Returns:
+        the values by name; and a line for each parameter that the node does not have, which it ignores as well.
 
     Raises:
-        ReplayOptionError: no such file, not YAML, not a parameter file of the node, or a value that cannot be.
+        ReplayOptionError: no such file, not YAML, not a parameter file of the node, or of more than one, or a value
+            that cannot be.
     """
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -32,18 +41,41 @@ def read_parameter_file(path: Path) -> Values:
         raise ReplayOptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     except yaml.YAMLError as error:
         raise ReplayOptionError(f"{path}: is not YAML: {' '.join(str(error).split())}") from None
-    nodes = content if isinstance(content, Mapping) else {}
-    values: Values = {}
-    for name, settings in nodes.items():
-        if str(name).strip("/").split("/")[-1] in (NODE_NAME, "*", "**") and isinstance(settings, Mapping):
-            values |= settings.get("ros__parameters") or {}
-    if not values:
+    of_node = {NODE_NAME, *_ANY_NODE}
+    meant = [(name, said) for name, said in _nodes(content) if name.rpartition("/")[2] in of_node]
+    if not meant:
         raise ReplayOptionError(
             f"{path}: has no parameters of the node; expected '/{NODE_NAME}:' with 'ros__parameters:' below it, as "
             "`rotavg_node --print-parameters` writes it"
         )
-    known = {name: value for name, value in values.items() if not name.startswith("qos_overrides")}
-    return {name: _checked(name, value, str(path)) for name, value in known.items()}
+    named = sorted({name for name, _ in meant if name.rpartition("/")[2] == NODE_NAME})
+    if len(named) > 1:
+        raise ReplayOptionError(f"{path}: has parameters of several nodes ({', '.join(named)}); leave those of one")
+    values, notes = {}, []
+    for name, value in (pair for _, said in meant for pair in _flat(said)):
+        if name in PARAMETERS:
+            values[name] = _checked(name, value, str(path))
+        elif not name.startswith(_RCLPYS):
+            notes.append(f"{path}: unknown parameter {name} is ignored" + _meant(name, "; did you mean {}?"))
+    return values, notes
+
+
+def _nodes(content: Any, name: str = "") -> Iterator[tuple[str, Mapping[Any, Any]]]:
+    """Full names of nodes and what is below their ``ros__parameters``; namespaces may be nested."""
+    for key, below in content.items() if isinstance(content, Mapping) else ():
+        if key == "ros__parameters":
+            yield name, below if isinstance(below, Mapping) else {}
+        else:
+            yield from _nodes(below, f"{name}/{str(key).strip('/')}")
+
+
+def _flat(settings: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Parameters by name; of nested ones the names are joined by dots."""
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def read_settings(words: Iterable[str]) -> Values:
@@ -68,10 +100,15 @@ def read_settings(words: Iterable[str]) -> Values:
 def _checked(name: str, value: Any, where: str) -> Any:
     """The value in its parameter's own type."""
     if name not in PARAMETERS:
-        close = difflib.get_close_matches(name, list(PARAMETERS), n=1)
-        hint = f"did you mean {close[0]}?" if close else "see `rotavg_node --print-parameters`"
+        hint = _meant(name, "did you mean {}?") or "see `rotavg_node --print-parameters`"
         raise ReplayOptionError(f"{where}: unknown parameter {name}; {hint}")
     try:
         return PARAMETERS[name].checked(value)
     except OptionError as error:
         raise ReplayOptionError(f"{where}: {error}") from None
+
+
+def _meant(name: str, words: str) -> str:
+    """A question whether a parameter of a similar name is meant; empty where there is none."""
+    close = difflib.get_close_matches(name, list(PARAMETERS), n=1)
+    return words.format(close[0]) if close else ""

@@ -24,6 +24,13 @@ _PER_TOPIC = {
     "edge_topics": {"edge_robots": 1, "edge_sensor_orientations": 4},
 }
 
+# Parameters that only matter to a node that runs; where they name topics, these would not be the bag's.
+_OF_LIVE_NODES = (
+    *("forward_topics", "forward_delay_s", "edge_frame_wait_s", "publish_tf", "transform_tolerance_s"),
+    *("correction_rate_deg_s", "correction_rate_m_s", "odometry_queue_depth", "edge_queue_depth", "tick_budget_s"),
+    *("solver_process", "state_file", "autosave_period_s", "odometry_timeout_s"),
+)
+
 
 class PlanError(UserError):
     """Topics that the bag does not have or that are good for nothing; the message names the candidates."""
@@ -64,6 +71,7 @@ class Plan:
         topics: every topic of the bag and its use.
         edge_frames_from_tf: edges of sensors are taken into the body's frame by the bag's static transforms.
         tick_work: what ticks may cost; None where the user has said how often there is one.
+        unused: parameters that were set, not to their defaults, and that a replay has no use for.
     """
 
     parameters: NodeParameters
@@ -73,6 +81,7 @@ class Plan:
     topics: tuple[TopicUse, ...]
     edge_frames_from_tf: bool = True
     tick_work: WorkRates | None = None
+    unused: tuple[str, ...] = ()
 
     @property
     def has_input(self) -> bool:
@@ -100,6 +109,9 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
     if bag.num_messages() == 0:
         raise PlanError(f"{bag.path}: has no messages; there is nothing to replay")
     found = find_candidates(bag)
+    defaults = NodeParameters().values()
+    unused = tuple(name for name in _OF_LIVE_NODES if values.get(name, defaults[name]) != defaults[name])
+    values = {name: value for name, value in values.items() if name not in _OF_LIVE_NODES}
     values = _without_absent_topics(bag, values)
     odometry = _odometry(bag, found, wishes.odometry or values.get("odometry_topics"))
     edges = _edges(bag, found, wishes.edges or values.get("edge_topics"))
@@ -116,7 +128,7 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
     references = _references(bag, found, wishes.references, parameters.robots, odometry)
     from_tf = parameters.edge_frames_from_tf and "edge_sensor_orientations" not in values
     tick_work = None if "solve_period_s" in values else WorkRates()
-    plan = Plan(parameters, odometry, edges, references, (), edge_frames_from_tf=from_tf, tick_work=tick_work)
+    plan = Plan(parameters, odometry, edges, references, (), from_tf, tick_work, unused)
     return replace(plan, topics=_uses(bag, found, plan))
 
 

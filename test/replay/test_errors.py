@@ -181,6 +181,20 @@ def test_options_that_cannot_be(
     assert not (tmp_path / "out").exists()
 
 
+def test_parameters_of_others_and_of_running_nodes_are_told_of(
+    tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "fleet.yaml"
+    path.write_text(
+        "/**:\n  ros__parameters:\n    max_velocity: 3.0\n    use_sim_time: true\n    state_file: map.npz\n"
+    )
+    assert main(["replay", str(small), "--list", "--params", str(path)]) == 0
+    assert capsys.readouterr().err.splitlines() == [
+        f"rotavg: warning: {path}: unknown parameter max_velocity is ignored",
+        "rotavg: warning: a replay has no use for state_file, which only a running node has",
+    ]
+
+
 def test_an_output_that_exists_is_refused_and_then_replaced(
     tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

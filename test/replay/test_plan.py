@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from rotavg_ros.bags.answer_messages import orientation_message
 from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION, typestore
@@ -154,13 +155,55 @@ def test_the_nodes_own_parameter_file(tmp_path: Path) -> None:
     path = tmp_path / "node.yaml"
     wanted = NodeParameters().changed({"keyframe_angle_deg": 7.0, "robots": ("rover",)})
     path.write_text(to_yaml(wanted))
-    values = read_parameter_file(path)
-    assert NodeParameters().changed(values) == wanted
+    values, notes = read_parameter_file(path)
+    assert notes == [] and NodeParameters().changed(values) == wanted
     path.write_text("/**:\n  ros__parameters:\n    keyframe_angle_deg: 7\n    qos_overrides./odom.depth: 5\n")
-    assert read_parameter_file(path) == {"keyframe_angle_deg": 7.0}
+    assert read_parameter_file(path) == ({"keyframe_angle_deg": 7.0}, [])
     path.write_text("/other:\n  ros__parameters:\n    keyframe_angle_deg: 7\n")
     with pytest.raises(ReplayOptionError, match="has no parameters of the node"):
         read_parameter_file(path)
     path.write_text("a: [")
     with pytest.raises(ReplayOptionError, match="is not YAML"):
         read_parameter_file(path)
+
+
+ANGLE = {"keyframe_angle_deg": 7.0}
+
+
+@pytest.mark.parametrize(
+    ("content", "notes"),
+    [
+        ({"/rotavg": {"ros__parameters": ANGLE | {"use_sim_time": True, "start_type_description_service": False}}}, []),
+        ({"/robot1": {"rotavg": {"ros__parameters": ANGLE}}, "/robot1/slam": {"ros__parameters": {"x": 1}}}, []),
+        ({"/**": {"ros__parameters": {"qos_overrides": {"/odom": {"subscription": {"depth": 5}}}, **ANGLE}}}, []),
+        (
+            {"/**": {"ros__parameters": ANGLE | {"max_velocity": 3.0, "planner": {"rate": 1}}}},
+            ["unknown parameter max_velocity is ignored", "unknown parameter planner.rate is ignored"],
+        ),
+        (
+            {"/**": {"ros__parameters": {"keyframe_angel_deg": 1.0}}, "rotavg": {"ros__parameters": ANGLE}},
+            ["unknown parameter keyframe_angel_deg is ignored; did you mean keyframe_angle_deg?"],
+        ),
+    ],
+    ids=["rclpy's own", "nested", "nested qos", "others", "a slip of the pen"],
+)
+def test_what_the_node_takes_is_taken(tmp_path: Path, content: dict, notes: list[str]) -> None:
+    path = tmp_path / "node.yaml"
+    path.write_text(yaml.safe_dump(content, sort_keys=False))
+    assert read_parameter_file(path) == (ANGLE, [f"{path}: {note}" for note in notes])
+
+
+def test_a_file_of_two_nodes_is_not_mixed(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.yaml"
+    path.write_text(yaml.safe_dump({robot: {"rotavg": {"ros__parameters": ANGLE}} for robot in ("red", "blue")}))
+    with pytest.raises(ReplayOptionError, match=r"several nodes \(/blue/rotavg, /red/rotavg\)"):
+        read_parameter_file(path)
+
+
+def test_what_only_a_running_node_has_is_left_out(plan_for) -> None:
+    topics = {"/imu": GOOD_IMU, "/relative_rotations": CLOSURE}
+    values = {"edge_topics": ("relative_rotations",), "forward_topics": ("relative_rotations:good",)}
+    values |= {"publish_tf": True, "autosave_period_s": 5.0, "solver_process": True}
+    plan = plan_for(topics, values=values)
+    assert roles(plan)["/relative_rotations"] == "loop closures"
+    assert plan.unused == ("forward_topics", "publish_tf", "autosave_period_s")
