@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -42,7 +41,7 @@ def assemble(bag: BagReader, plan: Plan, outcome: Outcome) -> RunRecord:
         ticks=outcome.ticks,
         topics=plan.topics,
         rejected=outcome.estimator.counts().rejected,
-        options=dataclasses.asdict(plan.parameters),
+        options=plan.parameters.values(),
         wall_seconds=outcome.wall_seconds,
         interrupted=outcome.interrupted or outcome.damage is not None,
     )

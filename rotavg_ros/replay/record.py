@@ -133,7 +133,7 @@ class RunRecord:
         ticks: in order.
         topics: every topic of the bag, by name.
         rejected: inputs refused, by :class:`~rotavg_ros.online.RejectReason` value.
-        options: the parameters, by the node's names.
+        options: the parameters as users write them, by the node's names.
         wall_seconds: that the replay took.
         interrupted: stopped by Ctrl-C, or by damage to the bag, before its end.
     """

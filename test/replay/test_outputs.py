@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import gtsam
@@ -18,6 +19,7 @@ from rosbags.highlevel import AnyReader
 
 from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
+from rotavg_ros.settings.parameters import PARAMETERS
 
 EVERYTHING = {
     "/abs_orientations": "rotavg_msgs/msg/AbsoluteOrientations",
@@ -106,6 +108,17 @@ def test_tables_are_like_those_of_solve(run: SimulatedRun, replayed: Path) -> No
     assert sorted(summary["files"]) == sorted(path.name for path in replayed.iterdir())
     assert {"report.html", "trajectory.png", "run.mcap"} <= set(summary["files"])
     assert not summary["interrupted"]
+
+
+def test_the_parameters_are_told_as_users_write_them(replayed: Path) -> None:
+    options = json.loads((replayed / "summary.json").read_text())["options"]
+    assert list(options) == list(PARAMETERS)
+    expected = {"keyframe_angle_deg": 5.0, "solve_period_s": 40.0, "odometry_topics": ["/odom:nav_msgs/msg/Odometry"]}
+    assert {name: options[name] for name in expected} == expected
+    page = (replayed / "report.html").read_text()
+    rows = re.findall(r'<td class="code">(\w+)</td>\s*<td class="code">([^<]*)</td>', page)
+    assert [name for name, _ in rows if name in PARAMETERS] == list(PARAMETERS)
+    assert {("keyframe_angle_deg", "5"), ("solve_period_s", "40"), ("warm_start", "True")} <= set(rows)
 
 
 def test_the_recording_is_what_a_node_would_have_published(run: SimulatedRun, bag: Path, replayed: Path) -> None:
