@@ -29,8 +29,7 @@ from rotavg_ros.datasets.planar import are_about_z
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, ViewGraphError
 
 # A stamp that names a keyframe may be this far from the odometry message that is meant.
-MAX_STAMP_DISTANCE_NS = 50_000_000
-
+_MAX_KEYFRAME_DISTANCE_NS = 50_000_000
 
 # Stamp in ns, position, world-from-body xyzw.
 _Pose = tuple[int, list[float], list[float]]
@@ -212,7 +211,7 @@ def _nearest(stamps_ns: NDArray[np.int64], end: Keyframe) -> int:
     right = int(np.searchsorted(stamps_ns, end.stamp_ns))
     candidates = [index for index in (right - 1, right) if 0 <= index < len(stamps_ns)]
     best = min(candidates, key=lambda index: abs(int(stamps_ns[index]) - end.stamp_ns))
-    return best if abs(int(stamps_ns[best]) - end.stamp_ns) <= MAX_STAMP_DISTANCE_NS else -1
+    return best if abs(int(stamps_ns[best]) - end.stamp_ns) <= _MAX_KEYFRAME_DISTANCE_NS else -1
 
 
 def _with_truth(graph_file: GraphFile, content: _Content) -> GraphFile:

@@ -17,6 +17,7 @@ from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.replay.options import read_parameter_file, read_settings
 from rotavg_ros.replay.plan import Plan, Wishes, make_plan
 from rotavg_ros.replay.run import Window
+from rotavg_ros.wording import counted
 
 # When it is worth saying how it would be faster.
 _MANY_TICKS, _LONG_SECONDS = 500, 60.0
@@ -156,17 +157,13 @@ def _told(summary: dict[str, Any], output: Path) -> str:
         if "orientation_error_mean_deg" in said:
             lines.append(_compared(robot, said))
     counts = (
-        f"{_counted(summary['keyframes'], 'keyframe')}, {_counted(summary['loop_closures'], 'loop closure')}, "
-        f"{_counted(summary['outliers'], 'outlier')}"
+        f"{counted(summary['keyframes'], 'keyframe')}, {counted(summary['loop_closures'], 'loop closure')}, "
+        f"{counted(summary['outliers'], 'outlier')}"
     )
     components = "" if summary["components"] == 1 else f", {summary['components']} components"
     times = f"{summary['duration_s']:.0f} s of the bag in {summary['wall_seconds']:.1f} s"
     lines.append(f"{counts}{components}; {times} → {output}")
     return "\n".join(lines)
-
-
-def _counted(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _compared(robot: str, said: dict[str, Any]) -> str:

@@ -29,6 +29,7 @@ from rotavg_ros.solver import Solution, methods, solve
 from rotavg_ros.solver.solution import residual_deg, residual_m
 from rotavg_ros.version import __version__
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
+from rotavg_ros.wording import counted
 
 OUTLIER_THRESHOLD = 0.5
 _ORIENTATIONS, _EDGES, _SUMMARY = "orientations.csv", "edges", "summary.json"
@@ -93,7 +94,7 @@ def _told(summary: dict[str, Any]) -> str:
     verdicts = f"{flagged} of {closures} {'closures' if odometry else 'edges'} flagged" if closures else "no closures"
     if slips:
         verdicts += f", {slips} of {odometry} odometry edges as well"
-    components = "1 component" if summary["components"] == 1 else f"{summary['components']} components"
+    components = counted(summary["components"], "component")
     return f"{summary['nodes']} nodes, {edges} edges, {verdicts}, {components}, {summary['solve_seconds']:.2f} s"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rotavg_ros import rotations
@@ -11,6 +12,11 @@ from rotavg_ros.view_graph import ViewGraph
 
 _ALIGNMENT_ITERATIONS = 30
 _SMOOTHING = np.radians(0.01)
+
+
+def body_from_world(world_from_body: NDArray[np.floating]) -> Tensor:
+    """Orientations ``(n, 4)`` xyzw as messages and files carry them, in the form that is compared here."""
+    return rotations.inverse(torch.from_numpy(world_from_body))
 
 
 def gauge_alignment(estimate: Tensor, truth: Tensor) -> Tensor:

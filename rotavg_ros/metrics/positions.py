@@ -32,7 +32,7 @@ def fit_onto(position: FloatArray, reference: FloatArray) -> RigidFit | None:
     Returns:
         None with fewer than two common positions.
     """
-    known = _finite(position) & _finite(reference)
+    known = known_rows(position) & known_rows(reference)
     if known.sum() < 2:
         return None
     estimate, target = position[known], reference[known]
@@ -55,5 +55,6 @@ def position_errors(position: FloatArray, reference: FloatArray) -> FloatArray:
     return distance
 
 
-def _finite(rows: FloatArray) -> NDArray[np.bool_]:
+def known_rows(rows: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which rows ``(n, …)`` of positions or orientations are known, ``(n,)``: those without NaN."""
     return np.asarray(np.isfinite(rows).all(axis=1))

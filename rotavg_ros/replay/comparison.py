@@ -9,9 +9,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from rotavg_ros import rotations
-from rotavg_ros.datasets.files.ground_truth import MAX_STAMP_DISTANCE_NS
-from rotavg_ros.metrics import gauge_alignment, orientation_errors, position_errors
+from rotavg_ros.datasets.files.ground_truth import MAX_TRUTH_DISTANCE_NS
+from rotavg_ros.metrics import body_from_world, gauge_alignment, known_rows, orientation_errors, position_errors
 from rotavg_ros.replay.record import Reference, RobotRecord
 
 FloatArray = NDArray[np.float64]
@@ -55,8 +54,8 @@ def truth_at_keyframes(reference: Reference, stamp_ns: NDArray[np.int64]) -> Tru
         return Truth(orientation, position)
     after = np.searchsorted(stamps, stamp_ns).clip(0, len(stamps) - 1)
     before = np.where(stamps[after] > stamp_ns, np.maximum(after - 1, 0), after)
-    known = (np.abs(stamps[before] - stamp_ns) <= MAX_STAMP_DISTANCE_NS) & (
-        np.abs(stamps[after] - stamp_ns) <= MAX_STAMP_DISTANCE_NS
+    known = (np.abs(stamps[before] - stamp_ns) <= MAX_TRUTH_DISTANCE_NS) & (
+        np.abs(stamps[after] - stamp_ns) <= MAX_TRUTH_DISTANCE_NS
     )
     # Seconds from the first sample, for nanoseconds since 1970 do not fit into a float.
     seconds = (stamps - stamps[0]) / 1e9
@@ -98,15 +97,17 @@ def errors_of_orientations(
         component: ``(n,)``; each is turned onto the reference by itself. Default: one component.
     """
     component = np.zeros(len(world_from_body), dtype=np.int64) if component is None else component
-    known = _finite(truth.world_from_body) & _finite(world_from_body)
+    known = known_rows(truth.world_from_body) & known_rows(world_from_body)
     reference = np.where(known[:, None], truth.world_from_body, np.nan)
     estimate = np.where(known[:, None], world_from_body, [0.0, 0.0, 0.0, 1.0])
-    angle = orientation_errors(_inverse(estimate), _inverse(reference), torch.from_numpy(component)).numpy()
+    angle = orientation_errors(
+        body_from_world(estimate), body_from_world(reference), torch.from_numpy(component)
+    ).numpy()
     heading = np.full(len(estimate), np.nan)
     for number in np.unique(component[known]):
         members = known & (component == number)
         true = Rotation.from_quat(reference[members])
-        gauge = gauge_alignment(_inverse(estimate[members]), _inverse(reference[members])).numpy()
+        gauge = gauge_alignment(body_from_world(estimate[members]), body_from_world(reference[members])).numpy()
         off = Rotation.from_quat(gauge) * Rotation.from_quat(estimate[members]) * true.inv()
         z, w = off.as_quat().T[2:]
         # The twist about z of the rotation from the true to the estimated orientation.
@@ -143,7 +144,7 @@ def compare(robot: RobotRecord, component: NDArray[np.int64]) -> RobotComparison
     if robot.reference is None:
         return None
     truth = _truth(robot.reference, robot.stamp_ns, robot.time_line)
-    if not _finite(truth.world_from_body).any():
+    if not known_rows(truth.world_from_body).any():
         return None
 
     def distance(position: FloatArray | None) -> FloatArray:
@@ -159,11 +160,3 @@ def compare(robot: RobotRecord, component: NDArray[np.int64]) -> RobotComparison
         dead_reckoned_distance=distance(robot.position_dead_reckoned),
         corrected_distance=distance(robot.position),
     )
-
-
-def _finite(rows: FloatArray) -> NDArray[np.bool_]:
-    return np.asarray(np.isfinite(rows).all(axis=1))
-
-
-def _inverse(quaternions: FloatArray) -> torch.Tensor:
-    return rotations.inverse(torch.from_numpy(quaternions))

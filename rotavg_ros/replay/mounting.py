@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rotavg_ros.datasets.files.ground_truth import MAX_TRUTH_DISTANCE_NS
+from rotavg_ros.metrics import known_rows
 from rotavg_ros.replay.record import Reference
 
-_MAX_STAMP_DISTANCE_NS = 150_000_000
 # Smaller turns between keyframes are mostly noise.
 _SMALLEST_TURN = np.radians(1.0)
 
@@ -34,8 +35,8 @@ def without_mounting(
     """
     seen = reference.on_last_time_line()
     nearest = np.searchsorted(seen.stamp_ns, stamp_ns).clip(0, len(seen.stamp_ns) - 1)
-    known = np.isfinite(odometry_world_from_body).all(axis=1)
-    known &= np.abs(seen.stamp_ns[nearest] - stamp_ns) <= _MAX_STAMP_DISTANCE_NS
+    known = known_rows(odometry_world_from_body)
+    known &= np.abs(seen.stamp_ns[nearest] - stamp_ns) <= MAX_TRUTH_DISTANCE_NS
     if known.sum() < 2:
         return reference
     body = _turns(odometry_world_from_body[known])

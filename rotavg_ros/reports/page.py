@@ -21,6 +21,7 @@ from rotavg_ros.reports.tables import (
 )
 from rotavg_ros.reports.tracks import tracks_of
 from rotavg_ros.view_graph import FALSE_CLOSURE_M
+from rotavg_ros.wording import counted
 
 MOST_CLOSURES = 40  # in the table that is open; edges.csv has all
 _NEARLY_ALL = 0.9
@@ -89,13 +90,13 @@ def _lead(facts: RunFacts) -> str:
     found = (
         "no loop closures"
         if closures == 0
-        else f"{_count(closures, 'loop closure')}, {facts.num_flagged} of which it holds false"
+        else f"{counted(closures, 'loop closure')}, {facts.num_flagged} of which it holds false"
     )
     began = ""
     if facts.start_ns > 10**18:  # after September 2001: seconds since 1970, not since a simulation's start
         began = f" It began at {datetime.fromtimestamp(facts.start_ns // 10**9, timezone.utc):%Y-%m-%d %H:%M:%S} UTC."
     of_robots = f" of {len(record.robots)} robots" if len(record.robots) > 1 else ""
-    return f"{_duration(record.duration_s)}{of_robots}, {_count(keyframes, 'keyframe')}, {found}.{began}"
+    return f"{_duration(record.duration_s)}{of_robots}, {counted(keyframes, 'keyframe')}, {found}.{began}"
 
 
 def _tiles(facts: RunFacts) -> list[Tile]:
@@ -157,7 +158,7 @@ def _notes(facts: RunFacts) -> list[str]:
         )
     notes += [f"{warning[:1].upper()}{warning[1:]}." for warning in record.answer.warnings]
     if facts.num_flagged_odometry:
-        count = _count(facts.num_flagged_odometry, "odometry edge")
+        count = counted(facts.num_flagged_odometry, "odometry edge")
         notes.append(f"{count} contradict the rest of the graph: a slip, a jump, or a wrong stamp.")
     return notes
 
@@ -207,7 +208,7 @@ def _closures(facts: RunFacts) -> Section:
     shown, further = ordered[:MOST_CLOSURES], ordered[MOST_CLOSURES:]
     flagged = [closure for closure in further if closure.outlier]
     more = len(further) - len(flagged)
-    rest = f" {_count(more, 'further closure')} with lower scores: edges.csv has all." if more else ""
+    rest = f" {counted(more, 'further closure')} with lower scores: edges.csv has all." if more else ""
     places = sum(closure.fails == "place" for closure in ordered)
     of_places = f", {places} of these for joining wrong places though their rotation may be right" if places else ""
     text = [
@@ -220,7 +221,7 @@ def _closures(facts: RunFacts) -> Section:
     if long := facts.believed_but_long():
         are = "is" if len(long) == 1 else "are"
         text.append(
-            f"{_count(len(long), 'believed closure')} {are} more than {FALSE_CLOSURE_M:g} m off after correction, "
+            f"{counted(len(long), 'believed closure')} {are} more than {FALSE_CLOSURE_M:g} m off after correction, "
             f"{long[0].off_m:.1f} m at most: nothing else tells enough of these places, or this front end states "
             "directions rather than lengths."
         )
@@ -237,7 +238,7 @@ def _solving(facts: RunFacts) -> Section:
         return Section("solving", "Solving", ["Nothing was solved."])
     cold = sum(tick.was_cold for tick in ticks)
     text = [
-        f"{_count(len(ticks), 'tick')}, {cold} of them from scratch (cold). "
+        f"{counted(len(ticks), 'tick')}, {cold} of them from scratch (cold). "
         f"Method {answer.method}, profile {answer.profile}, on the {answer.device}."
     ]
     return Section("solving", "Solving", text, ["ticks"], [stage_table(facts)] if answer.stage_seconds else [])
@@ -248,14 +249,14 @@ def _dropped(facts: RunFacts) -> Section:
     if not table.rows:
         return Section("dropped", "What was dropped", ["Nothing: every message of the used topics was taken."])
     total = sum(facts.record.rejected.values())
-    text = [f"{_count(total, 'message')} changed nothing, for these reasons."]
+    text = [f"{counted(total, 'message')} changed nothing, for these reasons."]
     return Section("dropped", "What was dropped", text, tables=[table])
 
 
 def _inputs(facts: RunFacts) -> Section:
     record = facts.record
     ignored = sum(not topic.used_as for topic in record.topics)
-    text = [f"{_count(len(record.topics), 'topic')} in the bag, {ignored} ignored."]
+    text = [f"{counted(len(record.topics), 'topic')} in the bag, {ignored} ignored."]
     tables = [topic_table(record.topics)] if record.topics else []
     return Section("inputs", "Topics and options", text, tables=[*tables, option_table(record.options)])
 
@@ -265,10 +266,6 @@ def _mean(values: Sequence[NDArray[np.float64]]) -> float:
     every = np.concatenate(values)
     known = every[np.isfinite(every)]
     return float(known.mean()) if len(known) else float("nan")
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _duration(seconds: float) -> str:

@@ -14,7 +14,7 @@ from rotavg_ros.datasets.planar import quaternion_of_heading
 from rotavg_ros.rotations import canonical, inverse
 
 # Ground truth by stamp belongs to a node only if it is this close in time.
-MAX_STAMP_DISTANCE_NS = 150_000_000
+MAX_TRUTH_DISTANCE_NS = 150_000_000
 
 _TOO_LARGE = 1e18  # seconds; 64 bits of nanoseconds end at 9.2e9
 
@@ -73,7 +73,7 @@ def attach_truth(graph_file: GraphFile, path: str | Path) -> GraphFile:
             what = "is ground truth by stamp, but the graph has no stamps; give them too (--stamps)"
             raise GraphFileError.at(path, None, what)
         nearest = _nearest(stamps, graph_file.stamps_ns)
-        matched = np.abs(stamps[nearest] - graph_file.stamps_ns) <= MAX_STAMP_DISTANCE_NS
+        matched = np.abs(stamps[nearest] - graph_file.stamps_ns) <= MAX_TRUTH_DISTANCE_NS
         x_y_heading = numbers[nearest[matched]]
         body_from_world[matched] = _body_from_world(quaternion_of_heading(x_y_heading[:, 2]))
         position[matched] = np.pad(x_y_heading[:, :2], ((0, 0), (0, 1)))

@@ -9,9 +9,15 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros import rotations
 from rotavg_ros.evaluation.live.node_answer import NodeAnswer
-from rotavg_ros.metrics import OutlierCounts, gauge_alignment, orientation_errors, true_edge_noise
+from rotavg_ros.metrics import (
+    OutlierCounts,
+    body_from_world,
+    gauge_alignment,
+    known_rows,
+    orientation_errors,
+    true_edge_noise,
+)
 from rotavg_ros.view_graph import FALSE_CLOSURE_DEG, EdgeKind, ViewGraph
 
 FloatArray = NDArray[np.floating]
@@ -97,20 +103,22 @@ def judge(answer: NodeAnswer, run: PlayedRun, is_closure: NDArray[np.bool_]) -> 
     steps = _steps(run.odometry_position[pose], odometry)
     true_position = unknown[:, :3] if run.true_position is None else run.true_position[pose]
 
-    known = np.isfinite(truth).all(axis=1)
+    known = known_rows(truth)
     start = int(np.argmax(known)) if known.any() else 0
     # Odometry is shown as the robot believed it from its first known pose on; the answer is fitted as a whole.
     frame = truth[start] if known.any() else odometry[0]
     odometry_turn = Rotation.from_quat(frame) * Rotation.from_quat(odometry[start]).inv()
     if known.any():
         first = answer.component == answer.component[start]
-        gauge = gauge_alignment(_inverse(answer.world_from_body[known & first]), _inverse(truth[known & first]))
+        gauge = gauge_alignment(
+            body_from_world(answer.world_from_body[known & first]), body_from_world(truth[known & first])
+        )
         corrected_turn = Rotation.from_quat(gauge.numpy())
     else:
         corrected_turn = Rotation.from_quat(odometry[0]) * Rotation.from_quat(answer.world_from_body[0]).inv()
     corrected_position = _walk(corrected_turn * Rotation.from_quat(answer.world_from_body), steps)
     odometry_position = _walk(odometry_turn * Rotation.from_quat(odometry), steps)
-    anchored = np.isfinite(true_position).all(axis=1)
+    anchored = known_rows(true_position)
     if anchored.any():
         odometry_position += true_position[anchored][0] - odometry_position[anchored][0]
         corrected_position += (true_position - corrected_position)[anchored].mean(axis=0)
@@ -171,8 +179,4 @@ def _walk(world_from_body: Rotation, steps: FloatArray) -> FloatArray:
 
 def _errors(estimate: FloatArray, truth: FloatArray, component: NDArray[np.int64] | None = None) -> FloatArray:
     components = None if component is None else torch.from_numpy(component)
-    return orientation_errors(_inverse(estimate), _inverse(truth), components).numpy()
-
-
-def _inverse(quaternions: FloatArray) -> torch.Tensor:
-    return rotations.inverse(torch.from_numpy(quaternions))
+    return orientation_errors(body_from_world(estimate), body_from_world(truth), components).numpy()
