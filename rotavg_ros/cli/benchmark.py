@@ -14,7 +14,9 @@ from rotavg_ros.evaluation.benchmark import report, schedule
 from rotavg_ros.evaluation.benchmark.measure import ENOUGH_S
 from rotavg_ros.evaluation.common.tables import Report, Table
 from rotavg_ros.evaluation.live import long_run, ticks
+from rotavg_ros.online.estimator import WORK_AFTER
 from rotavg_ros.results import make_folder
+from rotavg_ros.solver import SECONDS_PER_UNIT
 
 # The load average below which nothing else ran to speak of.
 _QUIET_LOAD = 0.5
@@ -58,8 +60,8 @@ The load average was {load} before the run, and what sends the odometry runs bes
 _TICKS_INTRODUCTION = """\
 The estimator in this process, and iSAM2 (GTSAM) after it, on a simulated city of {keyframes} keyframes with as many
 loop closures, a tenth of them false; two keyframes a tick go on coming, with two closures. An answer is of all
-keyframes: ours orientations and flags, or poses; iSAM2's poses. What goes on after an answer is 200 units of work,
-about half a millisecond each, and one factorisation more. iSAM2 knows the noise's deviations, has Cauchy's loss on
+keyframes: ours orientations and flags, or poses; iSAM2's poses. What goes on after an answer is {work:g} units of work,
+about {unit_ms:g} ms each, and one factorisation more. iSAM2 knows the noise's deviations, has Cauchy's loss on
 closures and judges none.
 Wall-clock milliseconds; loops beside them that keep a core busy each: {busy}. The load average was {load} before the
 run.
@@ -184,7 +186,12 @@ def _ticks(arguments: argparse.Namespace) -> Path:
     drive = ticks.Drive(keyframes, arguments.ticks, arguments.busy or 0)
     rows = ticks.run(drive, lambda numbers: progress(numbers, description="ticks", unit="tick"))
     introduction = _TICKS_INTRODUCTION.format(
-        keyframes=keyframes, busy=drive.busy, load=load, command=arguments.command_line
+        keyframes=keyframes,
+        busy=drive.busy,
+        load=load,
+        command=arguments.command_line,
+        work=WORK_AFTER,
+        unit_ms=1e3 * SECONDS_PER_UNIT,
     )
     name = f"benchmark-ticks-{keyframes}" + (f"-busy-{drive.busy}" if drive.busy else "")
     return Report(name, "Ticks beside iSAM2", introduction, {name: ticks.table(rows)}).write(arguments.output)

@@ -9,7 +9,7 @@ from functools import cache
 # Whole solves of so many edges take memory that is worth the milliseconds of giving it back.
 _MANY_EDGES = 1000
 _STAGES_OF_UPDATES = {"update", "poses"}
-# What goes on after answers takes that much in so many units of work, some seconds.
+# What goes on after answers takes that much in so many units of work, 1.5 s.
 _MUCH_WORK = 3000.0
 
 

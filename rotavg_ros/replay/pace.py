@@ -9,11 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rotavg_ros.online.options import NANOSECONDS
+from rotavg_ros.solver import SECONDS_PER_UNIT
 
 
 @dataclass(frozen=True)
 class WorkRates:
-    """What a tick costs, and what a replay may spend, in the solver's units of work, about half a millisecond each.
+    """What a tick costs, and what a replay may spend, in the solver's units of work.
+
+    A unit is :data:`~rotavg_ros.solver.SECONDS_PER_UNIT` of CPU.
 
     Attributes:
         bare: units that a tick costs besides for each keyframe and edge of the graph.
@@ -63,5 +66,5 @@ class Pace:
             return every
         return (
             f"{every}, less often where ticks are dear: {self._rates.per_second:g} units of work a second, about "
-            "half a millisecond each; -p solve_period_s:=S sets it"
+            f"{1e3 * SECONDS_PER_UNIT:g} ms each; -p solve_period_s:=S sets it"
         )

@@ -12,13 +12,14 @@ if TYPE_CHECKING:
     from rotavg_ros.solver.methods import DEVICES, METHODS, PROFILES, TRANSLATION_SCALES
     from rotavg_ros.solver.pipeline import advance, solve
     from rotavg_ros.solver.running.kept_labels import KeptLabels
-    from rotavg_ros.solver.running.work import Abandoned, abandonable, stop_if_abandoned
+    from rotavg_ros.solver.running.work import SECONDS_PER_UNIT, Abandoned, abandonable, stop_if_abandoned
     from rotavg_ros.solver.solution import Solution
 
 __all__ = [
     "DEVICES",
     "METHODS",
     "PROFILES",
+    "SECONDS_PER_UNIT",
     "TRANSLATION_SCALES",
     "Abandoned",
     "KeptLabels",
@@ -36,7 +37,7 @@ def __getattr__(name: str) -> Any:
         from rotavg_ros.solver import methods
 
         return getattr(methods, name)
-    if name in {"Abandoned", "abandonable", "stop_if_abandoned"}:
+    if name in {"SECONDS_PER_UNIT", "Abandoned", "abandonable", "stop_if_abandoned"}:
         from rotavg_ros.solver.running import work
 
         return getattr(work, name)

@@ -37,8 +37,8 @@ class Solution:
             translation is unknown; None likewise.
         warnings: why it should not be trusted, a sentence each: what was seen, what may be the cause, what to do.
         step_deviation: radians, by which each component of a step of odometry errs; NaN where the method says nothing.
-        work: units that the solve has cost, about half a millisecond each; counted where robots' graphs are solved, and
-            the same on every machine.
+        work: units of work that the solve has cost, :data:`~rotavg_ros.solver.SECONDS_PER_UNIT` each; counted where
+            robots' graphs are solved, and the same on every machine.
         is_anew: whether it is what a solve without a memory leads to.
     """
 

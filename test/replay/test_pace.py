@@ -43,6 +43,7 @@ def test_a_small_graph_ticks_at_every_strike(sizes: list[int]) -> None:
 @given(sizes=TICKS)
 def test_where_the_user_has_said_how_often_every_strike_is_a_tick(sizes: list[tuple[int, float]]) -> None:
     assert None not in play(Pace(0.5, None), sizes)
+    assert "units of work a second, about 0.5 ms each" in Pace(0.5, RATES).told()
     assert "every 0.5 s" in Pace(0.5, None).told() and "units" not in Pace(0.5, None).told()
 
 

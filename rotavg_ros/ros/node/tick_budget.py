@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections import deque
 from statistics import median
 
-# Of so many ticks the median tells what a unit costs; a unit costs about a millisecond before any has told.
+from rotavg_ros.solver import SECONDS_PER_UNIT
+
+# Of so many ticks the median tells what a unit costs.
 _TICKS = 20
-_SECONDS_PER_UNIT = 1e-3
 # Ticks of fewer units say more of all else than of the solver.
 _LEAST_WORK = 10.0
 
@@ -19,11 +20,11 @@ class TickBudget:
         self._seconds_per_unit: deque[float] = deque(maxlen=_TICKS)
 
     def units(self, seconds: float) -> float:
-        """Of work in so many seconds."""
-        costs = median(self._seconds_per_unit) if self._seconds_per_unit else _SECONDS_PER_UNIT
+        """Units of work in so many seconds; before any tick has told, by what a unit costs elsewhere."""
+        costs = median(self._seconds_per_unit) if self._seconds_per_unit else SECONDS_PER_UNIT
         return seconds / costs
 
     def learn(self, seconds: float, work: float) -> None:
-        """What so many units have cost."""
+        """So many units of work have taken so many seconds."""
         if work >= _LEAST_WORK:
             self._seconds_per_unit.append(seconds / work)

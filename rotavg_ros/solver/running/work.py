@@ -10,8 +10,11 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 
-# Entries on one side of a sparse matrix to one unit, which is half a millisecond with all that is done around a
-# factorisation.
+# Seconds of CPU that a unit of work takes: .39 to .54 ms in every part of robots' solves where it was measured
+# (docs/diary/ticks.md, "Units of work"). What is spent is counted in units and the same on every machine; seconds are
+# for people, and for a node until its first ticks have told how fast its machine is.
+SECONDS_PER_UNIT = 5e-4
+# Entries on one side of a sparse matrix to one unit, with all that is done around a factorisation.
 ENTRIES = 500.0
 
 
@@ -52,10 +55,10 @@ def stop_if_abandoned() -> None:
 
 @dataclass
 class Meter:
-    """Counts units.
+    """Counts work.
 
     Attributes:
-        spent: so far.
+        spent: units so far, :data:`SECONDS_PER_UNIT` each.
     """
 
     spent: float = 0.0

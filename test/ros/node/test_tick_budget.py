@@ -7,11 +7,12 @@ import pytest
 pytest.importorskip("rclpy")
 
 from rotavg_ros.ros.node.tick_budget import TickBudget
+from rotavg_ros.solver import SECONDS_PER_UNIT
 
 
 def test_units_go_by_what_ticks_have_cost() -> None:
     budget = TickBudget()
-    assert budget.units(0.2) == pytest.approx(200.0)  # a millisecond each, before any has told
+    assert budget.units(0.2) == pytest.approx(0.2 / SECONDS_PER_UNIT) == 400.0  # before any has told
     for seconds in (0.4, 0.5, 30.0):  # once the machine was asleep
         budget.learn(seconds, 100.0)
     assert budget.units(0.2) == pytest.approx(40.0)
