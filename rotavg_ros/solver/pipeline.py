@@ -86,52 +86,23 @@ def solve(
     Raises:
         UserError: no view-graph, an option outside its choices, or a start of the wrong shape or not of rotations.
     """
-    graph = view_graph_of(graph)
+    graph = view_graph_of(graph).to("cpu")
     check_choices(method, profile, device)
     if weights is not None:
         check_folder(weights)
+    _check_numbers(refinement_steps, work)
+    _check_start(warm_start, graph.num_nodes)
     names = method.split("+")
-    if refinement_steps is not None and refinement_steps < 0:
-        raise UserError(f"refinement steps must not be negative, got {refinement_steps}")
-    if work is not None and not work >= 0:
-        raise UserError(f"work must be a number of units, 0 or more, got {work}")
-    if warm_start is not None and tuple(warm_start.shape) != (graph.num_nodes, 4):
-        raise UserError(f"the warm start has shape {tuple(warm_start.shape)}, the graph needs ({graph.num_nodes}, 4)")
-    if warm_start is not None:
-        length = warm_start.double().norm(dim=1)
-        not_unit = ~((length - 1).abs() <= UNIT_NORM_TOLERANCE)
-        if bool(not_unit.any()):
-            row = int(not_unit.nonzero()[0])
-            raise UserError(f"the warm start's row {row} has length {length[row]:.6g}; give unit quaternions")
     if profile == "auto":
         profile = "slam" if bool(graph.is_odometry.any()) else "sfm"
-    where = (
-        devices.choose(device) if profile == "sfm" and all(method_named(name) is not None for name in names) else "cpu"
-    )
-    graph = graph.to("cpu")
-    stating_nothing: list[tuple[str, ...]] = []
-
-    def look(number: int) -> None:
-        if number == 0:
-            graph.components()  # the graph remembers them
-        else:
-            stating_nothing.append(warnings.stating_nothing(graph))
-
-    for_each(look, (0, 1), None if graph.num_edges > _WORTH_WORKERS else 1)
+    is_ours = all(method_named(name) is not None for name in names)
+    where = devices.choose(device) if profile == "sfm" and is_ours else "cpu"
+    stating_nothing = _first_look(graph)
     job = _Job(graph, graph.components(), names, profile)
-    steps = refinement_steps
-    goes_on_from = _memory_of(names, memory) if steps is None and warm_start is not None else None
-    watch = Stopwatch()
+    goes_on_from = _memory_of(names, memory) if refinement_steps is None and warm_start is not None else None
+    run = Run(Networks(where, weights), Stopwatch(), refinement_steps, warm_start, goes_on_from, work, anew)
     with metered() as meter:
-        try:
-            estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start, goes_on_from, work, anew))
-        except devices.GPU_ERRORS as error:
-            if where == "cpu":
-                raise
-            devices.fall_back(error)
-            where = "cpu"
-            watch = Stopwatch()
-            estimate = _run(job, Run(Networks(where, weights), watch, steps, warm_start))
+        estimate, run = _run_where_it_can(job, run)
     score = torch.where(graph.label == EdgeLabel.ACCEPTED, 0.0, estimate.outlier_score.cpu())
     score = torch.where(graph.label == EdgeLabel.REJECTED, 1.0, score)
     places = estimate.places
@@ -141,12 +112,12 @@ def solve(
         score,
         job.component,
         estimate.variance.cpu().double().sqrt(),
-        watch.seconds,
+        run.watch.seconds,
         method,
         profile,
-        where,
+        run.networks.device,
         estimate.memory,
-        (*estimate.warnings, *stating_nothing[0], *warnings.mostly_flagged(graph, score, rotation_score)),
+        (*estimate.warnings, *stating_nothing, *warnings.mostly_flagged(graph, score, rotation_score)),
         None if places is None else _root_at_origin(places.position, estimate.body_from_world, job.component),
         None if places is None else places.variance.sqrt(),
         rotation_score,
@@ -181,6 +152,53 @@ class _Job:
     component: Tensor
     names: list[str]
     profile: str
+
+
+def _check_numbers(refinement_steps: int | None, work: float | None) -> None:
+    """Raises :class:`UserError` for negative ones."""
+    if refinement_steps is not None and refinement_steps < 0:
+        raise UserError(f"refinement steps must not be negative, got {refinement_steps}")
+    if work is not None and not work >= 0:
+        raise UserError(f"work must be a number of units, 0 or more, got {work}")
+
+
+def _check_start(warm_start: Tensor | None, num_nodes: int) -> None:
+    """Raises :class:`UserError` for what are not as many rotations as there are nodes."""
+    if warm_start is None:
+        return
+    if tuple(warm_start.shape) != (num_nodes, 4):
+        raise UserError(f"the warm start has shape {tuple(warm_start.shape)}, the graph needs ({num_nodes}, 4)")
+    length = warm_start.double().norm(dim=1)
+    not_unit = ~((length - 1).abs() <= UNIT_NORM_TOLERANCE)
+    if bool(not_unit.any()):
+        row = int(not_unit.nonzero()[0])
+        raise UserError(f"the warm start's row {row} has length {length[row]:.6g}; give unit quaternions")
+
+
+def _first_look(graph: ViewGraph) -> tuple[str, ...]:
+    """Warnings of edges that state nothing; beside it the graph's components are found, which it remembers."""
+    found: list[tuple[str, ...]] = []
+
+    def look(number: int) -> None:
+        if number == 0:
+            graph.components()
+        else:
+            found.append(warnings.stating_nothing(graph))
+
+    for_each(look, (0, 1), None if graph.num_edges > _WORTH_WORKERS else 1)
+    return found[0]
+
+
+def _run_where_it_can(job: _Job, run: Run) -> tuple[Estimate, Run]:
+    """A GPU that does not do it is given up for the CPU; with the run that there was in the end."""
+    try:
+        return _run(job, run), run
+    except devices.GPU_ERRORS as error:
+        if run.networks.device == "cpu":
+            raise
+        devices.fall_back(error)
+        run = replace(run, networks=replace(run.networks, device="cpu"), watch=Stopwatch())
+        return _run(job, run), run
 
 
 def _memory_of(names: list[str], memory: object | None) -> SlamMemory | KeptLabels | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,8 +12,9 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.canonical_form import CanonicalForm
 from rotavg_ros.solver.algebra.residuals import EdgeResiduals
-from rotavg_ros.solver.estimate import Estimate, Run
+from rotavg_ros.solver.estimate import Estimate, Run, Stopwatch
 from rotavg_ros.solver.neurora.clean_net import CleanNet
+from rotavg_ros.solver.neurora.cleaned import Cleaned
 from rotavg_ros.solver.neurora.fine_net import FineNet
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.neurora.paper import PaperCleanNet, PaperFineNet, paper_fine_tune
@@ -58,7 +60,7 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     with watch.stage("bootstrap"):
         begun = (breadth_first if "tree" in stages.as_written else bootstrap)(cleaned, component)
         cleaned, orientations = begun.cleaned, begun.body_from_world
-        structure = _structure(begun, component)
+        cleared = _Cleared(judged, is_believed, cleaned, begun.parent_edge, _structure(begun, component))
         if run.warm_start is not None:
             start = form.canonical_orientations(run.warm_start.double().to(graph.device))
             orientations = rotations.canonical(
@@ -70,56 +72,96 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
                 orientations = paper_fine_tune(networks.load(PaperFineNet), cleaned, orientations)
             else:
                 orientations = fine_tune(networks.load(FineNet), cleaned, orientations, component)
-    warnings: tuple[str, ...] = ()
-    residual: Tensor | None = None
+    answer = _Answer(orientations)
     steps = run.refinement_steps
     if steps is None:
         steps = PRIORS.max_steps if stages.refine else 0
     if steps > 0:
-        with watch.stage("refine"):
-            allowed = (graph.label != EdgeLabel.REJECTED).double()
-            coarse = 1 - cleaned.outlier_probability if stages.weighted else torch.ones_like(allowed)
-            weights = EdgeWeights(allowed, allowed * coarse)
-            priors = PRIORS if stages.shaped else ROUND
-            if not stages.density:
-                priors = replace(priors, density=replace(priors.density, max_steps=0))
-            priors = replace(priors, max_steps=steps)
-            refinement = partial(refine, graph, structure=structure, priors=priors)
-            starts = [Start(orientations, weights.coarse)]
-            if stages.clean and stages.weighted:
-                starts += other_starts(judged, is_believed, begun.parent_edge, component)
-            settling = begin(graph, starts, weights.shaped, structure, priors)
-            weights = weights._replace(coarse=settling.coarse)
-            orientations = settle(graph, settling, weights, structure, priors)
-            if stages.stated:
-                noise = StatedNoise.of(graph, structure, priors, stages.stated_shapes)
-                orientations, weights = noise.refined(orientations, weights, refinement)
-        if stages.consensus:
-            with watch.stage("consensus"):
-                residual = EdgeResiduals(graph, orientations.float()).angles()
-                other = consensus(graph, orientations, component, CONSENSUS, residual)
-                if other is not None:
-                    warnings = other.warnings
-                if other is not None and other.body_from_world is not None and other.weight is not None:
-                    weights = weights.times(other.weight, other.weight)
-                    orientations = refinement(other.body_from_world, weights=weights)
-                    residual = None
+        answer = _refined(cleared, orientations, stages, steps, watch)
     score, variance = cleaned.outlier_probability.double(), torch.full((graph.num_nodes,), torch.nan)
     by_residuals = stages.fine_tunings > 0 and not ("cleannet" in stages.as_written and stages.clean)
     if steps > 0 or by_residuals:
         # Before, there is but a tree; now a residual is the noise but for the orientations' error. The paper's CleanNet
         # has the last word in any case.
-        angle, spread = residual_and_uncertainty(graph, orientations, component, residual)
-        score = residual_probability(angle, spread, NUMBERS.outlier_angle)
-        series = structure.series
-        score[series.edge] = series.score(angle[series.edge], spread[series.edge], NUMBERS.outlier_angle)
-        score[series.bridge] = series.bridge_score(score, component[graph.source], len(begun.roots))
+        angle, score = _scored(cleared, answer)
         if steps > 0:
             with watch.stage("uncertainty"):
-                stated = variances(graph, angle, score, series.bridge, References(component, form.first_nodes()))
+                to = References(component, form.first_nodes())
+                stated = variances(graph, angle, score, cleared.structure.series.bridge, to)
             variance = variance if stated is None else form.of_nodes(stated)
     score = score.index_select(0, form.edge)
-    return Estimate(form.orientations(orientations), score, variance, warnings=warnings)
+    return Estimate(form.orientations(answer.body_from_world), score, variance, warnings=answer.warnings)
+
+
+class _Cleared(NamedTuple):
+    """What is known of a graph's edges before orientations are refined.
+
+    Attributes:
+        judged: with CleanNet's word and labels.
+        is_believed: whether triangles bear that word out.
+        cleaned: with theirs, and as the tree has it.
+        parent_edge: ``(N,)`` the tree.
+        structure: the graph's connections.
+    """
+
+    judged: Cleaned
+    is_believed: bool
+    cleaned: Cleaned
+    parent_edge: Tensor
+    structure: Structure
+
+
+class _Answer(NamedTuple):
+    """Orientations ``(N, 4)``; their residuals ``(M,)`` rad, if they are known; a sentence for each doubt."""
+
+    body_from_world: Tensor
+    residual: Tensor | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def _refined(cleared: _Cleared, orientations: Tensor, stages: SfmStages, steps: int, watch: Stopwatch) -> _Answer:
+    """From the networks' orientations ``(N, 4)``, or from where it is better; then another answer, if there is one."""
+    graph, structure = cleared.judged.measured, cleared.structure
+    component = structure.component
+    with watch.stage("refine"):
+        allowed = (graph.label != EdgeLabel.REJECTED).double()
+        coarse = 1 - cleared.cleaned.outlier_probability if stages.weighted else torch.ones_like(allowed)
+        weights = EdgeWeights(allowed, allowed * coarse)
+        priors = replace(PRIORS if stages.shaped else ROUND, max_steps=steps)
+        if not stages.density:
+            priors = replace(priors, density=replace(priors.density, max_steps=0))
+        refinement = partial(refine, graph, structure=structure, priors=priors)
+        starts = [Start(orientations, weights.coarse)]
+        if stages.clean and stages.weighted:
+            starts += other_starts(cleared.judged, cleared.is_believed, cleared.parent_edge, component)
+        begun = begin(graph, starts, weights.shaped, structure, priors)
+        weights = weights._replace(coarse=begun.coarse)
+        orientations = settle(graph, begun, weights, structure, priors)
+        if stages.stated:
+            noise = StatedNoise.of(graph, structure, priors, stages.stated_shapes)
+            orientations, weights = noise.refined(orientations, weights, refinement)
+    if not stages.consensus:
+        return _Answer(orientations)
+    with watch.stage("consensus"):
+        residual = EdgeResiduals(graph, orientations.float()).angles()
+        other = consensus(graph, orientations, component, CONSENSUS, residual)
+        if other is None:
+            return _Answer(orientations, residual)
+        if other.body_from_world is None or other.weight is None:
+            return _Answer(orientations, residual, other.warnings)
+        weights = weights.times(other.weight, other.weight)
+        return _Answer(refinement(other.body_from_world, weights=weights), None, other.warnings)
+
+
+def _scored(cleared: _Cleared, answer: _Answer) -> tuple[Tensor, Tensor]:
+    """Residuals ``(M,)`` rad of an answer, and the probabilities of outliers ``(M,)`` that they tell."""
+    graph, structure = cleared.judged.measured, cleared.structure
+    series, component = structure.series, structure.component
+    angle, spread = residual_and_uncertainty(graph, answer.body_from_world, component, answer.residual)
+    score = residual_probability(angle, spread, NUMBERS.outlier_angle)
+    score[series.edge] = series.score(angle[series.edge], spread[series.edge], NUMBERS.outlier_angle)
+    score[series.bridge] = series.bridge_score(score, component[graph.source], len(structure.roots))
+    return angle, score
 
 
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:
