@@ -193,6 +193,9 @@ class RefinementPriors:
             steps, a quarter faster and 1 % worse; with twice as many, 1 % better and a fifth slower
             (``docs/diary/sfm-refinement.md``).
         same_valley: starts whose costs differ by less, of the cost, lead to one valley, but for where steps stop.
+        by_a_part: how much higher the cost may be, of the cost, of a place that a part of the edges led to.
+        rival_share: of a component's cameras that are turned otherwise by more than 20°: it is another place then, and
+            refined, too, where a few steps do not tell. Clusters that few edges join differ by so little.
         least_shaped_steps: of few steps that a user allows, so many at least are shaped.
         coarse_smoothing: radians: shorter residuals weigh as this one in coarse steps (Chatterjee & Govindu 2013).
         coarse_settled: coarse steps end once they turn cameras by less than this share of the typical residual.
@@ -225,6 +228,8 @@ class RefinementPriors:
     max_coarse_steps: int = 20
     telling_steps: int = 3
     same_valley: float = 5e-3
+    by_a_part: float = 0.03
+    rival_share: float = 0.02
     least_shaped_steps: int = 3
     coarse_smoothing: float = float(np.radians(1.0))
     coarse_settled: float = 0.03

@@ -34,6 +34,7 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.noise_density import NoiseDensity
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape
 from rotavg_ros.solver.sfm.priors import RefinementPriors
@@ -72,7 +73,8 @@ class Start(NamedTuple):
         body_from_world: ``(N, 4)``.
         coarse: ``(M,)`` positive, multiplied to the robust weights in coarse steps from there.
         among: ``(C,)`` bool, components that may begin there; None: all.
-        is_settled: coarse steps by a part of the edges led there; more are taken only if it is better as it is.
+        is_settled: coarse steps by a part of the edges led there; more are taken only if it is another place, and not
+            much worse.
     """
 
     body_from_world: Tensor
@@ -88,11 +90,13 @@ class Begun(NamedTuple):
         body_from_world: ``(N, 4)``.
         coarse: ``(M,)`` the weights that they went by.
         steps: how many there were.
+        rival: in some components another place, whose cost is too near for so few steps to tell; None: nowhere.
     """
 
     body_from_world: Tensor
     coarse: Tensor
     steps: int
+    rival: Begun | None = None
 
 
 def refine(
@@ -153,21 +157,65 @@ def begin(
         return orientations, problem.cost(orientations, shaped)
 
     orientations, least = told(orientations, steps)
-    coarse, barely = first.coarse, 1 - priors.same_valley
+    best, rival = Begun(orientations, first.coarse, steps), None
+    barely, nearest = 1 - priors.same_valley, torch.full_like(least, torch.inf)
     for other in others:
-        is_better = torch.ones_like(is_close) if other.among is None else other.among
+        may_begin = torch.ones_like(is_close) if other.among is None else other.among
         if other.is_settled:
-            is_better = is_better & (problem.cost(other.body_from_world, shaped) < barely * least)
-            if not bool(is_better.any()):
+            cost, apart = problem.cost(other.body_from_world, shaped), _share_apart(problem, best, other)
+            may_begin = may_begin & (cost < (1 + priors.by_a_part) * least) & (apart > priors.rival_share)
+            if not bool(may_begin.any()):
                 continue
         another, more = _coarse(problem, other)
         another, cost = told(another, more)
-        is_better = is_better & (cost < barely * least)
-        of_node = is_better[component]
-        orientations = torch.where(of_node[:, None], another, orientations)
-        coarse = torch.where(of_node[graph.source], other.coarse, coarse)
-        least, steps = torch.where(is_better, cost, least), max(steps, more)
-    return Begun(orientations, coarse, steps)
+        found = Begun(another, other.coarse, max(best.steps, more))
+        is_better = may_begin & (cost < barely * least)
+        is_rival = may_begin & ~is_better & (cost < torch.minimum(least / barely, nearest))
+        is_rival &= _share_apart(problem, best, found) > priors.rival_share
+        if bool(is_rival.any()):
+            rival, nearest = _where(problem, is_rival, found, rival or best), torch.where(is_rival, cost, nearest)
+        if bool(is_better.any()):
+            best, least = _where(problem, is_better, found, best), torch.where(is_better, cost, least)
+    is_rival = nearest < least / barely  # a better one may have come since
+    return best._replace(rival=_where(problem, is_rival, rival, best) if rival and bool(is_rival.any()) else None)
+
+
+def _where(problem: Problem, chosen: Tensor, one: Begun, other: Begun) -> Begun:
+    """``one`` in components ``(C,)`` that are chosen."""
+    of_node = chosen[problem.component]
+    orientations = torch.where(of_node[:, None], one.body_from_world, other.body_from_world)
+    coarse = torch.where(of_node[problem.graph.source], one.coarse, other.coarse)
+    return Begun(orientations, coarse, max(one.steps, other.steps))
+
+
+def _share_apart(problem: Problem, one: Begun, other: Begun | Start) -> Tensor:
+    """``(C,)`` of each component's nodes, how many orientations of two places are far from each other."""
+    component, count = problem.component, len(problem.roots)
+    turn = rotations.multiply(rotations.inverse(one.body_from_world), other.body_from_world)
+    moment = turn.new_zeros(count, 4, 4).index_add_(0, component, turn[:, :, None] * turn[:, None])
+    gauge = torch.linalg.eigh(moment).eigenvectors[:, :, -1]
+    return problem.mean((rotations.angle_between(turn, gauge[component]) > NUMBERS.outlier_angle).double())
+
+
+def settle_best(
+    graph: ViewGraph, begun: Begun, weights: EdgeWeights, structure: Structure, priors: RefinementPriors = PRIORS
+) -> tuple[Tensor, EdgeWeights]:
+    """:func:`settle` from where it began, and from its rival; of each component the one of lower cost.
+
+    Returns:
+        ``(N, 4)`` orientations, and the weights with which coarse steps led there.
+    """
+    weights = weights._replace(coarse=begun.coarse)
+    orientations = settle(graph, begun, weights, structure, priors)
+    if begun.rival is None:
+        return orientations, weights
+    problem, rival = Problem(graph, structure, priors), begun.rival
+    other = settle(graph, rival, weights, structure, priors)
+    is_better = problem.cost(other, weights.shaped.float()) < problem.cost(orientations, weights.shaped.float())
+    ended = _where(
+        problem, is_better, rival._replace(body_from_world=other), begun._replace(body_from_world=orientations)
+    )
+    return ended.body_from_world, weights._replace(coarse=ended.coarse)
 
 
 def settle(

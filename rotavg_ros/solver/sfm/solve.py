@@ -25,7 +25,7 @@ from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap, breadth_firs
 from rotavg_ros.solver.sfm.consensus.search import CONSENSUS, consensus
 from rotavg_ros.solver.sfm.cycles.evidence import with_triangles
 from rotavg_ros.solver.sfm.options import SfmStages
-from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, Start, begin, refine, settle
+from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, Start, begin, refine, settle_best
 from rotavg_ros.solver.sfm.series import EdgesInSeries
 from rotavg_ros.solver.sfm.starts.others import other_starts
 from rotavg_ros.solver.sfm.stated.noise import StatedNoise
@@ -135,8 +135,7 @@ def _refined(cleared: _Cleared, orientations: Tensor, stages: SfmStages, steps: 
         if stages.clean and stages.weighted:
             starts += other_starts(cleared.judged, cleared.is_believed, cleared.parent_edge, component)
         begun = begin(graph, starts, weights.shaped, structure, priors)
-        weights = weights._replace(coarse=begun.coarse)
-        orientations = settle(graph, begun, weights, structure, priors)
+        orientations, weights = settle_best(graph, begun, weights, structure, priors)
         if stages.stated:
             noise = StatedNoise.of(graph, structure, priors, stages.stated_shapes)
             orientations, weights = noise.refined(orientations, weights, refinement)
