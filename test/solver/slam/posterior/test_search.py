@@ -342,7 +342,15 @@ STRUCTURAL = {
         "_WORSE_STEPS",
     },
     "moves/runs": {"_LEAST_MEMBERS"},
-    "moves/slips": {"LEAST_WITNESSES", "_AGREE", "_AGREE_ANGLE", "OPTIMISM", "SETTLING", "SAME_PLACE"},
+    "moves/slips": {
+        "_FARTHEST_SHIFT",
+        "LEAST_WITNESSES",
+        "_AGREE",
+        "_AGREE_ANGLE",
+        "OPTIMISM",
+        "SETTLING",
+        "SAME_PLACE",
+    },
     "moves/starts": {"_INLIER_SQUARE", "_SHARP", "_STEP_LEVELS", "_CLOSURE_LEVEL", "_ROBUST_POWER"}
     | {"_ANNEALED_SLIPS", "_LEAST_WEIGHT", "_SAME_TURN"},
     # A cost by which a start is found; F alone decides what becomes of it.

@@ -25,6 +25,8 @@ OPTIMISM = 10.0
 _AGREE, _AGREE_ANGLE = 3.0, np.radians(2.0)
 # One false closure costs less than a slip.
 LEAST_WITNESSES = 2
+# A slip is moved by so many segments at most.
+_FARTHEST_SHIFT = 8
 # Positions that differ by less, in steps, are the same.
 SAME_PLACE = 1e-9
 
@@ -182,7 +184,11 @@ def propose_mending(mode: Mode) -> Iterator[Proposal]:
 
 
 def propose_shifts(mode: Mode) -> Iterator[Proposal]:
-    """Move each slip to the next sound segment of its chain, before or after."""
+    """Move each slip to a sound segment of its chain near it, before or after.
+
+    Not to the next ones alone: a closure between two segments may speak against the nearer one, and rivals are to be
+    there for places, which rotations do not know, to choose from.
+    """
     graph, limits = mode.problem.graph, mode.problem.limits
     segment = np.flatnonzero(graph.is_odometry[: graph.num_segments])
     start = np.minimum(graph.position[graph.source[segment]], graph.position[graph.target[segment]])
@@ -192,7 +198,7 @@ def propose_shifts(mode: Mode) -> Iterator[Proposal]:
     slipped = mode.slipped[mode.slipped < graph.num_segments]
     for edge in slipped[: limits.slips]:
         (at,) = np.flatnonzero(order == edge)
-        for place in (at - 1, at + 1):
+        for place in (at + side * far for far in range(1, _FARTHEST_SHIFT + 1) for side in (-1, 1)):
             other = int(order[place]) if 0 <= place < len(order) else -1
             if other >= 0 and mode.state.is_good[other] and chain[other] == chain[edge]:
                 state = _shifted(mode, int(edge), other, is_later=place > at)
