@@ -1,4 +1,4 @@
-"""The solve: options checked, a profile and a device chosen, the links of a combined method run one after the other."""
+"""The solve: checks the options, chooses a profile and a device, and runs the links of a combined method in turn."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, EdgeLabel, Hold
 
 # The noise that makes an edge an outlier, in radians.
 _OUTLIER_ANGLE = {"sfm": NUMBERS.outlier_angle, "slam": exceedance.OUTLIER_ANGLE}
-# With fewer edges two looks at them take less time than waking another worker.
+# With fewer edges, two passes over them take less time than waking another worker.
 _WORTH_WORKERS = 50_000
 
 
@@ -50,33 +50,34 @@ def solve(
 ) -> Solution:
     """Absolute orientations and outlier scores of a view-graph.
 
-    Every connected component has a frame of its own. Of a photo collection each is solved by itself; robots of one
-    graph are taken to err alike, so that one's noise, mounting and share of false closures tell of the others'.
+    Every connected component has a frame of its own. The components of a photo collection are solved independently.
+    The robots of one graph are assumed to share their noise, mounting and share of false closures, so data from one
+    inform the estimates for the others.
 
     Args:
-        graph: N nodes, M edges; or what has it as its ``graph``, as the result of ``read_graph`` does.
-        method: one of :data:`~rotavg_ros.solver.methods.METHODS`, or several joined by "+", of which each starts from
+        graph: N nodes, M edges; or an object with such a graph as its ``graph``, such as the result of ``read_graph``.
+        method: one of :data:`~rotavg_ros.solver.methods.METHODS`, or several joined by "+", each of which starts from
             the answer of the one before. "neurora~A,B" is the default on robots' graphs without A and B
-            (:data:`rotavg_ros.solver.slam.options.SWITCHES`); "neurora-paper~A,B" is the paper's with A and B as this
-            package has them (:data:`rotavg_ros.solver.sfm.options.PAPER_PARTS`).
+            (:data:`rotavg_ros.solver.slam.options.SWITCHES`); "neurora-paper~A,B" is the paper's method with A and B
+            replaced by this package's versions (:data:`rotavg_ros.solver.sfm.options.PAPER_PARTS`).
         profile: "slam" for odometry chains with loop closures, "sfm" for unordered view-graphs, "auto": "slam" if any
             edge is odometry.
-        device: where the SfM profile runs, whole: "cpu", "cuda", or "auto" (a GPU if torch finds one). Where there is
-            none that works, or it has too little memory, the CPU does it, which is logged. The SLAM profile and the
-            baselines are small and sparse; they run on the CPU.
-        refinement_steps: refinement steps at most, 0 for none; default: the method's own number. The SLAM profile
-            has 0 or all.
+        device: where the whole SfM profile runs: "cpu", "cuda", or "auto" (a GPU if torch finds one). If there is no
+            working GPU, or it has too little memory, the solve falls back to the CPU and logs it. The SLAM profile and
+            the baselines are small and sparse; they run on the CPU.
+        refinement_steps: maximum number of refinement steps, 0 for none; default: the method's own number. The SLAM
+            profile runs either none (0) or all.
         warm_start: ``(N, 4)`` body_from_world of an earlier solution to start from.
-        memory: that of the earlier solution by the same method, if the graph has only grown since, or its ``labels``,
-            the part of it that can be written down; with it a warm start of a SLAM graph judges the new edges and goes
-            on from all other verdicts. Where many closures are not explained by these, everything is judged anew beside
-            it.
-        work: units (:attr:`~rotavg_ros.solver.solution.Solution.work`) that such a solve may spend. Where it takes
-            more, the answer is what is known with what has come laid on, and :func:`advance` goes on with the rest.
-            The same on every machine. Default: all that it takes.
-        anew: such a solve is to lead to what one without a memory does;
+        memory: the memory of the earlier solution by the same method, if the graph has only grown since, or its
+            ``labels``, the part that can be written to a file. With it, a warm start of a SLAM graph judges the new
+            edges and keeps all other verdicts. If these leave many closures unexplained, everything is judged anew
+            alongside.
+        work: units (:attr:`~rotavg_ros.solver.solution.Solution.work`) that such a solve may spend. If it needs more,
+            the answer is the earlier one extended by the new edges, and :func:`advance` does the rest. The count is
+            the same on every machine. Default: no limit.
+        anew: such a solve is to arrive at the answer of a solve without a memory;
             :attr:`~rotavg_ros.solver.solution.Solution.is_anew` says when it has.
-        weights: folder of networks trained with ``rotavg train``; what it lacks comes from the package.
+        weights: folder of networks trained with ``rotavg train``; networks missing there come from the package.
 
     Returns:
         :class:`~rotavg_ros.solver.solution.Solution`: ``body_from_world`` ``(N, 4)`` xyzw, the inverse of what ROS
@@ -84,7 +85,8 @@ def solve(
         ``component`` and ``uncertainty`` ``(N,)``; and what was run.
 
     Raises:
-        UserError: no view-graph, an option outside its choices, or a start of the wrong shape or not of rotations.
+        UserError: ``graph`` is no view-graph, an option is outside its choices, or the warm start has the wrong shape
+            or does not consist of rotations.
     """
     graph = view_graph_of(graph).to("cpu")
     check_choices(method, profile, device)
@@ -129,14 +131,14 @@ def solve(
 
 
 def advance(memory: object | None, work: float) -> float:
-    """Go on with what a solve with a limit to its work has left; the next solve with this memory finds it done.
+    """Continue the work that a solve with a limit left undone; the next solve with this memory finds it done.
 
     Args:
-        memory: of its solution.
-        work: units to spend, and up to one factorisation more.
+        memory: the memory of that solve's solution.
+        work: units to spend; up to one factorisation more may be spent.
 
     Returns:
-        the units that were spent.
+        the units spent.
     """
     with metered() as meter:
         if isinstance(memory, SlamMemory):
@@ -155,7 +157,7 @@ class _Job:
 
 
 def _check_numbers(refinement_steps: int | None, work: float | None) -> None:
-    """Raises :class:`UserError` for negative ones."""
+    """Raises :class:`UserError` for negative numbers."""
     if refinement_steps is not None and refinement_steps < 0:
         raise UserError(f"refinement steps must not be negative, got {refinement_steps}")
     if work is not None and not work >= 0:
@@ -163,7 +165,7 @@ def _check_numbers(refinement_steps: int | None, work: float | None) -> None:
 
 
 def _check_start(warm_start: Tensor | None, num_nodes: int) -> None:
-    """Raises :class:`UserError` for what are not as many rotations as there are nodes."""
+    """Raises :class:`UserError` unless the start has one rotation per node."""
     if warm_start is None:
         return
     if tuple(warm_start.shape) != (num_nodes, 4):
@@ -176,7 +178,7 @@ def _check_start(warm_start: Tensor | None, num_nodes: int) -> None:
 
 
 def _first_look(graph: ViewGraph) -> tuple[str, ...]:
-    """Warnings of edges that state nothing; beside it the graph's components are found, which it remembers."""
+    """Warnings about edges that state nothing; in parallel, the graph finds its components, which it caches."""
     found: list[tuple[str, ...]] = []
 
     def look(number: int) -> None:
@@ -190,7 +192,7 @@ def _first_look(graph: ViewGraph) -> tuple[str, ...]:
 
 
 def _run_where_it_can(job: _Job, run: Run) -> tuple[Estimate, Run]:
-    """A GPU that does not do it is given up for the CPU; with the run that there was in the end."""
+    """Runs the job, on the CPU if the GPU fails; also returns the run that was used in the end."""
     try:
         return _run(job, run), run
     except devices.GPU_ERRORS as error:
@@ -202,12 +204,12 @@ def _run_where_it_can(job: _Job, run: Run) -> tuple[Estimate, Run]:
 
 
 def _memory_of(names: list[str], memory: object | None) -> SlamMemory | KeptLabels | None:
-    """What a method by these names can go on from, if it is that."""
+    """The memory, if the method of these names can continue from it."""
     return memory if names == [DEFAULT_METHOD] and isinstance(memory, SlamMemory | KeptLabels) else None
 
 
 def _run(job: _Job, run: Run) -> Estimate:
-    """Every link of the method; the last may go on from what an earlier solve of the graph remembers."""
+    """Runs every link of the method; the last may continue from the memory of an earlier solve of the graph."""
     device = run.networks.device
     job = replace(job, graph=job.graph.to(device), component=job.component.to(device))
     for name in job.names[:-1]:
@@ -219,18 +221,18 @@ def _run(job: _Job, run: Run) -> Estimate:
             estimate = update_slam(job.graph, memory, run)
         elif isinstance(memory, KeptLabels):
             estimate = resume_slam(job.graph, memory, run)
-            if estimate is None:  # nor is the start one that a search should begin with
+            if estimate is None:  # then a search should not begin at this start either
                 run = replace(run, warm_start=None)
     if estimate is not None:
         return _with_warnings(job.graph, estimate)
-    if run.anew:  # nothing can be gone on from, and nothing is to be begun with
+    if run.anew:  # there is nothing to continue from, and the search must not begin at the warm start
         run = replace(run, warm_start=None)
     estimate = _solve_once(job, job.names[-1], run)
     return _with_warnings(job.graph, estimate) if job.profile == "slam" else estimate
 
 
 def _with_warnings(graph: ViewGraph, estimate: Estimate) -> Estimate:
-    """With those about a whole solve of a robot's graph, which hold until the next one."""
+    """Adds the warnings about a whole solve of a robot's graph, which hold until the next whole solve."""
     goes_on = estimate.memory
     if isinstance(goes_on, SlamMemory) and goes_on.warnings is not None:
         return replace(estimate, warnings=goes_on.warnings)
@@ -252,15 +254,15 @@ def _solve_once(job: _Job, name: str, run: Run) -> Estimate:
         return _solve_baseline(job, name, run)
     if job.profile == "slam":
         return solve_slam(graph, method.slam, run)
-    from rotavg_ros.solver.sfm.solve import solve_sfm  # a robot's graph has no use for it
+    from rotavg_ros.solver.sfm.solve import solve_sfm  # not needed for a robot's graph
 
     return solve_sfm(graph, job.component, method.sfm, run)
 
 
 def _solve_baseline(job: _Job, name: str, run: Run) -> Estimate:
-    """One of the methods to compare with. It gives no scores, so the residuals it leaves must do."""
+    """One of the methods to compare with. It gives no scores, so scores are computed from its residuals."""
     graph = job.graph
-    if job.profile == "sfm":  # where an order of the nodes means nothing
+    if job.profile == "sfm":  # the order of the nodes means nothing there
         graph = replace(graph, kind=torch.full_like(graph.kind, EdgeKind.LOOP_CLOSURE))
     with run.watch.stage(name):
         orientations = baselines.BASELINES[name](graph, run.warm_start)
@@ -275,7 +277,7 @@ def _root_at_origin(position: Tensor, body_from_world: Tensor, component: Tensor
 
 
 def _first_nodes(component: Tensor) -> Tensor:
-    """``(C,)`` of every component."""
+    """``(C,)`` first node of every component."""
     first = torch.full((int(component.max()) + 1,), len(component))
     return first.scatter_reduce(0, component, torch.arange(len(component)), "amin")
 

@@ -1,13 +1,13 @@
-"""How long the noise's tails are: which cost the last steps lower.
+"""How heavy the noise's tails are: this selects the cost that the last steps lower.
 
-The cost |r|^½ is that of noise of density exp(−(r/s)^½), dense near nothing and with long tails, as real measurements
-and the recipes' have it. Normal noise about three axes has exp(−(r/s)²), and loses a fifth of its accuracy by |r|^½. So
-of each component that density is taken which makes its residuals likeliest, false edges having any rotation:
+The cost |r|^½ corresponds to noise of density exp(−(r/s)^½), with a sharp peak at zero and heavy tails, like real
+measurements and the recipes'. Normal noise about three axes has exp(−(r/s)²), and |r|^½ costs it a fifth of its
+accuracy. So each component uses the density of highest likelihood, with false edges uniform over rotations:
 
     p(r) = π c_β s⁻³ exp(−(r/s)^β) + (1 − π) / (8 π²),     β of ½, ¾, 1, 1½, 2,     c_β = β / (4π Γ(3/β)).
 
-An edge then weighs w = P(good | r) β r^(β−2) / s^β: with that, least squares step towards the maximum (expectation and
-maximisation). With β = ½, unless another is clearly likelier, all stays as it is.
+An edge then has weight w = P(good | r) β r^(β−2) / s^β, with which least-squares steps lead to the maximum (expectation
+and maximisation). β stays ½, and nothing changes, unless another value is clearly likelier.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from torch import Tensor
 
 from rotavg_ros.solver.sfm.priors import DensityPriors
 
-# Squared residuals are at least this, in units of the noise's shape, numerical.
+# Floor of squared residuals, in units of the noise's shape, numerical.
 _LEAST_SQUARE = 1e-12
-# An edge that is surely false keeps its ends attached, by this share of what one at the scale weighs.
+# A false edge keeps this share of the weight of an edge whose residual equals the scale, so its ends stay attached.
 _LEAST_WEIGHT = 1e-6
 
 
 @dataclass(frozen=True)
 class NoiseDensity:
-    """Of the noise of C components, in units of its shape.
+    """Density of the noise of C components, in units of its shape.
 
     Attributes:
         is_other: ``(C,)`` bool, whether β is not ½.
         exponent, scale: ``(C,)`` β and s.
-        log_odds: ``(C,)`` of an edge to be good, and less the logarithm of the even density: what P(good | r) begins
-            with.
-        component: ``(M,)`` of every edge.
+        log_odds: ``(C,)`` prior log-odds that an edge is good, minus the logarithm of the uniform density; a term of
+            P(good | r).
+        component: ``(M,)`` component of every edge.
     """
 
     is_other: Tensor
@@ -48,33 +48,33 @@ class NoiseDensity:
     def fitted(
         cls, square: Tensor, of_some: Tensor, component: Tensor, log_volume: Tensor, priors: DensityPriors
     ) -> NoiseDensity:
-        """The likeliest.
+        """The density of highest likelihood.
 
         Args:
             square: ``(K,)`` float64, expected squared residuals of some edges, in units of the noise's shape.
             of_some: ``(K,)`` their components.
-            component: ``(M,)`` of all edges.
-            log_volume: ``(C,)`` logarithm of what the shape makes of a volume.
+            component: ``(M,)`` components of all edges.
+            log_volume: ``(C,)`` logarithm of the factor by which the shape's units scale a volume.
         """
         count = len(log_volume)
         exponent = square.new_tensor(priors.exponents)[:, None]
         length = square.clamp(min=_LEAST_SQUARE).sqrt()
 
         def sums(value: Tensor) -> Tensor:
-            """``(B, C)`` of ``(B, K)``."""
+            """``(B, C)`` sums over components of ``(B, K)``."""
             if count == 1:
                 return value.sum(dim=1, keepdim=True)
             return value.new_zeros(len(value), count).index_add_(1, of_some, value)
 
         def of_each(value: Tensor) -> Tensor:
-            """``(B, K)`` of ``(B, C)``."""
+            """``(B, K)`` values of each edge's component, from ``(B, C)``."""
             return value if count == 1 else value[:, of_some]
 
         number = sums(torch.ones_like(length)[None]).clamp(min=1)
         power, even = length**exponent, _log_even_density(log_volume)
         log_scale = (sums(length.log()[None]) / number).repeat(len(exponent), 1)
         good = torch.full_like(log_scale, priors.good_share)
-        # Log-odds of each edge to be good.
+        # Log-odds that each edge is good.
         log_odds = torch.zeros_like(power)
         for number_of_round in range(priors.rounds + 1):
             if number_of_round > 0:
@@ -85,7 +85,7 @@ class NoiseDensity:
                 good = (known / number).clamp(1 / priors.most_certain, 1 - 1 / priors.most_certain)
             beginning = good.logit() + _log_constant(exponent) - 3 * log_scale - even
             log_odds = torch.addcmul(of_each(beginning), power, of_each(torch.exp(-exponent * log_scale)), value=-1)
-        # log(π p + (1 − π) even) is that of the second term and what the first one adds to it.
+        # log(π p + (1 − π) even) is the logarithm of the second term plus the softplus of the log-odds.
         likelihood = sums(torch.nn.functional.softplus(log_odds)) + number * ((1 - good).log() + even)
         likeliest = likelihood.max(dim=0)
         is_other = likeliest.values > likelihood[0] + priors.ahead
@@ -94,7 +94,7 @@ class NoiseDensity:
         return cls(is_other, exponent[which[0], 0], chosen[0], chosen[1].logit() - even, component)
 
     def weigh(self, square: Tensor, edges: slice | Tensor) -> Tensor:
-        """Weights of some edges, of their expected squared residuals."""
+        """Weights of some edges, from their expected squared residuals."""
         of = self.component[edges]
         square = square.clamp(min=_LEAST_SQUARE)
         exponent, scale, log_odds = (value.to(square)[of] for value in (self.exponent, self.scale, self.log_odds))
@@ -111,5 +111,5 @@ def _log_constant(exponent: Tensor) -> Tensor:
 
 
 def _log_even_density(log_volume: Tensor) -> Tensor:
-    """Of rotations that may be any, near none: farther off they are up to 2.5 times less dense, of no matter here."""
+    """Log density of uniform rotations near the identity; the factor of up to 2.5 farther away is negligible here."""
     return -math.log(8 * math.pi**2) - log_volume

@@ -1,10 +1,10 @@
 """The shape of a graph's noise: about which axes of the cameras' own frames measurements are exact.
 
-Two views fix the turn about the optical axis far better than pan and tilt, which trade against the translation
-(Daniilidis & Spetsakis 1997; of the Lund data's Sphinx, the errors about x, y and z are as 2.4 : 1.5 : 1). The shape is
-estimated from residuals; nothing is known of it beforehand. All cameras have the same, but an edge's noise belongs to
-the frame of one of its two ends, and which of them is not known, since the direction in which an edge is stated is its
-maker's choice. So each end has a probability.
+Two views fix the rotation about the optical axis far better than pan and tilt, which trade off against the translation
+(Daniilidis & Spetsakis 1997; in the Lund data's Sphinx, the errors about x, y and z are as 2.4 : 1.5 : 1). The shape is
+estimated from residuals alone, without a prior. All cameras share it, but an edge's noise belongs to the frame of one
+of its two ends. It is not known which one, since the direction in which an edge is stated is arbitrary. So each end has
+a probability.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rotavg_ros.solver.sfm.symmetric_rows import turned
 
 
 class ResidualSample(NamedTuple):
-    """Residuals of some edges, K of them.
+    """Residuals of K sampled edges.
 
     Attributes:
         vector: ``(3, K)`` rotation vectors in the world's frame, radians.
@@ -40,8 +40,8 @@ class NoiseShape:
 
     Attributes:
         information: ``(3, 3, N)`` rad⁻², symmetric, of an edge whose noise is in that node's frame; a matrix's entries
-            lie N apart, for sums over the nodes.
-        covariance: in the cameras' frames, ``(C, 3, 3)`` rad²; None: nothing was estimated.
+            lie N apart in memory, for sums over the nodes.
+        covariance: ``(C, 3, 3)`` rad², in the cameras' frames; None: nothing was estimated.
     """
 
     information: Tensor
@@ -49,7 +49,7 @@ class NoiseShape:
 
     @classmethod
     def round(cls, num_nodes: int, device: torch.device) -> NoiseShape:
-        """Every edge has the unit matrix."""
+        """The identity matrix for every node."""
         return cls(torch.eye(3, dtype=torch.float64, device=device)[:, :, None].expand(3, 3, num_nodes))
 
 
@@ -57,8 +57,8 @@ class ShapeEstimator:
     """Estimates noise shapes of the C components of a graph.
 
     Args:
-        component: ``(N,)``.
-        redundancy: ``(C,)`` how many edges each component has beyond a spanning tree.
+        component: ``(N,)`` component of every node.
+        redundancy: ``(C,)`` number of edges of each component beyond a spanning tree.
     """
 
     def __init__(self, component: Tensor, redundancy: Tensor, priors: NoiseShapePriors) -> None:
@@ -67,12 +67,12 @@ class ShapeEstimator:
     def estimate(
         self, sample: ResidualSample, body_from_world: Tensor, before: NoiseShape, is_held: Tensor
     ) -> NoiseShape:
-        """The shape that the residuals at given orientations have, every component for itself.
+        """The shape of the residuals at given orientations, estimated for each component independently.
 
         Args:
             body_from_world: ``(N, 4)``.
-            before: what was estimated a step ago.
-            is_held: ``(C,)`` components that keep in their cameras' frames what was estimated a step ago.
+            before: the estimate of the previous step.
+            is_held: ``(C,)`` components that keep the previous step's covariance in their cameras' frames.
         """
         matrix = _matrices(body_from_world)
         at_ends = (matrix.flatten(0, 1).index_select(1, end).view(3, 3, -1) for end in (sample.source, sample.target))
@@ -85,20 +85,20 @@ class ShapeEstimator:
         return self._placed(found, matrix)
 
     def _is_typical(self, vector: Tensor, group: Tensor) -> Tensor:
-        """Which residuals ``(3, K)`` tell the shape, ``(K,)``: those that are no longer than good ones mostly are.
+        """Indices of the residuals ``(3, K)`` from which the shape is estimated: those no longer than most good ones.
 
-        False edges that turn about one axis, as they do where places look alike and cameras are upright, would be taken
-        for noise that does: by a quarter of them Student's t is swamped.
+        False edges often turn about one axis, where places look alike and cameras are upright. They would be taken for
+        noise about that axis: a quarter of false edges is enough to swamp Student's t.
         """
         length = (vector * vector).sum(dim=0).sqrt()
-        # The cost |r|^½ meets as many edges exactly as a spanning tree has, which say nothing of their noise.
+        # The cost |r|^½ fits as many edges exactly as a spanning tree has; their residuals say nothing of their noise.
         nodes = torch.bincount(self._component, minlength=len(self._redundancy))
         share = 1 - (1 - self._priors.lower_share) * self._redundancy / (self._redundancy + nodes - 1).clamp(min=1)
         lower = quantile_by_group(length, group, share.clamp(0, 1))
         return (length <= self._priors.typical_lengths * lower[group]).nonzero()[:, 0]
 
     def carried(self, shape: NoiseShape, body_from_world: Tensor) -> NoiseShape:
-        """The same in the cameras' frames, where the cameras have turned to ``(N, 4)``."""
+        """The same shape in the cameras' frames, after the cameras have turned to ``(N, 4)``."""
         return shape if shape.covariance is None else self._placed(shape.covariance, _matrices(body_from_world))
 
     def _placed(self, covariance: Tensor, matrix: Tensor) -> NoiseShape:
@@ -111,9 +111,9 @@ class ShapeEstimator:
 
 
 def share_of_first(first_square: Tensor, second_square: Tensor) -> Tensor:
-    """Probability that noise belongs to the first of two frames, by its squared lengths in units of the noise there.
+    """Probability that noise belongs to the first of two frames, given its squared lengths in units of the noise there.
 
-    Densities are normal, which tells the two frames apart more sharply than the heavy tails of :func:`scatter` do.
+    Densities are normal, which tells the two frames apart more sharply than the heavy tails of :func:`scatter` would.
     """
     return torch.sigmoid((second_square - first_square) / 2)
 
@@ -135,16 +135,16 @@ def scatter(
 ) -> Tensor:
     """Robust covariance ``(G, 3, 3)`` about zero of the vectors of each group ``(K,)``, up to its scale.
 
-    The maximum likelihood estimate for Student's t with one degree of freedom (Kent & Tyler 1991), sought from
-    ``start``, an estimate from much the same vectors. Every vector is given as two frames have it, each ``(3, K)``; it
-    counts in both, by the probability that noise belongs to that frame.
+    The maximum likelihood estimate for Student's t with one degree of freedom (Kent & Tyler 1991), iterated from
+    ``start``, an estimate from nearly the same vectors. Every vector is given in two frames, each ``(3, K)``, and
+    counts in each with the probability that noise belongs to that frame.
     """
     count = torch.bincount(group, minlength=num_groups).clamp(min=1)[:, None, None]
     both, groups = torch.cat(vectors, dim=1), group.repeat(2)
     unit = torch.eye(3, dtype=both.dtype, device=both.device)
 
     def second_moment(weight: Tensor) -> Tensor:
-        if num_groups == 1:  # a matrix product adds up many times as fast
+        if num_groups == 1:  # a matrix product is many times as fast
             total = ((weight * both) @ both.t()).flatten()[:, None]
         else:
             products = ((weight * both)[:, None] * both[None]).flatten(0, 1)
@@ -171,7 +171,7 @@ def scatter(
 
 
 def as_far_as_supported(covariance: Tensor, redundancy: Tensor, priors: NoiseShapePriors) -> Tensor:
-    """The covariances ``(G, 3, 3)``, rounder the fewer residuals ``(G,)`` speak for them, and not too flat."""
+    """The covariances ``(G, 3, 3)``, shrunk towards round with fewer redundant edges ``(G,)``, and not too flat."""
     unit = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
     mean_variance = covariance.diagonal(dim1=1, dim2=2).mean(dim=1)
     support = (redundancy / (redundancy + priors.round_residuals))[:, None, None]

@@ -1,8 +1,8 @@
-"""The numbers of the SfM refinement, each with its unit, its source, and how much the answer depends on it.
+"""The constants of the SfM refinement, each with its unit, its source, and how much the answer depends on it.
 
-Half and twice each value (but for the numerical floors of 10⁻⁶ and less) were tried on tuning graphs of seven kinds:
-``docs/diary/sfm-refinement.md``. Where nothing is said below, the mean and the median error of each kind change by less
-than 1 %.
+Half and twice each value (except the numerical floors of 10⁻⁶ and less) were tried on tuning graphs of seven kinds:
+``docs/diary/sfm-refinement.md``. Unless stated otherwise below, the mean and the median error of each kind change by
+less than 1 %.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ class NoiseShapePriors:
     """How the noise's covariance in the cameras' frames is estimated (``noise_shape.py``).
 
     Attributes:
-        iterations, further_iterations: of the scatter's fixed point, from nothing and from the last step's scatter.
-        least_ratio: of standard deviations: no axis is believed to be more exact than this share of the least exact
-            one. Twice: 1–7 % worse means, 6–16 % worse medians, where noise has an exact axis. Half: 2 % better on the
-            paper's recipe alone, whose noise has an axis without any; cameras have none such.
-        least_deviation: radians, added to every axis, numerical: exact measurements have an inverse covariance, too.
-        lower_share, typical_lengths: residuals tell the shape that are no longer than so many times this quantile. A
-            quarter of normal noise is below 1.1 deviations of an axis, nearly all of it below 5; of 60 % of false
-            edges so many are left out that are longer than 10. With 8 times, medians where a third of the edges is
-            turned about the vertical are 1 to 2 % worse.
-        round_residuals: edges beyond a spanning tree that weigh as much as the assumption that noise is round.
+        iterations, further_iterations: number of fixed-point iterations of the scatter, from scratch and from the last
+            step's scatter.
+        least_ratio: smallest ratio of an axis's standard deviation to that of the least exact axis. Twice: 1–7 % worse
+            means, 6–16 % worse medians, where noise has an exact axis. Half: 2 % better only on the paper's recipe,
+            which has an axis without noise; real cameras have no such axis.
+        least_deviation: radians, added to every axis, numerical: lets the covariance of exact measurements be inverted.
+        lower_share, typical_lengths: the shape is estimated from residuals up to ``typical_lengths`` times their
+            quantile ``lower_share``. A quarter of normal noise is below 1.1 standard deviations of an axis, nearly all
+            of it below 5; with 60 % of false edges, those longer than 10 are left out. With 8 times, medians where a
+            third of the edges is turned about the vertical are 1 to 2 % worse.
+        round_residuals: number of edges beyond a spanning tree that weigh as much as the prior that noise is round.
     """
 
     iterations: int = 10
@@ -42,19 +43,20 @@ class NoiseShapePriors:
 class PrecisionPriors:
     """How far stated precisions are believed (``stated/precision.py``).
 
-    Chosen before any graph with precisions was solved, after those of robots' graphs; none was tuned.
+    The values follow those for robots' graphs and were chosen before any graph with precisions was solved; none was
+    tuned.
 
     Attributes:
-        worthless: probability beforehand that stated precisions say nothing.
-        num_exponents: α is one of so many numbers from 0 to 1.
-        least_exponent: a mean below this is hardly more than what was known beforehand, and counts as 0.
-        least_spread: of the logarithms of stated variances; where they spread by less, weights could gain 4 % of
-            variance at most.
-        max_log_ratio: logarithm of the factor by which an edge is believed to be better or worse than typical ones.
-        max_sample: edges that tell α.
-        least_residual: of the typical residual; shorter ones are of edges that the answer meets. Normal noise in three
-            dimensions is as short once in a million edges.
-        least_angle: rad; residuals count as at least this, numerical.
+        worthless: prior probability that stated precisions say nothing.
+        num_exponents: number of grid values of α from 0 to 1.
+        least_exponent: a posterior mean below this is hardly above the prior's, and counts as 0.
+        least_spread: least standard deviation of the logarithms of stated variances; with less, weights could reduce
+            the variance by 4 % at most.
+        max_log_ratio: largest logarithm of the factor by which an edge is believed to be better or worse than typical.
+        max_sample: maximum number of edges from which α is estimated.
+        least_residual: share of the typical residual; shorter residuals belong to edges that the answer fits exactly.
+            Normal noise in three dimensions is that short once in a million edges.
+        least_angle: rad, floor of the residuals, numerical.
     """
 
     worthless: float = 0.95
@@ -72,20 +74,21 @@ class CyclePriors:
     """What triangles say of edges (``cycles/evidence.py``).
 
     Attributes:
-        few_paths, run: paths of two edges of a component that are looked at for a third one: so many, in runs of so
-            many that begin with few edges, tell whether CleanNet knows its cameras.
-        paths_per_edge, least_paths, most_paths: where it does not, so many for each edge are looked at, if that is
-            between the other two.
-        freedom: degrees of freedom of Student's t, the density by which triangles of good edges close.
-        first_scale, scale_triangles: rad; of that density beforehand, and how many triangles tell as much.
-        least_scale: rad; edges that repeat each other would have it vanish.
-        base_spread, slope_spread: standard deviations beforehand of b and k, about 0.
-        rounds: of messages. Means of the default with 3 and 12 were 5 and 8 % worse, when the slope was fitted always.
-        full_trust: CleanNet counts in full where it explains so large a share of what triangles explain of others. On
-            recipes that it was trained on it explains 0.4 to 1.1 of it, on cameras turned anyhow 0.00 to 0.03.
+        few_paths, run: number of two-edge paths per component, and of consecutive paths in a run, that are searched for
+            a third edge to tell whether CleanNet's scores fit these cameras.
+        paths_per_edge, least_paths, most_paths: if they do not fit, number of paths searched per edge, and the bounds
+            of their total.
+        freedom: degrees of freedom of Student's t, the density of closing angles of triangles of good edges.
+        first_scale, scale_triangles: prior scale of that density, rad, and the number of triangles it counts for.
+        least_scale: rad; without it, edges that repeat each other would make the scale vanish.
+        base_spread, slope_spread: prior standard deviations of b and k, about 0.
+        rounds: number of rounds of messages. With 3 and 12, means of the default were 5 and 8 % worse (measured when
+            the slope was always fitted).
+        full_trust: CleanNet counts in full where it explains this share of what triangles explain of other triangles.
+            On recipes that it was trained on, the share is 0.4 to 1.1; on arbitrarily turned cameras, 0.00 to 0.03.
         by_chance: nats that may be explained by chance.
         shells: rad; densities of closing angles are constant between these.
-        density_rounds: of estimating them.
+        density_rounds: number of rounds in which these densities are estimated.
     """
 
     few_paths: int = 40_000
@@ -115,24 +118,25 @@ class ConsensusPriors:
     Chosen on every third scene of the four sets of scans (``docs/diary/sfm-scans.md``).
 
     Attributes:
-        contradicting: another answer is looked for where more triangles that close have an edge that the answer rejects
-            than would by chance, by so many of its standard deviations.
-        closing: rad; what a triangle closes by, in steps of which other answers begin.
-        glance: triangles that tell whether there may be another answer.
-        max_nodes, max_edges: of a component that is looked at; larger ones would take half a minute and more.
-        max_triangles: of a component, evenly spread over all that it has; so many that every edge of a complete graph
-            of a hundred nodes has all of its own.
+        contradicting: another answer is looked for where the number of closing triangles with a rejected edge exceeds
+            the number expected by chance by this many standard deviations.
+        closing: rad; widths of the closing angle with which triangles vote; each gives the start of one other answer.
+        glance: maximum number of triangles that are examined to tell whether there may be another answer.
+        max_nodes, max_edges: largest component that is examined; larger ones would take half a minute and more.
+        max_triangles: maximum number per component, evenly spread over all that it has; enough for every triangle of
+            every edge of a complete graph of a hundred nodes.
         freedom: degrees of freedom of Student's t, the density of good edges: a tenth of them err four times as much as
             typical ones.
-        least_scale: rad; of that density. What registrations state they hardly know better, and without it a few edges
-            that repeat each other are explained ever more exactly.
-        shells: rad; false edges have any density of the angle that they state, constant in each shell between these.
-            Failed registrations lie near where they began, some of them exactly there, for which the first shell is.
-        shell_edges: edges that a shell of the whole sphere's volume has beforehand.
-        curvature: precision of the two coefficients by which an edge's chances depend on how far its ends are turned.
-        max_rounds: of expectation and maximisation.
-        settled: nats by which a last round betters the likelihood at most.
-        ahead: nats by which another answer has to be likelier; two rounds' rounding, where it is the same one.
+        least_scale: rad, floor of that density's scale. Registrations are hardly more exact, and without the floor a
+            few edges that repeat each other would be explained ever more exactly.
+        shells: rad; the density of the angle that false edges state is free, but constant in each shell between these.
+            Failed registrations lie near where they began, some exactly there, hence the narrow first shell.
+        shell_edges: prior number of edges in a shell with the volume of the whole sphere.
+        curvature: prior precision of the two coefficients by which the probability that an edge is good depends on how
+            far its ends are turned.
+        max_rounds: maximum number of rounds of expectation and maximisation.
+        settled: nats; a round that improves the likelihood by less is the last.
+        ahead: nats by which another answer has to be likelier; covers the rounding of two runs that find the same one.
     """
 
     contradicting: float = 5.0
@@ -155,19 +159,20 @@ class ConsensusPriors:
 
 @dataclass(frozen=True)
 class DensityPriors:
-    """Which density of noise the last steps go by (``noise_density.py``).
+    """Which density of noise the last steps use (``noise_density.py``).
 
     The exponents are those that an experiment on graphs of normal noise, recipes, Lund and scans compared
-    (``docs/diary/sfm-refinement.md``); none of the numbers was tuned, nor how much the answer depends on them measured.
+    (``docs/diary/sfm-refinement.md``). None of the numbers was tuned, and the answer's dependence on them was not
+    measured.
 
     Attributes:
-        exponents: β, the first of which is that of the steps before.
-        ahead: nats by which another has to be likelier.
-        good_share: of the edges, to begin with.
+        exponents: values of β; the first is that of the steps before.
+        ahead: nats by which another exponent has to be likelier.
+        good_share: initial share of good edges.
         most_certain: one over the least share of false edges, numerical.
-        rounds: of expectation and maximisation.
-        least_prior: edges of less prior weight are not asked.
-        max_steps: by the density; as many of all steps as are left.
+        rounds: number of rounds of expectation and maximisation.
+        least_prior: edges of less prior weight are not used in the fit.
+        max_steps: maximum number of steps with the density, within the steps that are left.
     """
 
     exponents: tuple[float, ...] = (0.5, 0.75, 1.0, 1.5, 2.0)
@@ -183,45 +188,48 @@ class DensityPriors:
 class RefinementPriors:
     """How the refinement weighs edges and when it ends (``refinement.py``).
 
-    Standard errors are those of the answer, as a step's length λ has them (``refinement.py``). What names no other
-    source was chosen on the tuning graphs.
+    Standard errors are those of the answer, the unit of a step's length λ (``refinement.py``). Values without another
+    source were chosen on the tuning graphs.
 
     Attributes:
-        max_steps: bound on all steps; the tuning graphs take 5–20, some scans more.
-        max_coarse_steps: bound on the coarse ones; 1–4 are usual.
-        telling_steps: shaped ones after which starts are compared. With none, the better start is told by the coarse
-            steps, a quarter faster and 1 % worse; with twice as many, 1 % better and a fifth slower
+        max_steps: maximum number of all steps; the tuning graphs take 5–20, some scans more.
+        max_coarse_steps: maximum number of coarse steps; 1–4 are usual.
+        telling_steps: number of shaped steps after which starts are compared. With none, the coarse steps decide, a
+            quarter faster and 1 % worse; with twice as many, 1 % better and a fifth slower
             (``docs/diary/sfm-refinement.md``).
-        same_valley: starts whose costs differ by less, of the cost, lead to one valley, but for where steps stop.
-        by_a_part: how much higher the cost may be, of the cost, of a place that a part of the edges led to.
-        rival_share: of a component's cameras that are turned otherwise by more than 20°: it is another place then, and
-            refined, too, where a few steps do not tell. Clusters that few edges join differ by so little.
-        least_shaped_steps: of few steps that a user allows, so many at least are shaped.
+        same_valley: relative difference of costs below which two starts may lead to the same minimum and differ only in
+            where the steps stopped.
+        by_a_part: largest relative excess of the cost of a start that was found from a subset of the edges.
+        rival_share: a solution in which more than this share of a component's cameras is turned by more than 20° is a
+            different one; it is refined too if a few steps do not decide. Solutions may differ by no more than a
+            cluster that few edges join.
+        least_shaped_steps: minimum number of shaped steps where the user allows only a few steps.
         coarse_smoothing: radians: shorter residuals weigh as this one in coarse steps (Chatterjee & Govindu 2013).
         coarse_settled: coarse steps end once they turn cameras by less than this share of the typical residual.
-        relaxation: how many times its length a shaped step is taken. Any factor below 2 lowers the cost; 1 takes a
-            third more steps, 1.7 and more alternate.
-        stretched: standard errors: of steps shorter than this; longer ones are not yet in the last basin.
+        relaxation: factor by which a shaped step is lengthened. Any factor below 2 lowers the cost; 1 takes a third
+            more steps, 1.7 and more alternate.
+        stretched: standard errors: only shorter steps are lengthened; longer ones are not yet in the final basin.
         held: standard errors: the noise is not estimated again after a shorter shaped step. Twice: up to 1.5 %.
-        converged: standard errors: a shorter shaped step is the last. What lies ahead then is about a tenth of a
+        converged: standard errors: a shorter shaped step is the last. The remaining distance is then about a tenth of a
             standard error, half a per cent of the error. Twice: up to 2 %.
-        converged_angle: radians: a step that turns no camera by more is the last, too; far below what orientations are
-            good for.
+        converged_angle: radians: a step that turns no camera by more is also the last; far below the accuracy of the
+            orientations.
         step_tolerance: share of a step that conjugate gradients may leave to the next step.
-        least_angle: radians: the same absolutely; what single precision can tell.
-        least_square: variances of the noise: floor of a residual's expected square, numerical.
-        least_prior: of an edge's weight, numerical: keeps nodes attached of which all edges are rejected.
-        coarse_noise: radians: where residuals are typically larger, single precision, which leaves them exact to 10⁻⁷
-            rad, shows in no answer.
+        least_angle: radians: the same as an absolute value; the limit of single precision.
+        least_square: floor of a residual's expected square, in variances of the noise, numerical.
+        least_prior: floor of an edge's weight, numerical: keeps nodes attached whose edges are all rejected.
+        coarse_noise: radians: where residuals are typically larger, single precision is used; its error of 10⁻⁷ rad
+            then shows in no answer.
         least_residual: radians: floor of the typical residual, numerical.
-        well_knit_degree: edges per node from which on conjugate gradients are tried without a factorisation. Half: up
-            to 1.5 % on small graphs.
-        max_sample: edges of a component that tell its noise; half and twice: up to 1.4 %.
-        half_trusted: edges beyond a cycle with which CleanNet's log-odds count by half where they tell edges in
-            series apart: it knows graphs in which many edges check each other. Orientations of the synthetic recipes,
-            which have thousands, do not depend on it.
+        well_knit_degree: number of edges per node above which conjugate gradients are tried without a factorisation.
+            Half: up to 1.5 % on small graphs.
+        max_sample: maximum number of edges of a component from which its noise is estimated; half and twice: up to
+            1.4 %.
+        half_trusted: number of edges beyond a cycle at which CleanNet's log-odds count by half in telling edges in
+            series apart: it was trained on graphs in which many edges check each other. Orientations of the synthetic
+            recipes, which have thousands of edges, do not depend on it.
         shape: how the noise's shape is estimated.
-        density: which density the last steps go by.
+        density: which density the last steps use.
     """
 
     max_steps: int = 50

@@ -1,10 +1,10 @@
-"""Refinement of an SfM view-graph: robust Gauss–Newton steps on the tangent space, coarse ones and then shaped ones.
+"""Refinement of an SfM view-graph: robust Gauss–Newton steps in the tangent space, first coarse, then shaped.
 
-Coarse steps (ℓ1, round noise; Chatterjee & Govindu 2013) bring the orientations to within the noise, however wrong they
-were in places. Then the noise's shape Ω in the cameras' frames is estimated from the residuals, and shaped steps (ℓ½,
-Chatterjee & Govindu 2018) measure residuals by it, until they have converged.
+Coarse steps (ℓ1, round noise; Chatterjee & Govindu 2013) bring the orientations to within the noise, even where the
+start was badly wrong. Then the noise's shape Ω in the cameras' frames is estimated from the residuals, and shaped steps
+(ℓ½, Chatterjee & Govindu 2018) measure residuals with Ω until they have converged.
 
-A shaped step weighs an edge by its expected squared residual: its ends are uncertain themselves, so that an edge that
+A shaped step weights an edge by its expected squared residual: its ends are themselves uncertain, so an edge that
 happens to fit is not exact. With r the residual, p the edge's prior weight and v_u the variance of node u,
 
     w_uv = p_uv (rᵀ Ω r + v_u + v_v)^(−3/4),     v_u = φ / Σ w over the edges of u,     φ = Σ w² rᵀ Ω r / Σ w.
@@ -14,14 +14,14 @@ happens to fit is not exact. With r the residual, p the edge's prior weight and 
 
     F(R, v) = Σ_uv 4 p_uv (rᵀ Ω r + v_u + v_v)^(1/4) − φ Σ_u log v_u,
 
-since the fourth root is concave and its tangents bound it (majorise and minimise). A step towards the bound's minimum
-lowers the bound up to twice its length.
+since the fourth root is concave and bounded above by its tangents (majorise–minimise). A step towards the bound's
+minimum lowers the bound even if it is taken at up to twice its length.
 
-Where edges state about which axes they are exact, and are believed (``stated/shape.py``), T r takes the place of r in
-shaped steps, with a matrix T for each edge.
+Where edges state about which axes they are exact, and this is believed (``stated/shape.py``), T r replaces r in shaped
+steps, with a matrix T for each edge.
 
-A step's length λ is in standard errors of the answer: λ² = xᵀ L x / (φ N), of N nodes. It depends neither on the frames
-of world and cameras nor on the noise's size.
+A step's length λ is measured in standard errors of the answer: λ² = xᵀ L x / (φ N), with N nodes. It depends neither on
+the frames of world and cameras nor on the noise's size.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from rotavg_ros.solver.sfm.symmetric_rows import distinct_entries, turned
 from rotavg_ros.view_graph import ViewGraph
 
 PRIORS = RefinementPriors()
-# What the noise's shape earns: no axis is more exact than another.
+# For ablation of the noise's shape: no axis is more exact than another.
 ROUND = replace(PRIORS, shape=replace(PRIORS.shape, least_ratio=1.0))
 
 
@@ -51,9 +51,9 @@ class EdgeWeights(NamedTuple):
     """What is known of M edges before their residuals are.
 
     Attributes:
-        shaped: ``(M,)`` positive, multiplied to the robust weights in shaped steps.
-        coarse: ``(M,)`` the same in coarse steps. CleanNet's scores belong here alone: after these, residuals know
-            more.
+        shaped: ``(M,)`` positive factors of the robust weights in shaped steps.
+        coarse: ``(M,)`` the same in coarse steps. CleanNet's scores are used only here: after the coarse steps,
+            residuals are more informative.
         unit: ``(3, 3, M)`` T, symmetric, in the targets' frames: residuals r count as T r in shaped steps; None: T = 1.
     """
 
@@ -62,7 +62,7 @@ class EdgeWeights(NamedTuple):
     unit: Tensor | None = None
 
     def times(self, shaped: Tensor, coarse: Tensor) -> EdgeWeights:
-        """With factors ``(M,)`` to both weights."""
+        """Both weights multiplied by factors ``(M,)``."""
         return self._replace(shaped=self.shaped * shaped, coarse=self.coarse * coarse)
 
 
@@ -71,10 +71,10 @@ class Start(NamedTuple):
 
     Attributes:
         body_from_world: ``(N, 4)``.
-        coarse: ``(M,)`` positive, multiplied to the robust weights in coarse steps from there.
+        coarse: ``(M,)`` positive factors of the robust weights in coarse steps from there.
         among: ``(C,)`` bool, components that may begin there; None: all.
-        is_settled: coarse steps by a part of the edges led there; more are taken only if it is another place, and not
-            much worse.
+        is_settled: coarse steps on a subset of the edges led there; more are taken only if the start differs from the
+            best one and is not much worse.
     """
 
     body_from_world: Tensor
@@ -88,9 +88,9 @@ class Begun(NamedTuple):
 
     Attributes:
         body_from_world: ``(N, 4)``.
-        coarse: ``(M,)`` the weights that they went by.
-        steps: how many there were.
-        rival: in some components another place, whose cost is too near for so few steps to tell; None: nowhere.
+        coarse: ``(M,)`` the weights that these steps used.
+        steps: number of steps.
+        rival: another solution in some components, whose cost is too close for so few steps to decide; None: nowhere.
     """
 
     body_from_world: Tensor
@@ -107,12 +107,12 @@ def refine(
     weights: EdgeWeights | None = None,
     priors: RefinementPriors = PRIORS,
 ) -> Tensor:
-    """Reweighted least-squares steps until they have converged, at most ``max_steps``; each component by itself.
+    """Reweighted least-squares steps until convergence, at most ``max_steps``; each component independently.
 
     Args:
         body_from_world: ``(N, 4)`` start.
         structure: default: computed.
-        weights: default: ones, and no units.
+        weights: default: ones, without units.
 
     Returns:
         ``(N, 4)`` float64 orientations.
@@ -128,13 +128,13 @@ def refine(
 def begin(
     graph: ViewGraph, starts: Sequence[Start], shaped: Tensor, structure: Structure, priors: RefinementPriors = PRIORS
 ) -> Begun:
-    """Coarse steps; of each component from that of several starts where Σ w ‖r‖^½ is clearly lowest after them.
+    """Coarse steps from several starts; each component keeps the one with clearly the lowest Σ w ‖r‖^½ afterwards.
 
-    That is the cost of shaped steps, a few of which are taken to tell starts apart. A likelihood would not do: its
-    scale goes towards nothing where an answer meets as many edges exactly as there are nodes.
+    That is the cost of the shaped steps, a few of which are taken to tell starts apart. A likelihood would not do: its
+    scale tends to zero where an answer fits as many edges exactly as there are nodes.
 
     Args:
-        shaped: ``(M,)`` positive, multiplied to the robust weights in shaped steps.
+        shaped: ``(M,)`` positive factors of the robust weights in shaped steps.
     """
     problem, component = Problem(graph, structure, priors), structure.component
     shaped = shaped.float().clamp(min=priors.least_prior)
@@ -142,14 +142,14 @@ def begin(
     orientations, steps = _coarse(problem, first)
     if not others:
         return Begun(orientations, first.coarse, steps)
-    # Components in which starts are told apart by further steps, and where they are by the coarse ones alone.
+    # Components in which starts are told apart by further steps; in the others, the coarse steps decide.
     is_close = torch.zeros_like(structure.roots, dtype=torch.bool)
     for other in others:
         if not other.is_settled:
             is_close = is_close | (True if other.among is None else other.among)
 
     def told(orientations: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        """Orientations after the steps that tell, and their cost ``(C,)``."""
+        """Orientations after the further steps, and their cost ``(C,)``."""
         if bool(is_close.any()):
             few = min(priors.telling_steps, priors.max_steps - steps)
             further = _shaped(problem, orientations, EdgeWeights(shaped, shaped), few).orientations
@@ -176,12 +176,12 @@ def begin(
             rival, nearest = _where(problem, is_rival, found, rival or best), torch.where(is_rival, cost, nearest)
         if bool(is_better.any()):
             best, least = _where(problem, is_better, found, best), torch.where(is_better, cost, least)
-    is_rival = nearest < least / barely  # a better one may have come since
+    is_rival = nearest < least / barely  # a better start may have been found since
     return best._replace(rival=_where(problem, is_rival, rival, best) if rival and bool(is_rival.any()) else None)
 
 
 def _where(problem: Problem, chosen: Tensor, one: Begun, other: Begun) -> Begun:
-    """``one`` in components ``(C,)`` that are chosen."""
+    """``one`` in the chosen components ``(C,)``, ``other`` elsewhere."""
     of_node = chosen[problem.component]
     orientations = torch.where(of_node[:, None], one.body_from_world, other.body_from_world)
     coarse = torch.where(of_node[problem.graph.source], one.coarse, other.coarse)
@@ -189,7 +189,7 @@ def _where(problem: Problem, chosen: Tensor, one: Begun, other: Begun) -> Begun:
 
 
 def _share_apart(problem: Problem, one: Begun, other: Begun | Start) -> Tensor:
-    """``(C,)`` of each component's nodes, how many orientations of two places are far from each other."""
+    """``(C,)`` share of each component's nodes whose orientations in the two solutions are far apart."""
     component, count = problem.component, len(problem.roots)
     turn = rotations.multiply(rotations.inverse(one.body_from_world), other.body_from_world)
     moment = turn.new_zeros(count, 4, 4).index_add_(0, component, turn[:, :, None] * turn[:, None])
@@ -200,10 +200,10 @@ def _share_apart(problem: Problem, one: Begun, other: Begun | Start) -> Tensor:
 def settle_best(
     graph: ViewGraph, begun: Begun, weights: EdgeWeights, structure: Structure, priors: RefinementPriors = PRIORS
 ) -> tuple[Tensor, EdgeWeights]:
-    """:func:`settle` from where it began, and from its rival; of each component the one of lower cost.
+    """:func:`settle` from ``begun`` and from its rival; each component keeps the result of lower cost.
 
     Returns:
-        ``(N, 4)`` orientations, and the weights with which coarse steps led there.
+        ``(N, 4)`` orientations, and the weights of the coarse steps that led there.
     """
     weights = weights._replace(coarse=begun.coarse)
     orientations = settle(graph, begun, weights, structure, priors)
@@ -225,7 +225,7 @@ def settle(
     structure: Structure,
     priors: RefinementPriors = PRIORS,
 ) -> Tensor:
-    """Shaped steps until they have converged, as many as are left, then those by the noise's density, ``(N, 4)``."""
+    """Shaped steps until convergence, as many as are left, then steps with the noise's density; ``(N, 4)``."""
     problem = Problem(graph, structure, priors)
     weights = weights._replace(shaped=weights.shaped.float().clamp(min=priors.least_prior))
     settled = _shaped(problem, begun.body_from_world, weights, priors.max_steps - begun.steps)
@@ -234,7 +234,7 @@ def settle(
 
 
 class _Settled(NamedTuple):
-    """Where ℓ½ steps have led: orientations ``(N, 4)``, the noise there, variances ``(N,)``, how many steps it took."""
+    """Result of ℓ½ steps: orientations ``(N, 4)``, the noise there, variances ``(N,)``, number of steps."""
 
     orientations: Tensor
     noise: NoiseShape
@@ -243,7 +243,7 @@ class _Settled(NamedTuple):
 
 
 def _coarse(problem: Problem, start: Start) -> tuple[Tensor, int]:
-    """ℓ1 steps until they are settled; with their number."""
+    """ℓ1 steps until they have settled; also returns their number."""
     priors = problem.priors
     max_steps = min(priors.max_coarse_steps, priors.max_steps - priors.least_shaped_steps)
     orientations = start.body_from_world.double()
@@ -261,7 +261,7 @@ def _coarse(problem: Problem, start: Start) -> tuple[Tensor, int]:
 
 
 def _shaped(problem: Problem, orientations: Tensor, weights: EdgeWeights, max_steps: int) -> _Settled:
-    """ℓ½ steps that know the noise's shape and size, until they have converged."""
+    """ℓ½ steps with the noise's estimated shape and size, until convergence."""
     priors, prior = problem.priors, weights.shaped
     noise = problem.round
     variance = problem.variance_of_means()
@@ -287,7 +287,7 @@ def _shaped(problem: Problem, orientations: Tensor, weights: EdgeWeights, max_st
         length = (step.decrement / (dispersion * problem.num_nodes)).sqrt()
         stretch = torch.where(length < priors.stretched, priors.relaxation, 1.0)
         orientations = _turned(orientations, stretch[problem.component] * step.turn)
-        is_held = is_held | ~(length >= priors.held)  # also where there is no noise, and no length
+        is_held = is_held | ~(length >= priors.held)  # also where there is no noise and the length is NaN
         is_open = is_open & (length >= priors.converged)
         is_open = is_open & (problem.largest(step.turn.norm(dim=0)) >= priors.converged_angle)
         if not bool(is_open.any()):
@@ -297,7 +297,7 @@ def _shaped(problem: Problem, orientations: Tensor, weights: EdgeWeights, max_st
 
 
 def _by_density(problem: Problem, settled: _Settled, weights: EdgeWeights, max_steps: int) -> Tensor:
-    """Steps by the density that makes residuals likeliest, in components where that is not the one of ℓ½."""
+    """Steps with the density of highest likelihood, in components where that is not the density of ℓ½."""
     priors, prior = problem.priors, weights.shaped
     orientations, noise, variance, _ = settled
     density: NoiseDensity | None = None

@@ -1,4 +1,4 @@
-"""The SfM profile: clean → bootstrap → fine-tune, as the paper has it (NeuRoRA, §4), and refine."""
+"""The SfM profile: clean → bootstrap → fine-tune, as in the paper (NeuRoRA, §4), then refine."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.solver.sfm.uncertainty import References, variances
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-# A graph of more edges is worth measuring what tiles this machine likes.
+# For graphs with more edges it pays to measure which tile sizes are fastest on this machine.
 _TUNING_PAYS = 200_000
 
 
 def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) -> Estimate:
-    """One method on a graph, on the device that the graph is on.
+    """One method on a graph, on the graph's device.
 
     Args:
-        component: ``(N,)`` of every node.
+        component: ``(N,)`` component of every node.
     """
     networks, watch = run.networks, run.watch
     if graph.num_edges > _TUNING_PAYS and graph.device.type == "cpu":
@@ -81,8 +81,8 @@ def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) 
     score, variance = cleaned.outlier_probability.double(), torch.full((graph.num_nodes,), torch.nan)
     by_residuals = stages.fine_tunings > 0 and not ("cleannet" in stages.as_written and stages.clean)
     if steps > 0 or by_residuals:
-        # Before, there is but a tree; now a residual is the noise but for the orientations' error. The paper's CleanNet
-        # has the last word in any case.
+        # A tree alone leaves no residuals to judge by. Now a residual is the edge's noise, up to the orientations'
+        # error. With the paper's CleanNet, its own scores stand unless the orientations are refined.
         angle, score = _scored(cleared, answer)
         if steps > 0:
             with watch.stage("uncertainty"):
@@ -97,9 +97,9 @@ class _Cleared(NamedTuple):
     """What is known of a graph's edges before orientations are refined.
 
     Attributes:
-        judged: with CleanNet's word and labels.
-        is_believed: whether triangles bear that word out.
-        cleaned: with theirs, and as the tree has it.
+        judged: edges with CleanNet's scores and the labels.
+        is_believed: whether triangles confirm these scores.
+        cleaned: edges with the triangles' evidence included, as used by the tree.
         parent_edge: ``(N,)`` the tree.
         structure: the graph's connections.
     """
@@ -112,7 +112,7 @@ class _Cleared(NamedTuple):
 
 
 class _Answer(NamedTuple):
-    """Orientations ``(N, 4)``; their residuals ``(M,)`` rad, if they are known; a sentence for each doubt."""
+    """Orientations ``(N, 4)``; their residuals ``(M,)`` rad, if known; one sentence for each warning."""
 
     body_from_world: Tensor
     residual: Tensor | None = None
@@ -120,7 +120,7 @@ class _Answer(NamedTuple):
 
 
 def _refined(cleared: _Cleared, orientations: Tensor, stages: SfmStages, steps: int, watch: Stopwatch) -> _Answer:
-    """From the networks' orientations ``(N, 4)``, or from where it is better; then another answer, if there is one."""
+    """Refines from the networks' orientations ``(N, 4)`` or a better start; then looks for another answer."""
     graph, structure = cleared.judged.measured, cleared.structure
     component = structure.component
     with watch.stage("refine"):
@@ -153,7 +153,7 @@ def _refined(cleared: _Cleared, orientations: Tensor, stages: SfmStages, steps: 
 
 
 def _scored(cleared: _Cleared, answer: _Answer) -> tuple[Tensor, Tensor]:
-    """Residuals ``(M,)`` rad of an answer, and the probabilities of outliers ``(M,)`` that they tell."""
+    """Residuals ``(M,)`` rad of an answer, and the outlier probabilities ``(M,)`` that follow from them."""
     graph, structure = cleared.judged.measured, cleared.structure
     series, component = structure.series, structure.component
     angle, spread = residual_and_uncertainty(graph, answer.body_from_world, component, answer.residual)
@@ -164,12 +164,12 @@ def _scored(cleared: _Cleared, answer: _Answer) -> tuple[Tensor, Tensor]:
 
 
 def _structure(begun: Bootstrapped, component: Tensor) -> Structure:
-    """The graph's connections; of edges in series CleanNet says which is to blame, as far as it can know."""
+    """The graph's connections; among edges in series, CleanNet's scores say which is to blame, as far as reliable."""
     graph = begun.cleaned.measured
     series = EdgesInSeries.of(graph, begun.parent, begun.parent_edge)
     structure = Structure(component, begun.roots, begun.cleaned.edges, series)
     redundancy = structure.redundancy(graph)
-    # Of a lone cycle it has seen nothing that could tell.
+    # In a component with a single cycle, CleanNet has no evidence to tell its edges apart.
     others = (redundancy - 1).clamp(min=0)
     trust = (others / (others + PRIORS.half_trusted))[component[graph.source[series.edge]]]
     log_odds = begun.cleaned.outlier_probability[series.edge].double().logit()

@@ -1,4 +1,4 @@
-"""One least-squares step of the SfM refinement: residuals, robust weights, and the system that they make."""
+"""One least-squares step of the SfM refinement: residuals, robust weights, and the linear system."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class Structure:
 
     Attributes:
         component: ``(N,)`` connected components.
-        roots: ``(C,)`` a node of each, in the components' order; they are held fixed.
-        edges: the graph's edges sorted.
-        series: those of its edges that only check each other.
+        roots: ``(C,)`` one node of each component, in the components' order; it is held fixed.
+        edges: the graph's edges, sorted.
+        series: edges that only check each other.
     """
 
     component: Tensor
@@ -42,7 +42,7 @@ class Structure:
 
     @classmethod
     def of(cls, graph: ViewGraph, component: Tensor | None = None) -> Structure:
-        """Computed; a component's root is its first node."""
+        """Computed from a graph; a component's root is its first node."""
         component = graph.components() if component is None else component
         edges = SortedEdges.of(graph)
         nodes = torch.arange(graph.num_nodes, device=graph.device)
@@ -53,7 +53,7 @@ class Structure:
         return cls(component, roots, edges, series)
 
     def redundancy(self, graph: ViewGraph) -> Tensor:
-        """How many edges each component has beyond a spanning tree, ``(C,)``."""
+        """Number of edges of each component beyond a spanning tree, ``(C,)``."""
         nodes = torch.bincount(self.component, minlength=len(self.roots))
         if len(self.roots) == 1:
             return graph.num_edges - nodes + 1
@@ -62,14 +62,14 @@ class Structure:
 
 
 class Measure(NamedTuple):
-    """How residuals are measured and weighed.
+    """How residuals are measured and weighted.
 
     Attributes:
-        shape: of the noise.
-        variance: ``(N,)`` of the nodes, in units of the shape; numerical floors apart.
-        weigh: expected squared residuals of edges, and which edges they are → robust weights.
-        dtype: how exactly residuals and systems are computed.
-        source_share: ``(M,)`` probability of each edge that its noise is in its source's frame; None: as residuals say.
+        shape: shape of the noise.
+        variance: ``(N,)`` variances of the nodes, in units of the shape; without numerical floors.
+        weigh: function (expected squared residuals of edges, which edges these are) → robust weights.
+        dtype: precision in which residuals and systems are computed.
+        source_share: ``(M,)`` probability that each edge's noise is in its source's frame; None: from residuals.
         unit: ``(6, M)`` entries of T in the world's frame: residuals r count as T r (``stated/shape.py``), and the
             noise's shape is that of T r; None: T = 1.
     """
@@ -82,11 +82,11 @@ class Measure(NamedTuple):
     unit: Tensor | None = None
 
     def in_units(self, vector: Tensor, edges: slice | Tensor) -> Tensor:
-        """``T r`` of some edges, whose residuals are ``(3, k)``; or ``T`` times what pulls at them."""
+        """``T r`` of some edges with residuals ``(3, k)``; or ``T`` times their pulls."""
         return vector if self.unit is None else times(self.unit[:, edges].to(vector), vector)
 
     def rows(self, dtype: torch.dtype) -> Tensor:
-        """What nodes say of their edges, ``(k, N)``: variance and, unless noise is round, six entries of the shape."""
+        """The nodes' values used by their edges, ``(k, N)``: variance and, unless noise is round, six shape entries."""
         variance = self.variance[None]
         if self.shape.covariance is None:
             return variance.to(dtype)
@@ -94,12 +94,12 @@ class Measure(NamedTuple):
 
 
 class Expected(NamedTuple):
-    """Residuals ``(3, k)`` as a :class:`Measure` has them.
+    """Residuals ``(3, k)`` as measured by a :class:`Measure`.
 
     Attributes:
         pull: ``(3, k)`` Ω r.
         square: ``(k,)`` rᵀ Ω r.
-        variance: ``(k,)`` of both ends.
+        variance: ``(k,)`` sum over both ends.
         source_share: ``(k,)`` probability that the noise is in the source's frame; Ω is the mean of both ends'.
     """
 
@@ -118,7 +118,7 @@ class Expected(NamedTuple):
 
     @classmethod
     def of(cls, vector: Tensor, at_source: Tensor, at_target: Tensor, source_share: Tensor | None = None) -> Expected:
-        """Of residuals, given :meth:`Measure.rows` of both ends; the share, where it is held."""
+        """From residuals, given :meth:`Measure.rows` of both ends, and the source share if it is held fixed."""
         variance = at_source[0] + at_target[0]
         if len(at_source) == 1:  # noise is round: Ω = 1
             square = _dot(vector, vector)
@@ -138,9 +138,9 @@ class Step(NamedTuple):
 
     Attributes:
         turn: ``(3, N)`` radians, world's frame.
-        weight: ``(N,)`` of all edges of each node.
+        weight: ``(N,)`` total weight of each node's edges.
         decrement: ``(C,)`` xᵀ L x.
-        source_share: ``(M,)`` probability of each edge that its noise is in its source's frame.
+        source_share: ``(M,)`` probability that each edge's noise is in its source's frame.
     """
 
     turn: Tensor
@@ -150,12 +150,12 @@ class Step(NamedTuple):
 
 
 class Pull(NamedTuple):
-    """What edges do at some orientations.
+    """Weights and forces of the edges at given orientations.
 
     Attributes:
         weights: the edges' robust weights.
-        matrix: ``(6, M)`` entries of their weights with noise's shape, where edges have units of their own.
-        force: ``(3, N)`` weighted residuals that pull at each node, summed.
+        matrix: ``(6, M)`` entries of the weights times the noise's shape, where edges have units of their own.
+        force: ``(3, N)`` sum of the weighted residuals at each node.
     """
 
     weights: SplitWeights
@@ -164,7 +164,7 @@ class Pull(NamedTuple):
 
 
 class Problem:
-    """What stays the same from step to step, of a graph of C components."""
+    """What stays the same from step to step, for a graph of C components."""
 
     def __init__(self, graph: ViewGraph, structure: Structure, priors: RefinementPriors) -> None:
         self.graph, self.priors = graph, priors
@@ -183,15 +183,15 @@ class Problem:
         self._measured = measured_rows(graph.target_from_source, torch.float32)
 
     def mean(self, value: Tensor) -> Tensor:
-        """Means ``(C,)`` of the nodes' values ``(N,)``."""
+        """Means ``(C,)`` over each component of the nodes' values ``(N,)``."""
         return self.sum(value) / self.num_nodes
 
     def sum(self, value: Tensor) -> Tensor:
-        """Sums ``(C,)`` of the nodes' values ``(N,)``."""
+        """Sums ``(C,)`` over each component of the nodes' values ``(N,)``."""
         return value.new_zeros(len(self.roots)).index_add_(0, self.component, value)
 
     def largest(self, value: Tensor) -> Tensor:
-        """Maxima ``(C,)`` of the nodes' values ``(N,)``, which are not negative."""
+        """Maxima ``(C,)`` over each component of the nodes' non-negative values ``(N,)``."""
         return value.new_zeros(len(self.roots)).scatter_reduce(0, self.component, value, "amax")
 
     def evenly(self, value: float) -> Tensor:
@@ -199,7 +199,7 @@ class Problem:
         return torch.full((self.graph.num_nodes,), value, dtype=torch.float64, device=self.graph.device)
 
     def variance_of_means(self) -> Tensor:
-        """Variances ``(N,)`` of nodes whose edges all weigh one: three axes of unit variance each over the degree."""
+        """Variances ``(N,)`` of nodes whose edges all have weight 1: three axes of unit variance, over the degree."""
         return 3 / self.degree.clamp(min=1).double()
 
     def sample(self, orientations: Tensor, unit: Tensor | None = None) -> ResidualSample:
@@ -222,9 +222,9 @@ class Problem:
         return weight.new_zeros(len(self.roots)).index_add(0, of_edge, weight * angle.sqrt())
 
     def pooled(self, orientations: Tensor, measure: Measure, prior: Tensor) -> Tensor:
-        """Prior weights ``(M,)`` that let edges in series weigh as one expects them to err.
+        """Prior weights ``(M,)`` under which edges in series weigh according to their expected errors.
 
-        Their squared residuals say what they err by together. Each is expected to err by its share of the blame.
+        Their squared residuals give only their total error. Each edge is expected to have its share of the blame in it.
         """
         graph, series = self._in_series, self.series
         if graph.num_edges == 0:
@@ -241,7 +241,7 @@ class Problem:
         return pooled
 
     def density(self, sample: ResidualSample, measure: Measure, prior: Tensor) -> NoiseDensity:
-        """The density that makes some residuals, in their units, likeliest; edges that weigh nothing tell nothing."""
+        """The maximum-likelihood density of sampled residuals, in their units; edges of no weight are left out."""
         expected = self._expected(sample, measure)
         square = (expected.square + expected.variance).double()
         told = prior[self._chosen] > self.priors.density.least_prior
@@ -257,17 +257,17 @@ class Problem:
         return Expected.of(sample.vector, *ends)
 
     def dispersion(self, sample: ResidualSample, measure: Measure, prior: Tensor) -> Tensor:
-        """φ of each component, ``(C,)``, as some residuals, in their units, have it."""
+        """φ of each component, ``(C,)``, from sampled residuals in their units."""
         expected = self._expected(sample, measure)
         weight = measure.weigh(expected.square + expected.variance, self._chosen) * prior[self._chosen]
         return self._sum_of_some(weight * weight * expected.square) / self._sum_of_some(weight)
 
     def _sum_of_some(self, value: Tensor) -> Tensor:
-        """Sums ``(C,)`` of some edges' values ``(K,)``."""
+        """Sums ``(C,)`` over each component of the sampled edges' values ``(K,)``."""
         return value.new_zeros(len(self.roots)).index_add_(0, self._component_of_some, value)
 
     def step(self, orientations: Tensor, measure: Measure, prior: Tensor, is_open: Tensor) -> Step:
-        """The least-squares step of the components ``(C,)`` that are open; the others' is zero."""
+        """The least-squares step of the open components ``(C,)``; it is zero in the others."""
         weights, matrix, force = self._pull(orientations, measure, prior)
         force *= is_open[self.component]
         system: Laplacian
@@ -282,7 +282,7 @@ class Problem:
             self.is_well_knit = is_solved
         if not is_solved:
             if matrix is None:
-                # Cameras of a component share their noise's shape, which turning does not make larger.
+                # Cameras of a component share their noise's shape, and rotating it leaves its trace unchanged.
                 trace = measure.shape.information.diagonal().sum(dim=1)[self.graph.source]
                 approximate = factorised(self.graph, weights.total * trace / 3, self.roots)
             else:

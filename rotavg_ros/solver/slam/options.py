@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-# Terms of the posterior, moves and starts of its search, and the network, each with what is left without it.
+# Terms of the posterior, moves and starts of its search, and the networks, each with what holds without it.
 SWITCHES: dict[str, str] = {
     "cleannet": "closures are judged beforehand by their discrepancy with the odometry alone",
     "tree": "the search begins at odometry's orientations, not along CleanNet's tree",
@@ -43,12 +43,12 @@ SWITCHES: dict[str, str] = {
 
 @dataclass(frozen=True)
 class SlamStages:
-    """Every method draws the odometry together and has a start.
+    """Switches of the stages; every method contracts the odometry and has a start.
 
     Attributes:
         clean: CleanNet judges the closures.
         refine: the posterior is searched (:mod:`rotavg_ros.solver.slam.posterior`); otherwise the tree is the answer.
-        without: what of :data:`SWITCHES` is switched off in it.
+        without: those of :data:`SWITCHES` that are switched off.
     """
 
     clean: bool = True

@@ -1,4 +1,4 @@
-"""The SLAM profile: the posterior of a robot's graph, or its tree alone; or go on from the last solve."""
+"""The SLAM profile: solves a robot's graph by the posterior, or by the tree alone."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from rotavg_ros.solver.slam.preparation import Prepared, prepare
 from rotavg_ros.solver.slam.update.memory import SlamMemory, estimate_of, with_poses
 from rotavg_ros.view_graph import ViewGraph
 
-# Of the work of a whole solve, what an update takes about, before one has told.
+# Estimated work of an update, as a share of a whole solve's, until one has been measured.
 _UPDATE = 0.1
 
 
 def solve_slam(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
-    """One method on a graph that lives on the CPU; what it states more than once counts once."""
+    """One method on a graph on the CPU; repeated statements of the same measurement count once."""
     repeats = first_of_each(graph)
     if repeats is None:
         return _solve_once(graph, stages, run)
@@ -53,7 +53,7 @@ def _solve_once(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
 
 
 def _solve_by_tree(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
-    """Odometry drawn together, closures judged, orientations along the tree of least expected error."""
+    """Contracts the odometry, judges the closures, and takes orientations along the tree of least expected error."""
     watch = run.watch
     with watch.stage("contract"):
         prepared = prepare(graph)
@@ -68,9 +68,9 @@ def _solve_by_tree(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
 
 
 def whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
-    """By one posterior: the search from all starts, FineNet, what is published of the labellings, and their poses.
+    """Solves by the posterior: search from all starts, FineNet, the published answer of the labellings, their poses.
 
-    The graph is drawn together and cleaned as often as something may be wrong with all measurements of a kind.
+    The graph is contracted and cleaned again for each systematic error that all measurements of a kind may share.
     """
     with metered() as meter:
         estimate = _whole(graph, stages, run)
@@ -91,7 +91,7 @@ def _whole(graph: ViewGraph, stages: SlamStages, run: Run) -> Estimate:
         with run.watch.stage("poses"):
             poses, mode = median_poses(calibrated(graph, found.calibration), found.modes, tune)
     is_divided = bool(published.warnings) if poses is None else poses.poses.is_divided
-    # The posterior's warning is of answers that rotations alone do not tell apart.
+    # The posterior's warning concerns answers that rotations alone do not tell apart.
     told = estimate.warnings if is_divided else ()
     jumps = () if poses is None else of_jumps(poses.pose)
     estimate = replace(estimate, warnings=(*told, *notes_of(mode, found.suspected), *jumps))
@@ -106,7 +106,7 @@ def _clean_net(stages: SlamStages, run: Run) -> SlamCleanNet | None:
 
 
 def _tuning(stages: SlamStages, run: Run) -> Callable[[Mode], Mode]:
-    """A labelling with the noise of each edge as FineNet has it, or as it is."""
+    """The function that sets each edge's noise in a labelling by FineNet, or leaves it as it is."""
     if "fine-net" in stages.without:
         return lambda mode: mode
     return partial(fine_tuned, network=run.networks.load(SlamFineNet))

@@ -1,4 +1,4 @@
-"""The stages of a SLAM solve, as the pipeline runs them and as training sees them."""
+"""The stages of a SLAM solve, shared by the pipeline and by training."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from rotavg_ros.solver.slam.noise.model import NoiseModel, judge_by_chain
 from rotavg_ros.solver.slam.preparation import Prepared
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-# What a closure's probability counts for in the tree: none is trusted beyond this, and a false one is off by so much.
+# For the tree: the least probability that a closure is false, and the mean squared error, rad², of a false one.
 _MIN_DISTRUST = 0.02
 _FALSE_SQUARE = np.pi**2 / 3 + 2
-# How much of the network's log-odds the posterior adds to its own: a part, since both have seen some of the same
-# evidence, and the less the more closures are false, since agreement by chance is then as common as by truth.
+# Share of the network's log-odds that the posterior adds to its own: only a part, since both use some of the same
+# evidence; less the more closures are false, since agreement by chance is then as common as agreement of good ones.
 _NETWORK_SHARE = 0.6
 _MAX_NETWORK_LOG_ODDS = 4.0
 # Units of work for each closure that the network judges.
@@ -35,7 +35,7 @@ class CleanedClosures:
 
     Attributes:
         inlier_probability: ``(E,)``; 1 for odometry.
-        network_log_odds: ``(E,)`` log-odds of being good that the posterior's prior has; ±inf by label.
+        network_log_odds: ``(E,)`` log-odds of being good, used in the posterior's prior; ±inf by label.
     """
 
     inlier_probability: np.ndarray
@@ -45,11 +45,11 @@ class CleanedClosures:
 def clean(network: SlamCleanNet | None, prepared: Prepared, label: Tensor) -> CleanedClosures:
     """Judge every closure by its discrepancy with the odometry and, with a network, by the closures that agree with it.
 
-    A closure starts as good only if both say so: a group of false closures agrees with itself, and odometry that has
-    drifted far believes anything. What the network says counts in the posterior's prior, too.
+    A closure starts as good only if both criteria say so: false closures may agree with each other, and odometry that
+    has drifted far is compatible with anything. The network's log-odds also enter the posterior's prior.
 
     Args:
-        label: ``(M,)`` of the view-graph's edges.
+        label: ``(M,)`` labels of the view-graph's edges.
     """
     graph, noise = prepared.closure_graph, prepared.noise
     prior = np.zeros(len(graph.source))
@@ -71,7 +71,7 @@ def judge_closures(
     path_steps: np.ndarray,
     pairs: AgreementPairs,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Log-odds ``(C,)`` of closures to be good before the search, and those of the posterior's prior."""
+    """Log-odds ``(C,)`` that closures are good, before the search, and those for the posterior's prior."""
     by_chain = judge_by_chain(noise, squared_angle, path_steps) + noise.prior_log_odds
     if network is None or len(by_chain) == 0:
         return by_chain, np.zeros(len(by_chain))
@@ -84,8 +84,8 @@ def judge_closures(
 def bootstrap(prepared: Prepared, cleaned: CleanedClosures) -> Tensor:
     """Corrections ``(K, 4)`` along the tree of least expected squared error.
 
-    A step of odometry costs its variance; a closure costs its own and, as far as it is not trusted, what a false
-    one would do. So the tree follows the odometry until that has drifted farther than a trusted closure errs.
+    A step of odometry costs its variance; a closure costs its own variance plus the squared error of a false one times
+    its probability of being false. So the tree follows the odometry until its drift exceeds a trusted closure's error.
     """
     graph, noise = prepared.closure_graph, prepared.noise
     distrust = np.maximum(1 - cleaned.inlier_probability, _MIN_DISTRUST)
@@ -98,8 +98,8 @@ def bootstrap(prepared: Prepared, cleaned: CleanedClosures) -> Tensor:
 
 
 def outlier_scores(graph: ClosureGraph, outlier_probability: np.ndarray) -> np.ndarray:
-    """Probability of each edge of the view-graph to be wrong, ``(M,)``, from those of the closure graph's, ``(E,)``.
+    """Probability that each edge of the view-graph is wrong, ``(M,)``, from those of the closure graph, ``(E,)``.
 
-    A slip in a segment is as likely in any of its steps.
+    A slip in a segment is equally likely in any of its steps.
     """
     return np.asarray(graph.edge_values(outlier_probability) * graph.share_of_segment)

@@ -1,15 +1,15 @@
-"""How likely an answer makes all edges, false ones included, and the likeliest answer near a start.
+"""The likelihood of all edges under an answer, false ones included, and the likeliest answer near a start.
 
-An edge is good with a chance that falls with the angle θ by which its ends are turned against each other, since views
-that are turned far see little in common. Good ones have Student's t about what the answer predicts; of false ones the
-angle that they state has any density, and the axis is even. With r the residual and m the edge's own rotation,
+The probability that an edge is good falls with the angle θ between the orientations of its ends, since views with very
+different orientations see little in common. Good edges follow Student's t about the answer's prediction; for false
+edges the stated angle has a free density, and the axis is uniform. With r the residual and m the edge's own rotation,
 
     p = π(θ) t(r; s) + (1 − π(θ)) f(|m|),   logit π = a + b θ, b ≤ 0.
 
-Densities are in units of the even one over all rotations. a, b, s and f are the graph's own: expectation and
-maximisation find them with the orientations. An answer in which all views look alike explains registrations that
-failed near the identity as good ones; but there every pair should have been registered, and those that are far off tell
-that they were not.
+Densities are in units of the uniform one over all rotations. a, b, s and f are estimated for each graph together with
+the orientations (expectation and maximisation). An answer in which all views have the same orientation explains
+registrations that failed near the identity as good ones; but then every pair should have been registered, and edges
+with large angles contradict that.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianPattern
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.sfm.priors import ConsensusPriors
 
-# A round of Newton's method for a and b is cut there; both are of order one to ten.
+# Largest change of a and b in one round of Newton's method; both are of order one to ten.
 _LONGEST_STEP = 2.0
 
 
@@ -37,7 +37,7 @@ class Edges:
         num_nodes: N.
         source, target: ``(M,)``.
         measured: ``(4, M)`` target_from_source.
-        is_trusted: ``(M,)`` bool, labelled as good.
+        is_trusted: ``(M,)`` bool, edges labelled as good.
     """
 
     num_nodes: int
@@ -48,7 +48,7 @@ class Edges:
 
     @cached_property
     def pattern(self) -> LaplacianPattern:
-        """Of steps."""
+        """Sparsity pattern of the steps' systems."""
         return LaplacianPattern(self.num_nodes, self.source, self.target, np.zeros(1, dtype=np.int64))
 
 
@@ -60,7 +60,7 @@ class Fitted:
         body_from_world: ``(4, N)``.
         good: ``(M,)`` probability that each edge is good.
         log_likelihood: nats, of all edges.
-        scale: rad, of good edges.
+        scale: rad, scale s of good edges.
     """
 
     body_from_world: np.ndarray
@@ -71,7 +71,7 @@ class Fitted:
 
 @dataclass
 class Density:
-    """What expectation and maximisation go on from."""
+    """Parameters of the density, updated by expectation and maximisation."""
 
     priors: ConsensusPriors
     shell: np.ndarray
@@ -89,7 +89,7 @@ class Density:
         self._log_false = np.log(count / count.sum() / volume)
 
     def logs(self, square: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Log densities ``(M,)`` of each edge and being good, and false."""
+        """Log joint densities ``(M,)`` of each edge and its being good, and of its being false."""
         free = self.priors.freedom
         log_t = (
             math.lgamma((free + 3) / 2)
@@ -102,7 +102,7 @@ class Density:
         return log_expit(odds) + log_t, log_expit(-odds) + self._log_false[self.shell]
 
     def maximise(self, good: np.ndarray, square: np.ndarray, turned: np.ndarray) -> np.ndarray:
-        """All but the orientations; returns the weights ``(M,)`` rad⁻² of their least squares."""
+        """Updates all parameters but the orientations; returns the weights ``(M,)`` rad⁻² of their least squares."""
         free = self.priors.freedom
         self._is_false(1 - good)
         rows = np.stack((np.ones(len(turned)), turned))
@@ -138,7 +138,7 @@ def fitted(edges: Edges, body_from_world: np.ndarray, priors: ConsensusPriors) -
             break
         last = log_likelihood
         weight = density.maximise(good, square, turned)
-        # A node that no good edge reaches stays where its edges, all false, leave it.
+        # The floor keeps the system solvable where a node has only false edges.
         floor = 1e-9 * float(weight.max())
         step = edges.pattern.factorize(np.maximum(weight, floor)).fit(residual.T)
         turn = quaternion_rows.exp(np.ascontiguousarray(step.T))
@@ -147,5 +147,5 @@ def fitted(edges: Edges, body_from_world: np.ndarray, priors: ConsensusPriors) -
 
 
 def _length(vector: np.ndarray) -> np.ndarray:
-    """Of the columns of ``(3, M)``."""
+    """Lengths of the columns of ``(3, M)``."""
     return np.asarray(np.sqrt(np.einsum("in,in->n", vector, vector)))

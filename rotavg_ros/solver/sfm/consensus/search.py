@@ -1,9 +1,8 @@
-"""Another answer is looked for where edges that the first one rejects agree with each other.
+"""Looks for another answer where edges that the first one rejects agree with each other.
 
-Robust costs settle for what most edges near the start agree on roughly. Where false edges agree roughly, as failed
-registrations of scans do near the identity, the good ones still agree exactly: their triangles close. So other answers
-begin with the trees of those edges of which most triangles close. Of all answers the one is taken that makes the edges
-likeliest.
+Robust costs settle for what most edges near the start roughly agree on. False edges may agree roughly, as failed
+registrations of scans do near the identity, but good ones agree exactly: their triangles close. So other answers begin
+at trees of the edges with most closing triangles. The answer under which the edges are likeliest is chosen.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from rotavg_ros.solver.sfm.priors import ConsensusPriors
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 CONSENSUS = ConsensusPriors()
-# Edges without a triangle that closes are taken last.
+# Edges without a closing triangle are used last.
 _NO_VOTE = 1e-6
 _OTHER = (
     "edges that contradict each other agree among themselves: of two answers, in which {apart} of {all} orientations "
@@ -38,12 +37,12 @@ _TOO_LARGE = (
 
 
 class Consensus(NamedTuple):
-    """Of a graph of N nodes and M edges.
+    """Result of the search on a graph of N nodes and M edges.
 
     Attributes:
-        body_from_world: ``(N, 4)``, another answer in some components; None if none is likelier.
-        weight: ``(M,)`` probability that an edge is good; 1 in all others. None likewise.
-        warnings: a sentence, where another one was found, or could not be looked for.
+        body_from_world: ``(N, 4)``, with another answer in some components; None if none is likelier.
+        weight: ``(M,)`` probability that an edge is good; 1 in all other components. None if no answer is likelier.
+        warnings: a sentence where another answer was found, or could not be looked for.
     """
 
     body_from_world: Tensor | None
@@ -58,12 +57,12 @@ def consensus(
     priors: ConsensusPriors,
     angle: Tensor | None = None,
 ) -> Consensus | None:
-    """Another answer, in those components where one is likelier; None if edges contradict it nowhere.
+    """Another answer in those components where one is likelier; None if edges contradict the first one nowhere.
 
     Args:
         graph: N nodes, M edges, which run from lower to higher nodes.
         body_from_world: ``(N, 4)`` the first answer.
-        component: ``(N,)`` of every node.
+        component: ``(N,)`` component of every node.
         angle: ``(M,)`` rad, residuals of the first answer; default: computed.
     """
     angle = EdgeResiduals(graph, body_from_world.float()).angles() if angle is None else angle
@@ -102,7 +101,7 @@ def consensus(
 
 
 def _edges(graph: ViewGraph, node: Tensor, edge: Tensor) -> Edges:
-    """The edges ``edge`` ``(m,)`` of a graph, all among ``node`` ``(n,)``, which are numbered anew."""
+    """The edges ``edge`` ``(m,)`` of a graph, all among the nodes ``node`` ``(n,)``, which are renumbered."""
     number = torch.empty(graph.num_nodes, dtype=torch.int64)
     number[node] = torch.arange(len(node))
     source, target = (number[end[edge]].numpy() for end in (graph.source, graph.target))
@@ -112,10 +111,10 @@ def _edges(graph: ViewGraph, node: Tensor, edge: Tensor) -> Edges:
 
 
 def _searched(edges: Edges, answer: Tensor, priors: ConsensusPriors) -> Fitted | None:
-    """The likeliest answer, if it is another one than ``answer`` ``(n, 4)``, the first."""
+    """The likeliest answer if it is not the first one, ``answer`` ``(n, 4)``."""
     graph = ViewGraph.create(edges.source, edges.target, edges.measured.T, num_nodes=edges.num_nodes)
     if bool((graph.components() > 0).any()):
-        return None  # edges that a user has rejected hold it together
+        return None  # it is connected only by edges that the user has rejected
     triangles = Triangles.of(graph, priors.max_triangles)
     first = fitted(edges, np.ascontiguousarray(answer.numpy().T), priors)
     others = [
@@ -127,13 +126,13 @@ def _searched(edges: Edges, answer: Tensor, priors: ConsensusPriors) -> Fitted |
 
 
 def _along_tree(graph: ViewGraph, votes: Tensor) -> np.ndarray:
-    """``(4, n)`` along the tree of those edges that have most ``votes`` ``(m,)``."""
+    """Orientations ``(4, n)`` along the tree of the edges with most ``votes`` ``(m,)``."""
     forest = minimum_spanning_forest(graph, 1 / (_NO_VOTE + votes))
     return np.ascontiguousarray(compose_orientations(forest, graph).numpy().T)
 
 
 def _num_apart(one: Tensor, other: Tensor) -> int:
-    """How many orientations of two answers, each ``(n, 4)`` in its own gauge, are far from each other."""
+    """Number of orientations that are far apart in two answers, each ``(n, 4)`` in its own gauge."""
     turn = rotations.multiply(rotations.inverse(one), other)
     mean = torch.linalg.eigh(turn.t() @ turn).eigenvectors[:, -1]
     return int((rotations.angle_between(turn, mean.expand_as(turn)) > NUMBERS.outlier_angle).sum())

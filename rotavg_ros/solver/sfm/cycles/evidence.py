@@ -1,33 +1,34 @@
-"""What triangles say of every edge, where they do not bear out CleanNet.
+"""The evidence of triangles about every edge, used where triangles do not confirm CleanNet.
 
-**Of an edge.** Three good rotations of a triangle compose to none but for their noise; with a false one among them they
-compose to anything. Let g = 1 for a good edge, and λ the density of a triangle's closing angle where all three are good
-(Student's t of scale s in three dimensions) over that of even rotations. The triangle of edges e, c and d says of e
+**Edges.** The three rotations of a triangle compose to the identity, up to noise, if all are good; with a false one
+they compose to anything. Let g = 1 for a good edge, and λ the density of a triangle's closing angle if all three are
+good (Student's t of scale s in three dimensions) over that of uniform rotations. The triangle of edges e, c and d gives
 
     P(angle | g_e = 1) / P(angle | g_e = 0) = 1 − q + q λ,     q = P(g_c = 1) P(g_d = 1).
 
-Two triangles of an edge have no other edge in common, so their logarithms add up, to E_e. P(g_c) is what all but this
-triangle say of c: messages that go back and forth (sum-product, Pearl 1988; with loops of view-graphs Zach, Klopschitz
-and Pollefeys, CVPR 2010), a few rounds of them, though triangles of four cameras share edges. Beforehand
+Two triangles of an edge have no other edge in common, so their log ratios add up, to E_e. P(g_c) follows from all
+triangles of c but this one: messages are passed (sum-product, Pearl 1988; for loops of view-graphs Zach, Klopschitz and
+Pollefeys, CVPR 2010) for a few rounds, although triangles of four cameras share edges. The prior is
 
     logit P(g_e = 0) = b + k ℓ_e,     ℓ: CleanNet's log-odds;
 
-b, k and s are estimated with the g (expectation and maximisation).
+b, k and s are estimated together with the g (expectation and maximisation).
 
-**Of CleanNet.** It knows cameras like those that it was trained on, and of others next to nothing. With the probability
-π that all edges of a triangle are good, by its word or by anybody's, closing angles have the density
+**CleanNet.** It is reliable for cameras like those that it was trained on, and hardly for others. Given a probability π
+that all edges of a triangle are good, from CleanNet or any other source, closing angles have the density
 
     π f₁(angle) + (1 − π) f₀(angle),     f₁, f₀: any, constant in shells,
 
-and G is by how many nats this makes them likelier than one density for all. Half of the triangles say E, without
-CleanNet, and the other half has G of both. CleanNet's word counts by a, the posterior of triangles by 1 − a:
+and G is the gain in log-likelihood (nats) over a single density for all. E is computed from half of the triangles,
+without CleanNet; both values of G are computed on the other half. CleanNet has weight a, the triangles' posterior 1 −
+a:
 
     logit P(g_e = 0) = a ℓ_e + (1 − a) (b + k ℓ_e − E_e),     a = min(1, G_CleanNet / (¼ G_triangles)).
 
-It counts in full from a quarter on, since it judges something else: whether an edge's own noise exceeds 20°, of which
-triangles of noisy edges know less than of what they close by.
+CleanNet counts in full from a quarter on, since it predicts something else: whether an edge's own noise exceeds 20°.
+Triangles of noisy edges say less about that than about their closing angles.
 
-Closing angles depend on no choice of axes. All is estimated for each component by itself.
+Closing angles depend on no choice of axes. Everything is estimated for each component independently.
 """
 
 from __future__ import annotations
@@ -47,16 +48,16 @@ from rotavg_ros.solver.sfm.priors import CyclePriors
 from rotavg_ros.view_graph import EdgeLabel
 
 CYCLES = CyclePriors()
-# Probabilities are at least, and those of messages are less than one by this, numerical.
+# Floor of probabilities; distance of the messages' probabilities from one. Numerical.
 _LEAST, _SURE = 1e-12, 1e-6
 
 
 class Checked(NamedTuple):
-    """What CleanNet and triangles say together.
+    """The combined verdict of CleanNet and triangles.
 
     Attributes:
-        cleaned: with their probabilities.
-        is_believed: whether CleanNet's word counts for more than that of triangles somewhere.
+        cleaned: edges with the combined probabilities.
+        is_believed: whether CleanNet counts for more than triangles in any component.
     """
 
     cleaned: Cleaned
@@ -66,14 +67,14 @@ class Checked(NamedTuple):
 def with_triangles(
     cleaned: Cleaned, component: Tensor, is_judged: bool = True, priors: CyclePriors = CYCLES
 ) -> Checked:
-    """The outlier probabilities that CleanNet and triangles come to, as far as triangles bear out CleanNet.
+    """Outlier probabilities from CleanNet and triangles, with CleanNet's weight set by how far triangles confirm it.
 
-    Labels stand, as CleanNet's probabilities do where there are no triangles.
+    Labels are kept, and so are CleanNet's probabilities where there are no triangles.
 
     Args:
         cleaned: a graph whose edges run from lower to higher nodes.
-        component: ``(N,)`` of every node.
-        is_judged: whether CleanNet has said anything.
+        component: ``(N,)`` component of every node.
+        is_judged: whether CleanNet has judged the edges.
     """
     edges, said = _Edges.of(cleaned, component), _said(cleaned, is_judged)
     few = torch.full((edges.count,), priors.few_paths, device=component.device)
@@ -91,7 +92,7 @@ def with_triangles(
 
 
 def by_triangles(cleaned: Cleaned, component: Tensor, priors: CyclePriors = CYCLES) -> Cleaned:
-    """The same by what triangles say, whatever CleanNet's word is worth: with a = 0. Arguments as above."""
+    """The same from the triangles' posterior alone, with a = 0. Arguments as above."""
     edges, said = _Edges.of(cleaned, component), _said(cleaned, True)
     return _with_logit(cleaned, _logit_by_triangles(cleaned, component, edges, said, priors))
 
@@ -105,7 +106,7 @@ def _said(cleaned: Cleaned, is_judged: bool) -> Tensor:
 def _logit_by_triangles(
     cleaned: Cleaned, component: Tensor, edges: _Edges, said: Tensor, priors: CyclePriors
 ) -> Tensor:
-    """``(M,)`` b + k ℓ − E of many triangles."""
+    """``(M,)`` b + k ℓ − E, from many triangles."""
     most = priors.paths_per_edge * torch.bincount(edges.component, minlength=edges.count)
     most = most.clamp(priors.least_paths, priors.most_paths)
     triangles = Triangles.of(cleaned.measured, most, component=component)
@@ -140,12 +141,12 @@ class _Edges:
 
     @cached_property
     def is_free(self) -> Tensor | None:
-        """``(M,)`` bool: without a label; None where none has one."""
+        """``(M,)`` bool: edges without a label; None if no edge has one."""
         is_free = self.label == EdgeLabel.AUTOMATIC
         return None if bool(is_free.all()) else is_free
 
     def labelled(self, logit: Tensor) -> Tensor:
-        """``(M,)`` log-odds of being false but for what labels say."""
+        """``(M,)`` log-odds of being false, overridden by labels."""
         if self.is_free is None:
             return logit
         logit = torch.where(self.label == EdgeLabel.ACCEPTED, -NUMBERS.max_logit, logit)
@@ -153,25 +154,25 @@ class _Edges:
 
 
 class _Beforehand:
-    """Log-odds b + k ℓ of edges to be false before triangles are looked at, with ℓ ``(M,)`` of somebody."""
+    """Prior log-odds b + k ℓ that edges are false, before triangles are considered, with given ℓ ``(M,)``."""
 
     def __init__(self, edges: _Edges, said: Tensor, priors: CyclePriors) -> None:
         self.edges, self.priors = edges, priors
         self._said, self._free = said, torch.ones_like(said) if edges.is_free is None else edges.is_free.to(said)
-        # In double precision: where the same is said of all edges, next to nothing is left of the determinant.
+        # In double precision: where ℓ is the same for all edges, the determinant almost vanishes.
         self._base, self._slope = (said.new_zeros(edges.count, dtype=torch.float64) for _ in range(2))
-        # What bounds the curvature of log(1 + exp(b + k ℓ)), summed over edges: it is ¼ at most (Böhning 1992).
+        # Bounds of the curvature of log(1 + exp(b + k ℓ)), summed over edges: it is ¼ at most (Böhning 1992).
         base, cross, slope = (self._sums(self._free * said.double() ** power / 4) for power in (0, 1, 2))
         base, slope = base + priors.base_spread**-2, slope + priors.slope_spread**-2
         self._bound = base, cross, slope, slope * base - cross**2
 
     def logit(self) -> Tensor:
-        """``(M,)``, or what labels say."""
+        """``(M,)`` log-odds, overridden by labels."""
         base, slope = (_of_each(value, self.edges.component) for value in (self._base, self._slope))
         return self.edges.labelled(base.to(self._said) + slope.to(self._said) * self._said)
 
     def fit(self, outlier: Tensor) -> None:
-        """A step of b and k towards the likeliest, ``outlier`` ``(M,)`` being what is known of the edges now."""
+        """A step of b and k towards the maximum, given the edges' current probabilities ``outlier`` ``(M,)``."""
         base, cross, slope, determinant = self._bound
         off = self._free * (outlier - torch.sigmoid(self.logit()))
         by_base = self._sums(off) - self._base * self.priors.base_spread**-2
@@ -180,7 +181,7 @@ class _Beforehand:
         self._slope = self._slope + (base * by_slope - cross * by_base) / determinant
 
     def _sums(self, value: Tensor) -> Tensor:
-        """``(C,)`` float64."""
+        """``(C,)`` sums over components, float64."""
         return _sums(value.double(), self.edges.component, self.edges.count)
 
 
@@ -205,10 +206,10 @@ def _by_triangles(triangles: Triangles, beforehand: _Beforehand) -> Tensor:
 
 @dataclass
 class _Closing:
-    """By which angles triangles of good edges close (T triangles of C components).
+    """Density of the closing angles of triangles of good edges (T triangles, C components).
 
     Attributes:
-        square: ``(T,)`` rad², float32: of their angles.
+        square: ``(T,)`` rad², float32: squared closing angles.
         component: ``(T,)``.
         count: C.
     """
@@ -220,24 +221,24 @@ class _Closing:
 
     def __post_init__(self) -> None:
         self._scale_square = self.square.new_full((self.count,), self.priors.first_scale**2)
-        # Density of even rotations over rotation vectors, and the constant of Student's t.
+        # Density of uniform rotations over rotation vectors, and the constant of Student's t.
         even = 2 * torch.sinc(self.square.sqrt() / (2 * math.pi)).log() - math.log(8 * math.pi**2)
         freedom = self.priors.freedom
         half = math.lgamma((freedom + 3) / 2) - math.lgamma(freedom / 2)
         self._constant = half - 1.5 * math.log(freedom * math.pi) - even
 
     def ratio(self) -> Tensor:
-        """``(T,)`` λ: how much denser each angle is where three edges are good than where rotations are even."""
+        """``(T,)`` λ: density of each angle if all three edges are good, over that of uniform rotations."""
         scale_square = _of_each(self._scale_square, self.component)
         freedom = self.priors.freedom
         tail = (freedom + 3) / 2 * torch.log1p(self.square / scale_square / freedom)
         return torch.exp(self._constant - 1.5 * scale_square.log() - tail)
 
     def fit(self, good: Tensor, ratio: Tensor) -> None:
-        """A step of the scale towards the likeliest, ``good`` ``(T,)`` being P(all three edges are), but for angles."""
+        """A step of the scale towards the maximum, given ``good`` ``(T,)``, P(all edges good) without the angle."""
         closes = good * ratio / (1 - good + good * ratio).clamp(min=_LEAST)
         freedom = self.priors.freedom
-        # Student's t is a mixture of normal densities: an angle that is far off tells less.
+        # Student's t is a mixture of normal densities: a large angle says less about the scale.
         weight = closes * (freedom + 3) / (freedom + self.square / _of_each(self._scale_square, self.component))
         total, known = (_sums(value, self.component, self.count) for value in (weight * self.square, closes))
         worth = self.priors.scale_triangles
@@ -246,27 +247,27 @@ class _Closing:
 
 
 def _trust(said: Tensor, triangles: Triangles, edges: _Edges, priors: CyclePriors) -> Tensor:
-    """``(C,)`` a: how far ``said`` ``(M,)``, CleanNet's log-odds, counts beside triangles."""
+    """``(C,)`` a: the weight of ``said`` ``(M,)``, CleanNet's log-odds, relative to triangles."""
     saying, held_back = (Triangles(triangles.edge[:, k::2], triangles.angle[k::2].contiguous()) for k in (0, 1))
     if len(held_back.angle) == 0:
         return said.new_ones(edges.count)
     by_triangles = _by_triangles(saying, _Beforehand(edges, torch.zeros_like(said), priors))
     gained, possible = (_gain(logit, held_back, edges, priors) for logit in (said, by_triangles))
-    # What a few triangles tell by chance tells nothing of CleanNet.
+    # A gain that a few triangles may reach by chance is no evidence about CleanNet.
     return ((gained + priors.by_chance) / (priors.full_trust * possible + priors.by_chance)).clamp(max=1)
 
 
 def _gain(logit: Tensor, triangles: Triangles, edges: _Edges, priors: CyclePriors) -> Tensor:
-    """``(C,)`` G, nats, of log-odds ``(M,)`` of being false."""
+    """``(C,)`` G, nats, for log-odds ``(M,)`` of being false."""
     bounds = torch.tensor(priors.shells, device=logit.device, dtype=torch.float64)
     shells = len(bounds) - 1
-    # Share of even rotations in each shell, which counts as one triangle.
+    # Share of uniform rotations in each shell; the prior counts as one triangle.
     volume = ((bounds - bounds.sin()) / math.pi).diff().repeat(edges.count)
     component = edges.component[triangles.edge[0]]
     shell = component * shells + torch.bucketize(triangles.angle, bounds[1:-1])
 
     def density(weight: Tensor) -> Tensor:
-        """``(T,)`` in units of the even one."""
+        """``(T,)`` densities in units of the uniform one."""
         inside = volume.new_zeros(len(volume)).index_add_(0, shell, weight) + volume
         total = inside.reshape(edges.count, shells).sum(dim=1, keepdim=True)
         return ((inside / volume).reshape(edges.count, shells) / total).ravel()[shell]
@@ -283,12 +284,12 @@ def _gain(logit: Tensor, triangles: Triangles, edges: _Edges, priors: CyclePrior
         good = of_good / likelihood
     one_density = density(torch.ones_like(good))
     gain = _sums((likelihood / one_density).log(), component, edges.count)
-    # A word by which good triangles close by more than others is no word about good edges.
+    # Log-odds by which good triangles have larger closing angles than others do not identify good edges.
     return torch.where(mean_angle(good) < mean_angle(1 - good), gain.clamp(min=0), 0.0)
 
 
 def _of_each(value: Tensor, group: Tensor) -> Tensor:
-    """What each of a group has of ``value`` ``(C,)``; one value for all where there is one group."""
+    """The ``value`` ``(C,)`` of each element's group; a single value if there is one group."""
     return value if len(value) == 1 else value[group]
 
 

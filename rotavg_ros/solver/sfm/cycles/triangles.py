@@ -1,4 +1,4 @@
-"""Triangles of a view-graph: three edges whose rotations should compose to none."""
+"""Triangles of a view-graph: three edges whose rotations should compose to the identity."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.running.threads import for_each, slices
 from rotavg_ros.view_graph import ViewGraph
 
-# Paths that a thread looks at before it takes others.
+# Number of paths that a thread examines at a time.
 _SLICE_PATHS = 8192
 
 
@@ -21,7 +21,7 @@ class Triangles:
 
     Attributes:
         edge: ``(3, T)``.
-        angle: ``(T,)`` rad, by which each does not close.
+        angle: ``(T,)`` rad, closing angles: the rotation angle left when the three are composed.
     """
 
     edge: Tensor
@@ -36,18 +36,18 @@ class Triangles:
         component: Tensor | None = None,
         run: int = 1,
     ) -> Triangles:
-        """Of a graph whose edges run from lower to higher nodes.
+        """Triangles of a graph whose edges run from lower to higher nodes.
 
         Args:
             graph: M edges.
-            most: triangles at most; so many paths of two edges are looked at, evenly spread over all.
-            among: ``(M,)`` bool: triangles that have one of these edges alone; default: all.
-            component: ``(N,)`` of every node; then ``most`` is ``(C,)``, of each.
-            run: so many paths that follow each other are looked at together, the last of these perhaps beyond ``most``:
-                of a few edges many triangles, not of many few.
+            most: maximum number of two-edge paths that are examined, evenly spread, and so of triangles.
+            among: ``(M,)`` bool: only triangles with at least one of these edges; default: all.
+            component: ``(N,)`` component of every node; ``most`` is then ``(C,)``, per component.
+            run: number of consecutive paths examined together (the last run may exceed ``most``): this gives many
+                triangles of a few edges rather than a few of many edges.
         """
         key, source, target, order = graph.source * graph.num_nodes + graph.target, graph.source, graph.target, None
-        if not bool((key[1:] >= key[:-1]).all()):  # a canonical form is sorted, and copies of a large one cost memory
+        if not bool((key[1:] >= key[:-1]).all()):  # a canonical form is already sorted; copying it would cost memory
             key, order = key.sort(stable=True)
             source, target = source[order], target[order]
         first = torch.searchsorted(source, torch.arange(graph.num_nodes + 1, device=graph.device))
@@ -84,23 +84,24 @@ class Triangles:
         return cls(torch.cat(edges, dim=1), torch.cat(angles))
 
     def votes(self, closing: float, num_edges: int) -> Tensor:
-        """``(M,)`` how many triangles of each edge close, to within about ``closing`` rad."""
+        """``(M,)`` number of triangles of each edge that close to within about ``closing`` rad."""
         vote = torch.exp(-((self.angle / closing) ** 2) / 2)
         return torch.bincount(self.edge.ravel(), vote.repeat(3), num_edges)
 
     def contradicting(self, rejected: Tensor, group: Tensor, num_groups: int, closing: float) -> Tensor:
-        """Triangles with a rejected edge that close to within ``closing`` rad, beyond those that do so by chance.
+        """Excess of triangles with a rejected edge that close to within ``closing`` rad over the number by chance.
 
-        By chance triangles close by any rotation near none, of which one in 27 is three times as near.
+        Random closing rotations are uniform near the identity, so 1 in 27 of those within three times ``closing`` is
+        within ``closing``.
 
         Args:
             rejected: ``(M,)`` bool.
-            group: ``(M,)`` of each edge, the same for all of a triangle.
-            num_groups: how many there are.
+            group: ``(M,)`` group of each edge, the same for all edges of a triangle.
+            num_groups: number of groups.
             closing: rad.
 
         Returns:
-            ``(num_groups,)`` their number, in standard deviations of what is by chance.
+            ``(num_groups,)`` the excess, in standard deviations of the number by chance.
         """
         is_rejected = rejected[self.edge].any(dim=0)
         near, nearest = (
@@ -112,17 +113,17 @@ class Triangles:
 
 
 def _spread(count: Tensor, up_to: Tensor, group: Tensor, most: Tensor, run: int) -> Tensor:
-    """Paths, ``most`` of each group at most, evenly spread over its own whatever others there are.
+    """Paths, at most ``most`` of each group, evenly spread within the group and independent of other groups.
 
     Args:
-        count: ``(M,)`` paths that begin with each edge.
-        up_to: ``(M,)`` the same summed up: paths are numbered so.
-        group: ``(M,)`` of each edge.
+        count: ``(M,)`` number of paths that begin with each edge.
+        up_to: ``(M,)`` its cumulative sum, by which paths are numbered.
+        group: ``(M,)`` group of each edge.
         most: ``(C,)``.
-        run: so many follow each other.
+        run: number of consecutive paths taken together.
     """
     by_group = group.argsort(stable=True)
-    ends = count[by_group].cumsum(0)  # of the paths, had they been numbered group by group
+    ends = count[by_group].cumsum(0)  # ends of the edges' paths if these are numbered group by group
     paths = torch.bincount(group, weights=count.double(), minlength=len(most)).long()
     stride = run * (-(-paths // most)).clamp(min=1)
     taken = -(-paths // stride) * run

@@ -1,1 +1,1 @@
-"""Where refinements of view-graphs begin in which few edges check each other."""
+"""Starts of the refinement for view-graphs in which few edges check each other."""

@@ -1,8 +1,8 @@
-"""Other starts than CleanNet, tree and FineNet.
+"""Starts other than CleanNet, tree and FineNet.
 
-One wrong edge in a tree turns all that is behind it, and a network that knows nothing of such cameras, or such false
-edges, leads the refinement into another valley. So it begins at several places, of which few steps tell the best
-(``refinement.py``). Where cameras have many edges, a part of these is enough to tell.
+One wrong edge in a tree turns all nodes behind it, and a network that was not trained on such cameras, or such false
+edges, leads the refinement into a wrong minimum. So the refinement begins at several starts, and a few steps tell which
+is best (``refinement.py``). Where cameras have many edges, a subset of them suffices.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from rotavg_ros.solver.sfm.starts.spectral import spectral
 from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-# Of cameras with fewer edges, in the mean, other starts cost little, and all of their edges are needed to tell.
+# If cameras have fewer edges on average, other starts cost little and need all of the edges.
 _SPARSE_DEGREE = 20
 
 
 def is_sparse(graph: ViewGraph, component: Tensor) -> Tensor:
-    """In which components cameras have few edges, in the mean, ``(C,)`` bool; components ``(N,)`` of every node."""
+    """Components in which cameras have few edges on average, ``(C,)`` bool, given the components ``(N,)`` of nodes."""
     nodes = torch.bincount(component)
     edges = torch.bincount(component.index_select(0, graph.source), minlength=len(nodes))
     return 2 * edges < _SPARSE_DEGREE * nodes
 
 
 def other_starts(judged: Cleaned, is_believed: bool, parent_edge: Tensor, component: Tensor) -> list[Start]:
-    """By eigenvectors, begun at a tree that trusts all edges alike, and, of sparse components, by more.
+    """A start by eigenvectors, begun at a tree that trusts all edges alike, and more starts for sparse components.
 
     Args:
-        judged: N nodes, M edges with CleanNet's word and labels, as they are in canonical form.
-        is_believed: whether that word stood.
+        judged: N nodes, M edges with CleanNet's scores and labels, in canonical form.
+        is_believed: whether triangles confirm these scores.
         parent_edge: ``(N,)`` a spanning forest.
-        component: ``(N,)`` of every node.
+        component: ``(N,)`` component of every node.
     """
     graph, sparse = judged.measured, is_sparse(judged.measured, component)
     allowed = (graph.label != EdgeLabel.REJECTED).double()
@@ -58,17 +58,17 @@ def other_starts(judged: Cleaned, is_believed: bool, parent_edge: Tensor, compon
 
 
 def _by_all_alike(graph: ViewGraph, component: Tensor) -> tuple[Tensor, Tensor]:
-    """Orientations ``(N, 4)`` by a tree that trusts all edges alike, and by eigenvectors, begun there."""
+    """Orientations ``(N, 4)`` by a tree that trusts all edges alike, and by eigenvectors begun at these."""
     verdict = apply_labels(trust_all(graph), graph.label)
     tree = bootstrap(verdict, component).body_from_world
     return tree, spectral(graph, tree, component, 1 - verdict.outlier_probability.double())
 
 
 def _part(graph: ViewGraph, parent_edge: Tensor) -> Tensor:
-    """Indices of edges, evenly spread over those of each camera, half of :data:`_SPARSE_DEGREE` of each at most."""
+    """Indices of edges, spread evenly over each camera's, at most half of :data:`_SPARSE_DEGREE` per camera."""
     number = torch.arange(graph.num_edges, device=graph.device)
     count = torch.bincount(graph.source, minlength=graph.num_nodes)
-    # The rank of an edge among those that begin at its source; a canonical form is sorted by these.
+    # The rank of an edge among those with its source; a canonical form is sorted by source.
     rank = number - (count.cumsum(0) - count)[graph.source]
     most, of = _SPARSE_DEGREE // 2, count[graph.source]
     is_chosen = (rank + 1) * most // of > rank * most // of

@@ -1,10 +1,10 @@
-"""Refinement that believes what edges state of their noise, size and shape, as far as residuals bear it out.
+"""Refinement that believes the noise size and shape stated by edges as far as residuals confirm them.
 
-1. The residuals of an answer that took all edges to be alike tell the two exponents, α
-   (:mod:`rotavg_ros.solver.sfm.stated.precision`) and β (:mod:`rotavg_ros.solver.sfm.stated.shape`).
-2. Components in which one is not 0 are refined anew.
-3. Where β is not 0, both are estimated once more, from the residuals of the new answer, whose own errors are smaller
-   and hide less of the noise, and shaped steps go on from there. Coarse steps, which know no shapes, would leave it.
+1. Two exponents, α (:mod:`rotavg_ros.solver.sfm.stated.precision`) and β (:mod:`rotavg_ros.solver.sfm.stated.shape`),
+   are estimated from the residuals of an answer that treats all edges alike.
+2. Components in which α or β is not 0 are refined anew.
+3. Where β is not 0, both are estimated once more from the residuals of the new answer, whose smaller errors hide less
+   of the noise, and shaped steps continue from there. Coarse steps ignore shapes and would move away from it.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from rotavg_ros.view_graph import ViewGraph
 
 
 class StatedNoise(NamedTuple):
-    """What edges of a graph state of their noise (M edges, C components).
+    """What edges of a graph state about their noise (M edges, C components).
 
     Attributes:
-        graph, structure: of which; components have answers of their own.
+        graph, structure: the graph and its connections; exponents are estimated for each component.
         size: ``(M,)`` rad⁻² of any scale, NaN where unknown.
-        information: ``(M, 3, 3)`` in the targets' frames, NaN where unknown; None: sizes alone are believed.
-        priors: of the refinement.
+        information: ``(M, 3, 3)`` in the targets' frames, NaN where unknown; None: only sizes are believed.
+        priors: constants of the refinement.
     """
 
     graph: ViewGraph
@@ -44,21 +44,21 @@ class StatedNoise(NamedTuple):
 
     @classmethod
     def of(cls, graph: ViewGraph, structure: Structure, priors: RefinementPriors, with_shapes: bool) -> StatedNoise:
-        """What there is.
+        """Reads what the graph states.
 
         Args:
-            with_shapes: axes are believed, too.
+            with_shapes: whether axes are believed, too.
         """
         return cls(graph, structure, stated_sizes(graph), graph.information if with_shapes else None, priors)
 
     def refined(
         self, orientations: Tensor, weights: EdgeWeights, refine: Callable[..., Tensor]
     ) -> tuple[Tensor, EdgeWeights]:
-        """The orientations ``(N, 4)`` refined anew where statements are believed, and the edges' weights there.
+        """The orientations ``(N, 4)``, refined anew where statements are believed, and the edges' weights there.
 
         Args:
-            refine: :func:`rotavg_ros.solver.sfm.refinement.refine` of this graph.
-            weights: without statements.
+            refine: :func:`rotavg_ros.solver.sfm.refinement.refine` for this graph.
+            weights: weights without statements.
         """
         if not bool(self.size.isfinite().any()):
             return orientations, weights
@@ -81,7 +81,7 @@ class StatedNoise(NamedTuple):
         return torch.where(has_shapes[self.structure.component][:, None], again, orientations), chosen
 
     def _believed(self, orientations: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        """ρ ``(M,)`` and T ``(3, 3, M)`` as residuals at the orientations bear them out; None: of no edge."""
+        """ρ ``(M,)`` and T ``(3, 3, M)`` as far as residuals at the orientations confirm them; None: for no edge."""
         graph, structure = self.graph, self.structure
         component, redundancy = structure.component[graph.source], structure.redundancy(graph)
         angle = EdgeResiduals(graph, orientations.float()).angles()
@@ -99,7 +99,7 @@ class StatedNoise(NamedTuple):
         return ratio, believed_units(self.information, framed, self.priors.shape)
 
     def _components(self, ratio: Tensor | None, unit: Tensor | None) -> Tensor:
-        """In which components something is believed, ``(C,)`` bool."""
+        """Components in which any statement is believed, ``(C,)`` bool."""
         of_edge = torch.zeros_like(self.size, dtype=torch.bool)
         if ratio is not None:
             of_edge |= ratio != 1
@@ -112,7 +112,7 @@ class StatedNoise(NamedTuple):
 
 
 def _weighed(weights: EdgeWeights, ratio: Tensor | None, unit: Tensor | None) -> EdgeWeights:
-    """Weights that believe ρ, in whose roots residuals count in the costs |r|^½ and |r|, and T."""
+    """Weights that include ρ, with residuals in units of √ρ in the costs |r|^½ and |r|, and T."""
     if ratio is not None:
         weights = weights.times(ratio**-0.25, ratio**-0.5)
     return weights._replace(unit=unit)

@@ -1,17 +1,17 @@
-"""How far the precisions that edges state are believed: exactly as far as their residuals bear them out.
+"""How far the precisions that edges state are believed: exactly as far as their residuals confirm them.
 
-The scale of what a file states is often unknown, and its differences from edge to edge may mean nothing. So an edge's
-noise is assumed to have the variance of a typical edge's times
+The scale of the precisions in a file is often unknown, and differences between edges may mean nothing. So an edge's
+noise is assumed to have the variance of a typical edge times
 
     ρ_e = (typical precision / stated precision) ^ α,        0 ≤ α ≤ 1.
 
-α is the mean over its posterior. Beforehand it is 0 with a high probability, so that nothing is believed unless the
-residuals speak for it. Their density is Student's t with one degree of freedom in three dimensions and the scale
-s √ρ_e, which outliers do not swamp; s is the likeliest for each α. The residuals are those of an answer that took all
-edges to be alike. Where there are few edges, the cost |r|^½ has answers that meet as many edges exactly as there are
-nodes. Their residuals say nothing of their noise and are left out.
+α is its posterior mean. Its prior puts a high probability on 0, so that nothing is believed without evidence from the
+residuals. Their density is Student's t with one degree of freedom in three dimensions and the scale s √ρ_e, which is
+robust to outliers; s is the maximum-likelihood value for each α. The residuals are those of an answer that treats all
+edges alike. If edges are few, minimising |r|^½ fits as many edges exactly as there are nodes. The residuals of these
+edges say nothing of their noise and are left out.
 
-In the refinement an edge's residual then counts in units of √ρ_e. For the costs |r| and |r|^½ that is a weight of
+In the refinement an edge's residual then counts in units of √ρ_e. For the costs |r| and |r|^½ this is a weight of
 ρ^(−1/2) and ρ^(−1/4).
 """
 
@@ -28,17 +28,17 @@ from rotavg_ros.solver.sfm.priors import PrecisionPriors
 from rotavg_ros.view_graph import ViewGraph, mean_precision
 
 PRECISION_PRIORS = PrecisionPriors()
-# Fixed-point steps to the likeliest scale; what is left after so many is below 1 %.
+# Number of fixed-point steps to the likeliest scale; the remaining error is below 1 %.
 _SCALE_STEPS = 30
 
 
 class Residuals(NamedTuple):
-    """Of M edges in C components.
+    """Residuals of M edges in C components.
 
     Attributes:
         angle: ``(M,)`` rad.
-        component: ``(M,)`` of every edge.
-        redundancy: ``(C,)`` edges of each component beyond a spanning tree: so many residuals are worth something.
+        component: ``(M,)`` component of every edge.
+        redundancy: ``(C,)`` number of edges of each component beyond a spanning tree, its effective residuals.
     """
 
     angle: Tensor
@@ -47,7 +47,7 @@ class Residuals(NamedTuple):
 
 
 def stated_sizes(graph: ViewGraph) -> Tensor:
-    """One over the mean variance that each edge states, ``(M,)`` rad⁻² of any scale; NaN: nothing is stated."""
+    """One over the mean variance stated by each edge, ``(M,)`` rad⁻² of any scale; NaN: nothing is stated."""
     if graph.information is None:
         return graph.precision
     size = mean_precision(graph.information)
@@ -57,7 +57,7 @@ def stated_sizes(graph: ViewGraph) -> Tensor:
 def relative_variance(
     precision: Tensor, residuals: Residuals, priors: PrecisionPriors = PRECISION_PRIORS
 ) -> Tensor | None:
-    """Variance of every edge's noise in units of a typical edge's of its component, ``(M,)``; None where all are alike.
+    """Variance of every edge's noise in units of a typical edge of its component, ``(M,)``; None if all are alike.
 
     Args:
         precision: ``(M,)`` rad⁻², of any scale; NaN where unknown, which counts as typical.
@@ -76,16 +76,16 @@ def relative_variance(
 
 
 def is_telling(residuals: Residuals, priors: PrecisionPriors) -> Tensor:
-    """Which edges the answer does not meet, ``(M,)`` bool: their residuals are no vanishing share of typical ones."""
+    """Edges that the answer does not fit exactly, ``(M,)`` bool: residuals not negligible beside typical ones."""
     typical = median_by_group(residuals.angle, residuals.component, len(residuals.redundancy))
     return residuals.angle >= priors.least_residual * typical[residuals.component]
 
 
 def _exponents(log_ratio: Tensor, is_known: Tensor, residuals: Residuals, priors: PrecisionPriors) -> Tensor:
-    """Mean of α over its posterior, ``(C,)``; 0 where stated precisions hardly differ.
+    """Posterior mean of α, ``(C,)``; 0 where stated precisions hardly differ.
 
     Args:
-        log_ratio: ``(M,)`` of typical to stated precision.
+        log_ratio: ``(M,)`` log ratio of typical to stated precision.
         is_known: ``(M,)`` bool.
     """
     count = len(residuals.redundancy)
@@ -103,7 +103,7 @@ def _exponents(log_ratio: Tensor, is_known: Tensor, residuals: Residuals, priors
 
     scale = median_by_group(square, group, count).expand(len(exponent), count).nan_to_num(nan=1.0)
     for _ in range(_SCALE_STEPS):
-        # Kent & Tyler (1991): the derivative of the likelihood by s² vanishes at this fixed point.
+        # Kent & Tyler (1991): the derivative of the likelihood with respect to s² vanishes at this fixed point.
         scale = (4 / 3) * sums(scaled / (1 + scaled / scale[:, group])) / number
         scale = scale.clamp(min=priors.least_angle**2)
     log_likelihood = sums(
@@ -117,11 +117,11 @@ def _exponents(log_ratio: Tensor, is_known: Tensor, residuals: Residuals, priors
 
 
 def posterior_mean(exponent: Tensor, log_likelihood: Tensor, priors: PrecisionPriors) -> Tensor:
-    """Mean of an exponent, ``(C,)``, of which 0 is likely beforehand.
+    """Posterior mean of an exponent, ``(C,)``, with a prior that favours 0.
 
     Args:
         exponent: ``(K,)`` from 0 to 1.
-        log_likelihood: ``(K, C)`` of each.
+        log_likelihood: ``(K, C)`` log-likelihood of each.
     """
     prior = torch.full_like(exponent, (1 - priors.worthless) / (len(exponent) - 1))
     prior[0] = priors.worthless

@@ -1,20 +1,21 @@
-"""About which axes each edge states to be exact, and how far that is believed: as far as residuals bear it out.
+"""The axes about which each edge states to be exact, believed as far as residuals confirm them.
 
-A stated information has a size, one over the mean variance, and a shape, its covariance Σ_e scaled to a mean variance
-of one. :mod:`rotavg_ros.solver.sfm.stated.precision` has the size. An edge's noise is assumed to have the shape
+A stated information matrix has a size, one over the mean variance, and a shape, its covariance Σ_e scaled to a mean
+variance of one. :mod:`rotavg_ros.solver.sfm.stated.precision` handles the size. An edge's noise is assumed to have the
+shape
 
     Σ_e^β, scaled to a mean variance of one,     0 ≤ β ≤ 1,
 
-in the target's frame. T_e is its inverse square root. T_e r has the same shape C for all edges, in the cameras' frames,
-which is estimated for each β as the refinement does it (:mod:`rotavg_ros.solver.sfm.noise_shape`). So stated shapes are
-believed for what they know of single edges, not for what all edges have in common. The density of residuals is
-Student's t with one degree of freedom, in either end's frame with probability one half:
+in the target's frame. T_e is its inverse square root. T_e r has the same shape C for all edges, in the cameras' frames;
+C is estimated for each β as in the refinement (:mod:`rotavg_ros.solver.sfm.noise_shape`). So stated shapes are credited
+for what they say of single edges, not for what all edges have in common. The density of residuals is Student's t with
+one degree of freedom, in either end's frame with probability one half:
 
     log p_e = log det T_e − ½ log det C + log Σ_k ½ (1 + y_kᵀ C⁻¹ y_k)⁻²,     y_k = R_k T_e r_e / √ρ_e
 
-β is the mean over its posterior. Beforehand it is 0 with a high probability. Residuals may speak for β > 0 though no
-statement is true of its edge, since T says something of all edges, too: that their noise is in the targets' frames. So
-what the likelihood gains at most with the statements of other edges is subtracted.
+β is its posterior mean. Its prior puts a high probability on 0. Residuals may favour β > 0 although no statement is
+true of its own edge, since T also says that the noise of all edges is in the targets' frames. So the largest gain in
+likelihood that is reached with statements exchanged between edges is subtracted.
 """
 
 from __future__ import annotations
@@ -31,19 +32,19 @@ from rotavg_ros.solver.sfm.noise_shape import as_far_as_supported, scatter
 from rotavg_ros.solver.sfm.priors import NoiseShapePriors, PrecisionPriors
 from rotavg_ros.solver.sfm.stated.precision import PRECISION_PRIORS, Residuals, is_telling, posterior_mean
 
-# Of the common shape's fixed point, from nothing and from the β before. A β is not to gain by what is left of it: with
-# 10 and 3, as in the refinement, the Sphinx's likelihood gains 10 nats.
+# Iterations of the common shape's fixed point, from scratch and from the previous β. No β must gain from incomplete
+# convergence: with 10 and 3, as in the refinement, the Sphinx's likelihood gains 10 nats.
 _ITERATIONS, _FURTHER_ITERATIONS = 40, 10
 
 
 class FramedResiduals(NamedTuple):
-    """Of M edges in C components.
+    """Residuals of M edges in C components.
 
     Attributes:
         vector: ``(M, 3)`` rotation vectors in the targets' frames, rad, in units of √ρ.
         source_from_target: ``(M, 3, 3)`` takes them to the sources' frames.
-        component: ``(M,)`` of every edge.
-        redundancy: ``(C,)`` edges of each component beyond a spanning tree.
+        component: ``(M,)`` component of every edge.
+        redundancy: ``(C,)`` number of edges of each component beyond a spanning tree.
     """
 
     vector: Tensor
@@ -63,22 +64,22 @@ class FramedResiduals(NamedTuple):
 
 
 class _Shapes(NamedTuple):
-    """Of M edges: axes ``(M, 3, 3)`` in columns, and logarithms of their variances ``(M, 3)``."""
+    """Shapes of M edges: axes ``(M, 3, 3)`` in columns, and logarithms of the variances along them ``(M, 3)``."""
 
     axes: Tensor
     log_variance: Tensor
 
     @classmethod
     def of(cls, information: Tensor, is_known: Tensor, least_ratio: float) -> _Shapes:
-        """Of information ``(M, 3, 3)``; round where it is not known."""
+        """From information ``(M, 3, 3)``; round where it is not known."""
         unit = torch.eye(3, dtype=information.dtype, device=information.device)
         value, axes = torch.linalg.eigh(torch.where(is_known[:, None, None], information, unit))
-        # The first axis is the least exact one. What is not positive definite states nothing.
+        # The first axis is the least exact one. A matrix that is not positive definite counts as stating nothing.
         share = torch.where(value[:, :1] > 0, value / value[:, :1], 1.0)
         return cls(axes, -share.log().clamp(max=-2 * log(least_ratio)))
 
     def inverse_deviation(self, exponent: Tensor) -> Tensor:
-        """One over the standard deviations along the axes ``(M, 3)``, given β ``(M,)`` or for all."""
+        """One over the standard deviations along the axes ``(M, 3)``, given β ``(M,)`` or one β for all."""
         variance = (exponent[..., None] * self.log_variance).exp()
         return (variance / variance.mean(dim=1, keepdim=True)).rsqrt()
 
@@ -93,11 +94,11 @@ def believed_units(
     shape: NoiseShapePriors,
     priors: PrecisionPriors = PRECISION_PRIORS,
 ) -> Tensor | None:
-    """T of every edge, in its target's frame, ``(3, 3, M)``, one where β is 0; None where it is 0 everywhere.
+    """T of every edge, in its target's frame, ``(3, 3, M)``, the identity where β is 0; None if it is 0 everywhere.
 
     Args:
         information: ``(M, 3, 3)`` in the targets' frames, of any scale; NaN where unknown, which counts as round.
-        shape: how the common shape is estimated; no axis is believed to be more exact than its ``least_ratio``.
+        shape: how the common shape is estimated; its ``least_ratio`` bounds how exact an axis is believed to be.
     """
     is_known = information.isfinite().all(dim=2).all(dim=1)
     if not bool(is_known.any()):
@@ -123,10 +124,10 @@ def believed_units(
 def _exponents(
     shapes: _Shapes, residuals: FramedResiduals, worth: Tensor, shape: NoiseShapePriors, priors: PrecisionPriors
 ) -> Tensor:
-    """Mean of β over its posterior, ``(C,)``; 0 where stated shapes are round.
+    """Posterior mean of β, ``(C,)``; 0 where stated shapes are nearly round.
 
     Args:
-        worth: ``(C,)`` how much a residual counts.
+        worth: ``(C,)`` weight of each residual.
     """
     group, count = residuals.component, len(residuals.redundancy)
     number = torch.bincount(group, minlength=count)
@@ -137,7 +138,7 @@ def _exponents(
         for stated in (shapes, _Shapes(shapes.axes[others], shapes.log_variance[others]))
     )
     gain = own - own[0]
-    gain[1:] -= (of_others - of_others[0]).amax(dim=0)  # which is 0 at least
+    gain[1:] -= (of_others - of_others[0]).amax(dim=0)  # the maximum is at least 0
     mean_exponent = posterior_mean(exponent, gain, priors)
     variance = shapes.log_variance.var(dim=1, correction=0)
     spread = (variance.new_zeros(count).index_add_(0, group, variance) / number.clamp(min=1)).sqrt()
@@ -167,7 +168,7 @@ def _log_likelihoods(shapes: _Shapes, residuals: FramedResiduals, exponents: Ten
         at_target = shapes.units(inverse_deviation) @ residuals.vector[:, :, None]
         at_source = residuals.source_from_target @ at_target
         vectors = (at_source.squeeze(2).t().contiguous(), at_target.squeeze(2).t().contiguous())
-        start = scatter(vectors, group, len(redundancy), start, shape)  # the next β has much the same
+        start = scatter(vectors, group, len(redundancy), start, shape)  # nearly the same for the next β
         covariance = as_far_as_supported(start, redundancy, shape)
         inverse = torch.linalg.inv_ex(covariance).inverse.permute(1, 2, 0)[:, :, group]
         squares = [((inverse * vector).sum(dim=1) * vector).sum(dim=0) for vector in vectors]

@@ -1,4 +1,4 @@
-"""What is believed of translations before a graph is seen, in one frozen class; beside ``posterior/priors.py``."""
+"""All prior parameters of translations, in one frozen class; those of rotations are in ``posterior/priors.py``."""
 
 from __future__ import annotations
 
@@ -7,36 +7,38 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class PlacePriors:
-    """Lengths are in typical steps of odometry, the median of those that go anywhere, so that no unit matters.
+    """Prior parameters of translations.
+
+    Lengths are in typical steps of odometry (the median of non-zero steps), so results do not depend on the unit.
 
     Attributes:
-        step: median of the standard deviation of where one typical step of odometry ends, per component; its variance
-            grows with the way passed.
-        step_spread: standard deviation of its logarithm: small, since odometry that may err by anything makes room for
-            every false closure; …
-        largest_step: … and what it is at most, where everything is at one place.
-        closure: median of the standard deviation of a good closure's translation, …
-        closure_spread: … and that of its logarithm.
-        relative: median of what a good closure's translation errs by, of its own length, …
-        relative_spread: … and standard deviation of its logarithm: most front ends measure lengths, some guess them.
-        slip: standard deviation of how far a step is off by where it slipped, beside what its turn bends.
-        common: share of a closure's variance that it has in common with those near it, in the median; …
-        common_spread: … standard deviation of the logarithm of what they share over what they do not; …
-        most_common: … and the largest share.
-        tails: share of good closures whose translation errs by far more than others', …
-        tail_ratio: … by so many times the variance.
-        turned_deg: standard deviation of how much another place that looks alike is seen turned.
-        from_behind: share of places that look alike that do so from the other side, half a turn off.
+        step: median of the standard deviation of the end of one typical step of odometry, per component; the variance
+            grows with the distance travelled.
+        step_spread: standard deviation of its logarithm: small, since odometry with arbitrary errors would be
+            compatible with every false closure.
+        largest_step: upper bound of that standard deviation, for when everything is at one place.
+        closure: median of the standard deviation of a good closure's translation.
+        closure_spread: standard deviation of its logarithm.
+        relative: median of a good closure's translation error relative to its length.
+        relative_spread: standard deviation of its logarithm: most front ends measure lengths, some guess them.
+        slip: standard deviation of the position error of a step that slipped, beyond the effect of its turn.
+        common: median share of a closure's variance that it has in common with those near it.
+        common_spread: standard deviation of the logarithm of the shared over the unshared variance.
+        most_common: largest common share.
+        tails: share of good closures whose translation errs by far more than others'.
+        tail_ratio: factor of the variance of these.
+        turned_deg: standard deviation of the turn between the views of two places that look alike.
+        from_behind: share of places that look alike when seen from the other side, half a turn off.
         turned_in_place: share of false rotations at the right place: symmetric rooms, registrations that flip.
-        elsewhere: share of wrong places that are off as others far from them are, by the same turn of the map or the
-            same shift, where there are such: a priori that many of as many as are counted beforehand.
-        wrong_place: closures of a plausible rotation that join wrong places: a priori that many in as many as are
-            counted beforehand, …
-        counted: … in all, as for the shares of those that repeat others; what all tell counts for one closure within
-            a run.
-        repeats: share of wrong places that repeat the one of the closure before or after, where there is one: likewise.
-        least_wrong: a wrong place is off by so many standard deviations of a good closure at least, and by the map's
-            extent at most; all scales between are as likely.
+        elsewhere: prior share, with ``counted`` as its weight, of wrong places with the same displacement as others far
+            from them, by the same turn of the map or the same shift, where there are such.
+        wrong_place: prior number, out of ``counted``, of closures with a plausible rotation that join wrong places.
+        counted: number of closures for which these priors count, also for the shares of repeats; within a run, the
+            evidence of all others counts as one closure.
+        repeats: prior share, likewise, of wrong places that repeat that of the closure before or after, if there is
+            one.
+        least_wrong: least error of a wrong place, in standard deviations of a good closure; the largest is the map's
+            extent. All scales in between are equally likely.
     """
 
     step: float = 0.05

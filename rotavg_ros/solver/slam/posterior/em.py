@@ -25,14 +25,14 @@ from rotavg_ros.solver.slam.posterior.rows import (
 from rotavg_ros.solver.slam.posterior.state import Noise, State
 from rotavg_ros.solver.slam.posterior.system import Factorised
 
-# Residuals say nothing of noise or labels while orientations still turn by more than this; but not for ever.
+# Noise and labels are not estimated while orientations still turn by more than this, for at most this many solves.
 _SETTLED_TURN = np.radians(3.0)
 _MAX_UNSETTLED = 5
 _PROBABILITY_CONVERGED = 0.02
-# Noise that comes nearer by a constant factor from solve to solve, by this at most, is set to where that leads.
+# Noise that converges by a constant factor of at most this from solve to solve is set to the limit.
 _SLOWEST = 0.85
-# Newton's steps to the logarithm of the likeliest variance, up to a change of this, and how far from its prior it may
-# end, in standard deviations.
+# Newton steps to the logarithm of the likeliest variance, the change at which they stop, and the largest distance of
+# the result from the prior's median, in standard deviations.
 _NEWTON_STEPS, _NEWTON_CONVERGED, _FARTHEST = 20, 1e-9, 5.0
 
 
@@ -40,9 +40,9 @@ class Step(NamedTuple):
     """One Gauss–Newton step on the corrections.
 
     Attributes:
-        state: after it.
-        turned: largest component, rad.
-        gained: nats, by how much −log p of the residuals falls, ½ δᵀ H δ.
+        state: the state after it.
+        turned: largest component of the turns, rad.
+        gained: nats, decrease of −log p of the residuals, ½ δᵀ H δ.
         factorised: H.
     """
 
@@ -53,12 +53,12 @@ class Step(NamedTuple):
 
 
 def step(problem: Problem, state: State, *, all_rows: bool = True) -> Step:
-    """One Gauss–Newton step, and what it tells of each edge from all others.
+    """One Gauss–Newton step, which also updates the prediction of each edge by all others.
 
     Args:
         problem: the graph.
-        state: before.
-        all_rows: it tells of edges that weigh nothing, too.
+        state: the state before.
+        all_rows: whether to update the predictions of edges of no weight, too.
     """
     residual, variance = residuals(problem, state), variances(problem, state.noise)
     own = variance[: len(problem.graph.source)]
@@ -73,12 +73,12 @@ def step(problem: Problem, state: State, *, all_rows: bool = True) -> Step:
 def polish(
     problem: Problem, state: State, solves: int | None = None, *, hold_noise: bool = False
 ) -> tuple[State, Evaluation]:
-    """Corrections and noise at their optimum for labels as they are.
+    """Optimises corrections and noise with fixed labels.
 
     Args:
         problem: the graph.
         state: where to begin.
-        solves: at most, unless corrections still move by more than a step errs; default: those of the limits.
+        solves: maximum number, exceeded only while a solve still gains much; default: that of the limits.
         hold_noise: leave the noise as it is.
     """
     enough = problem.limits.polish_solves if solves is None else solves
@@ -100,18 +100,18 @@ def polish(
 
 
 def _extrapolated(before: Noise, after: Noise, last: np.ndarray) -> tuple[Noise, np.ndarray]:
-    """Where a sequence of noise leads (Aitken 1926), and the change that it went on by.
+    """The extrapolated limit of a sequence of noises (Aitken 1926), and the latest change.
 
     Args:
-        before: of the last solve.
-        after: estimated from it.
-        last: ``(2,)`` changes of the logarithms of both variances before; zero where those are not to be gone on from.
+        before: noise of the last solve.
+        after: noise estimated from it.
+        last: ``(2,)`` previous changes of the logarithms of both variances; zero where these must not be extrapolated.
     """
     change = np.log([after.step_variance / before.step_variance, after.closure_variance / before.closure_variance])
     ratio = float(change @ last) / max(float(last @ last), np.finfo(np.float64).tiny)
     if not last.any() or not ratio < _SLOWEST:
         return after, change
-    # Where it swings the ratio is negative, and that leads to between the last two.
+    # If the sequence alternates, the ratio is negative and the limit lies between the last two values.
     step, closure = np.exp(change * ratio / (1 - ratio)).tolist()
     farther = replace(
         after, step_variance=after.step_variance * step, closure_variance=after.closure_variance * closure
@@ -120,12 +120,12 @@ def _extrapolated(before: Noise, after: Noise, last: np.ndarray) -> tuple[Noise,
 
 
 def settle(problem: Problem, state: State, solves: int | None = None) -> State:
-    """Labels of closures and corrections together, labels as probabilities on the way, made at the end.
+    """Optimises closures' labels and corrections together; labels are probabilities meanwhile, rounded at the end.
 
     Args:
         problem: the graph.
         state: where to begin.
-        solves: at most; default: those of the limits.
+        solves: maximum number; default: that of the limits.
     """
     closure = problem.closure
     told = problem.log_odds[closure]
@@ -145,13 +145,13 @@ def settle(problem: Problem, state: State, solves: int | None = None) -> State:
 
 
 def estimate_noise(problem: Problem, state: State, factorised: Factorised) -> Noise:
-    """Both variances by the redundancy that residuals leave (Gull 1989, MacKay 1992), under their priors."""
+    """Both variances from residuals and their effective redundancy (Gull 1989, MacKay 1992), under their priors."""
     priors, noise, k = problem.priors, state.noise, problem.components
     num_edges = len(problem.graph.source)
     variance, residual = variances(problem, noise), residuals(problem, state)
     site = sites(problem, state, residual, variance)
     common = variance[num_edges:]
-    # A run's prior is a row like others, and has no tails.
+    # A run's prior is a row like any other, but has no tails.
     of_runs = 1 - np.minimum(factorised.resistance_of_kept[num_edges:] / common, 1.0)
     redundancy = k * np.concatenate((state.trusted * site.shrinkage, of_runs))
     square = np.concatenate((state.trusted * site.misfit, (residual[num_edges:] ** 2).sum(axis=1) / common))
@@ -172,17 +172,17 @@ def estimate_noise(problem: Problem, state: State, factorised: Factorised) -> No
 
 
 def _step_told(problem: Problem, state: State, weight: np.ndarray, residual: np.ndarray) -> float:
-    """How many of the components that odometry errs in tell of its tails, of all k: k_eff / k.
+    """Effective number of components of odometry's error, relative to k: k_eff / k.
 
-    Where gravity holds roll and pitch, or odometry sees turns about one axis of the body worse than those about others,
-    the squares of what it errs by are those of about one normal component, not of three that are smaller; these seem to
-    have tails. A sum of squares of normal components with shares q of the variance is about χ² with k_eff = 1 / Σ q²
-    degrees of freedom (Satterthwaite 1946).
+    Where gravity holds roll and pitch, or odometry is worse about one body axis than about the others, its squared
+    errors are those of about one normal component rather than of three smaller ones. Taken for three components, they
+    seem to have tails. A sum of squares of normal components with shares q of the variance is approximately χ² with
+    k_eff = 1 / Σ q² degrees of freedom (Satterthwaite 1946).
 
     Args:
         problem: the graph.
-        state: after a solve.
-        weight: ``(E + R,)`` rad⁻² in that.
+        state: the state after a solve.
+        weight: ``(E + R,)`` rad⁻², weights in it.
         residual: ``(E + R, 3)`` rad after it.
     """
     graph = problem.graph
@@ -190,7 +190,7 @@ def _step_told(problem: Problem, state: State, weight: np.ndarray, residual: np.
     if problem.components == 1 or "tilt" in problem.without or len(sound) == 0:
         return 1.0
     bodies, heavy, left = problem.body_from_world(state.correction), weight[sound], residual[sound]
-    # As if one edge more erred alike about all axes.
+    # As if one more edge erred alike about all axes.
     square = np.eye(3)
     for end in (graph.source, graph.target):
         at_end = np.einsum("eij,ej->ei", bodies[end[sound]], left)
@@ -200,23 +200,23 @@ def _step_told(problem: Problem, state: State, weight: np.ndarray, residual: np.
 
 
 def _told_upright(vertical: Vertical, weight: np.ndarray, residual: np.ndarray) -> float:
-    """The same about the vertical and about other axes, of ``(n,)`` weights and ``(n, 3)`` residuals in the world."""
+    """The same for the vertical and the other axes, from ``(n,)`` weights and ``(n, 3)`` residuals in the world."""
     axis = vertical.sharpened(residual, 1 / weight)
-    # About others no more than about the vertical.
+    # The variance about the other axes is at most that about the vertical.
     about = 1 + float(weight @ (residual @ axis) ** 2)
     share = max(about / (3 + float(weight @ (residual**2).sum(axis=1))), 1 / 3)
     return 1 / (share**2 + (1 - share) ** 2 / 2) / 3
 
 
 def likeliest_variance(squares: float, freedom: float, log_variance: float, log_prior: float, spread: float) -> float:
-    """The variance e^x that maximises −n/2 x − S/2 e⁻ˣ − (x − prior)²/(8 spread²), by Newton's steps.
+    """The variance e^x that maximises −n/2 x − S/2 e⁻ˣ − (x − prior)²/(8 spread²), by Newton steps.
 
     Args:
         squares: S.
         freedom: n.
-        log_variance: x to begin with.
-        log_prior: logarithm of the median variance.
-        spread: standard deviation of the logarithm of its root.
+        log_variance: initial x.
+        log_prior: logarithm of the prior's median variance.
+        spread: standard deviation of the logarithm of its square root.
     """
     x = log_variance
     for _ in range(_NEWTON_STEPS):
@@ -230,7 +230,7 @@ def likeliest_variance(squares: float, freedom: float, log_variance: float, log_
 
 
 def _gained(problem: Problem, before: Noise, after: Noise) -> float:
-    """By how much F fell, nats, about: each of n components tells the logarithm of its variance to ½ n."""
+    """Approximate decrease of F, nats: n components determine their log variance with a precision of ½ n."""
     steps = np.log(after.step_variance / before.step_variance) ** 2 * problem.graph.num_segments
     closures = np.log(after.closure_variance / before.closure_variance) ** 2 * len(problem.closure)
     return float(problem.components / 4 * (steps + closures))

@@ -22,9 +22,9 @@ from rotavg_ros.solver.slam.posterior.state import State
 from rotavg_ros.solver.slam.preparation import Prepared
 from rotavg_ros.solver.slam.stages import CleanedClosures
 
-# A gain of so many nats is worth to leave the mode before at once: what that promised, the new one promises as well.
+# After a gain of this many nats the search leaves the old mode at once: its promising moves exist in the new one too.
 _GAIN = 1.0
-# So many of the best modes are moved on from.
+# Number of best modes from which moves are tried.
 _BEAM = 3
 
 
@@ -32,7 +32,7 @@ class Search:
     """Modes of a problem, found by starts and moves.
 
     Attributes:
-        modes: what was found, the least F first.
+        modes: the modes found, in order of increasing F.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -43,12 +43,12 @@ class Search:
         self._tried = 0
 
     def run(self, prepared: Prepared, cleaned: CleanedClosures, correction: Tensor) -> None:
-        """From starts until some end alike, move on from the best modes until no move is predicted to lower F.
+        """Runs starts until several end alike, then moves from the best modes until no move is predicted to lower F.
 
         Args:
-            prepared: the graph drawn together.
-            cleaned: what CleanNet says of its closures.
-            correction: ``(K, 4)`` of the tree, or of an earlier answer to begin with.
+            prepared: the contracted graph.
+            cleaned: CleanNet's verdict on its closures.
+            correction: ``(K, 4)`` corrections of the tree, or of an earlier answer, to begin with.
         """
         begun: list[Mode] = []
         for name, state in starts(self.problem, prepared, cleaned, correction):
@@ -60,14 +60,14 @@ class Search:
         if from_tree:
             self._begun("minimum cuts", turned_parts(self.problem, prepared, correction))
         self.move_on()
-        if may_cut and not from_tree and self._seems_slipped(self.modes[0]):  # as moves have found since
+        if may_cut and not from_tree and self._seems_slipped(self.modes[0]):  # the moves since have revealed a slip
             self._begun("minimum cuts", turned_parts(self.problem, prepared, correction))
             self.move_on()
         if may_cut:
             self._cut_further(prepared)
 
     def _cut_further(self, prepared: Prepared) -> None:
-        """Minimum cuts from the best mode, as long as what they find is better."""
+        """Minimum cuts from the best mode, as long as they improve it."""
         least = np.inf
         while self.modes[0].cost < least - _GAIN and _has_slipped(best := self.modes[0]):
             least = best.cost
@@ -75,7 +75,7 @@ class Search:
             self.move_on()
 
     def _begun(self, name: str, state: State) -> Mode:
-        """The mode of a start, under such noise as the best one has; the first one tells what noise that is."""
+        """The mode of a start, begun with the noise of the best mode so far; the first start estimates its own."""
         if self.modes:
             best = self.modes[0]
             state = step(self.problem, with_noise(self.problem, state, best.state.noise)).state
@@ -88,7 +88,7 @@ class Search:
         self.keep(mode)
         uneven = noise.uneven(self.problem, state.noise)
         if uneven != state.noise:
-            # Labels that are right where odometry errs more here than there may not be found where it does not.
+            # If odometry's errors vary along the path, the right labels may not be found with uniform noise.
             self.keep(self.flipped(self.polished(with_noise(self.problem, state, uneven), name)))
         self._tune(self.modes[0])
         return mode
@@ -99,7 +99,7 @@ class Search:
         return _has_slipped(mode) or slips.may_have_slipped(mode)
 
     def move_on(self) -> None:
-        """The search from the modes that are kept."""
+        """Continues the search from the kept modes."""
         done = self._done
         while (mode := self._next(done)) is not None:
             done.append(mode)
@@ -117,7 +117,7 @@ class Search:
                     self._tune(near)
 
     def _tune(self, mode: Mode) -> None:
-        """The labels of a mode under their best noise, and what other labels cost under that."""
+        """Finds the best noise for the labels of a mode, and flips labels under that noise."""
         if any(mode.is_like(tuned.state) for tuned in self._tuned):
             return
         self._tuned.append(mode)
@@ -138,11 +138,11 @@ class Search:
         return Mode(self.problem, *polish(self.problem, state), origin)
 
     def flipped(self, mode: Mode) -> Mode:
-        """The mode with single labels flipped as long as F falls, and may come near the least."""
+        """The mode with single labels flipped as long as F falls and may come near the least F."""
         return flipped(mode, self.modes[0].cost + self.problem.limits.rival if self.modes else np.inf)
 
     def keep(self, mode: Mode) -> None:
-        """Among the modes, in the place of the same labels at a higher F."""
+        """Adds a mode, replacing one with the same labels and a higher F."""
         known = {other.key: other for other in self.modes}
         if mode.key not in known or known[mode.key].cost > mode.cost:
             known[mode.key] = mode
@@ -152,7 +152,7 @@ class Search:
         return next((mode for mode in self._near() if not any(mode.is_like(other.state) for other in done)), None)
 
     def _near(self) -> list[Mode]:
-        """The best modes that are not alike; of those alike the best stands for all."""
+        """The best modes, with only the best of those that are alike."""
         best: list[Mode] = []
         for mode in self.modes:
             if mode.cost > self.modes[0].cost + self.problem.limits.rival or len(best) == _BEAM:
@@ -163,12 +163,12 @@ class Search:
 
 
 def _has_slipped(mode: Mode) -> bool:
-    """Whether odometry slipped, or would have if its tails were not as wide."""
+    """Whether odometry slipped, or would have slipped with narrower tails."""
     return len(mode.slipped) > 0 or hides_slips(mode)
 
 
 def proposals(mode: Mode) -> Iterator[Proposal]:
-    """Of all moves that are switched on."""
+    """Proposals of all moves that are switched on."""
     without = mode.problem.without
     if "settling" not in without:
         yield from propose_settling(mode)

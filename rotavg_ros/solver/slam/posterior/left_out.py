@@ -1,4 +1,4 @@
-"""What the rest of the graph says of each edge: leave-one-out log-odds, scores; and labels by residuals alone."""
+"""Leave-one-out log-odds and scores of each edge, given the rest of the graph; and labels by residuals alone."""
 
 from __future__ import annotations
 

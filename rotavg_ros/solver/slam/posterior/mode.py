@@ -1,4 +1,4 @@
-"""A labelling at its optimum, and a proposal of another one."""
+"""A labelling at its optimum, and a proposal for another one."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from rotavg_ros.solver.slam.posterior.objective import Evaluation
 from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.state import State
 
-# Noise is another one if the ratio of a step's variance and a closure's differs by this, in the logarithm.
+# Noises count as different if the log ratio of a step's to a closure's variance differs by this.
 OTHER_NOISE = 1.0
-# Orientations are the same up to so many standard deviations of a closure.
+# Orientations count as the same within this many standard deviations of a closure.
 _SAME = 3.0
-# Covariances of up to so many closures are computed all at once.
+# Covariances of up to this many closures are computed all at once.
 _MAX_DENSE = 500
 
 
@@ -44,43 +44,43 @@ class Mode:
 
     @cached_property
     def labels(self) -> bytes:
-        """Equal for equal labels."""
+        """A key that is equal for equal labels."""
         return np.packbits(self.state.is_good).tobytes()
 
     @property
     def key(self) -> tuple[bytes, tuple[float, ...], int]:
-        """Equal for equal labels under the same values of all grids, and about the same ratio of variances."""
+        """A key that is equal for equal labels with equal grid values and about the same ratio of variances."""
         noise = self.state.noise
         return self.labels, noise.chosen, round(noise.log_ratio / OTHER_NOISE)
 
     def is_like(self, other: State) -> bool:
-        """Whether only single closures have another label, and turn nothing by more than closures err.
+        """Whether the labels of single closures alone differ, and orientations agree to within a closure's error.
 
-        No slip differs, nor two closures of a run.
+        No slip may differ, nor two closures of one run.
         """
         odometry = self.problem.graph.is_odometry
         slips_alike = np.array_equal(self.state.is_good[odometry], other.is_good[odometry])
         return slips_alike and self.holds_like(other) and self.is_turned_like(other)
 
     def holds_like(self, other: State) -> bool:
-        """Whether no two closures of a run have another label."""
+        """Whether no run has two closures whose labels differ."""
         closure = self.problem.closure
         differs = self.state.is_good[closure] != other.is_good[closure]
         return bool(np.bincount(self.problem.run[differs]).max(initial=0) < 2)
 
     def is_turned_like(self, other: State) -> bool:
-        """Whether orientations are the same up to what closures err."""
+        """Whether orientations agree to within a closure's error."""
         cosine = np.abs((self.state.correction * other.correction).sum(axis=0)).min()
         return bool(2 * np.arccos(min(float(cosine), 1.0)) < _SAME * np.sqrt(self.state.noise.closure_variance))
 
     @cached_property
     def is_false(self) -> np.ndarray:
-        """``(C,)`` bool."""
+        """``(C,)`` bool, closures labelled false."""
         return np.asarray(~self.state.is_good[self.problem.closure])
 
     @cached_property
     def left_out(self) -> LeftOut:
-        """What the rest of the graph says of every edge."""
+        """The prediction of every edge by the rest of the graph."""
         return leave_one_out(self.problem, self.state, self.evaluation.factorised)
 
     @cached_property
@@ -88,7 +88,7 @@ class Mode:
         return self.evaluation.factorised.covariance(self.problem.closure)
 
     def covariance_of(self, members: np.ndarray) -> np.ndarray:
-        """``(n, n)`` rad², of what is estimated of some closures."""
+        """``(n, n)`` rad², covariance of the fitted values of some closures."""
         if len(self.problem.closure) <= _MAX_DENSE:
             return np.asarray(self._covariance[np.ix_(members, members)])
         return self.evaluation.factorised.covariance(self.problem.closure[members])
@@ -104,13 +104,13 @@ class Mode:
 
 @dataclass(frozen=True)
 class Proposal:
-    """Where a search might go.
+    """A move that the search might try.
 
     Attributes:
-        name: of the move.
-        predicted: by how much F changes, nats, as far as it can be told before the work.
-        slack: tried if F is predicted to rise by no more than this, nats.
-        make: the state to polish.
+        name: name of the move.
+        predicted: predicted change of F, nats.
+        slack: nats; the move is tried if F is predicted to rise by no more than this.
+        make: function that makes the state to polish.
     """
 
     name: str

@@ -1,15 +1,14 @@
-"""F(labels, θ) = −log p(labels, θ | data) in nats, the corrections integrated out.
+"""F(labels, θ) = −log p(labels, θ | data) in nats, with the corrections integrated out.
 
 With r_e the residuals at the best corrections Ĉ and H the Hessian there,
 
     F = − Σ_sound log p(r_e | sound)  − Σ_slipped log p(r_e | slipped)  − Σ_good log p(r_e | good)  − Σ_runs log p(b)
         − log p(false closures)  − log p(labels)  − log p(θ)  + ½ k (log det H − d log 2π)
 
-d is the number of unknowns: key nodes but for the roots, and runs' common errors b. That is exact where densities are
-normal; those with tails are integrated by expectation propagation
-(:class:`rotavg_ros.solver.slam.posterior.densities.Sites`). Where a gyroscope's bias or a sensor's mounting was taken
-out, − log p of it is added (:mod:`rotavg_ros.solver.slam.posterior.calibration`). Two labellings are compared by F and
-by nothing else.
+d is the number of unknowns: key nodes except the roots, and runs' common errors b. This is exact for normal densities;
+those with tails are integrated by expectation propagation
+(:class:`rotavg_ros.solver.slam.posterior.densities.Sites`). Where a gyroscope's bias or a sensor's mounting error was
+removed, its − log p is added (:mod:`rotavg_ros.solver.slam.posterior.calibration`). Labellings are compared by F alone.
 """
 
 from __future__ import annotations
@@ -37,21 +36,21 @@ from rotavg_ros.solver.slam.posterior.state import (
 )
 from rotavg_ros.solver.slam.posterior.system import Factorised
 
-# In the place of an F that is not known, nats.
+# Added to an F that is not valid yet, nats.
 _UNKNOWN = 1e9
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """F of a state and what it was made of.
+    """F of a state and its parts.
 
     Attributes:
         terms: nats by name.
         residual: ``(E + R, 3)`` rad, of all rows.
         weight: ``(E + R,)`` rad⁻².
         factorised: H.
-        others: what all other edges say of each.
-        is_moving: whether corrections were not at their optimum yet, where F says nothing: it may come out as anything.
+        others: prediction of each edge by all others.
+        is_moving: whether corrections were not at their optimum yet, so that F is meaningless.
     """
 
     terms: dict[str, float]
@@ -63,7 +62,7 @@ class Evaluation:
 
     @property
     def total(self) -> float:
-        """F, nats; more than any other where corrections still move."""
+        """F, nats; larger than any other while corrections still move."""
         return sum(self.terms.values()) + self.is_moving * _UNKNOWN
 
 
@@ -72,8 +71,8 @@ def evaluate(problem: Problem, state: State, *, is_moving: bool = False) -> Eval
 
     Args:
         problem: the graph.
-        state: where to.
-        is_moving: they are not yet.
+        state: the state to evaluate.
+        is_moving: whether corrections have not reached their optimum.
     """
     graph, priors, k = problem.graph, problem.priors, problem.components
     state = replace(state, trusted=state.is_good.astype(np.float64))
@@ -86,7 +85,7 @@ def evaluate(problem: Problem, state: State, *, is_moving: bool = False) -> Eval
     told = with_others(state, factorised, if_good, own, k)
     site = sites(problem, told, residual, variance)
     weight, square = factorised.weight, (residual**2).sum(axis=1)
-    # Each as the normal density that stands for it, and by how much more its own density makes of what others say.
+    # The normal density that approximates each, and the log ratio of its own density's evidence to the approximation's.
     log_if_good = log_normal(square[:num_edges], 1 / weight[:num_edges], k) + site.log_density
     log_if_good -= log_normal(site.square, 1 / weight[:num_edges] + site.predicted, k)
     slipped = np.flatnonzero(graph.is_odometry & ~good)
@@ -112,7 +111,7 @@ def evaluate(problem: Problem, state: State, *, is_moving: bool = False) -> Eval
 
 
 def log_noise_prior(noise: Noise, priors: SlamPriors) -> float:
-    """Of θ: log-normal in both standard deviations; probabilities that grids are left at 0, all else as likely."""
+    """Log prior of θ: both standard deviations log-normal; a probability that each grid stays at 0, others uniform."""
     step = np.log(noise.step_variance) / 2 - np.log(np.radians(priors.step_deg))
     closure = np.log(noise.closure_variance) / 2 - np.log(np.radians(priors.closure_deg))
     some = priors.stated_share / (len(EXPONENTS) - 1)

@@ -1,4 +1,4 @@
-"""Every number that the posterior believes beforehand, and every bound of its search, in two frozen classes."""
+"""All prior parameters of the posterior, and all bounds of its search, in two frozen classes."""
 
 from __future__ import annotations
 
@@ -7,37 +7,39 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class SlamPriors:
-    """What is believed of a robot's graph before it is seen. Angles are in degrees, per component of a rotation.
+    """Prior parameters for a robot's graph. Angles are in degrees, per component of a rotation.
 
-    Rates that are not named here (the share of repeated turns, the stickiness of labels) are integrated over a grid,
+    Rates that are not listed here (the share of repeated turns, the stickiness of labels) are integrated over a grid,
     see :mod:`rotavg_ros.solver.slam.posterior.labels`.
 
     Attributes:
         step_deg: median of the standard deviation of one step of odometry.
-        closure_deg: the same of a good closure; and the standard deviation of how their sensor is said to be mounted.
-        noise_spread: standard deviation of the logarithm of both.
-        tails: probability that some of the sound segments err by far more than others; and that good closures do;
-            all shares that are summed over are as likely (:mod:`rotavg_ros.solver.slam.posterior.state`), …
-        tail_ratio: … and these have so many times the variance (Huber's contaminated normal).
-        outlier_share: mean of the Beta prior of the share of false closures, …
-        outlier_count: … and how many closures it counts for.
-        near_miss_share: mean of the Beta(1, ·) prior of the share of false closures wrong by a normal turn, or by
-            such a turn more than half a turn, …
-        near_miss_deg: … of this standard deviation; the others are wrong by any turn.
+        closure_deg: the same for a good closure; also the standard deviation of the error in the stated mounting of the
+            closures' sensor.
+        noise_spread: standard deviation of the logarithm of both standard deviations.
+        tails: probability that odometry has heavy tails (some sound segments err by far more than others), and likewise
+            for good closures; all values of the grid of shares are equally likely
+            (:mod:`rotavg_ros.solver.slam.posterior.state`).
+        tail_ratio: factor of the variance in the tails of closures (Huber's contaminated normal).
+        outlier_share: mean of the Beta prior of the share of false closures.
+        outlier_count: number of closures for which this prior counts.
+        near_miss_share: mean of the Beta(1, ·) prior of the share of false closures that are wrong by a normally
+            distributed turn, or by half a turn plus such a turn.
+        near_miss_deg: standard deviation of that turn; the other false closures are wrong by any turn.
         elsewhere_count: the share of false closures that repeat the wrong turn of others elsewhere on the path has the
-            prior Beta(1, elsewhere_count); that of repeats nearby, uniform.
-        slip_count: the share of slipping steps has the prior Beta(slip_count, slip_steps), …
-        slip_steps: … so the first slip is dear and later ones are cheaper.
-        slip_deg: standard deviation of what a step is off by where it slipped.
+            prior Beta(1, elsewhere_count); the share of repeats nearby has a uniform prior.
+        slip_count: the share of slipping steps has the prior Beta(slip_count, slip_steps).
+        slip_steps: see ``slip_count``; the first slip costs much and later ones less.
+        slip_deg: standard deviation of the error of a step that slipped.
         bias_deg: standard deviation of a component of a gyroscope's bias, per step.
-        run_gap_steps: closures follow each other in a run if their ends are at most so many steps of odometry apart,
-            both ends summed, …
-        common_errors: probability that closures of a run err alike; for how long and how far, all values that are
-            summed over are as likely (:mod:`rotavg_ros.solver.slam.posterior.state`).
-        turn_errors: probability that odometry errs more where it turns; all shares that are summed over are as likely.
-        stated_share: probability that stated variances say anything.
-        least_stated_ratio: no closure is believed to be more exact than this share of the typical variance.
-        largest_stated_ratio: a stated variance farther from the typical one than by this factor says nothing.
+        run_gap_steps: closures follow each other in a run if the distances between their two ends sum to at most this
+            many steps of odometry.
+        common_errors: probability that closures of a run share an error; all values of the grids of its length and size
+            are equally likely (:mod:`rotavg_ros.solver.slam.posterior.state`).
+        turn_errors: probability that odometry errs more where it turns; all shares of the grid are equally likely.
+        stated_share: probability that stated variances are informative.
+        least_stated_ratio: lower bound of a closure's believed variance, as a share of the typical variance.
+        largest_stated_ratio: a stated variance that differs from the typical one by more than this factor is ignored.
     """
 
     step_deg: float = 0.3
@@ -64,23 +66,23 @@ class SlamPriors:
 
 @dataclass(frozen=True)
 class SearchLimits:
-    """How far the search goes; none of them says what is likelier.
+    """How far the search goes; none of these limits changes F itself.
 
     Attributes:
-        polish_solves: sparse solves at most to bring a labelling to its optimum.
-        trial_solves: the same while other noise is tried, or flips of single labels.
+        polish_solves: maximum number of sparse solves to bring a labelling to its optimum.
+        trial_solves: the same while other noise, or flips of single labels, are tried.
         settling_solves: the same while labels are probabilities.
-        converged: what lowers F by less than so many nats, a step or other noise, is no movement.
-        flip_rounds: batches of single flips.
-        annealing_factor: by how much the loss of graduated non-convexity is sharpened from solve to solve.
-        robust_solves: of the ℓ½ start.
-        alike: starts are gone on from until so many end in the mode of least F.
-        tried: moves that are tried, at most.
-        slack: a move is tried if F is predicted to rise by no more than this, nats.
-        rival: modes within so many nats of the best are moved on from.
-        slips: places for a slip that are looked at.
-        window: false closures before (and after) one that it is compared with.
-        averaged: labellings that are averaged, at most.
+        converged: nats; a step or change of noise that lowers F by less counts as converged.
+        flip_rounds: maximum number of batches of single flips.
+        annealing_factor: factor by which the loss of graduated non-convexity is sharpened from solve to solve.
+        robust_solves: number of solves of the ℓ½ start.
+        alike: further starts are tried until this many end in the mode of least F.
+        tried: maximum number of moves that are tried.
+        slack: nats; a move is tried if F is predicted to rise by no more than this.
+        rival: nats; moves are also tried from modes whose F is within this of the best.
+        slips: number of places that are examined for a slip.
+        window: number of false closures before (and after) one with which it is compared.
+        averaged: maximum number of labellings that are averaged.
     """
 
     polish_solves: int = 20

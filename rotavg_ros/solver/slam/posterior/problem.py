@@ -1,4 +1,4 @@
-"""What stays the same while labels, noise and orientations change: the graph, its runs of closures, what is told."""
+"""What stays fixed while labels, noise and orientations change: the graph, its runs of closures, prior log-odds."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from rotavg_ros.solver.slam.posterior.state import RUN_STEPS, Noise
 from rotavg_ros.solver.slam.posterior.system import NormalEquations
 from rotavg_ros.solver.slam.preparation import Prepared
 
-# A share that is none; the logarithm stays finite.
+# Stands for a share of zero; its logarithm is finite.
 _NONE = 1e-12
-# Turns that differ by less, relative, tell nothing of what they do.
+# Turns that differ relatively by less do not let their effect be estimated.
 _SAME_TURNS = 0.1
 
 
@@ -34,16 +34,17 @@ class Problem:
     Attributes:
         graph: the closure graph.
         components: k, 1 where all rotations share an axis, else 3.
-        log_odds: ``(E,)`` of each edge to be good by networks and labels, beyond what is common to all; ±inf decide.
-        chain: ``(C,)`` number of the chain of closures, each near the next, that each is one of.
-        follows: ``(C,)`` the nearest closure that was detected before and is near enough for the same label, or -1.
-        priors: all that is believed beforehand.
-        limits: of the search.
+        log_odds: ``(E,)`` log-odds that each edge is good, by networks and labels, beyond those common to all; ±inf
+            decide.
+        chain: ``(C,)`` number of each closure's chain, in which each closure is near the next.
+        follows: ``(C,)`` the nearest closure that was detected before and is near enough to share the label, or -1.
+        priors: all prior parameters.
+        limits: limits of the search.
         without: names of terms and moves that are switched off (:data:`rotavg_ros.solver.slam.options.SWITCHES`).
-        calibrated: what was taken out of all odometry, or all closures, beforehand, if anything.
-        turned: ``(N,)`` rad², squares of the turns of odometry's steps from each node's root on; None if unknown.
-        travelled: ``(N,)`` metres of odometry from each node's root on; None if unknown.
-        relative: ``(E,)`` each edge's own variance over what noise makes of it, as FineNet has it; None: 1.
+        calibrated: the calibration that was removed from all odometry or all closures, if any.
+        turned: ``(N,)`` rad², sum of the squared turns of odometry's steps from each node's root; None if unknown.
+        travelled: ``(N,)`` metres of odometry from each node's root; None if unknown.
+        relative: ``(E,)`` each edge's own variance by FineNet over that by the noise model; None: 1.
     """
 
     graph: ClosureGraph
@@ -74,9 +75,9 @@ class Problem:
         """Find the chains of closures that follow each other closely.
 
         Args:
-            prepared: the graph drawn together, with its neighbouring closures.
-            log_odds: ``(E,)`` of each edge by itself. A network judges the closures of a run by the same evidence, so
-                that together they count once.
+            prepared: the contracted graph, with its neighbouring closures.
+            log_odds: ``(E,)`` log-odds of each edge by itself. A network judges the closures of a run by the same
+                evidence, so that all closures of a run together count once.
         """
         priors = SlamPriors() if priors is None else priors
         graph, pairs, components = prepared.closure_graph, prepared.pairs, prepared.noise.components
@@ -103,14 +104,14 @@ class Problem:
         )
 
     def with_relative(self, relative: np.ndarray) -> Problem:
-        """The same, but for ``relative`` ``(E,)`` times the variances; what is known of the pattern is shared."""
+        """The same problem with variances multiplied by ``relative`` ``(E,)``; the sparsity patterns are shared."""
         other = copy.copy(self)
         object.__setattr__(other, "relative", relative)
         return other
 
     @cached_property
     def closure(self) -> np.ndarray:
-        """``(C,)`` edges."""
+        """``(C,)`` edges that are closures."""
         return np.flatnonzero(self.graph.is_closure)
 
     @cached_property
@@ -124,12 +125,12 @@ class Problem:
         return np.ascontiguousarray(self.graph.residual.numpy().T)
 
     def body_from_world(self, correction: np.ndarray) -> np.ndarray:
-        """``(K, 3, 3)``, of key nodes under corrections ``(4, K)``."""
+        """``(K, 3, 3)`` orientations of key nodes under corrections ``(4, K)``."""
         return quaternion_rows.matrices(quaternion_rows.multiply(self._body_from_world, correction))
 
     @cached_property
     def _body_from_world(self) -> np.ndarray:
-        """``(4, K)`` of key nodes by odometry."""
+        """``(4, K)`` orientations of key nodes by odometry."""
         return np.ascontiguousarray(self.graph.odometry_orientation.numpy()[self.graph.nodes].T)
 
     @cached_property
@@ -139,17 +140,17 @@ class Problem:
 
     @cached_property
     def detection(self) -> np.ndarray:
-        """``(C,)`` closures in the order in which they were detected, that of their newer ends."""
+        """``(C,)`` closures in the order of their detection, which is that of their newer ends."""
         return _detection(self.ends)
 
     @cached_property
     def detected(self) -> np.ndarray:
-        """``(C,)`` when each was detected, as a rank."""
+        """``(C,)`` rank of each closure in the order of detection."""
         return np.argsort(self.detection)
 
     @cached_property
     def preceded(self) -> np.ndarray:
-        """``(C,)`` the closure that was detected last before each, if shortly before, else -1."""
+        """``(C,)`` the closure detected immediately before each, if it was shortly before, else -1."""
         newer = self.ends[self.detection, 1]
         is_near = np.diff(newer) <= self.priors.run_gap_steps
         preceded = np.full(len(newer), -1, dtype=np.int64)
@@ -171,7 +172,7 @@ class Problem:
 
     @cached_property
     def upright(self) -> Vertical | None:
-        """The vertical that the robot keeps, in space; None if it keeps none, or several robots differ in it."""
+        """The vertical about which the robot stays upright; None if there is none, or several robots differ in it."""
         return None if self.components == 1 else Vertical.of(self.graph.odometry_orientation)
 
     @property
@@ -181,11 +182,11 @@ class Problem:
 
     @cached_property
     def run(self) -> np.ndarray:
-        """``(C,)`` number of the run of each closure, none of them longer than any run."""
+        """``(C,)`` number of each closure's run, for the largest length of runs."""
         return runs_of(self.graph, self.chain, RUN_STEPS[-1])
 
     def system(self, noise: Noise) -> NormalEquations:
-        """Normal equations; runs of two and more closures have a common error."""
+        """Normal equations; runs of two or more closures have a common error."""
         if noise.run_steps not in self._systems:
             self._systems[noise.run_steps] = self._system(noise.run_steps)
         return self._systems[noise.run_steps]
@@ -211,18 +212,18 @@ class Problem:
 
     @cached_property
     def total_steps(self) -> float:
-        """Of all odometry."""
+        """Number of steps of all odometry."""
         return float(self.graph.own_steps[self.graph.is_odometry].sum())
 
     @cached_property
     def _passed(self) -> np.ndarray:
-        """``(3, N)`` steps of odometry from each node's root on; as many in all, by the squares of turns, by metres."""
+        """``(3, N)`` steps of odometry from each node's root: by number, by squared turns, by metres; equal in total."""
         steps = np.asarray(self.graph.paths.depth, dtype=np.float64)
         turned = None if "turns" in self.without else self.turned
         return np.stack((steps, self._as_steps(turned), self._as_steps(self.travelled)))
 
     def _as_steps(self, passed: np.ndarray | None) -> np.ndarray:
-        """``(N,)`` of what was passed from the root on, all of odometry as long as its steps; these if unknown."""
+        """``(N,)`` what was passed from the root, scaled to the total number of steps; the steps if it is unknown."""
         graph = self.graph
         steps = np.asarray(graph.paths.depth, dtype=np.float64)
         if passed is None:
@@ -234,12 +235,12 @@ class Problem:
 
     @cached_property
     def turn_steps(self) -> np.ndarray:
-        """``(E,)`` as many steps in all, shared out among segments by the squares of their turns."""
+        """``(E,)`` the same total of steps, distributed over segments by their squared turns."""
         return self._of_segments(1)
 
     @cached_property
     def length_steps(self) -> np.ndarray:
-        """``(E,)`` as many steps in all, shared out among segments by the metres that they pass."""
+        """``(E,)`` the same total of steps, distributed over segments by their lengths in metres."""
         return self._of_segments(2)
 
     def _of_segments(self, row: int) -> np.ndarray:
@@ -251,13 +252,13 @@ class Problem:
         return np.asarray(steps)
 
     def drawn(self, noise: Noise) -> ClosureGraph:
-        """The graph whose nodes lie along their segments as odometry's variance does under ``noise``."""
+        """The graph with nodes placed along their segments in proportion to odometry's variance under ``noise``."""
         steps, turns, _ = self._passed
         drawn = self.graph if noise.turn_share == 0 else self.graph.passing(steps + noise.turn_share * (turns - steps))
         return drawn if self.relative is None else drawn.varying(self.relative)
 
     def by_turns(self, noise: Noise) -> np.ndarray:
-        """``(M,)`` how much of the variance of odometry's edges goes by the squares of their turns under ``noise``."""
+        """``(M,)`` part of odometry's edge variances that is proportional to squared turns under ``noise``."""
         forest, share = self.graph.paths.forest, noise.turn_share
         out = np.zeros(len(self.graph.segment_of_edge))
         if share == 0:
@@ -270,13 +271,13 @@ class Problem:
 
     @cached_property
     def turns_vary(self) -> bool:
-        """Whether some odometry turns more than other."""
+        """Whether some parts of odometry turn more than others."""
         odometry = self.graph.is_odometry
         return not np.allclose(self.turn_steps[odometry], self.graph.own_steps[odometry], rtol=_SAME_TURNS)
 
 
 def _chains(graph: ClosureGraph, pairs: AgreementPairs, priors: SlamPriors) -> np.ndarray:
-    """``(C,)`` number of the chain of closures that each is one of."""
+    """``(C,)`` number of the chain that each closure belongs to."""
     count = int(graph.is_closure.sum())
     linked = pairs.steps <= priors.run_gap_steps
     links = coo_array((np.ones(int(linked.sum())), (pairs.first[linked], pairs.second[linked])), shape=(count,) * 2)
@@ -284,7 +285,7 @@ def _chains(graph: ClosureGraph, pairs: AgreementPairs, priors: SlamPriors) -> n
 
 
 def runs_of(graph: ClosureGraph, chain: np.ndarray, run_steps: float) -> np.ndarray:
-    """``(C,)`` number of each closure's run: its chain, cut at the older end after every ``run_steps`` of odometry."""
+    """``(C,)`` number of each closure's run: its chain, cut every ``run_steps`` of odometry at the older end."""
     older = closure_ends(graph, np.flatnonzero(graph.is_closure))[:, 0]
     start = np.full(int(chain.max(initial=-1)) + 1, np.inf)
     np.minimum.at(start, chain, older)
@@ -297,7 +298,7 @@ def _detection(ends: np.ndarray) -> np.ndarray:
 
 
 def _predecessors(graph: ClosureGraph, pairs: AgreementPairs, priors: SlamPriors) -> np.ndarray:
-    """``(C,)`` the nearest earlier closure whose ends are near both ends of each, or -1."""
+    """``(C,)`` the nearest earlier closure whose two ends are near those of each closure, or -1."""
     closure = np.flatnonzero(graph.is_closure)
     follows = np.full(len(closure), -1, dtype=np.int64)
     if len(pairs.first) == 0:

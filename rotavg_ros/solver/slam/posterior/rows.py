@@ -14,19 +14,19 @@ from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.state import Noise, Others, State
 from rotavg_ros.solver.slam.posterior.system import Factorised
 
-# What a false closure weighs, of a good one: nothing, but the system stays solvable.
+# Weight of a false closure relative to a good one: negligible, but the system stays solvable.
 _NOTHING = 1e-10
-# What is left of an edge without itself, at least; one that alone holds two parts together tells nothing of them.
+# Floor of 1 − w R; it vanishes for an edge that alone connects two parts.
 _LEAST_REST = 1e-6
-# Odometry errs by far more than usual for so many steps at most: a bump, a stretch of uneven floor. Without a bound a
-# slip of half a turn in a long segment passes for drift.
+# Largest number of consecutive steps with far larger errors: a bump, a stretch of uneven floor. Without this bound a
+# slip of half a turn in a long segment would pass for drift.
 _LONGEST_STRETCH = 30.0
-# A step turns nothing by more than this, rad; beyond, the linear system says nothing.
+# Largest turn of a node in one step, rad; the linear system is not valid beyond it.
 _MAX_TURN = 1.0
 
 
 def variances(problem: Problem, noise: Noise) -> np.ndarray:
-    """``(E + R,)`` rad² of every row's own noise if it is good; of closures, what their run does not share."""
+    """``(E + R,)`` rad² of every row's own noise if it is good; for closures, without the part shared by their run."""
     graph, system = problem.graph, problem.system(noise)
     steps = graph.own_steps + noise.turn_share * (problem.turn_steps - graph.own_steps)
     variance = steps * noise.step_variance
@@ -40,7 +40,7 @@ def variances(problem: Problem, noise: Noise) -> np.ndarray:
 
 
 def tails(problem: Problem, noise: Noise) -> Tails:
-    """Of each of E edges, the tails of its kind if it is good; of a long segment some steps err by more, not all."""
+    """Tails of each of E edges if it is good, by its kind; in a long segment only some steps err by more."""
     is_odometry = problem.graph.is_odometry
     share = np.minimum(1.0, _LONGEST_STRETCH / np.maximum(problem.graph.own_steps, 1.0))
     return Tails(
@@ -51,7 +51,7 @@ def tails(problem: Problem, noise: Noise) -> Tails:
 
 
 def residuals(problem: Problem, state: State) -> np.ndarray:
-    """``(E + R, 3)`` rad, of all rows."""
+    """``(E + R, 3)`` rad, residuals of all rows."""
     graph, system = problem.graph, problem.system(state.noise)
     vectors = quaternion_rows.residual_vectors(state.correction, problem.measured, graph.source, graph.target)
     edges = np.flatnonzero(system.shared)
@@ -60,7 +60,7 @@ def residuals(problem: Problem, state: State) -> np.ndarray:
 
 
 def with_noise(problem: Problem, state: State, noise: Noise) -> State:
-    """The state under another θ; where runs are other ones their common errors begin at zero."""
+    """The state under another θ; if the runs change, their common errors begin at zero."""
     if noise.run_steps == state.noise.run_steps:
         return replace(state, noise=noise)
     return replace(state, noise=noise, common=np.zeros((problem.system(noise).num_runs, 3)))
@@ -75,11 +75,11 @@ def moved(state: State, step: np.ndarray) -> State:
 
 
 def sites(problem: Problem, state: State, residual: np.ndarray, variance: np.ndarray) -> Sites:
-    """Of all edges, with what others said of them in the last solve.
+    """Sites of all edges, with the predictions by all others from the last solve.
 
     Args:
         problem: the graph.
-        state: after that solve.
+        state: the state after that solve.
         residual: ``(E + R, 3)`` rad.
         variance: ``(E + R,)`` rad² of :func:`variances`.
     """
@@ -91,9 +91,9 @@ def sites(problem: Problem, state: State, residual: np.ndarray, variance: np.nda
 
 
 def weights_if_good(state: State, own: np.ndarray, site: Sites) -> np.ndarray:
-    """``(E,)`` rad⁻²: from the last ones (those of normal noise before any) halfway to those of the sites.
+    """``(E,)`` rad⁻²: halfway, in the logarithm, from the last weights (initially those of normal noise) to the sites'.
 
-    Edges that answer each other would swing between two answers without end. Halfway in the logarithm.
+    Otherwise edges that depend on each other could alternate between two answers forever.
     """
     return np.asarray(np.sqrt(state.others.relative / own * site.weight))
 
@@ -107,18 +107,18 @@ def with_others(
     *,
     all_rows: bool = True,
 ) -> State:
-    """The state after a solve, with what that tells of each edge from all others.
+    """The state after a solve, with the prediction of each edge by all others.
 
-    That is taken together with what holds of any edge: its residual is a rotation. So of one that alone holds two parts
-    together nothing is told, and nothing speaks against it.
+    The prediction is combined with the fact that a residual is a rotation. So an edge that alone connects two parts has
+    no informative prediction, and nothing contradicts it.
 
     Args:
-        state: before.
+        state: the state before.
         factorised: H of the solve.
-        if_good: ``(E,)`` rad⁻², what edges weighed in it as good ones.
+        if_good: ``(E,)`` rad⁻², weights of the edges in it as good ones.
         own: ``(E,)`` rad², their variances.
         components: k.
-        all_rows: of those that weigh nothing, too; else what was told of these stays.
+        all_rows: also update rows of no weight; otherwise these keep their predictions.
     """
     resistance = (factorised.resistance if all_rows else factorised.resistance_of_kept)[: len(own)]
     rest = np.maximum(1 - factorised.weight[: len(own)] * resistance, _LEAST_REST)
@@ -135,14 +135,15 @@ def with_others(
 def weights(problem: Problem, state: State, good: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """``(E + R,)`` rad⁻² of all rows.
 
-    Where a label is a probability P, the residual comes out as it would in the mean over both labels: of what all
-    others say of it, with variance p, a weight w leaves 1 / (1 + w p). So an edge that is good with one in four moves
-    what it alone tells of by a quarter of what it would as a good one, while P w would move it nearly as far.
+    Where a label is a probability P, the weight makes the residual equal to its mean over both labels: if all others
+    predict it with variance p, a weight w leaves the share 1 / (1 + w p) of the discrepancy. So an edge that is good
+    with probability ¼ moves what it alone determines by a quarter of what it would as a good edge. The weight P w would
+    move it nearly as far as a good edge does.
 
     Args:
         problem: the graph.
         state: labels.
-        good: ``(E,)`` rad⁻², of edges as good ones.
+        good: ``(E,)`` rad⁻², weights of the edges as good ones.
         variance: ``(E + R,)`` rad² of :func:`variances`.
     """
     num_edges = len(problem.graph.source)
@@ -155,9 +156,9 @@ def weights(problem: Problem, state: State, good: np.ndarray, variance: np.ndarr
 
 
 def _bridged(problem: Problem, state: State, weight: np.ndarray) -> np.ndarray:
-    """Weights ``(E,)`` with which parts that false closures alone connect are held by one edge each.
+    """Weights ``(E,)`` in which each part that only false closures connect is held by one edge.
 
-    A part that nothing holds may be turned by anything; a normal density of the same volume stands for that.
+    A part that nothing holds may be turned by any rotation; a normal density of the same volume replaces the uniform.
     """
     if problem.is_held:
         return weight
@@ -171,7 +172,7 @@ def _bridged(problem: Problem, state: State, weight: np.ndarray) -> np.ndarray:
     loose = np.flatnonzero(~holds)
     low, high = np.sort(np.stack((part[graph.source[loose]], part[graph.target[loose]])), axis=0)
     between, first = np.unique(low * parts + high, return_index=True)
-    # Which of several edges between two parts it is makes no difference.
+    # It makes no difference which of several edges between two parts is used.
     bridges = coo_array((1.0 + np.arange(len(between)), np.divmod(between, parts)), shape=(parts, parts))
     chosen = minimum_spanning_tree(bridges.tocsr()).data.astype(np.int64) - 1
     weight = weight.copy()

@@ -1,4 +1,4 @@
-"""A robot's graph by its posterior: starts and moves, with what all measurements have wrong alike or without it."""
+"""Searches the posterior of a robot's graph, with and without corrections of systematic errors (calibration)."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ from rotavg_ros.solver.slam.preparation import Prepared, likely_bias, prepare_as
 from rotavg_ros.solver.slam.stages import CleanedClosures, clean
 from rotavg_ros.view_graph import ViewGraph
 
-# A part of the calibration is made better so many times at most, as long as F falls by more than this, nats.
+# Maximum number of rounds that improve a part of the calibration, and the least decrease of F, nats, for another round.
 _ROUNDS, _LEAST_GAIN = 8, 0.5
-# A mounting that makes all likelier by so many nats is worth a word.
+# A mounting that lowers F by this many nats is reported.
 _SUSPICIOUS = 5.0
-# Units of work for each edge of what a problem is told beforehand.
+# Units of work per edge to prepare a problem.
 _EDGE = 0.002
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A graph drawn together, and its problem.
+    """A contracted graph and its problem.
 
     Attributes:
-        prepared: without what all measurements have wrong alike, if anything.
-        cleaned: what CleanNet says of its closures.
-        problem: the posterior's view of it.
+        prepared: the contracted graph, after systematic errors were removed, if any.
+        cleaned: CleanNet's verdict on its closures.
+        problem: the problem that the posterior is defined on.
     """
 
     prepared: Prepared
@@ -61,9 +61,9 @@ class Drawn:
         priors: SlamPriors | None = None,
         components: int | None = None,
     ) -> Drawn:
-        """After what all have wrong alike is taken out of the measurements, if that is anything.
+        """Contracts the graph after the calibration, if any, is removed from the measurements.
 
-        Components: k, if it is to be another than that of the rotations that are left.
+        ``components`` is k, if it is to differ from that of the corrected rotations.
         """
         corrected = calibrated(graph, calibration)
         prepared = prepare_as_it_is(corrected, components)
@@ -86,12 +86,12 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Found:
-    """What the search found, the least F first.
+    """What the search found.
 
     Attributes:
-        drawn: without what was taken out of all measurements of a kind, if anything was.
-        modes: of it.
-        suspected: ``(3,)`` rad, by which closures and odometry seem to have other axes, if either may be why.
+        drawn: the contracted graph, after the calibration was removed, if any.
+        modes: its modes, in order of increasing F.
+        suspected: ``(3,)`` rad, apparent rotation between the axes of closures and odometry, if either may be wrong.
     """
 
     drawn: Drawn
@@ -105,18 +105,18 @@ class Found:
 
     @property
     def calibration(self) -> Calibration | None:
-        """What was taken out of all measurements of a kind, if anything was."""
+        """The calibration that was removed from the measurements, if any."""
         taken_out = self.drawn.problem.calibrated
         return None if taken_out is None else taken_out.calibration
 
     @property
     def mounting(self) -> np.ndarray:
-        """``(3,)`` rad that was taken out of closures."""
+        """``(3,)`` rad, the mounting error that was removed from closures."""
         return np.zeros(3) if self.calibration is None else self.calibration.mounting
 
     @property
     def is_mounted_nearby(self) -> bool:
-        """Whether what was taken out of closures may as well be odometry's fault."""
+        """Whether the mounting error removed from closures may as well be an error of odometry."""
         near = np.radians(self.drawn.problem.priors.closure_deg)
         return bool(self.mounting.any()) and is_about_as_said(self.mounting, near)
 
@@ -131,41 +131,42 @@ def search(
     without: Collection[str] = (),
     priors: SlamPriors | None = None,
 ) -> Found:
-    """The labellings of least F of a graph that states nothing twice.
+    """The labellings of least F of a graph without repeated edges.
 
     Args:
         graph: N nodes.
-        network: CleanNet, or None without it.
-        begin: corrections ``(K, 4)`` to begin with: along CleanNet's tree, or of an earlier answer.
+        network: CleanNet, or None to do without it.
+        begin: function that gives the corrections ``(K, 4)`` to begin with: along CleanNet's tree, or of an earlier
+            answer.
         without: terms and moves that are switched off.
-        priors: other ones than usual.
+        priors: default: the usual ones.
     """
     solver = _Solver(graph, network, begin, without, priors)
     as_said = solver.from_starts(None)
     likely = {part: solver.likely(as_said, part) for part in PARTS if part not in without}
     found, suspected = solver.with_parts(as_said, likely), None
     if found.is_mounted_nearby:
-        # It may as well be odometry's fault.
+        # It may as well be an error of odometry.
         mounted = found
         found = solver.with_parts(as_said, {part: each for part, each in likely.items() if part != "mounting"})
         if mounted.cost < found.cost - _SUSPICIOUS and np.linalg.norm(mounted.mounting) > ALIKE:
             suspected = mounted.mounting
     left = calibrated(graph, found.calibration)
     if left.rotation_components < graph.rotation_components:
-        # What is left turns about one axis, and so it errs.
+        # After the correction all rotations, and so their errors, are about one axis.
         found = solver.from_starts(found.calibration, left.rotation_components)
     return replace(found, suspected=suspected)
 
 
 class _Predicted(NamedTuple):
-    """By how many nats F changes with another calibration, as far as a Newton step tells."""
+    """Change of F, nats, that a Newton step predicts for another calibration."""
 
     cost: float
     calibration: Calibration
 
 
 class _Solver(NamedTuple):
-    """What :func:`search` is given."""
+    """The arguments of :func:`search`."""
 
     graph: ViewGraph
     network: SlamCleanNet | None
@@ -174,31 +175,31 @@ class _Solver(NamedTuple):
     priors: SlamPriors | None
 
     def from_starts(self, calibration: Calibration | None, components: int | None = None) -> Found:
-        """What is found from all starts after a calibration is taken out; k is the graph's, if nothing else is said."""
+        """Result from all starts after a calibration is removed; by default k is that of the graph."""
         drawn = self._drawn(calibration, components)
         begun = Search(drawn.problem)
         begun.run(drawn.prepared, drawn.cleaned, self.begin(drawn.prepared, drawn.cleaned))
         return Found(drawn, begun.modes)
 
     def likely(self, found: Found, part: str) -> list[Found]:
-        """What is found from all starts with one more part of the calibration, which closures beside odometry tell."""
+        """Results from all starts with one more part of the calibration, as likely from closures beside odometry."""
         before = found.calibration or Calibration.none()
         values = _likely(part, before.taken_out_of(self.graph), found.drawn.prepared)
         return [self.from_starts(replace(before, **{part: value})) for value in values]
 
     def with_parts(self, as_said: Found, likely: dict[str, list[Found]]) -> Found:
-        """What is found with some parts of the calibration or without them, from what is likely of each on."""
+        """The best result with some or no parts of the calibration, starting from the likely values of each."""
         if not likely:
             return as_said
         begun = min([as_said, *(each for of_part in likely.values() for each in of_part)], key=attrgetter("cost"))
         found = self.one_by_one(begun, likely)
         if begun is not as_said and found.calibration is not None and found.calibration.parts == set(likely):
-            # What one part explains, another may, too.
+            # What one part explains, another may explain as well.
             found = min(found, self.one_by_one(as_said, likely), key=attrgetter("cost"))
         return found
 
     def one_by_one(self, found: Found, parts: Collection[str]) -> Found:
-        """What is found by Newton's steps on more and more parts, the one that promises more first."""
+        """Result of Newton steps on one part after the other, the most promising first."""
         ordered = sorted(parts, key=lambda part: (self.predicted(found, part).cost, part))
         for part in ordered:
             found = self.with_part(found, part)
@@ -207,9 +208,9 @@ class _Solver(NamedTuple):
         return found
 
     def with_part(self, found: Found, part: str) -> Found:
-        """What is found with one more part of the calibration by Newton's steps.
+        """Result of Newton steps with one more part of the calibration.
 
-        Closures that another part was taken out of may speak of this one otherwise than before.
+        After another part was removed, closures may give a different estimate of this one.
         """
         if found.calibration is not None and part not in found.calibration.parts:
             found = min([found, *self.likely(found, part)], key=attrgetter("cost"))
@@ -221,7 +222,7 @@ class _Solver(NamedTuple):
         return found
 
     def predicted(self, found: Found, part: str) -> _Predicted:
-        """Newton's step from the best mode, on what is calibrated and one part more."""
+        """A Newton step from the best mode, on the parts already calibrated and one more."""
         best, before = found.modes[0], found.calibration or Calibration.none()
         problem, evaluation = best.problem, best.evaluation
         prepared, parts = found.drawn.prepared, {part, *before.parts}
@@ -233,7 +234,7 @@ class _Solver(NamedTuple):
         return _Predicted(cost - float(change @ information @ change) / 2, before.moved(change @ tried.axes))
 
     def _better(self, found: Found, part: str) -> Found | None:
-        """What is found from the best mode after that step, if F falls."""
+        """Result of a search from the best mode after that step, if F falls."""
         cost, calibration = self.predicted(found, part)
         if cost > -_LEAST_GAIN or (part == "mounting" and np.linalg.norm(calibration.mounting) < ALIKE):
             return None
@@ -246,15 +247,15 @@ class _Solver(NamedTuple):
         return better if better.cost < found.cost - _LEAST_GAIN else None
 
     def _drawn(self, calibration: Calibration | None, components: int | None = None) -> Drawn:
-        """F is compared with what is found without, so that k stays whatever C leaves."""
+        """The graph contracted with a calibration. F is compared with that without one, so k is kept by default."""
         k = components or self.graph.rotation_components
         return Drawn.of(self.graph, self.network, self.without, calibration, self.priors, k)
 
 
 def _likely(part: str, graph: ViewGraph, prepared: Prepared) -> list[np.ndarray]:
-    """``(3,)`` each, what closures beside odometry make of a part that nothing was taken out of yet."""
+    """Likely values ``(3,)`` of a part that was not calibrated yet, from closures beside odometry."""
     if part == "mounting":
-        # Where all that is measured turns about one axis, an upside-down sensor is what inverted closures look like.
+        # If all measurements are about one axis, inverted closures are indistinguishable from an upside-down sensor.
         if prepared.noise.components == 1 or not may_be_told(graph):
             return []
         return between_axes(graph) or estimate_mountings(graph, prepared.closure_graph, prepared.noise)
@@ -263,7 +264,7 @@ def _likely(part: str, graph: ViewGraph, prepared: Prepared) -> list[np.ndarray]
 
 
 def _travelled(graph: ViewGraph, prepared: Prepared) -> np.ndarray | None:
-    """``(N,)`` metres of odometry from each node's root on; None unless all of it is known."""
+    """``(N,)`` metres of odometry from each node's root; None unless all are known."""
     if graph.translation is None:
         return None
     length = torch.from_numpy(ways_passed(graph.translation.double().numpy(), way_along(graph)))
@@ -273,12 +274,12 @@ def _travelled(graph: ViewGraph, prepared: Prepared) -> np.ndarray | None:
 
 
 def _from_root(of_edge: Tensor, prepared: Prepared) -> np.ndarray:
-    """``(N,)`` sums of values ``(M,)`` of edges along the forest, from each node's root on."""
+    """``(N,)`` sums of the edges' values ``(M,)`` along the forest, from each node's root."""
     parent_edge = prepared.forest.parent_edge
     return accumulate_to_root(prepared.forest, np.where(parent_edge >= 0, of_edge.double().numpy()[parent_edge], 0.0))
 
 
 def _moved(mode: Mode, before: Drawn, after: Drawn) -> State:
-    """A mode's labels, noise and orientations on the same graph drawn together anew."""
+    """A mode's labels, noise and orientations, transferred to the same graph contracted anew."""
     correction = after.prepared.closure_graph.corrections(before.orientations(mode.state))
     return replace(mode.state, correction=np.ascontiguousarray(correction.numpy().T))

@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-# Nodes of the sums that stand for integrals over α, κ and the length of runs, in steps of odometry; with 0 closures err
+# Grids that replace integrals over α, κ and the length of runs, in steps of odometry; with 0, closures err
 # independently.
 EXPONENTS = (0.0, 0.5, 1.0)
 COMMON_SHARES = (0.15, 0.3, 0.6, 0.85)
 RUN_STEPS = (0.0, 20.0, 60.0)
-# … and over the share of odometry's variance that goes with how far it turns: half at most, since with
-# more F falls on B25b while its error grows.
+# … and over the share of odometry's variance that is proportional to its squared turns: at most half, since with more
+# F falls on B25b while its error grows.
 TURN_SHARES = (0.0, 0.5)
-# … and over the share of edges of a kind that are in its tails, and by how many times the variance odometry's are: a
-# floor that is a little uneven, or a bump.
+# … and over the share of edges of a kind in its tails, and the factor of the variance in odometry's tails: from a
+# slightly uneven floor to a bump.
 TAIL_SHARES = (0.0, 0.02, 0.1, 0.3)
 STEP_TAIL_RATIOS = (16.0, 64.0, 256.0)
 
@@ -26,14 +26,14 @@ class Noise:
 
     Attributes:
         step_variance: rad² per component, of one step of odometry.
-        closure_variance: rad² per component, of a good closure that states what is typical.
+        closure_variance: rad² per component, of a good closure whose stated variance is typical.
         exponent: α, how far the ratios of stated variances are believed.
         common_share: κ, share of a closure's error variance that its run has in common.
-        turn_share: share of odometry's variance that goes with the squares of the turns of its steps, not their number.
+        turn_share: share of odometry's variance proportional to the squared turns of its steps, not to their number.
         step_tails, closure_tails: share of sound segments, and of good closures, that err by far more than others.
-        step_tail_ratio: τ, how many times the variance of other segments those have.
+        step_tail_ratio: τ, variance of these segments relative to the others.
         step_told: φ, k_eff / k of odometry, 1 where it errs alike about all axes (estimated with the variances).
-        run_steps: no run is longer at its older end, in steps of odometry; 0 where closures err independently.
+        run_steps: largest length of a run at its older end, in steps of odometry; 0 where closures err independently.
     """
 
     step_variance: float
@@ -49,24 +49,24 @@ class Noise:
 
     @property
     def is_possible(self) -> bool:
-        """Whether it is one, where it comes from a file."""
+        """Whether the values are valid, for noise read from a file."""
         variances = self.step_variance, self.closure_variance, self.step_tail_ratio, self.step_told
         shares = self.common_share, self.turn_share, self.step_tails, self.closure_tails
         return min(variances) > 0 and max(shares) < 1
 
     def chosen_as(self, other: Noise) -> Noise:
-        """What residuals told of the one with what another one has chosen from grids."""
+        """The own values that are estimated from residuals, with another noise's values that are chosen from grids."""
         told = {name: getattr(self, name) for name in ("step_variance", "closure_variance", "step_told")}
         return replace(other, **told)
 
     @property
     def log_ratio(self) -> float:
-        """Logarithm of a step's variance over a closure's: how far odometry bends before closures do."""
+        """Logarithm of a step's variance over a closure's: how far odometry yields before closures do."""
         return float(np.log(self.step_variance / self.closure_variance))
 
     @property
     def chosen(self) -> tuple[float, ...]:
-        """What is chosen from grids: α, κ, the length of runs, the share that goes with turns, and tails."""
+        """Values chosen from grids: α, κ, the length of runs, the share that goes with turns, and tails."""
         return (
             self.exponent,
             self.common_share,
@@ -80,12 +80,12 @@ class Noise:
 
 @dataclass(frozen=True)
 class Others:
-    """What all other edges say of the residual of each of E.
+    """Prediction of each edge's residual by all others (E edges).
 
     Attributes:
-        rest: ``(E,)`` what the edge itself leaves of that, 1 − w R.
-        predicted: ``(E,)`` rad², its variance.
-        relative: ``(E,)`` what the edge weighed as a good one, times its variance.
+        rest: ``(E,)`` residual after the solve over the discrepancy with that prediction, 1 − w R.
+        predicted: ``(E,)`` rad², variance of the prediction.
+        relative: ``(E,)`` the edge's weight as a good one, times its variance.
     """
 
     rest: np.ndarray
@@ -94,20 +94,21 @@ class Others:
 
     @classmethod
     def before_any(cls, num_edges: int) -> Others:
-        """Before any solve: residuals are what others say, and all noise is normal."""
+        """Before any solve: residuals are the discrepancies, and all noise is normal."""
         return cls(np.ones(num_edges), np.zeros(num_edges), np.ones(num_edges))
 
 
 @dataclass(frozen=True)
 class State:
-    """Of a problem (K key nodes, R runs, E edges).
+    """A state of a problem (K key nodes, R runs, E edges).
 
     Attributes:
         correction: ``(4, K)`` C, world-frame corrections of the odometry's orientations.
         common: ``(R, 3)`` common errors of runs, rad.
-        trusted: ``(E,)`` 1 for good closures and sound segments, 0 for others; between while labels are probabilities.
+        trusted: ``(E,)`` 1 for good closures and sound segments, 0 for others; in between while labels are
+            probabilities.
         noise: θ.
-        others: what all other edges said of each in the last solve.
+        others: prediction of each edge by all others in the last solve.
     """
 
     correction: np.ndarray

@@ -1,8 +1,8 @@
 """The sparse system of the posterior: normal equations of edges between key nodes that may share a common error.
 
-Row e of J says  C_target − C_source + b = r_e,  b the common error of its run; a run's error has a row of its own with
-residual 0, its prior. H = Jᵀ W J is factorised once for each choice of weights and gives corrections, log det H and
-what everything else predicts of a row.
+Row e of J says  C_target − C_source + b = r_e,  with b the common error of its run. A run's error has a row of its own
+with residual 0, its prior. H = Jᵀ W J is factorised once for each choice of weights. It gives corrections, log det H
+and the prediction of each row by all others.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from rotavg_ros.solver.algebra.sparse.ldl import LDL, RowPattern
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.running.work import ENTRIES, rest, spend, stop_if_abandoned
 
-# Rows that weigh less than this share of the heaviest one are nothing.
+# Rows that weigh less than this share of the heaviest one are left out.
 _NO_WEIGHT = 1e-9
-# So many patterns of rows are kept. One that lacks no more than this share of another's rows, and has so many more at
-# most, is eliminated in the same order: what is lacking fills nothing in, what is more may fill in much.
+# Number of row patterns that are kept. A pattern reuses another's elimination order if it lacks at most this share of
+# its rows and has at most this many rows more: missing rows cause no fill-in, additional ones may cause much.
 _MAX_PATTERNS, _LACKING, _MORE = 8, 0.02, 3
 _MAX_LEVERAGE = 1 - 1e-6
 
@@ -33,8 +33,8 @@ class NormalEquations:
         num_nodes: K.
         source, target: ``(E,)`` key nodes.
         run: ``(E,)`` column of the common error in 0 … R − 1, or -1.
-        sign: ``(E,)`` ±1, the direction in which an edge has it.
-        roots: key nodes that stay where they are.
+        sign: ``(E,)`` ±1, sign of the common error in each edge.
+        roots: key nodes that are held fixed.
     """
 
     def __init__(
@@ -82,18 +82,18 @@ class NormalEquations:
         return Factorised(self, weight, pattern, factor, len(self.roots) * np.log(stiffness))
 
     def _pattern(self, weight: np.ndarray) -> _Pattern:
-        """Of the rows that weigh anything: others fill the factor of a graph with many false closures for nothing."""
+        """The pattern of rows of non-zero weight; with many false closures, the others would only add fill-in."""
         counts = weight > _NO_WEIGHT * weight.max(initial=0.0)
         key = np.packbits(counts).tobytes()
         if key not in self._patterns:
             if len(self._patterns) == _MAX_PATTERNS:
                 del self._patterns[next(iter(self._patterns))]
-            # Where nothing else holds a part together, next to nothing does.
+            # If the kept rows leave a part loose, all rows are used, even those of negligible weight.
             self._patterns[key] = self._laid_out(counts if self._is_held(counts) else self._whole)
         return self._patterns[key]
 
     def _laid_out(self, counts: np.ndarray) -> _Pattern:
-        """The pattern of some rows, in the order of one that has about the same, if there is such."""
+        """The pattern of some rows, in the elimination order of a similar one if there is any."""
         alike = next((other for other in self._ordered if _is_eliminated_alike(counts, other.counts)), None)
         rank = None if alike is None else alike.rows.rank
         pattern = _Pattern(counts, RowPattern(self.column[counts], self.value[counts], self.size, rank))
@@ -110,11 +110,11 @@ class NormalEquations:
 
 
 class _Pattern(NamedTuple):
-    """Of some of the rows.
+    """The pattern of some of the rows.
 
     Attributes:
-        counts: ``(E + R,)`` bool, which.
-        rows: where H's and its factor's entries stand.
+        counts: ``(E + R,)`` bool, which rows these are.
+        rows: positions of the entries of H and its factor.
     """
 
     counts: np.ndarray
@@ -122,7 +122,7 @@ class _Pattern(NamedTuple):
 
 
 def _is_eliminated_alike(counts: np.ndarray, others: np.ndarray) -> bool:
-    """Whether some rows ``(E + R,)`` bool have little fill in the order of elimination of others."""
+    """Whether some rows ``(E + R,)`` bool cause little fill-in in the elimination order of others."""
     more, lacking = np.count_nonzero(counts & ~others), np.count_nonzero(others & ~counts)
     return bool(more <= _MORE and lacking <= _LACKING * len(counts))
 
@@ -148,7 +148,7 @@ class Factorised:
 
     @property
     def num_entries(self) -> int:
-        """Of the factor."""
+        """Number of entries of the factor."""
         return self._factor.pattern.num_factor_entries
 
     def solve(self, right_hand_side: np.ndarray) -> np.ndarray:
@@ -158,7 +158,7 @@ class Factorised:
         return self._factor.solve(right_hand_side)
 
     def fit(self, difference: np.ndarray) -> np.ndarray:
-        """Unknowns ``(K + R, k)`` that explain ``(E + R, k)`` best."""
+        """Least-squares unknowns ``(K + R, k)`` for differences ``(E + R, k)``."""
         return self.solve(self.gradient(difference))
 
     def gradient(self, difference: np.ndarray) -> np.ndarray:
@@ -172,7 +172,7 @@ class Factorised:
 
     @cached_property
     def resistance(self) -> np.ndarray:
-        """``(E + R,)`` rad², variance of what the fit says of every row."""
+        """``(E + R,)`` rad², variance of the fitted value of every row."""
         variance, left_out = self.resistance_of_kept.copy(), ~self._counts
         far = self._factor.variance_of(self.system.column[left_out], self.system.value[left_out])
         variance[left_out] = np.minimum(far, _MAX_LEVERAGE / self.weight[left_out])
@@ -180,13 +180,13 @@ class Factorised:
 
     @cached_property
     def resistance_of_kept(self) -> np.ndarray:
-        """The same, but NaN of rows that weigh nothing, which takes less time."""
+        """The same, but NaN for rows of no weight, which takes less time."""
         variance = np.full(len(self.weight), np.nan)
         variance[self._counts] = np.minimum(self._factor.row_variance, _MAX_LEVERAGE / self.weight[self._counts])
         return variance
 
     def covariance(self, rows: np.ndarray) -> np.ndarray:
-        """``(n, n)`` rad², of what the fit says of some rows."""
+        """``(n, n)`` rad², covariance of the fitted values of some rows."""
         chosen = self.system.rows[rows]
         columns = np.zeros((self.system.size, len(rows)))
         np.add.at(columns, (self.system.column[rows], np.arange(len(rows))[:, None]), self.system.value[rows])
