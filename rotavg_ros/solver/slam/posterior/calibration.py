@@ -1,15 +1,15 @@
-"""What all measurements of a kind have wrong alike: what F makes of it.
+"""The term of F for systematic errors that all measurements of a kind share.
 
-A gyroscope's bias β turns every step of odometry too far, a sensor that is mounted otherwise than said by c every
-closure (:mod:`rotavg_ros.solver.slam.noise.gyro_bias`, :mod:`rotavg_ros.solver.slam.noise.mounting`). Both are taken
-out of what was measured before the graph is drawn together. What is left of p = (β, c) turns the residual of an edge by
-D p in the world's frame, so p is a further unknown of the normal equations, with N(0, Σ) as its prior. A sensor is
-either mounted about as it is said to be, known as closures are, or anyhow; what is likelier of the two at c counts, so
-that what closures do not tell of a small c stays small. Eliminating the corrections leaves
+A gyroscope's bias β turns every step of odometry too far, and a mounting error c of the sensor affects every closure
+(:mod:`rotavg_ros.solver.slam.noise.gyro_bias`, :mod:`rotavg_ros.solver.slam.noise.mounting`). Both are removed from the
+measurements before the graph is contracted. The remainder of p = (β, c) turns the residual of an edge by D p in the
+world's frame, so p is a further unknown of the normal equations, with prior N(0, Σ). A sensor is either mounted about
+as stated, with the accuracy of a closure, or in any orientation; the likelier of the two at c is used, so that the
+components of a small c that closures do not determine stay small. Eliminating the corrections leaves
 
     S = Dᵀ W (D − J H⁻¹ Jᵀ W D) + Σ⁻¹,       −log p = ½ pᵀ Σ⁻¹ p + ½ log det Σ + ½ log det S
 
-(Laplace's method). F is with either, both or none of them, whichever is least.
+(Laplace's method). F is the least of the values with either, both or none of them.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from rotavg_ros.view_graph import ViewGraph
 
 @dataclass(frozen=True)
 class Calibrated:
-    """Of a graph with E edges.
+    """The calibration of a graph with E edges.
 
     Attributes:
-        calibration: what was taken out.
-        axes: ``(d, 6)`` of :attr:`Calibration.vector` that closures can tell: all three of each part, or of the bias
-            the one about which all turns are.
+        calibration: what was removed.
+        axes: ``(d, 6)`` axes of :attr:`Calibration.vector` that closures can determine: all three of each part, or for
+            the bias only the one axis of all turns.
         design: ``(E, 3, d)`` D under the odometry's orientations; zero where a part turns no edge.
     """
 
@@ -48,7 +48,7 @@ class Calibrated:
 
     @classmethod
     def of(cls, graph: ViewGraph, prepared: Prepared, calibration: Calibration, parts: Collection[str]) -> Calibrated:
-        """Some parts, of a graph whose measurements ``calibration`` was taken out of before it was prepared."""
+        """Some parts, for a graph from whose measurements ``calibration`` was removed before it was prepared."""
         is_planar = prepared.noise.components == 1
         nothing = np.zeros((0, 6)), np.zeros((len(prepared.closure_graph.source), 3, 0))
         found = [nothing]
@@ -63,7 +63,7 @@ class Calibrated:
 
     @property
     def value(self) -> np.ndarray:
-        """``(d,)`` rad per step or rad that was taken out, along the axes."""
+        """``(d,)`` rad per step or rad that was removed, along the axes."""
         return np.asarray(self.axes @ self.calibration.vector)
 
     def precision(self, priors: SlamPriors) -> np.ndarray:
@@ -76,14 +76,14 @@ class Calibrated:
     def information(
         self, source: np.ndarray, state: State, residual: np.ndarray, factorised: Factorised, priors: SlamPriors
     ) -> tuple[np.ndarray, np.ndarray]:
-        """S ``(d, d)`` and the p ``(d,)`` by which F would fall most, beyond what was taken out.
+        """S ``(d, d)`` and the p ``(d,)`` that minimises F, beyond what was removed.
 
         Args:
-            source: ``(E,)`` key nodes of the edges.
-            state: at its optimum.
+            source: ``(E,)`` source key nodes of the edges.
+            state: the state at its optimum.
             residual: ``(E + R, 3)`` rad, there.
             factorised: H there.
-            priors: of Σ.
+            priors: give Σ.
         """
         num_edges, num_axes = len(source), len(self.axes)
         turned = rotations.to_matrix(torch.from_numpy(np.ascontiguousarray(state.correction.T))).numpy()[source]
@@ -99,7 +99,7 @@ class Calibrated:
         return information, np.linalg.solve(information, slope)
 
     def cost(self, information: np.ndarray, priors: SlamPriors) -> float:
-        """−log p, nats, the rest of S integrated."""
+        """−log p, nats, with the remainder of p integrated."""
         precision = self.precision(priors)
         occam = (np.linalg.slogdet(information)[1] - np.log(precision).sum()) / 2
         either = np.log(2) * bool(self.axes[:, 3:].any())
@@ -121,7 +121,7 @@ def _of_bias(graph: ViewGraph, prepared: Prepared, is_planar: bool) -> tuple[np.
 
 
 def _of_mounting(graph: ViewGraph, prepared: Prepared) -> tuple[np.ndarray, np.ndarray]:
-    """The same, of which three."""
+    """The same for the mounting, which has three axes."""
     closure_graph = prepared.closure_graph
     edge = np.flatnonzero(closure_graph.is_closure)
     source = torch.from_numpy(closure_graph.nodes[closure_graph.source[edge]])

@@ -16,12 +16,12 @@ _QUARTER_TURN = np.pi / 2
 
 
 class Tails(NamedTuple):
-    """Of n good edges, how many err by far more than others, and by how much.
+    """The tails of n good edges.
 
     Attributes:
-        share: ``(n,)`` t, chance of each to be in the tails.
-        ratio: ``(n,)`` τ, how many times its variance it has there.
-        told: ``(n,)`` φ, how much of what all components tell of that holds: less than 1 where they go together.
+        share: ``(n,)`` t, probability that each is in the tails.
+        ratio: ``(n,)`` τ, factor of its variance there.
+        told: ``(n,)`` φ, exponent on the components' likelihood ratio: less than 1 where components are dependent.
     """
 
     share: np.ndarray
@@ -29,12 +29,12 @@ class Tails(NamedTuple):
     told: np.ndarray
 
     def of(self, edges: np.ndarray) -> Tails:
-        """Of some of them."""
+        """The tails of some edges."""
         return Tails(self.share[edges], self.ratio[edges], self.told[edges])
 
 
 def anyhow(components: int) -> float:
-    """rad², variance of the normal density that has at zero the height of the uniform one over rotations."""
+    """rad², variance of the normal density whose value at zero is that of the uniform density over rotations."""
     volume = 2 * np.pi if components == 1 else 8 * np.pi**2
     return float(volume ** (2 / components) / (2 * np.pi))
 
@@ -51,12 +51,12 @@ def log_good(
     components: int,
     tails: Tails,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of good edges: log N(r; v + p) + log [(1 − t) + t (N(r; τ v + p) / N(r; v + p))^φ], and the share of the first.
+    """Good edges: log N(r; v + p) + log [(1 − t) + t (N(r; τ v + p) / N(r; v + p))^φ], and the share of the first term.
 
     Args:
         square: ``(n,)`` rad², ‖r‖².
         variance: ``(n,)`` rad², v, of the edge's own noise.
-        predicted: rad², p, of what r is compared with.
+        predicted: rad², p, variance of the prediction that r is compared with.
         components: k.
         tails: t, τ and φ.
     """
@@ -74,7 +74,7 @@ def beyond(
 ) -> np.ndarray:
     """``(n,)`` probability that the noise of a good edge exceeds ``angle``, rad.
 
-    What others say of the residual, N(μ, p), and its own density, of :func:`log_good`, tell it together.
+    It follows from the prediction by others, N(μ, p), and the edge's own density of :func:`log_good`.
     """
     _, exact = log_good(square, variance, predicted, components, tails)
     chances = []
@@ -86,12 +86,13 @@ def beyond(
 
 @dataclass(frozen=True)
 class Sites:
-    """The normal density that stands for a good edge's own one (n edges).
+    """The normal density that approximates a good edge's own density (n edges).
 
-    What all other edges say of a residual is N(μ, p). Were the edge's density N(0, 1/w), the residual would come out as
-    μ / (1 + w p). Of a mixture of normal densities of variances v_z, which hold with chances π_z given μ and p, it
-    comes out as μ Σ π_z v_z / (v_z + p). w is chosen so that both agree (expectation propagation, Minka 2001, by the
-    mean): where nothing else tells of an edge 1/w is the mean variance, where all is told w is the mean precision.
+    All other edges predict a residual as N(μ, p). If the edge's density were N(0, 1/w), the residual would be
+    μ / (1 + w p). For a mixture of normal densities with variances v_z, whose probabilities given μ and p are π_z, it
+    is μ Σ π_z v_z / (v_z + p). w is chosen so that both agree (expectation propagation, Minka 2001, matching the mean):
+    for an edge without any prediction 1/w is the mean variance, for one with an exact prediction w is the mean
+    precision.
 
     Attributes:
         square: ``(n,)`` rad², ‖μ‖².
@@ -118,7 +119,7 @@ class Sites:
         components: int,
         tails: Tails,
     ) -> Sites:
-        """Of densities of :func:`log_good`."""
+        """The sites of the densities of :func:`log_good`."""
         log_density, exact = log_good(square, variance, predicted, components, tails)
         near = exact / (variance + predicted)
         far = (1 - exact) / (tails.ratio * variance + predicted)
@@ -134,17 +135,17 @@ def log_false(
     near_miss_share: np.ndarray | float | None = None,
     predicted: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """Of closures that are false by themselves: log [(1 − m) u(r) + ½ m N(r; near miss + p) + ½ m h(r)].
+    """Closures that are false by themselves: log [(1 − m) u(r) + ½ m N(r; near miss + p) + ½ m h(r)].
 
-    u is uniform over rotations. A place is mistaken for one that looks alike and is seen at nearly the same angle, or
-    from the other end, as a corridor is: h is as wide about half a turn, about any axis.
+    u is uniform over rotations. A place may be mistaken for one that looks alike and is seen at nearly the same angle,
+    or from the opposite end, as in a corridor: h is equally wide around half a turn, about any axis.
 
     Args:
         square: rad², ‖r‖².
         components: k.
-        priors: the near misses' width, and m where it is not given.
+        priors: width of the near misses, and m if it is not given.
         near_miss_share: m, broadcast against ``square``.
-        predicted: rad², p, where what r is counted from is not known any better.
+        predicted: rad², p, variance of the prediction that r is counted from.
     """
     share = priors.near_miss_share if near_miss_share is None else near_miss_share
     variance = np.radians(priors.near_miss_deg) ** 2
@@ -155,14 +156,14 @@ def log_false(
 
 
 def log_half_turn(angle: np.ndarray, variance: np.ndarray | float, components: int) -> np.ndarray:
-    """Of turns by ``angle``, rad, that are normal about half a turn about any axis, with ``variance`` rad².
+    """Log density of turns by ``angle``, rad, normal around half a turn about any axis, with ``variance`` rad².
 
-    In three components angles of less than a quarter turn count as one in the volume that they share out: however
-    broad the density, none of it gathers at the identity.
+    In three components, angles of less than a quarter turn count as a quarter turn in the volume element. So even a
+    broad density has no peak at the identity.
     """
     angle = np.minimum(angle, np.pi)
     density = log_normal((np.pi - angle) ** 2, variance, 1)
-    if components == 3:  # from the angle's density, all axes alike
+    if components == 3:  # from the density of the angle, uniform over axes
         density = density + np.log(2.0) - np.log(4 * np.pi * np.maximum(angle, _QUARTER_TURN) ** 2)
     return np.asarray(density)
 
@@ -170,5 +171,5 @@ def log_half_turn(angle: np.ndarray, variance: np.ndarray | float, components: i
 def log_slipped(
     square: np.ndarray, variance: np.ndarray, predicted: np.ndarray | float, components: int, priors: SlamPriors
 ) -> np.ndarray:
-    """Of segments in which a step slipped: log N(r; slip² + v + p); the arguments are those of :func:`log_good`."""
+    """Segments in which a step slipped: log N(r; slip² + v + p); the arguments are those of :func:`log_good`."""
     return log_normal(square, np.radians(priors.slip_deg) ** 2 + variance + predicted, components)

@@ -17,20 +17,20 @@ from rotavg_ros.solver.slam.posterior.rows import residuals, sites, tails, varia
 from rotavg_ros.solver.slam.posterior.state import State
 from rotavg_ros.solver.slam.posterior.system import Factorised
 
-# Log-odds of what a user has decided.
+# Log-odds of labels that a user has set.
 CERTAIN = 1e6
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What is known of every edge without itself (E edges).
+    """What the rest of the graph says of every edge (E edges).
 
     Attributes:
-        log_odds: ``(E,)`` of being good, or of not having slipped: by how much F rises if that label flips.
-        square: ``(E,)`` rad², of the discrepancy with what the rest predicts.
+        log_odds: ``(E,)`` log-odds of being good, or of not having slipped: the rise of F if the label flips.
+        square: ``(E,)`` rad², squared discrepancy from the prediction by the rest.
         predicted: ``(E,)`` rad², variance of that prediction.
-        if_good: ``(E,)`` nats, log density of an edge that errs as a good one does.
-        unrepeated: ``(E,)`` the log-odds of closures if no false one repeated another's turn.
+        if_good: ``(E,)`` nats, log density of the edge as a good one.
+        unrepeated: ``(E,)`` log-odds of closures if no false one repeated another's turn.
     """
 
     log_odds: np.ndarray
@@ -41,7 +41,7 @@ class LeftOut:
 
 
 def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> LeftOut:
-    """What the rest of the graph says of every edge, the labels of all others given."""
+    """What the rest of the graph says of every edge, given the labels of all others."""
     rest()
     graph, k, priors, closure = problem.graph, problem.components, problem.priors, problem.closure
     num_edges = len(graph.source)
@@ -51,7 +51,7 @@ def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> Lef
     site = sites(problem, told, residual, variance)
     square, predicted = site.square, site.predicted
 
-    # The prior's log-odds, less the density of what an edge is if it is not good.
+    # The prior's log-odds, minus the log density of the edge if it is not good.
     odds = problem.log_odds.copy()
     is_false = ~state.is_good[closure]
     told_false, alone = if_false(problem, is_false, residual[closure], told.others.predicted[closure])
@@ -72,8 +72,8 @@ def leave_one_out(problem: Problem, state: State, factorised: Factorised) -> Lef
 def scores(problem: Problem, state: State, left_out: LeftOut) -> tuple[np.ndarray, np.ndarray]:
     """``(E,)`` probability that an edge's noise exceeds 10° or that a segment slipped, and how far the edge is trusted.
 
-    The trust, a factor of the weight, is the probability that an edge is good and its noise below 10°. So what is
-    published as false does not pull.
+    The trust, a factor of the weight, is the probability that an edge is good and its noise below 10°. So edges that
+    are published as false do not influence the answer.
     """
     closure, k = problem.closure, problem.components
     good = expit(left_out.log_odds)
@@ -89,7 +89,7 @@ def scores(problem: Problem, state: State, left_out: LeftOut) -> tuple[np.ndarra
 
 
 def slipped_or_tailed(problem: Problem, state: State, left_out: LeftOut) -> np.ndarray:
-    """Edges of odometry that slipped, or that are in its tails more likely than not."""
+    """Edges of odometry that slipped, or are in its tails with a probability above one half."""
     own = variances(problem, state.noise)[: len(left_out.square)]
     tailed = tails(problem, state.noise)
     _, usual = log_good(left_out.square, own, left_out.predicted, problem.components, tailed)
@@ -97,13 +97,13 @@ def slipped_or_tailed(problem: Problem, state: State, left_out: LeftOut) -> np.n
 
 
 def relabelled(problem: Problem, state: State) -> np.ndarray:
-    """``(E,)`` 1 for edges that residuals as they are speak for, else 0."""
+    """``(E,)`` 1 for edges that their current residuals favour, else 0."""
     good, otherwise = _log_densities(problem, state)
     return np.asarray(good > otherwise, dtype=np.float64)
 
 
 def rough_cost(problem: Problem, state: State) -> float:
-    """F without what is integrated, nats: edges by residuals and labels as they are, false closures all together."""
+    """F without the integrals over corrections, nats: from current residuals and labels, false closures jointly."""
     good, otherwise = _log_densities(problem, state)
     closure, is_false = problem.closure, ~state.is_good[problem.closure]
     odometry = problem.graph.is_odometry
@@ -115,7 +115,7 @@ def rough_cost(problem: Problem, state: State) -> float:
 
 
 def _log_densities(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarray]:
-    """``(E,)`` each: of edges if they are good, and if not, by residuals and the prior."""
+    """``(E,)`` each: log densities of edges if good, and if not, by residuals and the prior."""
     graph, k, priors, closure = problem.graph, problem.components, problem.priors, problem.closure
     num_edges = len(graph.source)
     without_common = replace(state, common=np.zeros_like(state.common))

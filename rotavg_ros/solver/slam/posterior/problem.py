@@ -217,7 +217,7 @@ class Problem:
 
     @cached_property
     def _passed(self) -> np.ndarray:
-        """``(3, N)`` steps of odometry from each node's root: by number, by squared turns, by metres; equal in total."""
+        """``(3, N)`` steps of odometry from each node's root: by number, squared turns and metres; equal in total."""
         steps = np.asarray(self.graph.paths.depth, dtype=np.float64)
         turned = None if "turns" in self.without else self.turned
         return np.stack((steps, self._as_steps(turned), self._as_steps(self.travelled)))

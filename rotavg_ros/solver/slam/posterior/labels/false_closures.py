@@ -1,4 +1,4 @@
-"""The density of false closures: wrong one by one, or repeats of one wrong turn."""
+"""The density of false closures: each wrong independently, or repeating one wrong turn."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from rotavg_ros.solver.slam.posterior.densities import anyhow, log_false
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 
-# Nodes of the sums that stand for integrals over rates: the shares of false closures that repeat their run's turn, that
-# of one shortly before and any one's; and of those that repeat none but are near misses.
+# Grids that replace integrals over rates: the shares of false closures that repeat the turn of their run, of one
+# shortly before, and of any other; and the share of near misses among those that repeat none.
 _RUN_SHARES = np.array([0.05, 0.5, 0.95])
 _NEAR_SHARES = np.array([0.05, 0.5, 0.95])
 _FAR_SHARES = np.array([0.01, 0.05, 0.2, 0.5])
 _NEAR_MISS_QUANTILES = np.array([1.0, 3.0, 5.0]) / 6
-# Of false closures of a robot that stays upright, that are wrong by a turn about the vertical if any are.
+# For a robot that stays upright: share of false closures wrong by a turn about the vertical, if there are such at all.
 _ABOUT_VERTICAL = 0.9
-# That each run of false closures repeats turns with shares of its own, beforehand.
+# Prior probability that each run of false closures has its own shares of repeats.
 _OWN_SHARES = 0.25
-# Predicted to less than this share of the variance of any rotation.
+# A closure counts as predicted if the variance is less than this share of that of a uniform rotation.
 _TOLD = 0.5
-# The least density that counts; a product is turned into its logarithm beyond these.
+# Floor of a density; bounds beyond which a product is moved into its logarithm.
 _LEAST, _SMALL, _LARGE = 1e-100, 1e-100, 1e100
-# Units of work for each closure that is looked at.
+# Units of work per closure that is evaluated.
 _LOOKED_AT = 0.015
 
 
-# Each of the first two with each of the second.
+# All combinations of the shares of the run and of those shortly before.
 _OF_RUN, _BEFORE = (share.reshape(-1, 1) for share in np.meshgrid(_RUN_SHARES, _NEAR_SHARES, indexing="ij"))
 
 
 def _grid(kinds: int) -> tuple[int, ...]:
-    """Of rates, for so many densities of false closures that are wrong by themselves."""
+    """Shape of the grid of rates, for ``kinds`` densities of independently false closures."""
     return len(_RUN_SHARES), len(_NEAR_SHARES), len(_FAR_SHARES), kinds, KERNELS
 
 
 def _split(rates: np.ndarray, kinds: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of values ``(G,)`` those where all runs share c and d, ``(9, …)``, and where each run has its own, ``(1, …)``."""
+    """Splits values ``(G,)`` into those with c and d shared by all runs, ``(9, …)``, and own to each, ``(1, …)``."""
     others = _grid(kinds)[2:]
     each = rates.reshape(len(_OF_RUN) + 1, *others)
     return each[:-1], each[-1:]
@@ -54,17 +54,17 @@ def _split(rates: np.ndarray, kinds: int) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class FalseDensity:
-    """Of n closures if they are false, none of them as a logarithm.
+    """Densities of n closures if they are false (not logarithms).
 
-    How often they repeat others, c and d, is the same for all runs, or each run has its own: one place is mistaken by
-    one turn as long as it is seen, another one by many. Of the grid's G points those where c and d are shared come
-    first, then those where they are summed over run by run.
+    The shares of repeats, c and d, are the same for all runs, or each run has its own: one place may be mistaken by the
+    same turn as long as it is seen, another by many different turns. Of the grid's G points, those with shared c and d
+    come first, then those where c and d are summed over run by run.
 
     Attributes:
-        alone: ``(M, n)`` wrong by themselves, for each share of near misses; and again where most turns are about the
-            vertical, if the robot knows one.
-        repeats: by the turns of others, of which some may be there.
-        run: ``(n,)`` number of the chain that each is one of.
+        alone: ``(M, n)`` densities if independently false, for each share of near misses; repeated with most turns
+            about the vertical, if there is one.
+        repeats: densities given the turns of other closures, where there are such.
+        run: ``(n,)`` number of each closure's run.
     """
 
     alone: np.ndarray
@@ -72,33 +72,34 @@ class FalseDensity:
     run: np.ndarray
 
     def log_sums(self) -> np.ndarray:
-        """``(G,)`` logarithms of all closures together, at each point of the grid of rates.
+        """``(G,)`` log density of all closures jointly, at each point of the grid of rates.
 
-        Each is (1 − c) ((1 − d) ((1 − g) alone + g of any) + d of those before) + c of its run, where there are such.
+        Each density is (1 − c) ((1 − d) ((1 − g) alone + g of any) + d of those before) + c of its run, where there are
+        such.
         """
         order = np.argsort(self.run, kind="stable")
         return _log_sums(self.alone, *self.repeats, self.run, order, (_RUN_SHARES, _NEAR_SHARES, _FAR_SHARES))
 
     def mean(self, log_rates: np.ndarray, own: np.ndarray) -> np.ndarray:
-        """``(n,)`` the same of each in the mean over the grid, whose points have these logarithms ``(G,)``.
+        """``(n,)`` density of each closure, averaged over the grid.
 
-        It is linear in all four, so what each counts for is summed over the grid beforehand.
+        It is linear in the four densities, so their coefficients are summed over the grid beforehand.
 
         Args:
-            log_rates: ``(G,)``.
-            own: ``(9, n)`` how likely each c and d is for a closure's run, if it has its own.
+            log_rates: ``(G,)`` log probabilities of the grid's points.
+            own: ``(9, n)`` probability of each c and d for a closure's run, if it has its own.
         """
         shared, _ = _split(np.exp(log_rates), len(self.alone))
         mean = self._summed(shared).sum(axis=0) + (self.by_shares(log_rates) * own).sum(axis=0)
         return np.asarray(np.maximum(mean, _LEAST))
 
     def by_shares(self, log_rates: np.ndarray) -> np.ndarray:
-        """``(9, n)`` of each, for each c and d, in the mean over the points at which runs have their own."""
+        """``(9, n)`` density of each, for each c and d, averaged over the points at which runs have their own."""
         _, own = _split(np.exp(log_rates), len(self.alone))
         return self._summed(own)
 
     def _summed(self, rates: np.ndarray) -> np.ndarray:
-        """``(9, n)`` for each c and d, summed over all else by ``rates``, ``(9 or 1, g, M, kernels)``."""
+        """``(9, n)`` densities for each c and d, summed with weights ``rates`` ``(9 or 1, g, M, kernels)``."""
         of_kernels = rates.sum(axis=(1, 2))
         has_run, has_near, has_any = self.repeats.has_any
         of_run, before = of_kernels @ self.repeats.density[0], of_kernels @ self.repeats.density[1]
@@ -119,11 +120,11 @@ def _log_sums(
     order: np.ndarray,
     shares: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> np.ndarray:
-    """Products of what :meth:`FalseDensity.log_sums` says of each closure, logarithms taken where they get small."""
+    """Logarithms of the products in :meth:`FalseDensity.log_sums`, taken whenever a product gets small."""
     of_run, before, of_any = shares
     ways, inner = len(of_run) * len(before), len(of_any) * len(alone) * density.shape[1]
     size = ways * inner
-    # Of the run at hand; of all runs, with the same c and d and with their own.
+    # Products for the current run; then for all runs, with shared c and d and with their own.
     product, total, is_small = np.ones(size), np.zeros(size), False
     products, totals = np.ones(size + inner), np.zeros(size + inner)
     for place in range(len(order)):
@@ -173,17 +174,18 @@ def false_density(
     rows: np.ndarray,
     both_sides: bool = False,
 ) -> FalseDensity:
-    """Closures wrong by themselves, or by the same turn of the world as other false ones.
+    """Densities of closures that are false independently, or by the same turn of the world as other false ones.
 
-    The density of a repeat is a kernel estimate over the false closures detected before (a Pólya urn), those near
-    weighing apart from all (:mod:`~rotavg_ros.solver.slam.noise.repeats`).
+    The density of a repeat is a kernel estimate over the false closures detected before (a Pólya urn); nearby ones are
+    weighted separately (:mod:`~rotavg_ros.solver.slam.noise.repeats`).
 
     Args:
-        is_false: ``(C,)`` bool, of the others.
+        problem: the graph.
+        is_false: ``(C,)`` bool, labels of the others.
         residual: ``(C, 3)`` rad, of the closures, from source to target.
-        predicted: ``(C,)`` rad², variance of what these are counted from.
-        rows: ``(n,)`` closures to be told of.
-        both_sides: given all others, not those before alone.
+        predicted: ``(C,)`` rad², variance of the predictions that residuals are counted from.
+        rows: ``(n,)`` closures to evaluate.
+        both_sides: given all others, not only those detected before.
     """
     spend(_LOOKED_AT * len(rows))
     k, count = problem.components, len(rows)
@@ -199,7 +201,7 @@ def false_density(
         return FalseDensity(alone, Repeats.none(count), run)
     older, newer = problem.ends.T
     turn = np.ascontiguousarray(quaternion_rows.exp((residual * problem.sign[:, None]).T).T)
-    # Of a closure that nothing else predicts it is not known by what turn it is wrong.
+    # If nothing else predicts a closure, the turn by which it is wrong is unknown.
     is_told = predicted < _TOLD * anyhow(k)
     false = problem.detection[is_false[problem.detection]]
     is_one = is_false[rows] if both_sides else None
@@ -209,16 +211,16 @@ def false_density(
 
 
 def _near_miss_shares(priors: SlamPriors) -> np.ndarray:
-    """``(M,)`` equally likely under Beta(1, b), whose mean is the share that is believed: 1 − (1 − u)^(1/b)."""
+    """``(M,)`` equally likely shares under Beta(1, b), whose mean is the prior's share: 1 − (1 − u)^(1/b)."""
     mean = priors.near_miss_share
     return np.asarray(-np.expm1(mean / (1 - mean) * np.log1p(-_NEAR_MISS_QUANTILES)))
 
 
 @cache
 def _log_repeat_prior(priors: SlamPriors, kinds: int, has_own: bool) -> np.ndarray:
-    """``(G,)`` of the grid's points: Beta(1, count) on the share that repeats a turn elsewhere, all else as likely.
+    """``(G,)`` log prior of the grid's points: Beta(1, count) for the share of repeats elsewhere, else uniform.
 
-    Each run has its own shares with the probability :data:`_OWN_SHARES`, else all have the same.
+    With probability :data:`_OWN_SHARES` each run has its own shares; otherwise all have the same.
     """
     far = (priors.elsewhere_count - 1) * np.log1p(-_FAR_SHARES) + np.log(np.gradient(_FAR_SHARES))
     shared = np.broadcast_to(far[:, None, None], _grid(kinds)).ravel()
@@ -229,7 +231,7 @@ def _log_repeat_prior(priors: SlamPriors, kinds: int, has_own: bool) -> np.ndarr
 
 
 def _log_weighted(problem: Problem, density: FalseDensity) -> np.ndarray:
-    """``(G,)`` prior times density of all false closures, at the grid's points."""
+    """``(G,)`` log of the prior times the density of all false closures, at the grid's points."""
     has_own = "own-repeats" not in problem.without
     return np.asarray(density.log_sums() + _log_repeat_prior(problem.priors, len(density.alone), has_own))
 
@@ -241,19 +243,20 @@ def repeat_rates(problem: Problem, density: FalseDensity) -> np.ndarray:
 
 
 def log_false_set(problem: Problem, density: FalseDensity) -> float:
-    """Of all false closures together, rates and width integrated."""
+    """Log density of all false closures jointly, with rates and kernel width integrated."""
     return float(np.logaddexp.reduce(_log_weighted(problem, density)))
 
 
 def if_false(
     problem: Problem, is_false: np.ndarray, residual: np.ndarray, predicted: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """``(C,)`` densities of each closure if it is false: given all other false ones, and by itself.
+    """``(C,)`` densities of each closure if it is false: given all other false ones, and independently.
 
     Args:
+        problem: the graph.
         is_false: ``(C,)`` bool.
         residual: ``(C, 3)`` rad, from source to target.
-        predicted: ``(C,)`` rad², variance of what these are counted from.
+        predicted: ``(C,)`` rad², variance of the predictions that residuals are counted from.
     """
     rows = np.flatnonzero(is_false)
     false = false_density(problem, is_false, residual, predicted, rows)
@@ -264,11 +267,11 @@ def if_false(
 
 
 def _own_shares(problem: Problem, rows: np.ndarray, by_shares: np.ndarray) -> np.ndarray:
-    """``(9, C)`` how likely each c and d is for each closure's run, given the others that are false.
+    """``(9, C)`` probability of each c and d for each closure's run, given the other false closures.
 
     Args:
         problem: the graph.
-        rows: ``(F,)`` closures that are false.
+        rows: ``(F,)`` false closures.
         by_shares: ``(9, F)`` their densities.
     """
     log = np.log(np.maximum(by_shares, _LEAST)).T

@@ -1,4 +1,4 @@
-"""Priors of labels: which closures are false, and where odometry slips, without a look at residuals."""
+"""Priors of labels: which closures are false, and where odometry slips, before residuals are considered."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from scipy.special import betaln
 from rotavg_ros.solver.slam.posterior.priors import SlamPriors
 from rotavg_ros.solver.slam.posterior.problem import Problem
 
-# Nodes of the sums that stand for integrals over rates: the share of false closures; the probability that a label is
-# that of a closure before; and how often that is the one detected last instead of the nearest of its run.
+# Grids that replace integrals over rates: the share of false closures; the probability that a label repeats that of an
+# earlier closure; and how often that is the one detected last rather than the nearest of its run.
 _SHARES = np.array([0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98])
 _STAY = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 0.97])
 _LAST_SHARES = np.array([0.0, 0.5, 1.0])
@@ -40,7 +40,7 @@ _DIGITS = np.multiply.accumulate(np.full(_LOG_STEPS.shape[1], 636413622384679300
 
 @cache
 def _log_grid_prior(priors: SlamPriors, without: frozenset[str]) -> np.ndarray:
-    """``(G,)`` of the grid's points: a Beta density on the shares, all else as likely, or as it is switched off."""
+    """``(G,)`` log prior of the grid's points: Beta for the shares, uniform for the rest unless switched off."""
     a = priors.outlier_share * priors.outlier_count
     b = (1 - priors.outlier_share) * priors.outlier_count
     log = (a - 1) * np.log(_SHARES) + (b - 1) * np.log1p(-_SHARES) + np.log(np.gradient(_SHARES))
@@ -55,17 +55,17 @@ def _log_prior(problem: Problem) -> np.ndarray:
 
 
 def _kind_of_step(of_run: np.ndarray, detected: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """Column of ``_LOG_STEPS``, from the labels of those before, 2 where there is none, and its own."""
+    """Column of ``_LOG_STEPS``, from the labels of the two earlier closures (2: there is none) and the own label."""
     return np.asarray((3 * of_run + detected) * 2 + label)
 
 
 def _label_of(before: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """``(C,)`` label of the closure before each, or 2."""
+    """``(C,)`` label of the closure before each, or 2 if there is none."""
     return np.where(before >= 0, label[before], 2)
 
 
 def log_label_prior(problem: Problem, is_false: np.ndarray) -> float:
-    """Of all closures' labels: each is that of one before or drawn anew; the rates are integrated."""
+    """Log prior of all labels: each repeats an earlier one or is drawn anew; the rates are integrated."""
     label = is_false.astype(np.int64)
     kind = _kind_of_step(_label_of(problem.follows, label), _label_of(problem.preceded, label), label)
     counts = np.bincount(kind, minlength=_LOG_STEPS.shape[1])
@@ -75,7 +75,7 @@ def log_label_prior(problem: Problem, is_false: np.ndarray) -> float:
 
 
 def label_log_odds(problem: Problem, is_false: np.ndarray) -> np.ndarray:
-    """``(C,)`` prior log-odds of each closure to be good, given the labels of all others."""
+    """``(C,)`` prior log-odds that each closure is good, given the labels of all others."""
     label = is_false.astype(np.int64)
     if len(label) == 0:
         return np.zeros(0)
@@ -83,7 +83,7 @@ def label_log_odds(problem: Problem, is_false: np.ndarray) -> np.ndarray:
     counts = np.bincount(_kind_of_step(of_run, detected, label), minlength=_LOG_STEPS.shape[1])
     log_rates = _log_prior(problem) + _LOG_STEPS @ counts
     changes = _steps_with(problem, label, 1 - label) - _steps_with(problem, label, label)
-    # Closures with the same neighbours have the same odds; what changes for each is told by one number.
+    # Closures with the same neighbours have the same odds; the changes of each are hashed to one number.
     _, first, which = np.unique(changes @ _DIGITS, return_index=True, return_inverse=True)
     with_other = np.logaddexp.reduce(log_rates[:, None] + _LOG_STEPS @ changes[first].T, axis=0)[which]
     gained = with_other - np.logaddexp.reduce(log_rates)
@@ -91,7 +91,7 @@ def label_log_odds(problem: Problem, is_false: np.ndarray) -> np.ndarray:
 
 
 def _steps_with(problem: Problem, label: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """``(C, 18)`` how often each kind of step occurs among those to and from a closure, were its label ``own``."""
+    """``(C, 18)`` count of each kind of step among those to and from a closure, if its label were ``own``."""
     follows, preceded, kinds = problem.follows, problem.preceded, _LOG_STEPS.shape[1]
     of_run, detected = _label_of(follows, label), _label_of(preceded, label)
     # A step from a closure that is both counts once.
@@ -108,13 +108,13 @@ def _steps_with(problem: Problem, label: np.ndarray, own: np.ndarray) -> np.ndar
 
 
 def log_slip_prior(problem: Problem, slipped: np.ndarray) -> float:
-    """Of which segments slipped: Beta–binomial over all steps, and any step of a segment.
+    """Log prior of the set of slipped segments: Beta–binomial over all steps; a slip is in any step of its segment.
 
-    The rate is integrated, so the first slip is dear and later ones are cheaper.
+    The rate is integrated, so the first slip costs much and later ones less.
 
     Args:
         problem: the graph.
-        slipped: edges.
+        slipped: edges that slipped.
     """
     priors, count, total = problem.priors, len(slipped), problem.total_steps
     prior = betaln(priors.slip_count + count, priors.slip_steps + total - count)
@@ -123,7 +123,7 @@ def log_slip_prior(problem: Problem, slipped: np.ndarray) -> float:
 
 
 def log_slip_odds(problem: Problem, steps: np.ndarray, slips: int) -> np.ndarray:
-    """Prior log-odds of segments of ``steps`` ``(n,)`` to have slipped, given that ``slips`` have."""
+    """Prior log-odds that segments of ``steps`` ``(n,)`` slipped, given that ``slips`` others have."""
     priors = problem.priors
     rate = (priors.slip_count + slips) / (priors.slip_steps + problem.total_steps)
     return np.asarray(np.log(rate * np.maximum(steps, 1.0)))

@@ -1,1 +1,1 @@
-"""What is published of the labellings that the search has found."""
+"""The published answer, from the labellings that the search has found."""

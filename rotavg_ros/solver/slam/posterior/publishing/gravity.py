@@ -1,8 +1,8 @@
 """A labelling's orientations where gravity holds roll and pitch, so that odometry errs about the vertical.
 
-A turn about the vertical n and one about other axes are two systems of the same rows. Labels and weights stay as they
-are, but that odometry's variances are multiplied by one factor about n and by another one about other axes: the
-redundancy that residuals leave tells both (restricted maximum likelihood). The search knows of one variance alone.
+Turns about the vertical n and about other axes form two systems with the same rows. Labels and weights stay fixed,
+except that odometry's variances are multiplied by one factor about n and another about other axes. Both factors are
+estimated from residuals and their redundancy (restricted maximum likelihood). The search itself uses a single variance.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from rotavg_ros.solver.slam.posterior.rows import moved, residuals
 from rotavg_ros.solver.slam.posterior.state import State
 from rotavg_ros.solver.slam.posterior.system import Factorised
 
-# Of a turn about the vertical, and about other axes.
+# Number of components of a turn about the vertical, and about other axes.
 _COMPONENTS = np.array([1, 2])
-# Solves at most; variances are at rest when their logarithms change by no more.
+# Maximum number of solves; largest change of the variances' logarithms at convergence.
 _SOLVES, _CONVERGED = 8, 0.1
 
 
 @dataclass(frozen=True)
 class Held:
-    """Orientations, and how far they err, rad² per component in the mean.
+    """Orientations and their variances, rad² per component, averaged over components.
 
     Attributes:
         state: corrections of K key nodes.
-        variance: ``(K,)`` of these.
-        apart: ``(S,)`` of the difference between those at both ends of a segment.
-        factor: ``(2,)`` of odometry's variances, about the vertical and about other axes.
+        variance: ``(K,)`` variances of these.
+        apart: ``(S,)`` variances of the difference between the two ends of each segment.
+        factor: ``(2,)`` factors of odometry's variances, about the vertical and about other axes.
     """
 
     state: State
@@ -43,16 +43,16 @@ class Held:
 
     @property
     def step_variance(self) -> float:
-        """Of one step of odometry."""
+        """rad² per component, of one step of odometry."""
         return self.state.noise.step_variance * float(self.factor @ _COMPONENTS) / 3
 
 
 def held_by_gravity(problem: Problem, state: State, solved: Factorised) -> Held:
-    """What a labelling comes to if all axes need not be alike; as it is where no vertical is known.
+    """The orientations of a labelling if axes may differ in variance; unchanged where no vertical is known.
 
     Args:
         problem: the graph.
-        state: at rest.
+        state: the converged state.
         solved: its last solve.
     """
     segments, nodes = problem.graph.num_segments, slice(problem.graph.num_nodes)
@@ -84,9 +84,9 @@ class _Both:
 
     Attributes:
         problem: the graph.
-        solved: by one variance.
+        solved: the solve with a single variance.
         sound: ``(n,)`` segments that have not slipped.
-        axes: ``(3, 3)`` each, onto which turns are projected.
+        axes: ``(3, 3)`` each, projections of turns.
     """
 
     problem: Problem
@@ -95,13 +95,13 @@ class _Both:
     axes: tuple[np.ndarray, np.ndarray]
 
     def factorised(self, factor: np.ndarray) -> list[Factorised]:
-        """Both, where odometry's variances are ``(2,)`` times as large."""
+        """Both systems, with odometry's variances multiplied by ``(2,)``."""
         weights = np.stack([self.solved.weight] * 2)
         weights[:, self.sound] /= factor[:, None]
         return [self.solved.system.factorise(weight) for weight in weights]
 
     def likeliest(self, state: State, solves: list[Factorised], used: np.ndarray) -> np.ndarray:
-        """``(2,)`` how many times as large odometry's variances are, after solves by others ``used``."""
+        """``(2,)`` likeliest factors of odometry's variances, after solves with the factors ``used``."""
         priors, step = self.problem.priors, state.noise.step_variance
         usual = 2 * float(np.log(np.radians(priors.step_deg))), priors.noise_spread
         left, told = residuals(self.problem, state)[self.sound], []
@@ -114,7 +114,7 @@ class _Both:
             return likeliest_variance(squares, max(freedom, 0.0), float(np.log(step * used[number])), *prior)
 
         about = likeliest(*told[0], 0, usual)
-        # What is about other axes goes with what is about the vertical, and is no more: gravity holds or does not.
+        # The factor for other axes has a prior relative to that for the vertical, and is not larger.
         other = likeliest(*told[1], 1, (float(np.log(about)), TILT_SPREAD))
         if other > about:
             squares, freedom = np.sum(told, axis=0).tolist()

@@ -1,4 +1,4 @@
-"""What is published of the rival labellings, in each of which single closures are probabilities: their median."""
+"""The published answer of rival labellings: averaged scores and median orientations; closures are probabilities."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from rotavg_ros.solver.slam.posterior.problem import Problem
 from rotavg_ros.solver.slam.posterior.publishing.gravity import held_by_gravity
 from rotavg_ros.solver.slam.posterior.state import Noise
 
-# No labelling counts that is less likely by so many nats, and no other noise of the same labels.
+# Labellings less likely than the best by more than this, nats, are ignored, and so is other noise of the same labels.
 _FAR, _FAR_NOISE = 5.0, 2.0
-# Rivals as likely as this that turn a node by more than this, rad, are worth a warning.
+# A warning is given for rivals of at least this probability that turn a node by more than this, rad.
 LIKELY, FAR_TURN = 0.05, np.radians(5.0)
 # What is less likely good than this does not pull at all.
 _SURELY_FALSE = 0.05
@@ -32,17 +32,17 @@ _SCORED = 0.0015
 
 @dataclass(frozen=True)
 class Published:
-    """Of a closure graph (K key nodes, E edges).
+    """The published answer on a closure graph (K key nodes, E edges).
 
     Attributes:
-        graph: with nodes along segments as the likeliest noise has it.
+        graph: the closure graph, with nodes placed along segments by the likeliest noise.
         correction: ``(4, K)``.
         outlier_probability: ``(E,)``.
         variance: ``(N,)`` rad², of the view-graph's nodes.
-        noise: of the likeliest labelling.
-        chosen: number of the mode whose orientations these are, the median.
-        rivals: probabilities of the labellings that were averaged, the best first.
-        warnings: where rivals are likely and differ.
+        noise: noise of the likeliest labelling.
+        chosen: index of the mode whose orientations are published, the median.
+        rivals: probabilities of the averaged labellings, the best first.
+        warnings: given where rivals are likely and differ.
     """
 
     graph: ClosureGraph
@@ -56,7 +56,7 @@ class Published:
 
     @property
     def body_from_world(self) -> Tensor:
-        """``(N, 4)``, of the view-graph's nodes."""
+        """``(N, 4)`` orientations of the view-graph's nodes."""
         return self.graph.orientations(torch.from_numpy(np.ascontiguousarray(self.correction.T)))
 
 
@@ -92,9 +92,9 @@ def publish(problem: Problem, modes: list[Mode], tuned: Callable[[Mode], Mode] =
 
 
 def median(corrections: list[np.ndarray], share: np.ndarray) -> int:
-    """Which of several orientations ``(4, K)`` each has the least mean angle to all, weighted by their shares.
+    """Index of the orientations, of several ``(4, K)``, with the least mean angle to all, weighted by their shares.
 
-    Where two maps are folded otherwise nothing lies halfway that either of them is near.
+    A mean would not do: between two maps that are folded differently, it is near neither.
     """
     if len(corrections) == 1:
         return 0
@@ -104,7 +104,7 @@ def median(corrections: list[np.ndarray], share: np.ndarray) -> int:
 
 
 def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: list[np.ndarray]) -> tuple[str, ...]:
-    """What rivals disagree about, if any that is likely turns a part of the map by far."""
+    """Warnings about the differences between rivals, if a likely one turns a part of the map by far."""
     largest = [float(np.sqrt((turn**2).sum(axis=0)).max(initial=0.0)) for turn in turns]
     others = [
         number
@@ -124,11 +124,11 @@ def _warnings(problem: Problem, rivals: list[Mode], share: np.ndarray, turns: li
 
 
 def distinct(problem: Problem, modes: list[Mode]) -> tuple[list[Mode], np.ndarray]:
-    """Modes that are no neighbours of a better one, and their probabilities; the best first.
+    """Modes that are not alike a better one, and their probabilities; the best first.
 
-    Labellings differ by a slip, by two closures of a run or by orientations; single closures are probabilities within
-    each. A labelling is as likely as under its best noise, so that one under which more noise was tried is no likelier
-    for that.
+    Labellings are distinct if they differ in a slip, in two closures of a run or in orientations; within each, single
+    closures are probabilities. A labelling's probability is that under its best noise, so it does not grow with the
+    number of noises tried.
     """
     labellings: list[list[Mode]] = []
     for mode in modes:
@@ -157,16 +157,16 @@ def _has_other_noise(mode: Mode, other: Mode) -> bool:
 
 
 def of_mode(mode: Mode) -> Published:
-    """One labelling's answer, single closures weighed by their leave-one-out probabilities.
+    """One labelling's answer, with single closures weighted by their leave-one-out probabilities.
 
-    Whether a segment slipped is another labelling's matter: what closures say of that they say together.
+    Slips stay as labelled: evidence about a slip comes from many closures jointly, so it distinguishes labellings.
     """
     problem, state, left_out = mode.problem, mode.state, mode.left_out
     is_decided, decided = np.isinf(problem.log_odds) | problem.graph.is_odometry, state.is_good
     for number in range(_ROUNDS):
         spend(_SCORED * len(state.trusted))
         score, trust = scores(problem, state, left_out)
-        if number > 0:  # closures that answer each other would swing from round to round
+        if number > 0:  # otherwise closures that depend on each other could alternate from round to round
             trust = (trust + state.trusted) / 2
         trusted = np.where(trust < _SURELY_FALSE, 0.0, trust)
         trusted = np.where(is_decided, decided, trusted).astype(np.float64)

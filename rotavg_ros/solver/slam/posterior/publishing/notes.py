@@ -9,22 +9,22 @@ from rotavg_ros import rotations
 from rotavg_ros.solver.slam.posterior.left_out import slipped_or_tailed
 from rotavg_ros.solver.slam.posterior.mode import Mode
 
-# Odometry that slipped by more than this, rad, is worth a word.
+# Slips of more than this, rad, are reported.
 _FAR_SLIP = np.radians(10.0)
 
 
 def notes_of(mode: Mode, suspected: np.ndarray | None = None) -> tuple[str, ...]:
-    """Slips of the odometry by far, and a sensor that is, or may be, mounted otherwise than said.
+    """Large slips of the odometry, and a sensor whose mounting differs, or may differ, from the stated one.
 
     Args:
         mode: the labelling.
-        suspected: ``(3,)`` rad, by which closures and odometry seem to have other axes, where nothing was made of it.
+        suspected: ``(3,)`` rad, apparent rotation between the axes of closures and odometry that was not corrected.
     """
     return (*_of_slips(mode), *_of_mounting(mode), *_of_suspected(suspected))
 
 
 def _of_slips(mode: Mode) -> tuple[str, ...]:
-    """What is to be known of a labelling by which odometry is off by far somewhere: a sentence, or none."""
+    """A sentence about large slips in a labelling, or none."""
     graph, off = mode.problem.graph, slipped_or_tailed(mode.problem, mode.state, mode.left_out)
     turned = np.sqrt((mode.evaluation.residual[off] ** 2).sum(axis=1))
     far = off[turned > _FAR_SLIP]
@@ -51,7 +51,7 @@ def _of_slips(mode: Mode) -> tuple[str, ...]:
 
 
 def _of_mounting(mode: Mode) -> tuple[str, ...]:
-    """How closures' sensor is held to be mounted otherwise than said: a sentence, or none."""
+    """A sentence about the estimated mounting of the closures' sensor where it differs from the stated one, or none."""
     calibrated = mode.problem.calibrated
     mounting = np.zeros(3) if calibrated is None else calibrated.calibration.mounting
     if not mounting.any():
@@ -67,7 +67,7 @@ def _of_mounting(mode: Mode) -> tuple[str, ...]:
 
 
 def _of_suspected(mounting: np.ndarray | None) -> tuple[str, ...]:
-    """By how much closures and odometry turn about other axes, without anything having been made of it."""
+    """A sentence about an apparent, uncorrected rotation between the axes of closures and odometry, or none."""
     if mounting is None:
         return ()
     degrees = np.degrees(np.linalg.norm(mounting))
