@@ -1,4 +1,4 @@
-"""Many view-graphs in one call: one pass of the networks over all of them, which is what keeps a GPU busy."""
+"""Many view-graphs in one call: one pass of the networks over all of them keeps a GPU busy."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def solve_batch(
     refinement_steps: int | None = None,
     weights: Path | None = None,
 ) -> list[Solution]:
-    """What :func:`~rotavg_ros.solver.solve` says of every graph; the arguments are the same.
+    """Solves every graph as :func:`~rotavg_ros.solver.solve` does; the arguments are the same.
 
-    SfM graphs are solved together as one graph of that many components, and ``stage_seconds`` are those of all. Systems
-    are solved until each component's is, so answers differ by what refinements leave: up to a tenth of a standard error
-    where cameras have few edges, 10⁻⁵ rad and less elsewhere. Their
-    ``warnings`` are those about edges that state nothing and about graphs that are mostly flagged; that edges which
-    contradict each other agree among themselves is told only of a graph that is solved alone. SLAM graphs, and methods
-    that are not ours, go one by one.
+    SfM graphs are solved together as one graph with that many components, and ``stage_seconds`` are those of all. The
+    linear systems are iterated until every component has converged, so answers differ from separate solves by the
+    refinement's tolerance: up to a tenth of a standard error where cameras have few edges, 10⁻⁵ rad and less elsewhere.
+    Their ``warnings`` are those about edges that state nothing and about mostly flagged graphs; the warning that edges
+    which contradict the answer agree among themselves is given only for graphs solved alone. SLAM graphs, and methods
+    that are not ours, are solved one by one.
 
     Returns:
         a solution per graph, in their order.
@@ -64,7 +64,7 @@ def solve_batch(
 
 
 def _union(graphs: Sequence[ViewGraph]) -> ViewGraph:
-    """All graphs side by side, but for translations and routes, which the SfM profile does not read."""
+    """All graphs side by side, without translations and routes, which the SfM profile does not read."""
     unread = {"num_nodes", "translation", "information", "route", "routes"}
     names = [f.name for f in fields(ViewGraph) if f.name not in unread]
     columns = {name: [getattr(graph, name) for graph in graphs] for name in names}

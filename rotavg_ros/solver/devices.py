@@ -1,4 +1,4 @@
-"""Where a solve runs: a GPU if there is one that works, else the CPU, which is said once."""
+"""Where a solve runs: on a working GPU if there is one, else on the CPU, which is logged once."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import warnings
 
 import torch
 
-# What a GPU fails with while it is at work: out of memory, or an error of the driver.
+# Errors of a GPU at work: out of memory, or an error of the driver.
 GPU_ERRORS: tuple[type[Exception], ...] = (
     torch.OutOfMemoryError,
     getattr(torch, "AcceleratorError", torch.OutOfMemoryError),  # since torch 2.8
@@ -19,13 +19,13 @@ _said: set[str] = set()
 
 
 def choose(device: str) -> str:
-    """What "auto", "cpu" or "cuda" comes to, "cpu" or "cuda"; that a GPU was asked for and cannot be had is logged."""
+    """Resolves "auto", "cpu" or "cuda" to "cpu" or "cuda"; logs if a requested GPU is not available."""
     if device == "cpu":
         return "cpu"
     problem = gpu_problem()
     if problem is None:
         return "cuda"
-    # With "auto" nobody has asked for a GPU where there is none.
+    # With "auto" and no GPU there is nothing to log.
     if device == "cuda" or torch.version.cuda is not None:
         fall_back(problem)
     return "cpu"

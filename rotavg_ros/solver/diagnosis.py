@@ -1,4 +1,4 @@
-"""Search or model? A robot's graph solved as usual, and by the same posterior from its true labels and orientations."""
+"""Tells errors of the search from errors of the model: solves a robot's graph as usual, and from the truth."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ __all__ = ["Comparison", "SlamPriors", "compare_with_truth", "from_truth", "orie
 
 @dataclass(frozen=True)
 class Comparison:
-    """What the search found, and what it finds from the truth by single flips alone (N nodes).
+    """The search's result, and its result from the truth by single flips alone (N nodes).
 
     Attributes:
         found: ``(N, 4)`` body_from_world as published.
         from_truth: ``(N, 4)``.
-        rise: F of the best labelling found less that from the truth, nats. Above zero the search failed, below it the
-            posterior prefers another answer than the truth.
-        terms: of F, by how much each rises.
+        rise: F of the best labelling found minus F from the truth, nats. If positive, the search failed; if negative,
+            the posterior prefers another answer to the truth.
+        terms: rise of each term of F.
         rivals: number of labellings that were averaged.
     """
 
@@ -60,7 +60,7 @@ def compare_with_truth(
         graph: N nodes, M edges.
         body_from_world: ``(N, 4)`` true orientations, all known.
         is_wrong: ``(M,)`` bool, false closures and odometry that slipped.
-        without: of :data:`rotavg_ros.solver.slam.options.SWITCHES`.
+        without: those of :data:`rotavg_ros.solver.slam.options.SWITCHES` that are switched off.
         weights: folder of networks to use in place of the package's.
     """
     repeats = first_of_each(graph)
@@ -74,7 +74,7 @@ def compare_with_truth(
 
     truthful = from_truth(found.drawn, body_from_world, is_wrong)
     if problem.calibrated is not None:
-        # All measurements may as well be as they should.
+        # The measurements may also be free of systematic errors.
         as_it_is = from_truth(Drawn.of(graph, network, without), body_from_world, is_wrong)
         truthful = min(truthful, as_it_is, key=lambda either: either.cost)
     truth = truthful.modes[0]
@@ -90,11 +90,11 @@ def compare_with_truth(
 
 @torch.no_grad()
 def orientations_under(graph: ViewGraph, priors: SlamPriors, *, weights: Path | None = None) -> Tensor:
-    """``(N, 4)`` body_from_world that the posterior publishes under other priors than usual.
+    """``(N, 4)`` body_from_world that the posterior publishes under given priors.
 
     Args:
         graph: N nodes.
-        priors: all that is believed beforehand.
+        priors: all prior parameters.
         weights: folder of networks to use in place of the package's.
     """
     repeats = first_of_each(graph)
@@ -104,7 +104,7 @@ def orientations_under(graph: ViewGraph, priors: SlamPriors, *, weights: Path | 
 
 
 def from_truth(drawn: Drawn, body_from_world: Tensor, is_wrong: Tensor) -> Found:
-    """What single flips and other noise find from the true labels ``(M,)`` and orientations ``(N, 4)``."""
+    """Result of single flips and other noise from the true labels ``(M,)`` and orientations ``(N, 4)``."""
     problem, closure_graph = drawn.problem, drawn.prepared.closure_graph
     trusted = np.ones(len(closure_graph.source))
     trusted[closure_graph.num_segments :] = ~is_wrong.numpy()[closure_graph.view_graph_edge]

@@ -1,4 +1,4 @@
-"""What the solve of either profile is given, and what it gives."""
+"""Input and output of the solve of either profile."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rotavg_ros.solver.neurora.network_store import Networks
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a profile's solve gives: orientations in any gauge, scores, variance in rad² (NaN: unknown).
+    """Result of a profile's solve: orientations in any gauge, scores, variance in rad² (NaN: unknown).
 
     ``memory`` is what makes the profile's next solve of the same graph, grown a little, cheaper; nobody else reads it.
     ``warnings`` say why it should not be trusted, a sentence each. ``places`` are there where translations are known.
@@ -35,13 +35,13 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Places:
-    """What translations add (N nodes, M edges): positions in the orientations' frame, and each edge's rotation alone.
+    """Results that need translations (N nodes, M edges): positions in the orientations' frame, and verdicts on edges.
 
     Attributes:
         position: ``(N, 3)`` metres.
         variance: ``(N,)`` m² per component, relative to the component's first node.
         rotation_score: ``(M,)`` probability that an edge's rotation is wrong; its outlier score counts its place, too.
-        precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count; 0 where nothing is known.
+        precision: ``(M, 2)`` rad⁻² and m⁻² per component, weights of the edges; 0 where nothing is known.
     """
 
     position: Tensor
@@ -65,16 +65,16 @@ class Stopwatch:
 
 @dataclass(frozen=True)
 class Run:
-    """What a profile's solve is given besides the graph and the stages to run.
+    """Arguments of a profile's solve besides the graph and the stages to run.
 
     Attributes:
-        networks: where they come from and run.
-        watch: for the seconds of the stages.
-        refinement_steps: at most, 0 for none; None: as many as the stages like.
+        networks: the networks' source and device.
+        watch: measures the seconds of the stages.
+        refinement_steps: maximum number, 0 for none; None: the stages' own number.
         warm_start: ``(N, 4)`` body_from_world to begin with instead of the tree's.
-        memory: of the profile's last solve by the same method, or its labels alone; the graph may be another one.
-        work: units that an update may spend; it leaves the rest to be gone on with. None: all it takes.
-        anew: an update is to lead to what a solve without a memory does.
+        memory: memory of the profile's last solve by the same method, or its labels alone; the graph may differ.
+        work: units that an update may spend; it leaves the rest for later. None: no limit.
+        anew: an update is to arrive at the answer of a solve without a memory.
     """
 
     networks: Networks

@@ -1,4 +1,4 @@
-"""The methods by name, what each runs in either profile; profiles and devices to choose from. Imports no torch."""
+"""The methods by name with their stages in either profile, and the choices of profiles and devices; no torch import."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rotavg_ros.solver.slam.options import SlamStages
 
 @dataclass(frozen=True)
 class Method:
-    """The stages that run; what one profile does not have leaves the other as the whole does it."""
+    """The stages that run in either profile; a switch that one profile lacks leaves that profile at its default."""
 
     sfm: SfmStages = field(default_factory=SfmStages)
     slam: SlamStages = field(default_factory=SlamStages)
@@ -24,14 +24,14 @@ def _without_refinement(clean: bool, fine_tunings: int) -> Method:
 
 
 def _as_written(clean: bool, fine_tunings: int, but_for: frozenset[str] = frozenset()) -> Method:
-    """The paper's text is about photos; robots' graphs get what this package has of the same stages."""
+    """The paper's method. Its text is about photos; robots' graphs use this package's versions of the same stages."""
     ours = _without_refinement(clean, fine_tunings)
     return replace(ours, sfm=replace(ours.sfm, as_written=PAPER_PARTS - but_for))
 
 
 DEFAULT_METHOD = "neurora"
 PAPER = "neurora-paper"
-# "neurora~slips,cleannet" is ours on robots' graphs without these, "neurora-paper~tree" the paper's with our tree.
+# "neurora~slips,cleannet" is ours on robots' graphs without these; "neurora-paper~tree" is the paper's with our tree.
 _WITHOUT, _AND = "~", ","
 NETWORK_METHODS = {
     DEFAULT_METHOD: Method(),
@@ -40,13 +40,13 @@ NETWORK_METHODS = {
     "cleannet-spt": _without_refinement(clean=True, fine_tunings=0),
     "spt-finenet": _without_refinement(clean=False, fine_tunings=1),
     "spt": _without_refinement(clean=False, fine_tunings=0),
-    # The paper as its text has it, with networks of its own.
+    # The paper's method as in its text, with networks of its own.
     PAPER: _as_written(clean=True, fine_tunings=1),
     "neurora-v2-paper": _as_written(clean=True, fine_tunings=2),
     "cleannet-spt-paper": _as_written(clean=True, fine_tunings=0),
     "spt-finenet-paper": _as_written(clean=False, fine_tunings=1),
     "spt-paper": _as_written(clean=False, fine_tunings=0),
-    # Ablations: what each network and the noise's shape earn.
+    # Ablations of each network and the noise's shape.
     "neurora-unweighted": Method(sfm=SfmStages(weighted=False)),
     "neurora-without-finenet": Method(sfm=SfmStages(fine_tunings=0)),
     "neurora-without-cleannet": Method(SfmStages(clean=False), SlamStages(clean=False)),
@@ -58,12 +58,12 @@ NETWORK_METHODS = {
     "neurora-scalar-precisions": Method(sfm=SfmStages(stated_shapes=False)),
     "neurora-without-consensus": Method(sfm=SfmStages(consensus=False)),
 }
-# Others' methods, to compare with.
+# Methods of others, for comparison.
 BASELINES = ("chatterjee", "geman-mcclure", "weiszfeld", "arrigoni", "wang")
 METHODS = (*NETWORK_METHODS, *BASELINES)
 PROFILES = ("auto", "slam", "sfm")
 DEVICES = ("auto", "cpu", "cuda")
-# What translations are: metres, so that closures are judged by them, or of no use for that.
+# Scale of translations: metres, so that closures are judged by them, or none that would be of use.
 TRANSLATION_SCALES = ("metric", "none")
 
 
@@ -71,9 +71,9 @@ def method_named(name: str) -> Method | None:
     """The stages of a network method, None if there is none of that name.
 
     Args:
-        name: of :data:`NETWORK_METHODS`; "neurora~A,B" is ours on robots' graphs without A and B, which are of
-            :data:`rotavg_ros.solver.slam.options.SWITCHES`; "neurora-paper~A,B" is the paper's with A and B, which
-            are of :data:`rotavg_ros.solver.sfm.options.PAPER_PARTS`, as this package has them.
+        name: one of :data:`NETWORK_METHODS`; "neurora~A,B" is ours on robots' graphs without A and B, out of
+            :data:`rotavg_ros.solver.slam.options.SWITCHES`; "neurora-paper~A,B" is the paper's with this package's
+            versions of A and B, out of :data:`rotavg_ros.solver.sfm.options.PAPER_PARTS`.
     """
     whole, *switched_off = name.split(_WITHOUT)
     if not switched_off:
@@ -87,10 +87,10 @@ def method_named(name: str) -> Method | None:
 
 
 def check_choices(method: str, profile: str, device: str) -> None:
-    """That a solve knows them.
+    """Checks that the choices exist.
 
     Raises:
-        UserError: it does not; the message names those that it does.
+        UserError: one does not exist; the message lists those that do.
     """
     for name in method.split("+"):
         if not is_method(name):
@@ -105,7 +105,7 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 
 
 def unknown_method(name: str, choices: Sequence[str]) -> str:
-    """What is to be said of a name that is no method's: the parts that there are to leave out, or all ``choices``."""
+    """Error message for an unknown method: lists the parts that can be left out, or all ``choices``."""
     whole, *parts = name.split(_WITHOUT)
     known = {DEFAULT_METHOD: sorted(SWITCHES), PAPER: sorted(PAPER_PARTS)}.get(whole, [])
     if known and len(parts) > 1:
@@ -120,7 +120,7 @@ def unknown_method(name: str, choices: Sequence[str]) -> str:
 
 
 def is_method(name: str) -> bool:
-    """Whether a solve knows it."""
+    """Whether a method of that name exists."""
     return name in BASELINES or method_named(name) is not None
 
 

@@ -1,4 +1,4 @@
-"""All networks of the package by name, and how to read those of others."""
+"""All networks of the package by name, and how to read networks trained elsewhere."""
 
 from __future__ import annotations
 

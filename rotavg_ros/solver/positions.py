@@ -1,8 +1,8 @@
 """Positions from known orientations: a sparse linear least-squares problem, since ``p_target - p_source = R t``.
 
 With the orientations fixed, translations are linear in the positions and their three axes share one scalar Laplacian.
-What odometry steps and closures are worth against each other, and where a closure's translation is too far off to
-be one, was settled on simulated runs, never on the robots reported.
+The relative weight of odometry steps and closures, and the error at which a closure's translation counts as wrong,
+were chosen on simulated runs, never on the robots reported.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros.solver.algebra.odometry_lengths import lengths_passed, typical_length, ways_passed
 from rotavg_ros.solver.algebra.sparse.laplacian import LaplacianPattern
 
-# A closure is worth as much as this many typical steps of odometry in a row.
+# A closure has the variance of this many typical steps of odometry in a row.
 _CLOSURE_STEPS = 30.0
 _PASSES = 5
-# Geman & McClure's weight is a quarter at this many standard deviations; squared normal errors have about this median.
+# Number of standard deviations at which Geman & McClure's weight is a quarter.
 _SCALE_SIGMAS = 3.0
 _MEDIAN_OF_SQUARED = 0.8
-# Keeps closures so slight that positions are odometry's, where one starts from.
+# Weight of closures in the initial solve, negligible beside odometry.
 _NEXT_TO_NOTHING = 1e-9
 
 
@@ -49,11 +49,11 @@ class Translations:
 
     @property
     def trust(self) -> NDArray[np.float64]:
-        """``(M,)``."""
+        """``(M,)`` weight factor of each edge."""
         return np.where(self.is_odometry, 1.0, 1.0 - self.outlier_score)
 
     def usable(self) -> Translations:
-        """Those that say anything."""
+        """The edges with a known translation that are trusted."""
         used = np.isfinite(self.translation).all(axis=1) & (self.trust >= 0.5)
         return Translations(**{each.name: getattr(self, each.name)[used] for each in fields(self)})
 
@@ -61,11 +61,11 @@ class Translations:
 def fit_positions(
     world_from_body: NDArray[np.float64], edges: Translations, origin: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Positions that fit the translations best, closures weighted down the farther they are off.
+    """Positions that fit the translations best, with closures weighted down by their residuals.
 
-    A closure whose rotation is right may still be of another place that looks alike: corridors are parallel. So the
-    passes begin at what odometry alone says, the scale on which closures are judged is their own median residual, and
-    what is far off loses all weight (Geman & McClure 1985).
+    A closure with a correct rotation may still belong to another place that looks alike: corridors are parallel. So the
+    passes begin at the positions by odometry alone, closures are judged on the scale of their own median residual, and
+    distant ones lose all weight (Geman & McClure 1985).
 
     Args:
         world_from_body: ``(N, 4)`` xyzw.
@@ -73,7 +73,7 @@ def fit_positions(
         origin: ``(N, 3)`` metres; the first node of every component gets its own, 0 for NaN.
 
     Returns:
-        ``(N, 3)`` metres; NaN for nodes on which there is no translation.
+        ``(N, 3)`` metres; NaN for nodes without any translation.
     """
     edges = edges.usable()
     source, target, is_odometry = edges.source, edges.target, edges.is_odometry
@@ -93,7 +93,7 @@ def fit_positions(
 
     position = solve(np.where(is_odometry, 1.0, _NEXT_TO_NOTHING))
     if not is_odometry.all():
-        # Closures that fit exactly are off by what rounding leaves of the longest step, and are no scale for others.
+        # Closures that fit exactly have residuals of rounding size, which must not set the scale for others.
         rounding = max((np.finfo(float).eps * np.abs(step).max()) ** 2, np.finfo(float).tiny)
         for _ in range(_PASSES):
             squared = ((position[target] - position[source] - step) ** 2).sum(axis=1)

@@ -27,19 +27,20 @@ class Solution:
             to the component's first node; NaN where the method gives none.
         stage_seconds: wall-clock seconds of each stage that ran.
         method, profile, device: what was run, with "auto" resolved.
-        memory: what makes the next solve of the same graph cheaper once it has grown a little, to be handed to it as it
-            is; None if there is none.
+        memory: makes the next solve of the same graph, grown a little, cheaper; pass it on unchanged. None if there is
+            none.
         position: ``(N, 3)`` float64 metres, each component's first node at the origin, in the frame of its orientation;
             None where translations are unknown or were not used.
         position_uncertainty: ``(N,)`` metres, standard deviation of each component; None likewise.
         rotation_score: ``(M,)`` probability that the edge's rotation alone errs by more than 10°; None likewise.
-        edge_precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count in the answer, 0 where a
+        edge_precision: ``(M, 2)`` rad⁻² and m⁻² per component, weights of the edges in the answer, 0 where a
             translation is unknown; None likewise.
-        warnings: why it should not be trusted, a sentence each: what was seen, what may be the cause, what to do.
-        step_deviation: radians, by which each component of a step of odometry errs; NaN where the method says nothing.
-        work: units of work that the solve has cost, :data:`~rotavg_ros.solver.SECONDS_PER_UNIT` each; counted where
-            robots' graphs are solved, and the same on every machine.
-        is_anew: whether it is what a solve without a memory leads to.
+        warnings: reasons not to trust the answer, one sentence each: what was seen, a possible cause, what to do.
+        step_deviation: radians, standard deviation of each component of a step of odometry; NaN where the method does
+            not estimate it.
+        work: units of work that the solve took, :data:`~rotavg_ros.solver.SECONDS_PER_UNIT` each; counted for robots'
+            graphs only, and the same on every machine.
+        is_anew: whether the answer is the one that a solve without a memory leads to.
     """
 
     body_from_world: Tensor
@@ -67,13 +68,13 @@ class Solution:
 
 
 def residual_deg(graph: ViewGraph, solution: Solution) -> np.ndarray:
-    """``(M,)`` degrees, between each edge's measured rotation and the solution's."""
+    """``(M,)`` degrees between each edge's measured rotation and the solution's."""
     ends = graph.source.cpu(), graph.target.cpu()
     return angles_off(solution.body_from_world.cpu(), graph.target_from_source.cpu(), *ends)
 
 
 def residual_m(graph: ViewGraph, solution: Solution) -> np.ndarray:
-    """``(M,)`` metres, between each edge's measured translation and the solution's; NaN without either."""
+    """``(M,)`` metres between each edge's measured translation and the solution's; NaN if either is unknown."""
     if solution.position is None or graph.translation is None:
         return np.full(graph.num_edges, np.nan)
     ends = graph.source.cpu(), graph.target.cpu()
@@ -81,7 +82,7 @@ def residual_m(graph: ViewGraph, solution: Solution) -> np.ndarray:
 
 
 def angles_off(body_from_world: Tensor, target_from_source: Tensor, source: Tensor, target: Tensor) -> np.ndarray:
-    """``(M,)`` degrees, between measured rotations ``(M, 4)`` and those of N orientations."""
+    """``(M,)`` degrees between measured rotations ``(M, 4)`` and those of N orientations."""
     residual = edge_residual(body_from_world, target_from_source, source, target)
     return np.asarray(torch.rad2deg(angle(residual)).numpy())
 
@@ -89,6 +90,6 @@ def angles_off(body_from_world: Tensor, target_from_source: Tensor, source: Tens
 def distances_off(
     body_from_world: Tensor, position: Tensor, translation: Tensor, source: Tensor, target: Tensor
 ) -> np.ndarray:
-    """``(M,)`` metres, between measured translations ``(M, 3)`` and those of N poses; NaN where none is known."""
+    """``(M,)`` metres between measured translations ``(M, 3)`` and those of N poses; NaN where none is known."""
     measured = rotate(inverse(body_from_world)[source], translation)
     return np.asarray((position[target] - position[source] - measured).norm(dim=1).numpy())

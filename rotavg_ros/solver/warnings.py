@@ -1,8 +1,8 @@
-"""Why an answer should not be trusted: what measurements and answer look like when a convention was mistaken.
+"""Reasons not to trust an answer, such as signs in measurements and answer that a convention was mistaken.
 
-All functions are pure and change nothing. They compare loop closures with the odometry between their ends, as it is
-stated and as it would be under a hypothesis: rotations inverted, quaternions in another order. Only closures that the
-hypothesis turns by 30° and more count: an identity is its own inverse and speaks for neither.
+All functions are pure. They compare loop closures with the odometry between their ends, as stated and under a
+hypothesis: rotations inverted, quaternions in another order. Only closures that the hypothesis turns by 30° or more
+count: an identity is its own inverse and supports neither.
 """
 
 from __future__ import annotations
@@ -29,43 +29,45 @@ from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # The probability above which an edge counts as flagged.
 _FLAGGED = 0.5
-# Closures that more than half of which are flagged says something of.
+# Minimum number of closures for a warning that more than half of them are flagged.
 _MIN_CLOSURES = 4
-# A closure agrees with a prediction up to so many degrees: the noise that makes an edge of a robot's graph an outlier,
-# and twice as much for odometry that drifts. Beside it, the closures that this takes: of fewer, more than half agree by
-# chance with a probability above 3e-5 (in the plane, where random rotations agree with probability 1/18 or 1/9).
+# Tolerances in degrees within which a closure agrees with a prediction: the noise that makes an edge of a robot's graph
+# an outlier, and twice as much for odometry that drifts; and the minimum number of closures for each. Of fewer, more
+# than half agree by chance with a probability above 3e-5 (in the plane, where random rotations agree with probability
+# 1/18 or 1/9).
 _TOLERANCES = ((10.0, 8), (20.0, 16))
 _MIN_COMPARED = _TOLERANCES[0][1]
-# False closures of one pair of places agree with each other, and so by chance with a prediction: those that agree join
-# at least so many pairs of stretches, each of so many odometry edges.
+# False closures of one pair of places agree with each other, and so may all agree with a prediction by chance. So
+# agreeing closures must join at least this many pairs of stretches, of this many odometry edges each.
 _MIN_PLACES, _STRETCH = 3, 30
-# A closure tells two readings apart if they differ by so many tolerances.
+# A closure tells two readings apart if they differ by this many tolerances.
 _TELLS = 3.0
-# Closures that are compared at most, those with the shortest ways along odometry.
+# Maximum number of closures that are compared, those with the shortest ways along odometry.
 _MAX_COMPARED = 200
-# A hypothesis is stated if less than the first share agrees without it and more than the second with it. No random
-# closures reach the second; 70 % of the closures must be wrong to stay below the first.
+# A hypothesis is reported if less than the first share agrees without it and more than the second with it. Random
+# closures never reach the second; correct closures fall below the first only if 70 % of them are wrong.
 _SHARE_AS_STATED, _SHARE_OTHERWISE = 0.3, 0.6
-# Of hypotheses whose shares differ by no more than such a factor, the first is stated.
+# Among hypotheses whose shares differ by at most this factor, the first is reported.
 _NEARLY = 0.9
-# An odometry edge turns by less than the first in the median, rad, and by more than the second if its quaternion's
-# order is mistaken: w = cos(θ/2) in x's place makes a turn by θ one by 180° - θ or more. Fewer edges than closures that
-# are compared tell nothing: one random rotation in seventeen looks like that.
+# The median odometry edge turns by less than the first angle, rad, and by more than the second if the quaternion's
+# order is mistaken: w = cos(θ/2) in x's place makes a turn by θ one by 180° - θ or more. With fewer edges than compared
+# closures this is not decisive: one random rotation in seventeen looks like that.
 _SMALL_STEP, _LARGE_STEP = math.radians(60.0), math.radians(120.0)
-# Half an angle in rad: below the first an edge states no rotation, to rounding; where the others turn by more than the
-# second in the median, none of them measures that. So large a share of the edges is worth a word.
+# Half angles in rad: below the first, an edge states no rotation, up to rounding; if the others' median is above the
+# second, no real measurement would. The last is the share of such edges that is reported.
 _NO_ROTATION, _SOME_ROTATION, _SHARE_OF_NOTHING = 1e-9, 0.01, 0.05
-# So few believed closures may be false together; they turn the answer far from odometry's if by more than this, rad.
+# Number of believed closures up to which all may be false together, and the angle from odometry's answer, rad, that
+# counts as far.
 _FEW_BELIEVED, _FAR = 10, math.radians(30.0)
 
 
 def mostly_flagged(graph: ViewGraph, outlier_score: Tensor, rotation_score: Tensor | None = None) -> tuple[str, ...]:
-    """More than half of the loop closures (of a graph without odometry: of the edges) flagged, labelled ones apart.
+    """Warns if more than half of the loop closures (without odometry: of the edges) are flagged, labelled ones aside.
 
     Args:
         graph: on the CPU, M edges.
         outlier_score: ``(M,)``.
-        rotation_score: ``(M,)`` likewise, of the rotations alone; None: places are not judged.
+        rotation_score: ``(M,)`` likewise, for the rotations alone; None: places are not judged.
     """
     judged = ~graph.is_odometry & (graph.label == EdgeLabel.AUTOMATIC)
     is_flagged = judged & (outlier_score > _FLAGGED)
@@ -93,9 +95,9 @@ def mostly_flagged(graph: ViewGraph, outlier_score: Tensor, rotation_score: Tens
 
 
 def stating_nothing(graph: ViewGraph) -> tuple[str, ...]:
-    """Many edges of a graph without odometry state exactly no rotation: what some front ends write that found nothing.
+    """Warns if many edges of a graph without odometry state exactly no rotation, as some front ends do on failure.
 
-    Rigs of parallel cameras state it, too, but each between a few cameras of its own.
+    Rigs of parallel cameras state this, too, but each only between a few cameras of its own.
 
     Args:
         graph: on the CPU, N nodes, M edges.
@@ -115,7 +117,7 @@ def stating_nothing(graph: ViewGraph) -> tuple[str, ...]:
 
 
 def of_whole_solve(graph: ViewGraph, body_from_world: Tensor, outlier_score: Tensor) -> tuple[str, ...]:
-    """What a solve of a robot's graph from scratch is checked for besides.
+    """Further checks of a solve of a robot's graph from scratch.
 
     Args:
         graph: on the CPU, N nodes, M edges.
@@ -134,7 +136,7 @@ def of_whole_solve(graph: ViewGraph, body_from_world: Tensor, outlier_score: Ten
 
 
 def _gaps_of_places(graph: ViewGraph) -> str | None:
-    """Translations of some odometry are unknown, for which those of all are of no use."""
+    """Warns if translations of some odometry are unknown, so that none can be used."""
     if graph.translation is None:
         return None
     known, odometry = graph.translation.isfinite().all(dim=1), graph.is_odometry
@@ -160,7 +162,7 @@ def _far_from_odometry(odometry: _Odometry, body_from_world: Tensor, believed: i
 
 
 def _angles_after_alignment(a: Tensor, b: Tensor, component: Tensor) -> Tensor:
-    """``(N,)`` angles between orientations after the one rotation of the world, for each component, that suits best.
+    """``(N,)`` angles between orientations after the best alignment of the world in each component.
 
     It is the chordal mean of a_v⁻¹ b_v: the first eigenvector of Σ q qᵀ (Markley et al. 2007).
     """
@@ -171,7 +173,7 @@ def _angles_after_alignment(a: Tensor, b: Tensor, component: Tensor) -> Tensor:
     return rotations.angle_between(mean[component], turn)
 
 
-# Quaternions as stored, target_from_source ``(n, 4)``, to what they would be.
+# Maps quaternions as stored, target_from_source ``(n, 4)``, to their reading under a hypothesis.
 _Reading = Callable[[Tensor], Tensor]
 
 
@@ -180,17 +182,17 @@ def _as_stated(quaternions: Tensor) -> Tensor:
 
 
 def _reordered(quaternions: Tensor) -> Tensor:
-    """(w, x, y, z) taken for (x, y, z, w), put right."""
+    """Corrects (w, x, y, z) that was taken for (x, y, z, w)."""
     return quaternions[:, [1, 2, 3, 0]]
 
 
 def _inversely_reordered(quaternions: Tensor) -> Tensor:
-    """The same where the inverse of what is stored was written, as files and messages have it."""
+    """The same if the file or message holds the inverse of what is stored."""
     return rotations.inverse(_reordered(rotations.inverse(quaternions)))
 
 
 class _Hypothesis(NamedTuple):
-    """How rotations would have to be read, and whose they are."""
+    """A reading of rotations, and the edges to which it applies."""
 
     odometry: _Reading
     closures: _Reading
@@ -204,12 +206,12 @@ _CLOSURES_REORDERED = (
     _Hypothesis(_as_stated, _inversely_reordered, "the closures'", True),
     _Hypothesis(_as_stated, _reordered, "the closures'", True),
 )
-# All reordered is the same whether the inverse was written or not, up to half a turn of the world about z.
+# If all are reordered, it makes no difference whether the inverse was written, up to half a turn of the world about z.
 _ODOMETRY_REORDERED = (
     _Hypothesis(_inversely_reordered, _inversely_reordered, "all", True),
     _Hypothesis(_inversely_reordered, _as_stated, "the odometry's", True),
 )
-# In the plane inverting all changes no agreement, and inverting odometry is as good as inverting closures.
+# In the plane, inverting all changes no agreement, and inverting odometry is equivalent to inverting closures.
 _ODOMETRY_INVERTED = (
     _Hypothesis(rotations.inverse, _as_stated, "the odometry's", False),
     _Hypothesis(rotations.inverse, rotations.inverse, "all", False),
@@ -217,9 +219,9 @@ _ODOMETRY_INVERTED = (
 
 
 class _Agreement(NamedTuple):
-    """Within ``degrees``: how many closures were compared, agree with odometry as stated, and under a hypothesis.
+    """Numbers of closures compared, agreeing within ``degrees`` as stated, and agreeing under a hypothesis.
 
-    The latter join ``places`` pairs of stretches.
+    The last join ``places`` pairs of stretches.
     """
 
     hypothesis: _Hypothesis
@@ -240,7 +242,7 @@ class _Agreement(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Of the closures compared, those that agree under the hypothesis."""
+        """Share of the compared closures that agree under the hypothesis."""
         return self.otherwise / self.compared
 
     def __str__(self) -> str:
@@ -254,11 +256,11 @@ class _Agreement(NamedTuple):
 
 @dataclass(frozen=True)
 class _Odometry:
-    """The odometry edges of a graph that nobody has rejected.
+    """The odometry edges of a graph that are not labelled as rejected.
 
     Attributes:
-        graph: all nodes, and these edges alone.
-        forest: of the fewest edges.
+        graph: all nodes, and these edges only.
+        forest: spanning forest with the fewest edges to each root.
     """
 
     graph: ViewGraph
@@ -272,15 +274,15 @@ class _Odometry:
 
     @property
     def component(self) -> Tensor:
-        """``(N,)`` what odometry alone connects, numbered by first node."""
+        """``(N,)`` components that odometry alone connects, numbered by first node."""
         return torch.from_numpy(self.forest.component)
 
     def level(self) -> Tensor:
-        """``(N,)`` edges from the root: along a chain, ways are differences of these."""
+        """``(N,)`` number of edges from the root: path lengths along a chain are differences of these."""
         return torch.from_numpy(accumulate_to_root(self.forest, (self.forest.parent_edge >= 0) * 1.0))
 
     def median_angle(self, reading: _Reading) -> float:
-        """Of its edges, in radians."""
+        """Median angle of its edges, in radians."""
         cosine = reading(self.graph.target_from_source)[:, 3].abs()
         return 2 * math.acos(min(float(cosine.median()), 1.0)) if len(cosine) else 0.0
 
@@ -298,7 +300,7 @@ class _Odometry:
 
 
 def _mistaken_convention(odometry: _Odometry, closures: ViewGraph) -> str | None:
-    """Inverted rotations or another order of quaternions, of the closures, the odometry or both."""
+    """Warns of inverted rotations or another order of quaternions, in the closures, the odometry or both."""
     tells = odometry.component[closures.source] == odometry.component[closures.target]
     closures = closures.select_edges(tells.nonzero()[:, 0])
     stated, reordered = (odometry.median_angle(reading) for reading in (_as_stated, _reordered))
@@ -327,7 +329,7 @@ def _mistaken_convention(odometry: _Odometry, closures: ViewGraph) -> str | None
 
 
 def _agreements(odometry: _Odometry, closures: ViewGraph, is_reordered: bool) -> Iterator[_Agreement]:
-    """What is striking. Inverting closures turns only some; what turns all is tried where few agree as it is."""
+    """Striking agreements. Inversion turns only some closures; readings that turn all are tried only if few agree."""
     level = odometry.level()
     nearest = (level[closures.source] - level[closures.target]).abs().argsort(stable=True)
     closures = closures.select_edges(nearest)

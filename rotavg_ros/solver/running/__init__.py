@@ -1,1 +1,1 @@
-"""Solves while they run: given up, counted, left for a while, on several threads."""
+"""Running solves: abandoning them, counting their work, suspending them, and their threads."""

@@ -1,8 +1,8 @@
-"""A solve that is left where it has done enough for now, and gone on with later.
+"""A solve that can be suspended after some work and resumed later.
 
-It runs on a thread of its own, of which nothing runs but while somebody waits for it in :meth:`Resumable.go_on`: two
-threads in turn, never at once. So it is the same code as a solve in one go, ends alike to the last bit, and can be left
-at each factorisation.
+It runs on a thread of its own, which runs only while a caller waits in :meth:`Resumable.go_on`: the two threads take
+turns and never run at once. So it runs the same code as a solve in one go, gives a bit-identical result, and can be
+suspended at each factorisation.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from rotavg_ros.solver.running.work import Abandoned, abandonable, abandonment, 
 
 Result = TypeVar("Result")
 
-# It rests where it is told to end, so that this is never waited for.
+# Time limit for joining the thread, which is never reached, since the thread ends wherever it rests.
 _PATIENCE_S = 5.0
 
 
 class Resumable(Generic[Result]):
-    """A solve that has not begun yet; it is given up when nobody holds it any more.
+    """A suspended solve, not begun yet; it is abandoned when nobody holds a reference any more.
 
     Args:
-        solve: what it does.
+        solve: the function to run.
     """
 
     def __init__(self, solve: Callable[[], Result]) -> None:
@@ -37,7 +37,7 @@ class Resumable(Generic[Result]):
 
     @property
     def has_failed(self) -> bool:
-        """Whether it has raised something, as where a tick is abandoned; it cannot be gone on with."""
+        """Whether it has raised an exception, as when a tick is abandoned; it cannot be resumed."""
         return self._turns.error is not None
 
     @property
@@ -47,23 +47,23 @@ class Resumable(Generic[Result]):
 
     @property
     def spent(self) -> float:
-        """Units of work so far."""
+        """Units of work spent so far."""
         return self._turns.spent
 
     @property
     def result(self) -> Result:
-        """Once it :attr:`has_ended`."""
+        """The result, once it :attr:`has_ended`."""
         (result,) = self._turns.results
         return result
 
     def go_on(self, units: float) -> bool:
-        """Solve until so many units of work are spent; whether it has ended.
+        """Solve until ``units`` of work are spent; returns whether it has ended.
 
-        A piece of more than what is left waits for the next call, unless this one has done nothing yet.
+        A piece of work larger than the remaining units waits for the next call, unless this one has done nothing yet.
 
         Raises:
-            Exception: what the solve raises, :class:`~rotavg_ros.solver.running.work.Abandoned` among them where
-                the solve around this call is given up.
+            Exception: whatever the solve raises, including :class:`~rotavg_ros.solver.running.work.Abandoned` if the
+                solve around this call is abandoned.
         """
         turns = self._turns
         before = turns.spent
@@ -79,7 +79,7 @@ class Resumable(Generic[Result]):
 
 
 class _Turns(Generic[Result]):
-    """What both threads know."""
+    """State shared by both threads."""
 
     def __init__(self, solve: Callable[[], Result]) -> None:
         self._solve = solve
@@ -110,7 +110,7 @@ class _Turns(Generic[Result]):
             raise
 
     def give_up(self) -> None:
-        """Have the thread end; it is not to be cut off in the middle of something when the interpreter ends."""
+        """Makes the thread end, so that it is not cut off in the middle of work when the interpreter exits."""
         self._is_given_up = True
         self._theirs.release()
         if self._thread is not None and self._thread is not threading.current_thread():
@@ -123,10 +123,10 @@ class _Turns(Generic[Result]):
                 self.results.append(self._solve())
             self.has_ended = True
         except BaseException as error:
-            # What the solve held would stay with the error, and the error with this, which it holds.
+            # Otherwise the error's frames would keep the solve's objects alive, and this object the error.
             traceback.clear_frames(error.__traceback__)
             self.error = self.error or (Abandoned() if isinstance(error, Abandoned) else error)
-        del self._solve  # what it has used is not held by whoever holds its result
+        del self._solve  # so that a reference to the result does not keep the solve's data alive
         self._ours.release()
 
     def _asks(self) -> bool:

@@ -1,6 +1,6 @@
-"""A solve while it runs: given up where nobody waits for it, its work counted, left for a while.
+"""Control of a running solve: abandon it when nobody waits for it, count its work, suspend it.
 
-All of it belongs to the context of a solve, so solves that overlap in threads have one each.
+All state belongs to the context of a solve, so solves that overlap in threads have one each.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ _meter: ContextVar[Meter | None] = ContextVar("meter", default=None)
 
 @contextmanager
 def metered() -> Iterator[Meter]:
-    """Inside, what a solve of this thread spends is counted, by meters around this one as well."""
+    """Inside, the work of this thread's solve is counted, also by enclosing meters."""
     meter, around = Meter(), _meter.get()
     token = _meter.set(meter)
     try:
@@ -94,7 +94,7 @@ def resting(rest: Callable[[float], None]) -> Iterator[None]:
 
 
 def spend(units: float) -> None:
-    """Call it once before a factorisation, or a part of one, of so many units."""
+    """Call it once before a factorisation, or a part of one, that costs ``units``."""
     count(units)
     rest = _rests.get()
     if rest is not None:
@@ -102,19 +102,19 @@ def spend(units: float) -> None:
 
 
 def rest() -> None:
-    """Call it where a good deal of work lies between two factorisations."""
+    """Call it where much work lies between two factorisations."""
     waits = _rests.get()
     if waits is not None:
         waits(0.0)
 
 
 def count(units: float) -> None:
-    """Add what was spent elsewhere for this solve."""
+    """Add units that were spent elsewhere for this solve."""
     meter = _meter.get()
     if meter is not None:
         meter.spent += units
 
 
 def abandonment() -> Callable[[], bool]:
-    """What says whether the solve around this is given up."""
+    """The function that tells whether the enclosing solve is abandoned."""
     return _is_abandoned.get()

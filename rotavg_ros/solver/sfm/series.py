@@ -1,8 +1,8 @@
 """Edges in series: those that only check each other.
 
-Where removing two edges takes a graph apart, every cycle through one of them passes the other. What they disagree by is
-known of both together alone: nothing tells which of them errs. Being such a pair is an equivalence, so the edges fall
-into classes. A cycle is one class. In a well-knit graph every edge is a class by itself.
+If removing two edges disconnects a graph, every cycle through one of them passes the other. Then only their total error
+is known, not which of them errs. Being such a pair is an equivalence relation, so the edges fall into classes. A lone
+cycle is one class. In a well-knit graph every edge is a class of its own.
 
 The classes come from one random flow around the cycles, an integer for each edge whose sums vanish at all nodes: two
 edges are in series if their flows are equal or opposite, and so are those of other edges with a probability of 2⁻⁶³
@@ -24,7 +24,7 @@ from rotavg_ros.view_graph import ViewGraph
 # SplitMix64's constants, as signed numbers.
 _GOLDEN = 0x9E3779B97F4A7C15 - (1 << 64)
 _MIXERS = ((30, 0xBF58476D1CE4E5B9 - (1 << 64)), (27, 0x94D049BB133111EB - (1 << 64)))
-# The flow's last bits sort out most edges that are in series with none.
+# The flow's last bits are enough to rule out most edges that are in series with none.
 _TABLE = 1 << 16
 
 
@@ -35,8 +35,8 @@ class EdgesInSeries(NamedTuple):
         edge: ``(K,)`` the graph's edges.
         group: ``(K,)`` the class of each.
         num_groups: G.
-        blame: ``(K,)`` float64, probability that it is this one, if one of its class is wrong; begun as equal.
-        bridge: ``(B,)`` edges that are on no cycle, so that nothing at all checks them.
+        blame: ``(K,)`` float64, probability that this edge is the wrong one if one of its class is; initially equal.
+        bridge: ``(B,)`` edges on no cycle, which nothing checks.
     """
 
     edge: Tensor
@@ -84,28 +84,28 @@ class EdgesInSeries(NamedTuple):
         return cls(edge[chosen], group, len(size), 1 / size.double()[group], bridge)
 
     def blamed(self, log_odds: Tensor) -> EdgesInSeries:
-        """With the blame that log-odds ``(K,)`` to be wrong give."""
+        """The same edges with blame from their log-odds ``(K,)`` of being wrong."""
         odds = torch.exp(log_odds - log_odds.amax()) if len(log_odds) else log_odds
         return self._replace(blame=odds / self.sums(odds)[self.group])
 
     def score(self, angle: Tensor, uncertainty: Tensor, outlier_angle: float) -> Tensor:
-        """Probability ``(K,)`` that noise exceeds ``outlier_angle``, rad: of one of the class, times the blame.
+        """Probability ``(K,)`` that noise exceeds ``outlier_angle``, rad: that of the whole class, times the blame.
 
         Args:
-            angle, uncertainty: ``(K,)`` rad, as residuals have them.
+            angle, uncertainty: ``(K,)`` rad, of the residuals.
         """
         together, spread = self.sums(angle.double()), self.sums(uncertainty.double().square()).sqrt()
         return self.blame * residual_probability(together, spread, outlier_angle)[self.group]
 
     def bridge_score(self, score: Tensor, of_edge: Tensor, num_components: int) -> Tensor:
-        """Probability ``(B,)`` that a bridge is wrong: the share of what its component checks, with one good edge more.
+        """Probability ``(B,)`` that a bridge is wrong: the mean score of its component's checked edges and a good one.
 
-        Orientations follow a bridge, so that its residual says nothing of it.
+        Orientations follow a bridge, so its residual says nothing about it.
 
         Args:
-            score: ``(M,)`` of the edges that others check.
+            score: ``(M,)`` scores of the edges that others check.
             of_edge: ``(M,)`` each edge's component.
-            num_components: of all.
+            num_components: number of components.
         """
         checked = torch.ones_like(score)
         checked[self.bridge] = 0

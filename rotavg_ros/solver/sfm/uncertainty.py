@@ -1,9 +1,9 @@
-"""How far refined orientations may be off, relative to one node of each component.
+"""Uncertainty of refined orientations, relative to one node of each component.
 
-The least-squares covariance σ² L⁻¹ of the edges that are believed: each counts by the probability that it is no
-outlier, and σ² is what residuals say of the noise, divided by the edges that check others. Random samples of that
-covariance tell its diagonal (:meth:`~rotavg_ros.solver.algebra.sparse.laplacian.FactorisedLaplacian.samples`). Noise
-is taken to be round. A factorisation takes too long where a graph is well knit.
+It is the least-squares covariance σ² L⁻¹ of the believed edges: each is weighted by the probability that it is no
+outlier, and σ² is the sum of squared residuals over the number of redundant edges. Its diagonal is estimated from
+random samples (:meth:`~rotavg_ros.solver.algebra.sparse.laplacian.FactorisedLaplacian.samples`). Noise is assumed
+round. A factorisation takes too long where a graph is well knit.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from rotavg_ros.view_graph import ViewGraph
 _WELL_KNIT_DEGREE = RefinementPriors().well_knit_degree
 # Sampled standard deviations err by 9 %.
 _SAMPLES = 64
-# Of edges that are surely wrong: they hold the graph together.
+# Weight of edges that are surely wrong, which keeps the graph connected.
 _LEAST_WEIGHT = 1e-3
 _FLAGGED = 0.5
-# Rad²: of graphs without any noise.
+# Floor of the variance, rad², for graphs without any noise.
 _LEAST_NOISE = 1e-12
 
 
@@ -50,7 +50,8 @@ def variances(graph: ViewGraph, angle: Tensor, score: Tensor, bridge: Tensor, to
     Args:
         angle: ``(M,)`` rad, residuals.
         score: ``(M,)`` probability that an edge is an outlier.
-        bridge: ``(B,)`` edges that nothing checks: as likely as their scores say, what is behind them is turned anyhow.
+        bridge: ``(B,)`` edges that nothing checks: with the probability of their scores, the part behind them is turned
+            by any rotation.
     """
     count = len(to.node)
     size = torch.bincount(to.component, minlength=count)
@@ -66,14 +67,14 @@ def variances(graph: ViewGraph, angle: Tensor, score: Tensor, bridge: Tensor, to
     def sums(value: Tensor) -> Tensor:
         return value.new_zeros(count).index_add_(0, to.component[source], value)
 
-    # Edges beyond a spanning tree that are believed, at least one.
+    # Number of believed edges beyond a spanning tree, at least one.
     checks = (sums((score[kept] < _FLAGGED).to(weight)) - size + 1).clamp(min=1)
     noise = sums(weight * angle[kept].to(weight).square()) / (3 * checks)
     turned = torch.zeros_like(score)
     turned[bridge] = score[bridge] * rotations.RANDOM_VARIANCE
     turned = turned[kept] / noise[to.component[source]].clamp(min=_LEAST_NOISE)
     weight = 1 / (1 / weight + turned)
-    # What is not asked for is held fixed as the references are.
+    # Nodes whose variance is not needed are held fixed, like the references.
     fixed = ~loose
     fixed[to.node] = True
     ends = source.cpu().numpy(), target.cpu().numpy()

@@ -1,9 +1,9 @@
-"""A robot's graph while it grows: what each tick answers, and what is done beside it.
+"""A robot's graph while it grows: the answer of each tick, and the solves that run alongside.
 
-What is known of the graph is the last solve's. Odometry that has come since is laid on; closures that have come ask for
-a solve that goes on from the last one (an update), and those it does not explain for a whole search. Both are left
-where the tick has spent its work, and gone on with in the next one. Until the update has ended, new closures count by
-the tangent of the last solve (:mod:`~rotavg_ros.solver.slam.update.conditioned`).
+The state of the graph is that of the last solve. New odometry is appended to it. New closures require a solve that
+continues from the last one (an update), and those it does not explain a whole search. Both are suspended when the tick
+has spent its work, and resumed in the next one. Until the update has ended, new closures are included by linearisation
+about the last solve (:mod:`~rotavg_ros.solver.slam.update.conditioned`).
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ from rotavg_ros.solver.slam.update.linear import Linear
 from rotavg_ros.solver.slam.update.memory import SlamMemory, with_poses
 from rotavg_ros.view_graph import ViewGraph
 
-# Of the work that a tick leaves an update has so much while a whole search waits for the rest; of the tick's own new
-# closures' columns have so much.
+# Share of a tick's remaining work for an update while a whole search waits for the rest; share of the tick's own work
+# for the columns of new closures.
 _UPDATES, _COLUMNS = 0.5, 0.8
-# No more closures than this are reckoned in by the tangent: as many as come while two updates of a large map run. Their
-# covariance is inverted once or twice a tick, 12 ms with translations.
+# Maximum number of closures that are included by linearisation: as many as arrive during two updates of a large map.
+# Their covariance is inverted once or twice a tick, 12 ms with translations.
 _MOST = 200
 _FLAGGED = 0.5
-# Closures that join what was apart and are this far from how they are held to do so, rad, are false to begin with.
+# Closures that join separate parts are initially false if they contradict the start by more than this, rad.
 _FAR = math.radians(30)
 
 
 def update_slam(graph: ViewGraph, memory: SlamMemory, run: Run) -> Estimate | None:
-    """The answer of a graph that has grown since ``memory``; None if nothing can be gone on from.
+    """The answer of a graph that has grown since ``memory``; None if it cannot be continued from.
 
     Args:
         graph: N nodes, M edges.
-        memory: of the last answer.
-        run: with the units of work that may be spent, as far as one factorisation does not cost more.
+        memory: memory of the last answer.
+        run: includes the units of work that may be spent, exceeded at most by one factorisation.
     """
     with run.watch.stage("update"):
         known = _caught_up(graph, memory, run)
@@ -81,10 +81,10 @@ def update_slam(graph: ViewGraph, memory: SlamMemory, run: Run) -> Estimate | No
 
 
 def resume_slam(graph: ViewGraph, labels: KeptLabels, run: Run) -> Estimate | None:
-    """The answer of a graph of which labels are left, and nothing else of the last solve; None if they do not fit it.
+    """The answer of a graph from the labels of the last solve alone; None if they do not fit the graph.
 
-    There is nothing to answer by meanwhile, so it goes to the end. Where closures have joined what was apart, the start
-    says how; which of them are good is gone into by a whole search beside the next answers.
+    There is no earlier answer to fall back on, so it is not suspended. Where closures have joined separate parts, the
+    start says how; which of them are good is decided by a whole search alongside the next answers.
     """
     if run.warm_start is None or labels.by_places is not has_places(graph) or first_of_each(graph) is not None:
         return None
@@ -118,7 +118,7 @@ def _far_from(graph: ViewGraph, edges: np.ndarray, start: torch.Tensor) -> np.nd
 
 
 def advance(memory: SlamMemory, work: float) -> None:
-    """Go on with what a tick has left, for so many units of work; the next one finds it there."""
+    """Continue what a tick has left undone, for ``work`` units; the next tick finds it done."""
     update, ahead = memory.update, memory.ahead
     with metered() as meter:
         if update is not None and not update.has_failed:
@@ -128,7 +128,7 @@ def advance(memory: SlamMemory, work: float) -> None:
 
 
 def _searched_ahead(graph: ViewGraph, known: SlamMemory, run: Run) -> SlamMemory:
-    """With a whole search under way where one is due."""
+    """The memory, with a whole search under way if one is due."""
     ahead = known.ahead
     if ahead is not None and ahead.has_failed:
         known = replace(known, ahead=None, anew=False)
@@ -154,7 +154,7 @@ def _is_same(graph: ViewGraph, other: ViewGraph) -> bool:
 
 
 def _by_itself(run: Run) -> Run:
-    """What a solve that outlives this one is given."""
+    """Arguments for a solve that outlives this one."""
     return replace(run, watch=Stopwatch(), memory=None, work=None, anew=False)
 
 
@@ -236,7 +236,7 @@ def _updated(graph: ViewGraph, memory: SlamMemory, run: Run) -> SlamMemory | Non
 
 
 def _laid_on(graph: ViewGraph, known: SlamMemory, ration: float) -> Estimate | None:
-    """The answer by what is known, odometry and closures that have come since laid on it."""
+    """The known answer, with odometry and closures since then added to it."""
     edges = np.arange(graph.num_edges)
     waits = (edges >= known.graph.num_edges) & ~graph.is_odometry.numpy()
     kept, closure = np.flatnonzero(~waits), np.flatnonzero(waits)
@@ -271,12 +271,12 @@ def _laid_on(graph: ViewGraph, known: SlamMemory, ration: float) -> Estimate | N
 
 
 def _linear(known: SlamMemory) -> Linear:
-    """The normal density about the last solve."""
+    """The normal approximation at the last solve."""
     return Linear.of_rotations(known.mode) if known.poses is None else Linear.of_poses(known.poses.pose)
 
 
 def _most_columns(linear: Linear, ration: float) -> int:
-    """Of how many closures a tick may work out the columns."""
+    """Number of closures whose columns a tick may compute."""
     return int(min(max(1.0, _COLUMNS * ration / (linear.column_work * linear.size)), _MOST))
 
 

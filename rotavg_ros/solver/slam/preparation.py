@@ -1,4 +1,4 @@
-"""What a SLAM solve begins with: the odometry drawn together, without its bias, and the scale of the noise."""
+"""Preparation of a SLAM solve: contracts the odometry, without its bias, and estimates the scale of the noise."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from rotavg_ros.solver.slam.noise.model import (
 )
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-# Odometry first: no number of steps is worth a closure.
+# Cost of a closure in the forest: larger than that of any number of odometry steps.
 _CLOSURE_COST = 1e6
-# Odometry that this share of the closures disagrees with may be biased; it is if without the bias so many fewer do,
-# and with less drift.
+# Odometry may be biased if this share of the closures disagrees with it; it counts as biased if removing the bias lets
+# that many fewer disagree, with less drift.
 _BIASED_SHARE = 0.5
 _BIAS_GAIN = 0.2
 _BIAS_ROUNDS = 2
-# Units of work of drawing an edge together, and of comparing a closure with its neighbours.
+# Units of work to contract an edge, and to compare a closure with its neighbours.
 _EDGE, _CLOSURE = 0.002, 0.008
 # It is not looked for, or not any further, where a cheaper look promises less than such parts of that gain: at most the
 # closures that disagree and are confirmed by a neighbour, and what the first round explains.
@@ -40,7 +40,7 @@ _BIAS_CONFIRMED, _BIAS_EXPLAINED = 0.75, 0.4
 
 @dataclass(frozen=True)
 class Prepared:
-    """A SLAM graph drawn together, with the scale of its noise (C closures).
+    """A contracted SLAM graph, with the scale of its noise (C closures).
 
     Attributes:
         closure_graph: the graph of the closures' ends.
@@ -48,7 +48,7 @@ class Prepared:
         path_steps: ``(C,)`` odometry steps between its ends; inf where odometry does not connect them.
         pairs: which closures agree.
         noise: estimated scales.
-        forest: along which the chains were drawn together.
+        forest: the forest along which the chains were contracted.
     """
 
     closure_graph: ClosureGraph
@@ -66,7 +66,7 @@ class Prepared:
 def prepare(graph: ViewGraph) -> Prepared:
     """Contract the odometry chains and estimate the noise of steps and closures. Rejected edges take no part.
 
-    If most closures disagree with the odometry, a constant bias may be why; it is taken out if fewer do without it.
+    If most closures disagree with the odometry, a constant bias may be the cause; it is removed if fewer then disagree.
     """
     prepared = prepare_as_it_is(graph)
     bias = likely_bias(graph, prepared)
@@ -79,7 +79,7 @@ def prepare(graph: ViewGraph) -> Prepared:
 
 
 def prepare_as_it_is(graph: ViewGraph, components: int | None = None) -> Prepared:
-    """The same whatever the odometry's bias; with noise of so many components, by default as many as rotations have."""
+    """The same without regard to a bias; ``components`` of the noise, by default as many as rotations have."""
     closure_graph, forest = draw_together(graph)
     spend(_CLOSURE * int(closure_graph.is_closure.sum()))
     closure = closure_graph.is_closure

@@ -1,1 +1,1 @@
-"""Systems of least squares of the SfM refinement, whose edges weigh by matrices."""
+"""Least-squares systems of the SfM refinement, with matrices as the edges' weights."""

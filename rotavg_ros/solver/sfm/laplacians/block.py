@@ -1,8 +1,8 @@
 """Laplacian systems whose weights are 3 × 3 matrices, by conjugate gradients.
 
 The weight of an edge between u and v is ``a_u S_u + a_v S_v``: S is a 3 × 3 matrix for each node, a_u and a_v are two
-scalars for each edge. So no matrix of an edge is ever formed, and a product with the whole takes two products with
-sparse matrices of scalars. A has in row v and column u what belongs to v's own matrix, a_v; Aᵀ what belongs to u's:
+scalars for each edge. So no edge's matrix is ever formed, and a product with L takes two products with sparse matrices
+of scalars. A has the coefficient a_v of v's own matrix in row v and column u; Aᵀ has that of u's:
 
     (L x)_v = D_v x_v − S_v (A x)_v − (Aᵀ S x)_v
 """
@@ -33,7 +33,7 @@ Preconditioner = Callable[[Tensor], Tensor]
 
 
 class SplitWeights(NamedTuple):
-    """Of M edges: positive weights ``(M,)``, and the share of each ``(M,)`` that belongs to its source's matrix."""
+    """Weights of M edges: positive weights ``(M,)``, and the share ``(M,)`` of each that has its source's matrix."""
 
     total: Tensor
     source_share: Tensor

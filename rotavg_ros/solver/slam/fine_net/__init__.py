@@ -1,1 +1,1 @@
-"""FineNet of robots' graphs: how far each edge errs here, by what the whole graph says of it and its neighbours."""
+"""FineNet of robots' graphs: predicts the error variance of each edge from evidence on its neighbourhood."""

@@ -1,4 +1,4 @@
-"""What a solve tells of how far each edge errs: the arrays from which FineNet's features are made."""
+"""A solve's evidence on the error of each edge: the arrays from which FineNet's features are made."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rotavg_ros.solver.slam.posterior.state import Noise, State
 
 @dataclass(frozen=True)
 class Evidence:
-    """Of the E edges of a closure graph of K key nodes, C of them closures, after a solve.
+    """Evidence on the E edges of a closure graph with K key nodes, C of them closures, after a solve.
 
     Attributes:
         source, target: ``(E,)`` key nodes.
@@ -21,18 +21,18 @@ class Evidence:
         is_good: ``(E,)`` bool, labels.
         own: ``(E,)`` rad², v, the variance of each edge's own noise as estimated.
         residual_square: ``(E,)`` rad², ‖r‖².
-        weight: ``(E,)`` rad⁻², what each edge weighs as a good one; with tails another one than 1 / v.
-        rest: ``(E,)`` 1 − w R, what the edge itself leaves of what all others say.
-        square: ``(E,)`` rad², ‖μ‖², the discrepancy with what all others say.
-        predicted: ``(E,)`` rad², p, the variance of that.
+        weight: ``(E,)`` rad⁻², weight of each edge as a good one; with tails it differs from 1 / v.
+        rest: ``(E,)`` 1 − w R, residual over the discrepancy with the prediction by all others.
+        square: ``(E,)`` rad², ‖μ‖², squared discrepancy with the prediction by all others.
+        predicted: ``(E,)`` rad², p, variance of that prediction.
         log_density: ``(E,)`` nats, of μ if the edge is good, tails included.
-        log_relative: ``(E,)`` of v over what noise makes of it: what was found in an earlier pass, else 0.
+        log_relative: ``(E,)`` log ratio of v to that of the noise model, from an earlier pass, else 0.
         position: ``(E, 2)`` where the older and the newer end lie along the odometry, in steps; chains are far apart.
         run: ``(C,)`` number of each closure's run.
         steps: ``(E,)`` steps of odometry: of segments their own, of closures those between their ends.
-        turn: ``(E,)`` squares of the turns of a segment's steps over what is usual; 1 where unknown, and of closures.
-        length: ``(E,)`` metres a step over what is usual; 1 where unknown, and of closures.
-        stated: ``(E,)`` logarithm of what closures state for a variance over what is usual; 0 where unknown.
+        turn: ``(E,)`` squared turns of a segment's steps over the usual value; 1 where unknown, and for closures.
+        length: ``(E,)`` metres a step over the usual value; 1 where unknown, and for closures.
+        stated: ``(E,)`` logarithm of closures' stated variance over the usual value; 0 where unknown.
         noise: θ.
         components: k, 1 where all rotations share an axis, else 3.
     """

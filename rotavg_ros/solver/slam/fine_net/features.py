@@ -1,9 +1,10 @@
 """FineNet's features: how far edges err, alone and with their neighbours, all in units of the estimated noise.
 
-What all others say of an edge, N(μ, p I), differs from its measurement by noise of variance v, so that of μ² one
-expects k (v + p): z² = μ² / k (v + p). Of z² the part a = v / (v + p) is told by the edge's own noise. A stretch of
-edges says log (Σ a z² + 1) / (Σ a + 1): nothing where others tell nothing, the logarithm of the variance over what is
-estimated where they tell all. Nothing here depends on frame, gauge, the noise's scale, directions or order of edges.
+All other edges predict an edge as N(μ, p I), with μ its discrepancy. Its own noise has variance v, so μ² has the
+expectation k (v + p): z² = μ² / k (v + p). The part a = v / (v + p) of z² is due to the edge's own noise. The feature
+of a stretch of edges is log (Σ a z² + 1) / (Σ a + 1): 0 if predictions are uninformative, the log ratio of actual to
+estimated variance if they are exact. No feature depends on frame, gauge, the noise's scale, or directions or order of
+edges.
 """
 
 from __future__ import annotations

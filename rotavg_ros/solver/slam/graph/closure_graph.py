@@ -1,4 +1,4 @@
-"""The closure graph: a SLAM pose graph with its odometry chains drawn together.
+"""The closure graph: a SLAM pose graph with its odometry chains contracted.
 
 A keyframe between two odometry edges and without a closure carries no information of its own, so a run of k odometry
 steps is one *segment* with k times the variance, and what is left has as many nodes as closures have ends. All

@@ -1,1 +1,1 @@
-"""How odometry and closures err, and how a closure is judged by that."""
+"""The noise of odometry and closures, and how closures are judged by it."""

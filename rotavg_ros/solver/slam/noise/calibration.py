@@ -1,4 +1,4 @@
-"""What all measurements of a kind have wrong alike, and a graph without it."""
+"""Systematic errors that all measurements of a kind share, and their removal from a graph."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ PARTS = ("bias", "mounting")
 
 @dataclass(frozen=True)
 class Calibration:
-    """Of one robot, or of all alike.
+    """Systematic errors of one robot, or common to all.
 
     Attributes:
         bias: ``(3,)`` rad per step that odometry turns too much, in the body's frame.
-        mounting: ``(3,)`` rad, by which the closures' sensor is mounted otherwise than said, in the body's frame.
+        mounting: ``(3,)`` rad, deviation of the closures' sensor from its stated mounting, in the body's frame.
     """
 
     bias: np.ndarray
@@ -35,12 +35,12 @@ class Calibration:
 
     @classmethod
     def none(cls) -> Calibration:
-        """All measurements are as they should be."""
+        """No systematic errors."""
         return cls(np.zeros(3), np.zeros(3))
 
     @property
     def parts(self) -> frozenset[str]:
-        """Which of :data:`PARTS` there is something of."""
+        """Those of :data:`PARTS` that are not zero."""
         return frozenset(part for part in PARTS if getattr(self, part).any())
 
     @property
@@ -49,17 +49,17 @@ class Calibration:
         return np.concatenate((self.bias, self.mounting))
 
     def moved(self, change: np.ndarray) -> Calibration:
-        """With ``(6,)`` more, rad per step and rad, of which is left after this was taken out."""
+        """The calibration plus ``(6,)``, rad per step and rad, that remains after it was removed."""
         both = (rotations.exp(torch.from_numpy(turn)[None]) for turn in (self.mounting, change[3:]))
         return Calibration(self.bias + change[:3], rotations.log(rotations.multiply(*both))[0].numpy())
 
     def taken_out_of(self, graph: ViewGraph) -> ViewGraph:
-        """The graph as it would have been measured without either."""
+        """The graph as it would have been measured without these errors."""
         if "bias" in self.parts:
             graph = without_bias(graph, self.bias)
         return without_mounting(graph, self.mounting) if "mounting" in self.parts else graph
 
 
 def calibrated(graph: ViewGraph, calibration: Calibration | None) -> ViewGraph:
-    """The graph without what is known to be wrong with all its measurements, if anything is."""
+    """The graph without its known systematic errors, if any."""
     return graph if calibration is None else calibration.taken_out_of(graph)

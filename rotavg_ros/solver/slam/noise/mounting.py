@@ -1,15 +1,16 @@
-"""A sensor of loop closures that is not mounted as it is said to be.
+"""A loop-closure sensor whose mounting differs from the stated one.
 
-Closures that a camera measures are turned into the body's frame by its mounting, the odometry is the body's own. If the
-mounting is off by a rotation C = exp(c), c in the body's frame, every closure states
+A camera's closures are transformed into the body's frame by its mounting, while the odometry is in the body's frame. If
+the mounting is off by a rotation C = exp(c), c in the body's frame, every closure states
 
     M = C R C⁻¹ = R exp((R⁻¹ − I) c) + O(c²),       t = C t_body
 
-instead of R and t_body. A closure that turns by nothing does not tell; one between poses in opposite headings is off by
-twice the part of c that is level. About an axis that all turns share nothing tells c, and nothing depends on it.
+instead of R and t_body. A closure without a turn gives no information on c; one between opposite headings is off by
+twice the horizontal part of c. The component of c about an axis that all turns share cannot be determined, and does not
+matter.
 
-Closures say no more than that they and odometry turn about other axes. Where these are far apart a frame was mistaken,
-and odometry's is the body's. A few degrees may as well be odometry's fault: so it is with visual odometry of KITTI.
+The data only show that closures and odometry turn about different axes. If these are far apart, a frame was mistaken,
+and odometry's is the body's. A few degrees may as well be an error of odometry, as with visual odometry of KITTI.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The vertical that a robot on the ground knows: the direction that its body keeps while it turns.
+"""The vertical of a robot on the ground: the direction of the world that stays constant in its body while it turns.
 
 Places that are mistaken for each other are both upright. So a false closure of such a robot is wrong by a turn of the
-world about the vertical, as far as the body's tilt varies, and not by any turn.
+world about the vertical, up to variations of the body's tilt, and not by an arbitrary turn.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Orientations and positions together, where translations are known: a robot's graph with both kinds of evidence."""
+"""Joint estimation of orientations and positions of a robot's graph, where translations are known."""

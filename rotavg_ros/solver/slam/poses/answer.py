@@ -1,4 +1,4 @@
-"""What is published where translations are known: poses of all keyframes, and how likely each closure is false."""
+"""The published answer where translations are known: poses of all keyframes, and probabilities of false closures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rotavg_ros.view_graph import FALSE_CLOSURE_M
 
 @dataclass(frozen=True)
 class Poses:
-    """Of N nodes and M edges.
+    """Poses of N nodes, and verdicts on M edges.
 
     Attributes:
         body_from_world: ``(N, 4)`` xyzw.
@@ -25,8 +25,8 @@ class Poses:
         position_variance: ``(N,)`` m² per component.
         outlier_probability: ``(M,)`` that a closure is false, in rotation or place; that odometry's position jumped.
         rotation_probability: ``(M,)`` that a closure's rotation is false; that odometry slipped.
-        precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count; 0 of translations that are not known.
-        is_divided: whether another labelling is nearly as likely, by which a part of the map is turned.
+        precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count; 0 for unknown translations.
+        is_divided: whether another labelling is nearly as likely in which a part of the map is turned.
     """
 
     body_from_world: np.ndarray
@@ -40,10 +40,10 @@ class Poses:
 
 
 def answer(rivals: list[PoseMode], share: np.ndarray) -> tuple[Poses, int]:
-    """Scores' average over rival labellings, and the poses of their median; also which that is.
+    """Scores averaged over rival labellings, the poses of their median, and the median's index.
 
     Args:
-        rivals: their poses.
+        rivals: poses of the rival labellings.
         share: their probabilities.
     """
     single = [_of_mode(pose) for pose in rivals]
@@ -90,7 +90,7 @@ def _of_mode(pose: PoseMode) -> Poses:
 
 
 def _apart(pose: PoseMode) -> np.ndarray:
-    """``(S, d, d)`` covariance of what each segment's ends differ by."""
+    """``(S, d, d)`` covariance of the difference between each segment's ends."""
     segments, d = pose.problem.drawn.num_segments, pose.problem.turns + pose.problem.shifts
     difference = np.concatenate((np.eye(d), -np.eye(d), np.zeros((d, d))), axis=1)
     rows = np.tile(difference, (segments, 1, 1))
@@ -100,7 +100,7 @@ def _apart(pose: PoseMode) -> np.ndarray:
 def _precision(pose: PoseMode) -> np.ndarray:
     """``(M, 2)`` rad⁻² and m⁻², with which the view-graph's edges count in the answer.
 
-    The steps of a segment share what it weighed, in the tails or not, as its variance passes along it.
+    A segment's weight, in the tails or not, is divided among its steps in proportion to their variances.
     """
     problem, noise, drawn = pose.problem, pose.state.noise, pose.problem.drawn
     closure, edges = problem.mode.problem.closure, problem.closures
@@ -117,10 +117,11 @@ def _precision(pose: PoseMode) -> np.ndarray:
 
 
 def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``(N, 4)`` and ``(N, 3)`` poses of all nodes, and how far along its segment each lies by variance, ``(N,)``.
+    """``(N, 4)`` and ``(N, 3)`` poses of all nodes, and each node's share of its segment's variance so far, ``(N,)``.
 
-    What a segment's shift is off by bends it: of a Brownian bridge b with z = −∫ d × dε, E[b | z] = Σ (G × Cov(z)⁻¹ z),
-    Σ of a step, G the lever up to there. What is left then goes with the way passed.
+    The residual of a segment's shift bends the segment: for a Brownian bridge b with z = −∫ d × dε,
+    E[b | z] = Σ (G × Cov(z)⁻¹ z), with Σ of a step and G the lever up to the node. The rest of the residual is
+    distributed by distance travelled.
     """
     problem, state, drawn = pose.problem, pose.state, pose.problem.drawn
     segments, shifts = slice(drawn.num_segments), problem.bases[1]
@@ -151,7 +152,7 @@ def _within_segments(pose: PoseMode) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
-    """``(E,)`` each: probability that a closure is false, in rotation or place; and that an edge's rotation is."""
+    """``(E,)`` each: probability that a closure is false, in rotation or place; that an edge's rotation is false."""
     problem, places, mode = pose.problem, pose.solved.places, pose.problem.mode
     predictions = pose.solved.predictions
     closure, k = mode.problem.closure, problem.turns
@@ -164,7 +165,7 @@ def _scores(pose: PoseMode) -> tuple[np.ndarray, np.ndarray]:
     if_false = exceedance(turn, predicted, OUTLIER_ANGLE, k)
     rotation = 1 - mode.state.trusted
     rotation[closure] = good * exceeds + (1 - good) * if_false
-    # An outlier errs by too much in rotation or place, whatever it is called.
+    # An outlier has too large an error in rotation or place, whatever its class.
     turned = np.concatenate((np.broadcast_to(exceeds, (len(places.chance) - 1, len(exceeds))), if_false[None]))
     elsewhere = places.beyond(FALSE_CLOSURE_M) * problem.told.is_known
     score = np.zeros(len(rotation))

@@ -1,4 +1,4 @@
-"""What is known of closures while poses are estimated: by all else, by rotations alone, and of which class they are."""
+"""Data on closures while poses are estimated: predictions by all else, results of rotations alone, and classes."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from rotavg_ros.solver.slam.posterior.densities import log_half_turn
 
 # Classes of good closures come first.
 GOOD = 2
-# The class of those that join the same wrong places as another one does, from the end.
+# Index, from the end, of the class of closures that join the same wrong places as another one.
 REPEATS = -2
-# What does not pull, in what it would: the system stays solvable.
+# Relative weight of a row that is not to pull: the system stays solvable.
 NOTHING = 1e-8
-# Two judge a closure's place otherwise if its chances to be right differ by this.
+# Two judgements of a closure's place differ if its probabilities of being right differ by this.
 _OTHERWISE = 0.5
-# In which errors are longer than a limit: in a plane, too, where that is a little too often.
+# Dimensions in which errors exceed a limit; used in a plane as well, where it gives slightly too high a probability.
 _DIMENSIONS = 3
-# Predicted to less than this share of what is known of anything.
+# A closure counts as predicted if the variance is less than this share of the uninformed one.
 _TOLD = 0.5
 # rad² per component of a turn about which nothing is known.
 ANYHOW = np.pi**2 / 3
-# Closures detected before (and after) one that it is compared with.
+# Number of closures detected before (and after) one with which it is compared.
 _WINDOW = 48
 
 
 @dataclass(frozen=True)
 class Predictions:
-    """What all else says of C closures' residuals.
+    """Predictions of C closures' residuals by all else.
 
     Attributes:
         mean: ``(C, k + m)`` μ, rad and metres.
@@ -43,17 +43,17 @@ class Predictions:
     covariance: np.ndarray
 
     def within(self, turns: int, turn: float, shift: np.ndarray) -> Predictions:
-        """With what holds of any closure: that nothing is turned, or farther off, than can be.
+        """The predictions combined with the prior bounds on turns and shifts.
 
-        Where a closure alone joins two robots, nothing else predicts it, and the density of a good one would vanish.
+        If a closure alone joins two robots, nothing else predicts it, and the density of a good one would vanish.
 
         Args:
             turns: k.
-            turn: variance per component a priori, rad², about what the closure says.
+            turn: prior variance per component, rad², about the closure's own value.
             shift: ``(C,)`` m², likewise.
         """
         spread = np.diagonal(self.covariance, axis1=1, axis2=2)
-        # V / (p + V), of turns and of shifts by themselves: nothing absurd of the one gets into the other.
+        # V / (p + V), separately for turns and for shifts, so that absurd values of one do not affect the other.
         share = np.empty_like(self.mean)
         share[:, :turns] = (turn / (spread[:, :turns].mean(axis=1) + turn))[:, None]
         share[:, turns:] = (shift / (spread[:, turns:].mean(axis=1) + shift))[:, None]
@@ -61,11 +61,11 @@ class Predictions:
         return Predictions(share * self.mean, root[:, :, None] * self.covariance * root[:, None, :])
 
     def tell(self, turns: int, extent: float) -> np.ndarray:
-        """``(C,)`` bool, whether turns and shifts are predicted to less than half the variance of any at all.
+        """``(C,)`` bool, whether turns and shifts are predicted with less than half the uninformed variance.
 
         Args:
             turns: k.
-            extent: m² per component, of places on the map.
+            extent: m² per component, variance of places on the map.
         """
         spread = np.diagonal(self.covariance, axis1=1, axis2=2)
         turn, shift = spread[:, :turns].mean(axis=1), spread[:, turns:].mean(axis=1)
@@ -77,14 +77,14 @@ class Told:
     """What rotations alone say of C closures.
 
     Attributes:
-        rotation_variance: ``(C,)`` rad² per component, of a good one's turn.
-        false_odds: ``(C,)`` nats: density of the turn if it is false, and how likely that is beforehand.
+        rotation_variance: ``(C,)`` rad² per component, of a good closure's turn.
+        false_odds: ``(C,)`` nats: log density of the turn if false, plus the prior log-odds of that.
         is_known: ``(C,)`` bool, whether a translation is stated.
-        label: ``(C,)`` +1 if somebody has accepted it, −1 if rejected, 0 else.
-        run: ``(C,)`` number of its run.
+        label: ``(C,)`` +1 if the closure is labelled accepted, −1 if rejected, else 0.
+        run: ``(C,)`` number of the closure's run.
         follows: ``(C,)`` the closure before each, or -1.
-        sign: ``(C,)`` +1 where it runs from its older to its newer end, else −1.
-        detection, detected: ``(C,)`` closures in the order in which they were detected, and when each was, as a rank.
+        sign: ``(C,)`` +1 where the closure runs from its older to its newer end, else −1.
+        detection, detected: ``(C,)`` closures in the order of their detection, and each one's rank in it.
     """
 
     rotation_variance: np.ndarray
@@ -98,12 +98,12 @@ class Told:
     detected: np.ndarray
 
     def detected_near(self, rows: np.ndarray, tells: np.ndarray, *, in_order: bool) -> Near:
-        """Some closures with those that were detected not long before, or after, among others; never with themselves.
+        """For some closures, those of the others detected shortly before or after them, never themselves.
 
         Args:
             rows: ``(n,)`` the closures.
             tells: the others, in the order of their detection.
-            in_order: those before alone.
+            in_order: only those before.
         """
         is_one = None if in_order else np.isin(rows, tells)
         return Near(rows, tells, places_near(self.detected[tells], self.detected[rows], is_one, _WINDOW))
@@ -111,16 +111,16 @@ class Told:
 
 @dataclass(frozen=True)
 class Places:
-    """Of C closures and J classes of translations (good ones first).
+    """Class probabilities and weights of C closures, with J classes of translations (good ones first).
 
     Attributes:
-        chance: ``(J + 1, C)`` of each class; the last is a false rotation.
-        weight: ``(C,)`` m⁻², with which each translation pulls.
+        chance: ``(J + 1, C)`` probability of each class; the last is a false rotation.
+        weight: ``(C,)`` m⁻², weight of each translation.
         rotation_weight: ``(C,)`` rad⁻², likewise.
-        squares, freedom: ``(3,)`` sums over good closures for the variances of their turns, of their translations
-            whatever their length, and of what goes with that, in those.
-        log_density: ``(C,)`` nats, of each with its classes summed over.
-        error, error_variance: ``(J + 1, C)`` m and m² per component, of ε in each class, the last of a false rotation:
+        squares, freedom: ``(3,)`` sums over good closures, in units of the respective variances: of their turns, of
+            their translations independent of length, and of the part proportional to length.
+        log_density: ``(C,)`` nats, of each closure, summed over its classes.
+        error, error_variance: ``(J + 1, C)`` m and m² per component, of ε in each class (the last: a false rotation):
             length of its mean, and variance.
     """
 
@@ -139,12 +139,12 @@ class Places:
         return np.asarray(self.chance[:GOOD].sum(axis=0))
 
     def is_like(self, other: Places) -> bool:
-        """Whether the same closures join right places."""
+        """Whether the same closures join the right places."""
         return bool((np.abs(self.right - other.right) < _OTHERWISE).all())
 
     @property
     def rotation_good(self) -> np.ndarray:
-        """``(C,)`` probability that a closure's rotation is no false one."""
+        """``(C,)`` probability that a closure's rotation is not false."""
         return np.asarray(1 - self.chance[-1])
 
     def beyond(self, metres: float) -> np.ndarray:
@@ -155,14 +155,14 @@ class Places:
 
 @dataclass(frozen=True)
 class Scale:
-    """How far C closures err, m² per component.
+    """Scales of the errors of C closures, m² per component.
 
     Attributes:
-        good: ``(C,)`` each, if it is good.
-        own: ``(C,)`` what of that it does not share with its run.
-        floor_share: ``(C,)`` the share of its own which does not go with its length.
-        extent: how far two places of the map are apart.
-        anywhere: ``(C,)`` how far a wrong one leads: to any place of the map, or as far as it states.
+        good: ``(C,)`` variance of each as a good closure.
+        own: ``(C,)`` part of that which is not shared with its run.
+        floor_share: ``(C,)`` share of the own part that does not grow with its length.
+        extent: variance of the distance between two places of the map.
+        anywhere: ``(C,)`` variance of a wrong closure: to any place of the map, or as far as it states.
     """
 
     good: np.ndarray
@@ -173,17 +173,17 @@ class Scale:
 
     @cached_property
     def closure(self) -> float:
-        """A typical good one."""
+        """Variance of a typical good closure."""
         return float(np.median(self.good)) if len(self.good) else self.extent
 
 
 @dataclass(frozen=True)
 class GivenTurn:
-    """What all else and a closure's turn say of its shift, along axes of their own.
+    """Predictions of closures' shifts by all else, given their turns, along principal axes.
 
     Attributes:
-        log_turn: ``(C,)`` nats, of the turn.
-        square: ``(C,)`` of the turn in standard deviations.
+        log_turn: ``(C,)`` nats, log density of the turn.
+        square: ``(C,)`` squared turn, in standard deviations.
         along: ``(C, m)`` metres, mean.
         spread: ``(C, m)`` m², variance.
     """
@@ -195,7 +195,7 @@ class GivenTurn:
 
 
 def given_turn(predictions: Predictions, variance: np.ndarray, turns: int) -> GivenTurn:
-    """With the variance ``(C,)`` of the turn's own noise, rad²."""
+    """The prediction given the turn, for a variance ``(C,)`` of the turn's own noise, rad²."""
     k, mean, covariance = turns, predictions.mean, predictions.covariance
     turn = covariance[:, :k, :k] + variance[:, None, None] * np.eye(k)
     root = inverse_root(turn)
@@ -214,14 +214,14 @@ def given_turn(predictions: Predictions, variance: np.ndarray, turns: int) -> Gi
 
 
 def along_axes(predictions: Predictions, turns: int) -> tuple[np.ndarray, np.ndarray]:
-    """``(C, m)`` metres and m² of shifts along the axes of their covariances, whatever the turns."""
+    """``(C, m)`` means, metres, and variances, m², of shifts along their covariances' axes, marginal over turns."""
     spread, axes = eigh(predictions.covariance[:, turns:, turns:])
     along = np.matmul(axes.transpose(0, 2, 1), predictions.mean[:, turns:, None])[:, :, 0]
     return along, np.maximum(spread, 0.0)
 
 
 def log_from_behind(predictions: Predictions, variance: np.ndarray, turns: int) -> np.ndarray:
-    """``(C,)`` nats, of turns that are half a turn off but for noise of ``variance`` ``(C,)`` rad²."""
+    """``(C,)`` nats, log density of turns that are half a turn off, with noise of ``variance`` ``(C,)`` rad²."""
     spread = np.trace(predictions.covariance[:, :turns, :turns], axis1=1, axis2=2) / turns
     angle = np.minimum(np.sqrt((predictions.mean[:, :turns] ** 2).sum(axis=1)), np.pi)
     return log_half_turn(angle, variance + spread, turns)

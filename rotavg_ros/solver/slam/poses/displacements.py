@@ -1,15 +1,15 @@
-"""Translations along the odometry, drawn together as its rotations are.
+"""Translations along the odometry, contracted as its rotations are.
 
-A segment says  p_b − p_a = Σ W_i t_i , W_i world_from_body where step i begins, which is at its older end: an edge that
-is stated the other way round says the same, and errs in the same frame. Orientations within it follow those of its ends
-(interpolated) and a Brownian bridge between them, so that with small turns δ of the world frame
+A segment states  p_b − p_a = Σ W_i t_i , with W_i world_from_body at the beginning of step i, its older end. An edge
+stated in the other direction says the same and errs in the same frame. Orientations within a segment are interpolated
+between its ends, plus a Brownian bridge, so that with small turns δ of the world frame
 
     r = Σ W_i t_i − (p_b − p_a)   changes by   − δ_a × A − δ_b × B − (δp_b − δp_a),     A + B = Σ W_i t_i ,
 
-and errs by what the bridge turns: with d(q) what of the way is left at q, less its mean B, the covariance of that is
-σ² ∫ (‖d‖² I − d dᵀ) dq where all axes err alike. That is the lever arm of odometry's turns: exact to first order, and
-sums alone, so that an edge that several steps were drawn together into keeps theirs (``odometry_route.py``): its lag
-goes from A to B, and what its steps' ends spread about their mean adds to d dᵀ.
+and has an error from the bridge's turns: with d(q) the way that is left at q, minus its mean B, the covariance is
+σ² ∫ (‖d‖² I − d dᵀ) dq if all axes err alike. This is the lever-arm effect of odometry's turns, exact to first order.
+It consists of sums only, so an edge contracted from several steps keeps theirs (``odometry_route.py``): its lag is
+moved from A to B, and the spread of its steps' ends about their mean is added to d dᵀ.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from rotavg_ros.view_graph import ViewGraph
 
 @dataclass(frozen=True)
 class Displacements:
-    """Of a closure graph (E edges between K key nodes, N nodes) at some orientations; lengths in metres.
+    """Displacements of a closure graph (E edges between K key nodes, N nodes) at given orientations, in metres.
 
     Attributes:
         displacement: ``(E, 3)`` of target from source in the world, as measured.
         at_source, at_target: ``(E, 3)`` A and B.
-        bridge: ``(E, 3, 3)`` ∫ (‖d‖² I − d dᵀ) dq, m² per rad² a step; 0 of edges that are no segments.
-        length: ``(E,)`` metres passed.
-        lever: ``(N, 3)`` ∫ d dq from the key node above up to each node.
-        passed: ``(N,)`` metres passed from the key node above up to each node.
-        way: ``(N, 3)`` displacement from the key node above.
+        bridge: ``(E, 3, 3)`` ∫ (‖d‖² I − d dᵀ) dq, m² per rad² a step; 0 for edges that are not segments.
+        length: ``(E,)`` metres travelled.
+        lever: ``(N, 3)`` ∫ d dq from the preceding key node up to each node.
+        passed: ``(N,)`` metres travelled from the preceding key node up to each node.
+        way: ``(N, 3)`` displacement from the preceding key node.
     """
 
     displacement: np.ndarray
@@ -57,13 +57,13 @@ class _Steps(NamedTuple):
     """P steps of odometry, segment by segment.
 
     Attributes:
-        first: ``(S + 1,)`` where each segment begins.
-        node: ``(P,)`` where each step ends.
-        is_forward: ``(P,)`` bool, whether its older end is where it begins, from the segment's start on.
+        first: ``(S + 1,)`` index of each segment's first step.
+        node: ``(P,)`` node at which each step ends.
+        is_forward: ``(P,)`` bool, whether a step begins at its older end, seen from the segment's start.
         is_last: ``(P,)`` bool, whether it ends at a key node.
-        measured_at: ``(P,)`` where along its segment its older end is.
-        share: ``(P,)`` how much of its segment's variance it has.
-        variance: ``(P,)`` of its turn, in that of one step.
+        measured_at: ``(P,)`` position of its older end along its segment.
+        share: ``(P,)`` its share of its segment's variance.
+        variance: ``(P,)`` variance of its turn, in units of that of one step.
     """
 
     first: np.ndarray
@@ -77,12 +77,12 @@ class _Steps(NamedTuple):
 
 @dataclass(frozen=True)
 class _Several:
-    """Edges (n) that several steps were drawn together into.
+    """Edges (n) that were contracted from several steps.
 
     Attributes:
         older, newer: ``(n,)`` their ends.
         newer_from_older: ``(n, 4)`` as measured.
-        bend: by the older ends' axes.
+        bend: in the older ends' axes.
     """
 
     older: np.ndarray
@@ -92,7 +92,7 @@ class _Several:
 
     @classmethod
     def of(cls, graph: ViewGraph, edge: np.ndarray, older: np.ndarray, bend: Bend) -> _Several:
-        """Of edges ``(n,)`` with their older ends ``(n,)``."""
+        """From edges ``(n,)`` with their older ends ``(n,)``."""
         source, target = graph.source.numpy()[edge], graph.target.numpy()[edge]
         measured = graph.target_from_source[edge].double()
         from_source = source == older
@@ -101,10 +101,10 @@ class _Several:
         return cls(older, newer, onwards, bend)
 
     def at(self, body_from_world: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Lags ``(n, 3)`` and spreads ``(n, 3, 3)`` by the world's axes, at orientations ``(N, 4)``.
+        """Lags ``(n, 3)`` and spreads ``(n, 3, 3)`` in the world's axes, at orientations ``(N, 4)``.
 
-        And how much farther the newer end lies, ``(n, 3)`` metres, since what an edge's turn is off by turns its steps
-        by and by: to first order, that × lag.
+        Also the displacement ``(n, 3)`` metres of the newer end, since the error of an edge's turn is distributed over
+        its steps: to first order, the error × lag.
         """
         world_from_older = rotations.inverse(torch.from_numpy(body_from_world[self.older]))
         world_from_newer = rotations.inverse(torch.from_numpy(body_from_world[self.newer]))
@@ -116,18 +116,18 @@ class _Several:
 
 
 class DrawnSteps:
-    """The steps of odometry in the order in which segments take them; what orientations do not change.
+    """The steps of odometry in the order of the segments, with the quantities that do not depend on orientations.
 
     Args:
-        graph: of N nodes and M edges.
+        graph: N nodes and M edges.
         translation: ``(M, 3)`` position of the target in the source's frame, metres.
-        length: ``(M,)`` metres that each edge's variance goes with.
-        drawn: the same graph, drawn together into S segments.
-        steps: ``(S,)`` their variance, in that of one step.
-        by_turns: ``(M,)`` how much of each edge's variance goes by the squares of its turns.
+        length: ``(M,)`` metres to which each edge's variance is proportional.
+        drawn: the same graph, contracted into S segments.
+        steps: ``(S,)`` variance of the segments, in units of that of one step.
+        by_turns: ``(M,)`` part of each edge's variance that is proportional to its squared turns.
 
     Attributes:
-        share: ``(M,)`` how much of its segment's variance each edge has; 1 of edges that are part of none.
+        share: ``(M,)`` each edge's share of its segment's variance; 1 for edges that are part of none.
     """
 
     def __init__(
@@ -194,7 +194,7 @@ class DrawnSteps:
         )
 
     def up_to_nodes(self, of_edge: np.ndarray) -> np.ndarray:
-        """``(N,)`` sums of values ``(M,)`` of odometry's edges from the key node above."""
+        """``(N,)`` sums of values ``(M,)`` of odometry's edges from the preceding key node."""
         return self._at_nodes(self._so_far(of_edge[self._edge, None]))[:, 0]
 
     def _whole(self, value: np.ndarray) -> np.ndarray:
@@ -204,13 +204,13 @@ class DrawnSteps:
         return np.asarray(np.add.reduceat(value, self._first, axis=0))
 
     def _so_far(self, value: np.ndarray) -> np.ndarray:
-        """Sums from each step's segment's start, its own included."""
+        """Sums from the start of each step's segment, including the step."""
         total = np.cumsum(value, axis=0)
         before = np.concatenate((np.zeros((1, value.shape[1])), total))[self._first]
         return np.asarray(total - before[self._segment])
 
     def _at_nodes(self, value: np.ndarray) -> np.ndarray:
-        """``(N, …)`` sums from the key node above; a key node is its own."""
+        """``(N, …)`` sums from the preceding key node; zero at key nodes."""
         out = np.zeros((self._num_nodes, value.shape[1]))
         out[self._node] = np.where(self._is_last[:, None], 0.0, value)
         return out
@@ -229,10 +229,10 @@ def _walk(
 
     Args:
         world: ``(P, 3)`` metres, the steps.
-        lag, spread: ``(P, 3)`` and ``(P, 3, 3)`` of those that are several; empty where none is.
-        steps: where they stand.
-        of_segments: ``(S, 3)`` A and B, ``(S, 3, 3)`` bridges; longer ones are left as they are from there on.
-        at_nodes: ``(N, 3)`` levers and ways; those of key nodes are left as they are.
+        lag, spread: ``(P, 3)`` and ``(P, 3, 3)`` of contracted steps; empty if there are none.
+        steps: positions of the steps.
+        of_segments: ``(S, 3)`` A and B, ``(S, 3, 3)`` bridges; entries beyond S are not changed.
+        at_nodes: ``(N, 3)`` levers and ways; those of key nodes are not changed.
     """
     at_source, at_target, bridge = of_segments
     lever, way = at_nodes
@@ -255,7 +255,7 @@ def _walk(
             for i in range(3):
                 before = passed[i]
                 passed[i] += world[p, i]
-                # What of the way is left where the step was measured.
+                # The way that is left where the step was measured.
                 d[i] = own[i] - (passed[i] if steps.is_forward[p] else before)
                 if are_several:
                     d[i] += lag[p, i]

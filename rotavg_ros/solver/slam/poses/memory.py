@@ -1,7 +1,7 @@
-"""What poses remember for the next solve of the same graph, grown by a few edges.
+"""The poses' memory for the next solve of the same graph, grown by a few edges.
 
-Odometry that no closure judges yet says nothing of what was there: what is new is placed along it. Where closures are
-new, the joint solve begins at the poses, the noise and the classes that were found.
+New odometry without closures does not change earlier poses: new nodes are placed along it. If there are new closures,
+the joint solve begins at the earlier poses, noise and classes.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from rotavg_ros.view_graph import ViewGraph
 
 @dataclass(frozen=True)
 class PoseMemory:
-    """Of a graph of N nodes and M edges, of which C are closures between key nodes.
+    """Memory of a graph of N nodes and M edges, of which C are closures between key nodes.
 
     Attributes:
-        poses: what was published.
-        alone: ``(N, 4)`` body_from_world by rotations alone, where their next solve goes on.
-        noise: of the poses, variances.
-        roots: nodes that stayed where they were.
-        edge: ``(C,)`` the view-graph's edges of closures.
+        poses: the published poses.
+        alone: ``(N, 4)`` body_from_world by rotations alone, where their next solve continues.
+        noise: variances of the joint solve.
+        roots: nodes that were held fixed.
+        edge: ``(C,)`` the view-graph's edges that are closures.
         places: their classes.
         pose: the joint solve.
     """
@@ -48,7 +48,7 @@ class PoseMemory:
 
     @classmethod
     def of(cls, pose: PoseMode, poses: Poses) -> PoseMemory:
-        """After a solve."""
+        """The memory after a solve."""
         drawn, mode = pose.problem.drawn, pose.problem.mode
         alone = drawn.orientations(torch.from_numpy(np.ascontiguousarray(mode.state.correction.T)))
         closures, places = pose.problem.closures, pose.solved.places
@@ -65,7 +65,7 @@ class PoseMemory:
         return len(self.poses.precision)
 
     def problem(self, graph: ViewGraph, translation: np.ndarray, mode: Mode) -> PoseProblem:
-        """Of a graph that has grown: odometry jumps where it did."""
+        """The problem of a graph that has grown, with the same jumps of odometry."""
         jump, before = None, self.pose.problem.jump
         if before is not None:
             jump = np.zeros(graph.num_edges)
@@ -73,7 +73,7 @@ class PoseMemory:
         return PoseProblem(graph, translation, mode, jump=jump)
 
     def start_alone(self, graph: ViewGraph) -> torch.Tensor | None:
-        """``(N, 4)`` where rotations alone go on in a graph that has grown; None where new nodes hang otherwise."""
+        """``(N, 4)`` start of rotations alone in a graph that has grown; None if new nodes do not hang on odometry."""
         growth = self._growth(graph)
         return None if growth is None else _laid_on(self.alone, growth)
 
@@ -82,11 +82,11 @@ class PoseMemory:
         return Growth.of(graph, new[graph.is_odometry[new].numpy()], self.num_nodes)
 
     def start(self, graph: ViewGraph, problem: PoseProblem) -> PoseStart | None:
-        """Where the joint solve of a graph that has grown from this one begins; None: from nothing.
+        """Start of the joint solve of a graph that has grown from this one; None: start from nothing.
 
         Args:
-            graph: whose odometry was drawn together, calibrated.
-            problem: the same.
+            graph: the calibrated graph whose odometry was contracted.
+            problem: its problem.
         """
         drawn, closures = problem.drawn, problem.closures
         growth = self._growth(graph)
@@ -97,7 +97,7 @@ class PoseMemory:
         orientation, position = grown
         correction = drawn.corrections(orientation).numpy().T
         common = np.zeros((problem.num_runs, 6))
-        # Whether the robot keeps a vertical may be seen otherwise since.
+        # The verdict on whether the robot keeps a vertical may have changed.
         noise = self.noise if problem.drift_axis is not None else replace(self.noise, tilt=self.noise.turn)
         state = PoseState(np.ascontiguousarray(correction), position[drawn.nodes], common, noise)
         column = np.full(graph.num_edges, -1)
@@ -105,7 +105,7 @@ class PoseMemory:
         return PoseStart(state, column[closures], self.places)
 
     def kept(self, num_edges: int) -> np.ndarray:
-        """``(R, M)`` float32 what :meth:`PoseStart.kept` needs of these edges, NaN where there is nothing."""
+        """``(R, M)`` float32 input of :meth:`PoseStart.kept` for the first M edges, NaN where nothing is known."""
         known = np.vstack((self.places.chance, self.places.weight, self.places.rotation_weight))
         places = np.full((len(known), num_edges), np.nan, np.float32)
         places[:, self.edge] = known
@@ -113,11 +113,11 @@ class PoseMemory:
 
     @property
     def step_variance(self) -> float:
-        """rad², of one step of odometry, the mean over components and steps."""
+        """rad², variance of one step of odometry, averaged over components and steps."""
         return self.pose.problem.mean_turn(self.noise)
 
     def extended(self, graph: ViewGraph, growth: Growth) -> PoseMemory | None:
-        """With odometry alone, on which new nodes hang; None where it has no translations."""
+        """The memory with new nodes placed along odometry; None if that has no translations."""
         new = np.arange(self.num_edges, graph.num_edges)
         grown = self._grown(graph, growth)
         if grown is None:
@@ -128,7 +128,7 @@ class PoseMemory:
         steps = graph.steps.numpy()
         step = np.nan_to_num(graph.translation[new].numpy())
         passed = lengths_passed(ways_passed(step), steps[new], self.pose.problem.typical)
-        # Beyond its anchor a node's way turns with the anchor's heading, and with its own steps'.
+        # The way from its anchor to a node turns with the anchor's heading and with the headings of its own steps.
         way = np.linalg.norm(position[self.num_nodes :] - position[growth.anchor], axis=1)
         turned = self.step_variance * growth.along(steps[growth.edge])
         lever = (poses.variance[growth.anchor] + turned / WALK) * way**2 * ACROSS
@@ -165,11 +165,11 @@ class PoseMemory:
 
 
 def _laid_on(orientation: torch.Tensor, growth: Growth) -> torch.Tensor:
-    """Orientations of known nodes, and of new ones along the odometry from them."""
+    """Orientations of known nodes, and of new ones along odometry from these."""
     anchor = torch.from_numpy(growth.anchor)
     return torch.cat((orientation, rotations.normalize(rotations.multiply(growth.turn, orientation[anchor]))))
 
 
-# A walk's heading errs along its way by a third of the variance at its end; of a lever's two or three components one
-# lies along the way, which it does not move.
+# The mean squared effect of a random walk's heading error along the way is a third of that of its final variance; one
+# component of the turn, about the way itself, does not move the end.
 WALK, ACROSS = 3.0, 0.5

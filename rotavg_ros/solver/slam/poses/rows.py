@@ -27,15 +27,15 @@ from rotavg_ros.solver.slam.posterior.state import RUN_STEPS
 from rotavg_ros.solver.slam.posterior.system import NormalEquations
 from rotavg_ros.view_graph import ViewGraph
 
-# Shifts off the plane of motion by less than this share of the longest are none.
+# Motion counts as planar if shifts off the plane are below this share of the longest.
 _PLANAR = 1e-6
-# A segment in which nothing moves errs by this share of a typical step at least.
+# Least error of a segment without motion, as a share of a typical step.
 _LEAST_LENGTH = 1e-3
 # The share of an error that is not shared; the system stays solvable.
 _NONE = 1e-6
-# A closure that is longer than so many times all of odometry is as wrong as if it were as long.
+# Closures longer than this many times all of odometry are clipped to that length.
 _FARTHEST = 1e3
-# Roots are tied down so many times more stiffly than any row.
+# Stiffness of the roots, relative to the stiffest row.
 _GROUNDING = 1e6
 
 
@@ -46,7 +46,7 @@ class PoseProblem:
     Attributes:
         graph: the view-graph whose odometry was drawn together, N nodes and M edges.
         translation: ``(M, 3)`` position of the target in the source's frame, metres; NaN where unknown, of closures.
-        mode: what rotations alone make of it.
+        mode: the labelling by rotations alone.
         priors: of translations.
         jump: ``(M,)`` m² per component, variance of the jump of each edge of odometry; 0 where there is none. None:
             nowhere.
@@ -60,12 +60,12 @@ class PoseProblem:
 
     @cached_property
     def drawn(self) -> ClosureGraph:
-        """Nodes lie along segments as odometry's variance does."""
+        """The contracted graph, with nodes placed along segments in proportion to odometry's variance."""
         return self.mode.problem.drawn(self.mode.state.noise)
 
     @cached_property
     def lengths(self) -> np.ndarray:
-        """``(M, 3)`` translations, 0 where unknown; closures' no longer than what no odometry passes."""
+        """``(M, 3)`` translations, 0 where unknown; those of closures are clipped to ``_FARTHEST`` times odometry's."""
         known = np.isfinite(self.translation).all(axis=1, keepdims=True)
         lengths = np.where(known, self.translation, 0.0)
         is_odometry = self.graph.is_odometry.numpy()
@@ -74,17 +74,17 @@ class PoseProblem:
 
     @cached_property
     def way(self) -> np.ndarray:
-        """``(M,)`` metres, passed along each edge's steps."""
+        """``(M,)`` metres travelled along each edge's steps."""
         return ways_passed(self.lengths, way_along(self.graph))
 
     @cached_property
     def typical(self) -> float:
-        """Metres, of a step of odometry."""
+        """Metres, length of a typical step of odometry."""
         return typical_length(self.way, self.graph.steps.numpy(), self.graph.is_odometry.numpy())
 
     @cached_property
     def lengths_passed(self) -> np.ndarray:
-        """``(M,)`` metres that each edge's variance goes with."""
+        """``(M,)`` metres to which each edge's variance is proportional."""
         return lengths_passed(self.way, self.graph.steps.numpy(), self.typical)
 
     @cached_property
@@ -110,16 +110,16 @@ class PoseProblem:
 
     @cached_property
     def about_drift_axis(self) -> np.ndarray:
-        """``(k, k)`` what of a turn is about the drift axis: all of it where there is none."""
+        """``(k, k)`` projection of a turn onto the drift axis; the identity where there is none."""
         return np.eye(self.turns) if self.drift_axis is None else np.outer(self.drift_axis, self.drift_axis)
 
     @property
     def num_about(self) -> int:
-        """How many components of a turn are about the drift axis: all of them where there is none."""
+        """Number of components of a turn about the drift axis; all of them where there is none."""
         return self.turns if self.drift_axis is None else 1
 
     def mean_turn(self, noise: PoseNoise) -> float:
-        """rad², of one step of odometry, the mean over components."""
+        """rad², variance of one step of odometry, averaged over components."""
         return float(self.mean_over_axes(np.array([noise.turn, noise.tilt])))
 
     def mean_over_axes(self, variance: np.ndarray) -> np.ndarray:
@@ -129,22 +129,22 @@ class PoseProblem:
 
     @property
     def turns(self) -> int:
-        """How many components a turn has, k."""
+        """Number of components of a turn, k."""
         return int(self.bases[0].shape[1])
 
     @property
     def shifts(self) -> int:
-        """How many components a shift has, m."""
+        """Number of components of a shift, m."""
         return int(self.bases[1].shape[1])
 
     @cached_property
     def own(self) -> np.ndarray:
-        """``(E,)`` rad², of the noise of each turn."""
+        """``(E,)`` rad², variance of the noise of each turn."""
         return variances(self.mode.problem, self.mode.state.noise)[: len(self.drawn.source)]
 
     @cached_property
     def runs(self) -> NormalEquations:
-        """Which closures err alike: translations always do, for as long as turns if these do."""
+        """Runs with common errors: translations always have them; the length is that of turns, if these have them."""
         noise = self.mode.state.noise
         return self.mode.problem.system(noise if noise.run_steps > 0 else replace(noise, run_steps=RUN_STEPS[-1]))
 
@@ -160,7 +160,7 @@ class PoseProblem:
 
     @cached_property
     def sign(self) -> np.ndarray:
-        """``(E,)`` the direction in which each has it, 0 without."""
+        """``(E,)`` sign of the common error in each edge, 0 if it has none."""
         return np.where(self.run >= 0, self.runs.sign, 0.0)
 
     @property
@@ -168,12 +168,12 @@ class PoseProblem:
         return self.runs.num_runs
 
     def common_turn(self, noise: PoseNoise) -> float:
-        """rad², variance of the turn that a run has in common; next to none where turns err by themselves."""
+        """rad², variance of the turn that a run has in common; negligible where turns err independently."""
         return noise.closure_turn * (self.mode.state.noise.common_share if self.turns_share else _NONE)
 
     @cached_property
     def turn_noise(self) -> PoseNoise:
-        """Turns' as rotations alone have it, shifts' as it is believed to be."""
+        """Initial noise: turns' from rotations alone, shifts' from the prior."""
         noise, priors, typical = self.mode.state.noise, self.priors, self.typical
         way, closure = priors.step**2 * typical, (priors.closure * typical) ** 2
         own, common = (1 - priors.common) * closure, priors.common * closure
@@ -197,13 +197,13 @@ class PoseProblem:
 
     @cached_property
     def _step_reports(self) -> np.ndarray:
-        """``(M,)`` metres, what one step of each edge may have reported: of several, what is left beside usual ones."""
+        """``(M,)`` metres, longest step that each edge may contain: of several steps, the rest beside typical ones."""
         steps = self.graph.steps.numpy()
         return np.asarray(np.maximum(self.way - (steps - 1) * self.typical, self.way / steps))
 
     @cached_property
     def longest_steps(self) -> np.ndarray:
-        """``(S,)`` the edge of each segment that reports the longest step."""
+        """``(S,)`` the edge with the longest reported step in each segment."""
         segment = self.drawn.segment_of_edge
         edge = np.flatnonzero(segment >= 0)
         order = np.lexsort((-self._step_reports[edge], segment[edge]))
@@ -211,13 +211,13 @@ class PoseProblem:
 
     @cached_property
     def could_jump(self) -> np.ndarray:
-        """``(S,)`` m² per component, variance of a jump of each segment: as far as its longest step reports."""
+        """``(S,)`` m² per component, variance of a jump of each segment: the square of its longest reported step."""
         return np.asarray(np.maximum(self._step_reports[self.longest_steps], _LEAST_LENGTH * self.typical) ** 2)
 
     def turn_variances(self, noise: PoseNoise) -> np.ndarray:
         """``(E, 2)`` rad² about the drift axis and any other one, tails as the last solve weighed them.
 
-        Of odometry as labelled, of closures as good ones, which err alike about all axes.
+        For odometry as labelled; for closures as good ones, which err alike about all axes.
         """
         state, priors, is_odometry = self.mode.state, self.mode.problem.priors, self.drawn.is_odometry
         steps = np.array([[noise.turn, noise.tilt]]) / state.noise.step_variance
@@ -228,11 +228,11 @@ class PoseProblem:
         return np.asarray(np.where(slipped, own + slip, own / state.others.relative[:, None]))
 
     def closure_turns(self, noise: PoseNoise) -> np.ndarray:
-        """``(C,)`` rad², of closures as good ones."""
+        """``(C,)`` rad², variances of closures as good ones."""
         return np.asarray(self.turn_variances(noise)[self.mode.problem.closure, 0])
 
     def bridge_variance(self, noise: PoseNoise) -> np.ndarray:
-        """``(2, S)`` rad² a step, within segments, about the drift axis and any other one; a slip is anywhere."""
+        """``(2, S)`` rad² a step within segments, about the drift axis and any other; a slip may be at any step."""
         slip = np.radians(self.mode.problem.priors.slip_deg) ** 2
         of_step = np.array([[noise.turn], [noise.tilt]])
         slipped = of_step + slip / np.maximum(self.steps, 1.0)
@@ -240,12 +240,12 @@ class PoseProblem:
 
     @cached_property
     def tailed(self) -> np.ndarray:
-        """``(S,)`` how many times its variance each segment has, in the tails as the last solve weighed them."""
+        """``(S,)`` factor of each segment's variance due to tails, as weighted in the last solve."""
         return np.asarray(1 / self.mode.state.others.relative[: self.drawn.num_segments])
 
     @cached_property
     def segment_of_node(self) -> np.ndarray:
-        """``(N,)`` the segment within which each node lies; -1 of key nodes."""
+        """``(N,)`` the segment within which each node lies; -1 for key nodes."""
         drawn = self.drawn
         inner = np.flatnonzero(drawn.paths.hangs_on_odometry & (drawn.above != drawn.below))
         segment = np.full(self.graph.num_nodes, -1)
@@ -254,20 +254,20 @@ class PoseProblem:
 
     @cached_property
     def steps(self) -> np.ndarray:
-        """``(S,)`` variance of each segment's turn in that of one step."""
+        """``(S,)`` variance of each segment's turn, in units of that of one step."""
         return self.own[: self.drawn.num_segments] / self.mode.state.noise.step_variance
 
     @cached_property
     def closures(self) -> np.ndarray:
-        """``(C,)`` the view-graph's edges that they are."""
+        """``(C,)`` the view-graph's edges of the closures."""
         return np.asarray(self.drawn.view_graph_edge[self.mode.problem.closure - self.drawn.num_segments])
 
     def closure_variance(self, noise: PoseNoise) -> np.ndarray:
-        """``(C,)`` m² per component, of good closures' translations."""
+        """``(C,)`` m² per component, variance of good closures' translations."""
         return noise.of_closures((self.lengths[self.closures] ** 2).sum(axis=1))
 
     def own_variance(self, noise: PoseNoise) -> np.ndarray:
-        """``(C,)`` m², what of that each does not share with its run."""
+        """``(C,)`` m², part of that which each closure does not share with its run."""
         is_shared = self.run[self.mode.problem.closure] >= 0
         return np.asarray(self.closure_variance(noise) - is_shared * noise.common)
 
@@ -283,7 +283,7 @@ class PoseProblem:
         label = np.where(np.isinf(odds), np.sign(odds), 0.0)
         with np.errstate(invalid="ignore"):
             false_odds = np.where(label == 0, good - left_out.log_odds[closure], 0.0)
-        # A place that looks alike is seen at nearly the angle at which the true one would be, which may not be known.
+        # A similar-looking place is seen at nearly the angle at which the true one would be, which may be uncertain.
         priors = problem.priors
         broad = predicted / (1 + predicted / ANYHOW)
         false_odds += log_false(square, k, priors, predicted=broad) - log_false(square, k, priors)
@@ -301,7 +301,7 @@ class PoseProblem:
 
     @cached_property
     def loose(self) -> np.ndarray:
-        """Key nodes that chains of odometry begin with, but for those that hold a root."""
+        """Key nodes at which chains of odometry begin, except chains with a root."""
         drawn = self.drawn
         chain = drawn.paths.chain[drawn.nodes]
         first = np.unique(chain, return_index=True)[1]
@@ -314,16 +314,16 @@ class PoseProblem:
 
     @cached_property
     def drawn_steps(self) -> DrawnSteps:
-        """Odometry's, in the order of the segments."""
+        """Odometry's steps, in the order of the segments."""
         by_turns = self.mode.problem.by_turns(self.mode.state.noise)
         return DrawnSteps(self.graph, self.lengths, self.lengths_passed, self.drawn, self.steps, by_turns)
 
     def displacements(self, body_from_world: np.ndarray) -> Displacements:
-        """At orientations ``(N, 4)``."""
+        """Displacements at orientations ``(N, 4)``."""
         return self.drawn_steps.displacements(body_from_world)
 
     def along_odometry(self, way: Displacements) -> np.ndarray:
-        """``(K, 3)`` metres, positions of the key nodes by odometry's displacements from its roots on."""
+        """``(K, 3)`` metres, positions of the key nodes by odometry's displacements from its roots."""
         drawn = self.drawn
         forest = drawn.paths.forest
         step = np.zeros((self.graph.num_nodes, 3))
@@ -333,7 +333,7 @@ class PoseProblem:
         return np.asarray(np.stack(from_root, axis=1)[drawn.nodes])
 
     def residuals(self, state: PoseState, way: Displacements) -> np.ndarray:
-        """``(E + R, k + m)`` measured less predicted."""
+        """``(E + R, k + m)`` measured minus predicted."""
         drawn, (turns, shifts) = self.drawn, self.bases
         measured = self.mode.problem.measured
         turn = quaternion_rows.residual_vectors(state.correction, measured, drawn.source, drawn.target)
@@ -359,16 +359,16 @@ class PoseProblem:
 
     @cached_property
     def _crossing(self) -> np.ndarray:
-        """``(3, m k)`` what makes of v the numbers of v × in the bases: (v × a) · b = v · (a × b)."""
+        """``(3, m k)`` map from v to the entries of v × in the bases: (v × a) · b = v · (a × b)."""
         turns, shifts = self.bases
         return np.asarray(np.cross(turns.T[None], shifts.T[:, None]).reshape(-1, 3).T)
 
     def _crossed(self, vector: np.ndarray) -> np.ndarray:
-        """``(E, m, k)`` of v × in the bases."""
+        """``(E, m, k)`` matrices of v × in the bases."""
         return np.asarray((vector @ self._crossing).reshape(len(vector), self.shifts, self.turns))
 
     def shift_covariance(self, state: PoseState, way: Displacements) -> np.ndarray:
-        """``(E, m, m)`` m², of the noise of odometry's shifts; of closures, what they do not share as good ones."""
+        """``(E, m, m)`` m², covariance of odometry's shifts; for closures, the unshared part as good ones."""
         drawn, num_segments = self.drawn, self.drawn.num_segments
         unit = np.eye(self.shifts)
         noise = state.noise
@@ -376,7 +376,7 @@ class PoseProblem:
         slipped = drawn.is_odometry & ~self.mode.state.is_good
         variance += np.where(slipped, (self.priors.slip * self.typical) ** 2, 0.0)
         variance[:num_segments] += self.jumps
-        # Odometry beside the chain that is not believed, which nothing hangs on, does not pull.
+        # Rejected odometry beside the chain connects nothing else, so it does not pull.
         variance[num_segments:] = np.where(slipped, variance / NOTHING, variance)[num_segments:]
         variance[self.mode.problem.closure] = self.own_variance(noise)
         covariance = variance[:, None, None] * unit
@@ -385,9 +385,9 @@ class PoseProblem:
         return np.asarray(covariance)
 
     def bent(self, way: Displacements) -> np.ndarray:
-        """``(2, S, m, m)`` m² per rad² a step, of segments' shifts by what bends them: about the drift axis, and not.
+        """``(2, S, m, m)`` m² per rad² a step, of segments' shifts due to bending, about the drift axis and the others.
 
-        Turns about n alone have ∫ (d × n) (d × n)ᵀ dq of ∫ (‖d‖² I − d dᵀ) dq.
+        Turns about n alone contribute ∫ (d × n) (d × n)ᵀ dq to ∫ (‖d‖² I − d dᵀ) dq.
         """
         shifts, bridge = self.bases[1], way.bridge[: self.drawn.num_segments]
         about = bridge
@@ -407,10 +407,10 @@ class PoseProblem:
         """``(E + R, d, d)`` W^½ of all rows.
 
         Args:
-            covariance: ``(E, m, m)`` of shifts.
+            covariance: ``(E, m, m)`` covariances of shifts.
             rotation_weight: ``(E, 2)`` rad⁻², about the drift axis and any other one.
-            closure_weight: ``(C,)`` m⁻², in the place of closures' covariances.
-            state: noise.
+            closure_weight: ``(C,)`` m⁻², used instead of closures' covariances.
+            state: gives the noise.
         """
         k, m = self.turns, self.shifts
         num_edges = len(covariance)
@@ -418,7 +418,7 @@ class PoseProblem:
         edges, common = root[:num_edges], root[num_edges:]
         about, other = np.sqrt(rotation_weight).T[:, :, None, None]
         edges[:, :k, :k] = about * self.about_drift_axis + other * (np.eye(k) - self.about_drift_axis)
-        # Upper triangular: Cholesky's from the last component on.
+        # Upper triangular: Cholesky from the last component backwards.
         edges[:, k:, k:] = inverse_root(covariance[:, ::-1, ::-1])[:, ::-1, ::-1]
         edges[self.mode.problem.closure, k:, k:] = np.sqrt(closure_weight)[:, None, None] * np.eye(m)
         if self.num_runs:
@@ -427,11 +427,11 @@ class PoseProblem:
         return root
 
     def loose_weight(self, extent: float) -> np.ndarray:
-        """``(d,)`` of chains that nothing joins: turned anyhow, and anywhere on a map of ``extent`` m²."""
+        """``(d,)`` weight of chains that nothing joins: any turn, and anywhere on a map of ``extent`` m²."""
         return np.concatenate((np.full(self.turns, 1 / ANYHOW), np.full(self.shifts, 1 / extent)))
 
     def root_weight(self, rotation_weight: np.ndarray, state: PoseState) -> np.ndarray:
-        """``(d,)`` what ties roots down."""
+        """``(d,)`` weight that ties roots down."""
         shift = max(1 / (state.noise.way * self.typical * _LEAST_LENGTH), 1 / state.noise.closure)
         tied = np.full(self.turns, float(rotation_weight.max())), np.full(self.shifts, shift)
         return _GROUNDING * np.concatenate(tied)

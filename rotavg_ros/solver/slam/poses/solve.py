@@ -16,12 +16,12 @@ from rotavg_ros.solver.slam.poses.search.rivals import rival_poses
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
 
-# Metres that nothing is squared with: odometry of such a step tells no places.
+# Metres; odometry with a longer step gives no places, so that squares do not overflow.
 _ABSURD = 1e100
 
 
 def has_places(graph: ViewGraph) -> bool:
-    """Whether translations of all odometry are known, of some closures, and lead anywhere."""
+    """Whether translations of all odometry and some closures are known, and odometry moves at all."""
     if graph.translation is None:
         return False
     known = (graph.translation.abs() < _ABSURD).all(dim=1)
@@ -33,12 +33,12 @@ def has_places(graph: ViewGraph) -> bool:
 def median_poses(
     graph: ViewGraph, modes: list[Mode], tuned: Callable[[Mode], Mode] = lambda mode: mode
 ) -> tuple[PoseMemory, Mode]:
-    """Poses, and the labelling that they are of, the median of those that both make likely.
+    """Poses and their labelling, the median of those that rotations and translations make likely.
 
     Args:
         graph: calibrated, with translations.
         modes: labellings of its rotations, the likeliest first.
-        tuned: a labelling with the noise of each edge as FineNet has it.
+        tuned: function that sets each edge's noise in a labelling by FineNet.
     """
     rivals = rival_poses(graph, _translations(graph), modes, tuned)
     poses, middle = answer(rivals.poses, rivals.share)
@@ -46,7 +46,7 @@ def median_poses(
 
 
 def poses_of_update(graph: ViewGraph, mode: Mode, memory: PoseMemory) -> PoseMemory | None:
-    """Of a graph calibrated that has grown, with the labels of its rotations; None if all is due."""
+    """Poses of a calibrated graph that has grown, with the labels of its rotations; None if a whole solve is due."""
     problem = memory.problem(graph, _translations(graph), mode)
     start = memory.start(graph, problem)
     if start is None:
@@ -56,13 +56,13 @@ def poses_of_update(graph: ViewGraph, mode: Mode, memory: PoseMemory) -> PoseMem
 
 
 def poses_of_labels(graph: ViewGraph, mode: Mode) -> PoseMemory:
-    """Of a graph calibrated, with the labels of its rotations, from nothing else."""
+    """Poses of a calibrated graph, from the labels of its rotations alone."""
     pose = estimate_poses(PoseProblem(graph, _translations(graph), mode))
     return PoseMemory.of(pose, answer([pose], np.ones(1))[0])
 
 
 def poses_of_kept(graph: ViewGraph, mode: Mode, kept: KeptLabels) -> PoseMemory:
-    """Of a graph calibrated, with the labels of its rotations, from what is known of its closures' places."""
+    """Poses of a calibrated graph, from the labels of its rotations and the kept classes of its closures' places."""
     problem = PoseProblem(graph, _translations(graph), mode)
     pose = estimate_poses(problem, start=PoseStart.kept(problem, kept.places, kept.pose_noise))
     return PoseMemory.of(pose, answer([pose], np.ones(1))[0])

@@ -1,4 +1,4 @@
-"""One joint solve, and what it tells of each closure."""
+"""One joint solve, and its predictions of closures."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from rotavg_ros.solver.slam.poses.state import PoseState
 
 @dataclass(frozen=True)
 class Solved:
-    """Of E edges, R runs and C closures; d = k + m.
+    """A joint solve with E edges, R runs and C closures; d = k + m.
 
     Attributes:
-        state: after the step, with the noise that it was done with.
-        way: displacements before it.
+        state: the state after the step, with the noise used in it.
+        way: displacements before the step.
         covariance: ``(E, m, m)`` m², of shifts.
         rotation_weight: ``(E, 2)`` rad⁻², of turns about the drift axis and any other one.
         closure_weight: ``(C,)`` m⁻², of closures' translations.
-        left: ``(E + R, d, 1)`` what it leaves of whitened rows.
-        factor: of its normal equations.
+        left: ``(E + R, d, 1)`` whitened residuals after the step.
+        factor: factor of its normal equations.
         moved: root mean square of the step, in standard errors of the answer.
-        scale: of closures' errors.
-        predictions: what all else says of closures.
-        maps: by what turns of the map they are off from that.
-        places: their classes, by that.
+        scale: scales of closures' errors.
+        predictions: predictions of closures by all else.
+        maps: turns of the map that would explain the closures' discrepancies.
+        places: the closures' classes that follow.
     """
 
     state: PoseState
@@ -54,8 +54,8 @@ class PoseMode:
     Attributes:
         problem: the graph.
         solved: the last solve.
-        cost: −log p of translations given what rotations say, nats; NaN unless rotations' labels were held.
-        first: nats, what the first solve made of closures and noise (:func:`likeliest_level`).
+        cost: −log p of translations given rotations, nats; NaN unless rotations' labels were held.
+        first: nats, log density of closures and noise in the first solve (:func:`likeliest_level`).
     """
 
     problem: PoseProblem
@@ -65,7 +65,7 @@ class PoseMode:
 
     @property
     def state(self) -> PoseState:
-        """Where the key nodes are, and the noise."""
+        """Poses of the key nodes, and the noise."""
         return self.solved.state
 
     def jumps_like(self, other: PoseMode) -> bool:

@@ -1,4 +1,4 @@
-"""Where the key nodes are, and how far odometry and closures err, rotations and translations together."""
+"""Poses of the key nodes, and variances of odometry and closures, for rotations and translations together."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ class PoseNoise:
 
     Attributes:
         turn: rad², of one step of odometry, about the vertical where the robot knows one.
-        closure_turn: rad², of a good closure that states what is typical.
-        way: m² per metre passed, of odometry.
-        closure: m², of a good closure's translation, and …
-        relative: … by what of its squared length that grows: some front ends tell directions rather than lengths.
-        common: m², of what closures near each other err alike, on top.
-        tilt: rad², of one step of odometry about any other axis: gravity may hold it. The same where no vertical is
-            known.
+        closure_turn: rad², of a good closure whose stated variance is typical.
+        way: m² per metre travelled, of odometry.
+        closure: m², of a good closure's translation.
+        relative: growth of that variance per squared length: some front ends measure directions rather than lengths.
+        common: m², additional variance of the error shared by closures near each other.
+        tilt: rad², of one step of odometry about any other axis, which gravity may hold. Equal to ``turn`` where no
+            vertical is known.
     """
 
     turn: float
@@ -41,24 +41,24 @@ class PoseNoise:
         return cls(*np.exp(logarithms).tolist())
 
     def of_closures(self, square_length: np.ndarray | float) -> np.ndarray:
-        """m² per component, of good closures' translations of this squared length, m²; all that they err by."""
+        """m² per component, total variance of good closures' translations of this squared length, m²."""
         return np.asarray(self.closure + self.common + self.relative * square_length)
 
     def of_shifts_times(self, of_odometry: float, of_closures: float) -> PoseNoise:
-        """With variances of shifts so many times as large, but for what goes with their length."""
+        """The noise with scaled variances of shifts, except the part proportional to length."""
         closure, common = of_closures * self.closure, of_closures * self.common
         return replace(self, way=of_odometry * self.way, closure=closure, common=common)
 
 
 @dataclass(frozen=True)
 class PoseState:
-    """Of K key nodes and R runs; d = k + m unknowns each.
+    """State of K key nodes and R runs; d = k + m unknowns each.
 
     Attributes:
         correction: ``(4, K)`` C, world-frame corrections of the odometry's orientations.
         position: ``(K, 3)`` metres.
         common: ``(R, 6)`` common errors of runs: rad, metres.
-        noise: how far everything errs.
+        noise: all variances.
     """
 
     correction: np.ndarray

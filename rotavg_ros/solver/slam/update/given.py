@@ -1,4 +1,4 @@
-"""What those of some closures that are believed say of the others, and of each other: conditional normal densities."""
+"""Conditional normal densities of closures, given those among them that are believed."""
 
 from __future__ import annotations
 

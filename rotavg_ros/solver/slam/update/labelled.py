@@ -1,4 +1,4 @@
-"""A solve from labels: the posterior's mode nearest to them, with no search for another."""
+"""A solve from labels: finds the posterior's mode nearest to them, without a search for others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A solve's answer as a normal density about it: what closures that come later are compared with, and what they move.
+"""The normal approximation at a solve's answer, with which later closures are compared and which they update.
 
 The unknowns of the last solve (K key nodes and R runs, d components each) are N(0, H⁻¹) about their estimates, H as it
 was factorised. Nodes between key nodes follow those by their shares; nodes that odometry has appended since move with

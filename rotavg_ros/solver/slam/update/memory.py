@@ -1,8 +1,8 @@
-"""What a solve by the posterior remembers for the next one of the same graph, grown by a few edges.
+"""The memory of a solve by the posterior for the next solve of the same graph, grown by a few edges.
 
-The labelling that was found, its noise and its calibration are where the next solve begins and, but for labels of
-single closures, where it ends. The whole search is due again once enough closures have come that this labelling does
-not explain: others only make it likelier. Odometry that no closure judges yet says nothing of what was there.
+The next solve begins with the labelling found, its noise and its calibration, and changes only labels of single
+closures. The whole search is due again once there are enough new closures that this labelling does not explain: others
+only make it likelier. New odometry without closures gives no evidence about older parts.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from rotavg_ros.solver.slam.update.grown_edges import begins_with, thinned_out
 from rotavg_ros.solver.slam.update.labelled import UNKNOWN, Labelled, solved_from
 from rotavg_ros.view_graph import ViewGraph
 
-# The whole search is due once closures that are not explained are more than this share of those that were searched, or
-# new ones more than the second; with any new one where other answers were nearly as likely.
+# The whole search is due once unexplained closures exceed the first share of those in the last search, or new ones
+# exceed the second; if another answer was nearly as likely, with any new closure.
 _MAX_UNEXPLAINED, _MAX_GROWTH = 0.05, 0.25
 _FLAGGED = 0.5
 _GOOD = 0.5
 
 
 class SearchedOn(NamedTuple):
-    """The outcome of an update: the answer, and the labelling."""
+    """Result of an update: the answer, and the labelling."""
 
     estimate: Estimate
     mode: Mode
@@ -51,28 +51,28 @@ class SearchedOn(NamedTuple):
 
 @dataclass(frozen=True)
 class SlamMemory:
-    """Of a graph of N nodes and M edges, C of them closures.
+    """Memory of a graph of N nodes and M edges, C of them closures.
 
     Attributes:
         graph: the view-graph.
-        trusted: ``(M,)`` 1 for good closures and sound odometry, 0 for others; all of a segment have its label.
-        noise: of that labelling.
-        mode: that labelling, as of the last solve; odometry alone has come since.
-        calibration: what was taken out of all measurements of a kind; None if nothing was.
-        body_from_world: ``(N, 4)`` that was found, in its own gauge.
-        outlier_score: ``(M,)`` that was published.
-        variance: ``(N,)`` rad², likewise.
+        trusted: ``(M,)`` 1 for good closures and sound odometry, 0 for others; all edges of a segment have its label.
+        noise: noise of that labelling.
+        mode: that labelling, as of the last solve; only odometry has been added since.
+        calibration: the calibration that was removed from the measurements; None if there was none.
+        body_from_world: ``(N, 4)`` found orientations, in their own gauge.
+        outlier_score: ``(M,)`` published scores.
+        variance: ``(N,)`` rad², published likewise.
         searched: C when the whole search began.
         is_divided: whether another answer was nearly as likely then.
-        unexplained: closures that came since and were flagged, and older ones whose label has changed.
-        notes: what the whole search says of its answer.
-        warnings: all that is to be told of it; None before somebody has looked.
-        poses: where translations are known.
+        unexplained: number of closures added since and flagged, and of older ones whose label has changed.
+        notes: the whole search's notes on its answer.
+        warnings: all warnings about it; None before they have been computed.
+        poses: memory of poses, where translations are known.
         ahead: the next whole solve, if one is under way.
-        anew: whether that begins with nothing, as a solve without a memory does.
-        update: the solve with closures that are new, if one is under way.
-        update_work: units that the last one took.
-        columns: of closures that are new, until that has ended.
+        anew: whether that starts from nothing, as a solve without a memory does.
+        update: the solve with new closures, if one is under way.
+        update_work: units that the last update took.
+        columns: columns of new closures, until the update has ended.
     """
 
     graph: ViewGraph

@@ -1,1 +1,1 @@
-"""Poses of a labelling by expectation–maximisation: where it begins, its loop, its noise, how it comes to rest."""
+"""Poses of a labelling by expectation–maximisation: start, loop, noise and convergence."""

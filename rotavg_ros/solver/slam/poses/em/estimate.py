@@ -1,8 +1,8 @@
 """Poses by expectation–maximisation around the joint solve.
 
-It begins with the orientations that rotations alone give and no closure's translation believed. What odometry and turns
-predict of each, lever arms included, tells which may be; a closure pulls as far as its classes' mean lets it, so that
-those near by come in first, and what they tie down judges the others.
+It begins with the orientations from rotations alone, and with no closure's translation believed. The predictions of
+odometry and turns, lever arms included, tell which may be right. A closure's weight follows from the mean over its
+classes, so nearby closures are accepted first, and the poses that they fix judge the others.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.solved import PoseMode, Solved
 from rotavg_ros.solver.slam.poses.state import PoseState
 
-# Units of work for each row, of each part of what is done beside the factorisation.
+# Units of work per row, for each part of the work beside the factorisation.
 _ROW = 0.001
-# A step turns nothing by more than this, rad.
+# Largest turn of a node in one step, rad.
 _MAX_TURN = 0.3
-# With which variances of shifts it is begun otherwise.
+# Factors of the prior variances of shifts for the alternative starts.
 _LEVELS: tuple[Level, ...] = (USUAL, (1 / 16, 1 / 16), (1 / 256, 1 / 256), (1.0, 1 / 256), (1.0, 1 / 4096))
-# No two places are nearer than so many typical steps.
+# Least extent of the map, in typical steps.
 _LEAST_EXTENT = 3.0
 
 
@@ -59,9 +59,9 @@ def estimate_poses(
     Args:
         problem: the labelling, and translations.
         hold: leave the labels of rotations as they are.
-        start: where to begin; default: at what rotations say, no closure's translation believed, …
-        level: … with variances of shifts so many times what is believed beforehand.
-        ending: where to end.
+        start: where to begin; default: the answer of rotations, with no closure's translation believed.
+        level: for the default start, factors of the prior variances of shifts.
+        ending: when to end before convergence.
     """
     is_good = problem.mode.state.is_good[problem.mode.problem.closure]
     judge = Judge(problem.told, problem.turns, problem.priors, is_good if hold else None)
@@ -101,7 +101,7 @@ def estimate_poses(
 
 
 def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge) -> Solved:
-    """One Gauss–Newton step, and classes of closures by what it tells."""
+    """One Gauss–Newton step, and the classes of closures that follow from it."""
     closure, k, num_nodes = problem.mode.problem.closure, problem.turns, problem.drawn.num_nodes
     way = problem.displacements(problem.orientations(state))
     residual, covariance = problem.residuals(state, way), problem.shift_covariance(state, way)
@@ -156,13 +156,13 @@ def _solve(problem: PoseProblem, state: PoseState, places: Places, judge: Judge)
 
 
 def likeliest_level(usual: PoseMode) -> Level:
-    """The level of shifts' noise under which closures are likeliest, each by itself, before any of them pulls.
+    """The level of shifts' noise under which closures are likeliest, each independently, before any of them pulls.
 
-    Odometry that errs by anything has room for every false closure, and they keep it so; taken for better than it is,
-    it holds true regions to be wrong. What it tells of closures by itself is a guess at which; −log p decides.
+    With too large an error, odometry is compatible with every false closure, and these keep it so. With too small an
+    error, it rejects true regions. The likelihood of closures under odometry alone gives a guess; −log p decides.
 
     Args:
-        usual: the same labelling, begun with what is believed beforehand.
+        usual: the same labelling, begun with the prior variances.
     """
     problem, told = usual.problem, [usual.first]
     judge = Judge(problem.told, problem.turns, problem.priors)
@@ -173,7 +173,7 @@ def likeliest_level(usual: PoseMode) -> Level:
 
 
 def _log_likely(problem: PoseProblem, solved: Solved) -> float:
-    """Nats, of closures, each by itself, and of the noise."""
+    """Nats, log density of closures, each independently, and of the noise."""
     return float(solved.places.log_density.sum()) + log_noise_prior(problem, solved.state.noise)
 
 
@@ -188,13 +188,13 @@ def _scale(problem: PoseProblem, state: PoseState) -> Scale:
     spread = float(np.var(state.position @ problem.bases[1], axis=0).mean())
     good, own = problem.closure_variance(state.noise), problem.own_variance(state.noise)
     extent = 2 * spread + (_LEAST_EXTENT * problem.typical) ** 2
-    # What a closure states may be absurd: no Gaussian of the map's extent would tell its classes from each other.
+    # A closure may state an absurd length, for which Gaussians of the map's extent would not distinguish its classes.
     stated = (problem.lengths[problem.closures] ** 2).sum(axis=1) / problem.shifts
     return Scale(good, own, state.noise.closure / own, extent, np.maximum(extent, stated))
 
 
 def _left_out(factor: BlockFactor, root: np.ndarray, left: np.ndarray, rows: np.ndarray) -> Predictions:
-    """What all else says of some rows, whose ``root`` is diagonal, by what is left of them and their leverages."""
+    """Predictions of some rows by all else, from their residuals and leverages; their ``root`` is diagonal."""
     sigma = 1 / np.diagonal(root[rows], axis1=1, axis2=2)
     others, covariance = factor.without(rows)
     mean = sigma * np.matmul(others, left[rows])[:, :, 0]

@@ -1,4 +1,4 @@
-"""How likely a labelling of rotations makes the translations, in nats: what rival labellings are compared by."""
+"""The likelihood of the translations under a labelling of rotations, nats, by which rival labellings are compared."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from rotavg_ros.solver.slam.poses.solved import Solved
 def translation_cost(problem: PoseProblem, solved: Solved, in_order: Places) -> float:
     """−log p of all translations, given rotations and their labels.
 
-    That of the normal densities that stand for all rows, poses integrated out, and by how much more each closure's own
-    density makes of what all else says (as :mod:`rotavg_ros.solver.slam.posterior.objective` has it for rotations);
-    less the same of rotations alone.
+    The sum of −log evidence of the normal densities that approximate all rows, with poses integrated out, and each
+    closure's log ratio of its own density's evidence to its approximation's (as for rotations in
+    :mod:`rotavg_ros.solver.slam.posterior.objective`), minus the same for rotations alone.
 
     Args:
         problem: the labelling.
-        solved: at rest, rotations' labels held.
-        in_order: classes of closures given those before alone.
+        solved: the converged solve, with rotations' labels held.
+        in_order: classes of closures given only those before.
     """
     gained = in_order.log_density - _as_normal(problem, solved) - _gained_by_rotations(problem)
     believed = log_noise_prior(problem, solved.state.noise) - log_noise_prior(problem, problem.turn_noise)
@@ -28,7 +28,7 @@ def translation_cost(problem: PoseProblem, solved: Solved, in_order: Places) -> 
 
 
 def _normal(problem: PoseProblem, solved: Solved) -> float:
-    """−log evidence of the normal densities, but for what both have in common."""
+    """−log evidence of the normal densities, without the terms that rotations alone have as well."""
     k, m, drawn = problem.turns, problem.shifts, problem.drawn
     odometry = np.flatnonzero(drawn.is_odometry)
     cost = float((solved.left**2).sum() + _log_det(problem, solved)) / 2
@@ -39,13 +39,13 @@ def _normal(problem: PoseProblem, solved: Solved) -> float:
     ) / 2
     cost += m / 2 * problem.num_runs * float(np.log(solved.state.noise.common))
     cost += k / 2 * problem.num_runs * float(np.log(problem.common_turn(solved.state.noise)))
-    # Rows less unknowns, per component of a shift; of loose nodes something is known beforehand.
+    # Rows minus unknowns, per component of a shift; loose nodes have a prior.
     redundant = len(drawn.source) - drawn.num_nodes + len(drawn.roots) + len(problem.loose)
     return cost + m / 2 * redundant * float(np.log(2 * np.pi))
 
 
 def _log_det(problem: PoseProblem, solved: Solved) -> float:
-    """Log det H, where chains that nothing joins are somewhere on the map, turned anyhow: they count for no more."""
+    """Log det H; chains that nothing joins have a prior over the map's extent and all turns."""
     if len(problem.loose) == 0:
         return solved.factor.log_det
     state = solved.state
@@ -56,7 +56,7 @@ def _log_det(problem: PoseProblem, solved: Solved) -> float:
 
 
 def _normal_of_rotations(problem: PoseProblem) -> float:
-    """The same of rotations alone, at the labelling's optimum."""
+    """The same for rotations alone, at the labelling's optimum."""
     evaluation, k = problem.mode.evaluation, problem.turns
     weight = evaluation.weight[:, None]
     cost = float((weight * evaluation.residual**2).sum() + k * evaluation.factorised.log_det) / 2
@@ -64,7 +64,7 @@ def _normal_of_rotations(problem: PoseProblem) -> float:
 
 
 def _as_normal(problem: PoseProblem, solved: Solved) -> np.ndarray:
-    """``(C,)`` nats, what the densities that stand for closures make of what all else says."""
+    """``(C,)`` nats, log evidence of closures under their normal approximations, given the predictions by all else."""
     k, m, closure = problem.turns, problem.shifts, problem.mode.problem.closure
     total = solved.predictions.covariance.copy()
     total[:, :k, :k] += (1 / solved.rotation_weight[closure, 0])[:, None, None] * np.eye(k)
@@ -75,7 +75,7 @@ def _as_normal(problem: PoseProblem, solved: Solved) -> np.ndarray:
 
 
 def _gained_by_rotations(problem: PoseProblem) -> np.ndarray:
-    """``(C,)`` nats, by how much more closures' own densities make of what rotations alone say."""
+    """``(C,)`` nats, log ratio of closures' own densities to their approximations, given rotations alone."""
     k, closure, left_out = problem.turns, problem.mode.problem.closure, problem.mode.left_out
     square, predicted = left_out.square[closure], left_out.predicted[closure]
 

@@ -1,4 +1,4 @@
-"""How far odometry and closures err, by the redundancy that residuals leave (restricted maximum likelihood)."""
+"""Variances of odometry and closures, from residuals and their redundancy (restricted maximum likelihood)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _Prior = tuple[float, float]
 
 
 def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
-    """All variances, each from its part of what is left over (Harville 1977), under their priors."""
+    """All variances, each from its part of the residuals (Harville 1977), under their priors."""
     noise, places = solved.state.noise, solved.places
     k, segments = problem.turns, np.flatnonzero(~problem.slipped & (problem.jumps == 0))
     redundancy = solved.factor.redundancy[segments]
@@ -37,7 +37,7 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
     left, turns = solved.left[segments, :k, 0], redundancy[:, :k, :k]
 
     def by_axes(axes: np.ndarray) -> np.ndarray:
-        """``(2,)`` the same of turns about some axes, ``(k, k)`` onto which turns are projected."""
+        """``(2,)`` the same for turns about some axes, given their projection ``(k, k)``."""
         return np.array([((left @ axes) ** 2).sum(), np.trace(turns @ axes, axis1=1, axis2=2).sum()])
 
     about = problem.about_drift_axis
@@ -55,10 +55,10 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
 
     noise = PoseNoise.of(np.log([likeliest(told, number) for number, told in enumerate(found)]))
     if problem.drift_axis is None or noise.tilt > noise.turn:
-        # Gravity holds or does not: false closures would make room for themselves by tilts.
+        # A larger variance of tilts is not allowed: it would make room for false closures.
         alone = likeliest(found[0] + found[-1], 0)
         noise = replace(noise, turn=alone, tilt=alone)
-    # Runs that join wrong places have more than that in common, and would make room for themselves.
+    # Runs that join wrong places have a larger common error, and would otherwise raise the bound to fit themselves.
     most = problem.priors.most_common
     farthest = problem.priors.largest_step**2 * problem.typical
     common = min(noise.common, most / (1 - most) * noise.closure)
@@ -67,13 +67,13 @@ def likeliest_noise(problem: PoseProblem, solved: Solved) -> PoseNoise:
 
 
 def log_noise_prior(problem: PoseProblem, noise: PoseNoise) -> float:
-    """Of all variances, nats, but for a constant."""
+    """Log prior of all variances, nats, up to a constant."""
     median, spread = np.array(priors_of(problem, noise)).T
     return -float(((noise.logarithms - median) ** 2 / (8 * spread**2)).sum())
 
 
 def priors_of(problem: PoseProblem, noise: PoseNoise) -> tuple[_Prior, ...]:
-    """Logarithms of median variances, and how far those of their roots spread; some go with others."""
+    """Logarithms of median variances, and log standard deviations of their roots; some depend on other variances."""
     of_turns, of_shifts, typical = problem.mode.problem.priors, problem.priors, problem.typical
     own = 2 * float(np.log(of_shifts.closure * typical)) + float(np.log1p(-of_shifts.common))
     return (

@@ -1,4 +1,4 @@
-"""Where an estimate of poses begins."""
+"""Starts of an estimate of poses."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.poses.state import PoseNoise, PoseState
 
-# Solves from a start, at most. An update goes no further: closures that are new pull from its second solve on, and the
-# next one goes on from there.
+# Maximum number of solves from a start, and in an update: there new closures pull from the second solve on, and the
+# next update continues.
 MAX_SOLVES, _MAX_UPDATE_SOLVES = 28, 2
-# Variances of shifts to begin with, of odometry and of closures, in those that are believed beforehand.
+# Initial variances of shifts, of odometry and of closures, in units of the prior ones.
 Level = tuple[float, float]
 USUAL: Level = (1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class PoseStart:
-    """What an earlier estimate came to.
+    """A start from an earlier estimate.
 
     Attributes:
         state: key nodes and noise.
-        column: ``(C,)`` where the places of each closure are, -1 of those that are new.
-        places: as they were judged.
-        solves: at most from there.
+        column: ``(C,)`` index of each closure in ``places``, -1 for new closures.
+        places: classes as they were judged.
+        solves: maximum number of solves from there.
     """
 
     state: PoseState
@@ -38,14 +38,14 @@ class PoseStart:
 
     @classmethod
     def at(cls, pose: PoseMode) -> PoseStart:
-        """Of the same labelling."""
+        """From an estimate of the same labelling."""
         return cls(pose.state, np.arange(len(pose.solved.places.weight)), pose.solved.places, MAX_SOLVES)
 
     @classmethod
     def beside(cls, pose: PoseMode, problem: PoseProblem) -> PoseStart:
-        """Of another labelling, with the noise of a similar one, and places as that one has them.
+        """For another labelling, with the noise and places of a similar one.
 
-        Places are judged anew of closures whose rotations are labelled otherwise.
+        Closures whose rotations are labelled differently are judged anew.
         """
         closure, noise = problem.mode.problem.closure, pose.state.noise
         is_same = problem.mode.state.is_good[closure] == pose.problem.mode.state.is_good[closure]
@@ -54,7 +54,7 @@ class PoseStart:
 
     @classmethod
     def believing(cls, pose: PoseMode, closures: np.ndarray) -> PoseStart:
-        """Of the same labelling, but that some closures ``(n,)`` are right."""
+        """For the same labelling, with some closures ``(n,)`` believed."""
         problem, noise, places = pose.problem, pose.state.noise, pose.solved.places
         chance, weight, rotation = places.chance.copy(), places.weight.copy(), places.rotation_weight.copy()
         chance[:, closures] = 0.0
@@ -66,7 +66,7 @@ class PoseStart:
 
     @classmethod
     def doubting(cls, pose: PoseMode, closures: np.ndarray) -> PoseStart:
-        """Of the same labelling, but that some closures ``(n,)`` join the same wrong places, turned as they say."""
+        """For the same labelling, with some closures ``(n,)`` held to join the same wrong places, turned as stated."""
         places = pose.solved.places
         chance, weight = places.chance.copy(), places.weight.copy()
         chance[:, closures] = 0.0
@@ -76,13 +76,13 @@ class PoseStart:
 
     @classmethod
     def kept(cls, problem: PoseProblem, kept: np.ndarray, noise: np.ndarray) -> PoseStart | None:
-        """Of labels that are known, and of what is known of places; None if another version of the solver kept it.
+        """From kept labels and classes of places; None if another version of the solver kept them.
 
-        Positions are those of odometry along what rotations say; one solve leads to where closures want them.
+        Positions are those of odometry along the orientations; one solve moves them to agree with closures.
 
         Args:
             problem: the labelling, and translations.
-            kept: ``(R, M)`` chances of classes and weights, of the view-graph's first M edges; NaN where not known.
+            kept: ``(R, M)`` class probabilities and weights of the view-graph's first M edges; NaN where unknown.
             noise: ``(7,)`` variances.
         """
         if len(kept) != CLASSES + 2 or len(noise) != len(fields(PoseNoise)) or not (noise > 0).all():
@@ -98,7 +98,7 @@ class PoseStart:
         return cls(state, column, places, MAX_SOLVES)
 
     def over(self, places: Places) -> Places:
-        """These, and others' ``places`` of what is new."""
+        """These places, with those of new closures taken from ``places``."""
         is_new, column = self.column < 0, self.column
         return replace(
             places,
@@ -109,7 +109,7 @@ class PoseStart:
 
 
 def along_odometry(problem: PoseProblem, level: Level = USUAL) -> PoseState:
-    """Orientations by rotations alone, positions along odometry, noise at a level of what is believed beforehand."""
+    """Orientations by rotations alone, positions along odometry, noise at a level of the prior."""
     mode = problem.mode
     common = np.zeros((problem.num_runs, 6))
     if problem.turns_share:

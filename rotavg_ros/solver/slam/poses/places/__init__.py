@@ -1,1 +1,1 @@
-"""Of which class each closure's error is, by what all else says of it: whether it joins the right places."""
+"""The class of each closure's error, given the predictions by all else: whether it joins the right places."""

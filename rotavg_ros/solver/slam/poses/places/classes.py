@@ -1,7 +1,7 @@
-"""The classes of a closure's error ε, and what all else says of it if it is of each.
+"""The classes of a closure's error ε, and its densities in each class given the predictions by all else.
 
-Translations of good closures err by their noise, or are in its tails; those that join wrong places lead anywhere, at
-one of a few scales, or to where another one's do. One class more has a false rotation, whose place nothing is known of.
+Translations of good closures have normal noise or are in its tails. Those that join wrong places lead anywhere, at one
+of a few scales, or to the same places as another one. A further class has a false rotation and an unknown place.
 """
 
 from __future__ import annotations
@@ -14,30 +14,30 @@ from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.slam.poses.closures import GOOD, Predictions, Scale, Told, along_axes, given_turn
 from rotavg_ros.solver.slam.poses.priors import PlacePriors
 
-# Classes of wrong places of their own; one more repeats another's.
+# Number of classes of wrong places of their own; one more repeats another closure's.
 WRONG = 6
 ELSEWHERE = WRONG + 1
-# All classes, those of false rotations last.
+# Number of all classes, with false rotations last.
 CLASSES = GOOD + ELSEWHERE + 1
-# Those that are wrong by themselves.
+# The classes that are wrong independently.
 BY_ITSELF = slice(GOOD, GOOD + WRONG)
-# Nobody calls a place alike that is seen turned by more standard deviations than this.
+# A place that is seen turned by more standard deviations than this does not look alike.
 _FARTHEST = 3.0
 
 
 @dataclass(frozen=True)
 class Said:
-    """What all else says of C closures, if they are of each of J classes of translations.
+    """Densities of C closures in each of J classes of translations, given the predictions by all else.
 
     Attributes:
-        predictions: turns and shifts, whatever their class.
+        predictions: predicted turns and shifts, independent of the class.
         turns: k.
-        scale: of errors.
+        scale: scales of errors.
         turned: ``(2, C)`` rad² per component, variances of turns of good ones and of wrong places seen nearly alike.
         variance: ``(J, C)`` m² per component, of ε.
-        log_turn: ``(J, C)`` nats, of turns.
-        along, spread: ``(J, C, m)`` metres and m², of shifts given turns, along axes of their own.
-        anywhere: ``(C, m)`` metres and m² of shifts whatever the turns, likewise.
+        log_turn: ``(J, C)`` nats, log densities of turns.
+        along, spread: ``(J, C, m)`` metres and m², mean and variance of shifts given turns, along principal axes.
+        anywhere: ``(C, m)`` metres and m² of shifts, marginal over turns, likewise.
     """
 
     predictions: Predictions
@@ -57,7 +57,7 @@ class Said:
         here, elsewhere = (given_turn(predictions, variance, turns) for variance in turned)
         spread = np.stack([here.spread] * GOOD + [elsewhere.spread] * ELSEWHERE)
         along = np.stack([here.along] * GOOD + [elsewhere.along] * ELSEWHERE)
-        # Turn and shift of a repeat are those of the one that it repeats, which is seen nearly at the right angle.
+        # A repeat has the turn and shift of the closure that it repeats, which is seen nearly at the right angle.
         repeats = -np.maximum(elsewhere.square - _FARTHEST**2, 0.0) / 2
         log_turn = np.stack([here.log_turn] * GOOD + [elsewhere.log_turn] * WRONG + [repeats])
         variance = _variances(scale, priors)
@@ -66,31 +66,31 @@ class Said:
 
     @cached_property
     def total(self) -> np.ndarray:
-        """``(J, C, m)`` m², of shifts, their own errors included."""
+        """``(J, C, m)`` m², variances of shifts including their own errors."""
         return np.asarray(self.spread + self.variance[:, :, None])
 
     @cached_property
     def log_shift(self) -> np.ndarray:
-        """``(J, C)`` nats, of shifts given turns; nothing of a repeat's."""
+        """``(J, C)`` nats, log densities of shifts given turns; 0 for repeats."""
         log_shift = log_normal(self.along, self.total)
         return np.where(np.arange(len(log_shift))[:, None] < len(log_shift) - 1, log_shift, 0.0)
 
     @cached_property
     def log_anywhere(self) -> np.ndarray:
-        """``(C,)`` nats, of shifts that lead anywhere on the map."""
+        """``(C,)`` nats, log densities of shifts that lead anywhere on the map."""
         along, spread = self.anywhere
         return log_normal(along, spread + self.scale.anywhere[:, None])
 
     @cached_property
     def log_in_place(self) -> np.ndarray:
-        """``(C,)`` nats, of shifts at the right place, whatever the turns."""
+        """``(C,)`` nats, log densities of shifts at the right place, marginal over turns."""
         along, spread = self.anywhere
         return log_normal(along, spread + self.scale.own[:, None])
 
     def errors(self) -> tuple[np.ndarray, np.ndarray]:
         """``(J + 1, C)`` metres and m² per component: length of ε's mean, and its variance.
 
-        A false rotation may be anywhere, whatever its turn says.
+        A closure with a false rotation may be anywhere, independent of its turn.
         """
         along, spread = (
             np.concatenate((of_classes, anywhere[None]))
@@ -103,7 +103,7 @@ class Said:
 
 
 def _variances(scale: Scale, priors: PlacePriors) -> np.ndarray:
-    """``(J, C)`` m² per component: of wrong places from the least that they are off by to the farthest."""
+    """``(J, C)`` m² per component; those of wrong places range from the least error to the largest."""
     good = scale.own * np.array([[1.0], [priors.tail_ratio]])
     least = min(priors.least_wrong**2 * scale.closure, scale.extent)
     wrong = scale.anywhere * (least / scale.anywhere) ** np.linspace(1.0, 0.0, WRONG)[:, None]
@@ -111,16 +111,16 @@ def _variances(scale: Scale, priors: PlacePriors) -> np.ndarray:
 
 
 def log_normal(off: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """``(…,)`` nats of ``(…, m)`` under normal densities with these variances."""
+    """``(…,)`` nats, log normal densities of ``(…, m)`` with these variances."""
     return -over_components(off**2 / variance + np.log(2 * np.pi * variance)) / 2
 
 
 def over_components(value: np.ndarray) -> np.ndarray:
-    """``(…,)`` sums of ``(…, m)``: over a last axis that is short, einsum takes a third of what NumPy's sums do."""
+    """``(…,)`` sums of ``(…, m)``: over a short last axis, einsum takes a third of the time of NumPy's sum."""
     return np.asarray(np.einsum("...m->...", value))
 
 
 def log_sum(logarithms: np.ndarray) -> np.ndarray:
-    """``(n,)`` log of sums over the first axis, of numbers that are finite."""
+    """``(n,)`` log-sum-exp over the first axis, for finite numbers."""
     largest = logarithms.max(axis=0)
     return np.asarray(largest + np.log(np.exp(logarithms - largest).sum(axis=0)))

@@ -1,8 +1,8 @@
-"""How a closure's translation errs: well, in tails, or because it joins wrong places; and whether its rotation does.
+"""Judges closures: normal noise, tails or wrong places in translation, and false rotations.
 
-All of these are one mixture of normal densities of one error ε (:mod:`rotavg_ros.solver.slam.poses.places.classes`).
-What everything else says of a closure's residual, N(μ, P) in k turns and m shifts together, gives each class its
-chance, and the weight with which the closure pulls (:mod:`rotavg_ros.solver.slam.poses.places.pulls`).
+All of these form one mixture of normal densities of one error ε (:mod:`rotavg_ros.solver.slam.poses.places.classes`).
+Everything else predicts a closure's residual as N(μ, P), in k turns and m shifts together. This gives the probability
+of each class, and the closure's weight (:mod:`rotavg_ros.solver.slam.poses.places.pulls`).
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
 from rotavg_ros.solver.slam.poses.repeats.neighbours import Repeats, repeats_of, wrong_share
 
 _LOG_NOTHING = -1e6
-# No chance that counts is less, and no share is less than this, or nearer to one.
+# Floor of probabilities; least distance of shares from zero and one.
 _LEAST_CHANCE, _SHARE = 1e-9, 0.01
-# Who is good, or false, with less than this chance becomes so by itself before others tell of it.
+# Closures that are good, or false, with a lower probability are not compared with others.
 _UNLIKELY = 1e-3
-# Units of work for each closure, of each part of what is asked.
+# Units of work per closure, for each part of the judgement.
 _CLOSURE = 0.007
 
 
 @dataclass(frozen=True)
 class Judge:
-    """Tells the classes of all closures by what all else says of them.
+    """Computes the classes of all closures from the predictions by all else.
 
     Attributes:
-        told: what rotations alone say.
+        told: results of rotations alone.
         turns: k.
-        priors: of places.
-        held: ``(C,)`` bool, which rotations are good; None: by their densities.
+        priors: prior parameters of places.
+        held: ``(C,)`` bool, labels of rotations, held fixed; None: judged by their densities.
     """
 
     told: Told
@@ -53,11 +53,11 @@ class Judge:
         """Classes under one choice of noise.
 
         Args:
-            predictions: what all else says.
-            maps: by what turns of the map closures are off from that.
-            before: ``(J + 1, C)`` chances as they were, for how common wrong places are.
-            scale: of errors.
-            in_order: given the closures before alone, so that densities multiply to that of all; else given all others.
+            predictions: predictions by all else.
+            maps: turns of the map that would explain the closures' discrepancies.
+            before: ``(J + 1, C)`` previous probabilities, which tell how common wrong places are.
+            scale: scales of errors.
+            in_order: given only the closures before, so that densities multiply to the joint one; else all others.
         """
         told, known = self.told, self.told.is_known
         said = Said.of(predictions, told, self.turns, scale, self.priors)
@@ -73,7 +73,7 @@ class Judge:
         anywhere = _Others(repeats.has_elsewhere, (likely * repeats.elsewhere).sum(axis=1))
         alike = self._log_repeats(_Others(repeats.has_alike, repeats.alike), repeats, alone, wrong, in_turn)
         log_class += self._log_classes(share, alike, self._log_elsewhere(anywhere, alone, wrong, in_turn))
-        # Without a translation nothing tells of a place: a closure whose rotation is right is good.
+        # Without a translation the place cannot be judged: a closure with a correct rotation is good.
         log_class[:, ~known] = _LOG_NOTHING
         log_class[0, ~known] = said.log_turn[0, ~known]
         log_turned, log_behind = self._log_false(said, maps, repeats, before, in_turn)
@@ -83,7 +83,7 @@ class Judge:
         return pulls.pulled(said, told, log_class, repeats.number)
 
     def nothing_known(self, is_good: np.ndarray, square: np.ndarray, scale: Scale) -> Places:
-        """Before any solve, of closures that rotations hold to be good, or not, and that are off by so many m²."""
+        """Classes before any solve, from rotations' labels and squared translation residuals, m²."""
         return pulls.nothing_known(self.told, self.priors, is_good, square, scale)
 
     def _repeats(
@@ -102,12 +102,12 @@ class Judge:
         log_repeats: tuple[np.ndarray, np.ndarray],
         log_elsewhere: tuple[np.ndarray, np.ndarray],
     ) -> np.ndarray:
-        """``(J, C)`` nats, of each class if the rotation is no false one.
+        """``(J, C)`` nats, log prior of each class if the rotation is not false.
 
         Args:
-            share: ``(C,)`` of wrong places.
-            log_repeats: that one is no neighbour's, and that it is.
-            log_elsewhere: that one which is none of these is nobody's at all, and that it is.
+            share: ``(C,)`` share of wrong places.
+            log_repeats: log probabilities that a wrong place does not repeat a neighbour's, and that it does.
+            log_elsewhere: the same, for those that repeat no neighbour's, of repeating any other.
         """
         priors = self.priors
         right, wrong = np.log1p(-share), np.log(share)
@@ -147,7 +147,7 @@ class Judge:
         return np.logaddexp(log_alone + elsewhere, log_repeat), log_behind + np.logaddexp(behind, log_repeat)
 
     def _could_be(self, chance: np.ndarray, label: int) -> np.ndarray:
-        """``(C,)`` bool, whose rotation may be good (1) or false (0): of others it is not asked who is off alike."""
+        """``(C,)`` bool, closures whose rotation may be good (1) or false (0); the others are not compared."""
         return chance > _UNLIKELY if self.held is None else self.held == label
 
     def _log_repeats(

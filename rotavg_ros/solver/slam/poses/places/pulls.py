@@ -1,4 +1,4 @@
-"""How much closures pull, given how likely each class of their errors is; and what they tell of their noise."""
+"""Weights of closures, given the probabilities of their error classes, and their contribution to noise estimates."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from rotavg_ros.solver.slam.poses.priors import PlacePriors
 
 
 def pulled(said: Said, told: Told, log_class: np.ndarray, number: np.ndarray) -> Places:
-    """What follows from how likely each class is.
+    """Probabilities, weights and noise sums from the joint densities of classes.
 
     Args:
-        said: what all else says.
+        said: densities in each class, given all else.
         told: which translations are known, and runs.
-        log_class: ``(J + 1, C)`` nats, of closures and of their class; that of false rotations last.
-        number: ``(C,)`` how many of all are off by about the same.
+        log_class: ``(J + 1, C)`` nats, joint log densities of closures and classes; false rotations last.
+        number: ``(C,)`` number of closures with about the same discrepancy.
     """
     known, k = told.is_known, said.turns
     log_density = log_sum(log_class)
@@ -40,14 +40,14 @@ def pulled(said: Said, told: Told, log_class: np.ndarray, number: np.ndarray) ->
 
 
 def nothing_known(told: Told, priors: PlacePriors, is_good: np.ndarray, square: np.ndarray, scale: Scale) -> Places:
-    """Before any solve: no translation pulls, rotations do as labelled, and as many places are wrong as may be.
+    """Before any solve: translations have no weight, rotations weigh as labelled, wrong places have prior probability.
 
     Args:
-        told: what rotations alone say.
-        priors: of places.
+        told: results of rotations alone.
+        priors: prior parameters of places.
         is_good: ``(C,)`` labels.
-        square: ``(C,)`` m², by what translations are off.
-        scale: of errors.
+        square: ``(C,)`` m², squared residuals of translations.
+        scale: scales of errors.
     """
     chance = np.zeros((CLASSES, len(is_good)))
     wrong = priors.wrong_place / priors.counted
@@ -59,10 +59,10 @@ def nothing_known(told: Told, priors: PlacePriors, is_good: np.ndarray, square: 
 
 
 def _shift_weight(said: Said, told: Told, classes: tuple[np.ndarray, np.ndarray], number: np.ndarray) -> np.ndarray:
-    """``(C,)`` m⁻²: the weight of one normal density that pulls as far as all classes do in the mean.
+    """``(C,)`` m⁻²: weight of the one normal density that gives the same mean as all classes together.
 
-    n closures that all join the same wrong places, those of a run or all that are off alike, say once where these are,
-    and not n times: each of these repeats errs by n times the variance of the class that it would be of by itself.
+    n closures that all join the same wrong places, in a run or with equal discrepancies, give evidence of these places
+    once, not n times: each repeat has n times the variance of the class that it would be in independently.
     """
     log_class, chance = classes
     alone = np.exp(log_class[BY_ITSELF] - log_sum(log_class[BY_ITSELF]))
@@ -77,7 +77,7 @@ def _shift_weight(said: Said, told: Told, classes: tuple[np.ndarray, np.ndarray]
 
 
 def _of_turns(said: Said, chance: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """``(C,)`` rad⁻² of turns likewise; squares and freedom of good closures' for the variance of their noise."""
+    """``(C,)`` rad⁻², weights of turns likewise; squares and freedom of good closures for their noise's variance."""
     k, (variance, nearly) = said.turns, said.turned
     right, alike = chance[:GOOD].sum(axis=0), chance[GOOD:-1].sum(axis=0)
     spread = np.trace(said.predictions.covariance[:, :k, :k], axis1=1, axis2=2) / k
@@ -89,5 +89,5 @@ def _of_turns(said: Said, chance: np.ndarray) -> tuple[np.ndarray, float, float]
 
 
 def _least_weight(square: np.ndarray, scale: Scale) -> np.ndarray:
-    """``(C,)`` m⁻², of closures that are off by ``square`` m²: however far that is, they pull next to nothing."""
+    """``(C,)`` m⁻², negligible weight of closures with squared residuals ``square``, m², however large."""
     return np.asarray(NOTHING / (scale.closure + square))

@@ -1,1 +1,1 @@
-"""What other closures say of the wrong places that each may join: places are mistaken again and again."""
+"""Evidence from other closures about the wrong places that each may join: places are mistaken repeatedly."""

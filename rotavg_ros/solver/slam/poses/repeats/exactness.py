@@ -1,9 +1,9 @@
-"""How exactly closures repeat each other's wrong places: in one of a few ways, which all of them have in common.
+"""How exactly closures repeat each other's wrong places: in one of a few ways, shared by all closures.
 
-One front end mistakes places for others to within centimetres, another one to within metres; some runs of false
-closures stay where they began, some drift. Were that each closure's own, each would pay anew for being exact, and a
-run of fifty false ones be dearer than a bent map that they fit. So ways are shared: how likely each is, is what those
-detected before tell (a Pólya urn).
+Some front ends mistake places to within centimetres, others to within metres; some runs of false closures stay where
+they began, others drift. If each closure had its own way, each would pay anew for being exact, and a run of fifty false
+ones would cost more than a bent map that they fit. So ways are shared: the probability of each follows from the
+closures detected before (a Pólya urn).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Closures that are false by the same turn of the map: a symmetric building seen as if it were turned about its middle.
+"""Closures that are false by the same turn of the map: a symmetric building seen as if turned about its centre.
 
-Such closures agree as one turn about one point, wherever they were seen, and not as one shift.
+Such closures agree on one turn about one point, wherever they were detected, and not on one shift.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What closures before and after a closure, and all others, say of whether it joins wrong places, and which."""
+"""Evidence from the closures before and after a closure, and all others, about whether it joins wrong places."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rotavg_ros.solver.slam.poses.repeats.exactness import (
 )
 from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
 
-# No share is less than this, or nearer to one; whoever is wrong with less than this chance tells nobody anything.
+# Least distance of shares from zero and one; closures less likely wrong than this are not used as evidence.
 _SHARE = _LEAST_CHANCE = 0.01
 
 

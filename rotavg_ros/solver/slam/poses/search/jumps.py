@@ -1,9 +1,9 @@
-"""Odometry whose position jumps though its heading does not: wheels that spin, a tracker that finds itself elsewhere.
+"""Odometry whose position jumps although its heading does not: spinning wheels, a tracker that relocalises elsewhere.
 
-What a step reports is then not where it led, so it is off by about as much as it reports: of a segment, by its longest
-step. Closures across the jump join wrong places, all by the same shift of the world. Where one jump, or one and another
-that takes it back, makes more of them right than it costs, poses are estimated anew with it; −log p of both decides, as
-of any two labellings.
+Such a step is wrong by about the length that it reports, and a segment by its longest step. Closures across the jump
+then seem to join wrong places, all by the same shift of the world. If one jump, or a jump and another that takes it
+back, explains enough of them to outweigh its cost, poses are estimated anew with it; −log p decides, as between any two
+labellings.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from rotavg_ros.solver.slam.poses.rows import PoseProblem
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.labels.prior import log_slip_prior
 
-# Shifts agree that differ by so many standard deviations of what they are known to.
+# Shifts agree if they differ by at most this many standard deviations of their uncertainty.
 _AGREE = 3.0
-# One closure says nothing that a wrong place does not explain as well.
+# Minimum number of closures for a jump; a single one is explained equally well by a wrong place.
 _LEAST_WITNESSES = 2
 _WRONG = 0.5
 # So many shifts are looked at, those first of which single closures say most; and so many of them, and so many places
@@ -31,7 +31,7 @@ _WRONG = 0.5
 _LOOKED_AT, _STRETCHES, _ENDS = 48, 4, 1000
 # Positions that differ by less, in steps, are the same.
 _SAME_PLACE = 1e-9
-# A step that jumped says so: it is off by no more than so many times what it reports.
+# Largest error of a step that jumped, relative to the length that it reports.
 _AS_FAR = 2.0
 # No chance is less.
 _LEAST = 1e-12

@@ -1,4 +1,4 @@
-"""Rival labellings by rotations and translations together: which are begun with, and which are left."""
+"""Rival labellings by rotations and translations together: which are started from, and which remain."""
 
 from __future__ import annotations
 
@@ -18,23 +18,22 @@ from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.mode import Mode
 from rotavg_ros.view_graph import ViewGraph
 
-# So many rival labellings are compared by their translations at most, none that rotations alone make less likely by
-# more nats than the first of these than the likeliest, or the likeliest without slips; those that are less likely by no
-# more than the second are published together.
+# Maximum number of rival labellings compared by their translations; largest distance, nats, by rotations alone from the
+# likeliest labelling, or the likeliest without slips; and largest final distance, nats, of rivals published together.
 _MAX_RIVALS, _FARTHEST, _FAR = 8, 20.0, 5.0
-# Whole runs are believed and doubted in so many labellings at most.
+# Maximum number of labellings in which whole runs are believed or doubted.
 _MAX_ASKED = 3
-# Jumps at most.
+# Maximum number of jumps.
 _MAX_JUMPS = 8
 
 
 @dataclass(frozen=True)
 class Rivals:
-    """What translations do not rule out, the likeliest first.
+    """Labellings that translations do not rule out, the likeliest first.
 
     Attributes:
         modes: labellings.
-        poses: of each, rotations judged by places, too.
+        poses: poses of each, with rotations judged by places, too.
         share: probabilities.
     """
 
@@ -49,10 +48,10 @@ def rival_poses(
     """Poses of labellings that translations do not rule out.
 
     Args:
-        graph: whose odometry was drawn together, calibrated.
+        graph: the calibrated graph whose odometry was contracted.
         translation: ``(M, 3)`` metres.
         modes: labellings of its rotations, the likeliest first.
-        tuned: the same labelling with the noise of each edge as FineNet has it, for its poses.
+        tuned: function that sets each edge's noise in a labelling by FineNet, for its poses.
     """
     ended: list[Rival] = []
     begun: list[PoseMode] = []
@@ -60,7 +59,7 @@ def rival_poses(
         begun.append(_begun(PoseProblem(graph, translation, mode), begun))
     for pose in begun:
         ended.append(settling(pose, min((rival.cost for rival in ended), default=np.inf)))
-    # How far odometry errs is a robot's, whatever the labels.
+    # Odometry's error is a property of the robot and does not depend on the labels.
     least = min(rival.cost for rival in ended)
     likeliest = next(pose for pose, rival in zip(begun, ended, strict=True) if rival.cost == least)
     if (other := _begun_otherwise(likeliest)) is not None:

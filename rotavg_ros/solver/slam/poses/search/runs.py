@@ -1,13 +1,13 @@
-"""Believe a whole run, or doubt it: closures that hold each other to be wrong, or right, though together they are not.
+"""Believe or doubt a whole run: closures that support each other's wrong class, although jointly it is less likely.
 
-One by one each is told by its neighbours that places are mistaken here. Of the K closures of a run, none of which
-pulls, all else says N(0, S) of their discrepancies y if all are right, S = A H⁻¹ Aᵀ + V, A their rows and V what
-each errs by itself. Where that is likelier than what they are held for, poses are estimated anew with the run believed;
-−log p of both decides, as of any two labellings.
+Each closure of a rejected run is judged wrong because its neighbours are. If all K closures of a run are right and none
+of them pulls, all else predicts their discrepancies y as N(0, S), S = A H⁻¹ Aᵀ + V, with A their rows and V their own
+variances. Where this is likelier than their current classes, poses are estimated anew with the run believed; −log p
+decides, as between any two labellings.
 
-The other way round closures that join the same wrong places bend the map until they fit, and each is told by the others
-that it is right. What a run has in common is an unknown by itself: where all else says that it is far from nothing, the
-run is held to join wrong places, and poses are estimated anew.
+Conversely, closures that join the same wrong places may bend the map until they fit, and each is judged right because
+the others are. A run's common error is an unknown of its own: where all else predicts it to be far from zero, the run
+is held to join wrong places, and poses are estimated anew.
 """
 
 from __future__ import annotations

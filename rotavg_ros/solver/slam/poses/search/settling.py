@@ -1,7 +1,7 @@
-"""A labelling of rotations, and what places make of it.
+"""Adapts a labelling of rotations to the evidence from places.
 
-A labelling that rotations alone make likeliest need not be so with places: where places speak against a rotation's
-label the label follows, rotations are solved anew, and so on as long as both together become likelier.
+The likeliest labelling by rotations alone need not be the likeliest with places. Where places contradict a rotation's
+label, the label is changed and rotations are solved anew, as long as both together become likelier.
 """
 
 from __future__ import annotations
@@ -19,21 +19,22 @@ from rotavg_ros.solver.slam.poses.solved import PoseMode
 from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.mode import Mode
 
-# Labels follow places so many times at most, as long as −log p falls by this, nats, and may come near the least so far.
+# Maximum number of rounds of relabelling; least decrease of −log p for another round, nats; and distance from the least
+# −log p so far at which a labelling is given up, nats.
 _ROUNDS, LEAST_GAIN, HOPELESS = 4, 0.1, 20.0
 _GOOD = 0.5
-# Another start is tried if −log p is predicted to rise by no more than this, nats: what closures gain is told one by
-# one, and a jump that was predicted to lose 4 gained 62.
+# Another start is tried if −log p is predicted to rise by no more than this, nats: the gain is predicted for each
+# closure independently, and a jump that was predicted to lose 4 gained 62.
 SLACK = 8.0
 
 
 @dataclass(frozen=True)
 class Rival:
-    """A labelling of rotations that places leave as it is.
+    """A labelling of rotations with its poses.
 
     Attributes:
         mode: the labelling.
-        pose: its poses, its labels held.
+        pose: its poses, estimated with labels held.
     """
 
     mode: Mode
@@ -50,11 +51,11 @@ class Rival:
 
 
 def settling(pose: PoseMode, least: float = np.inf) -> Rival:
-    """A labelling with labels of rotations as places have them, as long as both together become likelier by it.
+    """Relabels rotations by the evidence from places, as long as both together become likelier.
 
     Args:
-        pose: of the labelling to begin with.
-        least: −log p of another one, nats; of one that is far from it no more is asked.
+        pose: poses of the labelling to begin with.
+        least: −log p of another labelling, nats; a labelling far above it is not pursued.
     """
     begun, first, best = pose.problem, pose, None
     for _ in range(_ROUNDS):
@@ -70,18 +71,18 @@ def settling(pose: PoseMode, least: float = np.inf) -> Rival:
         pose = estimate_poses(rival.pose.problem, start=PoseStart.at(rival.pose))
     assert best is not None
     if best.mode.labels != begun.mode.labels and best.cost < least + HOPELESS:
-        # Closures that hold each other to be right, or wrong, may be less likely so all together.
+        # Closures that support each other's labels one by one may be less likely with these labels jointly.
         best = min(best, _held(begun, first), key=lambda rival: rival.cost)
     return best
 
 
 def settled(problem: PoseProblem, start: PoseStart) -> Rival:
-    """What a start comes to."""
+    """Result of a start."""
     return settling(estimate_poses(problem, start=start))
 
 
 def moved(rival: Rival, start: PoseStart) -> Rival:
-    """What another start of the same labelling comes to; the same where places end as they were."""
+    """Result of another start of the same labelling; the rival itself if places end as they were."""
     ending = Ending(until=rival.pose.solved.places)
     pose = estimate_poses(rival.pose.problem, start=start, ending=ending)
     is_same = pose.solved.places.is_like(rival.pose.solved.places)

@@ -11,22 +11,22 @@ from rotavg_ros.solver.slam.posterior.em import polish
 from rotavg_ros.solver.slam.posterior.left_out import relabelled
 from rotavg_ros.solver.slam.posterior.mode import Mode
 
-# If a batch does not lower F, the surest part of it is tried.
+# If a batch does not lower F, this most certain part of it is tried.
 _PART = 0.25
-# Labels are flipped that log-odds speak against by so many nats; the others are undecided either way.
+# Labels are flipped if log-odds contradict them by this many nats; the others count as undecided.
 _DECIDED = 1.0
-# F may fall so many times as fast as in the last round.
+# Assumed largest decrease of F in a further round, in units of that of the last round.
 _HOPE = 3
-# F that falls by less, in nats, has not fallen.
+# Least decrease of F, in nats, that counts.
 _LEAST_GAIN = 0.1
 
 
 def flipped(mode: Mode, limit: float = np.inf) -> Mode:
-    """All labels flipped that leave-one-out log-odds speak against, as long as F falls.
+    """Flips all labels that leave-one-out log-odds contradict, as long as F falls.
 
     Args:
         mode: where to begin.
-        limit: nats. It is given up where F, falling a few times as fast as in the last round, would not come below.
+        limit: nats; gives up where F would not get below it even if it fell a few times as fast as in the last round.
     """
     limits, begun, batches = mode.problem.limits, mode, _batches(mode)
     for rounds_left in range(limits.flip_rounds - 1, -1, -1):
@@ -44,7 +44,7 @@ def flipped(mode: Mode, limit: float = np.inf) -> Mode:
 
 
 def _batches(mode: Mode) -> Iterator[np.ndarray]:
-    """Edges to be flipped together, until F falls by it."""
+    """Batches of edges to be flipped together, tried until one lowers F."""
     wrong = _wrong(mode)
     while len(wrong):
         yield wrong
@@ -55,7 +55,7 @@ def _batches(mode: Mode) -> Iterator[np.ndarray]:
 
 
 def _wrong(mode: Mode) -> np.ndarray:
-    """Edges whose label log-odds speak against, the surest first."""
+    """Edges whose label the log-odds contradict, the most certain first."""
     log_odds, good = mode.left_out.log_odds, mode.state.is_good
     against = np.where(good, -log_odds, log_odds)
     wrong = np.flatnonzero(~np.isinf(mode.problem.log_odds) & (against > _DECIDED))
@@ -65,16 +65,16 @@ def _wrong(mode: Mode) -> np.ndarray:
 def _believed_alone(mode: Mode) -> np.ndarray:
     """False closures that would be good if none repeated another's turn.
 
-    What errs by little more than good closures do agrees with others that do, so one keeps the other false.
+    Closures whose errors slightly exceed those of good ones agree with each other, so one keeps the other false.
     """
     is_false = ~mode.state.is_good & mode.problem.graph.is_closure & ~np.isinf(mode.problem.log_odds)
     return np.flatnonzero(is_false & (mode.left_out.unrepeated > 0))
 
 
 def _fitting(mode: Mode) -> np.ndarray:
-    """False closures that fit orientations as they are.
+    """False closures that fit the current orientations.
 
-    Where nothing else joins two parts, none of those between them tells anything by itself; all together do.
+    If nothing else joins two parts, a single closure between them gives no evidence, but all of them together do.
     """
     is_false = ~mode.state.is_good & mode.problem.graph.is_closure & ~np.isinf(mode.problem.log_odds)
     return np.flatnonzero(is_false & (relabelled(mode.problem, mode.state) > 0))

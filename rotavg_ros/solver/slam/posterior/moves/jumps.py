@@ -22,9 +22,9 @@ from rotavg_ros.solver.slam.posterior.moves.truncated_cost import TruncatedCost
 
 _MAX_ROUNDS = 3
 _MAX_CANDIDATES = 40
-# An improvement by less than this many nats is none.
+# Least improvement that counts, nats.
 _MIN_GAIN = 0.5
-# Conductance of edges that are as wrong as can be, for an electrical flow that leaves them alone.
+# Conductance of maximally wrong edges in the electrical flow, which thus avoids them.
 _MIN_CARRIED = 1e-6
 
 
@@ -33,7 +33,7 @@ def jump_to_optimum(cost: TruncatedCost, correction: Tensor, pairs: AgreementPai
 
     Args:
         correction: ``(K, 4)`` start.
-        pairs: neighbouring closures; of those that agree one stands for all.
+        pairs: neighbouring closures; one represents all that agree with each other.
         is_agreed: ``(P,)`` bool, the pairs that agree.
     """
     jumps = _Jumps(cost, pairs, is_agreed)
@@ -50,7 +50,7 @@ class _Jumps:
 
     def __init__(self, cost: TruncatedCost, pairs: AgreementPairs, is_agreed: np.ndarray) -> None:
         self._cost, self._pairs, self._is_agreed = cost, pairs, is_agreed
-        # Of every edge, what its jump might have gained when it gained nothing.
+        # For every edge whose jump gained nothing, the upper bound of its gain at that time.
         self._hopeless = np.zeros(len(cost.cap))
         self._network = FlowNetwork(cost.graph.num_nodes, cost.graph.source, cost.graph.target)
 
@@ -63,7 +63,7 @@ class _Jumps:
         candidates = _candidates(cost, costs, self._pairs, self._is_agreed)
         if len(candidates) == 0:
             return correction, gained
-        # What an edge loses if one end turns is what it is yet short of its cap, or less if it turns but a little.
+        # If one end turns, an edge's cost rises at most by its distance from the cap.
         system = cost.pattern.factorize(np.maximum(cost.cap - costs, _MIN_CARRIED))
         questions = turns(cost, residual, residual[candidates], costs)
         bounds = questions.gain_bounds(system)
@@ -72,7 +72,7 @@ class _Jumps:
             edge = candidates[number]
             if costs[edge] < 0.5 * cost.cap[edge]:
                 continue
-            # Until something turns, all questions stand as they were put at first.
+            # Until a jump is accepted, all minimum-cut problems stay as they were set up.
             question, column, bound = questions, int(number), float(bounds[number])
             if gained > 0:
                 question, column = turns(cost, residual, residual[[edge]], costs), 0
@@ -99,7 +99,7 @@ class _Jumps:
 
 
 def _candidates(cost: TruncatedCost, costs: np.ndarray, pairs: AgreementPairs, is_agreed: np.ndarray) -> np.ndarray:
-    """Wrong segments, and of every group of wrong closures that agree with each other the best supported one."""
+    """Wrong segments, and the best supported one of every group of wrong closures that agree with each other."""
     closure = np.flatnonzero(cost.graph.is_closure)
     is_wrong = (costs > 0.5 * cost.cap) & (cost.cap > 0)
     wrong = is_wrong[closure]

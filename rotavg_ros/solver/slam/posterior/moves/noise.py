@@ -1,4 +1,4 @@
-"""Other noise for the same labels: how far stated precisions are believed, what closures share, and for how long."""
+"""Other noise for the same labels: belief in stated precisions, common errors of closures, their length, and tails."""
 
 from __future__ import annotations
 

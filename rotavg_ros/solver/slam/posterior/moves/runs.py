@@ -1,7 +1,7 @@
-"""Reject a whole run: good closures that hold each other good, whatever all else says of each.
+"""Reject a whole run: good closures that support each other although all else contradicts them.
 
-Of K closures of a run with residuals r, variances V (diagonal) and covariance R of what the fit says of them, all else
-says N(0, S) of their discrepancies y without them:
+For K closures of a run with residuals r, variances V (diagonal) and covariance R of their fitted values, all else
+predicts their discrepancies y without them as N(0, S):
 
     y = V (V − R)⁻¹ r,    S = V (V − R)⁻¹ V.
 """
@@ -21,12 +21,12 @@ from rotavg_ros.solver.slam.posterior.moves.slips import SETTLING, log_labelled
 from rotavg_ros.solver.slam.posterior.rows import variances
 from rotavg_ros.solver.slam.posterior.state import State
 
-# A run has so many good closures at least.
+# Least number of good closures of a run.
 _LEAST_MEMBERS = 2
 
 
 def propose_rejected_runs(mode: Mode) -> Iterator[Proposal]:
-    """Runs of good closures that pull against all else most."""
+    """Proposals to reject the runs of good closures that pull most against all else."""
     problem, limits = mode.problem, mode.problem.limits
     runs = _runs(mode)[: limits.slips]
     if not runs:

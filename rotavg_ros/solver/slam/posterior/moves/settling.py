@@ -1,4 +1,4 @@
-"""Labels as probabilities for a while: it comes past what stops single flips."""
+"""Treats labels as probabilities for a while, which passes barriers that stop single flips."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from rotavg_ros.solver.slam.posterior.mode import Mode, Proposal
 
 
 def propose_settling(mode: Mode) -> Iterator[Proposal]:
-    """Labels settled from where they are, which is worth trying if one of them is open.
+    """Settles labels from the current state, if the label of at least one closure is uncertain.
 
-    Labels that CleanNet and all other edges decide would be as probabilities what they are. What comes after the first
-    one that changes is not known before.
+    Labels that CleanNet and all other edges decide would not change as probabilities. The effect beyond the first label
+    that changes cannot be predicted.
     """
     problem = mode.problem
     first = float(np.abs(mode.left_out.log_odds[problem.closure]).min(initial=np.inf))

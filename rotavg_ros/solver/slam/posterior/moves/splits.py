@@ -1,7 +1,7 @@
-"""Turn what lies between a slip and another place: a slip that was two, or that is elsewhere by many segments.
+"""Turn the part between a slip and another place: for a slip that was in fact two, or many segments away.
 
-What lies beyond both is right as it is. So no turn of all that follows a place explains the closures from between, and
-no slip that is tried by itself gains by them.
+The parts beyond both are already right. So no turn of all that follows a place explains the closures from the part in
+between, and no single slip gains from them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Where a search begins: CleanNet's tree, closures annealed on odometry of several qualities, ℓ½, minimum cuts."""
+"""Starts of a search: CleanNet's tree, closures annealed on odometry of several qualities, ℓ½, minimum cuts."""
 
 from __future__ import annotations
 
@@ -31,30 +31,30 @@ from rotavg_ros.solver.slam.preparation import Prepared
 from rotavg_ros.solver.slam.stages import CleanedClosures
 from rotavg_ros.view_graph import ViewGraph
 
-# The 99 % quantile of χ² in k components: what is farther off is no inlier of truncated least squares.
+# The 99 % quantile of χ² in k components, beyond which truncated least squares counts no inliers.
 _INLIER_SQUARE = {1: 6.63, 3: 11.34}
 # Annealing has ended once the loss is as sharp as this.
 _SHARP = 1e3
-# Steps of this many prior standard deviations above (below) the median are tried, closures of half one below it. In
-# this order starts soonest agree on what is likeliest; odometry that is good and one that is far worse than anybody's
-# first, since those between end alike where nearly all closures are held false.
+# Step deviations this many prior standard deviations above (below) the median are tried, with closures half a one below
+# it. In this order starts agree soonest on the likeliest answer: good odometry and extremely bad odometry come first,
+# since those in between often end alike, with nearly all closures held false.
 _STEP_LEVELS, _CLOSURE_LEVEL = (1.0, 4.0, -1.0, 0.0, 2.0), -0.5
 # ρ(r) = |r|^½ beyond a standard deviation: weights are (1 + r²/σ²)^-¾.
 _ROBUST_POWER = -0.75
-# Chances of a slip per step under which parts are turned, first as dear as none.
+# Probabilities of a slip per step under which parts are turned, beginning with one at which slips cost nothing.
 _ANNEALED_SLIPS = (0.5, 0.01)
 _LEAST_WEIGHT = 1e-9
-# Closures between two chains agree if their turns differ by less than this, rad: what chains drift until they meet.
+# Closures between two chains agree if their turns differ by less than this, rad, to allow for the chains' drift.
 _SAME_TURN = np.radians(15.0)
 
 
 def starts(problem: Problem, prepared: Prepared, cleaned: CleanedClosures, tree: Tensor) -> Iterator[tuple[str, State]]:
-    """Name and state of each start that is switched on, made when it is asked for; the tree always is one.
+    """Name and state of each start that is switched on, generated lazily; the tree is always among them.
 
     Args:
         problem: the graph.
-        prepared: the same, drawn together.
-        cleaned: what CleanNet says of its closures.
+        prepared: the contracted graph.
+        cleaned: CleanNet's verdict on its closures.
         tree: corrections ``(K, 4)`` along CleanNet's tree, or of an earlier answer.
     """
     noise = noise_of(problem, prepared.noise)
@@ -70,14 +70,14 @@ def starts(problem: Problem, prepared: Prepared, cleaned: CleanedClosures, tree:
 
 
 def turned_parts(problem: Problem, prepared: Prepared, tree: Tensor) -> State:
-    """Parts turned where odometry slips as it seems, many at once."""
+    """A state with parts turned where odometry seems to slip, many at once."""
     near = noise_between_neighbours(prepared.pairs, problem.components)
     found = _turned_parts(problem, prepared, tree, near)
     return _labelled(problem, at(problem, found, np.ones(0), noise_of(problem, near)))
 
 
 def turned_further(problem: Problem, prepared: Prepared, state: State) -> State:
-    """Other parts turned than a state has: what two pairs of slips turned alike, no single one turns back."""
+    """A state with further parts turned: no single turn takes back what two pairs of slips turned alike."""
     noise = NoiseModel(
         problem.components, state.noise.step_variance, state.noise.closure_variance, prepared.noise.outlier_share
     )
@@ -87,7 +87,7 @@ def turned_further(problem: Problem, prepared: Prepared, state: State) -> State:
 
 
 def noise_of(problem: Problem, model: NoiseModel) -> Noise:
-    """θ to begin with."""
+    """Initial θ."""
     return Noise(model.step_variance, model.closure_variance, EXPONENTS[0], COMMON_SHARES[1], RUN_STEPS[0])
 
 
@@ -121,7 +121,7 @@ def annealed(problem: Problem, state: State) -> State:
 
 
 def _prior_levels(priors: SlamPriors) -> list[tuple[float, float]]:
-    """Step and closure variances, rad², that are likely beforehand."""
+    """Step and closure variances, rad², that are likely under the prior."""
     closure = np.radians(priors.closure_deg * np.exp(_CLOSURE_LEVEL * priors.noise_spread)) ** 2
     steps = np.radians(priors.step_deg * np.exp(priors.noise_spread * np.array(_STEP_LEVELS))) ** 2
     return [(float(step), float(closure)) for step in steps]
@@ -182,5 +182,5 @@ def _turned_parts(
 
 
 def _labelled(problem: Problem, state: State) -> State:
-    """With labels by what residuals cost one way or the other."""
+    """The state with each label set to the one that its residual favours."""
     return replace(state, common=np.zeros_like(state.common), trusted=relabelled(problem, state))

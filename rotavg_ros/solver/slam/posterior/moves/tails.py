@@ -1,4 +1,4 @@
-"""Slips and tails of odometry explain the same: slips that tails explain, and tails that hide slips."""
+"""Slips and tails of odometry explain the same data: moves for slips that tails explain, and tails that hide slips."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from rotavg_ros.solver.slam.posterior.state import STEP_TAIL_RATIOS, Noise, Stat
 def propose_tails(mode: Mode) -> Iterator[Proposal]:
     """Take back all slips that odometry's tails explain, with those tails that explain most.
 
-    Many small slips are what odometry with a few far worse segments looks like. One by one they are not taken back:
-    without tails each is a slip, and while they are slips nothing is left to be in the tails.
+    Odometry with a few far worse segments looks like many small slips. They are not taken back one by one: without
+    tails each is a slip, and while they are slips no segments are left to be in the tails.
     """
-    # What a label rejects stays rejected.
+    # Segments that a label rejects stay rejected.
     slips = mode.slipped[np.isfinite(mode.problem.log_odds[mode.slipped])]
     if len(slips) == 0:
         return
@@ -36,7 +36,7 @@ def propose_tails(mode: Mode) -> Iterator[Proposal]:
 def hides_slips(mode: Mode) -> bool:
     """Whether a segment is in wide tails that would clearly be a slip if tails were no wider than the least.
 
-    It is off by as much as by a slip, and what lies between two of those may be turned: what tells is the same.
+    Its error is that of a slip, and the part between two such segments may be turned, with the same evidence as slips.
     """
     noise, problem, told = mode.state.noise, mode.problem, mode.left_out
     if noise.step_tail_ratio == STEP_TAIL_RATIOS[0] or "slips" in problem.without:

@@ -23,22 +23,22 @@ from rotavg_ros.solver.slam.noise.model import NoiseModel
 # Estimates on the way to the optimum fit worse than the optimum: their variance counts this many times.
 _SLACK = 2.0
 _SETTLING_STEPS = 2
-# By this the loss is annealed from step to step; by more while it is so convex that no edge stands out.
+# Factors of the annealing per step; the larger one is used while the loss is so convex that no edge stands out.
 _ANNEALING_FACTOR, _COARSE_FACTOR = 1.4, 2.0
 _COARSE_CONVEXITY = 100.0
 _DESCENT_STEPS = 8
 _SETTLED_STEP = np.radians(0.03)
-# Odometry does not drift evenly: one segment in so many drifts by so much more (in variance) than its length tells.
+# Odometry does not drift evenly: this share of segments drifts by this much more (in variance) than by length.
 _UNEVEN_SHARE = 0.1
 _UNEVEN_RATIO = 16.0
 # A slip is less than a right angle; a segment that turns by more has slipped twice.
 _MAX_SLIP = np.pi / 2
 _COSINE_OF_MAX_SLIP = np.cos(_MAX_SLIP / 2)
-# Of a long segment only so many steps count for a slip: what is left of it after one says nothing more.
+# Maximum number of steps of a segment that count for a slip: the exact step in a long segment does not matter.
 _MAX_LOCATED_STEPS = 3.0
 # What a real part may be off by.
 _ROUNDING = 1e-9
-# Weight of what is believed wrong: enough to keep a graph solvable that falls apart without it.
+# Weight of edges that are believed wrong: enough to keep a graph solvable that falls apart without them.
 _MIN_WEIGHT = 1e-9
 
 
@@ -51,9 +51,9 @@ class TruncatedCost:
         variance: ``(E,)`` rad² per component.
         cap: ``(E,)`` what a wrong edge costs, ≥ 0.
         measured: ``(4, E)``, the graph's residuals, components in rows.
-        cap_of_two: ``(E,)`` what it costs if it is wrong by more than one slip.
-        uneven_cost: ``(E,)`` what a segment costs beforehand that drifts more than its length tells; inf for closures.
-        reach: ``(E,)`` the real part of a residual from which on an edge costs less than a wrong one.
+        cap_of_two: ``(E,)`` cost of an edge that is wrong by more than one slip.
+        uneven_cost: ``(E,)`` prior cost of a segment that drifts more than by its length; inf for closures.
+        reach: ``(E,)`` real part of a residual above which an edge costs less than a wrong one.
     """
 
     graph: ClosureGraph
@@ -68,7 +68,7 @@ class TruncatedCost:
     def create(graph: ClosureGraph, noise: NoiseModel, log_odds: np.ndarray) -> TruncatedCost:
         """From the noise and each edge's prior log-odds of being good, ``(E,)``; ±inf decide it."""
         variance = graph.own_steps * np.where(graph.is_odometry, noise.step_variance, noise.closure_variance)
-        # Without the edge, the way round passes at least one closure more; a segment's, two.
+        # Without the edge, the path around passes at least one further closure; for a segment, two.
         around = variance + np.where(graph.is_odometry, 2.0, 1.0) * noise.closure_variance
         cap = noise.inlier_log_odds(np.zeros(len(variance)), around) + np.clip(log_odds, -100, 100)
         cap = np.maximum(cap, 0.0)
@@ -105,7 +105,7 @@ class TruncatedCost:
             wrong = np.where(cosines < _COSINE_OF_MAX_SLIP, self.cap_of_two, self.cap)
             return np.asarray(np.minimum(self._if_good(_squared_angle(cosines), slice(None)), wrong))
         costs = np.where(cosines < _COSINE_OF_MAX_SLIP, self.cap_of_two[:, None], self.cap[:, None])
-        # Most edges that anything turns are beyond reach, and an arc cosine takes longer than all the rest.
+        # Most turned edges are beyond reach, and the arc cosine takes longer than everything else.
         near = np.flatnonzero(cosines > self.reach[:, None])
         good = self._if_good(_squared_angle(cosines.take(near)), near // cosines.shape[1])
         costs.put(near, np.minimum(good, costs.take(near)))

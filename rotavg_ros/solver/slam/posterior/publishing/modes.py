@@ -23,10 +23,10 @@ from rotavg_ros.solver.slam.posterior.state import Noise
 _FAR, _FAR_NOISE = 5.0, 2.0
 # A warning is given for rivals of at least this probability that turn a node by more than this, rad.
 LIKELY, FAR_TURN = 0.05, np.radians(5.0)
-# What is less likely good than this does not pull at all.
+# A closure with a lower probability of being good has no weight at all.
 _SURELY_FALSE = 0.05
 _ROUNDS = 2
-# Units of work for each edge that is scored.
+# Units of work per scored edge.
 _SCORED = 0.0015
 
 
@@ -61,12 +61,12 @@ class Published:
 
 
 def publish(problem: Problem, modes: list[Mode], tuned: Callable[[Mode], Mode] = lambda mode: mode) -> Published:
-    """Of distinct modes, by exp(−F): the average of their scores, the orientations of their median.
+    """The average score of distinct modes, weighted by exp(−F), and the orientations of their median.
 
     Args:
         problem: the graph.
         modes: the best first.
-        tuned: a mode with the noise of each edge as FineNet has it; labellings stay as likely as they are.
+        tuned: function that sets each edge's noise in a mode by FineNet; the probabilities of labellings do not change.
     """
     rivals, share = (modes[:1], np.ones(1)) if "rivals" in problem.without else distinct(problem, modes)
     answers = [of_mode(tuned(mode)) for mode in rivals]
@@ -85,7 +85,7 @@ def publish(problem: Problem, modes: list[Mode], tuned: Callable[[Mode], Mode] =
         variance += weight * (answer.variance + spread**2)
     warnings = _warnings(problem, rivals, share, turns)
     number = next(number for number, mode in enumerate(modes) if mode is rivals[middle])
-    # Shares add up to one but for rounding.
+    # Shares add up to one up to rounding.
     score = np.clip(score, 0.0, 1.0)
     noise = answers[0].noise
     return Published(graph, chosen.correction, score, variance, noise, number, tuple(share.tolist()), warnings)
