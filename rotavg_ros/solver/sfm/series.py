@@ -47,7 +47,7 @@ class EdgesInSeries(NamedTuple):
 
     @classmethod
     def of(cls, graph: ViewGraph, parent: Tensor, parent_edge: Tensor) -> EdgesInSeries:
-        """Of a graph with a spanning forest.
+        """The edges in series of a graph with a spanning forest.
 
         Args:
             parent, parent_edge: ``(N,)`` each node's parent and the edge to it; of a root itself, and -1.

@@ -99,7 +99,7 @@ class BlockEquations:
         return BlockFactor(pattern, np.ascontiguousarray(jacobian), factor, float(grounding))
 
     def _pattern_of(self, jacobian: np.ndarray) -> _Pattern:
-        """Of the rows that tell anything: others fill the factor of a graph with many false closures for nothing."""
+        """Pattern of the rows of non-zero weight; with many false closures, the others would only add fill-in."""
         counts = self._count(jacobian)
         pattern = self._pattern
         if pattern is None or not pattern.covers(counts):

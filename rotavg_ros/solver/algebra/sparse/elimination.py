@@ -164,7 +164,7 @@ class Elimination:
 
     @property
     def num_factor_entries(self) -> int:
-        """Of the factor."""
+        """Number of entries of the factor."""
         return int(self.shape.store[-1])
 
 

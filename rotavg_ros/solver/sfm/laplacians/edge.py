@@ -19,7 +19,7 @@ from rotavg_ros.solver.sfm.symmetric_rows import ENTRIES, full
 
 
 class MatrixWeights(NamedTuple):
-    """Of M edges.
+    """Matrix weights of M edges.
 
     Attributes:
         matrix: ``(6, M)`` entries of W.

@@ -24,7 +24,7 @@ from rotavg_ros.view_graph import ViewGraph
 
 @dataclass(frozen=True)
 class OdometryPaths:
-    """Of a view-graph of N nodes and M edges, of which F are closures or odometry outside the forest.
+    """Paths along a view-graph of N nodes and M edges, of which F are closures or odometry outside the forest.
 
     Attributes:
         forest: odometry first.

@@ -76,7 +76,7 @@ class NoiseModel:
 
 
 def pair_variance(pairs: AgreementPairs, noise: NoiseModel) -> np.ndarray:
-    """Of the difference of the residuals of two neighbouring closures that are good, ``(P,)`` rad² per component."""
+    """Variance of the difference of two good neighbouring closures' residuals, ``(P,)`` rad² per component."""
     return np.asarray(np.maximum(pairs.steps, 0.5) * noise.step_variance + 2 * noise.closure_variance)
 
 
@@ -88,7 +88,7 @@ def agree(pairs: AgreementPairs, noise: NoiseModel) -> np.ndarray:
 def discrepancies(
     squared_angle: np.ndarray, path_steps: np.ndarray, pairs: AgreementPairs, near_share: float = _NEAR_MISS_SHARE
 ) -> list[Discrepancies]:
-    """Of every closure with the odometry (``(C,)`` each; infinite steps tell nothing), and of agreeing closures.
+    """Discrepancies of every closure with the odometry (``(C,)`` each; infinite steps: none), and between neighbours.
 
     Args:
         near_share: share of the false closures that are near misses, as their neighbours see them. Odometry drifts by
@@ -127,7 +127,7 @@ def _prior(components: int) -> NoiseModel:
 
 
 def _model(mixture: Mixtures, components: int) -> NoiseModel:
-    """Of the first of some mixtures."""
+    """The noise model of the first of some mixtures."""
     values = (mixture.step_variance[0], mixture.closure_variance[0], mixture.false_share[0, 0])
     return NoiseModel(components, *(float(value) for value in values))
 

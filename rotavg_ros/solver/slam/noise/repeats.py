@@ -66,7 +66,7 @@ class Repeats(NamedTuple):
 
     @classmethod
     def none(cls, count: int) -> Repeats:
-        """Of n closures that are compared with nobody."""
+        """For n closures that are compared with no others."""
         return cls(np.zeros((_WHOSE, KERNELS, count)), np.zeros((_WHOSE, count), dtype=np.bool_))
 
 

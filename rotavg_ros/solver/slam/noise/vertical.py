@@ -29,7 +29,7 @@ _LEAST_TILT = np.radians(2.0)
 
 @dataclass(frozen=True)
 class Vertical:
-    """Of the world in which odometry was drawn together.
+    """The vertical of the world frame in which odometry was contracted.
 
     Attributes:
         axis: ``(3,)`` unit vector.
@@ -41,7 +41,7 @@ class Vertical:
 
     @classmethod
     def of(cls, body_from_world: Tensor) -> Vertical | None:
-        """Of orientations ``(N, 4)``; None if the body keeps no direction of the world, or more than one.
+        """From orientations ``(N, 4)``; None if the body keeps no direction of the world, or more than one.
 
         Of a direction n of the world the body sees R n. Its mean has the length 1 − τ² where it tilts by N(0, τ²) about
         two axes.

@@ -42,7 +42,7 @@ class _Rows:
 
 @dataclass(frozen=True)
 class Columns:
-    """Of n new closures, d rows each.
+    """Columns of n new closures, d rows each.
 
     Attributes:
         edge: ``(n,)`` edges of the view-graph.
@@ -63,7 +63,7 @@ class Columns:
 
     @classmethod
     def none(cls) -> Columns:
-        """Of no closures."""
+        """The columns of no closures."""
         nothing = np.empty(0, dtype=np.int64)
         return cls(nothing, (), (), np.empty((0, 0)), nothing, np.empty((0, 0)), np.empty((0, 0)))
 

@@ -23,7 +23,7 @@ _ENTRIES, _PASSED = 1.2e6, 0.4
 
 @dataclass(frozen=True)
 class Linear:
-    """Of N nodes and M edges; k components of turns and, where translations are known, m of shifts, d = k + m.
+    """For N nodes and M edges; k components of turns and, where translations are known, m of shifts, d = k + m.
 
     Rotations alone have one unknown for all components of a turn: there d is 1, k says how many these are.
 
@@ -75,7 +75,7 @@ class Linear:
 
     @classmethod
     def of_rotations(cls, mode: Mode) -> Linear:
-        """Of a labelling at its optimum."""
+        """From a labelling at its optimum."""
         problem, noise, factorised = mode.problem, mode.state.noise, mode.evaluation.factorised
         drawn = problem.drawn(noise)
         between = drawn.fraction * (1 - drawn.fraction) * drawn.length * noise.step_variance
@@ -109,7 +109,7 @@ class Linear:
 
     @classmethod
     def of_poses(cls, pose: PoseMode) -> Linear:
-        """Of a joint solve."""
+        """From a joint solve."""
         problem, solved, drawn = pose.problem, pose.solved, pose.problem.drawn
         # Between ticks a turn counts as one about any axis.
         turn = problem.mean_turn(pose.state.noise)

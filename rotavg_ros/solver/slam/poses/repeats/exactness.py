@@ -44,7 +44,7 @@ class Errors(NamedTuple):
 
 
 class Chains(NamedTuple):
-    """Of C closures, which may repeat the one before.
+    """Chains of C closures, each of which may repeat the one before.
 
     Attributes:
         order: ``(C,)`` closures as they were detected.

@@ -27,7 +27,7 @@ _SHARE = _LEAST_CHANCE = 0.01
 
 @dataclass(frozen=True)
 class Repeats:
-    """Of C closures, what others say of the wrong places that each may join.
+    """Evidence from others about the wrong places that each of C closures may join.
 
     Attributes:
         has_alike: ``(C,)`` how surely one before or after joins wrong places, seen nearly at the right angle, …
@@ -127,7 +127,7 @@ class _Pairs(NamedTuple):
 
 
 class _Exactness(NamedTuple):
-    """Of turns, or of shifts, of C closures in P pairs.
+    """Densities of turns, or of shifts, of C closures in P pairs.
 
     Attributes:
         density: ``(P,)`` for each end of a pair, if it repeats the other.

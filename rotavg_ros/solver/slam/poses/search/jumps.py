@@ -38,7 +38,7 @@ _LEAST = 1e-12
 
 
 def log_jump_prior(problem: PoseProblem) -> float:
-    """Of which segments jumped: as rare as slips, and in their longest steps."""
+    """Log prior of the set of segments that jumped: as rare as slips, and in their longest steps."""
     jumped = np.flatnonzero(problem.jumps)
     any_step = np.log(np.maximum(problem.drawn.own_steps[jumped], 1.0))
     return log_slip_prior(problem.mode.problem, jumped) - float(any_step.sum())
@@ -46,7 +46,7 @@ def log_jump_prior(problem: PoseProblem) -> float:
 
 @dataclass(frozen=True)
 class Jump:
-    """Of S segments and C closures.
+    """A jump in a graph of S segments and C closures.
 
     Attributes:
         segment: that jumps.
@@ -275,7 +275,7 @@ class _Witnesses:
         return np.asarray(np.where(self.agreeing(speaker, sign), self.gain, np.where(self.is_wrong, 0.0, -self.gain)))
 
     def jump(self, pose: PoseMode, speaker: int, place: tuple[int, int, float]) -> Jump:
-        """Of what one closure says, where that gains most."""
+        """The jump that one closure implies, at the place where it gains most."""
         begin, end, gained = place
         newer, older = self._inside(self.last, begin, end), self._inside(self.first, begin, end)
         into, out = newer & ~older & self.agreeing(speaker), older & ~newer & self.agreeing(speaker, -1.0)

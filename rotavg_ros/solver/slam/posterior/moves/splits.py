@@ -74,7 +74,7 @@ def propose_splits(mode: Mode) -> Iterator[Proposal]:
 
 
 def _groups(mode: Mode, witnesses: Witnesses) -> Iterator[_Group]:
-    """Of closures that are held false, those that one turn or its inverse explains."""
+    """Groups of closures held false that one turn or its inverse explains."""
     left = witnesses.can_tell & mode.is_false
     for number in np.flatnonzero(left):
         if left[number]:
