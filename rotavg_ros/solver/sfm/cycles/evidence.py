@@ -20,8 +20,8 @@ that all edges of a triangle are good, from CleanNet or any other source, closin
     π f₁(angle) + (1 − π) f₀(angle),     f₁, f₀: any, constant in shells,
 
 and G is the gain in log-likelihood (nats) over a single density for all. E is computed from half of the triangles,
-without CleanNet; both values of G are computed on the other half. CleanNet has weight a, the triangles' posterior 1 −
-a:
+without CleanNet; both values of G are computed on the other half. CleanNet has weight a, the triangles' posterior
+1 − a:
 
     logit P(g_e = 0) = a ℓ_e + (1 − a) (b + k ℓ_e − E_e),     a = min(1, G_CleanNet / (¼ G_triangles)).
 
