@@ -45,7 +45,7 @@ _TELLS = 3.0
 # Maximum number of closures that are compared, those with the shortest ways along odometry.
 _MAX_COMPARED = 200
 # A hypothesis is reported if less than the first share agrees without it and more than the second with it. Random
-# closures never reach the second; correct closures fall below the first only if 70 % of them are wrong.
+# closures never reach the second; closures as stated fall below the first only if 70 % of them are wrong.
 _SHARE_AS_STATED, _SHARE_OTHERWISE = 0.3, 0.6
 # Among hypotheses whose shares differ by at most this factor, the first is reported.
 _NEARLY = 0.9
