@@ -1,4 +1,4 @@
-"""What an estimator knows at a time: a growing graph, the last answer to it, and what ties the two to odometry."""
+"""An estimator's content: a growing graph, the last answer to it, and what ties the two to odometry."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ class Counts:
     """How large the estimator's state is, and what was refused so far.
 
     Attributes:
-        keyframes, edges, pending: sizes now.
+        keyframes, edges, pending: present sizes.
         queued: closures in the graph that wait to be solved, see :mod:`~rotavg_ros.online.answer.closure_queue`.
-        by_chance: of these, how many the last answer explains, as it would as many random ones.
-        rejected: inputs refused, by :class:`RejectReason` value.
+        by_chance: how many of these the last answer explains, though it would explain as many random ones.
+        rejected: number of refused inputs by :class:`RejectReason` value.
         time_jumps: how often the data's time went back.
-        time_is_back: whether odometry is refused since such a jump, and somebody has to decide.
-        odometry_restarts: how often the odometry of one of the robots began anew, or had to be taken for new.
-        marginalized, dropped_closures: how many keyframes and closures a full graph has done without so far.
-        is_full: whether nothing more can be spared, and there are no new keyframes.
-        robots: that have keyframes.
-        odometry_robots: whose odometry has come.
-        pending_by_robot: how many edges wait for each robot.
-        longest_pending: the end that the edge waits for that has waited the longest; None if none waits.
-        longest_pending_s: how long it has, seconds of the data's time.
+        time_is_back: whether odometry has been refused since such a jump, and somebody has to decide.
+        odometry_restarts: how often a robot's odometry began anew, or had to be treated as new.
+        marginalized, dropped_closures: numbers of keyframes and closures removed from a full graph so far.
+        is_full: whether nothing more can be spared, so that no new keyframes are added.
+        robots: names of the robots that have keyframes.
+        odometry_robots: names of the robots whose odometry has come.
+        pending_by_robot: number of edges that wait for each robot.
+        longest_pending: the end that the longest-waiting edge waits for; None if none waits.
+        longest_pending_s: how long it has waited, seconds of the data's time.
     """
 
     keyframes: int
@@ -68,12 +68,12 @@ class ContentState:
 
     Attributes:
         growth: the graph, and what is needed to grow it.
-        last: the last answer; the growth knows the same one.
+        last: the last answer; ``growth`` holds the same object.
         version: of the last answer.
-        ticked_revision: the graph's when it was last solved.
+        ticked_revision: the graph's revision when it was last solved.
         world_from_odometry: by robot: world_from_body = world_from_odometry ∘ odometry, as of its last corrected
             keyframe.
-        memory: what the solver remembers of the last answer; of it a file keeps the labels.
+        memory: what the solver remembers of the last answer; a file keeps only the labels of it.
     """
 
     growth: Growth
@@ -85,7 +85,7 @@ class ContentState:
 
     @classmethod
     def begin(cls, options: EstimatorOptions, version: int = 0) -> ContentState:
-        """Nothing, with answers that go on after a version."""
+        """An empty state, whose answers are numbered from the next version on."""
         last = LastAnswer()
         return cls(Growth.begin(options, last), last, version)
 
@@ -97,9 +97,9 @@ class AcceptedAnswer:
     Attributes:
         body_from_world, component, outlier: orientations ``(N, 4)``, components ``(N,)`` and flags ``(M,)``.
         revision: of the graph that they are about.
-        was_cold: solved from scratch.
+        was_cold: whether it was solved from scratch.
         memory: what the solver remembers of it.
-        known: what it tells of closures that are no part of it.
+        known: what is needed to judge closures that are not part of it.
     """
 
     body_from_world: Tensor
@@ -112,14 +112,14 @@ class AcceptedAnswer:
 
 
 class Content:
-    """All of it is forgotten together, by a new one in its place. Not thread-safe.
+    """Everything that is forgotten together, when a new content takes its place. Not thread-safe.
 
-    Where the last answer placed the robots' odometry is not part of the state; it is known again with the next one.
+    The placement of the robots' odometry frames is not part of the state; it is known again after the next answer.
 
     Attributes:
         builder: the graph, and what is needed to grow it.
         state: everything that a file keeps.
-        first_version: of the answers, before the first.
+        first_version: the version before this content's first answer.
     """
 
     def __init__(self, state: ContentState) -> None:
@@ -132,7 +132,7 @@ class Content:
 
     @property
     def version(self) -> int:
-        """Of the last answer."""
+        """Version of the last answer."""
         return self.state.version
 
     @property
@@ -157,9 +157,9 @@ class Content:
         return taken
 
     def odometry_frame(self, robot: str) -> tuple[OdometryFrame, int] | None:
-        """Where the robot's present odometry frame lies in the world, and how many steps of odometry ago that was.
+        """Where the robot's present odometry frame lies in the world, and for how many steps of odometry it has held.
 
-        None while nobody can say.
+        None while it is unknown.
         """
         frame = self._frames.get(robot)
         if frame is None:
@@ -167,11 +167,11 @@ class Content:
         return frame, self.builder.tracks[robot].num_keyframes - frame.keyframes_before + 1
 
     def take_frames(self, frames: Mapping[str, OdometryFrame]) -> None:
-        """An answer has placed these robots' odometry frames."""
+        """Take the odometry frames of robots that an answer has placed."""
         self._frames |= frames
 
     def correction(self, robot: str) -> Quaternion:
-        """world_from_odometry; before the robot's first answer, what makes its first odometry fit the gauge."""
+        """world_from_odometry; before the robot's first answer, the one that makes its first odometry fit the gauge."""
         if robot in self.state.world_from_odometry:
             return self.state.world_from_odometry[robot]
         return first_correction(self.builder, robot)
@@ -190,7 +190,7 @@ class Content:
 
     @property
     def is_behind(self) -> bool:
-        """Whether the last answer is not of the whole graph; an empty one has no answer to wait for."""
+        """Whether the last answer does not cover the whole graph; False for an empty one."""
         has_changed = self.builder.graph.revision != self._answered_revision
         return not self.is_empty and (has_changed or len(self.state.last.queue) > 0)
 
@@ -211,11 +211,11 @@ class Content:
         state.ticked_revision = snapshot.revision
         last.begin_problem()
         waited = len(last.queue)
-        # In silence the answer comes to what a solve from scratch says, beside ticks where the solver can do that.
+        # In silence the answer becomes that of a solve from scratch; if the solver can, it works on it between ticks.
         is_last = idle and not waited
         may_go_on = self.builder.options.warm_start and self.state.memory is not None
         anew = is_last and not force_cold and may_go_on
-        if anew and self.is_behind:  # the last tick failed: what is new comes first
+        if anew and self.is_behind:  # the last tick failed: new data come first
             is_last = anew = False
         if force_cold or (is_last and not anew):
             last.queue.let_in_all(snapshot.graph)
@@ -229,7 +229,7 @@ class Content:
         """Make the answer to the last problem the last answer."""
         state = self.state
         state.last.replace(answer.body_from_world, answer.component, answer.outlier, answer.known)
-        # After a compaction the labels alone of what is remembered fit the graph, and the solver sees that.
+        # After a compaction only the labels in the memory fit the graph; the solver notices.
         self._answered_revision, self._answer_was_cold = answer.revision, answer.was_cold
         state.memory = answer.memory
         state.version += 1
@@ -242,11 +242,11 @@ class Content:
         return self.state.memory
 
     def remember(self, memory: object | None) -> None:
-        """What the solver is about, where the answer stays as it was."""
+        """Keep the solver's memory where the answer stays as it was."""
         self.state.memory = memory
 
     def counts(self, time_jumps: int) -> Counts:
-        """Sizes and refusals now."""
+        """Present sizes and refusals."""
         growth = self.state.growth
         longest = growth.pending.longest(growth.data_time.now_ns)
         return Counts(

@@ -1,4 +1,4 @@
-"""The online estimator: odometry and edges in, ticks, answers out. The node and the offline replay share it whole."""
+"""The online estimator: odometry and edges in, ticks, answers out. The node and the offline replay share all of it."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ Solver = Callable[..., "Solution"]
 Advance = Callable[[object | None, float], float]
 
 # Units of work that a tick has before its answer, 15 ms, and after it, .1 s (see the solver's SECONDS_PER_UNIT). From
-# docs/diary/ticks.md, "Answers first": with 10 to 100 before it answers err alike; 95 % take at most .11 s with 100,
-# .02 with fewer. How many there are after it tells how soon a whole search has ended, and nothing of the last answer.
+# docs/diary/ticks.md, "Answers first": with 10 to 100 units before it, answers err alike; 95 % take at most .11 s with
+# 100, .02 s with fewer. The work after it decides how soon a whole search ends, and does not affect the last answer.
 TICK_WORK, WORK_AFTER = 30.0, 200.0
 
 
 class TickAbandonedError(Exception):
-    """A tick was given up, since nobody waits for its answer any more; the message says why."""
+    """A tick was abandoned, since its answer is no longer wanted; the message says why."""
 
 
 class _Tick:
@@ -72,7 +72,7 @@ class _Tick:
 class OnlineEstimator:
     """Thread-safe: inputs may come while another thread solves; they wait for microseconds.
 
-    Only where a full graph is compacted it is some tenths of a second, at 200 000 keyframes once in 20 000.
+    Only when a full graph is compacted do they wait some tenths of a second, at 200 000 keyframes once in 20 000.
 
     A tick solves from the previous answer while data flows (warm), and once more from scratch (cold) when the graph
     has not changed since the tick before. So the last answer before silence is what ``rotavg solve`` says of the
@@ -91,8 +91,8 @@ class OnlineEstimator:
         Args:
             options: default: the defaults.
             solver: default: :func:`rotavg_ros.solve`.
-            on_discard: told of every graph that is forgotten (:meth:`reset`, time that goes back) or replaced
-                (:meth:`load`), unless it is empty. Called within these methods, so it must be quick.
+            on_discard: called with every graph that is forgotten (:meth:`reset`, time that goes back) or replaced
+                (:meth:`load`), unless it is empty. It runs within these methods, so it must be quick.
             advance: default: :func:`rotavg_ros.solver.advance` with the default solver, nothing with another.
         """
         self.options = options or EstimatorOptions()
@@ -108,7 +108,7 @@ class OnlineEstimator:
         self._content = Content(ContentState.begin(self.options))
 
     def _start_over(self, state: ContentState) -> None:
-        """Begin with this content; the one before is handed over if there is anything in it."""
+        """Begin with this content; the one before is handed to ``on_discard`` unless it is empty."""
         discarded = Discarded(self._content.state)
         self._generation += 1
         self._content = Content(state)
@@ -118,7 +118,7 @@ class OnlineEstimator:
             self._on_discard(discarded)
 
     def _abandon_tick(self, why: str) -> None:
-        """Have the running tick, if there is one, end soon and change nothing."""
+        """Make the running tick, if there is one, end soon and change nothing."""
         if self._running is not None:
             self._running.abandoned_by = why
 
@@ -132,13 +132,13 @@ class OnlineEstimator:
         """Take an odometry message.
 
         Args:
-            robot: whose.
-            stamp_ns: nanoseconds, ascending per robot. One far ahead is believed only when the next agrees.
+            robot: name of the robot.
+            stamp_ns: nanoseconds, ascending per robot. A stamp far ahead is believed only if the next one agrees.
             world_from_body: xyzw, the body in the odometry's frame.
             position: metres, for the keyframes' distance criterion.
 
-        Odometry that begins anew begins a new component, first where the robot was last. When its stamps have gone
-        back for several messages in a row, the options say what becomes of it.
+        Odometry that begins anew begins a new component, placed at first where the robot was last. When its stamps have
+        gone back for several messages in a row, the options decide what happens.
 
         Returns:
             why it was refused and counted; None if it was taken.
@@ -159,11 +159,11 @@ class OnlineEstimator:
             return [self._content.add_odometry(message)[0] for message in since_jump][-1]
 
     def clock_went_back(self, now_ns: int) -> None:
-        """The clock that stamps the data (``/clock``) went back to ``now_ns``; taken as if odometry had told it."""
+        """The clock that stamps the data (``/clock``) went back to ``now_ns``; treated as if odometry had shown it."""
         with self._lock:
             data_time_ns = self._content.state.growth.data_time.now_ns
             if data_time_ns is None or data_time_ns - now_ns <= self.options.time_jump_ns:
-                return  # nothing of the future is known, or odometry has told it already
+                return  # no data from after it are known, or odometry has shown the jump already
             if self.options.on_time_jump == "reset":
                 self._time_jumps += 1
                 self._forget()
@@ -175,7 +175,7 @@ class OnlineEstimator:
 
         Args:
             edge: the edge.
-            generation: of the graph that it is meant for, see :attr:`generation`; it changes nothing in any other.
+            generation: of the graph that it is meant for, see :attr:`generation`; any other graph is left unchanged.
 
         Returns:
             why it was refused and counted; None if it was taken, may wait, or is meant for another graph.
@@ -186,10 +186,10 @@ class OnlineEstimator:
             return self._content.builder.add_edge(edge)
 
     def pop_given_up(self) -> list[tuple[KeyframeReference, KeyframeReference]]:
-        """Source and target of edges by id that were refused for want of room or of time since the last call.
+        """Source and target of edges by id that were refused for lack of room or time since the last call.
 
         They are counted as ``graph_full``, ``pending_overflow`` or ``pending_timeout``, and may be taken when their
-        sender repeats them. Of very many the last are returned.
+        sender repeats them. If there are very many, only the latest are returned.
         """
         with self._lock:
             given_up = list(self._content.state.growth.given_up)
@@ -205,7 +205,7 @@ class OnlineEstimator:
         """Accept or reject for good every edge with a sender's id, or hand it back; returns how many there are.
 
         Raises:
-            ViewGraphError: no :class:`EdgeLabel`; a file with another could never be loaded.
+            ViewGraphError: not an :class:`EdgeLabel`; a file with such a label could never be loaded.
         """
         edge_id = plain_number(edge_id)
         try:
@@ -228,7 +228,7 @@ class OnlineEstimator:
             return self._content.correction(robot) if robot in self._content.builder.tracks else None
 
     def counts(self) -> Counts:
-        """Sizes and refusals now."""
+        """Present sizes and refusals."""
         with self._lock:
             return self._content.counts(self._time_jumps)
 
@@ -246,7 +246,7 @@ class OnlineEstimator:
         return corrected_trajectories(answer, samples)
 
     def place(self, answer: Answer) -> dict[str, Trajectory]:
-        """The same; from now on :meth:`odometry_frame` goes by them, unless the answer is of what was forgotten."""
+        """The same; from now on :meth:`odometry_frame` uses them, unless the answer is about a forgotten graph."""
         trajectories = self.trajectories(answer)
         with self._lock:
             if answer.version > self._content.first_version:
@@ -256,10 +256,10 @@ class OnlineEstimator:
     def odometry_frame(self, robot: str) -> tuple[OdometryFrame, int] | None:
         """Where a robot's odometry frame lies in the world, by the last answer that was placed.
 
-        The number is of odometry's steps since the keyframe that it hangs on, the one under way counted whole.
+        The number counts odometry's steps since the keyframe that the frame is derived from, the unfinished one included.
 
-        Before the first answer it is where odometry says, and odometry that begins anew goes on where the robot was.
-        None before odometry with positions, and after a load until an answer has been placed.
+        Before the first answer odometry's own poses are used, and odometry that begins anew continues where the robot
+        was. None before odometry with positions, and after a load until an answer has been placed.
         """
         with self._lock:
             return self._content.odometry_frame(robot)
@@ -277,7 +277,7 @@ class OnlineEstimator:
 
     @property
     def generation(self) -> int:
-        """Counts how often everything was forgotten or replaced: what was sent before may be news again."""
+        """Counts how often everything was forgotten or replaced; what was sent before may then be new again."""
         return self._generation
 
     @property
@@ -287,7 +287,7 @@ class OnlineEstimator:
 
     @property
     def first_version(self) -> int:
-        """Answers up to this version are of what was forgotten or replaced since."""
+        """Answers up to this version are about a graph that has been forgotten or replaced since."""
         return self._content.first_version
 
     @property
@@ -301,7 +301,7 @@ class OnlineEstimator:
         return self._paused
 
     def pause(self, paused: bool) -> None:
-        """While paused, inputs are taken as ever but ticks do nothing, and a running one is given up, unless forced."""
+        """While paused, inputs are taken as usual, but ticks do nothing and a running one is given up, unless forced."""
         with self._lock:
             self._paused = paused
             if paused and self._running is not None and not self._running.is_forced:
@@ -340,10 +340,10 @@ class OnlineEstimator:
         """Solve, if there is anything new.
 
         Args:
-            force_cold: from scratch, and even while paused.
-            work: units of work that the solver may spend, see :data:`TICK_WORK`. Where it takes more, what is new is
-                laid on what is known, and :meth:`go_on` does the rest. Of a solve from scratch that is forced, or the
-                first, there is no end before its end.
+            force_cold: solve from scratch, even while paused.
+            work: units of work that the solver may spend, see :data:`TICK_WORK`. If it needs more, new data are fitted
+                to the known solution, and :meth:`go_on` does the rest. The limit does not apply to a forced solve from
+                scratch, nor to the first solve.
 
         Returns:
             the new answer; None if the last one still stands.
@@ -361,10 +361,10 @@ class OnlineEstimator:
             return replace(answer, seconds=time.perf_counter() - started)
 
     def go_on(self, work: float = WORK_AFTER) -> float:
-        """After a tick, with what it has left; the next one goes by it.
+        """After a tick, continue with the work that it has left; the next tick uses the result.
 
         Args:
-            work: units of work that the solver may spend, see :data:`WORK_AFTER`, and up to one factorisation more.
+            work: units of work that the solver may spend, see :data:`WORK_AFTER`; up to one factorisation more.
 
         Returns:
             the units of work that it has spent.
@@ -409,7 +409,7 @@ class OnlineEstimator:
         except Abandoned:
             raise TickAbandonedError(f"abandoned: {running.abandoned_by}") from None
         if problem.anew and not solution.is_anew:
-            with self._lock:  # nothing but what the solver is about has changed
+            with self._lock:  # nothing but the solver's memory has changed
                 if options is self.options:
                     content.remember(solution.memory)
             return None
@@ -429,7 +429,7 @@ class OnlineEstimator:
         )
         answer = replace(answer, waits=problem.waits)
         with self._lock:
-            if content is not self._content:  # the solve had ended before it could be told
+            if content is not self._content:  # the solve ended before it noticed that it was abandoned
                 raise TickAbandonedError(f"abandoned: {running.abandoned_by}")
             revision, memory = snapshot.revision, solution.memory
             content.accept(
@@ -447,5 +447,5 @@ def _default_solver() -> tuple[Solver, Advance]:
 
 
 def _solved_graph(graph: ViewGraph, options: EstimatorOptions) -> ViewGraph:
-    """Without translations that are no metres."""
+    """The graph without translations unless they are in metres."""
     return replace(graph, translation=None) if options.translation_scale == "none" else graph

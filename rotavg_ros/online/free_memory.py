@@ -1,4 +1,4 @@
-"""What a solve took goes back to the system, where a robot's other programs can use it."""
+"""Returns the memory that a solve took to the system, where a robot's other programs can use it."""
 
 from __future__ import annotations
 
@@ -6,27 +6,27 @@ import ctypes
 from collections.abc import Callable, Iterable
 from functools import cache
 
-# Whole solves of so many edges take memory that is worth the milliseconds of giving it back.
+# Whole solves of at least this many edges take enough memory to justify the milliseconds of giving it back.
 _MANY_EDGES = 1000
 _STAGES_OF_UPDATES = {"update", "poses"}
-# What goes on after answers takes that much in so many units of work, 1.5 s.
+# The work after answers takes as much memory in this many units of work, 1.5 s.
 _MUCH_WORK = 3000.0
 
 
 def give_back_after(num_edges: int, stages: Iterable[str]) -> None:
-    """Return it after a whole solve of a large graph, given the stages that ran."""
+    """Return memory after a whole solve of a large graph, given the stages that ran."""
     if num_edges >= _MANY_EDGES and not set(stages) <= _STAGES_OF_UPDATES:
         give_back()
 
 
 class AfterWork:
-    """Returns it now and then, while work goes on in parts."""
+    """Returns memory now and then, while work goes on in parts."""
 
     def __init__(self) -> None:
         self._units = 0.0
 
     def spent(self, units: float) -> None:
-        """So many units of work were done."""
+        """Note the units of work that were done."""
         self._units += units
         if self._units >= _MUCH_WORK:
             self._units = 0.0
@@ -36,7 +36,7 @@ class AfterWork:
 def give_back() -> None:
     """Return the memory that is free in this process, as far as the C library can (glibc); costs milliseconds.
 
-    What stays of a solve lies above what it took meanwhile, and would keep all of it in the process.
+    What a solve keeps lies above its temporary memory, which would otherwise stay in the process.
     """
     trim = _malloc_trim()
     if trim is not None:

@@ -1,4 +1,4 @@
-"""Arrays that grow by appending, and views of them that stay as they are."""
+"""Arrays that grow by appending, and views of them that do not change."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 
 
 class GrowingArray:
-    """Numpy array that grows at its end; its storage grows by half, so an append is O(1) on average.
+    """NumPy array that grows at its end; its storage grows by half, so an append is O(1) on average.
 
     A :attr:`view` keeps its length and its rows however much the array grows afterwards.
     """
@@ -38,7 +38,7 @@ class GrowingArray:
         self._size += len(rows)
 
     def insert(self, position: int, row: float) -> None:
-        """Put a row before another one, which changes the views there are; at the end it is an append."""
+        """Insert a row, which changes existing views; at the end it is an append."""
         self.append(row)
         if position < self._size - 1:
             self._data[position + 1 : self._size] = self._data[position : self._size - 1].copy()

@@ -1,4 +1,4 @@
-"""What comes in from outside, and why it may be refused."""
+"""Inputs from outside, and why they may be refused."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ class RejectedInputError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class OdometryMessage:
-    """What a robot's odometry says at a moment.
+    """A robot's odometry at a moment.
 
     Attributes:
         robot: the robot's name.
         stamp_ns: nanoseconds.
         world_from_body: xyzw, the body in the odometry's frame.
-        position: metres, None or not finite where it is not known.
+        position: metres; None or not finite where unknown.
     """
 
     robot: str
@@ -82,7 +82,7 @@ class KeyframeReference:
 
     Attributes:
         robot: the robot's name.
-        keyframe_id: decides when given; ``stamp_ns`` is then the keyframe's stamp, for information.
+        keyframe_id: identifies the keyframe when given; ``stamp_ns`` is then its stamp, for information.
         stamp_ns: nanoseconds in the robot's (or the bag's) clock; alone it means "the body at this moment".
     """
 
@@ -92,7 +92,7 @@ class KeyframeReference:
 
     @property
     def key(self) -> tuple[str, bool, int | None]:
-        """What decides which keyframe is meant: equal for equal ends."""
+        """What identifies the end: equal for equal ends."""
         by_id = self.keyframe_id is not None
         return (self.robot, by_id, self.keyframe_id if by_id else self.stamp_ns)
 
@@ -107,10 +107,10 @@ class EdgeMeasurement:
         target_from_source: xyzw, ``R_target R_source⁻¹`` of the body-from-world orientations; :meth:`from_ros` takes
             its inverse, which ROS and g2o state.
         kind: an :class:`EdgeKind` value.
-        precision: rad⁻²; 0 is unknown; negative or not finite refuses the edge (a sender that gets its own
-            covariance wrong is not to be trusted with the rotation).
-        translation: of the target's body in the source's body frame, metres; None unknown. An edge may well have none,
-            so one that is not finite merely counts as unknown.
+        precision: rad⁻²; 0 is unknown. An edge with a negative or non-finite precision is refused (a sender that gets
+            its own covariance wrong cannot be trusted with the rotation).
+        translation: of the target's body in the source's body frame, metres; None unknown. Edges without one are
+            usual, so a non-finite one merely counts as unknown.
     """
 
     edge_id: int
@@ -131,7 +131,7 @@ class EdgeMeasurement:
         translation: Sequence[float] | None = None,
         precision: float = 0.0,
     ) -> EdgeMeasurement:
-        """A loop closure as ROS, g2o and gtsam state one: by the target's pose in the source's frame.
+        """A loop closure as ROS, g2o and GTSAM define one: by the target's pose in the source's frame.
 
         Where the target looks 30° to the left of the source, ``source_from_target`` is (0, 0, 0.2588, 0.9659); the
         attribute ``target_from_source`` is its inverse. For odometry: ``dataclasses.replace(edge, kind=…)``.
@@ -146,10 +146,10 @@ class EdgeMeasurement:
         return cls(edge_id, source, target, target_from_source, precision=precision, translation=translation)
 
     def fingerprint(self, time_lines: tuple[int, int] = (0, 0)) -> int:
-        """64 bits that agree for a retransmission (same id, ends and rotation) and for nothing else in practice.
+        """64 bits that agree for a retransmission (same id, ends and rotation) and, in practice, for nothing else.
 
         Args:
-            time_lines: numbers of the time lines that the ends' stamps are of, 0 for an end by keyframe id.
+            time_lines: numbers of the time lines that the ends' stamps belong to, 0 for an end by keyframe id.
         """
         keys = (self.source.key, self.target.key)
         ends = repr((*keys, *time_lines) if any(time_lines) else keys).encode("utf-8", "surrogatepass")
@@ -175,17 +175,17 @@ def checked_rotation(xyzw: Sequence[float]) -> Quaternion:
 
 
 def check_length(numbers: Sequence[float] | None, length: int) -> None:
-    """Refuse what has another length; None is of any.
+    """Refuse numbers of another length; None is accepted.
 
     Raises:
-        RejectedInputError: it has.
+        RejectedInputError: the length differs.
     """
     if numbers is not None and len(numbers) != length:
         raise RejectedInputError(RejectReason.WRONG_LENGTH)
 
 
 def checked_stamp(stamp_ns: int) -> int:
-    """The stamp, if it is one.
+    """The stamp, if it is valid.
 
     Raises:
         RejectedInputError: negative or beyond 64 bits.
@@ -196,12 +196,12 @@ def checked_stamp(stamp_ns: int) -> int:
 
 
 def plain_number(number: Any) -> Any:
-    """Python's own, where somebody has NumPy's, which JSON cannot say."""
+    """Convert a NumPy number to Python's own, since JSON cannot represent it."""
     return number.item() if hasattr(number, "item") else number
 
 
 def plain_numbers(numbers: Sequence[float] | None) -> tuple[float, ...] | None:
-    """The same of several; an array has no truth, either."""
+    """The same for several numbers; a tuple, unlike an array, can be tested for truth."""
     return None if numbers is None else tuple(map(float, numbers))
 
 
@@ -212,7 +212,7 @@ def _plain_end(end: KeyframeReference) -> KeyframeReference:
 
 
 def checked_edge(edge: EdgeMeasurement) -> EdgeMeasurement:
-    """Everything about an edge that can be judged without knowing the graph.
+    """Check everything about an edge that can be judged without knowing the graph.
 
     Returns:
         the edge with ``target_from_source`` normalised and Python's own numbers.

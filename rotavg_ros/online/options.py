@@ -15,8 +15,8 @@ from rotavg_ros.option import DEGREES, DEGREES_PER_SECOND, METRES, METRES_PER_SE
 from rotavg_ros.solver import DEVICES, PROFILES, TRANSLATION_SCALES
 
 NANOSECONDS = 1_000_000_000
-# Edges that a graph may have for each keyframe that it may have, odometry's one included. So closures are bounded with
-# the keyframes, where a robot closes loops between the same few again and again.
+# Largest number of edges per possible keyframe, its odometry edge included. So closures are bounded by the keyframes,
+# even if a robot closes loops between the same few again and again.
 EDGES_PER_KEYFRAME = 6
 
 

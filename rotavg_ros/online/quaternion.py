@@ -1,4 +1,4 @@
-"""Quaternion algebra on plain tuples, for the path that runs once per message.
+"""Quaternion algebra on plain tuples, for code that runs once per message.
 
 Same conventions as :mod:`rotavg_ros.rotations` (xyzw, ``multiply(a, b)`` rotates by ``b`` first), but a product costs
 about a microsecond instead of the hundred that a torch tensor of four numbers takes.
@@ -30,7 +30,7 @@ def inverse(a: Quaternion) -> Quaternion:
 
 
 def rotate(a: Quaternion, vector: Sequence[float]) -> Vector:
-    """The vector, turned by a unit quaternion."""
+    """The vector rotated by a unit quaternion."""
     x, y, z = vector
     x, y, z, _ = multiply(multiply(a, (x, y, z, 0.0)), inverse(a))
     return (x, y, z)

@@ -1,1 +1,1 @@
-"""What is said of the graph: orientations in their gauge, verdicts, positions, pictures."""
+"""What an answer says about the graph: orientations in their gauge, verdicts, positions, pictures."""

@@ -21,8 +21,8 @@ def root_orientations(
 ) -> Tensor:
     """body_from_world that the first keyframe of every component keeps.
 
-    A keyframe that an earlier answer placed stays where it was: so a component keeps its gauge, the older of two
-    that join imposes its own, and what splits off (a rejected edge) stays put as well.
+    A keyframe that an earlier answer placed stays where it was. So a component keeps its gauge, the older of two
+    that join imposes its own, and a part that splits off (after an edge is rejected) stays put as well.
 
     Args:
         builder: its graph may have changed since.
@@ -48,7 +48,7 @@ def root_orientations(
 def first_correction(builder: GraphBuilder, robot: str) -> Quaternion:
     """world_from_odometry before the first answer about the robot's odometry chain.
 
-    The first chain's makes its first message fit the gauge; a later one has an anchor.
+    For the first chain it makes the first message fit the gauge; a later chain has an anchor.
     """
     if anchors := builder.tracks[robot].anchors:
         return anchors[-1]
@@ -57,10 +57,10 @@ def first_correction(builder: GraphBuilder, robot: str) -> Quaternion:
 
 
 def anchor(track: OdometryTrack, world_from_odometry: Quaternion) -> None:
-    """Let the chain that has just begun start where the robot was last: the best guess, though nothing is known.
+    """Let the chain that has just begun start where the robot was last, as a best guess: the true pose is unknown.
 
     Args:
-        track: with one chain more than anchors.
+        track: has one more chain than anchors.
         world_from_odometry: of the chain before.
     """
     last, first = track.samples.seam(track.chain)
@@ -69,7 +69,7 @@ def anchor(track: OdometryTrack, world_from_odometry: Quaternion) -> None:
 
 
 def corrections(builder: GraphBuilder, body_from_world: Tensor) -> dict[str, Quaternion]:
-    """world_from_odometry of every robot, from its newest keyframe in the answer that its present odometry covers.
+    """world_from_odometry of every robot, from the newest answered keyframe that its present odometry covers.
 
     Args:
         builder: its graph may have grown since the answer.
@@ -77,7 +77,7 @@ def corrections(builder: GraphBuilder, body_from_world: Tensor) -> dict[str, Qua
     """
     found = {}
     for robot, track in builder.tracks.items():
-        # Only where the odometry reaches: a front end with another clock has any number of keyframes elsewhere.
+        # Look only where the odometry reaches: a front end with another clock may have any number of keyframes outside.
         reach_ns = track.samples.reach()
         for node in builder.graph.nodes_newest_first(robot, track.samples.last_time_line, *reach_ns):
             if node >= len(body_from_world):
@@ -93,7 +93,7 @@ def corrections(builder: GraphBuilder, body_from_world: Tensor) -> dict[str, Qua
 
 
 def _initial_world_from_body(builder: GraphBuilder, robot: str, stamp_ns: int, time_line: int) -> Quaternion:
-    """Where a component's first keyframe begins."""
+    """Initial orientation of a component's first keyframe."""
     track = builder.tracks.get(robot)
     if track is None or stamp_ns == UNKNOWN_STAMP_NS:
         return quaternion.IDENTITY
@@ -103,5 +103,5 @@ def _initial_world_from_body(builder: GraphBuilder, robot: str, stamp_ns: int, t
     try:
         odometry = track.samples.world_from_body_at(stamp_ns, time_line)
     except RejectedInputError:
-        return quaternion.IDENTITY  # the odometry does not cover the keyframe: as good as anything
+        return quaternion.IDENTITY  # the odometry does not cover the keyframe, so any choice will do
     return odometry if chain == 0 else quaternion.multiply(track.anchors[chain - 1], odometry)

@@ -31,8 +31,8 @@ class Answer:
         keyframe_robot: ``(N,)`` int32 index into ``robots``.
         keyframe_id: ``(N,)`` uint64.
         stamp_ns: ``(N,)`` int64, -1 where unknown.
-        time_line: ``(N,)`` int64, which of its robot's time lines the stamp is of: where a robot's clock went back,
-            the next one begins, and the same stamps may come again.
+        time_line: ``(N,)`` int64, which of its robot's time lines the stamp belongs to. When a robot's clock goes
+            back, a new time line begins, and the same stamps may come again.
         world_from_body: ``(N, 4)`` float64 xyzw, w ≥ 0, in the component's fixed gauge.
         component: ``(N,)`` int64, numbered by first keyframe.
         uncertainty: ``(N,)`` float64, one sigma in radians relative to the component's first keyframe, NaN unknown.
@@ -42,23 +42,23 @@ class Answer:
         target_from_source: ``(M, 4)`` xyzw, as measured.
         precision: ``(M,)`` rad⁻², NaN unknown.
         translation: ``(M, 3)`` position of the target in the source's frame, metres; NaN unknown.
-        steps: ``(M,)`` odometry steps that an odometry edge stands for, more than one where keyframes in between were
-            marginalised.
+        steps: ``(M,)`` number of odometry steps that an odometry edge stands for; more than one where keyframes in
+            between were marginalised.
         outlier_score: ``(M,)`` float64 in [0, 1].
         outlier: ``(M,)`` bool, score above the edge's threshold; a user's label decides where there is one.
-        waits: ``(M,)`` bool, closures that are no part of the solve yet; their scores come from their residuals.
+        waits: ``(M,)`` bool, closures that are not part of the solve yet; their scores come from their residuals.
         was_cold: solved from scratch, as ``rotavg solve`` would.
-        seconds: of the whole tick.
-        work: units that the solver has spent, see :attr:`rotavg_ros.solver.solution.Solution.work`.
-        stage_seconds: of the solver's stages.
+        seconds: duration of the whole tick.
+        work: units of work that the solver has spent, see :attr:`rotavg_ros.solver.solution.Solution.work`.
+        stage_seconds: duration of each of the solver's stages.
         method, profile, device: as the solver resolved them.
-        warnings: why it should not be trusted, a sentence each.
+        warnings: reasons not to trust the answer, a sentence each.
         position: ``(N, 3)`` metres in the component's gauge, its first keyframe at the origin; None where translations
             were unknown or not used.
         position_uncertainty: ``(N,)`` metres, one sigma of each component; None likewise.
-        rotation_score: ``(M,)`` in [0, 1], that the edge's rotation alone is wrong; None likewise.
-        edge_precision: ``(M, 2)`` rad⁻² and m⁻² per component, with which edges count; None likewise.
-        step_deviation: radians, by which each component of a step of odometry errs; NaN unknown.
+        rotation_score: ``(M,)`` in [0, 1], score for the edge's rotation alone being wrong; None likewise.
+        edge_precision: ``(M, 2)`` rad⁻² and m⁻² per component, the weights of the edges; None likewise.
+        step_deviation: standard deviation of each component of an odometry step, radians; NaN unknown.
     """
 
     version: int
@@ -105,10 +105,10 @@ class Answer:
         version: int,
         was_cold: bool,
     ) -> Answer:
-        """What a solve of a snapshot says, with the orientations ``(N, 4)`` in their fixed gauge; ``seconds`` is 0.
+        """The answer from a snapshot's solution, with orientations ``(N, 4)`` in their fixed gauge; ``seconds`` is 0.
 
-        An edge is an outlier if its score exceeds its threshold, ``(M,)``; what a user has accepted has the score 0,
-        what was rejected 1.
+        An edge is an outlier if its score exceeds its threshold, ``(M,)``. Edges that a user has accepted get the
+        score 0, rejected ones 1.
         """
         graph = snapshot.graph
         score = solution.outlier_score.cpu()
@@ -152,12 +152,12 @@ class Answer:
 
     @cached_property
     def residual_deg(self) -> NDArray[np.float64]:
-        """``(M,)`` how far each edge's measured rotation is from the answer's."""
+        """``(M,)`` angle between each edge's measured rotation and the answer's, degrees."""
         return angles_off(self._body_from_world, torch.from_numpy(self.target_from_source), *self._ends)
 
     @cached_property
     def residual_m(self) -> NDArray[np.float64] | None:
-        """``(M,)`` the same of translations, metres; NaN where an edge has none. None without positions."""
+        """``(M,)`` the same for translations, metres; NaN where an edge has none. None without positions."""
         if self.position is None:
             return None
         position, translation = torch.from_numpy(self.position), torch.from_numpy(self.translation)
@@ -177,14 +177,14 @@ class Answer:
 
     @property
     def newest_stamp_ns(self) -> int:
-        """Of all keyframes on their robots' latest time lines; 0 without any stamp."""
+        """Newest stamp of all keyframes on their robots' latest time lines; 0 without any stamp."""
         latest = np.zeros(len(self.robots), dtype=np.int64)
         np.maximum.at(latest, self.keyframe_robot, self.time_line)
         is_latest = self.time_line == latest[self.keyframe_robot]
         return int(self.stamp_ns[is_latest].max(initial=0))
 
     def without_content(self) -> Answer:
-        """The same answer about no keyframes and no edges."""
+        """The same answer without keyframes and edges."""
         arrays: dict[str, Any] = {
             each.name: value[:0] for each in fields(self) if isinstance(value := getattr(self, each.name), np.ndarray)
         }
@@ -192,7 +192,7 @@ class Answer:
 
 
 def _in_gauge(solution: Solution, body_from_world: Tensor) -> NDArray[np.float64] | None:
-    """Positions ``(N, 3)``, which the solution has in the frame of each component's first keyframe."""
+    """Positions ``(N, 3)`` in the gauge; the solution has them in the frame of each component's first keyframe."""
     if solution.position is None:
         return None
     component = solution.component.cpu()

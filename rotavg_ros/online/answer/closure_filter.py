@@ -1,4 +1,4 @@
-"""Which closures may go on to a back end: those that answers believe, each once, and what becomes of them later."""
+"""Which closures may be passed on to a back end: those that answers believe, each once; later changes are reported."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rotavg_ros.view_graph import EdgeKind
 
 # A sender's name for an edge: the source's robot, and the edge's id.
 EdgeName = tuple[str, int]
-# Closures that wait for a verdict at most, and those whose later fate is followed; beyond, the oldest are forgotten.
+# Most closures that wait for a verdict, and most whose later verdicts are followed; beyond, the oldest are forgotten.
 _MOST_WAITING, _MOST_FOLLOWED = 100_000, 1_000_000
 
 _Item = TypeVar("_Item")
@@ -27,9 +27,9 @@ class Decision(Generic[_Item]):
     """What an answer changes.
 
     Attributes:
-        passed: what was handed in with closures that are believed now, in the order in which it came.
-        revoked: rows of the answer's edges that were let pass, and are false now.
-        reinstated: rows of those that were revoked, and are believed again.
+        passed: items handed in with closures that are believed now, in the order in which they came.
+        revoked: rows of the answer's edges that were let pass and are now judged false.
+        reinstated: rows of edges that were revoked and are believed again.
     """
 
     passed: list[_Item] = field(default_factory=list)
@@ -46,19 +46,19 @@ class _Waiting(Generic[_Item]):
 class ClosureFilter(Generic[_Item]):
     """Closures by the names that their senders gave them. Not thread-safe.
 
-    A closure passes with the first answer that has it and believes it, once it is old enough; one that is held false
-    waits on. Items of type ``_Item`` stand for what is to be sent on.
+    Once it is old enough, a closure passes with the first answer that contains and believes it; one that is judged
+    false goes on waiting. Items of type ``_Item`` stand for what is to be sent on.
 
     Attributes:
-        dropped: how many were forgotten while they waited, since too many did.
+        dropped: number of closures forgotten because too many waited.
     """
 
     def __init__(self, *, newest_counts: bool = False) -> None:
         """Begin with nothing.
 
         Args:
-            newest_counts: of measurements that share a name the newest decides, since the sender means it to stand for
-                those before; else all of them have to be believed.
+            newest_counts: of several measurements with one name the newest decides, since the sender means it to
+                replace those before; otherwise all of them have to be believed.
         """
         self._newest_counts = newest_counts
         self.dropped = 0
@@ -66,11 +66,11 @@ class ClosureFilter(Generic[_Item]):
         self._believed: dict[int, bool] = {}  # of those that were let pass: whether they still are
 
     def __len__(self) -> int:
-        """How many wait."""
+        """Number of closures that wait."""
         return len(self._waiting)
 
     def take(self, name: EdgeName, item: _Item, now: float) -> None:
-        """A closure has come, or another measurement by the same name.
+        """Take a closure, or another measurement of the same name.
 
         Args:
             name: the sender's.
@@ -89,7 +89,7 @@ class ClosureFilter(Generic[_Item]):
         return key in self._waiting or key in self._believed
 
     def passes(self, name: EdgeName) -> bool:
-        """Whether a closure was let pass and is believed still."""
+        """Whether a closure was let pass and is still believed."""
         return self._believed.get(_key(name), False)
 
     def decide(self, answer: Answer, now: float, delay_s: float) -> Decision[_Item]:
@@ -144,7 +144,7 @@ class ClosureFilter(Generic[_Item]):
 
 
 def _closures(answer: Answer) -> tuple[NDArray[np.int64], NDArray[np.uint64]]:
-    """Rows of the closures that an answer has solved, and their names as numbers."""
+    """Rows of the closures that were part of the answer's solve, and their names as numbers."""
     rows = np.flatnonzero((answer.kind == EdgeKind.LOOP_CLOSURE) & ~answer.waits)
     robot_keys = np.array([_robot_key(robot) for robot in answer.robots], dtype=np.uint64)
     if not len(rows):
@@ -153,7 +153,7 @@ def _closures(answer: Answer) -> tuple[NDArray[np.int64], NDArray[np.uint64]]:
 
 
 def _found(keys: NDArray[np.uint64], unique: NDArray[np.uint64]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Which keys there are in an ascending array, and where."""
+    """Which keys are in an ascending array, and where."""
     if not len(unique):
         return np.zeros(len(keys), dtype=bool), np.zeros(len(keys), dtype=np.int64)
     place = np.minimum(np.searchsorted(unique, keys), len(unique) - 1)
@@ -171,5 +171,5 @@ def _key(name: EdgeName) -> int:
 
 @cache
 def _robot_key(robot: str) -> int:
-    """64 bits that tell robots apart: two edges of different robots share a key in practice never."""
+    """64 bits that tell robots apart: in practice, edges of two robots never share a key."""
     return int.from_bytes(hashlib.blake2b(robot.encode("utf-8", "surrogatepass"), digest_size=8).digest(), "little")

@@ -1,12 +1,12 @@
 """Closures that wait to be solved, so that a flood of them takes many short ticks instead of one long one.
 
-What a tick costs follows the closures that are new to it, and how many of those in it are false. So in each tick only
-so many enter: those first that the last answer explains, the nearest to the newest keyframes before others. One closure
-that enters is one unit of work; nothing here knows of seconds, so a bag leads to the same answers on every machine.
-Where no more of those that came together are explained than random ones would be, those that are wait, too
-(:mod:`~rotavg_ros.online.answer.arrivals`). A closure that waits is no part of the solve. Its score comes from its
-residual (:mod:`~rotavg_ros.online.answer.screening`). While nothing comes, twice as many enter with each tick, until
-all are in.
+The cost of a tick grows with the number of closures that are new in it and the number of false ones in the solve. So
+each tick admits a limited number: first those that the last answer explains, the most likely first, then others, those
+at the newest keyframes first. The limit counts closures, not seconds, so a bag leads to the same answers on every
+machine. If no more of the closures that came together are explained than random ones would be, the explained ones wait
+too (:mod:`~rotavg_ros.online.answer.arrivals`). A closure that waits is not part of the solve; its score comes from its
+residual (:mod:`~rotavg_ros.online.answer.screening`). While nothing comes, the limit doubles with each tick, until all
+are in.
 """
 
 from __future__ import annotations
@@ -29,17 +29,18 @@ _MOST_DOUBLINGS = 30
 
 @dataclass(frozen=True)
 class EntryLimits:
-    """How many closures enter a solve in one tick. Ordinary ticks, which bring fewer, are what they were without it.
+    """How many closures enter a solve in one tick. Ordinary ticks bring fewer and are not affected.
 
     Attributes:
-        at_least: in any graph. The solver goes on from its last answer with so many; with many more it begins anew.
-        share: of the closures that are solved already, so many more. The solver begins anew after 5 % more.
-        per_keyframe: for each keyframe that is new since the last answer, so many more: a robot that drives on, and a
-            graph that is loaded, bring closures with their keyframes, a flood brings them without.
-        contradicting: of those that enter, the share of those that the last answer contradicts, at most.
-        flagged: while data flows, none but those at the newest keyframes of these enter once so many of the closures in
-            the solve are flagged, by the number of those believed. Each of them makes every tick dearer.
-        newest: so many keyframes of the last answer count as the newest, besides those that it does not know.
+        at_least: closures that may enter in any graph. With this many the solver continues from its last answer; with
+            many more it begins anew.
+        share: further closures that may enter, as a share of those in the solve. The solver begins anew after 5 % more.
+        per_keyframe: further closures that may enter for each keyframe that is new since the last answer. A robot that
+            drives on, and a graph that is loaded, bring closures with their keyframes; a flood brings them without.
+        contradicting: of the closures that enter, the largest share that the last answer may contradict.
+        flagged: ratio of flagged to believed closures in the solve. While data flows and the ratio is exceeded,
+            contradicted closures enter only at the newest keyframes. Each of them makes every tick dearer.
+        newest: number of the last answer's keyframes that count as newest, besides those added since.
     """
 
     at_least: int = 100
@@ -55,13 +56,15 @@ class ClosureQueue:
     """Which of a growing graph's edges wait, and in which order the others have entered the solve.
 
     Attributes:
-        waits: ``(m,)`` of the first m edges, those that were there when it was last asked.
-        order: edges that have entered, in that order; what the solver remembers of its last solve goes by it. None: all
-            are in, in their own order.
-        idle_ticks: how often in a row it was asked while nothing came.
-        arrivals: what came together.
-        prior_log_odds: ``(m,)`` nats, of those that wait, to be good before each was looked at; 0 of others.
-        num_by_chance: how many wait that the last answer explains, since as many random ones would be.
+        waits: ``(m,)`` which of the first m edges wait, those that were there at the last :meth:`let_in`.
+        order: edges that have entered, in that order, by which the solver's memory of its last solve is indexed. None:
+            all are in, in their own order.
+        idle_ticks: number of ticks in a row without new data while closures waited.
+        arrivals: which closures came together.
+        prior_log_odds: ``(m,)`` nats, of each waiting closure being good before its own residual counts; 0 for others.
+        num_by_chance: number of closures that wait although the last answer explains them, because it would explain
+            as many random ones.
+        limits: how many may enter in a tick.
     """
 
     waits: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
@@ -73,11 +76,11 @@ class ClosureQueue:
     limits: EntryLimits = field(default_factory=EntryLimits)
 
     def __len__(self) -> int:
-        """How many wait."""
+        """Number of closures that wait."""
         return int(self.waits.sum())
 
     def renumber(self, renumbering: Renumbering) -> None:
-        """Follow a compaction of the graph; what the solver remembers fits no graph after one."""
+        """Follow a compaction of the graph, after which the solver's memory fits no longer."""
         self.waits, self.order = renumbering.flags(self.waits), None
         self.arrivals.forget()
 
@@ -92,9 +95,9 @@ class ClosureQueue:
 
         Args:
             graph: N keyframes, M ≥ m edges.
-            known: by the last answer; None before the first, when all enter. All enter as well where there is no
-                odometry: such a graph grows by closures.
-            outlier: ``(m',)`` flags of the last answer, of the first edges.
+            known: what the last answer knows; None before the first, when all enter. All enter as well where there is
+                no odometry, since such a graph grows by closures.
+            outlier: ``(m',)`` flags of the last answer, for the first m' edges.
             idle: nothing has come since the last tick.
         """
         self.idle_ticks = self.idle_ticks + 1 if idle and len(self) else 0
@@ -125,7 +128,7 @@ class ClosureQueue:
         closures_in: NDArray[np.int64],
         flagged: NDArray[np.bool_],
     ) -> NDArray[np.int64]:
-        """Which of the closures that wait ``(M,)`` enter, given those in the solve ``(C,)`` and all flags ``(M,)``."""
+        """Which of the waiting closures ``(M,)`` enter, given those in the solve ``(C,)`` and the flags ``(M,)``."""
         candidates, limits, solved = np.flatnonzero(waits), self.limits, flagged[closures_in]
         num_known = len(known.body_from_world)
         most = limits.at_least + limits.share * len(solved) + limits.per_keyframe * (graph.num_nodes - num_known)
@@ -139,7 +142,7 @@ class ClosureQueue:
         prior = self.arrivals.prior_log_odds(candidates, told, believed)
         self.prior_log_odds[candidates] = prior
         is_good = told + prior >= 0
-        # The solve would believe these, whatever they came with.
+        # The solve would believe these, whatever group they came with.
         would_be = told + np.log(((~solved).sum() + GOOD) / (solved.sum() + FALSE)) >= 0
         self.num_by_chance = int((would_be & ~is_good).sum())
         later_end = torch.maximum(closures.source, closures.target).numpy()
@@ -148,7 +151,7 @@ class ClosureQueue:
         explained = explained[np.argsort(-(told + prior)[explained], kind="stable")][:most]
         may_enter, spare = ~is_good, most - len(explained)
         if not self.idle_ticks:
-            # Of a flood in which most are false none is worth asking the solve for.
+            # In a flood of mostly false closures, no contradicted one is worth the solve's time.
             is_ordinary = self.arrivals.num_together(candidates) <= limits.at_least
             may_enter &= ~would_be & (is_ordinary | (prior >= 0))
             spare = min(spare, int(limits.contradicting * most))
@@ -160,7 +163,7 @@ class ClosureQueue:
 
 
 def _beside(graph: ViewGraph, asked: NDArray[np.int64], believed: NDArray[np.int64]) -> Sequence[NDArray[np.int64]]:
-    """``(K,)`` how near some closures are to one of ``(B,)`` others, and these to each other."""
+    """``(K,)`` how near some closures are to the nearest of ``(B,)`` others, and ``(B,)`` these to each other."""
     names = ("source", "target", "kind", "steps")
     way = Way.along(graph.num_nodes, {name: getattr(graph, name).numpy() for name in names})
     position = way.position + way.chain * (way.length + 3 * GAP)

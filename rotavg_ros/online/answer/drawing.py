@@ -35,7 +35,7 @@ class Drawing:
 
 
 def draw(answer: Answer, trajectories: Iterable[Trajectory]) -> Drawing:
-    """Keyframes without a known position are left out, and their edges with them."""
+    """Draw an answer. Keyframes without a known position are left out, and their edges with them."""
     position = np.full((len(answer.keyframe_id), 3), np.nan)
     for trajectory in trajectories:
         position[trajectory.node] = trajectory.position

@@ -14,12 +14,12 @@ from rotavg_ros.online import quaternion
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-# Of closures that join two components so many are compared with each other, and beyond this angle none agrees.
+# Most closures that are compared where they join two components, and the angle beyond which two disagree.
 _MOST_JOINTS, _FAR = 200, math.radians(30)
 
 
 def is_numbered_by_first_node(component: Tensor) -> bool:
-    """Whether labels ``(N,)`` are those of components, each new one the next number."""
+    """Whether labels ``(N,)`` number components in the order of their first nodes, from 0."""
     if component.ndim != 1 or component.dtype != torch.int64:
         return False
     highest = torch.cummax(torch.cat((torch.tensor([-1]), component)), 0).values
@@ -61,16 +61,16 @@ def joins_components(previous: Tensor, current: Tensor) -> bool:
 def joined(body_from_world: Tensor, component: Tensor, graph: ViewGraph) -> Tensor:
     """Orientations of all nodes in one gauge for each component of the graph, where closures have joined some.
 
-    Each component is turned as the one closure to those before it says that most others agree with; where somebody has
-    accepted some, of these.
+    Each component is turned by the one closure to those before it that agrees best with the others. If a user has
+    accepted some of these closures, only accepted ones count.
 
     Args:
         body_from_world: ``(n, 4)`` of the first n nodes, in the gauges of components that were apart.
-        component: ``(n,)`` of these.
+        component: ``(n,)`` components of these nodes.
         graph: with N ≥ n nodes and odometry, on the CPU.
 
     Returns:
-        ``(N, 4)``; the component with the first node of all that have become one stays as it is.
+        ``(N, 4)``; of the components that have become one, the one with the first node stays as it is.
     """
     odometry = graph.is_odometry
     start = extend_along_edges(body_from_world, graph.select_edges(odometry)).clone()
@@ -97,7 +97,7 @@ def joined(body_from_world: Tensor, component: Tensor, graph: ViewGraph) -> Tens
 
 
 def _components_by_odometry(component: Tensor, graph: ViewGraph) -> Tensor:
-    """``(N,)`` numbered by first node: those of the first n nodes, with odometry since and no closures."""
+    """``(N,)`` numbered by first node: the components of the first n nodes, extended by odometry but not closures."""
     from scipy.sparse import coo_array  # only where something joins: a node has no other use for it
     from scipy.sparse.csgraph import connected_components
 
@@ -109,7 +109,7 @@ def _components_by_odometry(component: Tensor, graph: ViewGraph) -> Tensor:
 
 
 def _turns(start: Tensor, joints: ViewGraph, edges: np.ndarray, source_placed: np.ndarray) -> Tensor:
-    """``(n, 4)`` W by which orientations at the other ends, R → R W, fit those that are placed."""
+    """``(n, 4)`` rotations W that make the orientations at the unplaced ends, R → R W, fit the placed ones."""
     chosen = torch.from_numpy(edges[:: len(edges) // _MOST_JOINTS + 1])
     measured, begins = joints.target_from_source[chosen], torch.from_numpy(source_placed)[chosen]
     source, target = start[joints.source[chosen]], start[joints.target[chosen]]
@@ -118,7 +118,7 @@ def _turns(start: Tensor, joints: ViewGraph, edges: np.ndarray, source_placed: n
 
 
 def _most_agreed(turns: Tensor) -> Tensor:
-    """``(4,)`` the one that the others are nearest to; none counts for more than :data:`_FAR`."""
+    """``(4,)`` the turn with the least sum of angles to the others, each angle capped at :data:`_FAR`."""
     apart = rotations.angle(rotations.multiply(rotations.inverse(turns)[:, None], turns[None]))
     return turns[int(apart.clamp(max=_FAR).sum(dim=1).argmin())]
 

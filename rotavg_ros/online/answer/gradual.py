@@ -12,11 +12,11 @@ from rotavg_ros.online.quaternion import Vector
 
 @dataclass(frozen=True)
 class CorrectionRates:
-    """How fast a correction moves the body, besides what odometry says; 0: at once.
+    """How fast a correction may move the body, besides the motion from odometry; 0: at once.
 
     Attributes:
-        turn: rad/s.
-        way: m/s.
+        turn: rotation, rad/s.
+        way: translation, m/s.
     """
 
     turn: float = 0.0
@@ -27,8 +27,8 @@ class GradualFrame:
     """Follows a robot's odometry frame so that the body turns and moves to where it belongs no faster than allowed.
 
     What is limited is the body's motion, not the frame's: far from odometry's origin a slight turn of the frame moves
-    the body by metres. Time is the odometry's own. Where odometry begins anew, or the robot's clock goes back, there is
-    nothing to go on from.
+    the body by metres. Time is the odometry's own. When odometry begins anew, or the robot's clock goes back, the frame
+    is taken at once.
     """
 
     def __init__(self, rates: CorrectionRates) -> None:
@@ -41,8 +41,8 @@ class GradualFrame:
 
         Args:
             frame: where the odometry's frame belongs.
-            stamp_ns: of the message, nanoseconds.
-            odometry_position: of the body, in the odometry's frame, metres.
+            stamp_ns: stamp of the message, nanoseconds.
+            odometry_position: position of the body in the odometry's frame, metres.
         """
         before, elapsed_ns = self._frame, stamp_ns - self._stamp_ns
         if before is not None and before.chain == frame.chain and elapsed_ns > 0:
@@ -63,5 +63,5 @@ class GradualFrame:
 
     @staticmethod
     def _share(needed: float, allowed: float) -> float:
-        """How much of what is needed may be done; all where there is no limit."""
+        """Share of the needed correction that is allowed; 1 where there is no limit."""
         return 1.0 if allowed == 0.0 or needed <= allowed else allowed / needed

@@ -16,7 +16,7 @@ class Join:
     """Components whose relative orientation was arbitrary until now.
 
     Attributes:
-        robots: names of those that have keyframes in them, sorted; one alone: pieces of its track.
+        robots: names of the robots with keyframes in them, sorted; a single one: pieces of its track were joined.
         num_components: how many became one.
     """
 
@@ -43,7 +43,7 @@ def joins(before: Answer, now: Answer) -> list[Join]:
 
 
 def _places(before: Answer, nodes: NDArray[np.int64], now: Answer) -> NDArray[np.int64]:
-    """Where nodes of an earlier answer are in a later one; they must be."""
+    """Where nodes of an earlier answer are in a later one; all of them must still be there."""
     if len(now.keyframe_id) >= len(before.keyframe_id):
         same = (now.keyframe_id[nodes] == before.keyframe_id[nodes]).all()
         if same and (now.keyframe_robot[nodes] == before.keyframe_robot[nodes]).all():

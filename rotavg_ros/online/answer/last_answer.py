@@ -1,4 +1,4 @@
-"""The last answer, kept in the numbers of a graph that grows and is compacted meanwhile."""
+"""The last answer, kept in the numbering of a graph that grows and is compacted meanwhile."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ class LastAnswer:
         self._since_problem: Renumbering | None = None
 
     def begin_problem(self) -> None:
-        """From now on an answer comes in the graph's present numbers."""
+        """The next answer will be in the graph's present numbering."""
         self._since_problem = None
 
     def replace(self, body_from_world: Tensor, component: Tensor, outlier: NDArray[np.bool_], known: Known) -> None:
-        """Take the answer to the last problem, of N nodes and M edges in the numbers of that time."""
+        """Take the answer to the last problem, of N nodes and M edges in the numbering of that time."""
         self.body_from_world, self.component, self.outlier, self.known = body_from_world, component, outlier, known
         if self._since_problem is not None:
             self._apply(self._since_problem)
 
     def renumber(self, renumbering: Renumbering) -> None:
-        """Follow the graph."""
+        """Follow a compaction of the graph."""
         earlier = self._since_problem
         self._since_problem = renumbering if earlier is None else earlier.then(renumbering)
         self.queue.renumber(renumbering)

@@ -1,4 +1,4 @@
-"""Where a robot's odometry frame lies in the world, and with it the robot now, between two answers as well."""
+"""Where a robot's odometry frame lies in the world, and so where the robot is now, also between two answers."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from rotavg_ros.online.odometry.track import OdometryTrack
 from rotavg_ros.online.quaternion import Quaternion, Vector
 from rotavg_ros.view_graph import EdgeKind
 
-# Rotations about z alone have x and y below this.
+# Largest x and y of a quaternion that counts as a rotation about z.
 _PLANAR = 1e-6
 
 
 @dataclass(frozen=True)
 class Drift:
-    """How far a pose errs, as variances per component, that no answer has corrected yet.
+    """Variances per component of a pose that no answer has corrected yet.
 
     Attributes:
-        orientation, position: of the keyframe that the pose hangs on, rad² and m², relative to its component's first.
-        step_orientation, step_position: of a step of odometry, rad² and m². NaN where the answer does not tell.
+        orientation, position: of the keyframe that the pose is derived from, rad² and m², relative to the first
+            keyframe of its component.
+        step_orientation, step_position: of a step of odometry, rad² and m². NaN where the answer does not say.
     """
 
     orientation: float
@@ -36,7 +37,12 @@ class Drift:
     step_position: float
 
     def after(self, steps: int, way: float) -> tuple[float, float]:
-        """rad² and m² so many steps of odometry, and so many metres, off the keyframe, which may be turned."""
+        """Variances of orientation and position, rad² and m², beyond the keyframe.
+
+        Args:
+            steps: steps of odometry since the keyframe.
+            way: distance from the keyframe, metres; over it the keyframe's error of orientation moves the position.
+        """
         orientation = self.orientation + steps * self.step_orientation
         return orientation, self.position + steps * self.step_position + self.orientation * way**2
 
@@ -49,12 +55,12 @@ class OdometryFrame:
     """The pose of a robot's odometry frame in the world, from the robot's newest keyframe that an answer has placed.
 
     Attributes:
-        chain: number of the odometry chain that it is about.
+        chain: number of the odometry chain.
         orientation: world_from_odometry, xyzw.
-        origin: of the odometry's frame, metres in the world.
-        keyframe_position: of that keyframe in the odometry's frame, metres.
-        keyframes_before: how many keyframes the robot's odometry had made up to that one.
-        drift: how far poses err.
+        origin: position of the odometry frame's origin in the world, metres.
+        keyframe_position: position of that keyframe in the odometry frame, metres.
+        keyframes_before: number of keyframes that the robot's odometry had made up to that one.
+        drift: variances of poses derived from the frame.
         is_planar: whether the robot has turned about the world's z axis only.
     """
 
@@ -74,7 +80,7 @@ class OdometryFrame:
         position: Vector,
         odometry_position: Vector,
     ) -> OdometryFrame:
-        """The frame turned so in which a body at ``odometry_position`` is at ``position`` in the world, metres."""
+        """The frame so turned, with a body at ``odometry_position`` in it at ``position`` in the world, metres."""
         turned = quaternion.rotate(world_from_odometry, odometry_position)
         return cls(chain, world_from_odometry, quaternion.difference(position, turned), odometry_position)
 
@@ -85,7 +91,7 @@ class OdometryFrame:
 
 
 def first_frame(track: OdometryTrack, world_from_odometry: Quaternion) -> OdometryFrame | None:
-    """Before anything is known, the first odometry is where it says; None where it does not say."""
+    """The frame before the first answer: odometry's positions are taken as they are; None where it has none."""
     if track.latest is None or track.latest.position is None:
         return None
     at = track.latest.position
@@ -93,7 +99,7 @@ def first_frame(track: OdometryTrack, world_from_odometry: Quaternion) -> Odomet
 
 
 def next_frame(before: OdometryFrame, track: OdometryTrack, world_from_odometry: Quaternion) -> OdometryFrame | None:
-    """Of the chain that has just begun: it begins where the robot was last, the best guess."""
+    """The frame of the chain that has just begun; as a best guess, it begins where the robot was last."""
     last, first = track.samples.seam(track.chain)
     if last.position is None or first.position is None:
         return None
@@ -103,10 +109,10 @@ def next_frame(before: OdometryFrame, track: OdometryTrack, world_from_odometry:
 def placed_frames(
     answer: Answer, trajectories: Mapping[str, Trajectory], builder: GraphBuilder
 ) -> dict[str, OdometryFrame]:
-    """Of every robot whose present odometry covers a keyframe of the answer and has positions there.
+    """The frames of robots whose present odometry covers their newest keyframe in the answer and has positions there.
 
     Args:
-        answer: the last.
+        answer: the last answer.
         trajectories: of its keyframes.
         builder: its graph may have grown since.
     """
@@ -149,7 +155,7 @@ def _keyframes_since(builder: GraphBuilder, robot: str, moment: tuple[int, int])
 
 
 def _step_variances(answer: Answer) -> tuple[float, float]:
-    """rad² and m² per component of a step of odometry."""
+    """Variances of a step of odometry per component, rad² and m²."""
     if answer.edge_precision is None:
         return answer.step_deviation**2, math.nan
     odometry = answer.kind == EdgeKind.ODOMETRY

@@ -1,4 +1,4 @@
-"""What a tick solves: a graph, and the last answer as far as it goes."""
+"""What a tick solves: a graph, and the last answer to its first part."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from rotavg_ros.online.graph.snapshot import GraphSnapshot
 from rotavg_ros.solver.solution import Solution
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
 
-# While data flows, a flag changes only if the score passes the threshold by this share of the way to 0 or 1: on a
-# real robot's graph that halves the changes, and no more flags are wrong.
+# While data flows, a flag changes only if the score passes the threshold by this share of the distance to 0 or 1, the
+# smaller one. On a real robot's graph that halves the number of changes, and no more flags are wrong.
 _FLAG_HYSTERESIS = 0.4
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Nothing in it changes while it is solved, whatever becomes of the growing graph.
+    """The problem of one tick. Nothing in it changes while it is solved, even if the graph goes on growing.
 
     Attributes:
         snapshot: the graph, of N keyframes and M edges.
-        cold: to be solved from scratch.
-        answered: body_from_world ``(n, 4)`` of the last answer, for the first keyframes; None before the first.
+        cold: whether to solve from scratch.
+        answered: body_from_world ``(n, 4)`` of the last answer, for the first n keyframes; None before the first.
         component: ``(n,)`` of the last answer; None where it is not known.
-        outlier: ``(m,)`` flags of the last answer, of the first edges.
+        outlier: ``(m,)`` flags of the last answer, for the first m edges.
         memory: what the solver remembers of the last answer.
-        order: edges to be solved, in the order in which they have entered; None: all, in their own. The others wait.
-        prior_log_odds: ``(M,)`` nats, of closures that wait, to be good before each was looked at.
-        anew: nothing is new, and the answer is to become what a solve from scratch says.
+        order: edges to solve, in the order in which they have entered; None: all, in their own order. The others wait.
+        prior_log_odds: ``(M,)`` nats, of each waiting closure being good before its own residual counts.
+        anew: nothing is new, and the answer is to become that of a solve from scratch.
     """
 
     snapshot: GraphSnapshot
@@ -68,7 +68,7 @@ class Problem:
 
     @cached_property
     def goes_on_from(self) -> object | None:
-        """What the solver is given of :attr:`memory`: where components have become one, the labels alone."""
+        """The part of :attr:`memory` that the solver is given: only the labels where components have become one."""
         return getattr(self.memory, "labels", None) if self.joins else self.memory
 
     def warm_start(self) -> Tensor | None:
@@ -80,9 +80,9 @@ class Problem:
         return None if self.goes_on_from is None else joined(self.answered, self.component, self.graph)
 
     def thresholds(self, threshold: float, was_cold: bool) -> NDArray[np.float64]:
-        """The score above which each edge is an outlier ``(M,)``; the last answer's flags are kept when in doubt.
+        """The score above which each edge is an outlier ``(M,)``, with a hysteresis that favours the last flags.
 
-        A cold answer depends on the graph alone, so there nothing is kept.
+        A cold answer depends on the graph alone, so it has no hysteresis.
         """
         thresholds = np.full(self.snapshot.graph.num_edges, threshold)
         if not was_cold:
@@ -91,17 +91,17 @@ class Problem:
         return thresholds
 
     def known(self, solution: Solution, threshold: float) -> Known:
-        """What a solution of :attr:`graph` tells of closures that are no part of it."""
+        """What is needed from a solution of :attr:`graph` to judge closures that are not part of it."""
         believed = solution.outlier_score.cpu().numpy() <= threshold
         believed &= self.graph.kind.numpy() == EdgeKind.LOOP_CLOSURE
         return Known.of_solution(self.graph, solution, believed)
 
     def of_all_edges(self, solution: Solution, known: Known) -> Solution:
-        """A solution of :attr:`graph` as one of the whole graph: what waits has a score by its residual, and no weight.
+        """Extend a solution of :attr:`graph` to the whole graph: waiting edges get scores by residual, and no weight.
 
         Args:
             solution: of M' edges.
-            known: what it tells.
+            known: from that solution, see :meth:`known`.
         """
         if self.order is None:
             return solution

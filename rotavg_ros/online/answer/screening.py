@@ -1,6 +1,6 @@
-"""How far an answer explains closures that are not part of it: their residuals against what it knows.
+"""How well an answer explains closures that are not part of it, judged by their residuals.
 
-A closure that is no part of an answer does not pull it, so its residual is that of a measurement left out.
+A closure that is not part of an answer does not pull it, so its residual is that of a left-out measurement.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from rotavg_ros.online.answer.gauge import extend_along_edges
 from rotavg_ros.solver.solution import Solution, angles_off, distances_off
 from rotavg_ros.view_graph import ViewGraph
 
-# A closure's standard deviation per component where none can be told from those that are believed, and the least that
-# is taken for one: the residual of a closure that is part of an answer is less than its error.
+# A closure's standard deviation per component, radians and metres: the default where too few closures are believed, and
+# the least value used, since the residual of a closure that is part of an answer is smaller than its error.
 _DEVIATION, _LEAST_DEVIATION = np.radians(2.0), np.radians(1.0)
 _DEVIATION_M, _LEAST_DEVIATION_M = 0.5, 0.1
-# So many believed closures tell their standard deviation; of more every so many-th is looked at.
+# Number of believed closures needed to estimate the standard deviation, and about how many of them are looked at.
 _ENOUGH, _AT_MOST = 10, 1000
 # The median of an absolute value of the standard normal distribution is 1 / 1.4826.
 _DEVIATION_PER_MEDIAN = 1.4826
@@ -33,14 +33,14 @@ _COLUMNS = ("body_from_world", "variance", "component", "position", "position_va
 
 @dataclass(frozen=True)
 class Known:
-    """What an answer knows of its n keyframes, and how far its closures err.
+    """What an answer knows of its n keyframes, and the standard deviations of its closures.
 
     Attributes:
         body_from_world: ``(n, 4)``.
         variance: ``(n,)`` rad² of each component of the orientation, relative to the component's first keyframe;
             0 where the method gives none.
         component: ``(n,)`` connected component.
-        step_variance: rad², by which odometry's orientation errs more with each step.
+        step_variance: rad², variance of the orientation that each step of odometry adds, per component.
         deviation: rad, standard deviation of each component of a good closure's rotation.
         position: ``(n, 3)`` metres in the answer's world; None where there are none.
         position_variance: ``(n,)`` m² of each component; None likewise.
@@ -61,8 +61,8 @@ class Known:
         """What a solution of a graph knows.
 
         Args:
-            graph: N keyframes, M edges, those that were solved.
-            solution: of it.
+            graph: N keyframes, M edges, as it was solved.
+            solution: of this graph.
             believed: ``(M,)`` closures that are not outliers.
         """
         some = np.flatnonzero(believed)
@@ -87,21 +87,21 @@ class Known:
 
     @classmethod
     def of_orientations(cls, body_from_world: Tensor) -> Known:
-        """Where nothing but orientations ``(n, 4)`` is left of an answer, as in a state file; all are one component."""
+        """From orientations ``(n, 4)`` alone, all that a state file keeps of an answer; all are one component."""
         nothing = torch.zeros(len(body_from_world), dtype=torch.float64)
         return cls(body_from_world, nothing, nothing.long())
 
     def of_keyframes(self, nodes: Callable[[Tensor], Tensor]) -> Known:
-        """The same of the keyframes that a compaction has left; ``nodes`` chooses their rows."""
+        """The same for the keyframes that a compaction has left; ``nodes`` selects their rows."""
         columns: dict[str, Any] = {name: getattr(self, name) for name in _COLUMNS}
         left: dict[str, Any] = {name: nodes(column) for name, column in columns.items() if column is not None}
         return replace(self, **left)
 
     def carried_on(self, graph: ViewGraph) -> Known:
-        """The same of all N ≥ n keyframes of a graph that has grown, along its edges, odometry first.
+        """The same extended to all N ≥ n keyframes of a graph that has grown, along its edges, odometry first.
 
-        A keyframe that is new errs as the last one that is known does, and by a step more for each keyframe since; its
-        position is NaN.
+        A new keyframe has the variance of the last known one, plus one step's for each keyframe since; its position is
+        NaN.
         """
         known, new = len(self.body_from_world), graph.num_nodes - len(self.body_from_world)
         if new <= 0:
@@ -121,14 +121,14 @@ class Known:
         )
 
     def log_odds(self, closures: ViewGraph, graph: ViewGraph) -> NDArray[np.float64]:
-        """``(K,)`` nats, of each closure being good to its being false, both as likely before it was looked at.
+        """``(K,)`` nats, of each closure being good against being false, with even prior odds.
 
-        A good one errs normally, by its own deviation and those of its ends, which count as independent. A false one
-        has any rotation, and any place within the map. Between components nothing is known: 0.
+        The error of a good one is normal, with its own variance plus those of its ends, which count as independent. A
+        false one has any rotation, and any place within the map. Between components nothing is known: 0.
 
         Args:
-            closures: K of its edges.
-            graph: where all rotations share an axis, any rotation is one about that.
+            closures: K of the graph's edges.
+            graph: where all its rotations share an axis, any rotation means any about this axis.
         """
         components = graph.rotation_components
         source, target = closures.source, closures.target
@@ -137,14 +137,14 @@ class Known:
         if components == 1:
             anywhere = np.full(len(turned), np.log(2 * np.pi))
         else:
-            # The density of an angle r's rotation vector where all rotations are as likely: (2 sin(r/2) / r)² / 8π².
+            # Density of a rotation vector of angle r where all rotations are equally likely: (2 sin(r/2) / r)² / 8π².
             anywhere = np.log(8 * np.pi**2) - 2 * np.log(np.sinc(turned / (2 * np.pi)))
         odds = anywhere - components / 2 * np.log(2 * np.pi * variance) - turned**2 / (2 * variance)
         odds += self._log_odds_of_places(closures, 2 if components == 1 else 3)
         return np.where((self.component[source] == self.component[target]).numpy(), odds, 0.0)
 
     def _log_odds_of_places(self, closures: ViewGraph, components: int) -> NDArray[np.float64]:
-        """The same by translations alone; 0 where a position or a translation is not known."""
+        """The same from translations alone; 0 where a position or a translation is not known."""
         if self.position is None or self.position_variance is None or closures.translation is None:
             return np.zeros(closures.num_edges)
         source, target = closures.source, closures.target
@@ -170,8 +170,8 @@ def score_of(log_odds: NDArray[np.float64]) -> NDArray[np.float64]:
 def _deviation(residual: NDArray[np.float64], otherwise: float, least: float) -> float:
     """Standard deviation of a component, from the absolute residuals of believed closures.
 
-    In space it comes out up to 2.3 times too large, for an angle has three components there. What is too large lets
-    closures in that could wait.
+    In 3D it comes out up to 2.3 times too large, since an angle then has three components. Too large a value lets in
+    closures that could wait.
     """
     residual = residual[np.isfinite(residual)]
     if len(residual) < _ENOUGH:

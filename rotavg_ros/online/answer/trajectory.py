@@ -22,7 +22,7 @@ class Trajectory:
         node: ``(K,)`` indices into the answer's keyframes.
         stamp_ns, time_line: ``(K,)``; stamps ascend within a time line.
         world_from_body: ``(K, 4)`` xyzw.
-        position: ``(K, 3)`` metres in the world, from odometry's steps and closures; NaN where nothing tells.
+        position: ``(K, 3)`` metres in the world, from odometry's steps and closures; NaN where unknown.
         position_dead_reckoned: ``(K, 3)`` metres, from odometry's steps alone, from its first position on; NaN without.
         odometry_world_from_body, odometry_position: ``(K, 4)`` xyzw and ``(K, 3)`` metres, odometry's own; NaN without.
     """
@@ -41,11 +41,11 @@ def corrected_trajectories(answer: Answer, odometry_of: Mapping[str, OdometrySam
     """Poses of every robot's keyframes that have a stamp.
 
     Args:
-        answer: with N keyframes and M edges; where an odometry edge has no translation, the odometry's own stands in.
-        odometry_of: messages by robot, that stay as they are meanwhile.
+        answer: with N keyframes and M edges; where an odometry edge has no translation, the odometry's own is used.
+        odometry_of: messages by robot; they must not change meanwhile.
 
     Returns:
-        by robot; those without such keyframes are left out.
+        the trajectories by robot; robots without such keyframes are left out.
     """
     from rotavg_ros.solver.positions import Translations, fit_positions  # loads SciPy, as below: a node may never ask
 
@@ -103,7 +103,7 @@ def _nodes_by_time(answer: Answer, robot: str) -> NDArray[np.int64]:
 def _odometry_steps(
     answer: Answer, world_from_body: NDArray[np.float64], position: NDArray[np.float64], chain: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """``(M, 3)`` where odometry has the target in the source's frame; NaN between robots, chains, and without it."""
+    """``(M, 3)`` odometry's target position in the source's frame; NaN between robots or chains, or without odometry."""
     source, target = answer.source, answer.target
     robot = answer.keyframe_robot
     known = (robot[source] == robot[target]) & (chain[source] == chain[target]) & (chain[source] >= 0)
@@ -128,7 +128,7 @@ def dead_reckoning(
         world_from_body: ``(K, 4)`` xyzw, the orientations to use.
         odometry_world_from_body: ``(K, 4)`` xyzw, odometry's own.
         odometry_position: ``(K, 3)`` metres in odometry's frame.
-        chain: ``(K,)`` number of the odometry chain; from one to the next the step is unknown and counts as none.
+        chain: ``(K,)`` number of the odometry chain; the step from one chain to the next is unknown and taken as zero.
 
     Returns:
         ``(K, 3)`` metres; the first position is odometry's.

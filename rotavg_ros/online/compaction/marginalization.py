@@ -1,10 +1,10 @@
-"""Taking keyframes out of a pose graph without changing what it says of the others.
+"""Taking keyframes out of a pose graph without changing what it says about the others.
 
 A keyframe v between two odometry edges u → v → x and without a loop closure can be integrated out: rotations are
 composed, ``R_xu = R_xv R_vu``, variances are added. That is what :mod:`rotavg_ros.solver.slam.graph.closure_graph` does
-for every solve anyway, so the solution at all other keyframes stays what it was. What else is asked of the steps, how
-far each turned and where it led, an edge keeps as sums (:mod:`rotavg_ros.odometry_route`). Long runs of such keyframes
-vanish in a few vectorised rounds, each of which takes an independent set out of what is left (Luby 1986).
+for every solve anyway, so the solution at all other keyframes stays the same. What else is needed of the steps, how far
+each turned and where it led, the edge keeps as sums (:mod:`rotavg_ros.odometry_route`). Long runs of such keyframes are
+removed in a few vectorised rounds, each of which takes an independent set out of those left (Luby 1986).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Columns = dict[str, NDArray[Any]]
 
 
 def is_plain_odometry(edges: Columns) -> NDArray[np.bool_]:
-    """Odometry edges that nobody has labelled, ``(M,)``: these can be drawn together."""
+    """Odometry edges that nobody has labelled, ``(M,)``; these can be merged."""
     return np.asarray((edges["kind"] == EdgeKind.ODOMETRY) & (edges["label"] == EdgeLabel.AUTOMATIC))
 
 
@@ -52,10 +52,10 @@ class Contraction:
     Attributes:
         kept: ``(N',)`` the nodes that are left, ascending.
         edges: the edges that are left; ends are new nodes.
-        routes: ``(R', 38)`` of some of them.
-        last: ``(M',)`` ascending, the last of the edges that each consists of.
-        edge_of: ``(M,)`` which edge each has gone into.
-        marginalized: those there were, then the new ones.
+        routes: ``(R', 38)`` routes of some of them.
+        last: ``(M',)`` ascending, the last of the old edges that each consists of.
+        edge_of: ``(M,)`` the new edge that each old one has become part of.
+        marginalized: the earlier marginalised keyframes, then the new ones.
     """
 
     kept: NDArray[np.int64]
@@ -73,16 +73,16 @@ def marginalize(
     remove: NDArray[np.bool_],
     marginalized: MarginalizedKeyframes,
 ) -> Contraction:
-    """Take the nodes of a mask ``(N,)`` out, each of which :func:`are_between` steps and has no other edge.
+    """Take out the nodes of a mask ``(N,)``; each must be between steps (:func:`are_between`) and have no other edge.
 
-    Where only a pair of nodes would be left of a cycle of odometry, one node in it stays.
+    Where a cycle of odometry would shrink to a pair of nodes, one node in it stays.
 
     Args:
-        keyframes: robot, keyframe_id, stamp_ns, time_line.
+        keyframes: columns robot, keyframe_id, stamp_ns, time_line.
         edges: see :data:`Columns`.
-        routes: ``(R, 38)`` of some of them.
-        remove: ``(N,)``.
-        marginalized: those there are; their edges are renumbered, their poses kept.
+        routes: ``(R, 38)`` routes of some of the edges.
+        remove: ``(N,)`` the mask.
+        marginalized: the keyframes marginalised before; their edges are renumbered, their poses kept.
     """
     work = _Work.begin(keyframes, edges, routes, remove, marginalized)
     while work.round():
@@ -92,7 +92,7 @@ def marginalize(
 
 @dataclass
 class _Work:
-    """A contraction under way; edges keep their rows until the end, merged ones live on in the later row."""
+    """A contraction in progress; edges keep their rows until the end, two merged ones continue in the later row."""
 
     edges: Columns
     routes: NDArray[np.float64]
@@ -147,7 +147,7 @@ class _Work:
         )
 
     def round(self) -> bool:
-        """Take an independent set of the waiting nodes out; whether any are left."""
+        """Take out an independent set of the waiting nodes; returns False once none were left."""
         nodes = self.waiting
         if len(nodes) == 0:
             return False
@@ -168,7 +168,7 @@ class _Work:
         return True
 
     def _merge(self, nodes: NDArray[np.int64], pair: NDArray[np.int64], ends: NDArray[np.int64]) -> None:
-        """Draw the edges u – v – x of each node v, ``pair`` and ``ends`` ``(n, 2)``, together to u → x."""
+        """Merge the edges u – v – x of each node v, ``pair`` and ``ends`` ``(n, 2)``, into u → x."""
         edges = self.edges
         before, after = pair.T
         before_forwards, after_forwards = edges["target"][before] == nodes, edges["source"][after] == nodes
@@ -177,7 +177,7 @@ class _Work:
         x_from_u, x_in_u = rotations.multiply(x_from_v, v_from_u), _place(v_from_u, v_in_u, x_in_v)
         steps_before, steps = edges["steps"][before], edges["steps"][pair].sum(axis=1)
 
-        # What rides on an edge is told from that edge's source: u or v, v or x.
+        # Keyframes that lie on an edge are stored relative to that edge's source: u or v, v or x.
         zero, still = torch.zeros_like(v_in_u), rotations.identity(len(nodes))
         frames = (
             (before, before_forwards, (still, zero, 0 * steps), (v_from_u, v_in_u, steps_before)),
@@ -222,13 +222,13 @@ class _Work:
             "route": np.where(in_order, len(self.routes) + np.arange(len(nodes)), -1),
             "edge_id": np.uint64(OWN_EDGE_ID),
         }
-        with np.errstate(over="ignore", invalid="ignore"):  # a step may state anything
+        with np.errstate(over="ignore", invalid="ignore"):  # a step may have any values
             self.routes = np.concatenate((self.routes, _joined(edges, self.routes, parts)))
         for name, value in values.items():
             edges[name][survivor] = value
 
     def _riders_on(self, edges: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows of the keyframes on some edges, and the places of their edges among these."""
+        """Rows of the marginalised keyframes on the given edges, and the positions of their edges among these."""
         place_of_edge = np.full(len(self.merged_into), -1)
         place_of_edge[edges] = np.arange(len(edges))
         on_edge = self.riders["edge"]
@@ -268,7 +268,7 @@ class _Work:
 def _directed(
     edges: Columns, chosen: NDArray[np.int64], forwards: NDArray[np.bool_]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Rotation and translation of edges, turned round where they do not run forwards."""
+    """Rotation and translation of edges, inverted where they do not run forwards."""
     rotation = torch.from_numpy(edges["target_from_source"][chosen])
     translation = torch.from_numpy(edges["translation"][chosen])
     onwards = torch.from_numpy(forwards)[:, None]
@@ -281,12 +281,13 @@ def _directed(
 def _joined(
     edges: Columns, known: NDArray[np.float64], parts: Sequence[tuple[NDArray[np.int64], torch.Tensor, torch.Tensor]]
 ) -> NDArray[np.float64]:
-    """``(n, 38)`` what odometry did along pairs of edges, in the order of time; NaN where that is absurd.
+    """``(n, 38)`` the routes of odometry along pairs of edges, in order of time; NaN where not finite.
 
     Args:
-        edges: all there are.
+        edges: all edges.
         known: ``(R, 38)`` routes.
-        parts: the edges, how their farther ends are turned from their nearer ones, and where these see them.
+        parts: for the first and the second of each pair: the edges, farther_from_nearer rotations of their ends, and
+            positions of the farther ends in the frames of the nearer ones.
     """
     routes, turns = [], []
     for edge, farther_from_nearer, place in parts:

@@ -1,4 +1,4 @@
-"""Keyframes that are no nodes any more: each lies on an odometry edge, at a known pose along it."""
+"""Keyframes that are no longer nodes: each lies on an odometry edge, at a known pose along it."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class MarginalizedKeyframes:
         robot: ``(K,)`` int32 index.
         keyframe_id: ``(K,)`` uint64.
         stamp_ns: ``(K,)`` int64, -1 where unknown.
-        time_line: ``(K,)`` int64, which of its robot's time lines the stamp is of.
+        time_line: ``(K,)`` int64, which of its robot's time lines the stamp belongs to.
         edge: ``(K,)`` int64, the odometry edge.
-        keyframe_from_source: ``(K, 4)`` xyzw, from the frame of the edge's source.
+        keyframe_from_source: ``(K, 4)`` xyzw, rotation from the frame of the edge's source.
         position: ``(K, 3)`` in the frame of the edge's source, metres; NaN unknown.
         steps: ``(K,)`` odometry steps from the edge's source.
     """
@@ -55,11 +55,11 @@ class MarginalizedKeyframes:
         )
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """By name."""
+        """The columns by name."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
     def select(self, chosen: NDArray[Any]) -> MarginalizedKeyframes:
-        """Those of a mask or of indices, in that order."""
+        """The keyframes of a mask, or of indices in their order."""
         return MarginalizedKeyframes(**{name: values[chosen] for name, values in self.arrays().items()})
 
     def followed_by(self, others: MarginalizedKeyframes) -> MarginalizedKeyframes:
@@ -75,8 +75,9 @@ class MarginalizedIndex:
     """Finds marginalised keyframes by key and by moment.
 
     Attributes:
-        keyframes: which can be found.
-        forgotten_up_to: by robot index: keyframes up to this id were marginalised too, but where is no longer known.
+        keyframes: those that can be found.
+        forgotten_up_to: by robot index: keyframes up to this id may have been marginalised, but their poses are
+            forgotten.
     """
 
     keyframes: MarginalizedKeyframes
@@ -91,7 +92,7 @@ class MarginalizedIndex:
         return cls(keyframes, forgotten_up_to, by_id, by_moment)
 
     def limited_to(self, capacity: int) -> MarginalizedIndex:
-        """Of more than ``capacity`` the first are forgotten."""
+        """The index with at most ``capacity`` keyframes; the first ones are forgotten."""
         surplus = len(self.keyframes) - capacity
         if surplus <= 0:
             return self
@@ -125,7 +126,7 @@ class MarginalizedIndex:
             row: the keyframe.
             target_from_source: ``(4,)`` of its edge.
             translation: ``(3,)`` of the edge: position of the target in the source's frame, metres.
-            steps: of the edge.
+            steps: of the edge, in odometry steps.
 
         Returns:
             whether the nearer end is the edge's source; the keyframe's orientation ``(4,)`` and position ``(3,)`` in
@@ -141,7 +142,7 @@ class MarginalizedIndex:
 
 
 def _find(order: NDArray[np.int64], columns: Sequence[NDArray[Any]], key: tuple[int, ...]) -> int | None:
-    """The row with a key, of rows in ascending order of their keys."""
+    """The row with a key; ``order`` lists the rows in ascending order of their keys."""
 
     def key_of(row: int) -> tuple[int, ...]:
         return tuple(int(column[row]) for column in columns)

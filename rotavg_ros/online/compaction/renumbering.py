@@ -12,7 +12,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Renumbering:
-    """From N nodes and M edges to N' and M'; order is kept, so that the first n of either remain the first.
+    """From N nodes and M edges to N' and M'. The order is kept, so the first n of either remain the first.
 
     Attributes:
         kept: ``(N',)`` the nodes that are left, ascending.
@@ -27,7 +27,7 @@ class Renumbering:
     num_dropped: int
 
     def nodes(self, values: Tensor) -> Tensor:
-        """What is known of the first n nodes ``(n, …)``, of those that are left ``(n', …)``."""
+        """Values of the first n nodes ``(n, …)``, restricted to those that are left ``(n', …)``."""
         left = self.kept[: int(np.searchsorted(self.kept, len(values)))]
         return values[torch.from_numpy(left)]
 
@@ -39,7 +39,7 @@ class Renumbering:
         return flagged
 
     def then(self, later: Renumbering) -> Renumbering:
-        """Both, one after the other, of the nodes and edges there were before the first."""
+        """Both, one after the other, as one renumbering of the nodes and edges before the first."""
         edge_of = np.where(self.edge_of >= 0, later.edge_of[self.edge_of], -1)
         return Renumbering(
             self.kept[later.kept[later.kept < len(self.kept)]],

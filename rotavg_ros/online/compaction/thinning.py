@@ -1,16 +1,16 @@
 """Which keyframes and loop closures a full graph can best do without.
 
-Everything is thinned evenly over the way the robot has gone, in dyadic steps: of the keyframes (and then of the
-closures) within 2, 4, 8 … odometry steps of each other one stays, the older ones first. So however long it drives, what
-is left covers all of its way, and a closure to anywhere finds a keyframe near by.
+Everything is thinned evenly along the robot's path, in dyadic stretches: of the keyframes (and then of the closures)
+within a stretch of 2, 4, 8 … odometry steps one stays; older stretches are thinned first. So however long the robot
+drives, the rest covers the whole path, and a closure to any place finds a keyframe near by.
 
 1. Keyframes that no closure touches: taking them out changes nothing
    (:mod:`~rotavg_ros.online.compaction.marginalization`).
-2. Only when these do not suffice, closures: first those judged false, then those that are not the best (the newest that
-   is not false) on either of the two stretches of the way that they join, and those that span hardly more than a
-   stretch; stretches double until enough is free. So every stretch that has closures keeps one.
+2. Only if these do not suffice, closures: first those judged false, then those that are the best (the newest that is
+   not false) on neither of the two stretches of the path that they join, and those that span no more than a stretch.
+   Stretches double until enough is free. So every stretch that has closures keeps one.
 
-Closures without which the graph would fall apart, and those a user has accepted, stay.
+Closures without which the graph would fall apart stay, and so do those a user has accepted.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rotavg_ros.view_graph import EdgeKind, EdgeLabel
 
 
 def load() -> None:
-    """What a full graph needs of SciPy, by whom nobody waits for: loading it takes some tenths of a second."""
+    """Load the parts of SciPy that a full graph needs ahead of time, since it takes some tenths of a second."""
     import scipy.sparse.csgraph  # noqa: F401
 
 
@@ -51,7 +51,7 @@ class Way:
 
         odometry = edges["kind"] == EdgeKind.ODOMETRY
         ends = edges["source"][odometry], edges["target"][odometry]
-        # Of parallel edges the shortest counts; a sparse matrix would add them up.
+        # The shortest of parallel edges counts; a sparse matrix would add them up.
         low, high, steps = np.minimum(*ends), np.maximum(*ends), edges["steps"][odometry]
         order = np.lexsort((steps, high, low))
         low, high, steps = low[order], high[order], steps[order]
@@ -65,17 +65,17 @@ class Way:
 
     @property
     def length(self) -> float:
-        """Of the longest chain, steps."""
+        """Length of the longest chain, steps."""
         return float(self.position.max(initial=0.0))
 
 
 @dataclass(frozen=True)
 class Thinning:
-    """What to do without.
+    """What to remove.
 
     Attributes:
         nodes: ``(N,)`` bool; they can be marginalised once the edges are gone.
-        edges: ``(M,)`` bool.
+        edges: ``(M,)`` bool, those to drop.
     """
 
     nodes: NDArray[np.bool_]
@@ -90,21 +90,21 @@ def thin(
     surplus_nodes: int,
     surplus_edges: int,
 ) -> Thinning:
-    """Choose what goes; less than asked for where nothing else can be spared.
+    """Choose what to remove; less than asked for where nothing else can be spared.
 
     Args:
         num_nodes: N.
         edges: of the graph, see :data:`~rotavg_ros.online.compaction.marginalization.Columns`.
         is_false: ``(M,)`` edges that were judged outliers.
         protected: ``(N,)`` nodes that must stay; the first of every chain does in any case.
-        surplus_nodes, surplus_edges: how many have to go.
+        surplus_nodes, surplus_edges: how many to remove.
     """
     way = Way.along(num_nodes, edges)
     stays = protected.copy()
     stays[way.first] = True
     dropped = np.zeros(len(edges["source"]), dtype=bool)
 
-    # Only what is no plain odometry may be dropped: nodes lie between the same steps whatever is.
+    # Plain odometry is never dropped, so the nodes between two of its edges are the same whatever else is dropped.
     between, others = are_between(num_nodes, edges) & ~stays, np.flatnonzero(~is_plain_odometry(edges))
 
     def free() -> NDArray[np.bool_]:
@@ -121,7 +121,7 @@ def thin(
             spared = spared[~dropped[spared]]
             dropped[spared] = True
             if not lacking():
-                # No more than needed, and the oldest.
+                # Drop no more than needed, the oldest first.
                 enough, count = len(spared), 0
                 while enough - count > 1:
                     middle = (enough + count) // 2
@@ -133,13 +133,13 @@ def thin(
 
 
 def _evenly(way: Way, free: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
-    """``count`` of the free nodes ``(N,)``, so that what stays is as even as can be; all of them if there are fewer."""
+    """``count`` of the free nodes ``(N,)``, so that the rest is spread evenly; all of them if there are fewer."""
     if free.sum() <= count:
         return free
     less, width = np.zeros_like(free), 2.0
     while True:
         stretch = np.floor_divide(way.position, width)
-        # Nodes that stay anyway come first of their stretch and stand for it.
+        # Nodes that stay anyway are sorted first in their stretch and represent it.
         order = np.lexsort((free, stretch, way.chain))
         first = np.ones(len(order), dtype=bool)
         first[1:] = (np.diff(way.chain[order]) != 0) | (np.diff(stretch[order]) != 0)
@@ -157,7 +157,7 @@ def _evenly(way: Way, free: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
 def _sparable_closures(
     way: Way, edges: Columns, is_false: NDArray[np.bool_], stays: NDArray[np.bool_]
 ) -> Iterator[NDArray[np.int64]]:
-    """Closures in the order in which they go: arrays of edge indices, ascending, that may repeat what went before."""
+    """Closures in the order of removal: ascending arrays of edge indices, which may repeat earlier ones."""
     source, target = edges["source"], edges["target"]
     false = is_false | (edges["label"] == EdgeLabel.REJECTED)
     may_go = (edges["kind"] == EdgeKind.LOOP_CLOSURE) & (edges["label"] != EdgeLabel.ACCEPTED)
@@ -170,7 +170,7 @@ def _sparable_closures(
     ends.sort(axis=1)
     chain, position = way.chain[ends], way.position[ends]
     span = np.where(chain[:, 0] == chain[:, 1], np.abs(position[:, 0] - position[:, 1]), np.inf)
-    # The best first: what has to stay, then what is not false, then the newest.
+    # The best first: those that have to stay, then those that are not false, then the newest.
     rank = np.empty(len(closure), dtype=np.int64)
     rank[np.lexsort((-closure, false[closure], may_go[closure]))] = np.arange(len(closure))
     width = 1.0
@@ -185,7 +185,7 @@ def _sparable_closures(
 
 
 def _bridges(way: Way, edges: Columns, false: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Edges of a spanning forest over the odometry chains, of those that are not false where there are any."""
+    """Edges of a spanning forest over the odometry chains; edges that are not false are preferred."""
     from scipy.sparse import coo_array, csr_array
     from scipy.sparse.csgraph import minimum_spanning_tree
 
@@ -200,6 +200,6 @@ def _bridges(way: Way, edges: Columns, false: NDArray[np.bool_]) -> NDArray[np.i
     low, high, between = low[new], high[new], between[new]
     shape = (len(way.first), len(way.first))
     tree = minimum_spanning_tree(csr_array(coo_array((1.0 + false[between], (low, high)), shape=shape))).tocoo()
-    # Row by row and ascending, as `low` and `high` are.
+    # The keys ascend row by row, as `low` and `high` do.
     place = np.searchsorted(low * len(way.first) + high, tree.row.astype(np.int64) * len(way.first) + tree.col)
     return np.asarray(between[place])

@@ -1,1 +1,1 @@
-"""The graph as it grows: keyframes, edges, and what waits."""
+"""The growing graph: keyframes, edges, and what waits to enter it."""

@@ -1,4 +1,4 @@
-"""Ends of edges tied to keyframes: where a moment between keyframes lies, and what an edge says of the keyframes."""
+"""Ties ends of edges to keyframes: poses of moments between keyframes, and what an edge says about the keyframes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Attachment:
     """Where an edge's end is tied to the graph: a keyframe, and how the body has moved since.
 
     Attributes:
-        node: the keyframe's.
+        node: the keyframe's node.
         keyframe_from_body: the body's orientation in the keyframe's frame.
         position: of the body in the keyframe's frame, metres; NaN where the odometry carries none.
         at_keyframe: whether the end is one of the graph's keyframes, or at least between two of them.
@@ -38,7 +38,7 @@ def attach(
         reference: the end.
         graph: with the keyframes so far.
         track: the odometry of the end's robot, if there is any.
-        settle: no more odometry is expected for now: its last message stands for moments shortly after it.
+        settle: no more odometry is expected for now, so its last message stands for moments shortly after it.
 
     Raises:
         RejectedInputError: a stamp before the odometry's first or inside a gap of it, a robot without keyframes, or a
@@ -77,12 +77,12 @@ def attach(
 
 
 def _marginalized(reference: KeyframeReference, graph: GrowingViewGraph, time_line: int) -> Attachment | None:
-    """A keyframe that is no node any more, tied to the nearest one along the odometry that still is.
+    """A keyframe that is no longer a node, tied to the nearest one along the odometry that still is.
 
     Args:
-        reference: to it.
+        reference: to the keyframe.
         graph: that it was a node of.
-        time_line: number of the one that the reference's stamp is of, where it has no id.
+        time_line: number of the time line that the reference's stamp belongs to, where it has no id.
     """
     robot, keyframe_id = reference.robot, reference.keyframe_id
     found = graph.marginalized_keyframe(robot, keyframe_id, reference.stamp_ns, time_line)
@@ -94,7 +94,7 @@ def _marginalized(reference: KeyframeReference, graph: GrowingViewGraph, time_li
 
 
 def between_keyframes(edge: EdgeMeasurement, source: Attachment, target: Attachment) -> tuple[Quaternion, Vector]:
-    """What an edge between two moments says of the keyframes that they are tied to.
+    """What an edge between two moments says about the keyframes that they are tied to.
 
     Returns:
         target_from_source: ``R_kt R_ks⁻¹ = (R_kt R_t⁻¹) (R_t R_s⁻¹) (R_s R_ks⁻¹)`` for keyframes ks, kt, moments s, t.

@@ -25,12 +25,12 @@ class GraphBuilder:
     """Grows a graph from odometry and edges. Not thread-safe.
 
     The graph depends on the messages of each robot's odometry in their order and on the set of edges, not on how
-    they were interleaved: an edge by stamp waits until the odometry has come as far, and is then tied to the
-    keyframe at or before the stamp, with the odometry's rotation in between taken out. Only where a robot's clock
-    goes back does it matter what comes first, for then a stamp means the time line that has just begun.
+    they were interleaved. An edge by stamp waits until the odometry has reached the stamp, and is then tied to the
+    keyframe at or before it, with the odometry's motion in between taken out. Only where a robot's clock goes back
+    does the order matter, since from then on a stamp means the time line that has just begun.
 
     Attributes:
-        growth: what it has come to so far.
+        growth: the graph so far, and what is needed to grow it.
     """
 
     def __init__(self, growth: Growth) -> None:
@@ -62,8 +62,8 @@ class GraphBuilder:
         """Take an odometry message.
 
         Returns:
-            why it was refused and counted, None if it was taken; and the robot's messages since its clock went back,
-            if this one shows that it has.
+            why it was refused and counted, None if it was taken; and, if this message shows that the robot's clock has
+            gone back, its messages since then.
         """
         robot, growth = message.robot, self.growth
         track = self.tracks.get(robot)
@@ -85,7 +85,7 @@ class GraphBuilder:
         return None, []
 
     def _late(self, message: OdometryMessage, track: OdometryTrack) -> list[OdometryMessage]:
-        """Note a message that is out of order; returns those since the robot's clock went back, if that is clear."""
+        """Note an out-of-order message; returns the messages since the robot's clock went back, once that is clear."""
         options, jumps = self.options, self.growth.backward_jumps
         since_jump = jumps.late(message, track.samples.stamps_ns, options.time_jump_ns)
         if not since_jump or options.on_time_jump in KEEPS_TIME_LINE:
@@ -93,7 +93,7 @@ class GraphBuilder:
         return since_jump
 
     def begin_time_line(self, robot: str, num_late: int = 0) -> None:
-        """The robot's clock went back: stamps from now on are of a new time line, and its odometry of a new chain.
+        """The robot's clock went back: stamps now belong to a new time line, and its odometry to a new chain.
 
         Args:
             robot: with odometry.
@@ -129,11 +129,11 @@ class GraphBuilder:
         return self._edges.add(edge)
 
     def label_edge(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
-        """Label all edges a sender gave this id, waiting ones and later repetitions included; returns how many."""
+        """Label all edges with this sender's id, waiting ones and later repetitions included; returns how many."""
         return self._edges.label(source_robot, edge_id, label)
 
     def settle(self) -> None:
-        """No more input is expected for now: tie edges just ahead of the odometry to its end."""
+        """No more input is expected for now: tie edges slightly ahead of the odometry to its end."""
         for robot in self.tracks:
             self._edges.settle(robot)
 
@@ -158,7 +158,7 @@ class GraphBuilder:
         self._edges.place_all(self.growth.pending.pop_keyframe(robot, keyframe_id))
 
     def _is_anothers(self, robot: str, keyframe_id: int, moment: tuple[int, int]) -> bool:
-        """Whether a keyframe of another moment has this id: a front end may have chosen some before odometry did."""
+        """Whether a keyframe of another moment has this id; a front end may have used it before odometry did."""
         node = self.graph.node(robot, keyframe_id)
         if node is None:
             return self.graph.lies_on_an_edge(robot, keyframe_id)

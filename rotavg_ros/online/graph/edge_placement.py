@@ -1,4 +1,4 @@
-"""Edges into the graph: refused, tied to keyframes, or left to wait for what they refer to."""
+"""Places edges in the graph: each is refused, tied to keyframes, or left to wait for what it refers to."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class EdgePlacement:
 
         Args:
             edges: checked before.
-            settle: odometry's end stands for moments shortly after it.
+            settle: whether odometry's last message stands for moments shortly after it.
         """
         for edge in edges:
             try:
@@ -61,26 +61,26 @@ class EdgePlacement:
                 self._growth.refuse(rejection.reason)
 
     def decide(self, robot: str) -> None:
-        """Take the edges that waited to know which time line a robot is on, if that is known now."""
+        """Take the edges that waited until it was known which time line a robot is on, if it is known now."""
         if not self._growth.is_undecided(robot):
             for edge in self._growth.pending.pop_undecided(robot):
                 self.add(edge)
 
     def end_time_line(self, robot: str) -> None:
-        """No more odometry comes on a robot's time line: tie edges just ahead of its end to it, refuse the others."""
+        """No more odometry comes on a robot's time line: tie edges slightly ahead of its end to it, refuse the rest."""
         growth = self._growth
         self.settle(robot)
         growth.refuse(RejectReason.STAMP_OUT_OF_RANGE, len(growth.pending.pop_of_time_line(robot)))
 
     def settle(self, robot: str) -> None:
-        """No more odometry is expected for now: tie edges just ahead of its end to it."""
+        """No more odometry is expected for now: tie edges slightly ahead of its end to it."""
         growth, track = self._growth, self._growth.tracks[robot]
         if track.latest is not None and not track.begins_time_line:
             horizon_ns = track.latest.stamp_ns + growth.options.odometry_bounds.tolerance_ns
             self.place_all(growth.pending.pop_until(robot, horizon_ns), settle=True)
 
     def label(self, source_robot: str, edge_id: int, label: EdgeLabel) -> int:
-        """Label all edges a sender gave this id, waiting ones and later repetitions included; returns how many."""
+        """Label all edges with this sender's id, waiting ones and later repetitions included; returns how many."""
         growth = self._growth
         waiting = sum(edge.edge_id == edge_id and edge.source.robot == source_robot for edge in growth.pending)
         labelled = growth.graph.label_edges(source_robot, edge_id, label) if edge_id != OWN_EDGE_ID else 0
@@ -89,7 +89,7 @@ class EdgePlacement:
         return labelled + waiting
 
     def _undecided_end(self, edge: EdgeMeasurement) -> KeyframeReference | None:
-        """The first end whose stamp matters and may be of one of two time lines."""
+        """The first end whose stamp matters and may belong to either of two time lines."""
         growth = self._growth
         for end in (edge.source, edge.target):
             if end.stamp_ns is not None and growth.is_undecided(end.robot):
@@ -99,7 +99,7 @@ class EdgePlacement:
         return None
 
     def _fingerprint(self, edge: EdgeMeasurement) -> int:
-        """Of an edge to moments on their time lines: a looped bag states the same stamps, but of other keyframes."""
+        """Fingerprint of an edge and its time lines: a looped bag repeats the stamps, but means other keyframes."""
         source, target = (
             0 if end.keyframe_id is not None else self._growth.time_line_of(end.robot, end.stamp_ns)
             for end in (edge.source, edge.target)
@@ -107,7 +107,7 @@ class EdgePlacement:
         return edge.fingerprint((source, target))
 
     def _complete_stamps(self, edge: EdgeMeasurement) -> None:
-        """A repeated edge may say when a keyframe was taken where the first did not."""
+        """Take stamps from a repeated edge for keyframes whose stamps the first one did not give."""
         graph = self._growth.graph
         for end in (edge.source, edge.target):
             if end.keyframe_id is None or end.stamp_ns is None:
@@ -117,7 +117,7 @@ class EdgePlacement:
                 graph.add_keyframe(end.robot, end.keyframe_id, end.stamp_ns, time_line)
 
     def _create_keyframes(self, edge: EdgeMeasurement) -> None:
-        """Make the keyframes that the edge names, where edges may do so."""
+        """Create the keyframes that the edge names, where edges may do so."""
         growth = self._growth
         chosen_by_front_end = growth.options.keyframe_source == "edges" and edge.kind == EdgeKind.ODOMETRY
         for end in (edge.source, edge.target):

@@ -7,20 +7,20 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-# As Python objects they take ten times the room, so only the newest are.
+# Python objects take ten times the memory, so only the newest numbers are kept as such.
 _NEWEST = 4096
 
 
 class Fingerprints:
     """A set of 64-bit numbers that forgets the oldest.
 
-    It holds the newest ``capacity`` at least and twice as many at most.
+    It holds at least the newest ``capacity`` numbers and at most twice as many.
     """
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
         self._newest: set[int] = set()
-        # Ascending; when `_younger` is full it becomes `_older`, and what that held is forgotten.
+        # Ascending; when `_younger` is full it becomes `_older`, and the previous `_older` is forgotten.
         self._younger = self._older = np.empty(0, dtype=np.uint64)
 
     def __len__(self) -> int:
@@ -32,7 +32,7 @@ class Fingerprints:
     def add(self, number: int) -> None:
         self._newest.add(number)
         if len(self._newest) >= min(_NEWEST, self._capacity):
-            # Two ascending runs, which a stable sort only merges.
+            # Two ascending runs, which a stable sort merges quickly.
             runs = self._younger, np.sort(self._newest_as_array())
             self._younger = np.sort(np.concatenate(runs), kind="stable")
             self._newest = set()

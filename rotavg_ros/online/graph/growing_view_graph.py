@@ -1,4 +1,4 @@
-"""A view-graph that grows by appending; when it is compacted, some keyframes and edges go and the others move up."""
+"""A view-graph that grows by appending; compaction removes some keyframes and edges, and the others move up."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _EDGE_COLUMNS = {
     "route": (np.int64, None),
 }
 _SOLVED_COLUMNS = ("source", "target", "target_from_source", "kind", "precision", "label", "steps")
-# Of all keyframes, the share that are the robots' latest and stay whatever happens.
+# Share of all keyframes that are protected from compaction as the robots' latest.
 _LATEST_SHARE = 0.1
 
 
@@ -63,7 +63,7 @@ class GrowingViewGraph:
         return len(self._edge["edge_id"])
 
     def add_keyframe(self, robot: str, keyframe_id: int, stamp_ns: int = UNKNOWN_STAMP_NS, time_line: int = 0) -> int:
-        """Append a keyframe, or find it and complete its moment, a stamp on a time line; returns its node."""
+        """Append a keyframe, or find it and add a missing moment (a stamp on a time line); returns its node."""
         robot_index = self._index_of_robot(robot)
         index = self._index[robot_index]
         node = index.node(keyframe_id)
@@ -108,7 +108,7 @@ class GrowingViewGraph:
         return self.robots[int(self._keyframe["robot"].view[node])]
 
     def moment_of(self, node: int) -> tuple[int, int]:
-        """Nanoseconds, or -1, and the number of the time line."""
+        """Stamp in nanoseconds, -1 where unknown, and number of the time line."""
         return int(self._keyframe["stamp_ns"].view[node]), int(self._keyframe["time_line"].view[node])
 
     def keyframe_at_or_before(self, robot: str, stamp_ns: int, time_line: int) -> int | None:
@@ -127,7 +127,7 @@ class GrowingViewGraph:
         return iter(()) if index is None else index.newest_first(time_line, first_ns, last_ns)
 
     def moments(self, robot: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Stamps and time lines of the robot's nodes with a stamp, in the order of the moments."""
+        """Stamps and time lines of the robot's nodes with a stamp, in order of their moments."""
         return (KeyframeIndex() if (index := self._index_of(robot)) is None else index).moments
 
     def marginalized_keyframe(
@@ -150,7 +150,7 @@ class GrowingViewGraph:
         return int(self._edge["source" if at_source else "target"].view[edge]), (qx, qy, qz, qw), (x, y, z)
 
     def lies_on_an_edge(self, robot: str, keyframe_id: int) -> bool:
-        """Whether it is a marginalised keyframe of which it is known where it was."""
+        """Whether it is a marginalised keyframe whose pose is still known."""
         return self._marginalized_row(robot, keyframe_id) is not None
 
     def was_marginalized(self, robot: str, keyframe_id: int) -> bool:
@@ -167,13 +167,13 @@ class GrowingViewGraph:
         max_marginalized: int,
         needed: Sequence[int],
     ) -> Renumbering | None:
-        """Do without so many keyframes and edges, as :func:`thin` chooses them; None if nothing can be spared.
+        """Remove keyframes and edges that :func:`thin` chooses; None if nothing can be spared.
 
         Args:
-            surplus_keyframes, surplus_edges: how many.
-            is_false: edges judged to be outliers, of the first M' ≤ M.
-            max_marginalized: keyframes beyond it that were marginalised are forgotten.
-            needed: nodes that stay, beside the robots' latest.
+            surplus_keyframes, surplus_edges: how many to remove.
+            is_false: which of the first M' ≤ M edges are judged to be outliers.
+            max_marginalized: number of marginalised keyframes whose poses are remembered.
+            needed: nodes that stay, besides the robots' latest.
         """
         keyframes: Columns = {name: column.view for name, column in self._keyframe.items()}
         edges: Columns = {name: column.view for name, column in self._edge.items()}
@@ -204,7 +204,7 @@ class GrowingViewGraph:
         return Renumbering(contraction.kept, edge_of, stays[contraction.last], int(thinning.edges.sum()))
 
     def snapshot(self) -> GraphSnapshot:
-        """The graph now. Only the labels and moments, which alone can change later, are copied."""
+        """The present graph. Only labels and moments are copied, since nothing else can change later."""
         columns = {name: self._edge[name].view for name in _SOLVED_COLUMNS}
         columns["label"] = columns["label"].copy()
         columns["translation"] = self._edge["translation"].view

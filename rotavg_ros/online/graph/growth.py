@@ -1,4 +1,4 @@
-"""What a growing graph has come to so far: everything that decides how it grows on."""
+"""A growing graph and everything that decides how it goes on growing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rotavg_ros.online.odometry.time_jumps import BackwardJumps
 from rotavg_ros.online.odometry.track import OdometryTrack
 from rotavg_ros.online.options import EstimatorOptions
 
-# Where nobody asks what was given up, the oldest are forgotten: some tens of megabytes.
+# Edges remembered as given up, some tens of megabytes; beyond, the oldest are forgotten.
 _MOST_GIVEN_UP = 100_000
 
 
@@ -24,19 +24,19 @@ class Growth:
     """The growing graph and its surroundings; a state file holds all of it but the options and what was given up.
 
     Attributes:
-        options: that apply from now on.
-        answer: what has been answered about the graph so far.
+        options: those that apply from now on.
+        answer: what the last answer says about the graph.
         pending: edges that wait for a keyframe or for odometry.
         fingerprints: of the edges in the graph and of the latest of those that were in it.
         graph: the graph.
         tracks: odometry per robot.
-        backward_jumps: late odometry, as long as it may show that time went back.
+        backward_jumps: late odometry messages, as long as they may show that time went back.
         rejected: how many inputs were refused, by :class:`RejectReason`.
         labels: the users' verdicts, by source robot and edge id.
         room: what was taken out of a full graph.
         data_time: newest stamp of odometry or of keyframes.
-        given_up: ends of edges between keyframes by id that were refused for want of room or of time, since somebody
-            asked.
+        given_up: ends of edges between keyframes by id that were refused for lack of room or time since the last
+            request for them.
     """
 
     options: EstimatorOptions
@@ -74,13 +74,13 @@ class Growth:
         return self.refuse(reason)
 
     def has_room_for_keyframe(self) -> bool:
-        """Whether one may come, if need be after others have gone."""
+        """Whether one more may be added; if the graph is full, room is made first."""
         if self.graph.num_keyframes >= self.options.max_keyframes:
             self._make_room()
         return self.graph.num_keyframes < self.options.max_keyframes
 
     def has_room_for_edge(self) -> bool:
-        """Whether one may come, if need be after others have gone."""
+        """Whether one more may be added; if the graph is full, room is made first."""
         if self.graph.num_edges >= self.options.most_edges:
             self._make_room()
         return self.graph.num_edges < self.options.most_edges
@@ -102,12 +102,12 @@ class Growth:
         return 0 if track is None or stamp_ns is None else track.time_line_of(stamp_ns)
 
     def is_undecided(self, robot: str) -> bool:
-        """Whether it is open which time line of a robot a stamp that comes now is of."""
+        """Whether it is unclear to which time line of a robot a stamp that comes now belongs."""
         track = self.tracks.get(robot)
         return self.backward_jumps.is_undecided(robot) or (track is not None and track.begins_time_line)
 
     def advance_data_time(self, stamp_ns: int) -> None:
-        """Let what has waited for too long go."""
+        """Advance the data's time and give up edges that have waited too long."""
         now_ns = self.data_time.advance(stamp_ns, self.options.continuity_limits.lead_ns)
         if now_ns is not None:
             for edge in self.pending.pop_expired(now_ns):

@@ -1,4 +1,4 @@
-"""From keys and moments to nodes: which keyframe is meant."""
+"""Finds nodes by keyframe id and by moment."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class KeyframeIndex:
 
     def __init__(self) -> None:
         self._node_of_id: dict[int, int] = {}
-        # In ascending order of the time lines, then of the stamps, then of the nodes.
+        # In ascending order of time line, then stamp, then node.
         self._time_line = GrowingArray(np.int64)
         self._stamp_ns = GrowingArray(np.int64)
         self._node = GrowingArray(np.int64)
@@ -75,7 +75,7 @@ class KeyframeIndex:
 
     @property
     def moments(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Stamps and time lines, in the order of the moments."""
+        """Stamps and time lines, in order of the moments."""
         return self._stamp_ns.view, self._time_line.view
 
     def _rows_of(self, time_line: int) -> tuple[int, int]:

@@ -17,8 +17,8 @@ class Waiting:
     Attributes:
         edge: the edge.
         waits_for: the end that is not there yet.
-        since_ns: in data time; None while no data time is known.
-        is_undecided: whether it waits to know which time line the end's stamp is of.
+        since_ns: start of the wait in data time; None while no data time is known.
+        is_undecided: whether it waits until it is known to which time line the end's stamp belongs.
     """
 
     edge: EdgeMeasurement
@@ -28,12 +28,12 @@ class Waiting:
 
 
 class PendingEdges:
-    """Each waiting edge waits for one of its ends. When there are more than ``capacity`` the oldest has to go.
+    """Each waiting edge waits for one of its ends. When there are more than ``capacity``, the oldest is removed.
 
-    Undecided ones wait until it is known which time line of a robot their stamps are of.
+    Undecided ones wait until it is known to which time line of a robot their stamps belong.
 
     Attributes:
-        by_robot: how many wait for each robot.
+        by_robot: number of edges that wait for each robot.
     """
 
     def __init__(self, capacity: int, timeout_ns: int) -> None:
@@ -58,7 +58,7 @@ class PendingEdges:
         return (waiting.edge for waiting in self._waiting.values())
 
     def longest(self, data_time_ns: int | None) -> tuple[KeyframeReference, int] | None:
-        """What the first edge to come waits for, and for how many nanoseconds of data time; None if none waits."""
+        """What the oldest edge waits for, and for how many nanoseconds of data time; None if none waits."""
         first = next(iter(self._waiting.values()), None)
         if first is None:
             return None
@@ -73,7 +73,7 @@ class PendingEdges:
         data_time_ns: int | None,
         is_undecided: bool = False,
     ) -> EdgeMeasurement | None:
-        """Let an edge wait for one of its ends; returns the edge that had to go for it, if any."""
+        """Let an edge wait for one of its ends; returns the edge removed to make room for it, if any."""
         evicted = None
         if len(self._waiting) >= self._capacity:
             evicted = self._remove(next(iter(self._waiting)))
@@ -94,24 +94,24 @@ class PendingEdges:
             insort(self._by_stamp.setdefault(reference.robot, []), (_stamp(reference), self._serial))
 
     def pop_undecided(self, robot: str) -> list[EdgeMeasurement]:
-        """Take out what has waited for a decision about a robot's time line."""
+        """Take out the edges that have waited for a decision about a robot's time line."""
         return [self._remove(serial) for serial in list(self._undecided.get(robot, ()))]
 
     def pop_of_time_line(self, robot: str) -> list[EdgeMeasurement]:
-        """Take out what waits for a moment of a robot on a time line that has come to its end."""
+        """Take out the edges that wait for a moment of a robot on a time line that has ended."""
         return self.pop_until(robot, MAX_STAMP_NS)
 
     def restart_timeouts(self) -> None:
-        """Data time has changed: whatever waits has only begun to."""
+        """Data time has changed: the timeouts of all waiting edges start again."""
         for waiting in self._waiting.values():
             waiting.since_ns = None
 
     def pop_keyframe(self, robot: str, keyframe_id: int) -> list[EdgeMeasurement]:
-        """Take out what waits for a keyframe."""
+        """Take out the edges that wait for a keyframe."""
         return [self._remove(serial) for serial in list(self._by_keyframe.get((robot, keyframe_id), ()))]
 
     def pop_until(self, robot: str, stamp_ns: int) -> list[EdgeMeasurement]:
-        """Take out what waits for a moment of a robot not later than the stamp."""
+        """Take out the edges that wait for a moment of a robot not later than the stamp."""
         stamps = self._by_stamp.get(robot)
         if not stamps or stamps[0][0] > stamp_ns:
             return []
@@ -119,7 +119,7 @@ class PendingEdges:
         return [self._remove(serial) for _, serial in ready]
 
     def pop_expired(self, data_time_ns: int) -> list[EdgeMeasurement]:
-        """Take out what has waited for longer than the timeout in data time."""
+        """Take out the edges that have waited for longer than the timeout in data time."""
         expired = []
         for serial, waiting in self._waiting.items():
             if waiting.since_ns is None:
@@ -154,11 +154,11 @@ class PendingEdges:
         return waiting.edge
 
     def waiting(self) -> list[Waiting]:
-        """What waits, in order of arrival; it stays as it is."""
+        """Copies of what waits, in order of arrival."""
         return [replace(waiting) for waiting in self._waiting.values()]
 
     def take(self, waiting: Iterable[Waiting]) -> None:
-        """Let wait again what :meth:`waiting` returned."""
+        """Let the edges that :meth:`waiting` returned wait again."""
         for each in waiting:
             self._add(each)
 

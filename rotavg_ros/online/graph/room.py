@@ -1,4 +1,4 @@
-"""Room in the graph for another keyframe or edge: where it is full, what can be spared goes."""
+"""Makes room in a full graph for another keyframe or edge by taking out what can be spared."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from numpy.typing import NDArray
 from rotavg_ros.online.compaction.renumbering import Renumbering
 from rotavg_ros.online.graph.growing_view_graph import GrowingViewGraph
 
-# How full a full graph is after keyframes or closures have been taken out of it: the cost of doing so, which grows
-# with the graph, is shared by all that come until it is full again.
+# Share of the limit that a full graph is reduced to. The cost of doing so, which grows with the graph, is thus spread
+# over all keyframes or edges that come until it is full again.
 _FILL = 0.9
-# If less than this share of the limit could be spared, it is not tried again before a tenth of it has come.
+# If less than this share of the limit could be spared, the next attempt waits for a tenth of the limit of changes.
 _WORTHWHILE = 0.01
-# Of how many marginalised keyframes it stays known where they were: so many limits of keyframes, or a few megabytes.
+# Positions of up to 4 x max_keyframes marginalised keyframes are remembered, and at least of 50 000 (a few megabytes).
 _REMEMBERED = 4
 _REMEMBERED_AT_LEAST = 50_000
 
 
 class GraphsAnswer(Protocol):
-    """What has been answered about the graph so far, in the graph's numbers."""
+    """What has been answered about the graph so far, in the graph's numbering."""
 
     @property
     def outlier(self) -> NDArray[np.bool_]:
-        """Flags ``(m,)`` of the first edges."""
+        """Flags ``(m,)`` of the first m edges."""
 
     def renumber(self, renumbering: Renumbering) -> None:
-        """Follow the graph."""
+        """Follow a compaction of the graph."""
 
 
 @dataclass
@@ -38,8 +38,8 @@ class Room:
     """Compacts a graph that is full.
 
     Attributes:
-        marginalized, dropped_closures: how many keyframes and closures were taken out so far.
-        compact_from_revision: of the graph, for keyframes and for edges; before it nothing more can be spared.
+        marginalized, dropped_closures: numbers of keyframes and closures taken out so far.
+        compact_from_revision: graph revision from which the next attempt is made, for keyframes and for edges.
     """
 
     marginalized: int = 0
@@ -47,23 +47,23 @@ class Room:
     compact_from_revision: list[int] = field(default_factory=lambda: [0, 0])
 
     def is_full(self, graph: GrowingViewGraph, max_keyframes: int) -> bool:
-        """Whether there may be no more keyframes, though whatever can be spared has been taken out."""
+        """Whether no keyframe can be added, even after everything that can be spared has been taken out."""
         return graph.num_keyframes >= max_keyframes and graph.revision < self.compact_from_revision[0]
 
     def try_again(self) -> None:
-        """The limits have changed."""
+        """Attempt again from now on, since the limits have changed."""
         self.compact_from_revision = [0, 0]
 
     def make(
         self, graph: GrowingViewGraph, max_keyframes: int, max_edges: int, answer: GraphsAnswer, needed: Sequence[int]
     ) -> bool:
-        """Take keyframes and closures that can be spared out of a full graph; whether there were any.
+        """Take keyframes and closures that can be spared out of a full graph; returns whether there were any.
 
         Args:
-            graph: perhaps full.
-            max_keyframes, max_edges: what it may have.
-            answer: to it.
-            needed: nodes that cannot be spared, whatever their place among the robots' keyframes.
+            graph: the graph, full or not.
+            max_keyframes, max_edges: its limits.
+            answer: the answer about it.
+            needed: nodes that cannot be spared, wherever they are among the robots' keyframes.
         """
         sizes, limits = (graph.num_keyframes, graph.num_edges), (max_keyframes, max_edges)
         surplus = [

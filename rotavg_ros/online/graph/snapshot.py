@@ -22,11 +22,11 @@ class GraphEdge:
         source, target: nodes.
         target_from_source: xyzw, of unit length.
         kind, label: :class:`EdgeKind` and :class:`EdgeLabel` values.
-        edge_id: the sender's; default: of an edge that the estimator itself makes.
+        edge_id: the sender's; default: the id of edges that the estimator itself makes.
         precision: rad⁻², NaN unknown.
         translation: of the target in the source's frame, metres; NaN unknown.
-        steps: odometry steps that it stands for.
-        route: row of the graph's routes; -1 of a single one.
+        steps: number of odometry steps that it stands for.
+        route: row in the graph's routes; -1: none.
     """
 
     source: int
@@ -51,10 +51,10 @@ class GraphSnapshot:
         keyframe_robot: ``(N,)`` int32 index into ``robots``.
         keyframe_id: ``(N,)`` uint64.
         stamp_ns: ``(N,)`` int64, -1 where unknown.
-        time_line: ``(N,)`` int64, which of its robot's time lines the stamp is of, from 0.
+        time_line: ``(N,)`` int64, which of its robot's time lines the stamp belongs to, from 0.
         edge_id: ``(M,)`` uint64, the senders' ids.
         translation: ``(M, 3)`` position of the edge's target in its source's frame, metres; NaN unknown.
-        marginalized: keyframes that the edges have swallowed.
+        marginalized: keyframes that were marginalised and now lie on edges.
         revision: of the growing graph.
     """
 

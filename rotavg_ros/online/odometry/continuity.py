@@ -1,4 +1,4 @@
-"""Whether an odometry message goes on from the one before: stamps far ahead, jumps, and odometry that begins anew."""
+"""Whether an odometry message continues the one before: stamps far ahead, jumps, and odometry that begins anew."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from rotavg_ros.online import quaternion
 from rotavg_ros.online.measurements import RejectedInputError, RejectReason
 from rotavg_ros.online.quaternion import UNKNOWN_VECTOR, Quaternion, Vector
 
-# Within a shorter time than this, stamps and rotations are too noisy for a rate to mean anything.
+# Over a shorter time than this, stamps and rotations are too noisy for a rate to mean anything.
 _SHORTEST_S = 0.2
-# A pose this near to zero is where odometry begins, and one this near to another is the same …
+# A pose this near to zero counts as the start of odometry, and one this near to another as the same pose …
 _ZERO_ANGLE = math.radians(1.0)
 _ZERO_DISTANCE_M = 0.1
-# … and an odometry that has begun anew, if going on would have led this far from there.
+# … and odometry at zero counts as begun anew if its last motion, continued, would have led farther away than this.
 _RETURN_ANGLE = math.radians(20.0)
 _RETURN_DISTANCE_M = 1.0
-# Going on is at any of these shares of the last speed: a robot may brake, or stand where it has come home to.
+# The last motion is continued at each of these shares of its speed: a robot may brake, or stop where it started.
 _SHARES_OF_SPEED = (0.0, 0.5, 1.0)
 
 
@@ -36,12 +36,12 @@ class OdometrySample:
 
 @dataclass(frozen=True)
 class ContinuityLimits:
-    """What odometry is believed to do between two messages; infinite: anything.
+    """The largest believable change between two odometry messages; infinite: no limit.
 
     Attributes:
         turn_rate: rad/s.
-        speed: m/s; counts only while the odometry carries positions.
-        lead_ns: a stamp farther ahead of the last than this has to be confirmed.
+        speed: m/s; applies only while the odometry carries positions.
+        lead_ns: a stamp farther ahead of the last than this has to be confirmed by the next.
     """
 
     turn_rate: float = math.inf
@@ -53,10 +53,10 @@ ANY_MOTION = ContinuityLimits()
 
 
 class ContinuityCheck:
-    """Refuses a message that does not go on from the last one, until the next one sides with it.
+    """Refuses a message that does not continue the last one, until the next one confirms it.
 
-    So a single message with a stamp years ahead or a wild pose is one refusal, while a source that paused, or began
-    anew, loses one message. All decisions are made from messages alone, so that a bag is judged as the robot was.
+    So a single message with a stamp years ahead or a wild pose is refused, and a source that paused or began anew
+    loses one message. All decisions depend on messages alone, so a bag is judged as the robot was.
     """
 
     def __init__(self, limits: ContinuityLimits) -> None:
@@ -65,17 +65,17 @@ class ContinuityCheck:
         self._refused_jumps = False
 
     def admit(self, sample: OdometrySample, last: OdometrySample, before: OdometrySample | None) -> bool:
-        """Judge a message, stamped after the last one that was admitted.
+        """Judge a message that is stamped after the last one admitted.
 
         Args:
             sample: the message.
             last, before: the last admitted message of the same chain, and the one before it, if any.
 
         Returns:
-            whether the odometry has begun anew, so that nothing is known of the rotation since ``last``.
+            whether the odometry has begun anew, so that the rotation since ``last`` is unknown.
 
         Raises:
-            RejectedInputError: the message stands alone so far.
+            RejectedInputError: no other message confirms this one yet.
         """
         return self._judge(sample, last, before, after_break=False)
 
@@ -103,11 +103,11 @@ class ContinuityCheck:
         return after_break and not goes_on(sample, last, self.limits)
 
     def forget(self) -> None:
-        """What was refused has nothing to do with what comes next."""
+        """Forget the refused message, which is unrelated to what comes next."""
         self._refused = None
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What was refused last, for :meth:`from_arrays`: a row of stamp, rotation and position, or none."""
+        """The message refused last, for :meth:`from_arrays`: a row of stamp, rotation and position, or none."""
         refused = [] if self._refused is None else [self._refused]
         return {
             "refused_stamp_ns": np.array([sample.stamp_ns for sample in refused], dtype=np.int64),
@@ -136,7 +136,7 @@ def has_jumped(
         sample: the message.
         last: the message before it.
         before: the message before that, if any.
-        limits: with an infinite turn rate, odometry that begins anew is not looked out for either.
+        limits: with an infinite turn rate, odometry that begins anew is not detected either.
     """
     seconds = max(1e-9 * (sample.stamp_ns - last.stamp_ns), _SHORTEST_S)
     angle, metres = _angle_and_metres(last, sample)
@@ -152,7 +152,7 @@ def has_jumped(
 
 
 def goes_on(sample: OdometrySample, last: OdometrySample, limits: ContinuityLimits) -> bool:
-    """Whether odometry that nobody watched in between is nearer to where it was last than to where it would begin.
+    """Whether odometry, unobserved in between, is nearer to its last pose than to zero, where it would begin.
 
     Args:
         sample: the message.
@@ -163,7 +163,7 @@ def goes_on(sample: OdometrySample, last: OdometrySample, limits: ContinuityLimi
 
 
 def stands_still(sample: OdometrySample, last: OdometrySample) -> bool:
-    """Whether a message tells the very pose of the last one, at which no odometry begins."""
+    """Whether a message repeats the last pose, and that pose is not one at which odometry begins."""
     angle, metres = _angle_and_metres(last, sample)
     return angle < _ZERO_ANGLE and metres < _ZERO_DISTANCE_M and _distance(_beginning(sample), sample) > 1
 
@@ -180,7 +180,7 @@ def _angle_and_metres(first: OdometrySample, second: OdometrySample) -> tuple[fl
 
 
 def _distance(first: OdometrySample, second: OdometrySample) -> float:
-    """How far apart two poses are, in units of what tells a return to zero."""
+    """How far apart two poses are, in units of :data:`_RETURN_ANGLE` and :data:`_RETURN_DISTANCE_M`."""
     angle, metres = _angle_and_metres(first, second)
     return angle / _RETURN_ANGLE + metres / _RETURN_DISTANCE_M
 
@@ -191,7 +191,7 @@ def _is_zero(sample: OdometrySample) -> bool:
 
 
 def _going_on(last: OdometrySample, before: OdometrySample, stamp_ns: int, share: float) -> OdometrySample:
-    """Where a share of the last two messages' speed leads at a stamp, not farther than as far as they are apart."""
+    """The pose at a stamp, at a share of the last two messages' speed and at most one more such step away."""
     steps = share * min(1.0, (stamp_ns - last.stamp_ns) / (last.stamp_ns - before.stamp_ns))
     turn = quaternion.multiply(quaternion.inverse(before.world_from_body), last.world_from_body)
     rotation = quaternion.multiply(last.world_from_body, quaternion.slerp(quaternion.IDENTITY, turn, steps))

@@ -1,4 +1,4 @@
-"""The newest moment that the data speaks of, told from its stamps; nothing reads a clock."""
+"""The newest moment in the data, known from its stamps; no clock is read."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass
 class DataTime:
-    """A stamp far ahead counts only when a second one says so.
+    """The data's time. A stamp far ahead counts only when a second one confirms it.
 
     Attributes:
         now_ns: newest stamp; None before the first, and again after time went back.
@@ -18,7 +18,7 @@ class DataTime:
     claimed_ns: int | None = None
 
     def advance(self, stamp_ns: int, lead_ns: float) -> int | None:
-        """Take a stamp; returns the time now if the stamp counts, however old it is."""
+        """Take a stamp; returns the present time if the stamp counts, however old it is, else None."""
         if self.now_ns is not None and stamp_ns - self.now_ns > lead_ns:
             claimed_ns, self.claimed_ns = self.claimed_ns, stamp_ns
             if claimed_ns is None or not 0 <= stamp_ns - claimed_ns <= lead_ns:

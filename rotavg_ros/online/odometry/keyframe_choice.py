@@ -13,7 +13,7 @@ class KeyframePolicy:
 
     Attributes:
         angle: radians.
-        distance: metres; counts only while the odometry carries positions.
+        distance: metres; applies only while the odometry carries positions.
         interval_ns: nanoseconds.
     """
 

@@ -1,4 +1,4 @@
-"""A robot's odometry messages as they were taken, and where the body was at any moment among them."""
+"""A robot's odometry messages as they were taken, and the body's pose at any moment between them."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _COLUMNS = ("stamp_ns", "world_from_body", "position", "is_keyframe", "chain", "
 
 @dataclass(frozen=True)
 class OdometryBounds:
-    """How far the odometry may be stretched when a moment between its messages is asked for.
+    """How far odometry may be extended or interpolated for a moment between its messages, and how much is kept.
 
     Attributes:
         tolerance_ns: a stamp this far before the first or after the last message takes that message's rotation.
-        max_gap_ns: between two messages farther apart than this nothing is interpolated.
-        max_samples: beyond it, the older half gives up every second message that is not a keyframe.
+        max_gap_ns: there is no interpolation between two messages farther apart than this.
+        max_samples: beyond it, every second message of the older half that is not a keyframe is removed.
     """
 
     tolerance_ns: int
@@ -37,9 +37,9 @@ class OdometryBounds:
 class OdometrySamples:
     """Messages in the order in which they were taken, in chains and time lines.
 
-    Between two chains nothing is known of the body's rotation. Stamps ascend within a time line; where the robot's
-    clock went back, a new time line begins and a new chain with it. So a stamp means a moment only together with the
-    number of its time line; where that is left out, the present one is meant.
+    Between two chains the body's rotation is unknown. Stamps ascend within a time line; where the robot's clock went
+    back, a new time line begins and a new chain with it. So a stamp defines a moment only together with the number of
+    its time line; if that is left out, the present one is meant.
 
     Attributes:
         bounds: see :class:`OdometryBounds`.
@@ -52,7 +52,7 @@ class OdometrySamples:
         self._world_from_body = GrowingArray(np.float64, 4)
         self._position = GrowingArray(np.float64, 3)
         self._is_keyframe = GrowingArray(np.bool_)
-        # As wide as what is looked up in them: a search would copy narrower columns whole.
+        # As wide as the values looked up in them: a search would copy narrower columns whole.
         self._chain = GrowingArray(np.int64)
         self._time_line = GrowingArray(np.int64)
 
@@ -71,18 +71,18 @@ class OdometrySamples:
         self._time_line.append(time_line)
 
     def frozen(self) -> OdometrySamples:
-        """The messages so far, to be read while others come and old ones are thinned out; not to be added to."""
+        """A read-only copy of the messages so far, safe to read while others come and old ones are thinned out."""
         frozen = copy.copy(self)
         for name in _COLUMNS:
             setattr(frozen, f"_{name}", copy.copy(getattr(self, f"_{name}")))
         return frozen
 
     def mark_keyframe(self) -> None:
-        """Let the last message never be thinned out."""
+        """Mark the last message, so that it is never thinned out."""
         self._is_keyframe.view[-1] = True
 
     def release_keyframes(self, kept_stamps_ns: NDArray[np.int64], kept_time_lines: NDArray[np.int64]) -> None:
-        """Where keyframes take up most of the room, let those be thinned out that are none of these ``(K,)``."""
+        """If keyframes take up most of the room, allow thinning of all but these ``(K,)``."""
         if np.count_nonzero(self._is_keyframe.view) > self.bounds.max_samples // 2:
             rows = self._rows_from(kept_stamps_ns, kept_time_lines)
             kept = np.zeros(len(self), dtype=bool)
@@ -102,7 +102,7 @@ class OdometrySamples:
         )
 
     def reach(self) -> tuple[int, int]:
-        """First and last stamp at which the last message's chain tells of the body, gaps apart. There must be one.
+        """First and last stamp that the last message's chain covers, apart from gaps. There must be a message.
 
         The tolerance is included, but not towards another chain of the same time line.
         """
@@ -118,7 +118,7 @@ class OdometrySamples:
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
-        """Of the messages ``(n,)`` in the order in which they were taken, not copied."""
+        """Stamps of the messages ``(n,)`` in the order in which they were taken, not copied."""
         return self._stamp_ns.view
 
     @property
@@ -132,8 +132,8 @@ class OdometrySamples:
     def time_line_of(self, stamp_ns: int, lead_ns: float) -> int:
         """Number of the time line that a stamp from outside means. There must be a message.
 
-        It is the present one, from its first message on to ``lead_ns`` after its last; for any other stamp the latest
-        that has messages on both sides of it, or the present one where there is none.
+        It is the present one from its first message until ``lead_ns`` after its last. For any other stamp it is the
+        latest time line with messages on both sides of it, or the present one if there is none.
         """
         present, tolerance_ns = self.last_time_line, self.bounds.tolerance_ns
         if present == 0:
@@ -147,7 +147,7 @@ class OdometrySamples:
         return int(covering[-1]) if len(covering) else present
 
     def world_from_body_at(self, stamp_ns: int, time_line: int | None = None) -> Quaternion:
-        """The odometry's rotation at a moment: interpolated between two messages, clamped just outside of them.
+        """The odometry's rotation at a moment: interpolated between two messages, clamped just outside them.
 
         Raises:
             RejectedInputError: the stamp is outside the odometry by more than the tolerance, or inside a gap, which
@@ -217,7 +217,7 @@ class OdometrySamples:
         return quaternion.inverse(self._rotation(0))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The messages as arrays, for :meth:`from_arrays`; what may change later is copied."""
+        """The messages as arrays, for :meth:`from_arrays`; columns that may change later are copied."""
         columns = {name: getattr(self, f"_{name}").view for name in _COLUMNS}
         columns["is_keyframe"] = columns["is_keyframe"].copy()
         return columns | {"limit": np.array(self._limit)}
@@ -232,7 +232,7 @@ class OdometrySamples:
         return samples
 
     def _rows_of(self, time_line: int | None) -> slice:
-        """Where a time line's messages are; there must be one."""
+        """Rows of a time line's messages; there must be one."""
         column = self._time_line.view
         if column[-1] == 0:
             return slice(0, len(column))
@@ -264,5 +264,5 @@ class OdometrySamples:
         for name in _COLUMNS:
             column = getattr(self, f"_{name}")
             column.replace(column.view[keep])
-        # Where keyframes fill the room the limit yields; a quarter of it at least lies between two thinnings.
+        # If keyframes fill the room, the limit is raised; at least a quarter of it comes between two thinnings.
         self._limit = max(self.bounds.max_samples, int(keep.sum()) + self.bounds.max_samples // 4 + 1)

@@ -1,4 +1,4 @@
-"""A clock that went back (a bag that begins again, a simulation that restarts), told from messages that come late."""
+"""Detects a clock that went back (a bag that begins again, a simulation that restarts) from late messages."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 
 from rotavg_ros.online.measurements import OdometryMessage
 
-# So many messages in a row must agree before the past is believed: stray ones, however old, change nothing.
+# Number of messages in a row that must agree before a jump is believed: stray ones, however old, change nothing.
 _RUN_LENGTH = 5
-# They follow each other if no step among them is longer than so many of the robot's own: 5 s at 10 Hz. With fewer a
-# pause in the wrong moment costs the messages before it; stray stamps lie so much farther apart that more would do.
+# They count as consecutive if no step among them exceeds this many of the robot's usual steps: 5 s at 10 Hz. With fewer,
+# a pause at the wrong moment loses the messages before it; stray stamps lie so far apart that more would work as well.
 _LONGEST_STEP = 50.0
-# The robot's own step is exceeded by a tenth of its latest: a few pauses do not count, and the pauses between messages
-# that come in bursts do. Of that many messages.
+# The robot's usual step is the 0.9 quantile of its steps, so that a few pauses do not count, but the pauses between
+# bursts of messages do. The quantile is taken over this many of the latest messages.
 RECENT = 100
 _USUAL = 0.9
 
 POLICIES = ("new_component", "reset", "ignore", "error")
-# With these a robot's stamps mean what they did before, whatever its clock says.
+# With these policies no new time line begins, so a robot's stamps keep their meaning whatever its clock says.
 KEEPS_TIME_LINE = ("ignore", "error")
 
 
@@ -36,13 +36,13 @@ class BackwardJumps:
         """Note a message that was refused as out of order.
 
         Args:
-            message: what was refused.
-            taken_ns: ``(n,)`` stamps of its robot's messages that were taken, the newest last, of the latest
-                :data:`RECENT` or more; at least one.
-            threshold_ns: going back by no more than this is no jump.
+            message: the refused message.
+            taken_ns: ``(n,)`` stamps of its robot's accepted messages, the newest last: the latest :data:`RECENT` or
+                more if there are as many; at least one.
+            threshold_ns: going back by no more than this is not a jump.
 
         Returns:
-            the messages since the jump, in their order, once per jump; empty as long as there is no telling.
+            the messages since the jump, in order, once per jump; empty as long as it is not certain.
         """
         run = self._runs.setdefault(message.robot, [])
         if run and not 0 < message.stamp_ns - run[-1].stamp_ns <= _longest_step_ns(taken_ns[-RECENT:]):
@@ -55,16 +55,16 @@ class BackwardJumps:
         return self._runs.pop(message.robot)
 
     def on_time(self, robot: str) -> None:
-        """Note a message that came in order: time runs on as before."""
+        """Note a message that came in order: time goes on as before."""
         self._runs.pop(robot, None)
         self._told.discard(robot)
 
     def is_undecided(self, robot: str) -> bool:
-        """Whether late messages that follow each other have come, but too few to believe that time went back."""
+        """Whether consecutive late messages have come, but too few to believe that time went back."""
         return len(self._runs.get(robot, ())) >= 2
 
     def header(self) -> dict[str, Any]:
-        """Everything, as JSON can say it, for :meth:`from_header`."""
+        """Everything in a form that JSON can represent, for :meth:`from_header`."""
         runs = {
             robot: [
                 [message.stamp_ns, list(map(float, message.world_from_body)), message.position and [*message.position]]
@@ -84,12 +84,12 @@ class BackwardJumps:
 
     @property
     def is_back(self) -> bool:
-        """Whether a robot's messages have come from before a jump ever since."""
+        """Whether a robot's clock went back and its messages have been late ever since."""
         return bool(self._told)
 
 
 def _longest_step_ns(taken_ns: NDArray[np.int64]) -> float:
-    """Late messages of a robot with these stamps ``(n,)`` that lie farther apart do not belong together."""
+    """Longest step between consecutive late messages of a robot whose accepted messages have these stamps ``(n,)``."""
     steps = np.diff(taken_ns)
-    steps = steps[steps > 0]  # where time went back before, there is a step back
+    steps = steps[steps > 0]  # steps are negative where time went back before
     return _LONGEST_STEP * float(np.quantile(steps, _USUAL)) if len(steps) else math.inf

@@ -1,4 +1,4 @@
-"""A robot's odometry: which messages go on from the last, and which become keyframes."""
+"""A robot's odometry: which messages continue the last one, and which become keyframes."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from rotavg_ros.online.quaternion import Quaternion
 
 
 class OdometryTrack:
-    """The odometry of one robot, in chains between which nothing is known of the body's rotation.
+    """The odometry of one robot, in chains between which the body's rotation is unknown.
 
-    A new chain begins where the odometry began anew, where the robot's clock went back, and where a track that was
-    restored from a file cannot tell that the odometry has gone on meanwhile.
+    A new chain begins where the odometry began anew, where the robot's clock went back, and where, after a restore
+    from a file, it is not certain that the odometry has continued.
 
     Attributes:
         samples: the messages.
         latest: the last message.
-        last_keyframe: of the latest message's chain.
+        last_keyframe: the last keyframe of the latest message's chain.
         chain: number of the latest message's chain, from 0.
         time_line: number of the latest message's time line, from 0.
-        anchors: world_from_odometry, one for every chain but the first, where whoever knows the world has set it.
-        num_keyframes: number of the next keyframe; how many there are, where no other's bear a number between.
+        anchors: world_from_odometry, one for every chain but the first, set by whoever knows the world.
+        num_keyframes: id of the next keyframe; equals the number of keyframes unless a front end has taken ids between.
     """
 
     def __init__(self, bounds: OdometryBounds, limits: ContinuityLimits = ANY_MOTION) -> None:
@@ -74,8 +74,8 @@ class OdometryTrack:
             position: metres, or None; one that is not finite counts as None.
 
         Raises:
-            RejectedInputError: a stamp not after the last one, a rotation or position that is none, or a message that
-                does not go on from the last one and that no other sides with yet.
+            RejectedInputError: the stamp is not after the last one, the rotation or position is invalid, or the message
+                does not continue the last one and no other confirms it yet.
         """
         stamp_ns = checked_stamp(stamp_ns)
         rotation = checked_rotation(world_from_body)
@@ -102,7 +102,7 @@ class OdometryTrack:
         return sample
 
     def _note_position(self, has_lost_position: bool) -> None:
-        """Since when positions are lost, while the last keyframe has one or there is none yet."""
+        """Note since when positions are missing, if the last keyframe has one or there is no keyframe yet."""
         assert self.latest is not None
         if not has_lost_position or (self.last_keyframe is not None and self.last_keyframe.position is None):
             self._without_position_since = None
@@ -122,9 +122,9 @@ class OdometryTrack:
     def reached(self, policy: KeyframePolicy) -> bool:
         """Whether the latest message is far enough from the last keyframe to become one.
 
-        One whose position is lost (NaN) waits for those with one, no longer than odometry may pause: the edge between
-        keyframes of which one has no position has no translation, and without translations of all odometry the
-        solver judges no places.
+        A message without a position (NaN) does not become a keyframe until positions have been missing for longer than
+        odometry may pause. An edge at a keyframe without a position has no translation, and unless all odometry has
+        translations the solver does not judge places.
         """
         sample, keyframe = self.latest, self.last_keyframe
         if sample is None:
@@ -147,7 +147,7 @@ class OdometryTrack:
         self.num_keyframes += 1
 
     def reaches(self, stamp_ns: int) -> bool:
-        """Whether the odometry has come as far as the stamp."""
+        """Whether the odometry has reached the stamp."""
         return self.latest is not None and self.latest.stamp_ns >= stamp_ns
 
     def within_tolerance(self, stamp_ns: int) -> bool:
@@ -175,7 +175,7 @@ class OdometryTrack:
     def from_arrays(
         cls, bounds: OdometryBounds, arrays: dict[str, NDArray[Any]], limits: ContinuityLimits = ANY_MOTION
     ) -> OdometryTrack:
-        """The track that :meth:`arrays` came from; its next message says whether odometry has gone on meanwhile."""
+        """The track that :meth:`arrays` came from; its next message decides whether odometry has continued."""
         track = cls(bounds, limits)
         track.samples = samples = OdometrySamples.from_arrays(bounds, arrays)
         track._continuity = ContinuityCheck.from_arrays(limits, arrays)

@@ -1,1 +1,1 @@
-"""Solves in a process of their own, so that they never hold up who feeds the graph."""
+"""Runs solves in a process of their own, so that they never delay whoever feeds the graph."""

@@ -17,7 +17,7 @@ from rotavg_ros.online.solver_process.wire import ABANDON, KNOWN, Advance, Reque
 from rotavg_ros.solver import Abandoned, KeptLabels, Solution, stop_if_abandoned
 from rotavg_ros.view_graph import ViewGraph
 
-# So often a solve that is waited for is asked whether anybody still wants it.
+# Interval, in seconds, of checks whether the solve that is under way is still wanted.
 _PATIENCE_S = 0.02
 _EXIT_TIMEOUT_S = 5.0
 
@@ -28,7 +28,7 @@ class _Remembered:
 
     Attributes:
         number: of the solve.
-        labels: that are left if the process dies.
+        labels: all that is left of it if the process dies.
     """
 
     number: int
@@ -38,18 +38,18 @@ class _Remembered:
 class SolverProcess:
     """Callable as :func:`rotavg_ros.solve`; one solve at a time.
 
-    Python runs one thread at a time, so that a solve of small steps in the same process delays each odometry message by
+    Python runs one thread at a time, so a solve of small steps in the same process delays each odometry message by
     milliseconds, and by a hundred on a busy machine. Here only arrays come and go. What a solve remembers for the next
-    one stays in the other process, but for the labels. If that process dies, the solve fails, and the next one starts
-    another, which goes on from these.
+    one stays in the other process, except for the labels. If that process dies, the solve fails, and the next one
+    starts another process, which continues from the labels.
     """
 
     def __init__(self, threads: int, process: ServerProcess | None = None) -> None:
         """Begin with a process that takes a second or two to be ready; the first solve waits for it.
 
         Args:
-            threads: of torch.
-            process: that serves; default: another interpreter.
+            threads: number of torch's threads.
+            process: the process that solves; default: another interpreter.
         """
         self._threads = threads
         self._lock = threading.Lock()
@@ -60,13 +60,13 @@ class SolverProcess:
 
     def _begin(self, process: ServerProcess) -> None:
         self._process = process
-        with suppress(OSError):  # it has died, which the first solve tells
+        with suppress(OSError):  # it has died, which the first solve reports
             process.connection.send_bytes(str(self._threads).encode())
 
     @property
     def is_alive(self) -> bool:
-        """Whether the process has not ended, as far as this side knows; to be asked between solves."""
-        return not self._process.connection.poll(0)  # nothing was asked: what comes is its end
+        """Whether the process is running, as far as this side knows; only meaningful between solves."""
+        return not self._process.connection.poll(0)  # nothing was asked, so anything readable is the end of the stream
 
     @property
     def pid(self) -> int:
@@ -84,7 +84,7 @@ class SolverProcess:
 
         Raises:
             UserError: as there, or the process has died.
-            Abandoned: nobody waits for the solution any more.
+            Abandoned: the solution is no longer wanted.
         """
         with self._lock:
             if not self.is_alive:
@@ -112,10 +112,10 @@ class SolverProcess:
             return replace(solution, memory=_Remembered(request.number, kept))
 
     def _told(self, graph: ViewGraph) -> dict[str, Any]:
-        """A graph's fields; routes, which change with every thinning only, are told once."""
+        """A graph's fields; routes, which only change with a thinning, are sent once."""
         fields = to_arrays(graph)
         if graph.routes is not None:
-            before, self._routes = self._routes, graph.routes  # kept, so that no other one comes to lie there
+            before, self._routes = self._routes, graph.routes  # kept, so that no other tensor takes its address
             if before is not None and before.data_ptr() == graph.routes.data_ptr() and len(before) == len(graph.routes):
                 fields["routes"] = KNOWN
         return fields
@@ -125,7 +125,7 @@ class SolverProcess:
 
         Raises:
             UserError: the process has died.
-            Abandoned: nobody waits for it any more.
+            Abandoned: the work is no longer wanted.
         """
         if not isinstance(memory, _Remembered):
             return 0.0
@@ -149,7 +149,7 @@ class SolverProcess:
                 stop_if_abandoned()
             except Abandoned:
                 self._process.connection.send_bytes(ABANDON)
-                self._process.connection.recv_bytes()  # it may have been ready just now; nobody wants it
+                self._process.connection.recv_bytes()  # the answer may just have become ready; it is dropped
                 raise
         outcome = pickle.loads(self._process.connection.recv_bytes())  # noqa: S301 - of our own process
         if isinstance(outcome, BaseException):
@@ -157,5 +157,5 @@ class SolverProcess:
         return outcome
 
     def close(self) -> None:
-        """End the process, in the middle of a solve as well."""
+        """End the process, even in the middle of a solve."""
         self._process.close()

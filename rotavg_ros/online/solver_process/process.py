@@ -1,7 +1,7 @@
-"""The process that solves, as the side that asks sees it: another interpreter, or a copy of this one.
+"""The process that solves, as seen by the process that asks: another interpreter, or a fork of this one.
 
-A copy shares with this process what both have imported: torch takes its second or two of CPU time and its hundred
-megabytes once instead of twice. But it may be made only while this process has no other threads.
+A fork shares with this process what was imported: torch takes its second or two of CPU time and its hundred megabytes
+once instead of twice. But it may be made only while this process has no other threads.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import Protocol
 
-# With -c and -m Python looks for modules in the folder where it is started, first of all: a user's queue.py, say.
+# With -c and -m Python first looks for modules in the folder where it is started, and might find a user's queue.py.
 _SERVER = """\
 import sys
 sys.path[:] = [folder for folder in sys.path if folder]
@@ -26,19 +26,19 @@ serve(int(sys.argv[1]))
 
 
 class ServerProcess(Protocol):
-    """A process that serves, and this side's end of what connects both."""
+    """A process that serves, and this side's end of the connection."""
 
     connection: Connection
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """Process id."""
 
     def exit_code(self, timeout: float) -> int | None:
-        """As :class:`subprocess.Popen` has it, once it has ended; None if it has not after so many seconds."""
+        """Exit code as in :class:`subprocess.Popen`; None if the process has not ended after ``timeout`` seconds."""
 
     def close(self) -> None:
-        """End it, in the middle of a solve as well."""
+        """End it, even in the middle of a solve."""
 
 
 class Spawned:
@@ -48,7 +48,7 @@ class Spawned:
         ours, theirs = socket.socketpair()
         with theirs:
             server = [sys.executable, "-c", _SERVER, str(theirs.fileno())]
-            # Ctrl-C is for whoever asks, who ends this process itself.
+            # Ctrl-C is for the asking process, which ends this one itself.
             command = ["/bin/sh", "-c", 'trap "" INT; exec "$@"', "sh", *server]
             self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()])
         self.connection = Connection(ours.detach())
@@ -70,12 +70,12 @@ class Spawned:
 
 
 class Forked:
-    """A copy of this process, which must have no other threads yet."""
+    """A fork of this process, which must have no other threads yet."""
 
     def __init__(self) -> None:
         ours, theirs = socket.socketpair()
         with theirs:
-            # A copy of this side's end must not stay open there, or it would not hear when this process has gone.
+            # This side's end must not stay open in the fork, or it would not notice when this process ends.
             self._process = get_context("fork").Process(target=_serve_as_copy, args=(ours, theirs), daemon=True)
             self._process.start()
         self.connection = Connection(ours.detach())
@@ -98,7 +98,7 @@ class Forked:
 
 def _serve_as_copy(ours: socket.socket, theirs: socket.socket) -> None:
     ours.close()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that this is a copy of
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has it
             signal.signal(number, signal.SIG_DFL)
@@ -106,7 +106,7 @@ def _serve_as_copy(ours: socket.socket, theirs: socket.socket) -> None:
 
 
 def serve(descriptor: int) -> None:
-    """Solve what comes from the other end of a socket, until nobody holds that any more."""
+    """Solve what comes from the other end of a socket, until that is closed."""
     from rotavg_ros.startup import loading
 
     with loading():

@@ -33,7 +33,7 @@ class Server:
         """Solve until the other side has gone.
 
         Raises:
-            EOFError: it has gone before it asked for anything.
+            EOFError: it has gone before it sent the number of threads.
         """
         torch.set_num_threads(int(self._connection.recv_bytes()))
         threading.Thread(target=self._listen, name="listener", daemon=True).start()
@@ -47,7 +47,7 @@ class Server:
                 answer = RuntimeError(f"{type(error).__name__}: {error}")
             try:
                 self._connection.send_bytes(pickle.dumps(answer, protocol=5))
-            except OSError:  # the other side has gone, and the listener has not heard of it yet
+            except OSError:  # the other side has gone, and the listener has not noticed yet
                 return
 
     def _listen(self) -> None:
@@ -60,7 +60,7 @@ class Server:
                     self._is_abandoned = False
                     self._requests.put(message)
         except (EOFError, OSError):
-            os._exit(0)  # in the middle of a solve, perhaps, that nobody waits for
+            os._exit(0)  # perhaps in the middle of a solve, which nobody waits for
 
     def _advance(self, request: Advance) -> float:
         number, memory = self._memory

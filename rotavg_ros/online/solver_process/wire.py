@@ -9,21 +9,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# In the place of a request: the running solve is not wanted any more.
+# Sent instead of a request: the running solve is no longer wanted.
 ABANDON = b""
-# In the place of a graph's routes: those of the request before.
+# Sent instead of a graph's routes: those of the request before.
 KNOWN = "known"
 
 
 @dataclass
 class Request:
-    """A solve that is asked for.
+    """A request for a solve.
 
     Attributes:
-        number: counts them.
+        number: counts the requests.
         graph: a :class:`ViewGraph`'s fields, or :data:`KNOWN` for its routes.
         warm_start: ``(N, 4)``.
-        remembered: number of the solve whose memory may be gone on from.
+        remembered: number of the solve whose memory may be used.
         options: of :func:`rotavg_ros.solve`.
         labels: what is left of a memory that the other side does not have: arrays of
             :class:`rotavg_ros.solver.KeptLabels`, and a :class:`ViewGraph`'s fields.
@@ -39,11 +39,11 @@ class Request:
 
 @dataclass
 class Advance:
-    """Going on with what a solve has left is asked for.
+    """A request to continue the work that a solve has left.
 
     Attributes:
         remembered: number of the solve.
-        work: units.
+        work: units of work that may be spent.
     """
 
     remembered: int

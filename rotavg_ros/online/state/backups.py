@@ -1,4 +1,4 @@
-"""Copies of what a state file is about to lose, beside it."""
+"""Backups, beside a state file, of a state that it is about to lose."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from rotavg_ros.online.state.file import Arrays, StateFileError, write
 from rotavg_ros.whole_file import real
 
-# How many there are at most: the newest one, and of the others the largest.
+# Most backups that are kept: the newest one, and the largest of the others.
 KEPT = 5
 _NUMBERED = re.compile(r"\.bak-(\d+)$")
 
@@ -18,15 +18,15 @@ _NUMBERED = re.compile(r"\.bak-(\d+)$")
 def back_up(state_file: Path, arrays: Arrays) -> Path:
     """Write a state into a new backup beside a state file; backups beyond :data:`KEPT` are deleted.
 
-    Where links lead to the file, it is beside the file itself. Numbers tell which backup is newer: clocks that are set
-    back are what makes backups.
+    If the path is a link, the backup is beside the file itself. Backups are numbered, not dated, since it is clocks set
+    back that cause backups.
 
     Returns:
         the backup.
 
     Raises:
-        StateFileError: the disk is full or the folder not writable. Then the state file itself, if there is one,
-            has become the backup, so that whatever is saved next does not replace it; the message says so.
+        StateFileError: the disk is full or the folder not writable. Then the state file itself, if there is one, has
+            been renamed to the backup, so that the next save does not replace it; the message says so.
     """
     state_file = real(state_file)
     backup = _next(state_file)
@@ -61,7 +61,7 @@ def _next(state_file: Path) -> Path:
 
 
 def _drop_surplus(state_file: Path) -> None:
-    """A clock that goes wild must not push the one large map out with a series of small ones."""
+    """Delete surplus backups by size, so that an erratic clock cannot replace the one large map with small ones."""
     older = backups(state_file)[1:]
     with suppress(OSError):
         by_size = sorted(older, key=lambda path: path.stat().st_size, reverse=True)

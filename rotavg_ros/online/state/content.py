@@ -1,4 +1,4 @@
-"""What a state file holds: everything that decides how the graph grows on, as arrays and a header for JSON."""
+"""What a state file holds: everything that decides how the graph goes on growing, as arrays and a JSON header."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class State:
 
     Attributes:
         arrays: by name.
-        header: the rest, for JSON but for the pending edges.
+        header: everything else in JSON's types, except the pending edges.
         pending: edges that wait.
     """
 
@@ -57,13 +57,13 @@ class State:
     pending: list[Waiting]
 
     def encoded(self) -> Arrays:
-        """All of it as arrays; the header is JSON's bytes."""
+        """All of it as arrays; the header becomes the bytes of its JSON."""
         header = self.header | {"pending": [asdict(waiting) for waiting in self.pending]}
         return self.arrays | {"header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
 
 
 def collect(content: ContentState) -> State:
-    """The state, mostly as views: quick, so that the estimator's lock is held only briefly."""
+    """The state, mostly as views; this is quick, so the estimator's lock is held only briefly."""
     growth, last = content.growth, content.last
     snapshot = growth.graph.snapshot()
     marginalized = snapshot.marginalized
@@ -73,7 +73,7 @@ def collect(content: ContentState) -> State:
         arrays |= {"route": snapshot.graph.route.numpy(), "routes": snapshot.graph.routes.numpy()}
     arrays["answered"] = np.empty((0, 4)) if last.body_from_world is None else last.body_from_world.numpy()
     labels = _labels(content)
-    # Without labels the next answer begins with nothing, and not with the last one.
+    # Without labels the next answer starts from scratch, not from the last one.
     known = last.component if labels else None
     arrays["component"] = np.empty(0, dtype=np.int64) if known is None else known.numpy()
     arrays["outlier"], arrays["queued"] = last.outlier, np.flatnonzero(last.queue.waits)
@@ -102,9 +102,9 @@ def collect(content: ContentState) -> State:
 
 
 def _labels(content: ContentState) -> Arrays:
-    """Those that the solver remembers, of the graph's edges in their own order; nothing if they are of another graph.
+    """The labels that the solver remembers, in the graph's own order of edges; empty if they are of another graph.
 
-    The solver has edges in the order in which they entered.
+    The solver keeps edges in the order in which they entered.
     """
     kept: KeptLabels | None = getattr(content.memory, "labels", None)
     if kept is None:
@@ -122,7 +122,7 @@ def _labels(content: ContentState) -> Arrays:
 
 
 def restore(arrays: Arrays, options: EstimatorOptions) -> ContentState:
-    """What :func:`collect` took, to go on with.
+    """Restore what :func:`collect` took.
 
     Raises:
         StateFileError: the arrays do not fit together.
@@ -178,7 +178,7 @@ def _restore(arrays: Arrays, header: dict[str, Any], options: EstimatorOptions) 
 
 
 def _kept_labels(arrays: Arrays, graph: ViewGraph, queued: NDArray[np.bool_]) -> KeptLabels | None:
-    """In the order in which edges enter now; None, and a whole search comes first, where they are no labels."""
+    """The labels in the order in which edges enter now; None if they are invalid, so that a whole search comes first."""
     entered = np.flatnonzero(~queued)
     with suppress(KeyError, ValueError, IndexError):
         now = arrays | {name: arrays[name][..., entered] for name in ("trusted", "places")}

@@ -1,4 +1,4 @@
-"""What an estimator has forgotten or replaced, as long as it can still be kept."""
+"""What an estimator has forgotten or replaced, while it can still be backed up."""
 
 from __future__ import annotations
 

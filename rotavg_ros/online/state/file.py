@@ -29,16 +29,16 @@ class StateFileError(UserError):
 
 
 class StateFileInUseError(StateFileError):
-    """Another node reads and writes it."""
+    """Another node is using the state file."""
 
 
 def check_kind(path: Path) -> None:
-    """Refuse a path that something else than a file has.
+    """Refuse a path of something other than a file.
 
     Raises:
         StateFileError: a folder, a FIFO, a socket or a device.
     """
-    with suppress(OSError):  # nothing there yet, or nothing that may be looked at
+    with suppress(OSError):  # nothing there yet, or it may not be examined
         _check_kind(path, path.stat().st_mode)
 
 
@@ -50,7 +50,7 @@ def _check_kind(path: Path, mode: int) -> None:
 
 
 def _open(path: Path) -> BinaryIO:
-    """Open for reading, without waiting for somebody who writes into a FIFO."""
+    """Open for reading, without waiting for a writer if it is a FIFO."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         _check_kind(path, os.fstat(descriptor).st_mode)
@@ -61,11 +61,10 @@ def _open(path: Path) -> BinaryIO:
 
 
 def write(path: Path, arrays: Arrays) -> None:
-    """Write it whole, see :func:`~rotavg_ros.whole_file.replacing`, and onto the disk.
+    """Write a state file, whole or not at all (:func:`~rotavg_ros.whole_file.replacing`), and flush it to the disk.
 
     Raises:
-        StateFileError: the folder is missing or not writable, the disk is full, or something else than a file has
-            the path.
+        StateFileError: the folder is missing or not writable, the disk is full, or the path is not that of a file.
     """
     check_kind(path)
     try:
@@ -79,7 +78,7 @@ def write(path: Path, arrays: Arrays) -> None:
 
 
 def _synchronise(folder: Path) -> None:
-    """Have the file's new name on the disk before anybody relies on it."""
+    """Flush the file's new name to the disk before anybody relies on it."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

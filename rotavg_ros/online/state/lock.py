@@ -1,4 +1,4 @@
-"""A state file is one process's: a lock on a file beside it, which the kernel lets go when the process ends."""
+"""Reserves a state file for one process: a lock on a file beside it, which the kernel releases with the process."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from rotavg_ros.whole_file import real
 class StateFileLock:
     """Held from :meth:`acquire` to :meth:`release`, or to the end of the process, however it ends.
 
-    The file beside the state file holds the owner's process id. It is looked at again whenever the state file is
-    used, for folders are moved and made anew.
+    The file beside the state file holds the owner's process id. It is checked again whenever the state file is used,
+    since folders may be moved or recreated.
     """
 
     def __init__(self, state_file: Path) -> None:
@@ -51,7 +51,7 @@ class StateFileLock:
             raise StateFileError(f"cannot write the state file {self._state_file}: {error.strerror}") from error
 
     def release(self) -> None:
-        """Let go, and leave no file behind."""
+        """Release the lock, and leave no file behind."""
         with self._one_at_a_time:
             if self._descriptor is not None and _is_file(self._path, self._descriptor):
                 with suppress(OSError):
@@ -60,7 +60,7 @@ class StateFileLock:
 
     @property
     def _path(self) -> Path:
-        """Beside the file itself, whatever links lead to it."""
+        """Path of the lock file, beside the state file itself even if a link leads there."""
         place = real(self._state_file)
         return place.with_name(f".{place.name}.lock")
 
@@ -75,7 +75,7 @@ def _locked(path: Path) -> int | None:
 
     Raises:
         BlockingIOError: somebody else has it.
-        OSError: it cannot be made or locked.
+        OSError: it cannot be created or locked.
     """
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
     try:
@@ -87,14 +87,14 @@ def _locked(path: Path) -> int | None:
         os.write(descriptor, f"{os.getpid()}\n".encode())
     except OSError as error:
         if error.errno == errno.ENOSPC:
-            return descriptor  # locked all the same; only who holds it cannot be told
+            return descriptor  # locked all the same; only the owner's id is missing
         os.close(descriptor)
         raise
     return descriptor
 
 
 def _is_file(path: Path, descriptor: int) -> bool:
-    """Whether the descriptor is of the file that has this path now."""
+    """Whether the descriptor belongs to the file that is now at this path."""
     try:
         there, ours = path.stat(), os.fstat(descriptor)
     except OSError:

@@ -1,4 +1,4 @@
-"""State files of earlier versions, brought into today's form."""
+"""Converts state files of earlier versions to today's form."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _FIRST_WITH_TIME_LINES = 4
 _FIRST_WITH_QUEUE = 5
 # Before it, the first answer after a load was a cold one.
 _FIRST_WITH_LABELS = 6
-# Before it, of what all measurements of a kind have wrong alike a gyroscope's bias alone was known.
+# Before it, the only systematic error that was known was a gyroscope's bias.
 _FIRST_WITH_CALIBRATION = 7
 
 
 def upgraded(arrays: Arrays, header: dict[str, Any]) -> tuple[Arrays, dict[str, Any]]:
     """Arrays and header as today's version writes them.
 
-    Two entries of the header stay open, for the graph is needed to fill them: ``unplaced`` edges that waited, and
+    Two entries of the header remain to be filled in, since they need the graph: ``unplaced`` edges that waited, and
     ``world_from_odometry``, which is None.
     """
     if header["format_version"] < _FIRST_WITH_STEPS:
