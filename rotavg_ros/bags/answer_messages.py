@@ -1,4 +1,4 @@
-"""What the node publishes, as messages for a bag: bit for bit those of :mod:`rotavg_ros.ros`, which a test checks."""
+"""The node's outputs as messages for a bag, bit for bit those of :mod:`rotavg_ros.ros`; a test checks this."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PATH = "nav_msgs/msg/Path"
 MARKERS = "visualization_msgs/msg/MarkerArray"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
-_END_OF_TIME_S = 2**31  # seconds of a stamp are 32 bits with a sign
+_END_OF_TIME_S = 2**31  # seconds of a stamp are signed 32-bit
 
 
 def orientations_message(answer: Answer, frame_id: str) -> Any:
@@ -140,7 +140,7 @@ def _type(name: str) -> Any:
 
 
 def _make(type_name: str, /, **values: Any) -> Any:
-    """A message with the fields that are not given at zero, or empty."""
+    """A message in which fields that are not given are zero or empty."""
     _, fields = typestore().fielddefs[type_name]
     return _type(type_name)(**{field: values[field] if field in values else _zero(node) for field, node in fields})
 

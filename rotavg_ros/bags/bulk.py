@@ -1,7 +1,7 @@
 """Messages with thousands of points or poses, serialised a sequence at a time.
 
-The library makes an object of every point, and packs it by itself: a path of 8000 poses takes 100 ms. Here a sequence
-whose elements all look alike is one array. The bytes are the library's, which a test checks.
+The library makes an object of every point and packs each separately: a path of 8000 poses takes 100 ms. Here a sequence
+of uniform elements is one array. The bytes are the same as the library's; a test checks this.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rosbags.interfaces import Nodetype
 
 from rotavg_ros.bags.message_types import typestore
 
-# Little-endian CDR, and nothing else about it.
+# Little-endian CDR without options.
 _ENCAPSULATION = b"\x00\x01\x00\x00"
 _NAMES = "bool byte uint8 int8 uint16 int16 uint32 int32 uint64 int64 float32 float64"
 _FORMATS = dict(zip(_NAMES.split(), "?BBbHhIiQqfd", strict=True))
@@ -24,10 +24,10 @@ _FORMATS = dict(zip(_NAMES.split(), "?BBbHhIiQqfd", strict=True))
 
 @dataclass(frozen=True)
 class Rows:
-    """Stands for a sequence of messages that consist of numbers of one kind alone, such as points.
+    """Stands for a sequence of messages whose fields are all numbers of one type, such as points.
 
     Attributes:
-        values: ``(K, k)``, in the kind of the fields.
+        values: ``(K, k)``, of the fields' type.
     """
 
     values: NDArray[Any]
@@ -39,7 +39,7 @@ class StampedPoses:
 
     Attributes:
         stamp: ``(K, 2)`` int64 seconds and nanoseconds.
-        frame_id: of all.
+        frame_id: the frame of all poses.
         pose: ``(K, 7)`` position and orientation.
     """
 
@@ -99,10 +99,10 @@ def _align(out: bytearray, size: int) -> None:
 
 
 def _put_poses(out: bytearray, poses: StampedPoses) -> None:
-    """One by one they end at a multiple of 8 bytes, so that all but the first are padded alike."""
+    """Append poses. Each ends at a multiple of 8 bytes, so all but the first have the same padding."""
     for rows in (slice(0, 1), slice(1, None)):
         stamp, pose = poses.stamp[rows], poses.pose[rows]
-        head = bytearray(len(out) % 8 * b"\0")  # where in a word of 8 bytes the first of these begins
+        head = bytearray(len(out) % 8 * b"\0")  # the first one's offset in a word of 8 bytes
         begin = len(head)
         for part in (0, 0):
             _put_base(head, part, "uint32")

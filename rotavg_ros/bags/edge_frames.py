@@ -11,11 +11,11 @@ from rotavg_ros.bags.messages import Edge
 from rotavg_ros.inputs.sensor_frames import Mounting, SensorFrames
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE
 
-_ROBOT = ""  # a graph is of one
+_ROBOT = ""  # a graph has only one
 
 
 class EdgeFrames:
-    """How a robot's sensors sit, once its bag has been read."""
+    """The mounting of a robot's sensors, known once its bag has been read."""
 
     def __init__(self) -> None:
         self._sensors, self._body = SensorFrames(), ""
@@ -26,12 +26,12 @@ class EdgeFrames:
         self._sensors.take(transforms)
 
     def note_body(self, frame: str) -> None:
-        """Remember the ``child_frame_id`` of odometry; the first that says one counts."""
+        """Remember the ``child_frame_id`` of odometry; the first non-empty one counts."""
         self._body = self._body or frame
         self._sensors.note_body(_ROBOT, frame)
 
     def edge_of_body(self, edge: Edge) -> Edge:
-        """The edge between bodies; as it is, where nothing says how its sensor sits, or where it is no rotation."""
+        """The edge between bodies; unchanged if the sensor's mounting is not known or the edge is not a rotation."""
         off = abs(float(np.linalg.norm(edge.source_from_target)) - 1)
         if not edge.frame_id or not off <= UNIT_NORM_TOLERANCE:
             return edge
@@ -52,7 +52,7 @@ class EdgeFrames:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A line about edges that were taken as they are, though odometry tells of another frame."""
+        """A line about edges that were taken as they are, although odometry is of another frame."""
         if not self._unknown or not self._body:
             return ()
         named = ", ".join(list(self._unknown)[:3])

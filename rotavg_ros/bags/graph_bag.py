@@ -20,7 +20,7 @@ def read_graph(path: str | Path) -> GraphFile:
 
 
 def write_graph(path: str | Path, graph_file: GraphFile) -> None:
-    """Write a rosbag2 folder; an older bag there is replaced, as files are, but nothing that is not a bag.
+    """Write a rosbag2 folder; an existing bag is replaced, as files are, but nothing that is not a bag.
 
     Raises:
         BagWriteError: the place cannot be written.
@@ -29,7 +29,7 @@ def write_graph(path: str | Path, graph_file: GraphFile) -> None:
 
 
 def not_stored(path: str | Path, graph_file: GraphFile) -> list[str]:
-    """What of this graph a bag has no room for, in words."""
+    """The parts of this graph that a bag cannot store, in words."""
     graph = graph_file.graph
     lost = {
         "information matrices beyond the rotation's precision": graph_file.edge_information is not None

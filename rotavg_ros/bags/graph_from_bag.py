@@ -28,7 +28,7 @@ from rotavg_ros.datasets.files.graph_file import MAX_NODE_ID, GraphFile
 from rotavg_ros.datasets.planar import are_about_z
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, ViewGraphError
 
-# A stamp that names a keyframe may be this far from the odometry message that is meant.
+# Largest difference between a stamp that names a keyframe and the stamp of its odometry message.
 _MAX_KEYFRAME_DISTANCE_NS = 50_000_000
 
 # Stamp in ns, position, world-from-body xyzw.
@@ -41,7 +41,7 @@ _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 
 @dataclass
 class _Content:
-    """What the known topics of a bag hold, in the order of recording."""
+    """The content of a bag's known topics, in the order of recording."""
 
     edges: list[Edge] = field(default_factory=list)
     odometry: list[_Pose] = field(default_factory=list)
@@ -57,7 +57,7 @@ class _Content:
 
     @property
     def has_translations(self) -> bool:
-        """Whether there is one for any edge."""
+        """Whether any edge has a translation."""
         return any(edge.translation is not None for edge in self.edges)
 
 
@@ -67,8 +67,8 @@ def read_graph_bag(path: str | Path) -> GraphFile:
     Where the edges name their ends by id, they are the graph, in the order of the edges' own numbers. Where they name
     them by stamp, every odometry message is a keyframe, consecutive ones are joined by odometry edges, and an end
     belongs to the nearest odometry message within 0.05 s; edges without such a message are skipped and counted. Edges
-    between sensors are taken into the body's frame by the bag's static transforms. Of a damaged bag the graph is that
-    of what can be read.
+    between sensors are converted to the body's frame by the bag's static transforms. From a damaged bag, everything
+    that can be read is used.
 
     Raises:
         BagReadError: an unreadable bag, one without edges, or one that needs odometry and has none.
@@ -109,13 +109,13 @@ def _read(bag: BagReader) -> _Content:
             content.truth.append(read_odometry(message))
         else:
             frames.take(message)
-    content.edges = list(map(frames.edge_of_body, content.edges))  # the last transform may come after them
+    content.edges = list(map(frames.edge_of_body, content.edges))  # the last transform may come after the edges
     content.warnings = frames.warnings
     return content
 
 
 def _check(path: str | Path, content: _Content) -> None:
-    """Refuse what a graph has no room for."""
+    """Refuse content that a graph cannot hold."""
     ends = [end for edge in content.edges for end in (edge.source, edge.target)]
     robots = sorted({end.robot for end in ends})
     if len(robots) > 1:
@@ -207,7 +207,7 @@ def _translations(edges: Sequence[Edge]) -> NDArray[np.float64]:
 
 
 def _nearest(stamps_ns: NDArray[np.int64], end: Keyframe) -> int:
-    """Index of the stamp that an end means, or -1."""
+    """Index of the stamp nearest to an end's, or -1 if it is too far away."""
     right = int(np.searchsorted(stamps_ns, end.stamp_ns))
     candidates = [index for index in (right - 1, right) if 0 <= index < len(stamps_ns)]
     best = min(candidates, key=lambda index: abs(int(stamps_ns[index]) - end.stamp_ns))
@@ -215,7 +215,7 @@ def _nearest(stamps_ns: NDArray[np.int64], end: Keyframe) -> int:
 
 
 def _with_truth(graph_file: GraphFile, content: _Content) -> GraphFile:
-    """Ground truth belongs to the node of the same stamp; stamps that were made up for the bag are dropped again."""
+    """Add ground truth to the nodes of the same stamps; drop stamps that were only made up for the bag."""
     assert graph_file.stamps_ns is not None
     nodes_at: dict[int, list[int]] = {}
     for node, stamp in enumerate(graph_file.stamps_ns.tolist()):

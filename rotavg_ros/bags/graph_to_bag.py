@@ -1,4 +1,4 @@
-"""A view-graph file as a bag, from which :mod:`rotavg_ros.bags.graph_from_bag` reads it back without loss.
+"""Writes a view-graph as a bag, from which :mod:`rotavg_ros.bags.graph_from_bag` reads it back without loss.
 
 Topics: ``/relative_rotations`` carries every edge, odometry included, by the id and the stamp of both ends;
 ``/odom`` is odometry chained (where there is odometry); ``/ground_truth`` is there if the file has it.
@@ -27,10 +27,10 @@ from rotavg_ros.datasets.dead_reckoning import chain_poses
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.online.options import NANOSECONDS
 
-# Stamps of a graph that has none: as if a keyframe had been taken every 0.1 s.
+# First stamp for a graph without stamps, which get one keyframe every 0.1 s.
 START_STAMP_NS = 1_700_000_000_000_000_000
 DEFAULT_PERIOD_NS = 100_000_000
-# Seconds of a message's stamp are 32 bits with a sign, and a recording's times have none.
+# Seconds of a message's stamp are signed 32-bit, and a recording's times are unsigned.
 _END_OF_TIME_NS = 2**31 * NANOSECONDS
 
 
@@ -38,8 +38,8 @@ def write_graph_bag(path: str | Path, graph_file: GraphFile, *, overwrite: bool 
     """Write a graph as a rosbag2 MCAP folder; each edge is published when the later of its ends exists.
 
     Raises:
-        BagWriteError: the folder exists (without ``overwrite``), its place cannot be written, or a stamp is none that
-            a message can have.
+        BagWriteError: the folder exists (without ``overwrite``), its place cannot be written, or a message cannot hold
+            a stamp.
     """
     graph = graph_file.graph
     stamps_ns = graph_file.stamps_ns
@@ -48,7 +48,7 @@ def write_graph_bag(path: str | Path, graph_file: GraphFile, *, overwrite: bool 
     _check_stamps(Path(path), graph_file.node_ids, stamps_ns)
     source, target = graph.source.cpu().numpy(), graph.target.cpu().numpy()
     published_ns = np.maximum(stamps_ns[source], stamps_ns[target])
-    # At one instant: where the robot is, where it truly is, then what it measured.
+    # Order at one instant: odometry, ground truth, then measurements.
     events: list[tuple[int, int, int]] = []
     has_odometry = bool(graph.is_odometry.any())
     if has_odometry:

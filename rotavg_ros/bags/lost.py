@@ -1,4 +1,4 @@
-"""What of a damaged bag could not be read."""
+"""What could not be read of a damaged bag."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from rotavg_ros.bags.salvage import Losses
 
 @dataclass
 class Lost:
-    """What is known of it so far.
+    """What is known about the losses so far.
 
     Attributes:
-        recordings: of those that are damaged.
-        expected: how many messages the bag says it has; None where that is lost as well.
+        recordings: losses of the damaged recordings.
+        expected: number of messages according to the bag; None if that is lost as well.
         cause: why the bag as a whole could not be opened.
-        undecodable: topic and time of messages that make no sense.
-        problem: why nothing is read behind a place; None: no such place.
-        is_final: the whole bag has been looked at.
+        undecodable: topic and time of messages that could not be decoded.
+        problem: why nothing is read beyond some place; None: there is no such place.
+        is_final: whether the whole bag has been examined.
     """
 
     recordings: Sequence[Losses] = ()
@@ -32,7 +32,7 @@ class Lost:
     is_final: bool = False
 
     def told(self, reader: AnyReader) -> str:
-        """In a line; ``reader`` is that of what is left."""
+        """The losses in a line; ``reader`` reads what is left."""
         start_ns, end_ns = int(reader.start_time), int(reader.end_time)
         parts = [line for losses in self.recordings for line in losses.told(start_ns, end_ns)]
         parts += [] if parts or self.cause is None else [self.cause]

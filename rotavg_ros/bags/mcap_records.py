@@ -1,4 +1,4 @@
-"""Records of MCAP files that may be damaged: what is sound comes out, and whether that is all."""
+"""Reads records of MCAP files that may be damaged: the sound ones, and whether these are all."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import get_chunk_data_stream
 
-# What mcap raises where a file makes no sense.
+# Errors that mcap raises for invalid content.
 NONSENSE = (McapError, ValueError, struct.error, MemoryError)
 # Opcode and length before every record.
 _RECORD_HEAD = struct.Struct("<BQ")
@@ -25,7 +25,7 @@ Block = list[Schema | Channel | Message]
 
 
 class Exact:
-    """A file whose end is an error where more is wanted, before anything of it is in the memory."""
+    """A file that raises an error if more is requested than it has left, before anything is read into memory."""
 
     def __init__(self, file: IO[bytes], size: int) -> None:
         self._file, self._left = file, size
@@ -38,7 +38,7 @@ class Exact:
 
 
 def summary_of(file: IO[bytes]) -> Any:
-    """The index at the end of the file; None if it is not there, or says nothing of chunks."""
+    """The index at the end of the file; None if it is missing, or does not list chunks."""
     try:
         file.seek(0)
         summary = SeekingReader(file).get_summary()
@@ -48,19 +48,19 @@ def summary_of(file: IO[bytes]) -> Any:
 
 
 def record_head_of(file: IO[bytes]) -> int:
-    """Opcode of the record that begins here; the file is read up to its content. 0 where the file ends before."""
+    """Opcode of the record that begins here, 0 if the file ends before; the file is read up to the record's content."""
     head = file.read(_RECORD_HEAD.size)
     return head[0] if len(head) == _RECORD_HEAD.size else 0
 
 
 def whole(chunk: Chunk) -> bytes:
-    """A chunk's content, which must fit its checksum if it has one."""
+    """A chunk's content, which must match its checksum if it has one."""
     stream, length = get_chunk_data_stream(chunk, validate_crc=True)
     return stream.read(length)
 
 
 def begun(chunk: Chunk) -> bytes:
-    """The beginning of a chunk's content, as far as it goes."""
+    """The beginning of an incomplete chunk's content, as far as it can be decompressed."""
     if chunk.compression == "zstd":
         return zstandard.ZstdDecompressor().decompressobj().decompress(chunk.data)
     if chunk.compression == "lz4":
@@ -93,7 +93,7 @@ def _record(opcode: int, body: bytes) -> Schema | Channel | Message:
     """A record of a chunk.
 
     Raises:
-        ValueError: chunks have none of that kind.
+        ValueError: a kind of record that chunks do not contain.
     """
     stream = ReadDataStream(BytesIO(body))
     if opcode == Opcode.MESSAGE:

@@ -1,4 +1,4 @@
-"""Numbers to ROS messages (as `rosbags` has them) and back: the bags' border, where ROS's conventions begin."""
+"""Converts numbers to ROS messages (as in `rosbags`) and back; ROS's conventions apply to the messages only."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rotavg_ros.bags.message_types import typestore
 from rotavg_ros.online.options import NANOSECONDS
 
-# Not estimated by anybody: 36 zeros, as most odometry sources send.
+# Unknown covariance: 36 zeros, as most odometry sources send.
 _NO_COVARIANCE = np.zeros(36)
 
 
@@ -43,7 +43,7 @@ class Edge:
         precision: rad⁻²; NaN: unknown.
         kind: :class:`rotavg_ros.view_graph.EdgeKind`.
         translation: ``(3,)`` position of the target in the source frame, metres; None: unknown.
-        frame_id: of the sensor between whose poses it was measured; empty: the body's.
+        frame_id: frame of the sensor between whose poses it was measured; empty: the body's.
     """
 
     stamp_ns: int
@@ -125,14 +125,14 @@ def edge_message(edge: Edge) -> Any:
 
 
 def _translation(translation: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """Nothing where it is unknown."""
+    """The message's translation; empty if unknown."""
     if translation is None or not np.isfinite(translation).all():
         return np.empty(0)
     return np.asarray(translation, dtype=np.float64)
 
 
 def read_edge(message: Any) -> Edge:
-    """What a ``rotavg_msgs/msg/RelativeRotation`` says."""
+    """The edge in a ``rotavg_msgs/msg/RelativeRotation``."""
     rotation = message.rotation
     return Edge(
         stamp_ns=_nanoseconds(message.header.stamp),
@@ -149,7 +149,7 @@ def read_edge(message: Any) -> Edge:
 
 
 def read_edges(message: Any) -> list[Edge]:
-    """What a ``rotavg_msgs/msg/RelativeRotationArray`` says."""
+    """The edges in a ``rotavg_msgs/msg/RelativeRotationArray``."""
     edges = map(read_edge, message.edges)
     return [replace(edge, frame_id=edge.frame_id or message.header.frame_id) for edge in edges]
 

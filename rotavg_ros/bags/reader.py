@@ -22,13 +22,13 @@ from rotavg_ros.bags.message_types import typestore
 from rotavg_ros.bags.salvage import salvaging_reader
 from rotavg_ros.errors import UserError, asking_about
 
-# Files that are bags by themselves.
+# Suffixes of files that can be bags by themselves.
 RECORDING_SUFFIXES = (".mcap", ".db3", ".bag")
 _METADATA = "metadata.yaml"
 
 
 class BagReadError(UserError):
-    """A bag that cannot be read as what it should be; the message names it, what is wrong and what to do."""
+    """A bag that cannot be read; the message names it, what is wrong and what to do."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class BagMessage:
     Attributes:
         topic, message_type: e.g. ``/odom``, ``nav_msgs/msg/Odometry``.
         time_ns: when it was recorded.
-        data: as serialised (CDR in ROS 2 bags).
+        data: serialised message (CDR in ROS 2 bags).
     """
 
     topic: str
@@ -52,7 +52,7 @@ class BagReader:
 
     Args:
         path: of the bag.
-        salvage: read of a damaged bag what can be read, and tell of the rest in :attr:`damage`.
+        salvage: whether to read what is readable of a damaged bag, and to report the rest in :attr:`damage`.
 
     Raises:
         BagReadError: no such bag, a truncated or foreign file, an unknown compression, an sqlite file whose last
@@ -92,7 +92,7 @@ class BagReader:
 
     @property
     def damage(self) -> str | None:
-        """What cannot be read, as far as it is known by now, in a line; None: nothing."""
+        """A line about what cannot be read, as far as known by now; None: nothing."""
         return None if self._lost is None else f"{self._path}: the bag is damaged: {self._lost.told(self._open())}"
 
     @property
@@ -166,7 +166,7 @@ class BagReader:
         Types of packages that are not installed are decoded by the definitions in the bag.
         """
         for connection, time_ns, data in self._records(topics, start_ns, stop_ns):
-            reader = self._open()  # another one, once the bag has turned out to be damaged
+            reader = self._open()  # a new one after the bag has turned out to be damaged
             if connection.msgtype not in reader.typestore.fielddefs:
                 raise BagReadError(
                     f"{self._path}: {connection.topic} has type {connection.msgtype}, which neither the bag nor rotavg "
@@ -187,7 +187,7 @@ class BagReader:
     def _records(
         self, topics: Collection[str] | None, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Records in their order; where a recording turns out to be damaged, those that can be read behind it, too."""
+        """Records in order; if a recording turns out to be damaged, also those that can be read after the damage."""
         passed = _Passed()
         while True:
             try:
@@ -222,14 +222,14 @@ class BagReader:
             count += 1
             yield record
         if start_ns is None and stop_ns is None and count < expected:
-            # Garbled records may pass for ones of a kind that readers have to skip.
+            # Garbled records may look like a kind that readers have to skip.
             raise BagReadError(
                 f"{self._path}: the bag is damaged: only {count} of {expected} messages can be read; "
                 "`ros2 bag convert` may save them"
             )
 
     def _salvage(self, problem: BagReadError, *, thorough: bool = False) -> None:
-        """Go on with a reader of what is left.
+        """Continue with a reader of what is left.
 
         Raises:
             BagReadError: the problem, since nothing is left.
@@ -273,7 +273,7 @@ class BagReader:
 
 
 class _Passed:
-    """Which records have been handed out, of an iteration in the order of time that begins again."""
+    """Remembers which records have been handed out, for an iteration in time order that starts again."""
 
     def __init__(self) -> None:
         self._newest_ns = -1
@@ -281,11 +281,11 @@ class _Passed:
         self._horizon_ns, self._again = -1, Counter[tuple[str, bytes]]()
 
     def begin_again(self) -> None:
-        """What was new until now comes once more."""
+        """The iteration starts again: records that were handed out come once more."""
         self._horizon_ns, self._again = self._newest_ns, Counter(self._at_newest)
 
     def is_new(self, connection: Connection, time_ns: int, data: bytes) -> bool:
-        """Whether a record has not been handed out; it has now."""
+        """Whether a record has not been handed out before; it counts as handed out from now on."""
         key = connection.topic, bytes(data)
         if time_ns < self._horizon_ns:
             return False
@@ -326,7 +326,7 @@ def _bag_of(path: Path, salvage: bool) -> Path:
 
 
 def _listed(folder: Path) -> list[str]:
-    """Names of the recordings that a rosbag2 folder's metadata tells of; none where that cannot be read."""
+    """Names of the recordings listed in a rosbag2 folder's metadata; empty if that cannot be read."""
     try:
         metadata = yaml.safe_load((folder / _METADATA).read_text(encoding="utf-8"))
         return [PurePath(each).name for each in metadata["rosbag2_bagfile_information"]["relative_file_paths"]]
@@ -335,7 +335,7 @@ def _listed(folder: Path) -> list[str]:
 
 
 def _check_log(recording: Path) -> None:
-    """Refuse an sqlite file whose last messages are in the log beside it: rosbags reads the file alone.
+    """Refuse an sqlite file whose last messages are in the log beside it, since rosbags reads only the file.
 
     Raises:
         BagReadError: there is such a log.

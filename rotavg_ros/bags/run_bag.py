@@ -16,7 +16,7 @@ from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 def write_run_bag(path: str | Path, run: SimulatedRun, *, overwrite: bool = False) -> None:
     """Write ``/odom`` and ``/ground_truth`` at every pose, and loop closures by stamp on ``/relative_rotations``.
 
-    Odometry edges are not published: whoever listens makes keyframes from ``/odom``.
+    Odometry edges are not published: subscribers make keyframes from ``/odom``.
 
     Raises:
         BagWriteError: the folder exists (without ``overwrite``), or its place cannot be written.

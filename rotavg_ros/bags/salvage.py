@@ -1,8 +1,8 @@
-"""What can still be read of a damaged MCAP recording: all sound chunks, and of a torn one what was written.
+"""Reads what is left of a damaged MCAP recording: all sound chunks, and the written part of a torn one.
 
-A recorder that loses its power leaves a file without index, which ends in the middle of a chunk. A bad disk leaves
-chunks whose checksum or compression does not fit; nobody can say which of their messages are sound, so they are left
-out. A chunk without checksum counts up to where its records make no sense.
+A recorder that loses its power leaves a file without an index that ends in the middle of a chunk. A bad disk leaves
+chunks with a wrong checksum or invalid compression; it is not known which of their messages are sound, so they are left
+out. A chunk without a checksum is read up to the first invalid record.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _MAX_STAMP_NS = 2**63 - 1
 
 
 class _Place(NamedTuple):
-    """Of a chunk: where it begins in the file, and when its first and its last message were recorded."""
+    """Where a chunk begins in the file, and when its first and its last message were recorded."""
 
     offset: int
     start_ns: int
@@ -39,13 +39,13 @@ class _Place(NamedTuple):
 
 @dataclass
 class Losses:
-    """What of a recording cannot be read.
+    """What cannot be read of a recording.
 
     Attributes:
-        file: its name.
-        chunks: those that are corrupt.
-        is_cut: the file ends before its messages do.
-        has_index: the file has its end, with the index.
+        file: name of its file.
+        chunks: corrupt chunks.
+        is_cut: whether the file ends in the middle of its messages.
+        has_index: whether the file is complete to its end, with the index.
     """
 
     file: str
@@ -54,7 +54,7 @@ class Losses:
     has_index: bool = True
 
     def told(self, start_ns: int, end_ns: int) -> list[str]:
-        """What is lost, a line each; nothing where nothing is.
+        """A line for each loss.
 
         Args:
             start_ns, end_ns: of all messages of the bag that can be read.
@@ -73,11 +73,11 @@ class Losses:
 
 
 class SalvagedRecording:
-    """A storage as rosbags' readers want one, that reads what is sound and tells what is not.
+    """A storage for rosbags' readers that reads what is sound and reports what is not.
 
     Attributes:
-        connections, metadata: of what can be read.
-        losses: what cannot; known once it is open.
+        connections, metadata: of the readable part.
+        losses: what cannot be read; known once it is open.
     """
 
     def __init__(self, path: Path) -> None:
@@ -88,7 +88,7 @@ class SalvagedRecording:
         self.losses = Losses(path.name)
 
     def open(self) -> None:
-        """Read all of it once, to know what there is; a second time does nothing.
+        """Read everything once, to know what there is; a second call does nothing.
 
         Raises:
             ReaderError: no message can be read.
@@ -185,7 +185,7 @@ class SalvagedRecording:
             yield self._torn(file, reached)
 
     def _torn(self, file: IO[bytes], offset: int) -> Block:
-        """What was written of the chunk in which the file ends."""
+        """The written records of the chunk in which the file ends."""
         file.seek(offset)
         if record_head_of(file) != Opcode.CHUNK:
             return []
@@ -209,12 +209,12 @@ def _metadata(count: int, start_ns: int, end_ns: int) -> ReaderMetadata:
 
 
 def salvaging_reader(recordings: Iterable[Path], store: Typestore, *, thorough: bool) -> tuple[AnyReader, list[Losses]]:
-    """A reader of MCAP recordings, open, that reads the damaged ones as far as they go.
+    """An open reader of MCAP recordings that reads damaged ones as far as possible.
 
     Args:
-        recordings: of one bag, in their order. Those of which nothing can be read are left out.
+        recordings: of one bag, in order. Those of which nothing can be read are left out.
         store: types for messages without a definition.
-        thorough: whether any may be damaged, though its index is sound.
+        thorough: whether recordings with a sound index may be damaged, too.
 
     Returns:
         the reader, and what each of the damaged recordings has lost.
@@ -242,7 +242,7 @@ def _opens(path: Path) -> bool:
 
 
 def _salvaged(path: Path) -> SalvagedRecording:
-    """Open; without connections where nothing can be read."""
+    """The recording, opened; without connections if nothing can be read."""
     recording = SalvagedRecording(path)
     with suppress(ReaderError, OSError):
         recording.open()

@@ -11,7 +11,7 @@ EDGE_TOPIC = "/relative_rotations"
 EDGE_ARRAY_TOPIC = "/relative_rotation_arrays"
 TRUTH_TOPIC = "/ground_truth"
 
-# Key of the bag's own metadata that says what messages cannot: that it was a graph, and what was missing in it.
+# Key in the bag's own metadata for what messages cannot express: that it was a graph, and what was missing in it.
 GRAPH_NOTE = "rotavg_graph"
 
 

@@ -24,12 +24,12 @@ class BagWriteError(UserError):
 
 
 class BagWriter:
-    """A rosbag2 folder in the making: it appears under its name when the ``with`` block ends well.
+    """An unfinished rosbag2 folder; it gets its name when the ``with`` block ends without an error.
 
     Args:
         path: the bag's folder, which must not exist.
         overwrite: replace an existing bag (only a folder that is a bag, or an empty one).
-        compressed: chunks by zstd.
+        compressed: whether to compress chunks with zstd.
 
     Raises:
         BagWriteError: the folder exists, or its place cannot be written.
@@ -84,7 +84,7 @@ class BagWriter:
         self.write_raw(topic, stamp_ns, bulk.serialize(message, self._connections[topic].msgtype))
 
     def write_raw(self, topic: str, stamp_ns: int, cdr: bytes | memoryview) -> None:
-        """Append a message that is serialised already."""
+        """Append a message that is already serialised."""
         assert self._writer is not None
         try:
             self._writer.write(self._connections[topic], int(stamp_ns), cdr)
@@ -92,7 +92,7 @@ class BagWriter:
             raise self._cannot_write(error) from None
 
     def set_note(self, key: str, value: str) -> None:
-        """A line of the bag's own metadata (``custom_data``)."""
+        """Write a line of the bag's own metadata (``custom_data``)."""
         assert self._writer is not None
         self._writer.set_custom_data(key, value)
 
@@ -122,7 +122,7 @@ class BagWriter:
 
 
 def refuse_existing(path: Path, *, overwrite: bool) -> None:
-    """Nothing that is no bag is ever replaced, and a bag only on request.
+    """Refuse to replace a bag without ``overwrite``, and anything that is not a bag in any case.
 
     Raises:
         BagWriteError: something is at the bag's place.

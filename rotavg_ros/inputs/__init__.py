@@ -1,6 +1,6 @@
-"""What others' messages say, as measurements: one module per source, chosen by the type's name.
+"""Converts messages of other packages to measurements: one module per source, chosen by the type's name.
 
-Converters look at a message's fields only, so they take rclpy's messages as well as those that `rosbags` decodes, and
+Converters only read a message's fields, so they accept rclpy's messages as well as those that `rosbags` decodes, and
 import neither.
 """
 

@@ -31,9 +31,9 @@ class _Keyframe:
 class KeyframeOdomConverter:
     """A robot's keyframes with their odometry: an odometry edge from each to the next.
 
-    Where messages were lost the edge spans the gap, which it may, because each message carries the whole odometry. A
-    new chain, without an edge to the last one, begins where the odometry has jumped, and after an id that does not
-    ascend, which is refused: who counts anew has a new odometry.
+    Where messages were lost the edge spans the gap, since each message carries the whole odometry. A new chain, without
+    an edge to the last one, begins where the odometry has jumped, and after an id that does not ascend. Such an id is
+    refused: a sender that starts counting again has new odometry.
     """
 
     def __init__(self, source: Source) -> None:
@@ -46,7 +46,7 @@ class KeyframeOdomConverter:
         self._before: OdometrySample | None = None
 
     def note_given_up(self, source: KeyframeReference, target: KeyframeReference) -> None:
-        """Odometry is sent once."""
+        """Do nothing, since odometry is sent only once."""
 
     def __call__(self, message: Any) -> Iterator[EdgeRecord]:
         try:

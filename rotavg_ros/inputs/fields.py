@@ -1,7 +1,7 @@
-"""Fields of ROS messages as plain numbers, and the one place where directions turn around.
+"""Fields of ROS messages as plain numbers, and the only place where the direction of edges is inverted.
 
-A message carries an edge as the orientation of the target in the source frame (source_from_target). Inside, an edge is
-target_from_source.
+A message carries an edge as the orientation of the target in the source frame (source_from_target). Internally, an edge
+is target_from_source.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def to_vector(vector: Any) -> Vector:
 
 
 def target_from_source(source_from_target: Quaternion, body_from_sensor: Quaternion) -> Quaternion:
-    """The inside direction, between bodies, of a border rotation between sensors.
+    """The internal rotation, between bodies, from a message's rotation between sensors.
 
     Raises:
         RejectedInputError: not a rotation.
@@ -67,14 +67,14 @@ def precision_of_information(information: Sequence[float]) -> float:
 def precision_of_covariance(covariance: Sequence[float]) -> float:
     """Rad⁻²: the inverse of the mean variance of the rotation in a 6 × 6 covariance matrix; 0 unknown.
 
-    A variance of zero, or NaN, is what senders write who know none. A negative sum stays negative, to be refused.
+    Senders that do not know the variance write zero or NaN. A negative sum stays negative, so that it is refused.
     """
     total = sum(float(covariance[index]) for index in _ROTATION_DIAGONAL)
     return 3 / total if total and not math.isnan(total) else 0.0
 
 
 def edge_id_of(source: Key, target: Key, kind: int) -> int:
-    """A number for an edge whose sender gives it none, the same in every run.
+    """An id for an edge whose sender gives none, the same in every run.
 
     Within a robot: kind (1 bit), source's id (31 bits), target's id (32 bits). Between robots: kind, and a hash of both
     ends (63 bits), which tells robots apart.

@@ -1,4 +1,4 @@
-"""What senders of pose graphs have in common: edges between keyframes of their own, sent again and again."""
+"""What senders of pose graphs have in common: they send edges between their own keyframes again and again."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from rotavg_ros.online.measurements import MAX_ID, RejectedInputError
 from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.view_graph import EdgeKind
 
-# Beyond so many, what was seen is forgotten, so that nonsense cannot fill the memory; the estimator knows repetitions
-# as well, at a higher price.
+# Most edges remembered as seen; beyond, they are forgotten, so that nonsense cannot fill the memory. The estimator
+# recognises repetitions as well, at a higher cost.
 _MOST_REMEMBERED = 1_000_000
 
 _LARGEST_REFINEMENT = math.radians(10.0)
@@ -24,11 +24,11 @@ _LARGEST_REFINEMENT = math.radians(10.0)
 class ForeignGraph:
     """Edges by keyframe id; each measurement passes once, however often the sender repeats its graph.
 
-    Once more passes what the estimator has given up, a closure whose keyframe came too late, say.
+    An edge that the estimator has given up, such as a closure whose keyframe came too late, passes once more.
 
     A repeated closure with another rotation is another measurement of the same pair. A repeated odometry edge may be
-    refined a little; with quite another rotation it is refused, because then the sender has begun anew and means other
-    places by the same ids.
+    refined slightly; with a very different rotation it is refused, because then the sender has begun anew and uses the
+    same ids for other places.
     """
 
     def __init__(self, source: Source) -> None:
@@ -36,7 +36,7 @@ class ForeignGraph:
         self._seen = Fingerprints(_MOST_REMEMBERED)
         self._stamp_ns: dict[Key, int] = {}
         self._odometry: dict[tuple[Key, Key], Quaternion] = {}
-        # Numbers of the last losses between two keyframes: what was seen before them is new again.
+        # Number of the last loss between two keyframes; edges that were seen before it are new again.
         self._loss: dict[tuple[Key, Key], int] = {}
         self._num_losses = 0
 
@@ -86,7 +86,7 @@ class ForeignGraph:
         self._seen.add(measurement)
         source, target = (KeyframeReference(*key, self._stamp_ns.get(key)) for key in ends)
         edge_id = edge_id_of(*ends, kind)
-        # Where on the body the sensor sits is not known: the way of the sensor stands for that of the body.
+        # The sensor's position on the body is unknown, so its translation is taken for that of the body.
         position = quaternion.rotate(self._source.body_from_sensor, to_vector(translation))
         yield EdgeRecord(EdgeMeasurement(edge_id, source, target, inside, kind, precision, position))
 
@@ -104,15 +104,15 @@ def _make_room(memory: dict[Any, Any]) -> None:
 def edges_in_order(
     edges: Iterable[Any], kind_of: Mapping[int, int], no_edges: Collection[int]
 ) -> tuple[list[Any], int]:
-    """Edges of the known types, odometry first, for it makes the keyframes that closures refer to.
+    """Edges of the known types, odometry first, since it creates the keyframes that closures refer to.
 
     Args:
-        edges: with a field ``type``.
+        edges: messages with a field ``type``.
         kind_of: the ``EdgeKind`` of every type that joins two keyframes.
-        no_edges: types that are something else.
+        no_edges: types that do not join two keyframes.
 
     Returns:
-        those edges, and how many are of a type that nobody knows.
+        those edges, and the number of edges of unknown types.
     """
     edges = [edge for edge in edges if edge.type not in no_edges]
     known = sorted((edge for edge in edges if edge.type in kind_of), key=lambda edge: kind_of[edge.type])

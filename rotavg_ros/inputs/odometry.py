@@ -1,4 +1,4 @@
-"""Odometry of rotation: whoever says how the body is turned at a stamp."""
+"""Odometry from all message types that state the body's orientation at a stamp."""
 
 from __future__ import annotations
 

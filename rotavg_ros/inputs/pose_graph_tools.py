@@ -28,7 +28,7 @@ _NO_EDGES = (2, 4, 5, 6)
 
 
 class PoseGraphConverter(ForeignGraph):
-    """The sender's verdict on a closure counts, and counts no more as soon as the sender takes it back."""
+    """The sender's verdict on a closure counts until the sender withdraws it."""
 
     edges_field = "edges"
     sends_parts = True

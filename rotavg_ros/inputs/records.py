@@ -1,4 +1,4 @@
-"""What a converter knows about its source, and what it makes of a message."""
+"""What a converter knows about its source, and the records that it makes from a message."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from rotavg_ros.view_graph import EdgeLabel
 
 @dataclass(frozen=True)
 class Source:
-    """Where messages come from: what they do not say themselves.
+    """The source of messages: what they do not state themselves.
 
     Attributes:
-        robot: whose they are, where they name no robot.
+        robot: the robot that they belong to if they name none.
         robots: names of all robots, for messages that number them.
-        body_from_sensor: orientation in the body frame of the sensor frame that the messages' rotations are given in.
-        limits: what odometry is believed to do from one keyframe to the next.
+        body_from_sensor: orientation, in the body frame, of the sensor frame in which the messages state rotations.
+        limits: largest believable change of odometry from one keyframe to the next.
     """
 
     robot: str
@@ -31,9 +31,9 @@ class Source:
     limits: ContinuityLimits = ANY_MOTION
 
     def robot_of(self, number: int) -> str:
-        """Name of the robot with a number: its place in ``robots``, unless robots there have numbers for names.
+        """Name of the robot with a number, which is its place in ``robots`` unless robots there are named by numbers.
 
-        A number that means none of them becomes a name itself.
+        A number that fits none of them becomes a name itself.
         """
         return self._name_of_number.get(number, str(number))
 
@@ -49,9 +49,9 @@ class EdgeRecord:
 
     Attributes:
         edge: the measurement, or why it cannot be read.
-        sender, sequence: whom the message is about, and its sender's count; 0 for senders that do not.
-        frame_id: the sensor frame that the sender says it measured in; empty where it says nothing.
-        element: of a message of many edges, the one that this is.
+        sender, sequence: the robot that the message is about, and the sender's count; 0 if the sender does not count.
+        frame_id: the sensor frame in which the sender measured; empty if it does not say.
+        element: the edge's element in a message of many edges.
     """
 
     edge: EdgeMeasurement | RejectReason
@@ -77,9 +77,9 @@ class OdometryRecord:
     Attributes:
         stamp_ns: nanoseconds.
         world_from_body: xyzw, not checked.
-        position: metres, of the sensor, not checked; None where the message carries none.
-        frame_id, child_frame_id: of the odometry and of what moves in it; empty where the message does not say.
-        body_from_sensor: xyzw, of what the message says the pose of.
+        position: of the sensor, metres, not checked; None if the message carries none.
+        frame_id, child_frame_id: of the odometry and of the moving frame; empty if the message does not say.
+        body_from_sensor: xyzw, of the frame whose pose the message states.
     """
 
     stamp_ns: int
@@ -91,12 +91,12 @@ class OdometryRecord:
 
     @property
     def world_from_sensor(self) -> Quaternion:
-        """xyzw, as the message says."""
+        """xyzw, as stated in the message."""
         return multiply(self.world_from_body, self.body_from_sensor)
 
     @property
     def known_position(self) -> Vector | None:
-        """The position; None, too, where the source has lost it (NaN, infinite)."""
+        """The position; None also if the source has lost it (NaN, infinite)."""
         return self.position if self.position is not None and all(map(math.isfinite, self.position)) else None
 
 
@@ -107,26 +107,26 @@ class EdgeConverter(Protocol):
         """What is new in a message."""
 
     def forget(self) -> None:
-        """Begin anew, as the graph does: everything that is sent again is new."""
+        """Begin anew with the graph: everything that is sent again is new."""
 
     def note_given_up(self, source: KeyframeReference, target: KeyframeReference) -> None:
-        """An edge between these, by id, was lost for want of room or of time: when it is sent again, it is new."""
+        """An edge between these, by id, was lost for lack of room or time: when it is sent again, it is new."""
 
 
 class WholeGraphConverter(EdgeConverter, Protocol):
-    """Of messages that hold a graph, which can be sent on without some of its edges.
+    """Converter of messages that hold a graph, which can be sent on without some of its edges.
 
     Attributes:
         edges_field: the message's field with the edges.
-        sends_parts: whether a message may hold a part of the graph; else each stands for all before it.
+        sends_parts: whether a message may hold a part of the graph; otherwise each replaces all before it.
     """
 
     edges_field: str
     sends_parts: bool
 
     def closure_name(self, edge: Any) -> tuple[str, int] | None:
-        """Source's robot and id of an element of that field, as in its record; None of what is no closure."""
+        """Source robot and id of an element of that field, as in its record; None if it is not a closure."""
 
 
-# Message, body_from_sensor → record. Raises RejectedInputError for what cannot be read at all.
+# Message, body_from_sensor → record. Raises RejectedInputError if the message cannot be read at all.
 OdometryConverter = Callable[[Any, Quaternion], OdometryRecord]

@@ -1,4 +1,4 @@
-"""Type names to converters."""
+"""Converters by type name."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ _FOREIGN: dict[str, Callable[[Source], EdgeConverter]] = {
     "cslam_common_interfaces/msg/InterRobotLoopClosure": InterRobotLoopClosureConverter,
 }
 
-# What carries edges; each topic has a converter of its own.
+# Types that carry edges; each topic gets a converter of its own.
 EDGE_CONVERTERS: dict[str, Callable[[Source], EdgeConverter]] = {
     "rotavg_msgs/msg/RelativeRotation": RelativeRotationConverter,
     "rotavg_msgs/msg/RelativeRotationArray": RelativeRotationArrayConverter,
     **_FOREIGN,
 }
 
-# Edges between keyframes that the sender itself has chosen and numbered, so that none may be made from odometry.
+# Types with edges between keyframes that the sender has chosen and numbered, so that none may be made from odometry.
 BRINGS_KEYFRAMES = frozenset(_FOREIGN)
 
-# Says in which frame it is attached to the body, and nothing of the frame that the body turns in.
+# Its frame_id is the frame attached to the body; it does not name the frame in which the body turns.
 FRAMELESS_ODOMETRY = "sensor_msgs/msg/Imu"
 
-# What carries the rotation of a robot's odometry.
+# Types that carry the rotation of a robot's odometry.
 ODOMETRY_CONVERTERS: dict[str, OdometryConverter] = {
     "nav_msgs/msg/Odometry": from_odometry,
     "geometry_msgs/msg/PoseWithCovarianceStamped": from_pose_with_covariance,

@@ -18,7 +18,7 @@ _BY_ID, _BY_STAMP = 0, 1
 
 
 class RelativeRotationConverter:
-    """Single edges; every message is taken for what it is, the estimator knows repetitions."""
+    """Single edges; every message is passed on, since the estimator recognises repetitions."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
@@ -48,7 +48,7 @@ class RelativeRotationArrayConverter(RelativeRotationConverter):
 
 
 def edge_from_message(message: Any, source: Source) -> EdgeMeasurement:
-    """An edge between bodies from one between sensors.
+    """The edge between bodies from a message's edge between sensors.
 
     Raises:
         RejectedInputError: a field that cannot be read at all.
@@ -65,7 +65,7 @@ def edge_from_message(message: Any, source: Source) -> EdgeMeasurement:
 
 
 def _translation(message: Any, source: Source) -> Vector | None:
-    """Between bodies, as far as a sensor's orientation tells; None where the message has none."""
+    """Translation between bodies, as far as the sensor's orientation determines it; None if the message has none."""
     if len(message.translation) != _AXES:
         return None
     x, y, z = (float(part) for part in message.translation)

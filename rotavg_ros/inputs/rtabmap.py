@@ -1,4 +1,4 @@
-"""RTAB-Map's graph, ``rtabmap_msgs/MapGraph``: whole in every message, with nodes left out when it is optimised.
+"""RTAB-Map's graph, ``rtabmap_msgs/MapGraph``: whole in every message, but optimisation may leave out nodes.
 
 Facts from the package's message definitions and from ``rtabmap/core/Link.h``: a link's transform is the pose of
 ``to_id`` in the frame of ``from_id``, its matrix is information, not covariance, and nodes carry no stamps.
@@ -17,7 +17,7 @@ from rotavg_ros.online.measurements import RejectedInputError
 from rotavg_ros.view_graph import EdgeKind
 
 # Link types. 0 joins neighbours in time; 1 … 5 are closures: global, in space, in time, by a user, virtual. 6 stands
-# for links through a node that was merged into another, closures among them, so it may be as wrong as one.
+# for links through a node that was merged into another. These may include closures, so it may be as wrong as one.
 _KIND = {0: EdgeKind.ODOMETRY} | dict.fromkeys(range(1, 7), EdgeKind.LOOP_CLOSURE)
 # Pose priors, landmarks and gravity do not join two keyframes.
 _NO_EDGES = (7, 8, 9)

@@ -1,6 +1,6 @@
-"""How sensors sit on a robot's body, as static transforms say (``tf2_msgs/TFMessage``), and edges between bodies.
+"""The mounting of sensors on a robot's body from static transforms (``tf2_msgs/TFMessage``), and edges between bodies.
 
-A transform of tf is the pose of its child's frame in its parent's. An edge between two poses of a sensor, T, is the
+A tf transform is the pose of the child frame in the parent frame. An edge between two poses of a sensor, T, is the
 edge X T X⁻¹ between those of the body, where X is the pose of the sensor in the body's frame.
 """
 
@@ -16,7 +16,7 @@ from rotavg_ros.online import EdgeMeasurement, quaternion
 from rotavg_ros.online.measurements import RejectedInputError, checked_rotation
 from rotavg_ros.online.quaternion import IDENTITY, Quaternion, Vector
 
-# Beyond so many frames, new ones are nonsense.
+# Most frames remembered; beyond, new ones are assumed to be nonsense.
 _MOST_FRAMES = 10_000
 
 
@@ -28,7 +28,7 @@ class Mounting:
     position: Vector = (0.0, 0.0, 0.0)
 
     def of(self, inner: Mounting) -> Mounting:
-        """The pose in the outer frame of what has the pose ``inner`` in this one."""
+        """The pose, in the outer frame, of a frame with the pose ``inner`` in this one."""
         turned = quaternion.rotate(self.orientation, inner.position)
         x, y, z = (a + b for a, b in zip(self.position, turned, strict=True))
         return Mounting(quaternion.normalize(quaternion.multiply(self.orientation, inner.orientation)), (x, y, z))
@@ -40,7 +40,7 @@ class Mounting:
         return Mounting(back, (-x, -y, -z))
 
     def edge_of_body(self, edge: EdgeMeasurement) -> EdgeMeasurement:
-        """The edge between bodies that is measured between sensors with this pose in the body's frame."""
+        """The edge between bodies, from one measured between sensors with this pose in the body's frame."""
         if self == _AT_THE_BODY:
             return edge
         x, y, z, w = edge.target_from_source
@@ -70,7 +70,7 @@ class SensorFrames:
         self._found: dict[tuple[str, str], Mounting | None] = {}
 
     def take(self, message: Any) -> None:
-        """Take the transforms of a ``tf2_msgs/TFMessage``; one that is no pose is left out, a newer one counts."""
+        """Take the transforms of a ``tf2_msgs/TFMessage``; invalid poses are ignored, newer ones replace older ones."""
         for each in message.transforms:
             parent, child = _name(each.header.frame_id), _name(each.child_frame_id)
             mounting = _mounting(each.transform)
@@ -79,12 +79,12 @@ class SensorFrames:
         self._found.clear()
 
     def note_body(self, robot: str, frame: str, body_from_frame: Quaternion = IDENTITY) -> None:
-        """Remember in which frame a robot's odometry moves.
+        """Remember the frame whose motion a robot's odometry describes.
 
         Args:
-            robot: whose odometry.
-            frame: its ``child_frame_id``; empty where it says nothing.
-            body_from_frame: how that frame is turned in the body's.
+            robot: name of the robot.
+            frame: the odometry's ``child_frame_id``; empty if it does not say.
+            body_from_frame: orientation of that frame in the body's.
         """
         if frame and robot not in self._bodies:
             self._bodies[robot] = _name(frame), Mounting(body_from_frame)
@@ -110,7 +110,7 @@ class SensorFrames:
         return None
 
     def _ancestors(self, frame: str) -> Iterator[tuple[str, Mounting]]:
-        """A frame, its parent and so on, with the pose of the frame in each; a ring ends where it began."""
+        """A frame, its parent and so on, with the pose of the frame in each; stops after one turn of a cycle."""
         seen: set[str] = set()
         pose = Mounting()
         while frame not in seen:
@@ -123,12 +123,12 @@ class SensorFrames:
 
 
 def _name(frame: str) -> str:
-    """As tf2 has it; tf1 put a '/' before."""
+    """The frame's name as in tf2; tf1 put a '/' before it."""
     return frame.removeprefix("/")
 
 
 def _mounting(transform: Any) -> Mounting | None:
-    """Of a ``geometry_msgs/Transform``; None where it is no pose."""
+    """From a ``geometry_msgs/Transform``; None if it is not a valid pose."""
     position = to_vector(transform.translation)
     try:
         orientation = checked_rotation(to_tuple(transform.rotation))

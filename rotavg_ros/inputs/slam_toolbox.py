@@ -1,10 +1,10 @@
 """slam_toolbox's graph, ``slam_toolbox/PoseGraph``, whole in every message, and ``NewNodeEvent``, a node at a time.
 
 Facts from the package's message definitions and its mapper: ``relative_pose`` is the pose of the target's robot in the
-frame of the source's, nodes are numbered one after the other as they are made, and an edge's matrix is the covariance
+frame of the source's, nodes are numbered consecutively as they are created, and an edge's matrix is the covariance
 of (x, y, yaw). A graph comes after a loop closure, seconds after its newest node, and its header's stamp is the moment
-of publishing, so it says of no node when that was taken: the stamps are those of the events. An event has the edge from
-the node before; where there is none, as at the first node, both of its ids are 0.
+of publishing, so it gives no node's stamp; the stamps are those of the events. An event has the edge from the node
+before; where there is none, as at the first node, both of its ids are 0.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class _NumberedGraph(ForeignGraph):
 
 
 class GraphConverter(_NumberedGraph):
-    """``PoseGraph``: odometry first, for it makes the keyframes that closures refer to."""
+    """``PoseGraph``: odometry first, since it creates the keyframes that closures refer to."""
 
     edges_field = "edges"
     sends_parts = False
@@ -69,7 +69,7 @@ class GraphConverter(_NumberedGraph):
 
 
 class NewNodeConverter(_NumberedGraph):
-    """``NewNodeEvent``: when a node was taken, and the odometry that leads to it."""
+    """``NewNodeEvent``: the stamp of a node, and the odometry that leads to it."""
 
     def __call__(self, message: Any) -> Iterator[EdgeRecord]:
         try:
@@ -90,7 +90,7 @@ def _precision(variance: float) -> float:
 
 
 def _parts(relative_pose: Any) -> tuple[Any, Any]:
-    """Orientation and position of a ``geometry_msgs/Pose``, or of a ``Pose2D``, which earlier versions have."""
+    """Orientation and position of a ``geometry_msgs/Pose``, or of a ``Pose2D``, which earlier versions use."""
     if not hasattr(relative_pose, "theta"):
         return relative_pose.orientation, relative_pose.position
     half = relative_pose.theta / 2 if math.isfinite(relative_pose.theta) else math.nan

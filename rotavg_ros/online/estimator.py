@@ -256,7 +256,7 @@ class OnlineEstimator:
     def odometry_frame(self, robot: str) -> tuple[OdometryFrame, int] | None:
         """Where a robot's odometry frame lies in the world, by the last answer that was placed.
 
-        The number counts odometry's steps since the keyframe that the frame is derived from, the unfinished one included.
+        The number counts odometry's steps since the frame's keyframe, including the unfinished one.
 
         Before the first answer odometry's own poses are used, and odometry that begins anew continues where the robot
         was. None before odometry with positions, and after a load until an answer has been placed.
@@ -301,7 +301,7 @@ class OnlineEstimator:
         return self._paused
 
     def pause(self, paused: bool) -> None:
-        """While paused, inputs are taken as usual, but ticks do nothing and a running one is given up, unless forced."""
+        """While paused, inputs are taken as usual but ticks do nothing and a running one is given up, unless forced."""
         with self._lock:
             self._paused = paused
             if paused and self._running is not None and not self._running.is_forced:

@@ -1,4 +1,4 @@
-"""From a finished replay to its record: poses by robot, references, topics."""
+"""Assembles the record of a finished replay: poses by robot, references, topics."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _IMU = "sensor_msgs/msg/Imu"
 
 
 def assemble(bag: BagReader, plan: Plan, outcome: Outcome) -> RunRecord:
-    """Everything that is known about a replay.
+    """The record of a replay.
 
     Raises:
-        GraphFileError: a reference that cannot be read, or that belongs to something else.
+        GraphFileError: a reference that cannot be read, or that does not belong to the bag.
     """
     answer = outcome.answer
     trajectories = outcome.estimator.trajectories(answer)
@@ -87,10 +87,10 @@ def _references(
 
 
 def _from_file(path: Path, trajectory: Trajectory, odometry_ns: NDArray[np.int64]) -> Reference:
-    """A file's poses; those without stamps are of the odometry's messages, or of the keyframes, one by one.
+    """A file's poses; those without stamps belong one by one to the odometry's messages or to the keyframes.
 
     Raises:
-        GraphFileError: stamps of another time, or a number of rows that fits neither.
+        GraphFileError: stamps of another time, or a number of rows that matches neither.
     """
     poses = read_pose_file(path)
     rows, keyframes_ns = len(poses.position), trajectory.stamp_ns

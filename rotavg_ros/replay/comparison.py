@@ -57,7 +57,7 @@ def truth_at_keyframes(reference: Reference, stamp_ns: NDArray[np.int64]) -> Tru
     known = (np.abs(stamps[before] - stamp_ns) <= MAX_TRUTH_DISTANCE_NS) & (
         np.abs(stamps[after] - stamp_ns) <= MAX_TRUTH_DISTANCE_NS
     )
-    # Seconds from the first sample, for nanoseconds since 1970 do not fit into a float.
+    # Seconds since the first sample: nanoseconds since 1970 do not fit into a float.
     seconds = (stamps - stamps[0]) / 1e9
     at = ((stamp_ns[known] - stamps[0]) / 1e9).clip(0, seconds[-1])
     if known.any():
@@ -73,7 +73,7 @@ def truth_at_keyframes(reference: Reference, stamp_ns: NDArray[np.int64]) -> Tru
 
 
 def _truth(reference: Reference, stamp_ns: NDArray[np.int64], time_line: NDArray[np.int64]) -> Truth:
-    """:func:`truth_at_keyframes`, each time line of a robot with that of the reference."""
+    """:func:`truth_at_keyframes` for each time line of a robot with that of the reference."""
     orientation = np.full((len(stamp_ns), 4), np.nan)
     position = None if reference.position is None else np.full((len(stamp_ns), 3), np.nan)
     for number in np.unique(time_line).tolist():
@@ -94,7 +94,7 @@ def errors_of_orientations(
 
     Args:
         world_from_body: ``(n, 4)`` xyzw; NaN rows are unknown.
-        component: ``(n,)``; each is turned onto the reference by itself. Default: one component.
+        component: ``(n,)``; each component is rotated onto the reference separately. Default: one component.
     """
     component = np.zeros(len(world_from_body), dtype=np.int64) if component is None else component
     known = known_rows(truth.world_from_body) & known_rows(world_from_body)
@@ -123,8 +123,8 @@ class RobotComparison:
         truth: the reference at the keyframes.
         odometry, corrected: orientation errors.
         odometry_distance: ``(n,)`` position error of odometry, metres.
-        dead_reckoned_distance: of odometry's steps along corrected orientations.
-        corrected_distance: of the corrected positions.
+        dead_reckoned_distance: the same for odometry's steps along corrected orientations.
+        corrected_distance: the same for the corrected positions.
     """
 
     truth: Truth
@@ -136,7 +136,7 @@ class RobotComparison:
 
 
 def compare(robot: RobotRecord, component: NDArray[np.int64]) -> RobotComparison | None:
-    """A robot's run against its reference; None where there is none, or none of it at a keyframe's time.
+    """Compare a robot's run with its reference; None if there is none, or if it covers no keyframe.
 
     Args:
         component: ``(n,)`` the components of the robot's keyframes.

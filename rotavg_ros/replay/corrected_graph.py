@@ -13,14 +13,14 @@ from rotavg_ros.online import Answer
 from rotavg_ros.replay.record import RunRecord
 from rotavg_ros.view_graph import EdgeKind
 
-# Steps in a plane have no height beyond rounding, metres.
+# Largest height of a step that still counts as planar, metres.
 _FLAT_M = 1e-6
-# A robot's own numbers that are farther apart are only counted; so many robots do not have that numbers run out.
+# Ids of one robot that span more than this are replaced by consecutive numbers, so that ids of several robots fit.
 _MOST_BETWEEN = 1 << 40
 
 
 def write_graph_of_run(path: Path, record: RunRecord) -> None:
-    """Write corrected vertices and what is believed of the edges.
+    """Write the corrected vertices and the edges that are believed.
 
     Args:
         path: of the file.
@@ -56,10 +56,10 @@ def write_graph_of_run(path: Path, record: RunRecord) -> None:
 
 
 def keyframe_ids(answer: Answer) -> np.ndarray:
-    """``(N,)`` int64: the only robot's own numbers; of several robots, or of too large numbers, they count from 0.
+    """``(N,)`` int64: the own ids of a single robot; for several robots, or too large ids, they count from 0.
 
-    One robot's follow another's, with one left out between them, and differ as their own do: what joins consecutive
-    ones is odometry to readers that know no kinds of edges.
+    The robots' ranges follow each other with a gap of one, and ids within a range differ as the robot's own do. To
+    readers without kinds of edges, an edge between consecutive ids is odometry.
     """
     ids = answer.keyframe_id
     largest = np.iinfo(np.int64).max

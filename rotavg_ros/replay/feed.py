@@ -1,4 +1,4 @@
-"""A bag's messages into the estimator, by the converters that the node's subscriptions use."""
+"""Feeds a bag's messages into the estimator, with the converters that the node's subscriptions use."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ OnOdometry = Callable[[str, OdometryRecord], None]
 
 
 class Feed:
-    """Hands messages on by topic.
+    """Passes messages on by topic.
 
     Args:
-        estimator: gets everything.
-        plan: which topic is what.
-        frames: how the sensors sit that edges are measured between.
+        estimator: receives all measurements.
+        plan: the use of each topic.
+        frames: the mounting of the sensors between which edges are measured.
         on_odometry: is told of every odometry message that was taken.
     """
 
@@ -60,11 +60,11 @@ class Feed:
 
     @property
     def topics(self) -> list[str]:
-        """Everything that has to be read."""
+        """All topics that have to be read."""
         return list(self._handlers)
 
     def __call__(self, topic: str, message: Any) -> None:
-        """Hand one message on."""
+        """Pass one message on."""
         for handle in self._handlers[topic]:
             handle(message)
 
@@ -78,7 +78,7 @@ class Feed:
             self._on_odometry(robot, record)
 
     def _take_edges(self, convert: EdgeConverter, topic: str, message: Any) -> None:
-        if self._generation != self._estimator.generation:  # time went back: what is sent again is new
+        if self._generation != self._estimator.generation:  # time went back: repeated edges are new again
             self._generation = self._estimator.generation
             for converter in self._edge_converters:
                 converter.forget()

@@ -1,4 +1,4 @@
-"""A bag's edges between sensors, taken into the bodies' frames by the static transforms recorded with them."""
+"""Converts a bag's edges between sensors to the bodies' frames by the static transforms recorded with them."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from rotavg_ros.replay.plan import Plan
 
 
 class BagFrames:
-    """How the sensors of a bag sit, of the whole bag from the beginning on.
+    """The mounting of a bag's sensors, known for the whole bag from the beginning on.
 
-    Where the node waits a while for a transform, nothing has to wait here.
+    The node waits a while for a transform; here nothing has to wait.
     """
 
     def __init__(self, bag: BagReader, plan: Plan) -> None:
-        """Look into the bag for static transforms, and for the frames that odometry moves in."""
+        """Read the bag's static transforms, and the frames whose motion odometry describes."""
         self._is_on = plan.edge_frames_from_tf
         self._sensors, self._bodies = SensorFrames(), set[str]()
         self._unknown: dict[str, dict[str, None]] = {}
@@ -37,7 +37,7 @@ class BagFrames:
                 self._bodies |= {frame} if frame else set()
 
     def edge_of_body(self, edge: EdgeMeasurement, frame: str, topic: str) -> EdgeMeasurement:
-        """The edge between bodies; as it is, where nothing says how the sensor sits."""
+        """The edge between bodies; unchanged if the mounting of the sensor is not known."""
         if not self._is_on or not frame:
             return edge
         body_from_sensor = self._sensors.body_from(edge.source.robot, frame)
@@ -48,7 +48,7 @@ class BagFrames:
 
     @property
     def warnings(self) -> list[str]:
-        """One line for each topic with edges that were taken as they are, though odometry tells of another frame."""
+        """One line for each topic with edges that were taken as they are, although odometry is of another frame."""
         lines, bodies = [], ", ".join(sorted(self._bodies))
         for topic, frames in self._unknown.items() if self._bodies else ():
             named = ", ".join(list(frames)[:3])

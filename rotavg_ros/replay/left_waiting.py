@@ -6,16 +6,16 @@ from collections.abc import Collection
 
 from rotavg_ros.online.content import Counts
 
-# So many names are told at most.
+# Most names that are shown.
 _MOST_NAMES = 3
 
 
 def told(counts: Counts, robots: Collection[str]) -> str | None:
-    """How many there are, and what to do; None where there are none.
+    """How many there are, and what to do; None if there are none.
 
     Args:
         counts: at the end.
-        robots: that the replay has odometry of, or whose edges make keyframes.
+        robots: those with odometry in the replay, or whose edges create keyframes.
     """
     if not counts.pending:
         return None

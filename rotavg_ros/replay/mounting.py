@@ -1,4 +1,4 @@
-"""How a reference's sensor sits in the body, from how both turn: bags seldom say how an IMU is mounted."""
+"""Finds the mounting of a reference's sensor from the motion of both, since bags seldom say how an IMU is mounted."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _SMALLEST_TURN = np.radians(1.0)
 def without_mounting(
     reference: Reference, stamp_ns: NDArray[np.int64], odometry_world_from_body: NDArray[np.float64]
 ) -> Reference:
-    """The reference with the sensor's mounting rotation taken out, so that it speaks of the body.
+    """The reference without the sensor's mounting rotation, so that it describes the body.
 
     A turn of the body between two keyframes is the sensor's, seen in other axes: ``v_body = R_body_sensor v_sensor``
-    for rotation vectors, which is Wahba's problem (solved as by Kabsch 1976). A body that turns about one axis only
-    leaves open how the sensor sits about that axis, and there it makes no difference.
+    for rotation vectors, which is Wahba's problem (solved as by Kabsch 1976). If a body turns about only one axis, the
+    mounting angle about that axis remains undetermined, but then it makes no difference.
 
     Args:
         reference: orientations of a sensor.
@@ -31,7 +31,7 @@ def without_mounting(
         odometry_world_from_body: ``(n, 4)`` xyzw at the keyframes; NaN rows unknown.
 
     Returns:
-        as given, where there are no turns in common.
+        the reference unchanged if there are no common turns.
     """
     seen = reference.on_last_time_line()
     nearest = np.searchsorted(seen.stamp_ns, stamp_ns).clip(0, len(seen.stamp_ns) - 1)

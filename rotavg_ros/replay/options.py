@@ -15,25 +15,25 @@ from rotavg_ros.settings.parameters import NODE_NAME, PARAMETERS
 
 Values = dict[str, Any]
 
-# Names of nodes in parameter files that mean any.
+# Node names in parameter files that match any node.
 _ANY_NODE = ("*", "**")
-# How the names of parameters begin that rclpy gives every node.
+# Prefixes of the parameters that rclpy gives every node.
 _RCLPYS = ("qos_overrides.", "start_type_description_service", "use_sim_time")
 
 
 class ReplayOptionError(UserError):
-    """A parameter that the node does not have, or a value that it cannot have."""
+    """A parameter that the node does not have, or an invalid value."""
 
 
 def read_parameter_file(path: Path) -> tuple[Values, list[str]]:
-    """What a file for ``--params-file`` says about the node; what rclpy alone makes use of is passed over.
+    """The node's parameters in a file for ``--params-file``; those that only rclpy uses are ignored.
 
     Returns:
         the values by name; and a line for each parameter that the node does not have, which it ignores as well.
 
     Raises:
-        ReplayOptionError: no such file, not YAML, not a parameter file of the node, or of more than one, or a value
-            that cannot be.
+        ReplayOptionError: no such file, not YAML, not a parameter file of the node, or of more than one, or an invalid
+            value.
     """
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -61,7 +61,7 @@ def read_parameter_file(path: Path) -> tuple[Values, list[str]]:
 
 
 def _nodes(content: Any, name: str = "") -> Iterator[tuple[str, Mapping[Any, Any]]]:
-    """Full names of nodes and what is below their ``ros__parameters``; namespaces may be nested."""
+    """Full names of nodes and the content of their ``ros__parameters``; namespaces may be nested."""
     for key, below in content.items() if isinstance(content, Mapping) else ():
         if key == "ros__parameters":
             yield name, below if isinstance(below, Mapping) else {}
@@ -70,7 +70,7 @@ def _nodes(content: Any, name: str = "") -> Iterator[tuple[str, Mapping[Any, Any
 
 
 def _flat(settings: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Parameters by name; of nested ones the names are joined by dots."""
+    """Parameters by name; names of nested ones are joined by dots."""
     for key, value in settings.items():
         if isinstance(value, Mapping):
             yield from _flat(value, f"{prefix}{key}.")
@@ -82,7 +82,7 @@ def read_settings(words: Iterable[str]) -> Values:
     """Parameters from words ``name:=value``, the value in YAML, as after ``--ros-args -p``.
 
     Raises:
-        ReplayOptionError: another form, an unknown name, or a value that cannot be.
+        ReplayOptionError: another form, an unknown name, or an invalid value.
     """
     values: Values = {}
     for word in words:
@@ -109,6 +109,6 @@ def _checked(name: str, value: Any, where: str) -> Any:
 
 
 def _meant(name: str, words: str) -> str:
-    """A question whether a parameter of a similar name is meant; empty where there is none."""
+    """A question whether a parameter with a similar name is meant; empty if there is none."""
     close = difflib.get_close_matches(name, list(PARAMETERS), n=1)
     return words.format(close[0]) if close else ""

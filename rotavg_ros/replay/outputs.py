@@ -1,4 +1,4 @@
-"""A replay's output folder: each file appears under its name when it is complete."""
+"""A replay's output folder: each file gets its final name when it is complete."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ from rotavg_ros.replay.summary import summarize
 RECORDING = "run.mcap"
 SUMMARY = "summary.json"
 
-_UNFINISHED = ".unfinished."  # and the number of the process
+_UNFINISHED = ".unfinished."  # followed by the process id
 
 
 class OutputError(UserError):
-    """An output folder that is there already, or cannot be written."""
+    """An output folder that already exists, or cannot be written."""
 
 
 @contextmanager
 def output_folder(folder: Path, *, overwrite: bool) -> Iterator[tuple[Path, bool]]:
-    """A workplace inside the output folder; what was written there takes its place when the block ends well.
+    """A temporary folder inside the output folder; its files are moved there when the block ends without an error.
 
-    An older replay's files go then, and the workplaces of replays that were killed; whatever else is in the folder
-    stays. Yields the workplace, and whether an older replay's answer is to be replaced.
+    Then the files of an older replay and the temporary folders of killed replays are deleted; everything else in the
+    folder stays. Yields the temporary folder, and whether an older replay's answer is to be replaced.
 
     Raises:
-        OutputError: the folder has something in it (without ``overwrite``), or cannot be written.
+        OutputError: the folder is not empty (without ``overwrite``), or cannot be written.
     """
     with asking_about(folder, OutputError):
         is_new, is_folder = not folder.exists(), folder.is_dir()
@@ -71,7 +71,7 @@ def output_folder(folder: Path, *, overwrite: bool) -> Iterator[tuple[Path, bool
 
 
 def _is_left_over(path: Path) -> bool:
-    """Whether a process worked there that is no more."""
+    """Whether it is the temporary folder of a process that no longer exists."""
     number = path.name.removeprefix(_UNFINISHED)
     if number == path.name or not number.isdecimal():
         return False
@@ -79,13 +79,13 @@ def _is_left_over(path: Path) -> bool:
         os.kill(int(number), 0)
     except ProcessLookupError:
         return True
-    except (PermissionError, OverflowError):  # another user's; no number that a process has
+    except (PermissionError, OverflowError):  # another user's process; too large for a process id
         return False
     return int(number) == os.getpid()
 
 
 def _files_of(folder: Path) -> list[str]:
-    """The files that an older summary says it came with."""
+    """The files that an older summary lists as its own."""
     try:
         names = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["files"]
     except (OSError, ValueError, KeyError, TypeError):
@@ -97,7 +97,7 @@ def write_tables(folder: Path, record: RunRecord) -> None:
     """Write trajectories, graph and csv files.
 
     Args:
-        folder: where.
+        folder: where to write them.
         record: the run.
 
     Raises:
@@ -126,7 +126,7 @@ def write_summary(folder: Path, record: RunRecord, bag: Path, outcome: Outcome) 
 
 
 def _write_trajectory(folder: Path, name: str, odometry_name: str, robot: RobotRecord) -> None:
-    """Poses, those with stamps in a file for every time line: the last under the name itself, earlier ones numbered."""
+    """Write poses; those with stamps go to a file per time line, the last under the plain name, earlier ones numbered."""
     nothing = np.zeros((len(robot.stamp_ns), 3))
     position = nothing if robot.position is None else np.nan_to_num(robot.position)
     odometry = nothing if robot.odometry_position is None else np.nan_to_num(robot.odometry_position)
@@ -153,7 +153,7 @@ def _write_tum(
 
 
 def _orientation_columns(answer: Answer) -> list[Column]:
-    """As `rotavg solve` writes them; with several robots their number is the last column."""
+    """As `rotavg solve` writes them; with several robots, the robot's number is the last column."""
     order = np.lexsort((answer.keyframe_id, answer.keyframe_robot))
     columns = orientation_columns(keyframe_ids(answer)[order], answer.world_from_body[order], answer.component[order])
     if len(answer.robots) > 1:
@@ -162,7 +162,7 @@ def _orientation_columns(answer: Answer) -> list[Column]:
 
 
 def _edge_columns(answer: Answer) -> list[Column]:
-    """As `rotavg solve` writes them, and the senders' ids; with several robots their numbers are the last columns."""
+    """As `rotavg solve` writes them, and the senders' ids; with several robots, their numbers are the last columns."""
     ids, robot, judged = keyframe_ids(answer), answer.keyframe_robot, None
     if answer.rotation_score is not None and answer.residual_m is not None:
         judged = answer.rotation_score, answer.residual_deg, answer.residual_m

@@ -1,7 +1,7 @@
-"""When a replay ticks: as often as the node does while its graph is small, and less often where a tick is dear.
+"""When a replay ticks: as often as the node while the graph is small, and less often where ticks are expensive.
 
-A tick's cost is counted in units of work, never in seconds, so that a bag leads to the same ticks on every machine. On
-the last answer, which is a cold solve of everything, it has no influence.
+A tick's cost is counted in units of work, never in seconds, so that a bag leads to the same ticks on every machine. The
+last answer is a cold solve of everything, so it does not depend on the pace.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ class WorkRates:
     A unit is :data:`~rotavg_ros.solver.SECONDS_PER_UNIT` of CPU.
 
     Attributes:
-        bare: units that a tick costs besides for each keyframe and edge of the graph.
-        at_first: that may be spent at any time: a bag of some thousand keyframes never waits.
-        per_second: that may be spent besides, for each second of the bag's time.
+        bare: additional units that a tick costs for each keyframe and edge of the graph.
+        at_first: units that may be spent from the start, so that a bag of some thousand keyframes never waits.
+        per_second: further units that may be spent for each second of the bag's time.
     """
 
     bare: float = 0.0015
@@ -30,13 +30,13 @@ class WorkRates:
 
 
 class Pace:
-    """The strikes of the replay's clock, and which of them are ticks."""
+    """Decides at which strikes of the replay's clock there is a tick."""
 
     def __init__(self, period_s: float, rates: WorkRates | None) -> None:
         """Begin with the first message.
 
         Args:
-            period_s: between strikes, of the bag's time.
+            period_s: time between strikes, in the bag's time.
             rates: None: every strike is a tick.
         """
         self.period_ns = round(period_s * NANOSECONDS)
@@ -44,7 +44,7 @@ class Pace:
         self._saved = 0.0 if rates is None else rates.at_first
 
     def strikes(self, count: int = 1) -> bool:
-        """So many periods have passed: whether there may be a tick now."""
+        """``count`` periods have passed; returns whether there may be a tick now."""
         if self._rates is not None:
             self._saved += count * self._rates.per_second * self.period_ns / NANOSECONDS
         return self._saved >= 0
@@ -53,14 +53,14 @@ class Pace:
         """A tick has given an answer.
 
         Args:
-            size: keyframes and edges of the graph.
+            size: number of keyframes and edges of the graph.
             work: units that the solver has spent on it.
         """
         if self._rates is not None:
             self._saved -= size * self._rates.bare + work
 
     def told(self) -> str:
-        """What the user is told beforehand, in a line."""
+        """A line for the user about the pace, shown before the replay."""
         every = f"a tick every {self.period_ns / NANOSECONDS:g} s of the bag's time"
         if self._rates is None:
             return every

@@ -1,4 +1,4 @@
-"""Which topic of a bag a replay uses as what: what the user says, and a good guess for the rest."""
+"""Decides what a replay uses each topic of a bag for: as the user says, and by a good guess for the rest."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from rotavg_ros.replay.record import TopicUse
 from rotavg_ros.replay.topics import Candidate, Candidates, find_candidates
 from rotavg_ros.settings.parameters import NodeParameters
 
-# Parameters that name topics, and those with so many numbers or names for each of them.
+# Parameters that name topics, and for each the parameters with values per topic, with the number of values.
 _PER_TOPIC = {
     "odometry_topics": {"robots": 1, "odometry_sensor_orientations": 4},
     "edge_topics": {"edge_robots": 1, "edge_sensor_orientations": 4},
 }
 
-# Parameters that only matter to a node that runs; where they name topics, these would not be the bag's.
+# Parameters that only matter to a running node; topics that they name would not be the bag's.
 _OF_LIVE_NODES = (
     *("forward_topics", "forward_delay_s", "edge_frame_wait_s", "publish_tf", "transform_tolerance_s"),
     *("correction_rate_deg_s", "correction_rate_m_s", "odometry_queue_depth", "edge_queue_depth", "tick_budget_s"),
@@ -33,16 +33,16 @@ _OF_LIVE_NODES = (
 
 
 class PlanError(UserError):
-    """Topics that the bag does not have or that are good for nothing; the message names the candidates."""
+    """Topics that the bag does not have or that cannot be used; the message names the candidates."""
 
 
 @dataclass(frozen=True)
 class Wishes:
-    """What the user wants used; None: guess. Entries are ``topic`` or ``topic:package/msg/Type``, or ``none`` alone.
+    """What the user wants to use; None: guess. Entries are ``topic``, ``topic:package/msg/Type``, or just ``none``.
 
     Attributes:
         odometry, edges: topics.
-        references: topics or files, one per robot in their order.
+        references: topics or files, one per robot in the robots' order.
         robots: names, one per odometry topic.
     """
 
@@ -61,17 +61,17 @@ class Input(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything decided.
+    """All decisions about a replay.
 
     Attributes:
-        parameters: the node's, their topics those of the bag; ``odometry_topics`` may name one that is not there.
-        odometry: one per robot, in the order of ``parameters.robots``; none where the bag has no odometry.
+        parameters: the node's, with the bag's topics; ``odometry_topics`` may name one that the bag lacks.
+        odometry: one per robot, in the order of ``parameters.robots``; empty if the bag has no odometry.
         edges: in the order of ``parameters.edge_topics``.
         references: topic or file by robot.
         topics: every topic of the bag and its use.
-        edge_frames_from_tf: edges of sensors are taken into the body's frame by the bag's static transforms.
-        tick_work: what ticks may cost; None where the user has said how often there is one.
-        unused: parameters that were set, not to their defaults, and that a replay has no use for.
+        edge_frames_from_tf: whether edges of sensors are converted to the body's frame by the bag's static transforms.
+        tick_work: what ticks may cost; None if the user has set how often they come.
+        unused: parameters that were set to other than their defaults, but that a replay does not use.
     """
 
     parameters: NodeParameters
@@ -97,13 +97,13 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
 
     Args:
         bag: open.
-        values: parameters that the user has set, by name. Topics among them count as wishes, but need not all be there:
-            a node may listen to more than was recorded.
-        wishes: from options, which win.
+        values: parameters that the user has set, by name. Topics among them count as wishes, but need not all be in the
+            bag: a node may listen to more than was recorded.
+        wishes: from command-line options, which take precedence.
 
     Raises:
-        PlanError: a topic that is not in the bag, or whose type nothing can be made of.
-        GraphFileError: a file for reference that holds no poses.
+        PlanError: a topic that is not in the bag, or whose type is not supported.
+        GraphFileError: a reference file that holds no poses.
         OptionError: parameters that do not fit together.
     """
     if bag.num_messages() == 0:
@@ -133,7 +133,7 @@ def make_plan(bag: BagReader, values: Mapping[str, Any], wishes: Wishes) -> Plan
 
 
 def _without_absent_topics(bag: BagReader, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters for the topics that the bag has; without any of them they are left to guessing."""
+    """The parameters restricted to topics that the bag has; if it has none of them, the topics are guessed."""
     recorded, kept = bag.topics, dict(values)
     for topics, lists in _PER_TOPIC.items():
         entries = values.get(topics, ())
@@ -191,7 +191,7 @@ def _chosen(
 
 
 def _robots(wanted: Sequence[str] | None, odometry: Sequence[Input]) -> tuple[str, ...]:
-    """Names for the robots behind the odometry topics: told, or their topics' namespaces, or the only one's."""
+    """Names for the robots of the odometry topics: as given, or their topics' namespaces, or the default for one."""
     if wanted:
         return tuple(wanted)
     if len(odometry) < 2:
@@ -222,9 +222,9 @@ def _references(
         with asking_about(path, PlanError):
             exists = path.exists()
         if not is_topic and exists and path.suffix not in RECORDING_SUFFIXES:
-            read_pose_file(entry)  # a mistake shows before the replay, not after it
+            read_pose_file(entry)  # so that a mistake shows before the replay
             references[robot] = path
-        elif not is_topic and path.suffix and not exists:  # no topic's name has a dot
+        elif not is_topic and path.suffix and not exists:  # topic names have no dots
             names = ", ".join(candidate.topic for candidate in found.references) or "none"
             raise PlanError(f"{entry}: no such file, and no topic of that name; candidates for a reference: {names}")
         else:
@@ -233,7 +233,7 @@ def _references(
 
 
 def _uses(bag: BagReader, found: Candidates, plan: Plan) -> tuple[TopicUse, ...]:
-    """Every topic of the bag, and its part in the plan."""
+    """Every topic of the bag, and its use in the plan."""
     roles: dict[str, list[str]] = {}
     for robot, source in zip(plan.parameters.robots, plan.odometry, strict=False):
         roles.setdefault(source.topic, []).append(f"odometry of {robot}")

@@ -1,4 +1,4 @@
-"""What a replay leaves behind, in memory: everything its outputs and the report are made of."""
+"""A replay's results in memory: everything that its outputs and the report are made from."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from rotavg_ros.online import Answer
 
 @dataclass(frozen=True)
 class TickRecord:
-    """One answer on the way.
+    """One answer during the replay.
 
     Attributes:
         stamp_ns: bag time.
-        seconds: that the tick took.
-        was_cold: solved from scratch.
-        keyframes, edges, outliers: sizes.
-        flips: edges whose outlier flag is another than one answer ago; new edges do not count.
+        seconds: duration of the tick.
+        was_cold: whether it was solved from scratch.
+        keyframes, edges, outliers: their numbers.
+        flips: number of edges whose outlier flag has changed since the answer before; new edges do not count.
     """
 
     stamp_ns: int
@@ -33,13 +33,13 @@ class TickRecord:
 
 @dataclass(frozen=True)
 class TopicUse:
-    """A topic of the bag and its part in the replay.
+    """A topic of the bag and its use in the replay.
 
     Attributes:
         topic, type_name: e.g. ``/odom``, ``nav_msgs/msg/Odometry``.
-        messages: how many the bag has.
+        messages: number of its messages in the bag.
         used_as: e.g. ``odometry of robot``, ``loop closures``, ``reference``; empty: not used.
-        why_not: of an unused topic; empty where there is nothing to explain.
+        why_not: why it is not used; empty if there is nothing to explain.
     """
 
     topic: str
@@ -51,14 +51,14 @@ class TopicUse:
 
 @dataclass(frozen=True)
 class Reference:
-    """Where somebody else says a robot was (r poses, ascending stamps): ground truth, or a check.
+    """A robot's poses from another source (r poses, ascending stamps): ground truth, or a check.
 
     Attributes:
         name: the topic or the file.
         stamp_ns: ``(r,)`` int64, on the bag's clock; ascending within a time line.
         world_from_body: ``(r, 4)`` xyzw, in a world of its own.
-        position: ``(r, 3)`` metres; None where it states none.
-        time_line: ``(r,)`` int64 as of a robot's keyframes; None: one, which stands for all of the robot's.
+        position: ``(r, 3)`` metres; None if it has none.
+        time_line: ``(r,)`` int64, as for a robot's keyframes; None: a single one, which stands for all of the robot's.
     """
 
     name: str
@@ -68,9 +68,9 @@ class Reference:
     time_line: NDArray[np.int64] | None = None
 
     def on_time_line(self, time_line: int, num_time_lines: int) -> Reference | None:
-        """What it says of one of a robot's time lines; None where nobody knows.
+        """The part that belongs to one of a robot's time lines; None if that is not known.
 
-        Its own stamps went back as often as the robot's; if not, only the last of both belong together for sure.
+        If its own stamps went back as often as the robot's, their time lines correspond; if not, only the last do.
         """
         if self.time_line is None:
             return self
@@ -80,7 +80,7 @@ class Reference:
         return self._chosen(self.time_line == time_line) if num_time_lines == last + 1 else None
 
     def on_last_time_line(self) -> Reference:
-        """What it says since its stamps went back for the last time."""
+        """The part since its stamps last went back."""
         return self if self.time_line is None else self._chosen(self.time_line == self.time_line.max(initial=0))
 
     def _chosen(self, rows: NDArray[np.bool_]) -> Reference:
@@ -96,13 +96,13 @@ class RobotRecord:
         robot: its name.
         nodes: ``(n,)`` int64 indices into the answer's keyframes.
         stamp_ns: ``(n,)`` int64; ascending within a time line.
-        time_line: ``(n,)`` int64: where the robot's clock went back, the next one begins.
+        time_line: ``(n,)`` int64; a new one begins where the robot's clock went back.
         keyframe_id: ``(n,)`` uint64.
         odometry_world_from_body: ``(n, 4)`` xyzw, in odometry's frame; NaN rows without odometry.
         odometry_position: ``(n, 3)`` metres in odometry's frame; None without positions.
         world_from_body: ``(n, 4)`` xyzw, corrected.
-        position_dead_reckoned: ``(n, 3)`` metres, odometry's steps along the corrected orientations; None without.
-        position: ``(n, 3)`` metres, least squares over odometry's and surviving closures' translations; None without.
+        position_dead_reckoned: ``(n, 3)`` metres, odometry's steps along the corrected orientations; None: unknown.
+        position: ``(n, 3)`` metres, least squares over the translations of odometry and inlier closures; None: unknown.
         uncertainty: ``(n,)`` one sigma of the orientation in radians, NaN unknown.
         reference: to compare with; None without.
     """
@@ -126,16 +126,16 @@ class RunRecord:
     """A whole replay.
 
     Attributes:
-        name: of the bag.
-        duration_s: of the replayed part, in bag time.
+        name: name of the bag.
+        duration_s: duration of the replayed part, in bag time.
         answer: the last one; a cold solve.
         robots: those with keyframes that have stamps.
         ticks: in order.
         topics: every topic of the bag, by name.
         rejected: inputs refused, by :class:`~rotavg_ros.online.RejectReason` value.
         options: the parameters as users write them, by the node's names.
-        wall_seconds: that the replay took.
-        interrupted: stopped by Ctrl-C, or by damage to the bag, before its end.
+        wall_seconds: duration of the replay.
+        interrupted: whether it was stopped by Ctrl-C, or by damage to the bag, before its end.
     """
 
     name: str

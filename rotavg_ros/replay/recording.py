@@ -1,4 +1,4 @@
-"""Everything the node would have published, into one MCAP file on the bag's clock."""
+"""Records everything that the node would have published into one MCAP file, on the bag's clock."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ _OK, _WARN = 0, 1
 
 
 class Recording:
-    """The file in the making; it is under its name when the ``with`` block ends well.
+    """The unfinished file; it gets its name when the ``with`` block ends without an error.
 
     Args:
         path: of the file.
         parameters: of the node.
         estimator: whose answers these are.
-        answer_period_ns: in bag time, between answers that are recorded, for they grow with the run; the last one is.
+        answer_period_ns: least bag time between recorded answers, since they grow with the run; the last one is always
+            recorded.
 
     Raises:
         BagWriteError: the place cannot be written.
@@ -71,14 +72,14 @@ class Recording:
             folder.rmdir()
 
     def orientation(self, time_ns: int, robot: str, odometry: OdometryRecord) -> None:
-        """The corrected orientation at an odometry message."""
+        """Record the corrected orientation at an odometry message."""
         orientation = self._estimator.current_orientation(robot)
         if orientation is not None:
             message = messages.orientation_message(odometry.stamp_ns, orientation, self._frame_id)
             self._bag.write(f"{self._prefix[robot]}orientation", time_ns, message)
 
     def answer(self, time_ns: int, answer: Answer, *, is_last: bool = False) -> None:
-        """An answer, unless the one before was recorded just now."""
+        """Record an answer, unless the previous one was recorded less than a period ago."""
         self._tick_seconds.append(answer.seconds)
         self._answer = answer
         if time_ns < self._next_answer_ns and not is_last:
@@ -95,7 +96,7 @@ class Recording:
         self._bag.write_bulk(f"/{NODE_NAME}/markers", time_ns, messages.markers_message(drawing, self._frame_id))
 
     def diagnostics(self, time_ns: int) -> None:
-        """How the estimator is doing, once a second, without what only a live node has (latencies, lost messages)."""
+        """Record diagnostics once a second, without those that only a live node has (latencies, lost messages)."""
         if time_ns < self._next_diagnostics_ns:
             return
         self._next_diagnostics_ns = time_ns + _DIAGNOSTICS_PERIOD_NS

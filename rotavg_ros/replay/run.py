@@ -1,4 +1,4 @@
-"""The replay: a bag's messages through the online estimator, ticking on the bag's clock as the node does on its own."""
+"""The replay: a bag's messages through the online estimator, with ticks by the bag's clock as in the node by its own."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Window:
     Attributes:
         start_s: seconds after the bag's beginning.
         duration_s: seconds; None: to the end.
-        rate: times real time; 0: as fast as possible.
+        rate: multiple of real time; 0: as fast as possible.
     """
 
     start_s: float = 0.0
@@ -46,19 +46,19 @@ class Window:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A replay that came to its end, or to that of the user's patience.
+    """A replay that came to its end, or that the user stopped.
 
     Attributes:
-        estimator: with everything it was told.
-        answer: the last; a cold solve.
+        estimator: the estimator with all its inputs.
+        answer: the last one; a cold solve.
         ticks: one per answer.
-        odometry_stamps_ns: of the messages that were taken, by robot.
+        odometry_stamps_ns: stamps of the odometry messages that were taken, by robot.
         start_ns, end_ns: bag time of the replayed part.
-        failures: ticks whose solve failed; the last one did not.
-        interrupted: before the end.
-        damage: what of the bag could not be read; None: nothing.
+        failures: number of ticks whose solve failed; the last one did not.
+        interrupted: whether it was stopped before the end.
+        damage: what could not be read of the bag; None: nothing.
         warnings: about how the bag was read, and edges that were not used, a line each.
-        wall_seconds: that it took.
+        wall_seconds: duration of the replay.
     """
 
     estimator: OnlineEstimator
@@ -75,16 +75,16 @@ class Outcome:
 
 
 class ReplayError(UserError):
-    """A bag of which nothing came; the message says why."""
+    """A bag that gave no result; the message says why."""
 
 
 @dataclass(frozen=True)
 class Onlooker:
-    """Who follows a replay.
+    """Observes a replay.
 
     Attributes:
         progress: called with the seconds of bag time that have passed since the last call.
-        stop: asked between messages whether the user wants it to end.
+        stop: called between messages; returns whether the user wants to stop.
     """
 
     progress: Callable[[float], object]
@@ -97,15 +97,15 @@ def replay(
     """Replay.
 
     Args:
-        bag: open; of a damaged one what can be read is replayed, if it salvages.
-        plan: what its topics are used as.
-        window: which part.
+        bag: open; if it was opened with ``salvage``, the readable part of a damaged bag is replayed.
+        plan: the use of its topics.
+        window: the part to replay.
         recording: file for what the node would have published.
         answer_period_ns: see :class:`Recording`.
-        onlooker: who follows it.
+        onlooker: observes the replay.
 
     Raises:
-        BagReadError: a bag that is damaged before anything could be made of it.
+        BagReadError: a bag that is damaged before anything useful.
         ReplayError: no message, or none from which a keyframe could be made.
     """
     started = time.perf_counter()
@@ -153,7 +153,7 @@ def replay(
 
 
 class _Loop:
-    """The clock, and what happens when it strikes."""
+    """The replay's clock, and what happens at its strikes."""
 
     def __init__(self, estimator: OnlineEstimator, pace: Pace, recorder: Recording) -> None:
         self._estimator, self._recorder, self._pace = estimator, recorder, pace
@@ -187,7 +187,7 @@ class _Loop:
         self._recorder.orientation(self._now_ns, robot, record)
 
     def finish(self) -> Answer | None:
-        """Silence: the last answer is a cold solve, as the node's; None if there is nothing to solve.
+        """After the last message, make the last answer, a cold solve as in the node; None if there is nothing to solve.
 
         Raises:
             UserError: from the solver.
@@ -199,7 +199,7 @@ class _Loop:
         return self._last
 
     def _tick(self) -> bool:
-        """Whether anything was done."""
+        """Tick; returns whether anything was done."""
         try:
             answer = self._estimator.tick()
             if answer is not None:
@@ -230,11 +230,11 @@ class _Loop:
 
 
 def _flips(before: Answer, now: Answer) -> int:
-    """How many edges in both answers have changed their flags."""
+    """Number of edges in both answers whose flags have changed."""
     shared = min(len(before.edge_id), len(now.edge_id))
     if (before.edge_id[:shared] == now.edge_id[:shared]).all():
         return int((before.outlier[:shared] != now.outlier[:shared]).sum())
-    # Keyframes were marginalised in between; of the estimator's own edges it is not known which was which.
+    # Keyframes were marginalised in between; the estimator's own edges cannot be matched.
     _, old, new = np.intersect1d(before.edge_id, now.edge_id, return_indices=True)
     is_known = now.edge_id[new] != OWN_EDGE_ID
     return int((before.outlier[old] != now.outlier[new])[is_known].sum())
@@ -254,7 +254,7 @@ def _bounds(bag: BagReader, window: Window) -> tuple[int, int]:
 
 
 def _wait_until(moment: float, stop: Callable[[], bool]) -> None:
-    """Sleep until a time of ``perf_counter``, in naps after which the user may have had enough."""
+    """Sleep until a time of ``perf_counter``, in short naps after which ``stop`` is asked."""
     while (left := moment - time.perf_counter()) > 0 and not stop():
         time.sleep(min(left, _NAP_S))
 
@@ -271,7 +271,7 @@ def _why_nothing(plan: Plan, counts: Counts) -> str:
 
 
 def _without_odometry(plan: Plan, counts: Counts) -> str | None:
-    """What closures by stamp lack in a bag of which no topic is odometry."""
+    """A warning about closures by stamp in a bag without odometry; None if none wait."""
     if not counts.pending:
         return None
     unfit = [use for use in plan.topics if use.type_name in ODOMETRY_CONVERTERS and use.why_not]

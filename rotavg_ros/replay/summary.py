@@ -17,12 +17,12 @@ from rotavg_ros.view_graph import EdgeKind
 
 
 def summarize(record: RunRecord, bag: Path, outcome: Outcome) -> dict[str, Any]:
-    """What ``summary.json`` says, but for the names of the files.
+    """The content of ``summary.json``, except the names of the files.
 
     Args:
         record: the run.
-        bag: where it came from.
-        outcome: what the record was made of.
+        bag: the bag that it came from.
+        outcome: the outcome that the record was made from.
     """
     answer = record.answer
     closures = answer.kind == EdgeKind.LOOP_CLOSURE

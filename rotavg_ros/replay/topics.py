@@ -1,4 +1,4 @@
-"""What each topic of a bag is good for, by the type of its messages, its name and a first look into them."""
+"""What each topic of a bag can be used for, judged by its type, its name and its first messages."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from rotavg_ros.view_graph import EdgeKind
 
 _ODOMETRY, _IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu"
 _TRUTH_NAME = re.compile(r"ground.?truth|(^|[/_])(gt|truth|mocap|vicon|optitrack)([/_]|$)", re.IGNORECASE)
-# Into so many messages of edges is looked for the kind of graph they make.
+# Number of edge messages that are examined for the kind of graph they make.
 _FIRST_EDGES = 100
-# Into so many of odometry for an orientation: a filter that has yet to find its own writes zeros or NaN.
+# Number of odometry messages that are searched for an orientation: a filter that has not converged sends zeros or NaN.
 _FIRST_POSES = 100
 _NO_ORIENTATION = f"none of its first {_FIRST_POSES} messages states an orientation"
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A topic that messages could be taken from, and how many it has."""
+    """A topic that could be used, and its number of messages."""
 
     topic: str
     type_name: str
@@ -39,13 +39,13 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Candidates:
-    """The topics of a bag that are good for something, the best of each kind first.
+    """The usable topics of a bag, the best of each kind first.
 
     Attributes:
-        odometry: could carry a robot on from moment to moment.
-        references: could be compared with; ground truth, then poses, then IMUs.
-        edges: relative rotations.
-        brings_keyframes: the edges' sender chooses the keyframes.
+        odometry: topics that could serve as odometry.
+        references: topics to compare with: ground truth, then poses, then IMUs.
+        edges: topics with relative rotations.
+        brings_keyframes: whether the edges' sender chooses the keyframes.
         why_not: by topic, why one that looks useful is not.
     """
 
@@ -57,7 +57,7 @@ class Candidates:
 
 
 def find_candidates(bag: BagReader) -> Candidates:
-    """Look at every topic of the bag, and into the first messages of some.
+    """Examine every topic of the bag, and the first messages of some.
 
     Raises:
         BagReadError: a damaged bag.
@@ -88,7 +88,7 @@ def find_candidates(bag: BagReader) -> Candidates:
 
 
 def _as_odometry(candidate: Candidate) -> tuple[int, int, int, str]:
-    """Odometry proper, then IMUs, then poses, which may jump as a localisation's do; a good name; many messages."""
+    """Sort key: odometry, then IMUs, then poses (a localisation's may jump); a good name; many messages."""
     by_type = {_ODOMETRY: 0, _IMU: 1}.get(candidate.type_name, 2)
     name = candidate.topic.rsplit("/", 1)[-1]
     by_name = 0 if candidate.topic == "/odom" else 1 if name == "odom" else 2 if "odom" in name else 3

@@ -103,7 +103,7 @@ def _nodes_by_time(answer: Answer, robot: str) -> NDArray[np.int64]:
 def _odometry_steps(
     answer: Answer, world_from_body: NDArray[np.float64], position: NDArray[np.float64], chain: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """``(M, 3)`` odometry's target position in the source's frame; NaN between robots or chains, or without odometry."""
+    """``(M, 3)`` odometry's target position in the source's frame; NaN between robots or chains or without odometry."""
     source, target = answer.source, answer.target
     robot = answer.keyframe_robot
     known = (robot[source] == robot[target]) & (chain[source] == chain[target]) & (chain[source] >= 0)

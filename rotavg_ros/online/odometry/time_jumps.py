@@ -12,8 +12,9 @@ from rotavg_ros.online.measurements import OdometryMessage
 
 # Number of messages in a row that must agree before a jump is believed: stray ones, however old, change nothing.
 _RUN_LENGTH = 5
-# They count as consecutive if no step among them exceeds this many of the robot's usual steps: 5 s at 10 Hz. With fewer,
-# a pause at the wrong moment loses the messages before it; stray stamps lie so far apart that more would work as well.
+# They count as consecutive if no step among them exceeds this many of the robot's usual steps: 5 s at 10 Hz. With a
+# smaller number, a pause at the wrong moment loses the messages before it; a larger one would work as well, since stray
+# stamps lie much farther apart.
 _LONGEST_STEP = 50.0
 # The robot's usual step is the 0.9 quantile of its steps, so that a few pauses do not count, but the pauses between
 # bursts of messages do. The quantile is taken over this many of the latest messages.

@@ -178,7 +178,7 @@ def _restore(arrays: Arrays, header: dict[str, Any], options: EstimatorOptions) 
 
 
 def _kept_labels(arrays: Arrays, graph: ViewGraph, queued: NDArray[np.bool_]) -> KeptLabels | None:
-    """The labels in the order in which edges enter now; None if they are invalid, so that a whole search comes first."""
+    """The labels in the order in which edges enter now; None if they are invalid: then a whole search comes first."""
     entered = np.flatnonzero(~queued)
     with suppress(KeyError, ValueError, IndexError):
         now = arrays | {name: arrays[name][..., entered] for name in ("trusted", "places")}

@@ -1,1 +1,1 @@
-"""What plays to a node and listens to it, to demonstrate and to measure."""
+"""Plays data to a node and records its outputs, for demonstrations and measurements."""

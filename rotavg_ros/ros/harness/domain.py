@@ -6,10 +6,10 @@ import random
 import socket
 from collections.abc import Iterable
 
-# Beyond 101 DDS ports would collide with the system's ephemeral ones.
+# Beyond 101, DDS ports would collide with the system's ephemeral ones.
 DOMAIN_IDS = range(1, 102)
-# Of the RTPS specification: where a domain's participants listen for each other, all of them at the first port (but not
-# those that keep to this machine), the first few each at one of the others.
+# From the RTPS specification: the ports on which a domain's participants listen for each other. All of them use the
+# first (except those confined to this machine), and each of the first few uses one of the others.
 _BASE_PORT, _PORTS_PER_DOMAIN = 7400, 250
 _DISCOVERY_PORTS = (0, 10, 12, 14)
 
@@ -18,7 +18,7 @@ def free_domain_id(candidates: Iterable[int] | None = None) -> int:
     """The first of the candidates on which no participant of this machine listens at the moment.
 
     Args:
-        candidates: default: all, in random order, so that two who choose at the same time choose differently.
+        candidates: default: all, in random order, so that two processes that choose at once choose differently.
 
     Raises:
         RuntimeError: all are in use.

@@ -49,7 +49,7 @@ def installed_node() -> Path:
 
 @cache
 def keep_to_this_machine() -> None:
-    """Let this process and those it starts talk among themselves only: own domain, no network; once for all."""
+    """Let this process and those it starts talk only among themselves: own domain, no network; takes effect once."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
 
@@ -59,9 +59,9 @@ class Playing:
     """What is played to the node.
 
     Attributes:
-        bag: its path.
-        topics: of the bag.
-        rate: times real time.
+        bag: path of the bag.
+        topics: topics of the bag to play.
+        rate: multiple of real time.
     """
 
     bag: Path
@@ -81,10 +81,10 @@ def play_to_node(
         playing: the bag, and how.
         parameters: of the node, by name.
         log: file for what the node and the player print.
-        waiting: shows that something takes its time.
+        waiting: context that shows what is being waited for.
 
     Raises:
-        LiveRunError: the node died or gave no answer; the message has its last words.
+        LiveRunError: the node died or gave no answer; the message quotes its last output.
     """
     with log.open("wb") as sink, Recorder() as recorder:
         node = _StartedNode(parameters, log, sink)
@@ -118,7 +118,7 @@ class _StartedNode:
         """Listen until the condition holds.
 
         Raises:
-            LiveRunError: the node died, or ``failure``: the time was over.
+            LiveRunError: the node died, or the time ran out; the message then includes ``failure``.
         """
         deadline = time.monotonic() + timeout_s
         while not condition():
@@ -144,7 +144,7 @@ class _StartedNode:
 
 def _play(playing: Playing, recorder: Recorder, node: _StartedNode, sink: BinaryIO) -> None:
     command = [sys.executable, "-m", "rotavg_ros.cli.main", "play", str(playing.bag), "--rate", str(playing.rate)]
-    # Ctrl-C reaches the player as well; what it says then is for the log.
+    # Ctrl-C reaches the player as well; what it prints then goes to the log.
     player = subprocess.Popen(
         [*command, "--topics", *playing.topics], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=sink
     )
@@ -159,7 +159,7 @@ def _play(playing: Playing, recorder: Recorder, node: _StartedNode, sink: Binary
 
 
 def stop_process(process: subprocess.Popen[bytes]) -> int:
-    """End one process that we started, gently if it can be; returns its exit code."""
+    """End one process that we started, gently if possible; returns its exit code."""
     for how in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
         if process.poll() is not None:
             break

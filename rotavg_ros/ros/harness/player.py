@@ -20,11 +20,11 @@ from rotavg_ros.bags.reader import BagMessage, BagReader
 from rotavg_ros.errors import UserError
 from rotavg_ros.online.options import NANOSECONDS
 
-# A publisher keeps so many messages to send lost ones again. Fast DDS asks its readers what they miss every 3 s.
+# Number of messages that a publisher keeps for retransmission. Fast DDS asks its readers what they lack every 3 s.
 _DEPTH = 10_000
 _ACKNOWLEDGE_TIMEOUT_S = 10.0
 _CLOCK_PERIOD_NS = 10_000_000
-# Subscribers of one process do not appear at once: go on when their number has been the same for so long.
+# Subscribers of one process do not appear at once: start when their number has been constant for this long.
 _SETTLE_SECONDS = 0.5
 _CATCH_UP_SECONDS = 0.01
 
@@ -40,9 +40,9 @@ class PlayOptions:
     Attributes:
         rate: bag seconds per second; 0: as fast as ``max_messages_per_second`` allows.
         topics: only these; default: all whose message types are installed.
-        wait_for_subscribers_s: wait so long for somebody to listen; 0: do not wait.
-        clock: publish the bag's time on ``/clock``.
-        max_messages_per_second: bound of bursts, which transports lose otherwise.
+        wait_for_subscribers_s: how long to wait for subscribers; 0: do not wait.
+        clock: whether to publish the bag's time on ``/clock``.
+        max_messages_per_second: limit on bursts, which transports would otherwise lose.
     """
 
     rate: float = 1.0
@@ -75,7 +75,7 @@ def play(
 
     Raises:
         BagReadError: an unreadable bag, or no such topic.
-        PlayError: a ROS 1 bag, an impossible option, a message type that is not installed, nobody who listens, or a
+        PlayError: a ROS 1 bag, an impossible option, a message type that is not installed, no subscribers, or a
             reliable subscriber that does not get everything.
     """
     _check(options)
@@ -140,7 +140,7 @@ class _Player:
             ahead = due - time.monotonic()
             if ahead > 0.001:  # shorter sleeps take longer than they should
                 time.sleep(ahead)
-            # After a hold-up, go on at the bounded pace instead of making up for it in one burst.
+            # After a delay, go on at the bounded pace instead of catching up in one burst.
             due = max(due, time.monotonic() - _CATCH_UP_SECONDS) + shortest
             if self._clock is not None and (clock_ns is None or message.time_ns - clock_ns >= _CLOCK_PERIOD_NS):
                 clock_ns = message.time_ns

@@ -1,4 +1,4 @@
-"""What a process and those that it has started take: a node solves in a process of its own."""
+"""CPU time and memory of a process and its children: a node solves in a process of its own."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ _PROC = Path("/proc")
 
 
 def children(pid: int) -> list[int]:
-    """Processes that this one has started and that still run, in the order of their numbers."""
+    """Ids of the child processes that still run, ascending."""
     return [other for other in sorted(_pids()) if _parent(other) == pid]
 
 
 def cpu_seconds(pid: int) -> float:
-    """User and system time so far, of all threads, of the process and its children."""
+    """User and system time so far of all threads of the process and its children."""
     ticks = 0
     for each in (pid, *children(pid)):
         fields = _fields(each)
@@ -24,7 +24,7 @@ def cpu_seconds(pid: int) -> float:
 
 
 def peak_memory_mb(pid: int) -> float:
-    """The most memory that the process has had resident, 10⁶ bytes; 0 if it has ended."""
+    """Peak resident memory of the process, 10⁶ bytes; 0 if it has ended."""
     try:
         status = (_PROC / str(pid) / "status").read_text(encoding="utf-8")
     except OSError:
@@ -34,12 +34,12 @@ def peak_memory_mb(pid: int) -> float:
 
 
 def memory_mb(pid: int) -> float:
-    """What the process and its children have resident, 10⁶ bytes; what several share counts once."""
+    """Resident memory of the process and its children, 10⁶ bytes; shared memory counts once."""
     return sum(map(_proportional_mb, (pid, *children(pid))))
 
 
 def _proportional_mb(pid: int) -> float:
-    """Resident, 10⁶ bytes, of which what n processes share counts for an n-th part; 0 if it has ended."""
+    """Resident memory, 10⁶ bytes, with 1/n of what n processes share; 0 if the process has ended."""
     try:
         rolled_up = (_PROC / str(pid) / "smaps_rollup").read_text(encoding="utf-8")
     except OSError:
@@ -57,7 +57,7 @@ def _parent(pid: int) -> int:
 
 
 def _fields(pid: int) -> list[str]:
-    """Of /proc/PID/stat, from the state on; empty if the process has ended."""
+    """Fields of /proc/PID/stat, from the state on; empty if the process has ended."""
     try:
         return (_PROC / str(pid) / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()
     except OSError:

@@ -19,7 +19,7 @@ from rotavg_ros.evaluation.live.node_answer import NodeAnswer
 _LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _SENSOR = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
-# What stands still in the diagnostics when a node has nothing left to do.
+# Diagnostic values that stop changing when a node has nothing left to do.
 _AT_REST = ("answer version", "edge messages", "odometry messages", "pending", "ticks")
 
 
@@ -59,7 +59,7 @@ class Recorder:
 
     @property
     def hears_node(self) -> bool:
-        """Whether a node reports its diagnostics; it is ready for messages then."""
+        """Whether a node reports its diagnostics, which means that it is ready for messages."""
         return bool(self._reports)
 
     @property
@@ -69,11 +69,11 @@ class Recorder:
 
     @property
     def reports(self) -> list[dict[str, str]]:
-        """The node's diagnostics since it began, or since they were forgotten."""
+        """The node's diagnostics since the start, or since they were forgotten."""
         return list(self._reports)
 
     def forget_reports(self) -> None:
-        """Judge rest by reports that come from now on."""
+        """Judge only by reports that come from now on whether the node is at rest."""
         self._reports.clear()
 
     @property

@@ -1,4 +1,4 @@
-"""The node on a small machine: what graphs of several sizes take of one core and of two."""
+"""The node on a small machine: memory and time for graphs of several sizes, on one core and on two."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def run(
     """A node for each size on one core and on two, odometry at 50 Hz.
 
     Args:
-        sizes: keyframes, with as many loop closures.
-        seconds: for each, once the graph has been solved.
-        watch: passes the runs through and may show how far they are.
+        sizes: numbers of keyframes, with as many loop closures.
+        seconds: duration of each run, once the graph has been solved.
+        watch: passes the runs through and may show their progress.
 
     Raises:
-        TooFewCoresError: this process may use one core alone.
+        TooFewCoresError: this process may use only one core.
         LiveRunError: see :func:`soak.run_loads`.
     """
     available = len(os.sched_getaffinity(0))

@@ -1,4 +1,4 @@
-"""The node under load: a large graph over DDS, a few keyframes more every second, and odometry at a high rate."""
+"""The node under load: a large graph over DDS, a few more keyframes every second, and odometry at a high rate."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ _ODOMETRY_TOPIC, _EDGE_TOPIC = "odom", "relative_rotation_arrays"
 
 @dataclass(frozen=True)
 class Load:
-    """What a node has to bear.
+    """The load of a node.
 
     Attributes:
-        keyframes: that it holds, with as many loop closures.
-        seconds: for so long, once the graph has been solved; four keyframes a second go on coming.
-        rate_hz: of odometry.
-        cores: that it may run on; 0: all.
+        keyframes: number of keyframes in the graph, with as many loop closures.
+        seconds: duration, once the graph has been solved; four more keyframes come every second.
+        rate_hz: rate of odometry.
+        cores: number of cores that it may use; 0: all.
     """
 
     keyframes: int
@@ -56,11 +56,11 @@ class Load:
 
 @dataclass(frozen=True)
 class SoakRow:
-    """What the node reported at one rate: milliseconds and counts; and what it took.
+    """What the node reported at one rate (milliseconds and counts), and the CPU time and memory that it took.
 
-    Ticks are those after the graph was solved; ``start_max_ms`` is the longest of those until then. ``cpu_share`` is
-    of a core, the solver's process included; ``node_mb`` and ``solver_mb`` are the peaks of either process, 10⁶ bytes,
-    in which what both share counts twice; ``both_mb`` is what they have at the end, in which it counts once.
+    Ticks are those after the graph was solved; ``start_max_ms`` is the longest one before. ``cpu_share`` is the number
+    of cores busy, the solver's process included. ``node_mb`` and ``solver_mb`` are the peaks of the two processes, 10⁶
+    bytes, each including shared memory; ``both_mb`` is their sum at the end, in which shared memory counts once.
     """
 
     rate_hz: float
@@ -83,7 +83,7 @@ class SoakRow:
 
 
 def table(rows: Sequence[SoakRow]) -> Table:
-    """The rows as they stand."""
+    """The rows as a table."""
     columns = (
         Column("odometry Hz", ".0f"),
         Column("keyframes"),
@@ -113,11 +113,11 @@ def run(num_keyframes: int, seconds: float, rates_hz: Sequence[float] = RATES_HZ
 def run_loads(
     loads: Sequence[Load], watch: Callable[[Iterable[Load]], Iterable[Load]] = lambda loads: loads
 ) -> list[SoakRow]:
-    """One node after the other.
+    """Run one node after the other.
 
     Args:
-        loads: what each has to bear.
-        watch: passes them through and may show how far they are.
+        loads: the load of each.
+        watch: passes them through and may show the progress.
 
     Raises:
         LiveRunError: the node is not installed, died, or did not take the graph.
@@ -195,14 +195,14 @@ def _soak(graph: ViewGraph, load: Load) -> SoakRow:
 
 
 def _cores(count: int) -> list[int]:
-    """The first so many of those that this process may use."""
+    """The first ``count`` of the cores that this process may use."""
     return sorted(os.sched_getaffinity(0))[:count]
 
 
 def _wait(
     recorder: Recorder, node: subprocess.Popen[bytes], arrived: Callable[[dict[str, str]], bool], failure: str
 ) -> dict[str, str]:
-    """Spin until a report of the node's diagnostics says so; returns that report."""
+    """Spin until a report of the node's diagnostics fulfils the condition; returns that report."""
     deadline = time.monotonic() + _TIMEOUT_S
     while not ((report := recorder.last_report) and arrived(report)):
         recorder.spin(0.1)
@@ -239,11 +239,11 @@ class _Sender:
 
     @property
     def is_heard(self) -> bool:
-        """Whether somebody subscribes to both topics; edges sent before are lost, and the graph would stay in parts."""
+        """Whether both topics have subscribers; edges sent before are lost, and the graph would stay disconnected."""
         return all(publisher.get_subscription_count() for publisher in (self._edges, self._odometry))
 
     def send_edges_up_to(self, num_keyframes: int) -> None:
-        """Whatever connects the first so many keyframes and has not been sent."""
+        """Send the edges between the first ``num_keyframes`` keyframes that have not been sent yet."""
         end = int(np.searchsorted(self._arrival, num_keyframes))
         for start in range(self._edges_sent, end, _EDGES_PER_MESSAGE):
             part = self._messages[start : min(start + _EDGES_PER_MESSAGE, end)]
@@ -252,7 +252,7 @@ class _Sender:
         self._edges_sent = end
 
     def send_odometry_up_to(self, count: int, rate_hz: float) -> None:
-        """So many messages in all; stamps are now."""
+        """Send messages until there have been ``count`` in all; their stamps are the present time."""
         while self.odometry_sent < count:
             message = Odometry()
             message.header.stamp = self._node.get_clock().now().to_msg()
@@ -263,7 +263,7 @@ class _Sender:
 
 
 def _edge_messages(graph: ViewGraph) -> list[RelativeRotation]:
-    """The graph's edges; a message has the orientation of the target in the source's frame."""
+    """The graph's edges as messages, which state the target's orientation in the source's frame."""
     columns = (graph.source, graph.target, rotations.inverse(graph.target_from_source), graph.kind, graph.precision)
     rows = zip(*(column.tolist() for column in columns), strict=True)
     return [

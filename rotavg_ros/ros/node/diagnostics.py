@@ -1,4 +1,4 @@
-"""How the node is doing, told once a second."""
+"""The node's diagnostics, published once a second."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from rotavg_ros.view_graph import EdgeKind
 
 # An answer that lags behind the graph by more solve periods than this is stale.
 _STALE_PERIODS = 10
-# Ticks longer ago than this say nothing about the load now.
+# Ticks longer ago than this say nothing about the present load.
 _RECENT_S = 60.0
-# Robots' names come from messages and may be anything; a few are told.
+# Robots' names come from messages and may be anything; only this many are shown.
 _MOST_NAMES = 3
 # What happens when time goes back, by the policy.
 TIME_WENT_BACK = {
@@ -30,12 +30,12 @@ TIME_WENT_BACK = {
 KEPT = "what was forgotten or replaced is kept in"
 NOT_KEPT = "what was forgotten or replaced could not be backed up:"
 OTHER_ROBOTS = "the state file is of robots that are not named in robots"
-# Refusals that a healthy system produces: a sender that repeats itself.
+# Refusals that occur in a healthy system, where senders repeat themselves.
 _HARMLESS = {"duplicate_edge", "marginalized_keyframe"}
 
 
 class Reporter:
-    """Turns :class:`Health` into a status; remembers the last report to tell what is new."""
+    """Turns :class:`Health` into a status; remembers the last report to recognise what is new."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -46,7 +46,7 @@ class Reporter:
         self._reported = time.monotonic()
 
     def report(self, health: Health, counts: Counts, parameters: NodeParameters, paused: bool) -> DiagnosticStatus:
-        """The status now. ERROR: answers do not come; WARN: they may be worse than they could be."""
+        """The present status. ERROR: answers do not come; WARN: they may be worse than they could be."""
         now = time.monotonic()
         values = _values(health, counts, paused, now)
         received = sum(counter.received for counter in health.odometry.values())
@@ -81,7 +81,7 @@ class Reporter:
 
 
 def of_other_robots(known: Collection[str], parameters: NodeParameters) -> str | None:
-    """What to say of a state file in which these robots have odometry; None where all are named."""
+    """The warning about a state file in which these robots have odometry; None if all are named in the parameters."""
     others = [robot for robot in known if robot not in parameters.robots]
     if not others:
         return None
@@ -127,7 +127,7 @@ def _warnings(health: Health, parameters: NodeParameters, now: float) -> list[st
 
 
 def _of_waiting(counts: Counts, parameters: NodeParameters) -> list[str]:
-    """Edges that wait for what will hardly come."""
+    """Warnings about edges that wait for something that is unlikely to come."""
     known = {*parameters.robots, *counts.robots}
     unknown = {robot: number for robot, number in counts.pending_by_robot.items() if robot not in known}
     if unknown:

@@ -1,4 +1,4 @@
-"""The ROS node: messages in, messages out. What they mean is decided in :mod:`rotavg_ros.online`."""
+"""The ROS node: messages in, messages out. Their content is handled in :mod:`rotavg_ros.online`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from rotavg_ros.settings.parameters import NODE_NAME, NodeParameters
 from rotavg_ros.solver.methods import check_choices
 from rotavg_ros.version import __version__
 
-_SHORT_SOLVE_S = 0.2  # a longer one need not be waited for at the end: nobody would read its answer
+_SHORT_SOLVE_S = 0.2  # a longer one is not waited for at the end, since nobody would read its answer
 
 
 class RotavgNode(parameter_server.ParameterNode):
@@ -40,15 +40,15 @@ class RotavgNode(parameter_server.ParameterNode):
     Callbacks run on the executor's thread and stay short; solving, saving and publishing answers happen on workers.
 
     Raises:
-        UserError: parameters that cannot be; the message is one line for the user.
+        UserError: invalid parameters; the message is one line for the user.
     """
 
     def __init__(self, executor: Executor, process: ServerProcess | None = None) -> None:
-        """Declare parameters, begin with the solver and listen.
+        """Declare the parameters, start the solver and subscribe.
 
         Args:
-            executor: calls workers back.
-            process: that solves; default: another interpreter, if parameters ask for one.
+            executor: runs the callbacks of the workers' futures.
+            process: the process that solves; default: another interpreter, if the parameters ask for one.
         """
         try:
             super().__init__(NODE_NAME)
@@ -66,7 +66,7 @@ class RotavgNode(parameter_server.ParameterNode):
         self._saver = Worker(executor, "rotavg_saver")
         self._outputs = Outputs(self, parameters, self._estimator)
         given = frozenset(parameter_server.given(self))
-        # An orientation that was given settles how sensors sit.
+        # An orientation that was given decides how sensors are mounted.
         from_tf = parameters.edge_frames_from_tf and "edge_sensor_orientations" not in given
         listened = replace(parameters, edge_frames_from_tf=from_tf)
         listening = Subscriptions(self, listened, self._estimator, self._health, self._outputs, self._on_time_jump)
@@ -77,7 +77,7 @@ class RotavgNode(parameter_server.ParameterNode):
         Services(self, self._estimator, self._solving, workers, parameters.robots[0])
         self._worker.submit(thinning.load)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # ticks though /clock is paused or absent
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # ticks even if /clock is paused or absent
         self._solve_timer = self._create_timer(parameters.solve_period_s, self._on_solve_timer)
         self._create_timer(1.0, self._on_diagnostics_timer)
         if parameters.autosave_period_s > 0:
@@ -97,7 +97,7 @@ class RotavgNode(parameter_server.ParameterNode):
             self.get_logger().warning(line)
 
     def close(self, timeout_s: float) -> bool:
-        """Save if that is wanted, and stop working; False if a save still runs after the timeout, or a solve does."""
+        """Save if autosave is on, and stop; False if a save or a solve is still running after the timeout."""
         if self._settings.autosave_period_s > 0:
             self._saver.submit(lambda: self._solving.autosave_quietly(at_the_end=True))
         self._saver.submit(self._solving.tell_what_is_lost)
@@ -118,7 +118,7 @@ class RotavgNode(parameter_server.ParameterNode):
             UserError: the solver does not know its options; nothing has changed then.
         """
         old, options = self._settings, parameters.estimator
-        # Here, for the solver would tell only after the solve that runs.
+        # Checked here, since the solver would only report it after the running solve.
         check_choices(options.method, options.profile, options.device)
         if options != self._estimator.options:
             self._estimator.set_options(options)
@@ -134,7 +134,7 @@ class RotavgNode(parameter_server.ParameterNode):
         self._worker.submit_once(self._solving.tick_quietly)
 
     def _on_clock_jump(self, _jump: TimeJump) -> None:
-        """Simulated time went back: only ``use_sim_time`` knows of that."""
+        """Simulated time went back, which can only happen with ``use_sim_time``."""
         time_jumps = self._estimator.time_jumps
         self._estimator.clock_went_back(self.get_clock().now().nanoseconds)
         if self._estimator.time_jumps != time_jumps:

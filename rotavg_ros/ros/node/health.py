@@ -9,28 +9,32 @@ from dataclasses import dataclass, field
 from rotavg_ros.online import Answer
 from rotavg_ros.ros.node.message_counting import Durations, TopicCounter
 
-# So long the diagnostics tell of something that has happened once.
+# How long the diagnostics mention something that happened once, seconds.
 _NOTICE_S = 60.0
 
 
 @dataclass
 class Health:
-    """What the node measures about itself. Times are of the monotonic clock, in seconds.
+    """What the node measures about itself. Times are in seconds of the monotonic clock.
 
     Attributes:
-        odometry, edges: counters per topic name.
-        ticks, odometry_callback, odometry_latency: durations; latency from sending to ``orientation``.
-        answer: the last one published, and when.
-        last_odometry: when a message was last taken, per topic name.
-        mistakes: in the wiring and the parameters, a line each.
+        odometry, edges: message counters by topic name.
+        ticks, odometry_callback: durations of ticks and of the odometry callback.
+        odometry_latency: time from the sending of odometry to the publishing of ``orientation``.
+        started: when the node started.
+        last_odometry: when a message was last taken, by topic name.
+        mistakes: present mistakes in the wiring and the parameters, a line each.
+        answer: the last answer published; None before the first, or once it is forgotten.
+        answered: when an answer was last published; None before the first.
         joins: how often components became one.
-        held_back: closures that wait to be sent on (``forward_topics``).
-        held_back_dropped: closures that waited and will not be sent on, since too many did.
+        held_back: number of closures that wait to be sent on (``forward_topics``).
+        held_back_dropped: number of closures that will not be sent on, because too many waited.
         unsolved_since: since when the graph has been ahead of the answer; None if it is not.
-        solve_failures: how many ticks failed in all; ``failure`` is the last one's message, None after a good tick.
-        save_failure: why the last save failed, None if it did not.
-        waiting_for_frames: edges that wait for the transform between their frame and the body's.
-        notices: what has happened to the graph, and when.
+        solve_failures: number of ticks that have failed so far.
+        failure: error message of the last tick; None if it succeeded.
+        save_failure: why the last save failed; None if it succeeded.
+        waiting_for_frames: number of edges that wait for the transform between their frame and the body's.
+        notices: what has happened to the graph, with the time when it happened.
     """
 
     odometry: dict[str, TopicCounter] = field(default_factory=dict)
@@ -61,20 +65,20 @@ class Health:
         return [*self.odometry.values(), *self.edges.values()]
 
     def note(self, notice: str) -> None:
-        """Have the diagnostics tell of something for a minute."""
+        """Let the diagnostics mention something for a minute."""
         now = time.monotonic()
         self.notices = {text: noted for text, noted in self.notices.items() if now - noted < _NOTICE_S} | {notice: now}
 
     def recent_notices(self, now: float) -> list[str]:
-        """What has happened in the last minute."""
+        """Notices of the last minute."""
         return [notice for notice, noted in self.notices.items() if now - noted < _NOTICE_S]
 
     def took_odometry(self, topic: str) -> None:
-        """A message was taken."""
+        """An odometry message was taken."""
         self.last_odometry[topic] = time.monotonic()
 
     def fell_behind(self) -> None:
-        """The graph has changed since the answer, if that was not known yet."""
+        """The graph has changed since the answer; the first such call sets :attr:`unsolved_since`."""
         if self.unsolved_since is None:
             self.unsolved_since = time.monotonic()
 
@@ -88,7 +92,7 @@ class Health:
         self.failure = str(error)
 
     def tick_went_well(self) -> None:
-        """A tick came to its end, with an answer or without."""
+        """A tick ended without an error, with or without an answer."""
         self.failure = None
 
     def joined(self) -> None:
@@ -96,12 +100,12 @@ class Health:
         self.joins += 1
 
     def published(self, answer: Answer) -> None:
-        """An answer went out, and is the last one from now on."""
+        """An answer was published."""
         self.ticks.add(answer.seconds)
         self.answer, self.answered, self.unsolved_since = answer, time.monotonic(), None
 
     def forget_answer(self) -> None:
-        """There is no last answer any more."""
+        """The last answer was forgotten."""
         self.answer = None
 
     def begin_anew(self) -> None:
@@ -110,9 +114,9 @@ class Health:
         self.ticks = Durations()
 
     def saved(self, failure: str | None = None) -> None:
-        """The state was saved, or why not."""
+        """The state was saved, or ``failure`` says why not."""
         self.save_failure = failure
 
     def noticed(self, mistakes: list[str]) -> None:
-        """These are the mistakes in wiring and parameters now."""
+        """Set the present mistakes in wiring and parameters."""
         self.mistakes = mistakes

@@ -1,4 +1,4 @@
-"""The process of the node: arguments, signals, the executor's loop, and an end that is always clean."""
+"""The process of the node: arguments, signals, the executor's loop, and a clean end in every case."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rotavg_ros.startup import loading
 if TYPE_CHECKING:
     from rotavg_ros.online.solver_process.process import ServerProcess
 
-# A wait of the executor is not interrupted by a signal, so it must be short.
+# Signals do not interrupt the executor's wait, so it must be short.
 _LONGEST_WAIT_S = 0.1
 _PATIENCE_AT_EXIT_S = 1.0
 _LOG_PERIOD_S = 5.0
@@ -52,9 +52,9 @@ def main() -> int:
 
 
 class _StopSignal:
-    """SIGINT, SIGTERM and SIGHUP end the process at once while it starts; later they ask for the end.
+    """SIGINT, SIGTERM and SIGHUP end the process at once while it starts; later they request the end.
 
-    SIGHUP comes when the terminal closes; whoever started the node with ``nohup`` has it ignored.
+    SIGHUP comes when the terminal closes; under ``nohup`` it is ignored.
     """
 
     def __init__(self) -> None:
@@ -65,19 +65,19 @@ class _StopSignal:
                 signal.signal(number, self._request)
 
     def has_started(self) -> None:
-        """From now on there is something to tidy up at the end."""
+        """From now on there is something to clean up at the end."""
         self._starting = False
 
     def _request(self, _number: int, _frame: FrameType | None) -> None:
         if self._starting:
-            os._exit(0)  # in the middle of an import, perhaps; there is nothing to tidy up yet
+            os._exit(0)  # perhaps in the middle of an import; there is nothing to clean up yet
         self.requested = True
 
 
 def _solver_process() -> ServerProcess:
-    """A copy of this process that solves, made while there are no threads: both share torch."""
+    """A fork of this process that solves, made while there are no threads, so that both share torch."""
     with loading():
-        import torch  # noqa: F401 - before there are two
+        import torch  # noqa: F401 - loaded before the fork
 
         from rotavg_ros.online.solver_process.process import Forked
     return Forked()
@@ -127,7 +127,7 @@ def _answer_arguments(arguments: list[str]) -> int:
 
 
 def _fail_without(error: ModuleNotFoundError) -> int:
-    """A package is missing that ROS 2, or the build of this workspace, brings."""
+    """Report a missing package that comes with ROS 2 or with the build of this workspace."""
     package = (error.name or "").partition(".")[0]
     return _fail(
         f"there is no Python package {package}; source ROS 2's setup.sh and this workspace's install/setup.sh, or "

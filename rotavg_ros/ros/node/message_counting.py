@@ -1,4 +1,4 @@
-"""Counting what never arrived, and how long it took what did."""
+"""Counts lost messages, and measures durations."""
 
 from __future__ import annotations
 
@@ -8,38 +8,39 @@ from typing import Any
 
 import numpy as np
 
-# Beyond so many, the name that was silent the longest is forgotten: names come from messages, and may be anything.
+# Most names remembered, since names come from messages and may be anything; the one silent longest is forgotten.
 _MOST_NAMES = 1000
-# The same of counts that are under way, and of gaps in them.
+# The same limit for counts in progress, and for gaps in them.
 _MOST_COUNTS = 100
-# A larger step is a sender that restarted or sends nonsense, not that many lost messages.
+# A larger step means a sender that restarted or sends nonsense, not that many lost messages.
 _LARGEST_GAP = 1_000_000
 
 
 class SequenceGaps:
-    """Lost messages of senders that number theirs consecutively.
+    """Counts lost messages of senders that number theirs consecutively.
 
-    Messages do not say who has sent them: a sender may speak of several robots, and several of one. So a number goes
-    on the nearest count below it, whosever that is; how many are missing in all does not depend on it. A number inside
-    a gap shows that the gap was the step from one sender's count to another's: nothing was lost in it.
+    Messages do not say who has sent them: a sender may report on several robots, and several senders on one. So a
+    number continues the nearest count below it, whichever sender that belongs to; the total of missing numbers does not
+    depend on this. A number inside a gap shows that the gap was the step from one sender's count to another's, in which
+    nothing was lost.
 
     Attributes:
-        lost: numbers that were left out, or fewer: a count that has ended hides losses of one that passes it.
-        before_first: numbers below the first that was seen: sent before we listened, or lost while we connected.
+        lost: numbers that were skipped, or fewer: a count that has ended hides losses of one that passes it.
+        before_first: numbers below the first one seen: sent before we listened, or lost while we connected.
     """
 
     def __init__(self) -> None:
         self.lost = 0
         self.before_first = 0
         self._names: dict[str, None] = {}
-        self._counts: list[int] = []  # the last number of each; at the end that of the newest message
-        self._gaps: list[tuple[int, int]] = []  # the numbers before and after
+        self._counts: list[int] = []  # the last number of each count; the newest message's is last
+        self._gaps: list[tuple[int, int]] = []  # the numbers before and after each
 
     def observe(self, name: str, number: int) -> None:
-        """Note a number; one that goes on no count begins one: its sender is new, or started anew.
+        """Note a number; one that continues no count begins a new one: its sender is new or has restarted.
 
         Args:
-            name: of what the message is about. The first of a name may well be the first of a sender.
+            name: of what the message is about. The first message with a name may be the first of a sender.
             number: from 1; 0 if the sender does not count.
         """
         if number <= 0:
@@ -66,7 +67,7 @@ class SequenceGaps:
         del self._counts[:-_MOST_COUNTS], self._gaps[:-_MOST_COUNTS]
 
     def _is_new(self, name: str) -> bool:
-        """Whether nothing has come by this name."""
+        """Whether no message has come with this name before."""
         is_new = name not in self._names
         self._names.pop(name, None)
         self._names[name] = None
@@ -81,7 +82,7 @@ def _missing(before: int, after: int) -> int:
 
 
 class TopicCounter:
-    """Messages of one subscription: how many came, and how many got lost by the sender's and the middleware's count."""
+    """Messages of one subscription: how many came, and how many were lost, by the sender's and middleware's counts."""
 
     def __init__(self) -> None:
         self.received = 0
@@ -92,9 +93,9 @@ class TopicCounter:
         """Note a message.
 
         Args:
-            info: rclpy's message info, None where rclpy hands out none.
-            num_publishers: the middleware's numbers are per publisher and do not say whose, so they count only while
-                there is one.
+            info: rclpy's message info; None if rclpy provides none.
+            num_publishers: number of publishers. The middleware's numbers are per publisher and do not say which, so
+                they count only while there is one.
         """
         self.received += 1
         if info is not None and num_publishers == 1:
@@ -102,7 +103,7 @@ class TopicCounter:
 
     @property
     def lost(self) -> int:
-        """The larger of the two counts, for both see the same losses."""
+        """The larger of the two counts, since both see the same losses."""
         return max(self.by_sequence.lost, self.by_middleware.lost)
 
     @property
@@ -114,7 +115,7 @@ class Durations:
     """The last durations of something, in seconds, and their percentiles."""
 
     def __init__(self, length: int = 1000) -> None:
-        # When, on the monotonic clock, and how long. Copied as a whole before it is read: another thread may add.
+        # Time of the end, on the monotonic clock, and duration. Copied before it is read: another thread may add.
         self._recent: deque[tuple[float, float]] = deque(maxlen=length)
         self.count = 0
         self.longest = 0.0
@@ -125,7 +126,7 @@ class Durations:
         self.longest = max(self.longest, seconds)
 
     def percentile_ms(self, percent: float) -> float:
-        """Milliseconds; NaN before the first."""
+        """Percentile in milliseconds; NaN before the first."""
         recent = [seconds for _, seconds in list(self._recent)]
         return 1e3 * float(np.percentile(recent, percent)) if recent else float("nan")
 
@@ -134,7 +135,7 @@ class Durations:
         return [1e3 * seconds for when, seconds in list(self._recent) if began <= when < ended]
 
     def median_ms(self, window_s: float) -> float:
-        """Milliseconds, of the last so many seconds; NaN where nothing happened in them."""
+        """Median over the last ``window_s`` seconds, milliseconds; NaN if there is nothing in them."""
         now = time.monotonic()
         inside = self.between_ms(now - window_s, now)
         return float(np.median(inside)) if inside else float("nan")

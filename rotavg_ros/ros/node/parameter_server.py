@@ -1,4 +1,4 @@
-"""The parameters as rclpy sees them: declared with ranges and descriptions, read, and watched for changes."""
+"""The node's parameters in rclpy: declared with ranges and descriptions, read, and watched for changes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.option import Option, OptionError
 from rotavg_ros.settings.parameters import PARAMETERS, NodeParameters
 
-# How rclpy names the parameters that change a topic's quality of service.
+# Prefix of rclpy's parameters that change a topic's quality of service.
 _QOS = "qos_overrides"
 
 
@@ -22,7 +22,7 @@ class ParameterNode(Node):
     """A node that refuses a parameter's value in the words of :mod:`rotavg_ros.option`, not in rclpy's."""
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """As rclpy's, which the services call; 5 is taken for 5.0 where a number with a fraction is wanted."""
+        """As rclpy's, which the services call; an integer such as 5 is accepted for a float parameter."""
         try:
             return super().set_parameters_atomically([_as_wanted(each) for each in parameter_list])
         except OptionError as error:
@@ -38,7 +38,7 @@ def declare(node: Node) -> NodeParameters:
     started_with, values = given(node), {}
     for name, option in PARAMETERS.items():
         parameter = _as_wanted(started_with.get(name) or Parameter(name, value=_for_ros(option.default)))
-        if parameter.type_ is Parameter.Type.NOT_SET:  # what becomes of `-p name:=[]`
+        if parameter.type_ is Parameter.Type.NOT_SET:  # as after `-p name:=[]`
             raise OptionError(f"parameter {name} is empty; give it a value or leave it out")
         node.declare_parameter(name, parameter.value, _descriptor(option), ignore_override=True)
         values[name] = parameter.value
@@ -46,16 +46,16 @@ def declare(node: Node) -> NodeParameters:
 
 
 def given(node: Node) -> Mapping[str, Parameter]:
-    """What a node was started with, by name, its own parameters and others."""
+    """Parameters that a node was started with, by name: its own and others."""
     overrides: Mapping[str, Parameter] = getattr(node, "_parameter_overrides", {})
     return overrides
 
 
 def unknown(node: Node) -> tuple[list[str], list[str]]:
-    """One line for every parameter the node was given that it does not have; to be asked once all topics are there.
+    """One line for every given parameter that the node does not have; call it once all topics exist.
 
     Returns:
-        those that are surely meant for this node, and those that a file for many nodes may hold for another one.
+        lines about those that are certainly meant for this node, and about those that may be meant for another.
     """
     qos = [f"{_QOS}.{name}" for name in node.get_parameters_by_prefix(_QOS)]
     ours = [*PARAMETERS, *qos]
@@ -70,10 +70,10 @@ def unknown(node: Node) -> tuple[list[str], list[str]]:
 
 
 def _as_wanted(parameter: Parameter) -> Parameter:
-    """A parameter of ours with its value in its own type, another's as it is.
+    """One of our parameters with its value in the declared type; any other parameter unchanged.
 
     Raises:
-        OptionError: a value that it cannot have.
+        OptionError: an invalid value.
     """
     if parameter.name not in PARAMETERS or parameter.type_ is Parameter.Type.NOT_SET:
         return parameter
@@ -85,7 +85,7 @@ def _for_ros(value: Any) -> Any:
 
 
 def watch(node: Node, current: Callable[[], NodeParameters], apply: Callable[[NodeParameters], None]) -> None:
-    """Check every change as a set, together with what is not changed, and apply it if it is good."""
+    """Check every set of changes, together with the unchanged parameters, and apply it if it is valid."""
 
     def on_set(changes: list[Parameter]) -> SetParametersResult:
         try:

@@ -1,4 +1,4 @@
-"""The node's services. Slow ones are done by workers; none blocks the executor."""
+"""The node's services. Slow ones run on workers; none blocks the executor."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Services:
             ("save", solving.save, workers.saver),
             ("load", self._load, workers.saver),
         ):
-            # The default group runs one callback at a time, and would run nothing while one of these is awaited.
+            # The default group runs one callback at a time, and would run nothing else while one of these waits.
             on_trigger = partial(self._on_trigger, job, thread)
             node.create_service(Trigger, f"~/{name}", on_trigger, callback_group=ReentrantCallbackGroup())
         node.create_service(Trigger, "~/reset", self._on_reset)

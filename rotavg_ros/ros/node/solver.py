@@ -1,4 +1,4 @@
-"""The solver that a node asks: in a process of its own, or in the node's."""
+"""The solver that a node uses: in a process of its own, or in the node's."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Solver:
         """Begin with a process of its own, if parameters ask for one.
 
         Args:
-            process: that serves; default: another interpreter, where one is needed.
+            process: the process that solves; default: another interpreter, if one is needed.
         """
         threads = parameters.solver_threads or max(1, torch.get_num_threads() - 1)
         self._process = SolverProcess(threads, process) if parameters.solver_process else None
@@ -43,7 +43,7 @@ class Solver:
             torch.set_num_threads(threads)
 
     def warm_up(self, options: EstimatorOptions) -> str:
-        """Solve a triangle, which costs nothing: it loads the networks; returns the device.
+        """Solve a triangle, which loads the networks; returns the device.
 
         Raises:
             UserError: options that the solver does not know.

@@ -1,7 +1,7 @@
-"""Everything slow: ticks and their answers, and drawing, on one worker's thread; the state file on another's.
+"""Everything slow: ticks, their answers and drawing on one worker's thread; the state file on another's.
 
-A solve may take longer than the time between two autosaves, and a save must not wait for it; nor does a load, or a
-reset on the executor's thread, which give the running solve up.
+A solve may take longer than the time between two autosaves, and a save must not wait for it. Neither does a load, nor a
+reset on the executor's thread; these abandon the running solve.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from rotavg_ros.settings.parameters import NodeParameters
 from rotavg_ros.whole_file import remove_leftovers
 
 _LOG_PERIOD_S = 5.0
-# Of a tick's budget, before its answer.
+# Share of a tick's budget that may be spent before its answer.
 _BEFORE = TICK_WORK / WORK_AFTER
 
 
@@ -37,10 +37,10 @@ class Solving:
     """Jobs for the workers, and :meth:`reset`, which takes milliseconds.
 
     Attributes:
-        tick_budget_s: what may be spent after a tick's answer on what that has left; a part of it before it. Inf by
-            itself.
+        tick_budget_s: time for the remaining work after a tick's answer, seconds; a share of it applies before the
+            answer. Infinite by default.
 
-    Those that a service asks for return what to tell the caller, or raise.
+    Jobs for a service return the message for the caller, or raise.
 
     Raises:
         UserError: the state file cannot be read or written.
@@ -93,7 +93,7 @@ class Solving:
         return answer
 
     def _go_on(self) -> None:
-        """What the tick has left, once its answer is out."""
+        """Do the work that the tick has left, once its answer is published."""
         started = time.perf_counter()
         work = self._estimator.go_on(self._budget.units(self.tick_budget_s))
         self._budget.learn(time.perf_counter() - started, work)
@@ -135,14 +135,14 @@ class Solving:
         return f"loaded {self._saved_keyframes} keyframes from {state_file}"
 
     def tick_quietly(self) -> None:
-        """As :meth:`tick`; what goes wrong is logged."""
+        """As :meth:`tick`, with the work after it; errors are logged."""
         self._quietly("solving failed: ", self._tick_and_go_on)
 
     def autosave_quietly(self, at_the_end: bool = False) -> None:
-        """Save what has changed since it was last saved; what goes wrong is logged once, until it goes well again.
+        """Save if anything has changed since the last save; an error is logged once, until saving works again.
 
         Args:
-            at_the_end: odometry counts as well, for where the robot is tells the next node whether it has gone on.
+            at_the_end: save new odometry as well, since the next node compares it with where the robot is then.
         """
         content = self._content()
         moved = at_the_end and self._estimator.counts().keyframes > 0
@@ -156,7 +156,7 @@ class Solving:
             self._health.saved(failure=str(error))
 
     def tell_what_is_lost(self) -> None:
-        """At the end, after the last save if there is one: what was not saved, if anything was not."""
+        """Warn at the end, after the last save if there is one, about anything that was not saved."""
         keyframes = self._estimator.counts().keyframes
         if keyframes == 0 or self._content() == self._saved:
             return
@@ -169,7 +169,7 @@ class Solving:
         self._node.get_logger().warning(f"{what}; {how} to keep all")
 
     def back_up_quietly(self, discarded: Discarded) -> None:
-        """Keep what was forgotten or replaced beside the state file; the diagnostics tell of it, or why it failed."""
+        """Back up what was forgotten or replaced beside the state file; the diagnostics report it, or why it failed."""
         if self._state_file is None:
             return
         try:
@@ -181,16 +181,16 @@ class Solving:
         self._health.note(notice)
 
     def let_go(self) -> None:
-        """Let other nodes have the state file; nothing is saved any more."""
+        """Release the state file to other nodes; nothing more is saved."""
         if self._lock is not None:
             self._lock.release()
 
     def draw_quietly(self) -> None:
-        """Draw the last answer for those who look; what goes wrong is logged."""
+        """Draw the last answer for its subscribers; errors are logged."""
         self._quietly("drawing failed: ", lambda: self._outputs.draw(self._health.answer))
 
     def forget_quietly(self) -> None:
-        """Latch empty answers in place of those that the estimator has forgotten; what goes wrong is logged."""
+        """Latch empty answers in place of those that the estimator has forgotten; errors are logged."""
         self._quietly("", self._forget_answer)
 
     def _quietly(self, what: str, job: Callable[[], object]) -> None:
@@ -228,7 +228,7 @@ class Solving:
                 self._health.forget_answer()
 
     def _content(self) -> tuple[int, int]:
-        """Differs when the graph does."""
+        """A value that differs when the graph does."""
         return self._estimator.generation, self._estimator.revision
 
     def _resume(self, state_file: Path) -> None:
@@ -247,7 +247,7 @@ class Solving:
         self._tell_of_other_robots()
 
     def _tell_of_other_robots(self) -> None:
-        """Of a state file that has been read: it may be another robot's, copied with the parameters."""
+        """Warn if the state file that was read may be another robot's, copied with the parameters."""
         notice = of_other_robots(self._estimator.counts().odometry_robots, self._parameters)
         if notice is not None:
             self._node.get_logger().warning(notice)
@@ -257,7 +257,7 @@ class Solving:
         """The state file, which is this node's alone.
 
         Raises:
-            UserError: there is none, another node has it, or it is to be written and its folder cannot be.
+            UserError: there is none, another node uses it, or it is to be written and its folder is not writable.
         """
         if self._state_file is None or self._lock is None:
             raise UserError("the parameter state_file is empty; start the node with the file's name")

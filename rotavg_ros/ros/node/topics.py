@@ -1,4 +1,4 @@
-"""Quality of service, robots' names in topics', and mistakes about topics in one line."""
+"""Quality of service, robots' names in topic names, and one-line errors about topics."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from rotavg_ros.errors import UserError
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
-# What ROS allows in front of a topic's name.
+# Prefixes that ROS allows before a topic's name.
 _PREFIX = re.compile(r"/?([A-Za-z_][A-Za-z0-9_]*/)+")
 
 
 def checked_prefixes(prefixes: Mapping[str, str]) -> Mapping[str, str]:
-    """What stands before the topics of each robot, as :meth:`NodeParameters.prefixes` has it.
+    """The prefixes of the robots' topics (:meth:`NodeParameters.prefixes`), checked.
 
     Raises:
         UserError: a name cannot be part of a topic's, or two robots would have the same topics.
@@ -46,7 +46,7 @@ def overrides() -> QoSOverridingOptions:
 
 @contextmanager
 def user_error_about(topic: str) -> Iterator[None]:
-    """What rclpy says about a topic's name or its ``qos_overrides``, in one line."""
+    """Turn rclpy's errors about a topic's name or ``qos_overrides`` into one-line user errors."""
     try:
         yield
     except Exception as error:  # rclpy has a different type for every mistake
@@ -56,10 +56,10 @@ def user_error_about(topic: str) -> Iterator[None]:
 def publisher(node: Node, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
     """A publisher whose quality of service the user may override.
 
-    rclpy writes an override into the profile that it is given, so it gets one of its own.
+    rclpy writes overrides into the profile that it is given, so it gets a copy.
 
     Raises:
-        UserError: the topic's name or its ``qos_overrides`` cannot be.
+        UserError: an invalid topic name or ``qos_overrides``.
     """
     with user_error_about(topic):
         return node.create_publisher(message_type, topic, copy(qos), qos_overriding_options=overrides())

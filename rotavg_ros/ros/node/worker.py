@@ -1,4 +1,4 @@
-"""A thread on which something slow happens."""
+"""A thread for slow jobs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rclpy.task import Future
 
 @dataclass(frozen=True)
 class Workers:
-    """The node's two: a save need not wait for a solve."""
+    """The node's two workers, so that a save need not wait for a solve."""
 
     solver: Worker
     saver: Worker
@@ -38,13 +38,13 @@ class Worker:
         return future
 
     def submit_once(self, job: Callable[[], Any]) -> None:
-        """Queue a job unless it waits already, so that a timer cannot fill the queue."""
+        """Queue a job unless it is already waiting, so that a timer cannot fill the queue."""
         if job not in self._waiting:
             self._waiting.add(job)
             self.submit(job)
 
     def stop(self, timeout_s: float, finish: bool = False) -> bool:
-        """Take no more jobs and wait for the running one, or for all; False if that was not done in time."""
+        """Take no more jobs and wait for the running one, or for all (``finish``); False if that took too long."""
         self._stopping = not finish
         self._jobs.put(None)
         self._thread.join(max(timeout_s, 0.0))
@@ -55,7 +55,7 @@ class Worker:
             if self._stopping:
                 break
             job, future = entry
-            self._waiting.discard(job)  # before it runs: what changes from now on needs it once more
+            self._waiting.discard(job)  # before it runs: a change from now on requires another run
             try:
                 future.set_result(job())
             except Exception as error:

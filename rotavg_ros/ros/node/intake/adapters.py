@@ -1,4 +1,4 @@
-"""Entries of the topic parameters, ``topic`` or ``topic:package/msg/Type``, to message types and converters.
+"""Message types and converters for entries of the topic parameters, ``topic`` or ``topic:package/msg/Type``.
 
 A package is imported only when a topic asks for one of its types.
 """
@@ -31,12 +31,12 @@ class EdgeTopic:
 
     @property
     def element_type(self) -> type:
-        """Of the edges of a message that may have very many."""
+        """Message type of the edges in an array message."""
         return _message_type("edge", self.topic, DEFAULT_EDGE_TYPE)
 
     @property
     def is_array(self) -> bool:
-        """Whether messages may have very many edges: to be taken as bytes, for :class:`SerializedArray`."""
+        """Whether messages may have very many edges and are therefore taken as bytes (:class:`SerializedArray`)."""
         return self.type_name == _EDGE_ARRAY_TYPE
 
 

@@ -1,4 +1,4 @@
-"""Edges that name a sensor's frame, taken into the body's by ``/tf_static``; those that come before it wait a while."""
+"""Converts edges in a sensor's frame to the body's by ``/tf_static``; edges that come before it wait a while."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _TOPIC = "/tf_static"
 # Every broadcaster of static transforms latches one message.
 _DEPTH = 1000
 _MOST_WAITING = 10_000
-# How often it is looked whether the first edges have waited long enough, and at how many of them.
+# How often waiting edges are checked, and how many at a time.
 _LOOK_PERIOD_S, _LOOK_AT = 0.1, 1000
 
 
@@ -39,22 +39,22 @@ class _Waiting(NamedTuple):
 
 
 class EdgeFrames:
-    """Hands every edge on, as one between bodies where it is known how the sensor sits. Runs on the executor's thread.
+    """Passes every edge on, converted to the body's frame if the sensor's mounting is known.
 
-    Where nothing says that in time, edges are taken as they are, and the later ones of that frame do not wait any more.
-    A transform that comes still later counts from then on.
+    If the mounting is not known in time, edges are taken as they are, and later ones of that frame no longer wait. A
+    transform that comes still later is used from then on. Runs on the executor's thread.
     """
 
     def __init__(self, node: Node, wait_s: float | None, add: Callable[[EdgeRecord, Input], None]) -> None:
-        """Listen to static transforms, where tf2_msgs is installed.
+        """Listen to static transforms, if tf2_msgs is installed.
 
         Args:
             node: the node.
-            wait_s: how long an edge waits for one; None: all edges are taken as they are.
+            wait_s: how long an edge waits for a transform, seconds; None: all edges are taken as they are.
             add: takes an edge and the topic that it came on.
 
         Raises:
-            UserError: the topic's ``qos_overrides`` cannot be.
+            UserError: invalid ``qos_overrides`` of the topic.
         """
         self._node, self._wait_s, self._add = node, wait_s or 0.0, add
         self._sensors = SensorFrames()
@@ -74,20 +74,20 @@ class EdgeFrames:
 
     @property
     def waiting(self) -> int:
-        """How many edges wait."""
+        """Number of edges that wait."""
         return len(self._waiting)
 
     def note_transforms(self, message: Any) -> None:
-        """Remember how frames sit in each other, see :meth:`SensorFrames.take`, and look what has waited for it."""
+        """Remember transforms between frames (:meth:`SensorFrames.take`), and check the edges that waited for them."""
         self._sensors.take(message)
         self._look()
 
     def note_body(self, robot: str, frame: str, body_from_frame: Quaternion) -> None:
-        """Remember in which frame a robot's odometry moves, see :meth:`SensorFrames.note_body`."""
+        """Remember the frame whose motion a robot's odometry describes, see :meth:`SensorFrames.note_body`."""
         self._sensors.note_body(robot, frame, body_from_frame)
 
     def take(self, record: EdgeRecord, topic: Input) -> None:
-        """Hand an edge on, now or in a while."""
+        """Pass an edge on, now or later."""
         if not self._is_on or not record.frame_id:
             self._add(record, topic)
             return
@@ -102,7 +102,7 @@ class EdgeFrames:
         self._waiting.append(waiting)
         if len(self._waiting) > _MOST_WAITING:
             self._give_up(self._waiting.popleft())
-        if self._timer.is_canceled():  # set anew for each edge it would never be due while edges flow
+        if self._timer.is_canceled():  # if reset for each edge, it would never fire while edges flow
             self._timer.reset()
 
     def forget(self) -> None:
@@ -125,7 +125,7 @@ class EdgeFrames:
             self._timer.cancel()
 
     def _hand_on(self, waiting: _Waiting) -> bool:
-        """Hand an edge on if it is known how its sensor sits."""
+        """Pass an edge on if the mounting of its sensor is known; returns whether it is."""
         edge, frame, topic = waiting.edge, waiting.record.frame_id, waiting.topic
         body_from_sensor = self._sensors.body_from(edge.source.robot, frame)
         if body_from_sensor is None:
@@ -140,7 +140,7 @@ class EdgeFrames:
         return True
 
     def _give_up(self, waiting: _Waiting) -> None:
-        """Hand an edge on as it is."""
+        """Pass an edge on as it is."""
         edge, frame, topic = waiting.edge, waiting.record.frame_id, waiting.topic
         if topic.placement.get((edge.source.robot, frame)) is not Placement.UNKNOWN:
             self._node.get_logger().warning(
@@ -152,7 +152,7 @@ class EdgeFrames:
 
 
 def _tf_message() -> type | None:
-    """``tf2_msgs/TFMessage``, where that package is installed."""
+    """``tf2_msgs/TFMessage`` if that package is installed, else None."""
     try:
         from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
     except ImportError:

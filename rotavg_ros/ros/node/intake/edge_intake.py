@@ -1,4 +1,4 @@
-"""Edges of messages, long ones a slice at a time, so that odometry, services and signals get their turn in between."""
+"""Takes edges from messages, long ones in slices, so that odometry, services and signals are handled in between."""
 
 from __future__ import annotations
 
@@ -20,13 +20,12 @@ from rotavg_ros.ros.node.message_counting import TopicCounter
 
 _SLICE_S = 0.005
 _BREAK_S = 0.001
-# With so many messages under way no more are taken: they wait in the middleware's queue, which is bounded, and what it
-# loses is counted.
+# Most messages in progress. Further ones wait in the middleware's queue, which is bounded; what it loses is counted.
 _MOST_MESSAGES = 100
 
 
 class _WhileThereIsRoom(MutuallyExclusiveCallbackGroup):
-    """Callbacks run one at a time, and only while there is room for what they bring."""
+    """Runs callbacks one at a time, and only while there is room for further messages."""
 
     def __init__(self, has_room: Callable[[], bool]) -> None:
         super().__init__()
@@ -39,11 +38,11 @@ class _WhileThereIsRoom(MutuallyExclusiveCallbackGroup):
 class EdgeIntake:
     """Takes edges in the order in which their messages came. Runs on the executor's thread.
 
-    Another thread may replace the graph at any moment (``~/load``). What is left of messages is dropped then.
+    Another thread may replace the graph at any moment (``~/load``). The rest of the messages is dropped then.
 
     Attributes:
-        callback_group: for the subscriptions to edges; it holds them back while too many messages are under way.
-        frames: takes the edges of sensors into the body's frame.
+        callback_group: for the subscriptions to edges; it holds them back while too many messages are in progress.
+        frames: converts edges of sensors to the body's frame.
     """
 
     def __init__(
@@ -58,9 +57,9 @@ class EdgeIntake:
 
         Args:
             node: the node.
-            estimator: gets them.
-            forwarding: told of what became of those that are to be sent on.
-            on_refusal: told of every edge that is refused.
+            estimator: receives the edges.
+            forwarding: is told what became of the edges that are to be sent on.
+            on_refusal: is told of every edge that is refused.
             frame_wait_s: see :class:`EdgeFrames`.
         """
         self._estimator, self._forwarding = estimator, forwarding
@@ -74,11 +73,11 @@ class EdgeIntake:
         self._timer.cancel()
 
     def add_source(self, convert: EdgeConverter) -> None:
-        """Have a converter forget what it remembers whenever the estimator does."""
+        """Register a converter, which then forgets what it remembers whenever the estimator does."""
         self._converters.append(convert)
 
     def take(self, topic: Input, counter: TopicCounter, records: Iterator[EdgeRecord | EdgeVerdict]) -> None:
-        """Take what a message says, now or in a while."""
+        """Take the records of a message, now or later."""
         self._forget_with_the_estimator()
         for ends in self._estimator.pop_given_up():
             for convert in self._converters:
@@ -99,7 +98,7 @@ class EdgeIntake:
             self._timer.cancel()
 
     def _take_a_slice(self) -> None:
-        """Take what is under way, until there is nothing left, time is up, or what it is about is forgotten."""
+        """Take records until none are left, time is up, or the graph has been forgotten."""
         generation, deadline = self._generation, time.perf_counter() + _SLICE_S
         while self._under_way:
             topic, counter, records = self._under_way[0]
@@ -122,7 +121,7 @@ class EdgeIntake:
             self.frames.take(record, topic)
 
     def _add(self, record: EdgeRecord, topic: Input) -> None:
-        if self._generation != self._estimator.generation:  # it has waited, and what it was about is forgotten
+        if self._generation != self._estimator.generation:  # it has waited, and its graph has been forgotten
             self._forget_with_the_estimator()
             return
         assert not isinstance(record.edge, RejectReason)
@@ -134,7 +133,7 @@ class EdgeIntake:
             self._on_refusal(reason)
 
     def _forget_with_the_estimator(self) -> None:
-        """After a reset, what a sender repeats is new again, and what it sent before is of no use."""
+        """After a reset, what a sender repeats is new again, and what it sent before is useless."""
         if self._generation != self._estimator.generation:
             self._generation = self._estimator.generation
             self._under_way.clear()

@@ -1,4 +1,4 @@
-"""Closures that are believed, sent on to a back end in the very messages in which they came."""
+"""Sends closures that are believed on to a back end, in the same messages in which they came."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from rotavg_ros.ros.node.topics import publisher, user_error_about
 from rotavg_ros.settings.parameters import NodeParameters
 from rotavg_ros.view_graph import EdgeKind
 
-# Graphs that wait to be sent, or of which something waits.
+# Most graphs that wait to be sent, or with edges that wait.
 _MOST_GRAPHS = 1000
 
 
 class Forward:
-    """One edge topic's way on: how its messages are taken apart and put together again.
+    """Forwards one edge topic: takes its messages apart and puts them together again.
 
     Attributes:
-        topic: where edges come from.
-        filter: what waits, and what has passed.
-        shares_names: whether different edges have come with the same id of the same robot.
+        topic: the topic that edges come from.
+        filter: the closures that wait, and those that have passed.
+        shares_names: whether different edges of one robot have come with the same id.
     """
 
     def __init__(self, topic: str, output: Publisher) -> None:
@@ -48,17 +48,17 @@ class Forward:
         return ClosureFilter()
 
     def begin(self, message: Any, records: Iterable[EdgeRecord | EdgeVerdict]) -> Iterator[EdgeRecord | EdgeVerdict]:
-        """The records of a message that has come, each with what is to be sent on of it."""
+        """The records of a message that has come, each with the element to send on for it."""
         for record in records:
             yield replace(record, element=message) if isinstance(record, EdgeRecord) else record
 
     def send(self, items: list[Any]) -> None:
-        """Send on what may pass."""
+        """Send on the items that may pass."""
         for item in items:
             self._output.publish(item)
 
     def end(self) -> None:
-        """An answer has been looked at."""
+        """All decisions of an answer have been made."""
 
     def forget(self) -> None:
         """Begin anew, as the graph does."""
@@ -66,7 +66,7 @@ class Forward:
 
 
 class ArrayForward(Forward):
-    """``rotavg_msgs/RelativeRotationArray``: what passes together is sent together."""
+    """Forwards ``rotavg_msgs/RelativeRotationArray``: edges that pass together are sent together."""
 
     def __init__(self, edges: EdgeTopic, output: Publisher) -> None:
         super().__init__(edges.topic, output)
@@ -85,7 +85,7 @@ class ArrayForward(Forward):
 
 
 class _Graph:
-    """A message with a graph, or a part of one: which of its edges are closures, and which were sent on last."""
+    """A message with a graph or a part of one, the names of its closures, and which edges were sent on last."""
 
     def __init__(self, message: Any, converter: WholeGraphConverter) -> None:
         self.message, self.field = message, converter.edges_field
@@ -104,10 +104,10 @@ class _Graph:
 
 
 class WholeGraphForward(Forward):
-    """A graph goes out as it came, but for closures that are not believed; again when that changes.
+    """Sends a graph as it came, but without closures that are not believed, and again when the verdicts change.
 
-    Where senders send whole graphs only the newest counts, for their optimisers leave closures out. Where they send
-    parts, a part stays until all of it was sent, or a newer one has its closures.
+    If senders send whole graphs, only the newest counts, since their optimisers may have removed closures. If they send
+    parts, a part is kept until all of it has been sent, or until a newer part contains its closures.
     """
 
     def __init__(self, topic: str, output: Publisher, converter: WholeGraphConverter) -> None:
@@ -117,17 +117,17 @@ class WholeGraphForward(Forward):
         self._graphs: list[_Graph] = []
 
     def _new_filter(self) -> ClosureFilter[Any]:
-        return ClosureFilter(newest_counts=True)  # a sender that refines a closure sends it in the place of the old one
+        return ClosureFilter(newest_counts=True)  # a refined closure replaces the old one
 
     def begin(self, message: Any, records: Iterable[EdgeRecord | EdgeVerdict]) -> Iterator[EdgeRecord | EdgeVerdict]:
         yield from super().begin(None, records)
         self._incoming.append(_Graph(message, self._converter))
 
     def send(self, items: list[Any]) -> None:
-        """What passes is a part of a graph."""
+        """Do nothing: closures are sent with their graphs (:meth:`end`)."""
 
     def end(self) -> None:
-        """Send on what is not as it was sent last."""
+        """Send the graphs whose selection of edges has changed since they were last sent."""
         while self._incoming:
             if not self._converter.sends_parts:
                 self._graphs.clear()
@@ -154,7 +154,7 @@ class Forwarding:
     Edges come on the executor's thread, answers on the solver's worker.
 
     Raises:
-        UserError: a topic's name or its ``qos_overrides`` cannot be, or an output is listened to.
+        UserError: an invalid topic name or ``qos_overrides``, or an output that is listened to.
     """
 
     def __init__(self, node: Node, parameters: NodeParameters, estimator: OnlineEstimator) -> None:
@@ -180,18 +180,18 @@ class Forwarding:
 
     @property
     def waiting(self) -> int:
-        """How many closures are held back."""
+        """Number of closures that are held back."""
         with self._lock:
             return sum(len(each.filter) for each in self._forwards)
 
     @property
     def dropped(self) -> int:
-        """How many were held back and will not go on any more, since too many waited."""
+        """Number of closures that were held back and will not be sent on, because too many waited."""
         with self._lock:
             return sum(each.filter.dropped for each in self._forwards)
 
     def warnings(self) -> list[str]:
-        """What is not as it should be, a line each."""
+        """Present mistakes, a line each."""
         return [
             f"{each.topic}: different closures have the same id of the same robot, and go on only together "
             "(forward_topics): give each an id of its own"
@@ -200,7 +200,7 @@ class Forwarding:
         ]
 
     def of(self, edges: EdgeTopic) -> Forward | None:
-        """Where the messages of an edge topic go; None if nowhere."""
+        """The forward of an edge topic; None if its messages are not sent on."""
         topic = self._output_of.get(edges.topic)
         if topic is None:
             return None
@@ -216,7 +216,7 @@ class Forwarding:
         return forward
 
     def _check_outputs(self, listened: Iterable[str]) -> None:
-        """Compare the outputs' full names, with the namespace and remappings, with those of what is listened to."""
+        """Check that no output's full name, with namespace and remappings, is that of an input or another output."""
         taken = {self._full_name(topic) for topic in listened}
         for topic, output in self._output_of.items():
             name = self._full_name(output)
@@ -235,9 +235,9 @@ class Forwarding:
         """An edge was handed to the estimator: send it on at once if it is odometry, or let it wait.
 
         Args:
-            forward: of its topic.
-            record: with the edge.
-            refusal: what the estimator has said.
+            forward: of the edge's topic.
+            record: the record with the edge.
+            refusal: why the estimator refused it; None if it did not.
             generation: of the graph that the edge was meant for; if that is forgotten, so is the edge.
         """
         if isinstance(record.edge, RejectReason) or refusal not in (None, RejectReason.DUPLICATE_EDGE):
@@ -257,7 +257,7 @@ class Forwarding:
             forward.send([record.element])
 
     def decide(self, answer: Answer | None) -> None:
-        """Send on what the last answer believes; nothing if it has been looked at and nothing waits."""
+        """Send on what the last answer believes; nothing if it was used before and nothing waits."""
         with self._lock:
             self._forget_with_the_estimator()
             if answer is None or not self._forwards or answer.version <= self._estimator.first_version:

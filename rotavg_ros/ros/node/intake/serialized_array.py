@@ -1,10 +1,10 @@
 """A message as the middleware delivers it, taken apart element by element.
 
-rclpy unpacks a message whole, in one go of seconds where it has 100 000 elements, and nothing else runs meanwhile. Read
-from the serialised bytes, an element takes ten microseconds, and whoever reads decides when to go on.
+rclpy unpacks a message as a whole, which takes seconds for 100 000 elements, and nothing else runs meanwhile. Read from
+the serialised bytes, an element takes ten microseconds, and the reader decides when to continue.
 
-The bytes are CDR as the OMG's DDSI-RTPS 2.5, chapter 10 has it: two bytes name the representation, two are options, and
-primitives are aligned to their size, counted from behind these four.
+The bytes are CDR as in the OMG's DDSI-RTPS 2.5, chapter 10: two bytes name the representation, two are options, and
+primitives are aligned to their size, counted from after these four.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 
 from rclpy.serialization import deserialize_message
 
-# What fields of a message definition are called, and what struct calls them.
+# Type names in message definitions, and their format characters in ``struct``.
 _PRIMITIVES = {
     "boolean": "?",
     "octet": "B",
@@ -33,11 +33,11 @@ _PRIMITIVES = {
     "uint32": "I",
     "uint64": "Q",
 }
-# Representations with these first two bytes are read here, plain CDR of either byte order.
+# First two bytes of the representations that are read here: plain CDR in either byte order.
 _BYTE_ORDERS = {b"\x00\x00": ">", b"\x00\x01": "<"}
 _HEADER_BYTES = 4
 
-# Of the bytes behind the header and a position in them: the value there, and where it ends.
+# Takes the bytes after the header and a position in them; returns the value there and the position of its end.
 _Read = Callable[[memoryview, int], tuple[Any, int]]
 
 
@@ -45,8 +45,8 @@ class SerializedArray:
     """A message of a header and a sequence, such as ``rotavg_msgs/RelativeRotationArray``.
 
     Attributes:
-        header: a ``std_msgs/Header``, or what has its fields.
-        edges: the elements, each read when it is asked for, and once; they have the fields of the element's message.
+        header: a ``std_msgs/Header``, or an object with its fields.
+        edges: iterator over the elements, which are read on demand; they have the fields of the element's message.
     """
 
     def __init__(self, serialized: bytes, message_type: type) -> None:
@@ -67,7 +67,7 @@ class SerializedArray:
 
 
 def as_message(element: Any, message_type: type) -> Any:
-    """An element as a message of its type, to be published."""
+    """An element as a message of its type, for publishing."""
     if isinstance(element, message_type):
         return element
     message = message_type()
@@ -93,7 +93,7 @@ def _elements(content: memoryview, at: int, element_type: str, order: str) -> It
 
 @cache
 def _reader(type_name: str, order: str) -> _Read:
-    """Of a field type as ``get_fields_and_field_types`` names it: a primitive, string, sequence, or message."""
+    """Reader of a field type, named as in ``get_fields_and_field_types``: primitive, string, sequence or message."""
     if type_name in _PRIMITIVES:
         return _primitive_reader(struct.Struct(order + _PRIMITIVES[type_name]))
     if type_name == "string":
@@ -119,7 +119,7 @@ def _primitive_reader(number: struct.Struct) -> _Read:
 
 def _string_reader(read_length: _Read) -> _Read:
     def read(content: memoryview, at: int) -> tuple[str, int]:
-        length, at = read_length(content, at)  # with the zero at its end
+        length, at = read_length(content, at)  # includes the terminating zero
         return str(content[at : at + length - 1], "utf-8", "replace"), at + length
 
     return read

@@ -1,4 +1,4 @@
-"""What the node listens to: every message is counted, translated, and handed to the estimator."""
+"""The node's subscriptions: every message is counted, converted, and handed to the estimator."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Subscriptions:
         forwarding: where believed closures go.
 
     Raises:
-        UserError: a topic's name, type or ``qos_overrides`` cannot be.
+        UserError: an invalid topic name, type or ``qos_overrides``.
     """
 
     def __init__(
@@ -85,14 +85,14 @@ class Subscriptions:
 
     @property
     def waiting_for_frames(self) -> int:
-        """How many edges wait for the transform between their frame and the body's."""
+        """Number of edges that wait for the transform between their frame and the body's."""
         return self._intake.frames.waiting
 
     def _full_name(self, topic: str) -> str:
-        """With the namespace and remappings.
+        """The topic's name with the namespace and remappings.
 
         Raises:
-            UserError: no topic can be called that, or another entry means the same one.
+            UserError: an invalid topic name, or one that another entry resolves to as well.
         """
         with user_error_about(topic):
             name: str = self._node.resolve_topic_name(topic)
@@ -107,7 +107,7 @@ class Subscriptions:
         handle: Callable[[Any, dict[str, Any] | None], None],
         counter: TopicCounter,
     ) -> None:
-        """Subscribe and count; ``handle`` gets the message, and its info where this rclpy hands it out."""
+        """Subscribe and count; ``handle`` gets the message, and its info if this rclpy provides it."""
         subscription: Subscription
         self.inputs.append(topic)
 
@@ -118,7 +118,7 @@ class Subscriptions:
         def without_info(message: Any) -> None:
             with_info(message, None)
 
-        # Humble's callbacks take the message alone.
+        # In Humble, callbacks take only the message.
         callback: Any = with_info if hasattr(Subscription, "CallbackType") else without_info
         with user_error_about(topic.name):
             subscription = self._node.create_subscription(

@@ -1,7 +1,7 @@
-"""Mistakes in how the node is connected: what it listens to, who publishes there, and in which frames.
+"""Finds mistakes in how the node is connected: what it listens to, who publishes there, and in which frames.
 
-None of them is an error to ROS; each costs an integrator an afternoon. Looked for once a second, told in the
-diagnostics with the topic and what to do.
+None of them is an error to ROS; each costs an integrator an afternoon. They are looked for once a second and reported
+in the diagnostics with the topic and what to do.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from rotavg_ros.ros.node.intake.forwarding import Forward
 from rotavg_ros.settings.parameters import NodeParameters
 
 _CLOCK = "/clock"
-# Frames come from messages and may be anything; so many different ones of a topic tell enough.
+# Frames come from messages and may be anything; this many different ones per topic are enough for a warning.
 _MOST_FRAMES = 3
 _MOST_PLACEMENTS = 1000
 
 
 class Placement(Enum):
-    """What is known of how a sensor sits on a robot's body."""
+    """What is known about the mounting of a sensor on a robot's body."""
 
     AWAITED = auto()
     KNOWN = auto()
-    UNKNOWN = auto()  # nobody has said it in time
+    UNKNOWN = auto()  # no transform came in time
 
 
 @dataclass
@@ -39,15 +39,15 @@ class Input:
     """A topic that the node listens to.
 
     Attributes:
-        name: of the topic, in full.
-        type_name: of its messages, ``package/msg/Type``.
+        name: full name of the topic.
+        type_name: type of its messages, ``package/msg/Type``.
         parameter: the parameter that names it, ``odometry_topics`` or ``edge_topics``.
         robot: whose odometry it is; empty for edges.
-        qos: what is asked for. A copy, for rclpy writes what the user overrides into it.
-        frames: of the messages so far: of odometry header.frame_id and that of the body, of edges that of the sensor.
+        qos: the requested profile. A copy, since rclpy writes the user's overrides into it.
+        frames: frames of the messages so far: for odometry header.frame_id and the body's, for edges the sensor's.
         forward: where its believed closures go; None if nowhere.
-        placement: of edges: how their sensors sit, by robot and frame.
-        published: when somebody was last seen to publish it, by the monotonic clock; at first when it was subscribed.
+        placement: for edges: what is known about the mounting of their sensors, by robot and frame.
+        published: when the topic last had a publisher, by the monotonic clock; initially when it was subscribed to.
     """
 
     name: str
@@ -68,29 +68,29 @@ class Input:
         return bool(self.robot)
 
     def is_published(self) -> None:
-        """Somebody publishes it now."""
+        """The topic has a publisher now."""
         self.published = time.monotonic()
 
     def note_frames(self, *frames: str) -> None:
-        """Remember in which frames a message is."""
+        """Remember the frames of a message."""
         if frames not in self.frames and len(self.frames) < _MOST_FRAMES:
             self.frames[frames] = None
 
     def note_placement(self, robot: str, frame: str, placement: Placement) -> None:
-        """Remember what is known of how a robot's sensor sits."""
+        """Remember what is known about the mounting of a robot's sensor."""
         if (robot, frame) in self.placement or len(self.placement) < _MOST_PLACEMENTS:
             self.placement[robot, frame] = placement
 
     @property
     def sensors(self) -> list[str]:
-        """Frames of edges that are taken as they are, though they may be of sensors."""
+        """Frames whose edges are taken as they are, although they may be sensors' frames."""
         told = {frame for _, frame in self.placement}
         unknown = {frame for (_, frame), placement in self.placement.items() if placement is Placement.UNKNOWN}
         return [frame for (frame,) in self.frames if frame and (frame in unknown or frame not in told)]
 
 
 class Wiring:
-    """Looks at the ROS graph around a node, and at what came over it."""
+    """Checks the ROS graph around a node, and the messages that came over it."""
 
     def __init__(self, node: Node, inputs: Sequence[Input], outputs: Sequence[str], given: frozenset[str]) -> None:
         """Watch a node.
@@ -104,7 +104,7 @@ class Wiring:
         self._node, self._inputs, self._outputs, self._given = node, inputs, outputs, given
 
     def warnings(self, parameters: NodeParameters) -> list[str]:
-        """One line for each mistake that there is now."""
+        """One line for each present mistake."""
         found: list[str] = []
         now = time.monotonic()
         missing = []
@@ -125,9 +125,9 @@ class Wiring:
         return found
 
     def _of_missing(self, missing: Sequence[Input], parameters: NodeParameters) -> list[str]:
-        """Topics that nobody publishes, as far as they are needed."""
+        """Warnings about needed topics that nobody publishes."""
         edges = [each for each in self._inputs if not each.is_odometry]
-        # The default topics are two forms of the same; whoever uses one does without the other.
+        # The default topics are two forms of the same input; a user of one does not need the other.
         all_needed = "edge_topics" in self._given or all(each in missing for each in edges)
         needs_odometry = parameters.estimator.needs_odometry
         lines = []
@@ -139,7 +139,7 @@ class Wiring:
         return lines
 
     def _topics_of(self, type_name: str) -> list[str]:
-        """Topics of a type that others publish and that this node does not know, a few of them."""
+        """A few topics of a type that others publish and that this node does not listen to."""
         own = self._node.get_fully_qualified_name()
         known = {each.name for each in self._inputs}
         by_others = (
@@ -173,7 +173,7 @@ class Wiring:
 
 
 def _of_publishers(topic: Input, publishers: Sequence[TopicEndpointInfo]) -> list[str]:
-    """What is wrong with those who publish a topic."""
+    """Warnings about the publishers of a topic."""
     lines = []
     fitting = [each for each in publishers if each.topic_type == topic.type_name]
     for other in sorted({each.topic_type for each in publishers} - {topic.type_name}):

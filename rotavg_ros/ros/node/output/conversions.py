@@ -1,4 +1,4 @@
-"""Answers to messages; the way back is in :mod:`rotavg_ros.inputs`. Messages carry orientations as world_from_body."""
+"""Converts answers to messages, with orientations as world_from_body; the inverse is in :mod:`rotavg_ros.inputs`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rotavg_ros.online.quaternion import Quaternion
 
 
 def to_time(stamp_ns: int) -> Time:
-    """A message's stamp; what a Time cannot hold (unknown, or beyond 2038) becomes zero."""
+    """A message's stamp; a time that Time cannot hold (unknown, or beyond 2038) becomes zero."""
     seconds, nanosec = divmod(stamp_ns, NANOSECONDS)
     return Time(sec=seconds, nanosec=nanosec) if 0 <= seconds < 2**31 else Time()
 
@@ -72,7 +72,7 @@ def _header(answer: Answer, frame_id: str) -> Header:
 
 
 def _array(typecode: str, values: NDArray[Any], dtype: DTypeLike) -> array[Any]:
-    """Flat, in the form that a message takes over without looking at every element."""
+    """A flat array in the form that a message accepts without checking every element."""
     flat = array(typecode)
     flat.frombytes(np.ascontiguousarray(values, dtype=dtype).tobytes())
     return flat

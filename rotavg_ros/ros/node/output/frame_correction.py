@@ -1,4 +1,4 @@
-"""The transform from the world frame to a robot's odometry frame, for those who ask for it."""
+"""The transform from the world frame to a robot's odometry frame, published on request (``publish_tf``)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from rotavg_ros.ros.node.topics import publisher
 
 
 class FrameCorrection:
-    """Publishes on ``/tf``; says nothing there for a robot whose odometry has no frame that could be placed.
+    """Publishes on ``/tf``, but not for a robot whose odometry has no frame that could be placed.
 
     Raises:
-        UserError: tf2_msgs is not installed, or a topic's ``qos_overrides`` cannot be.
+        UserError: tf2_msgs is not installed, or a topic's ``qos_overrides`` are invalid.
     """
 
     def __init__(self, node: Node, world_frame: str, tolerance_ns: int) -> None:
@@ -27,7 +27,7 @@ class FrameCorrection:
         Args:
             node: the node.
             world_frame: name of the parent frame.
-            tolerance_ns: so far ahead transforms are dated, so that they are there when the next odometry is.
+            tolerance_ns: how far ahead transforms are dated, so that they are available for the next odometry message.
         """
         try:
             from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
@@ -54,7 +54,7 @@ class FrameCorrection:
         self._publisher.publish(self._message_type(transforms=[transform]))
 
     def warnings(self) -> list[str]:
-        """What there is to say about it, a line each."""
+        """Present mistakes, a line each."""
         return list(self._mistakes.values())
 
     def _mistake(self, robot: str, frame: str) -> str | None:

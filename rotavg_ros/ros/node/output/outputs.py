@@ -23,22 +23,22 @@ from rotavg_ros.ros.node.output.visualization import markers_message, no_markers
 from rotavg_ros.ros.node.topics import LATCHED, checked_prefixes, publisher
 from rotavg_ros.settings.parameters import NodeParameters
 
-# After a drawing the worker does other things for so many times as long: at 10 000 keyframes one takes half a second.
+# Pause for other work after a drawing, in multiples of its duration: half a second at 10 000 keyframes.
 _REST = 4.0
 
 
 class Outputs:
-    """All publishers but that of the diagnostics.
+    """All publishers except that of the diagnostics.
 
     Raises:
-        UserError: a robot's name cannot be part of a topic's, a topic's ``qos_overrides`` cannot be, or ``publish_tf``
-            without tf2_msgs.
+        UserError: a robot's name cannot be part of a topic's, a topic's ``qos_overrides`` are invalid, or
+            ``publish_tf`` without tf2_msgs.
     """
 
     def __init__(self, node: Node, parameters: NodeParameters, estimator: OnlineEstimator) -> None:
         self._estimator = estimator
         self._robots, self._frame_id = parameters.robots, parameters.world_frame
-        # Of each picture the answer that was drawn, by its version, and how many looked; fewer if some have gone since.
+        # For each picture: version of the answer drawn, and number of subscribers then, less those gone since.
         self._drawn: dict[Publisher, tuple[int, int]] = {}
         self._rests_until = 0.0  # on the monotonic clock
         latched = partial(publisher, node, qos=LATCHED)
@@ -61,7 +61,7 @@ class Outputs:
         return [self._orientations.topic_name, *oriented, *self._poses.topics]
 
     def warnings(self) -> list[str]:
-        """What is not as it should be, a line each."""
+        """Present mistakes, a line each."""
         return self._poses.warnings()
 
     def set_parameters(self, parameters: NodeParameters) -> None:
@@ -74,11 +74,11 @@ class Outputs:
         self._flags.publish(flags_message(answer, self._frame_id))
 
     def draw(self, answer: Answer | None) -> None:
-        """Path and markers of the last answer, for those who look, and poses; again when somebody begins to.
+        """Publish paths and markers of the last answer if anybody subscribes, and again for new subscribers.
 
-        Without an answer, since all was forgotten, what was drawn is taken back.
+        From now on poses follow the answer, too. If there is no answer, since all was forgotten, drawings are erased.
 
-        Called once a second at least, so that what is left out because too much time went into drawing comes later.
+        Called at least once a second, so that drawings skipped to save time are made later.
         """
         if answer is None:
             self._erase()
@@ -113,26 +113,26 @@ class Outputs:
         self._drawn.clear()
 
     def _trajectories(self, answer: Answer) -> dict[str, Trajectory]:
-        """Of the answer, by which poses go from now on."""
+        """Trajectories of the answer, which poses follow from now on."""
         if self._placed[0] != answer.version:
             self._placed = answer.version, self._estimator.place(answer)
         return self._placed[1]
 
     def _lacks(self, picture: Publisher, answer: Answer, watchers: int) -> bool:
-        """Whether somebody looks, of so many, who has not been sent this answer yet."""
+        """Whether some of the picture's subscribers (``watchers`` in number) have not been sent this answer yet."""
         version, watchers_then = self._drawn.get(picture, (0, 0))
         if watchers < watchers_then:
             self._drawn[picture] = version, watchers
         return watchers > 0 and (version != answer.version or watchers > watchers_then)
 
     def publish_odometry(self, robot: str, topic: str, message: Any, record: OdometryRecord) -> None:
-        """The robot's corrected orientation and pose at the moment of its newest odometry message.
+        """Publish the robot's corrected orientation and pose at the moment of its newest odometry message.
 
         Args:
-            robot: whose.
-            topic: that the message came on.
-            message: of odometry.
-            record: what it says.
+            robot: name of the robot.
+            topic: the topic that the message came on.
+            message: the odometry message.
+            record: its content.
         """
         orientation = self._estimator.current_orientation(robot)
         if orientation is None:

@@ -1,4 +1,4 @@
-"""Where the robots are now, at odometry's rate: ``corrected_odometry``, and the odometry frames on ``/tf``."""
+"""The robots' present poses at odometry's rate: ``corrected_odometry``, and the odometry frames on ``/tf``."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from rotavg_ros.ros.node.output.frame_correction import FrameCorrection
 from rotavg_ros.ros.node.topics import publisher
 from rotavg_ros.settings.parameters import NodeParameters
 
-# Of what nobody can tell, in rad² or m², or these over s²: a filter that fuses it takes next to nothing from it.
+# Variance of unknown quantities, in rad² or m², or these per s²: large enough that a filter practically ignores them.
 UNKNOWN_VARIANCE = 1e6
 # The diagonal of a pose's 6 × 6 covariance: position, then orientation, about x, y, z of the world's frame.
 _DIAGONAL = slice(None, None, 7)
 
 
 class RobotPoses:
-    """One pose of each robot for every odometry message with a position, corrected as the last placed answer has it.
+    """Publishes a pose for every odometry message with a position, corrected by the last placed answer.
 
     Raises:
-        UserError: a topic's ``qos_overrides`` cannot be, or ``publish_tf`` without tf2_msgs.
+        UserError: a topic's ``qos_overrides`` are invalid, or ``publish_tf`` without tf2_msgs.
     """
 
     def __init__(
         self, node: Node, parameters: NodeParameters, estimator: OnlineEstimator, prefix: Mapping[str, str]
     ) -> None:
-        """Advertise the topics; ``prefix`` stands before a robot's own."""
+        """Advertise the topics; ``prefix`` holds the prefix of each robot's topics."""
         self._estimator = estimator
         self._frame_id = parameters.world_frame
         self._publishers = {
@@ -59,7 +59,7 @@ class RobotPoses:
 
     @property
     def are_wanted(self) -> bool:
-        """Whether anybody takes them."""
+        """Whether anybody uses the poses."""
         return self._tf is not None or any(each.get_subscription_count() for each in self._publishers.values())
 
     def set_parameters(self, parameters: NodeParameters) -> None:
@@ -69,17 +69,17 @@ class RobotPoses:
             gradual.rates = self._rates
 
     def warnings(self) -> list[str]:
-        """What is not as it should be, a line each."""
+        """Present mistakes, a line each."""
         return [] if self._tf is None else self._tf.warnings()
 
     def publish(self, robot: str, topic: str, message: Any, record: OdometryRecord) -> None:
-        """The robot's pose, and its odometry's, at the moment of its newest odometry message, if that has a position.
+        """Publish the poses of the robot and of its odometry frame at its newest message, if that has a position.
 
         Args:
-            robot: whose.
-            topic: that the message came on.
-            message: of odometry.
-            record: what it says.
+            robot: name of the robot.
+            topic: the topic that the message came on.
+            message: the odometry message.
+            record: its content.
         """
         position = record.known_position
         placed = self._estimator.odometry_frame(robot) if position is not None else None
@@ -97,7 +97,7 @@ class RobotPoses:
             self._publishers[robot].publish(pose)
 
     def _gradual_frame(self, robot: str) -> GradualFrame:
-        """A new one once everything was forgotten or replaced: then there is nothing to go on from."""
+        """The robot's gradual frame; a new one, without a past, once everything was forgotten or replaced."""
         if self._generation != self._estimator.generation:
             self._generation = self._estimator.generation
             self._gradual.clear()
@@ -109,7 +109,7 @@ def _rates(parameters: NodeParameters) -> CorrectionRates:
 
 
 def _odometry_message(message: Any, record: OdometryRecord, frame: OdometryFrame, position: Vector) -> Odometry:
-    """The message with its pose in the world; its velocity is in the frame that moves, and stays as it is if known."""
+    """The message with its pose in the world; its velocity, if known, is in the moving frame and stays as it is."""
     odometry = Odometry(child_frame_id=record.child_frame_id)
     odometry.header.stamp = message.header.stamp
     x, y, z = frame.place(position)
@@ -126,14 +126,14 @@ def _odometry_message(message: Any, record: OdometryRecord, frame: OdometryFrame
 
 
 def covariance(frame: OdometryFrame, steps: int, odometry_position: Vector) -> NDArray[np.float64]:
-    """``(36,)`` of a pose, row by row; position and orientation are stated without what they have in common.
+    """``(36,)`` covariance of a pose, row by row, without the correlation of position and orientation.
 
     Args:
-        frame: where the answer puts the odometry's frame.
-        steps: of odometry since the keyframe that it hangs on.
-        odometry_position: of the body in the odometry's frame, metres.
+        frame: the odometry frame according to the answer.
+        steps: number of odometry steps since the frame's keyframe.
+        odometry_position: of the body in the odometry frame, metres.
 
-    A robot that turns about z alone errs in no other rotation, nor in height.
+    For a robot that turns only about z, the variances of the other rotations and of the height are 0.
     """
     orientation, position = frame.drift.after(steps, math.dist(odometry_position, frame.keyframe_position))
     spread = np.array([position] * 3 + [orientation] * 3)

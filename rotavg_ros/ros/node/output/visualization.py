@@ -29,12 +29,12 @@ def path_message(trajectory: Trajectory, frame_id: str) -> Path:
 
 
 def no_path(frame_id: str) -> Path:
-    """Of a robot without keyframes."""
+    """An empty path, for a robot without keyframes."""
     return Path(header=Header(frame_id=frame_id))
 
 
 def no_markers(frame_id: str) -> MarkerArray:
-    """In place of all that were drawn."""
+    """A message that deletes all markers."""
     return MarkerArray(markers=[Marker(header=Header(frame_id=frame_id), action=Marker.DELETEALL)])
 
 
