@@ -2,7 +2,7 @@
 
 - :func:`solve` a :class:`ViewGraph`, or the content of a file that :func:`read_graph` reads, for a :class:`Solution`.
 - :class:`OnlineEstimator`: odometry and :class:`EdgeMeasurement` in, ticks, an :class:`Answer` out; no ROS needed.
-- Mistakes in what is given raise :class:`UserError` with one line that says what is wrong.
+- Mistakes in the input raise :class:`UserError` with one line that says what is wrong.
 """
 
 from __future__ import annotations

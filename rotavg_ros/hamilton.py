@@ -1,4 +1,4 @@
-"""The Hamilton product of quaternions, written once for components of any kind: numbers, arrays, tensors.
+"""The Hamilton product of quaternions, for components of any kind: numbers, arrays, tensors.
 
 ``rotations.py`` has the algebra of tensors, ``solver/algebra/quaternion_rows.py`` that of arrays in rows, and
 ``online`` that of single quaternions. ``solver/algebra/residuals.py`` fuses the product for large graphs.

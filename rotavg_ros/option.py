@@ -1,4 +1,4 @@
-"""Options: dataclass fields that say what they mean and may be, once for the library, the node and a replay."""
+"""Options: dataclass fields with meaning and bounds, defined once for the library, the node and a replay."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ _Class = TypeVar("_Class", bound=type)
 
 
 class OptionError(UserError):
-    """Options that cannot be, alone or together."""
+    """Options that are invalid, alone or together."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """What users write behind an option's name where the field's own name does not tell the unit.
+    """The unit in which users write an option, if it differs from the field's or is not part of the field's name.
 
     Attributes:
-        suffix: behind the field's name.
+        suffix: appended to the field's name.
         inside: the field's unit.
-        size: of what users write, in the field's unit.
+        size: size of the users' unit in the field's unit.
     """
 
     suffix: str = ""
@@ -57,9 +57,9 @@ class Option:
         default: as users write it.
         description: what it means.
         within: its bounds as users write them, both allowed; None: any number.
-        choices: the texts that it may be; none: any.
-        live: it can be changed while a node runs.
-        unit: of what users write.
+        choices: the allowed texts; none: any.
+        live: whether it can be changed while a node runs.
+        unit: the unit in which users write it.
     """
 
     field: str
@@ -72,20 +72,20 @@ class Option:
 
     @property
     def name(self) -> str:
-        """As users write it."""
+        """The name as users write it."""
         return self.field + self.unit.suffix
 
     @property
     def range(self) -> str:
-        """Its bounds; empty if it has none."""
+        """Its bounds as text; empty if it has none."""
         return "{:g} … {:g}".format(*self.within) if self.within else ""
 
     def to_field(self, written: Any) -> Any:
-        """A value that users wrote, in the field's unit."""
+        """Convert a value as users write it to the field's unit."""
         return written if self.unit.size == 1 else written * self.unit.size
 
     def written(self, options: Any) -> Any:
-        """The value in a dataclass, as users write it; 15 digits, so that 7° in radians are 7° again."""
+        """The value in a dataclass as users write it, to 15 digits, so that 7° in radians is 7° again."""
         value = getattr(options, self.field)
         return value if self.unit.size == 1 or not _is(float, value) else float(f"{value / self.unit.size:.15g}")
 
@@ -93,7 +93,7 @@ class Option:
         """A value in the option's own type: a float for a whole number, a tuple for a list.
 
         Raises:
-            OptionError: another type, none of the choices, or out of range.
+            OptionError: a wrong type, not one of the choices, or out of range.
         """
         if isinstance(self.default, tuple):
             kind = type(self.default[0])
@@ -123,14 +123,14 @@ def option(
     live: bool = False,
     unit: Unit = AS_NAMED,
 ) -> Any:
-    """A dataclass's field with an :class:`Option`; the default and what it must be within are as users write them."""
+    """A dataclass field with an :class:`Option`; the default and the bounds are as users write them."""
     described = Option("", default, description, within, choices, live, unit)
     return field(default=described.to_field(default), metadata={"option": described})
 
 
 @cache
 def options_of(owner: type) -> tuple[Option, ...]:
-    """The options of a dataclass, in its order; other fields are passed over."""
+    """The options of a dataclass, in its order; other fields are skipped."""
     described = [each for each in fields(owner) if "option" in each.metadata]
     return tuple(replace(each.metadata["option"], field=each.name) for each in described)
 
@@ -139,7 +139,7 @@ def check_options(options: Any) -> None:
     """Check all options of a dataclass's instance.
 
     Raises:
-        OptionError: the first that cannot be, named and measured as users write it.
+        OptionError: the first invalid one, with its name and value as users write them.
     """
     owner: type = type(options)
     for each in options_of(owner):
@@ -147,7 +147,7 @@ def check_options(options: Any) -> None:
 
 
 def documented(owner: _Class) -> _Class:
-    """A class decorator: the docstring ends with what every option means."""
+    """A class decorator that appends the meaning of every option to the docstring."""
 
     def wrap(each: Option) -> list[str]:
         return textwrap.wrap(_told(each), 108, subsequent_indent="    ", break_on_hyphens=False)
@@ -166,7 +166,7 @@ def _told(each: Option) -> str:
 
 
 def _is(kind: type, value: Any) -> bool:
-    """Whether a value is of a kind; a whole number is a number, and neither is true or false."""
+    """Whether a value is of a kind; an int counts as a float, and neither counts as a bool."""
     if kind is bool or isinstance(value, bool):
         return kind is bool and isinstance(value, bool)
     return isinstance(value, _NUMBERS.get(kind, kind))

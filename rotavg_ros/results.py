@@ -1,4 +1,4 @@
-"""What all results need that are written to a folder: the folder, and a word on what produced them."""
+"""What all results in a folder need: the folder, and a line on what produced them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def make_folder(folder: Path) -> None:
     """Create a folder to write to before hours of work depend on it.
 
     Raises:
-        ResultError: it cannot be, or nothing can be written there.
+        ResultError: it cannot be created, or nothing can be written there.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -40,7 +40,7 @@ def provenance() -> str:
 
 
 def commit() -> str:
-    """Of the sources that run, "-dirty" where they have been changed since; "unknown" outside a checkout."""
+    """Commit of the running sources, with "-dirty" if they have been changed since; "unknown" outside a checkout."""
     try:
         command = ["git", "describe", "--always", "--dirty"]
         result = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)

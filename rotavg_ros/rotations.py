@@ -16,7 +16,7 @@ from rotavg_ros.hamilton import hamilton_product
 
 # Below this squared angle (rad²) the series of sin(x)/x is exact to double precision.
 _SMALL_ANGLE_SQUARED = 1e-8
-# Rad², of a component of the rotation vector of a turn drawn from all alike: a third of the mean of θ² (1 − cos θ) / π.
+# Variance of a component of a uniformly random rotation's vector, rad²: a third of the mean of θ² (1 − cos θ) / π.
 RANDOM_VARIANCE = (math.pi**2 / 3 + 2) / 3
 
 

@@ -1,4 +1,4 @@
-"""A quicker start and end of a process: what it imports stays until it ends, so no collector need look through it."""
+"""Makes a process start and end faster: imported objects live until its end, so they need no garbage collection."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from contextlib import contextmanager
 
 @contextmanager
 def loading() -> Iterator[None]:
-    """Import within it, in a process of one's own.
+    """A context for imports, in a process of one's own.
 
-    Torch makes some hundred thousand objects. The garbage collector would go through them again and again while they
-    come, with each full collection later on, and at the end: half a second of a short command's CPU time in all
-    (docs/performance.md). Nothing of them is ever garbage.
+    Torch makes some hundred thousand objects. The garbage collector would scan them repeatedly while they are created,
+    in each full collection later, and at the end: half a second of a short command's CPU time in all
+    (docs/performance.md). None of them is ever garbage.
     """
     was_enabled = gc.isenabled()
     gc.disable()
@@ -26,5 +26,5 @@ def loading() -> Iterator[None]:
 
 
 def leave_to_the_system() -> None:
-    """To be called when the process is about to end: what is left is not looked through once more."""
+    """Call this when the process is about to end, so that the remaining objects are not scanned again."""
     gc.freeze()

@@ -18,28 +18,28 @@ from rotavg_ros.rotations import canonical, from_matrix, inverse, log, rotate, t
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 _Column = TypeVar("_Column", Tensor, np.ndarray)
 
-# A robot's loop closure is false if its rotation errs by more degrees than this, or its translation by more metres.
+# A robot's loop closure is false if the error of its rotation exceeds this (degrees), or that of its translation (m).
 FALSE_CLOSURE_DEG, FALSE_CLOSURE_M = 10.0, 2.0
-# A quaternion whose norm is farther than this from one is refused rather than normalised, and so is a matrix R of whose
-# R Rᵀ an entry is farther than this from the identity's.
+# A quaternion is refused rather than normalised if its norm differs from one by more than this, and so is a matrix R if
+# an entry of R Rᵀ differs by more than this from the identity's.
 UNIT_NORM_TOLERANCE = 1e-3
-# No robot drives farther between two keyframes, in whatever unit; the squares of far longer ways overflow.
+# No robot drives farther between two keyframes, in whatever unit; the squares of far larger distances overflow.
 MAX_TRANSLATION = 1e9
-# An odometry edge's variance in units of one step's: no more are drawn together, and far more or less overflows.
+# Bounds of an odometry edge's variance in units of one step's: no more are merged, and far beyond them it overflows.
 STEPS = (1e-9, 1e9)
 # scipy's graph routines count nodes in 32 bits.
 _MAX_NODES = 2**31 - 1
-# Nodes without an edge that the largest index alone may imply: more are ids taken for indices, or `num_nodes` says that
-# they are meant. One costs a solve 1.5–2.3 kB and 20 µs (measured), these together 0.2 GB and 2 s.
+# Most nodes without an edge that the largest index may imply without `num_nodes`; more suggest that ids were passed as
+# indices. One costs a solve 1.5–2.3 kB and 20 µs (measured), this many 0.2 GB and 2 s.
 _MAX_IMPLIED_LONE_NODES = 100_000
-# Rotations whose axes spread less than this (relative) are all about one axis.
+# Rotations whose axes spread less than this (relative) count as all about one axis.
 _PLANAR_SPREAD = 1e-10
-# An information matrix whose least eigenvalue is a smaller share of its largest is singular, but for rounding.
+# An information matrix counts as singular if its smallest eigenvalue is a smaller share of its largest than this.
 _LEAST_EIGENVALUE = 1e-12
 
 
 class EdgeKind(IntEnum):
-    """What measured an edge."""
+    """The source of an edge's measurement."""
 
     ODOMETRY = 0
     LOOP_CLOSURE = 1
@@ -69,15 +69,15 @@ class ViewGraph:
         kind: ``(M,)`` int64 :class:`EdgeKind`.
         precision: ``(M,)`` float64, 1/variance of the rotation vector's components in rad⁻²; NaN where unknown.
         label: ``(M,)`` int64 :class:`EdgeLabel`.
-        steps: ``(M,)`` float64, odometry steps that an odometry edge stands for: its variance in units of one. 1 but
-            for edges that several were drawn together into; of loop closures without meaning.
+        steps: ``(M,)`` float64, number of odometry steps that an odometry edge stands for: its variance in units of one
+            step's. 1 except for merged edges; without meaning for loop closures.
         translation: ``(M, 3)`` float64, position of the target in the source's frame, metres; NaN where unknown. None
             where no edge has one.
         information: ``(M, 3, 3)`` float64 rad⁻², symmetric positive definite: inverse covariance of the rotation vector
             e in ``target_from_source = exp(e) R_target R_source⁻¹``, an error in the target's frame; NaN where unknown.
             None where no edge has one. Only the SfM profile reads it.
-        route: ``(M,)`` int64, the row of ``routes`` that says what odometry did between the ends of an edge that
-            several steps were drawn together into; -1 of others, and None where there are none.
+        route: ``(M,)`` int64, the row of ``routes`` that says what odometry did between the ends of a merged edge; -1
+            for other edges, and None if there are no routes.
         routes: ``(R, 38)`` float64, :attr:`~rotavg_ros.odometry_route.Routes.columns`.
     """
 
@@ -124,15 +124,15 @@ class ViewGraph:
                 edge or a gtsam BetweenFactor states.
             num_nodes: default: the largest index that occurs plus one.
             kind: :class:`EdgeKind` codes; default: every edge is a loop closure (an SfM view-graph).
-            precision: rad⁻². Values that are not positive and finite count as unknown; these, and the default, are one
-                over the mean variance that ``information`` implies, where there is one.
+            precision: rad⁻². Values that are not positive and finite count as unknown. Unknown ones, and the default,
+                are one over the mean variance that ``information`` implies, where there is one.
             label: :class:`EdgeLabel` codes; default: automatic.
             steps: between 10⁻⁹ and 10⁹; default: 1.
             translation: ``(M, 3)`` metres, position of the target in the source's frame, the same whichever way the
                 rotation is given; default: none is known. Rows that are not finite or longer than 10⁹ count as unknown.
             information: ``(M, 3, 3)`` rad⁻², of the error in the target's frame, the same whichever way the rotation is
-                given; default: none is known. Matrices that are not finite and positive definite count as unknown; of
-                others the symmetric part counts.
+                given; default: none is known. Matrices that are not finite and positive definite count as unknown;
+                otherwise the symmetric part is used.
 
         Raises:
             ViewGraphError: none or both of the two rotations, arrays that are not numbers or whose shapes do not fit,
@@ -175,7 +175,7 @@ class ViewGraph:
         return self.kind == EdgeKind.ODOMETRY
 
     def to(self, device: torch.device | str) -> ViewGraph:
-        """The same graph on another device; itself if it is there."""
+        """The same graph on another device; itself if it is already there."""
         if self.device == torch.device(device):
             return self
         columns: dict[str, Any] = {name: column.to(device) for name, column in self._columns.items()}
@@ -193,7 +193,7 @@ class ViewGraph:
         return replace(self, **columns)
 
     def reverse_edges(self, edges: Tensor) -> ViewGraph:
-        """The same graph, some edges of which are stated from the target to the source.
+        """The same graph with some edges reversed, from their target to their source.
 
         Args:
             edges: ``(M,)`` mask.
@@ -212,7 +212,7 @@ class ViewGraph:
         return replace(self, source=source, target=target, target_from_source=stated, **turned)
 
     def of_routes(self, part: int | slice) -> Tensor | None:
-        """``(M,)`` or ``(M, …)``, a column of ``routes``, or some, of each edge; NaN where unknown, None if of all."""
+        """``(M,)`` or ``(M, …)``, columns of ``routes`` for each edge; NaN where unknown, None if all are unknown."""
         if self.route is None or self.routes is None or len(self.routes) == 0:
             return None
         known = self.route >= 0
@@ -221,7 +221,7 @@ class ViewGraph:
 
     @property
     def _columns(self) -> dict[str, Any]:
-        """What there is of each edge, by name."""
+        """The columns that exist, by name."""
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in {"num_nodes", "routes"}}
         return {name: column for name, column in values.items() if column is not None}
 
@@ -244,7 +244,7 @@ class ViewGraph:
 
     @cached_property
     def _components(self) -> Tensor:
-        # Loads a tenth of a second; whoever imports this module may never ask.
+        # Takes a tenth of a second to load, and may never be needed.
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import connected_components
 
@@ -258,14 +258,14 @@ class ViewGraph:
         count, labels = connected_components(adjacency, directed=False)
         # scipy numbers components in the order of a traversal; ours follow the nodes' order.
         first = np.empty(count, dtype=np.int64)
-        first[labels[::-1]] = np.arange(len(labels))[::-1]  # of those with one number the last stays, which comes first
+        first[labels[::-1]] = np.arange(len(labels))[::-1]  # the last assignment of a label is its first node
         rank = np.empty(count, dtype=np.int64)
         rank[np.argsort(first)] = np.arange(count)
         return torch.from_numpy(rank[labels]).to(self.device)
 
 
 class HoldsViewGraph(Protocol):
-    """What has a view-graph as its ``graph``, as the content of a file does."""
+    """An object with a view-graph as its ``graph``, such as the content of a file."""
 
     @property
     def graph(self) -> ViewGraph: ...
@@ -275,7 +275,7 @@ def view_graph_of(holder: ViewGraph | HoldsViewGraph) -> ViewGraph:
     """The view-graph itself, or the one that a file's content holds.
 
     Raises:
-        ViewGraphError: neither.
+        ViewGraphError: it is neither.
     """
     graph = holder if isinstance(holder, ViewGraph) else getattr(holder, "graph", None)
     if not isinstance(graph, ViewGraph):
@@ -285,7 +285,7 @@ def view_graph_of(holder: ViewGraph | HoldsViewGraph) -> ViewGraph:
 
 
 def _translations(values: ArrayLike, num_edges: int) -> Tensor:
-    """``(M, 3)`` metres; rows that are not finite or too long to be true become NaN."""
+    """``(M, 3)`` metres; rows that are not finite or implausibly long become NaN."""
     places = _as_tensor("translation", values, torch.float64)
     if places.shape != (num_edges, 3):
         raise ViewGraphError(f"translation has shape {tuple(places.shape)}; it must be ({num_edges}, 3), metres")
@@ -361,7 +361,7 @@ def _quaternions(target_from_source: ArrayLike | None, source_from_target: Array
 
 
 def _num_nodes(source: Tensor, target: Tensor, given: int | None) -> int:
-    """How many nodes a graph of these edges has; refuses ends beyond them."""
+    """Number of nodes in a graph of these edges; refuses ends beyond them."""
     smallest, largest = torch.minimum(source, target), torch.maximum(source, target)
     _refuse(smallest < 0, "node {}; node indices count from 0", smallest)
     if given is not None and not 0 <= given <= _MAX_NODES:
@@ -379,7 +379,7 @@ def _num_nodes(source: Tensor, target: Tensor, given: int | None) -> int:
 
 
 def _as_tensor(name: str, values: ArrayLike | None, dtype: torch.dtype) -> Tensor:
-    """The values in that dtype, float64 or int64; copied unless they are a tensor of it already."""
+    """The values in that dtype, float64 or int64; copied unless they already are a tensor of it."""
     if not isinstance(values, Tensor):
         try:
             array = np.asarray(values)

@@ -1,4 +1,4 @@
-"""Files that are whole at any moment: written beside their place and moved into it."""
+"""Files that are complete at any moment: written beside their place and then moved into it."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ _TEMPORARY = ".tmp"
 
 
 def real(path: Path) -> Path:
-    """Where a file lies, or will lie, whatever links lead there."""
+    """The path of a file, existing or not, with all links resolved."""
     return Path(os.path.realpath(path))
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """An empty file beside ``path`` that takes its place at the end of the block, and vanishes after an error.
+    """An empty file beside ``path`` that takes its place at the end of the block, and is deleted after an error.
 
-    Links that lead to the file stay. It keeps its rights; a new one has those that the umask leaves to any file.
+    Links to the file stay. It keeps its permissions; a new file gets the usual ones by the umask.
 
     Raises:
         OSError: the place cannot be written.
@@ -33,7 +33,7 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         try:
             mode = stat.S_IMODE((os.stat(place) if place.exists() else os.fstat(descriptor)).st_mode)
-            os.fchmod(descriptor, mode | stat.S_IWUSR)  # before there is anything in it that others may not read
+            os.fchmod(descriptor, mode | stat.S_IWUSR)  # before anything is in it that others may not read
         finally:
             os.close(descriptor)
         yield temporary
@@ -45,7 +45,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def remove_leftovers(path: Path) -> None:
-    """Delete what was being written beside a file when the process was killed."""
+    """Delete temporary files beside a file, left by a process that was killed."""
     place = real(path)
     for leftover in place.parent.glob(f".{glob.escape(place.name)}.*{_TEMPORARY}"):
         with suppress(OSError):

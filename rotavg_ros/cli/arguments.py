@@ -1,13 +1,13 @@
-"""Types of command line arguments that say in plain words what is wrong with one."""
+"""Types of command line arguments with error messages in plain words."""
 
 from __future__ import annotations
 
 import argparse
 import math
 
-# As for the node's solver_threads; far more exhaust the process's memory maps before anything is solved.
+# The same limit as for the node's solver_threads; far more would exhaust the process's memory maps.
 _MAX_THREADS = 1024
-# Of seconds, degrees, rates … none means more, and multiples of what is far beyond are numbers no more.
+# No meaningful number of seconds, degrees or a rate exceeds this, and multiples of far larger ones may overflow.
 _MAX_NUMBER = 1e12
 
 

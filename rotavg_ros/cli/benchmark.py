@@ -18,7 +18,7 @@ from rotavg_ros.online.estimator import WORK_AFTER
 from rotavg_ros.results import make_folder
 from rotavg_ros.solver import SECONDS_PER_UNIT
 
-# The load average below which nothing else ran to speak of.
+# Load average below which hardly anything else was running.
 _QUIET_LOAD = 0.5
 _QUIET = ": nothing else ran to speak of."
 _BUSY = """:
@@ -101,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """An option of another kind of run would pass unheard."""
+    """Refuse options of another kind of run, which would otherwise be ignored silently."""
     hours, several = arguments.hours is not None, len(arguments.keyframes or ()) > 1
     is_live = (arguments.soak and not hours) or arguments.small
     of_ticks = arguments.ticks is not None

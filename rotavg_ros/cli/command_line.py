@@ -1,4 +1,4 @@
-"""The command that a report was made by, spelled again from what argparse made of it."""
+"""Reconstructs the command that made a report from the parsed arguments."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Collection, Iterator
 from typing import Any
 
-# Where things lie changes no figure, and is nobody else's business.
+# Paths do not affect the figures, and are private.
 _PLACES = frozenset({"output", "keep", "data"})
 
 
@@ -17,8 +17,8 @@ def command_line(
     """What to type for these arguments: positional words, then the options that differ from their defaults.
 
     Args:
-        parser: the whole command's, subcommands and all.
-        arguments: what the parser made of the words on the command line.
+        parser: of the whole command, with its subcommands.
+        arguments: the parsed arguments.
         left_out: destinations of options that the command does not show.
     """
     return shlex.join([parser.prog, *_words(parser, arguments, left_out)])
@@ -62,6 +62,6 @@ def _texts(value: Any) -> list[str]:
 
 
 def _are_equal(value: Any, default: Any) -> bool:
-    """A default may be a tuple where argparse makes a list."""
+    """Whether a value equals its default, which may be a tuple where argparse makes a list."""
     is_listed = isinstance(value, list) and isinstance(default, (list, tuple))
     return list(value) == list(default) if is_listed else bool(value == default)

@@ -1,4 +1,4 @@
-"""What ``rotavg convert`` does: it reads one form and writes another."""
+"""What ``rotavg convert`` does: it reads one format and writes another."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class ConvertError(UserError):
 
 
 class Format(NamedTuple):
-    """What holds a view-graph.
+    """A format that holds a view-graph.
 
     The module has ``read_graph(path) -> GraphFile``, ``write_graph(path, graph_file)``
-    and ``not_stored(path, graph_file) -> list[str]``: what of this graph the format has no room for.
+    and ``not_stored(path, graph_file) -> list[str]``: the parts of this graph that the format cannot store.
     """
 
     suffixes: tuple[str, ...]
@@ -31,7 +31,7 @@ class Format(NamedTuple):
     module: ModuleType
 
 
-# The last one also gets the suffixes that nobody knows: it can tell by content, and what it cannot it explains.
+# The last one also gets unknown suffixes: it recognises formats by content, and explains what it cannot read.
 FORMATS = (
     Format(("", ".mcap", ".db3", ".bag"), is_folder=True, module=graph_bag),
     Format(
@@ -43,7 +43,7 @@ FORMATS = (
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read, attach what came in further files, write."""
+    """Read, attach the content of further files, write."""
     _check_output(arguments.input, arguments.output, overwrite=arguments.overwrite)
     with working(f"converting {arguments.input}"):
         graph_file = format_of(arguments.input).read_graph(arguments.input)
@@ -72,7 +72,7 @@ def _check_output(source: Path, output: Path, *, overwrite: bool) -> None:
         is_source = exists and source.exists() and output.samefile(source)
     if exists and not overwrite:
         raise ConvertError(f"{output}: exists already; choose another OUTPUT or give --overwrite")
-    # Comments, landmarks, a bag's other topics: what is not a view-graph's would be gone.
+    # Everything outside the view-graph would be lost: comments, landmarks, a bag's other topics.
     if is_source:
         raise ConvertError(f"{output}: is the INPUT itself; choose another OUTPUT")
     bags, files = FORMATS

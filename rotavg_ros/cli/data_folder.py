@@ -1,4 +1,4 @@
-"""Where the data sets of an evaluation lie."""
+"""Finds the data sets of an evaluation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _VARIABLE = "ROTAVG_DATA"
 
 
 class DataFolderError(UserError):
-    """Data sets that nobody named, or that are not there."""
+    """The data sets were not named, or are not there."""
 
 
 def add_data_argument(parser: argparse.ArgumentParser) -> None:
@@ -25,7 +25,7 @@ def data_folder(arguments: argparse.Namespace, needed: Sequence[str]) -> Path:
     """The folder named by ``--data`` or the environment.
 
     Args:
-        needed: files and folders in it that an evaluation reads, sooner or later.
+        needed: files and folders in it that an evaluation will read.
 
     Raises:
         DataFolderError: no folder is named, or it lacks something.

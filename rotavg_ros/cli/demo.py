@@ -26,7 +26,7 @@ from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.evaluation.live.played_run import LiveReport, PlayedRun, edge_is_false, judge
 
-# Playing is paced so that the node works as it would live, and a visitor still stays.
+# Duration of the playback: slow enough for the node to work as it would live, short enough for a visitor.
 _PLAY_SECONDS = 12.0
 _MESSAGES_PER_SECOND = 1200.0
 
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
             scene = _simulated(bag, arguments) if arguments.graph is None else _own_graph(bag, arguments)
     except UserError:
         with suppress(OSError):
-            output.rmdir()  # nobody needs an empty folder
+            output.rmdir()  # leave no empty folder behind
         raise
     print(f"{scene.title}: {scene.description}\nplaying it to the node …", flush=True)
     keep_to_this_machine()
@@ -153,7 +153,7 @@ def _rate(bag: Path) -> float:
 
 
 def _summary(report: LiveReport) -> dict[str, Any]:
-    """What the table says, as numbers; None where the truth is unknown."""
+    """The table's content as numbers; None where the truth is unknown."""
     verdicts, degrees = report.verdicts, None
     if report.knows_errors:
         degrees = {

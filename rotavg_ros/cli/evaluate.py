@@ -153,7 +153,7 @@ def _contenders(
     weights: Path | None = None,
     keep: KeptAnswers | None = None,
 ) -> dict[str, Contender]:
-    """Those asked for, or what can run here of the default."""
+    """The contenders asked for, or those of the default that can run here."""
     chosen = names if names is not None else [name for name in default if is_available(name)]
     with working("warming up"):
         warm_up(contenders(chosen, ROSTER, weights).values(), ROSTER)

@@ -35,14 +35,14 @@ from rotavg_ros.solver.methods import SWITCHES, without
 _UNCERTAINTY_GRAPHS = ("CSAIL", "intel", "manhattan", "sphere2500")
 _UNCERTAINTY_DRAWS = 20
 _RECORDED_SEEDS = (0, 1, 2)
-# Peers that the recorded suite's tables do without, unless asked for.
+# Peers that the recorded suite's tables leave out unless asked for.
 _STRESS_ONLY = ("isam2-cauchy", "isam2-geman-mcclure", "open3d")
-# Unless --without asks for them.
+# Left out unless --without asks for them.
 _ABLATIONS = frozenset(without(name) for name in SWITCHES)
 
 
 class SlamOptionsError(UserError):
-    """An option that the chosen suite has no use for."""
+    """An option that the chosen suite does not use."""
 
 
 def run(arguments: argparse.Namespace) -> Path:
@@ -80,7 +80,7 @@ def _run_stress(arguments: argparse.Namespace) -> Path:
     scores = score_all(drawings(kinds, seeds), chosen, _watch(len(kinds) * len(seeds) * len(chosen)))
     diagnoses: list[Diagnosis] = []
     if arguments.search_or_model and not scores.interrupted:
-        with until_interrupted():  # what is done is written
+        with until_interrupted():  # what is done by then is written
             cases_again = progress(drawings(kinds, seeds), total=len(kinds) * len(seeds), description="from the truth")
             diagnoses.extend(map(diagnose, cases_again))
     priors: list[list[sensitivity.Answer]] = []
@@ -100,7 +100,7 @@ def _run_recorded(arguments: argparse.Namespace) -> Path:
     seeds = arguments.seeds or _RECORDED_SEEDS
     names = _methods(arguments, ROSTER, [name for name in ROWS if name not in _STRESS_ONLY])
     chosen = contenders(names, ROSTER, keep=arguments.keep)
-    # What the last table needs shows before the hours that the others take.
+    # Missing files for the last table are noticed before the hours that the others take.
     more = [_uncertainty_file(name) for name in _UNCERTAINTY_GRAPHS] if arguments.uncertainty else []
     data = data_folder(arguments, ("slam", *more))
     with working("warming up"):
@@ -141,7 +141,7 @@ def _refuse_what_stress_alone_has(arguments: argparse.Namespace) -> None:
 
 
 def _methods(arguments: argparse.Namespace, roster: Roster, default: Iterable[str]) -> list[str]:
-    """Those asked for, or all by default that can run here; always with ours and the oracle, which ratios need."""
+    """The methods asked for, or the default ones that can run here; always with ours and the oracle, for ratios."""
     names = arguments.methods or [name for name in default if roster.can_run(name) and name not in _ABLATIONS]
     if arguments.without:
         names = [*names, *(without(name) for name in arguments.without)]
@@ -151,7 +151,7 @@ def _methods(arguments: argparse.Namespace, roster: Roster, default: Iterable[st
 
 
 def _warm_up(names: Sequence[str], *, with_translations: bool) -> None:
-    """Let every contender pay its one-time costs, before anything is timed."""
+    """Run every contender once, so that one-time costs are not timed."""
     chosen = contenders(names, ROSTER).values()
     warm_up(chosen, ROSTER)
     if with_translations:

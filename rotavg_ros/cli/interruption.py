@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP: the end at once while a command loads, later an exception, so that it tidies up."""
+"""Ctrl-C, SIGTERM and SIGHUP: they end a loading command at once; later they raise, so that it can clean up."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interruption:
-    """Whether somebody wants the end.
+    """Whether the end has been requested.
 
     Args:
-        is_own_process: take the signals over; those that are ignored, as ``nohup`` has it, stay so.
+        is_own_process: whether to handle the signals; ignored ones, as under ``nohup``, stay ignored.
     """
 
     def __init__(self, is_own_process: bool) -> None:
@@ -25,16 +25,16 @@ class Interruption:
 
     @property
     def exit_code(self) -> int:
-        """As shells have it, 128 and the signal's number; 0: nobody has asked."""
+        """As in shells, 128 plus the signal's number; 0: no request."""
         return 0 if self._number is None else 128 + self._number
 
     def has_loaded(self) -> None:
-        """From now on there may be something to tidy up."""
+        """From now on there may be something to clean up."""
         self._is_loading = False
 
     def _on_signal(self, number: int, _frame: FrameType | None) -> None:
         if self._is_loading:
             os.write(2, b"rotavg: interrupted\n")
-            os._exit(128 + number)  # an exception would come out of some import as that module's fault
+            os._exit(128 + number)  # an exception during an import would look like that module's fault
         self._number = number
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""The `rotavg` command. What a subcommand does is imported when it runs, so that help and mistakes come at once."""
+"""The `rotavg` command. A subcommand's code is imported when it runs, so that help and mistakes come at once."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Command(NamedTuple):
 
     Its options are in the module of :mod:`rotavg_ros.cli.options` of the same name: a docstring for ``--help``, and
     ``add_arguments(parser)``. ``module`` has ``run(arguments) -> exit code``; besides the options, ``arguments`` has
-    ``command_line``, the whole command as it may be typed again, for reports.
+    ``command_line``, the whole command as it can be typed again, for reports.
     """
 
     name: str
@@ -47,19 +47,19 @@ COMMANDS = (
 
 
 class UsageError(UserError):
-    """Words on the command line that do not make a command."""
+    """Words on the command line that are not a valid command."""
 
 
 class _Parser(argparse.ArgumentParser):
-    """Reports mistakes in the one line that every mistake gets, and takes a last word that may be left out anywhere.
+    """Reports mistakes in one line, and accepts an optional last positional argument anywhere.
 
-    Before Python 3.13 such a word is held to have been left out where the first option comes before it.
+    Before Python 3.13, argparse assumes that such an argument was left out if an option comes before it.
     """
 
     _between_options = False
 
     def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
-        """As :class:`argparse.ArgumentParser` has it."""
+        """As in :class:`argparse.ArgumentParser`."""
         may_be_left_out = any(action.nargs == "?" and not action.option_strings for action in self._actions)
         if self._between_options or not may_be_left_out:
             return super().parse_known_args(args, namespace)
@@ -74,7 +74,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 EXIT_USER_ERROR = 2
-EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -109,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("rotavg: interrupted", file=sys.stderr)
         return interruption.exit_code or EXIT_INTERRUPTED
     except BrokenPipeError:
-        # Whoever read our output (`| head`) has seen enough. Python would complain again when it closes stdout.
+        # The reader of our output (`| head`) has closed it. Python would complain again when it closes stdout.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     finally:
@@ -118,20 +118,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def print_error(error: UserError) -> None:
-    """The one line that a mistake of the user's gets."""
+    """Print a user's mistake in one line."""
     print(f"rotavg: error: {error}", file=sys.stderr)
 
 
 def print_warning(warning: str) -> None:
-    """A line about what went on in spite of something."""
+    """Print a warning in one line."""
     print(f"rotavg: warning: {warning}", file=sys.stderr)
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
-    """What the words after ``rotavg`` say; besides options, ``command`` and ``command_line`` (see :class:`Command`).
+    """Parse the words after ``rotavg``; adds ``command`` and ``command_line`` to the options (see :class:`Command`).
 
     Raises:
-        UsageError: they make no command.
+        UsageError: they are not a valid command.
     """
     # Only the chosen subcommand gets its arguments; the others are known by name and one line of help.
     chosen = next((word for word in arguments if not word.startswith("-")), None)

@@ -12,7 +12,7 @@ from rotavg_ros.errors import UserError
 
 
 class PlayNeedsRosError(UserError):
-    """Playing is the one thing among bags that takes ROS 2."""
+    """ROS 2 is missing; playing is the only use of bags that needs it."""
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -61,7 +61,7 @@ def _run_statistics(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def _writing(output: Path) -> Iterator[None]:
-    """Inside, ``output`` is written by matplotlib, whose word for an unknown suffix is a ValueError."""
+    """For a block in which matplotlib writes ``output``; it raises a ValueError for an unknown suffix."""
     try:
         yield
     except UserError:

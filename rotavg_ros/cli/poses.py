@@ -16,7 +16,7 @@ POSE_FILES = ("graph.g2o", "trajectory.kitti", "trajectory.tum")
 
 
 def pose_files(graph_file: GraphFile) -> list[str]:
-    """Names of what :func:`write_corrected_poses` writes."""
+    """Names of the files that :func:`write_corrected_poses` writes."""
     return [name for name in POSE_FILES if graph_file.stamps_ns is not None or not name.endswith(".tum")]
 
 
@@ -26,7 +26,7 @@ def write_corrected_poses(folder: Path, graph_file: GraphFile, solution: Solutio
     Positions are the answer's, or fitted to the edges' translations where it has none.
 
     Args:
-        folder: where.
+        folder: where to write them.
         graph_file: N nodes, M edges.
         solution: its answer.
 
@@ -51,7 +51,7 @@ def write_corrected_poses(folder: Path, graph_file: GraphFile, solution: Solutio
 
 
 def _fitted(graph_file: GraphFile, world_from_body: np.ndarray, outlier_score: np.ndarray) -> np.ndarray:
-    """``(N, 3)`` metres, along orientations as they are."""
+    """``(N, 3)`` metres, fitted with the given orientations."""
     graph = graph_file.graph
     translation = graph_file.edge_translation
     edges = Translations(

@@ -1,4 +1,4 @@
-"""Signs of life on a terminal for whatever takes long; nothing where stderr is no terminal."""
+"""Shows progress of long steps on a terminal; nothing if stderr is not a terminal."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TypeVar
 
 Item = TypeVar("Item")
 
-# A step that is over sooner shows nothing.
+# Shorter steps show nothing.
 _DELAY_SECONDS = 1.0
 _PERIOD_SECONDS = 0.5
 
@@ -20,14 +20,14 @@ def progress(items: Iterable[Item], *, description: str, total: int | None = Non
     """Pass items through; show a bar whose seconds go on while an item takes long.
 
     Args:
-        total: how many there are; None: as many as ``items`` says, if it does.
+        total: number of items; None: the length of ``items``, if it has one.
     """
     if total is None and isinstance(items, Sized):
         total = len(items)
     if not sys.stderr.isatty():
         yield from items
         return
-    from tqdm import tqdm  # not worth its import where no bar can show
+    from tqdm import tqdm  # not imported where no bar can be shown
 
     with tqdm(desc=description, total=total, unit=unit, leave=False) as bar, _meanwhile(bar.refresh):
         for item in items:
@@ -37,7 +37,7 @@ def progress(items: Iterable[Item], *, description: str, total: int | None = Non
 
 @contextmanager
 def seconds_bar(description: str, total: float) -> Iterator[Callable[[float], object]]:
-    """A bar over seconds of recorded time with the time that is left; yields what moves it on by so many seconds."""
+    """A bar over seconds of recorded time with the time left; yields a function that advances it by some seconds."""
     if not sys.stderr.isatty():
         yield lambda _: None
         return
@@ -64,7 +64,7 @@ def working(description: str) -> Iterator[None]:
             yield
     finally:
         if time.monotonic() - start > _DELAY_SECONDS:
-            print("\r\033[K", end="", file=sys.stderr, flush=True)  # leave no half line behind
+            print("\r\033[K", end="", file=sys.stderr, flush=True)  # leave no partial line behind
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""What ``rotavg replay`` does: it drives the node's estimator through a bag and writes what it said."""
+"""What ``rotavg replay`` does: it runs the node's estimator on a bag and writes the results."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rotavg_ros.replay.plan import Plan, Wishes, make_plan
 from rotavg_ros.replay.run import Window
 from rotavg_ros.wording import counted
 
-# When it is worth saying how it would be faster.
+# Number of ticks and duration from which a hint on how to make it faster is shown.
 _MANY_TICKS, _LONG_SECONDS = 500, 60.0
 
 
@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check_inputs(bag: Path, plan: Plan, output: Path) -> None:
-    """The answer's files must not take the place of what they are made from."""
+    """Refuse an output folder whose files would replace the inputs."""
     files = [reference for reference in plan.references.values() if isinstance(reference, Path)]
     with asking_about(output, ReplayUsageError):
         place = output.resolve()
@@ -72,7 +72,7 @@ def _check_inputs(bag: Path, plan: Plan, output: Path) -> None:
 
 
 def _replay(bag: BagReader, plan: Plan, window: Window, arguments: argparse.Namespace) -> dict[str, Any]:
-    # The solver and the pictures take seconds to import: not before there is something to do for them.
+    # The solver and the plots take seconds to import, so they are imported only when needed.
     from rotavg_ros.replay.assemble import assemble
     from rotavg_ros.replay.outputs import RECORDING, output_folder, write_summary, write_tables
     from rotavg_ros.replay.run import Onlooker, replay
@@ -93,10 +93,10 @@ def _replay(bag: BagReader, plan: Plan, window: Window, arguments: argparse.Name
 
 @contextmanager
 def _asked_to_stop(may_end_early: bool) -> Iterator[Callable[[], bool]]:
-    """The first Ctrl-C only asks for the end, so that what is done can be written; the second one ends at once.
+    """The first Ctrl-C only requests the end, so that what is done can be written; the second one ends at once.
 
     Args:
-        may_end_early: or else the first one ends at once: a part of an answer must not replace a whole one.
+        may_end_early: if False, the first one ends at once, since a partial answer must not replace a whole one.
     """
     if not may_end_early:
         yield lambda: False
@@ -114,7 +114,7 @@ def _asked_to_stop(may_end_early: bool) -> Iterator[Callable[[], bool]]:
         yield lambda: times > 0
     finally:
         signal.signal(signal.SIGINT, before)
-    if times > 1:  # raised where Python only complains of exceptions, as in the callback of a weak reference
+    if times > 1:  # raised again in case Python swallowed it, as in the callback of a weak reference
         raise KeyboardInterrupt
 
 
@@ -133,7 +133,7 @@ def _described(plan: Plan) -> str:
 
 
 def _is_cut_short(summary: dict[str, Any]) -> bool:
-    """Whether the user did not let it end."""
+    """Whether the user stopped it before its end."""
     return bool(summary["interrupted"]) and summary["damage"] is None
 
 
@@ -174,7 +174,7 @@ def _compared(robot: str, said: dict[str, Any]) -> str:
 
 
 def _arrow(values: dict[str, float | None], unit: str) -> str:
-    """Odometry's error and the corrected one's."""
+    """The errors of odometry and of the corrected answer."""
     return " → ".join(
         "?" if values[which] is None else f"{values[which]:.2f}{unit}" for which in ("odometry", "corrected")
     )

@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     refuse_existing(arguments.output, overwrite=arguments.overwrite)
     with working("simulating"):
         simulated = simulate(arguments)
-        # First what is likelier to fail, so that no bag lies there of a command that did not work.
+        # First the step that is more likely to fail, so that a failed command leaves no bag behind.
         if arguments.graph is not None:
             write_graph(arguments.graph, simulated.to_graph_file())
         write_run_bag(arguments.output, simulated, overwrite=arguments.overwrite)

@@ -36,7 +36,7 @@ _ORIENTATIONS, _EDGES, _SUMMARY = "orientations.csv", "edges", "summary.json"
 
 
 class SolveError(UserError):
-    """Graphs, options and output folder that do not fit together."""
+    """Graphs, options or an output folder that do not fit together."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Job:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Solve every graph; a bad one does not keep the others from being solved."""
+    """Solve every graph; a bad one does not stop the others."""
     if arguments.without:
         if arguments.method != methods.DEFAULT_METHOD:
             raise SolveError(f"--without is for --method {methods.DEFAULT_METHOD}, not {arguments.method}")
@@ -64,8 +64,8 @@ def run(arguments: argparse.Namespace) -> int:
     )
     if arguments.translation_scale == "none":
         solve_graph = _blind_to_translations(solve_graph)
-    # One-time costs (loading weights, first kernels) are not the graphs', and wrong options show before any work; what
-    # photo collections alone need is loaded with the first of them.
+    # One-time costs (loading weights, first kernels) are not charged to the graphs, and wrong options show before any
+    # work. What only photo collections need is loaded with the first of them.
     warm = _Warm(solve_graph)
     warm.up(has_odometry=True)
     errors: list[UserError] = []
@@ -88,7 +88,7 @@ def _blind_to_translations(solve_graph: Callable[[ViewGraph], Solution]) -> Call
 
 
 def _told(summary: dict[str, Any]) -> str:
-    """The summary in a line. Edges of a graph without odometry are called just that."""
+    """The summary in a line. In a graph without odometry, closures are called edges."""
     edges, closures, flagged = (summary[name] for name in ("edges", "loop_closures", "flagged_closures"))
     odometry, slips = edges - closures, summary["outliers"] - flagged
     verdicts = f"{flagged} of {closures} {'closures' if odometry else 'edges'} flagged" if closures else "no closures"
@@ -102,10 +102,10 @@ def solve_file(job: Job, solver: _Warm, edges: str, *, poses: bool = False) -> d
     """Read, solve and write one graph.
 
     Args:
-        job: which, and where to.
+        job: the graph and its output folder.
         solver: with its options.
         edges: format of the edges' file, or ``none``.
-        poses: write positions as well.
+        poses: whether to write positions as well.
 
     Returns:
         The content of its ``summary.json``.
@@ -128,7 +128,7 @@ def solve_file(job: Job, solver: _Warm, edges: str, *, poses: bool = False) -> d
 
 
 def plan(graphs: list[Path], output: Path, *, poses: bool = False) -> list[Job]:
-    """Where each answer goes, after everything has been checked that can be before any work.
+    """Where each answer goes, after all checks that are possible before any work.
 
     Raises:
         SolveError: two graphs with one stem, an output folder that cannot be written, or a graph that an
@@ -163,7 +163,7 @@ def _files(graph_file: GraphFile, edges: str, *, poses: bool) -> list[str]:
 
 
 def _older_pose_files(folder: Path) -> list[str]:
-    """Those that the summary in a folder says it came with: a graph.g2o of somebody else's is none."""
+    """The pose files listed in a folder's summary, so that another program's graph.g2o is left alone."""
     try:
         names = json.loads((folder / _SUMMARY).read_text(encoding="utf-8"))["files"]
     except (OSError, ValueError, KeyError, TypeError):
@@ -199,7 +199,7 @@ def summarize(
 
 
 def write_answer(output: Path, graph_file: GraphFile, solution: Solution, summary: dict[str, Any], edges: str) -> None:
-    """Write all files under temporary names, then put them in place; the edges and poses of an older answer go.
+    """Write all files under temporary names, then move them in place; edges and poses of an older answer are deleted.
 
     Raises:
         SolveError: the folder cannot be written; an older answer is then still intact.
@@ -229,7 +229,7 @@ def write_answer(output: Path, graph_file: GraphFile, solution: Solution, summar
         raise SolveError(f"{output}: cannot be written: {error.strerror or error}") from None
     finally:
         for path in temporary.values():
-            with suppress(OSError):  # below what is no folder there is nothing to remove
+            with suppress(OSError):  # if it is not a folder, there is nothing to remove in it
                 path.unlink()
 
 
@@ -255,7 +255,7 @@ class _Warm:
         self._is_warm: set[bool] = set()
 
     def up(self, *, has_odometry: bool) -> None:
-        """For graphs of a kind."""
+        """Warm up for a kind of graph."""
         if has_odometry not in self._is_warm:
             self._is_warm.add(has_odometry)
             self._solve_graph(_warm_up_graph(has_odometry))

@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _config_name(arguments: argparse.Namespace) -> str:
-    """The configuration that is named, or that of the network's name."""
+    """The configuration that was given, or the one with the network's name."""
     network: str = arguments.network
     if arguments.config is None and network not in _shipped():
         several = ", ".join(name for name in _shipped() if network in name and not name.startswith("slam"))
@@ -73,7 +73,7 @@ def load_config(name: str) -> TrainingConfig:
     """A configuration by path or, without a file of that name, by the name of a shipped one.
 
     Raises:
-        TrainingConfigError: neither, or a file that makes no configuration.
+        TrainingConfigError: neither exists, or the file is not a configuration.
     """
     shipped = _shipped()
     path = Path(name)
@@ -92,8 +92,8 @@ class Inputs:
 
     Attributes:
         config: how the user named the configuration, for the card.
-        clean_net: weights for the CleanNet before a FineNet.
-        start: weights to begin with.
+        clean_net: weights of the CleanNet that precedes a FineNet.
+        start: initial weights.
     """
 
     config: str
@@ -128,7 +128,7 @@ def make_trainer(network: str, config: TrainingConfig, given: Inputs, output: Pa
     if config.family == "slam" and device == "cuda":
         raise TrainCommandError("the SLAM profile's networks train on the CPU, where its graphs live")
     name = f"{config.family}-{network}"
-    # What is wrong with any of the files shows before the minutes that drawing graphs takes.
+    # Errors in any of the files are noticed before the minutes that drawing graphs takes.
     weights = None if given.start is None else read_network(NETWORKS[name], given.start)
     make_folder(output)
     inputs: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""What ``rotavg train slam --from`` does: it fine-tunes FineNet of robots' graphs on how the user's own robot errs."""
+"""What ``rotavg train slam --from`` does: it fine-tunes the SLAM FineNet to the errors of the user's own robot."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _TRIED = "tried"
 
 
 class OwnRobotError(UserError):
-    """Runs that say too little of how a robot errs."""
+    """Runs that say too little about a robot's errors."""
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Look, simulate, train, compare; keep what is better."""
+    """Examine the runs, simulate, train, compare; keep the better network."""
     truths = arguments.truth or [None] * len(arguments.runs)
     if len(truths) != len(arguments.runs):
         raise OwnRobotError(f"--truth names {len(truths)} files, --from {len(arguments.runs)}; give one for each")

@@ -18,7 +18,7 @@ def chain_poses(
 
     Args:
         edge_translation: ``(M, 3)`` position of the target in the source frame, metres.
-        body_from_world: ``(N, 4)`` xyzw, if the orientations are known already; default: chained as well.
+        body_from_world: ``(N, 4)`` xyzw, if the orientations are already known; default: chained as well.
 
     Returns:
         ``(N, 3)`` positions in the world frame, metres, and ``(N, 4)`` world-from-body orientations, w ≥ 0.

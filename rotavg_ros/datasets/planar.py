@@ -1,10 +1,10 @@
-"""Rotations about z, as planar pose graphs and ground truth state them."""
+"""Rotations about z, as in planar pose graphs and ground truth."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# In half angles: rotations off z by less are rounding of 32-bit numbers, which is 6e-8.
+# Largest x and y of a rotation about z (half angles): allows for the rounding of 32-bit numbers, which is 6e-8.
 _ROUNDING = 1e-6
 
 

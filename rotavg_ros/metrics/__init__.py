@@ -1,11 +1,11 @@
-"""How right an answer is: errors of orientations and positions, verdicts on edges, and scores as probabilities.
+"""How accurate an answer is: errors of orientations and positions, verdicts on edges, and scores as probabilities.
 
-Training, evaluation, replay and reports use them alike. Where evo defines a metric, ours is the same, and a test
+Training, evaluation, replay and reports all use them. Where evo defines a metric, ours is the same, and a test
 compares the two: the absolute rotation error (evo's APE, rotation angle, of aligned orientations), the relative one
 (RPE, rotation angle: :func:`true_edge_noise` of the estimate's own steps) and the position error after alignment (APE,
-translation part, after evo's ``align``; its root mean square is the ATE). evo is no dependency of a robot, whose
-replays are compared with a reference, too, so it takes part in tests alone. It defines no alignment of orientations by
-themselves: :func:`gauge_alignment` is the paper's.
+translation part, after evo's ``align``; its root mean square is the ATE). evo is only used in tests, since it is not a
+dependency on a robot, whose replays are also compared with a reference. It defines no alignment of orientations by
+themselves; :func:`gauge_alignment` is the paper's.
 """
 
 from rotavg_ros.metrics.calibration import CalibrationBins, expected_calibration_error

@@ -19,7 +19,7 @@ class CalibrationBins:
         self._count, self._score_sum, self._happened = (np.zeros(bins) for _ in range(3))
 
     def add(self, probability: Tensor, happened: Tensor) -> None:
-        """Count ``(M,)`` probabilities in [0, 1] and whether what they speak of happened, ``(M,)`` bool."""
+        """Count ``(M,)`` probabilities in [0, 1] and whether their events happened, ``(M,)`` bool."""
         scores, truth = probability.double().cpu().numpy(), happened.double().cpu().numpy()
         bins = len(self._count)
         bin_of = np.minimum((scores * bins).astype(np.int64), bins - 1)
@@ -28,7 +28,7 @@ class CalibrationBins:
         self._happened += np.bincount(bin_of, truth, bins)
 
     def extend(self, other: CalibrationBins) -> None:
-        """Take in what another has counted in bins of the same number."""
+        """Add the counts of another with the same number of bins."""
         self._count += other._count
         self._score_sum += other._score_sum
         self._happened += other._happened

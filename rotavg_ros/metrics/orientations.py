@@ -15,7 +15,7 @@ _SMOOTHING = np.radians(0.01)
 
 
 def body_from_world(world_from_body: NDArray[np.floating]) -> Tensor:
-    """Orientations ``(n, 4)`` xyzw as messages and files carry them, in the form that is compared here."""
+    """Orientations ``(n, 4)`` xyzw as in messages and files, converted to the form that is compared here."""
     return rotations.inverse(torch.from_numpy(world_from_body))
 
 

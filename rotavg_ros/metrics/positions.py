@@ -19,7 +19,7 @@ class RigidFit:
     shift: FloatArray
 
     def __call__(self, position: FloatArray) -> FloatArray:
-        """Both ``(n, 3)``."""
+        """Transform positions, ``(n, 3)`` to ``(n, 3)``."""
         return np.asarray(self.turn.apply(position)).reshape(-1, 3) + self.shift
 
 

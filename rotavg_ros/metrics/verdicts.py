@@ -1,4 +1,4 @@
-"""Verdicts on edges, and scores to tell them by, against the truth."""
+"""Verdicts on edges, and the scores behind them, compared with the truth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class OutlierCounts:
 
     @classmethod
     def of(cls, flagged: Tensor, is_outlier: Tensor) -> OutlierCounts:
-        """Both ``(M,)`` bool."""
+        """From flags and truth, both ``(M,)`` bool."""
         return cls(
             int((flagged & is_outlier).sum()),
             int((flagged & ~is_outlier).sum()),
@@ -65,7 +65,7 @@ def roc_area(value: np.ndarray, is_positive: np.ndarray) -> float:
     negatives = len(is_positive) - positives
     if positives == 0 or negatives == 0:
         return float("nan")
-    # Ranks from 1, equal values sharing their mean rank; scipy.stats has them, too, and costs every replay 30 MB.
+    # Ranks from 1; equal values share their mean rank. scipy.stats has this, too, but would cost every replay 30 MB.
     _, place, count = np.unique(value, return_inverse=True, return_counts=True)
     rank = np.cumsum(count) - (count - 1) / 2
     rank_sum = rank[place][is_positive].sum()

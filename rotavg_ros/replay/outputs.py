@@ -126,7 +126,7 @@ def write_summary(folder: Path, record: RunRecord, bag: Path, outcome: Outcome) 
 
 
 def _write_trajectory(folder: Path, name: str, odometry_name: str, robot: RobotRecord) -> None:
-    """Write poses; those with stamps go to a file per time line, the last under the plain name, earlier ones numbered."""
+    """Write poses; those with stamps go to a file per time line: the last to the plain name, earlier ones numbered."""
     nothing = np.zeros((len(robot.stamp_ns), 3))
     position = nothing if robot.position is None else np.nan_to_num(robot.position)
     odometry = nothing if robot.odometry_position is None else np.nan_to_num(robot.odometry_position)

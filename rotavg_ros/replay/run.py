@@ -1,4 +1,4 @@
-"""The replay: a bag's messages through the online estimator, with ticks by the bag's clock as in the node by its own."""
+"""The replay: a bag's messages through the online estimator, which ticks by the bag's clock as the node by its own."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What a user can set, of the node and of a replay alike; free of ROS."""
+"""Settings of the node and of a replay, without ROS."""

@@ -178,9 +178,9 @@ class NodeParameters:
         return {topic: output for topic, _, output in pairs}
 
     def prefixes(self) -> dict[str, str]:
-        """What stands before the topics of each robot: nothing where there is but one, else its name.
+        """The prefix of each robot's topics: empty if there is only one robot, else its name.
 
-        No part of a topic's name may begin with a digit, so a number follows ``robot_``. Not checked otherwise.
+        No part of a topic's name may begin with a digit, so a number gets ``robot_`` before it. Not checked otherwise.
         """
         if len(self.robots) == 1:
             return {self.robots[0]: ""}
@@ -191,7 +191,7 @@ class NodeParameters:
         return _orientations(self.odometry_sensor_orientations, len(self.odometry_topics))
 
     def edge_sources(self) -> list[Source]:
-        """What every edge topic's messages do not say themselves."""
+        """For every edge topic, what its messages do not state themselves."""
         number = len(self.edge_topics)
         robots = self.edge_robots * (number // len(self.edge_robots))
         sensors = _orientations(self.edge_sensor_orientations, number)
@@ -200,7 +200,7 @@ class NodeParameters:
         return [Source(robot or self.robots[0], self.robots, sensor, limits) for robot, sensor in pairs]
 
     def values(self) -> dict[str, Any]:
-        """All of them by name, as users write them."""
+        """All parameters by name, as users write them."""
         own = {each.name: each.written(self) for each in options_of(NodeParameters)}
         estimators = {each.name: each.written(self.estimator) for each in options_of(EstimatorOptions)}
         return {name: (own | estimators)[name] for name in PARAMETERS}
@@ -241,6 +241,6 @@ def _check_orientations(what: str, numbers: tuple[float, ...], topics: int) -> N
 
 
 def _orientations(numbers: tuple[float, ...], topics: int) -> list[Quaternion]:
-    """One per topic, from numbers for each or for all."""
+    """One orientation per topic, from numbers for each topic or one set for all."""
     each = [quaternion.normalize(numbers[start : start + 4]) for start in range(0, len(numbers), 4)]
     return each * (topics // len(each))

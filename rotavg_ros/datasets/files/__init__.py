@@ -1,1 +1,1 @@
-"""Readers and writers of view-graphs, of what comes with them, and of poses."""
+"""Readers and writers of view-graphs, their companion files, and poses."""

@@ -1,4 +1,4 @@
-"""A solved pose graph in g2o: corrected vertices, and what is believed of the edges."""
+"""A solved pose graph in g2o: corrected vertices, and the edges that are believed."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from rotavg_ros.datasets.files.pose_graph_rows import (
     rotation_information,
 )
 
-# A closure whose rotation is likelier wrong than right is left out.
+# A closure whose rotation is more likely wrong than right is left out.
 _FALSE = 0.5
 
 
 def is_told(outlier: np.ndarray, is_odometry: np.ndarray, judged: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray:
-    """``(M,)`` bool, edges that plain least squares may have: no outliers.
+    """``(M,)`` bool, edges that are safe for plain least squares: no outliers.
 
-    Where precisions were estimated these say what each edge is believed to tell. Closures of right rotation that join
-    the wrong place stay for the former, and odometry that slipped or jumped joins what it joined.
+    Where precisions were estimated, these state how far each edge is believed. Then closures with a right rotation that
+    join the wrong place are kept for their rotation, and odometry that slipped or jumped still joins its ends.
 
     Args:
         outlier: ``(M,)`` bool.
@@ -46,17 +46,17 @@ def write_corrected_graph(
     told: np.ndarray,
     precision: np.ndarray | None = None,
 ) -> None:
-    """Write corrected vertices and some edges, so that plain least squares can go on from there.
+    """Write corrected vertices and some edges, so that plain least squares can continue from there.
 
-    Unknown precisions become a typical one of those that are known, since the format has no other word for them; for
-    an odometry edge that several were drawn together into, as much less.
+    Unknown precisions become a typical known one, since the format cannot express unknown ones; for a merged odometry
+    edge, it is divided by the number of steps.
 
     Args:
         path: of the g2o file.
         graph_file: N nodes, M edges; translations that are NaN are not known.
         world_from_body, position: ``(N, 4)`` xyzw and ``(N, 3)`` metres.
-        told: ``(M,)`` bool, which edges (:func:`is_told`).
-        precision: ``(M, 2)`` rad⁻² and m⁻² per component as estimated; default: what edges state.
+        told: ``(M,)`` bool, the edges to write (:func:`is_told`).
+        precision: ``(M, 2)`` estimated, rad⁻² and m⁻² per component; default: as stated by the edges.
 
     Raises:
         GraphFileError: the file cannot be written.
@@ -84,7 +84,7 @@ def write_corrected_graph(
 
 
 def _isotropic(precision: np.ndarray) -> np.ndarray:
-    """``(M, 21)`` information of edges that err alike in every direction."""
+    """``(M, 21)`` information of edges whose errors are isotropic."""
     information = np.zeros((len(precision), 21))
     information[:, ANGULAR_DIAGONAL] = precision[:, [0]]
     information[:, POSITION_DIAGONAL] = np.maximum(precision[:, [1]], NO_INFORMATION)

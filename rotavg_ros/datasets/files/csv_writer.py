@@ -1,6 +1,6 @@
 """Numeric csv files, written tens of times faster than row by row: digits are computed for whole columns.
 
-The columns of an answer's two tables are the same whoever has answered.
+The columns of an answer's two tables are defined here, the same for every program that writes them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-# Written at once by default: some MB of characters.
+# Rows written at once by default: some MB of characters.
 _BLOCK_ROWS = 1 << 16
 
 
@@ -26,7 +26,7 @@ class Column(NamedTuple):
 
 
 def orientation_columns(ids: np.ndarray, world_from_body: np.ndarray, component: np.ndarray) -> list[Column]:
-    """Of ``orientations.csv``: ``(N,)`` ids, ``(N, 4)`` xyzw and ``(N,)`` components."""
+    """Columns of ``orientations.csv``: ``(N,)`` ids, ``(N, 4)`` xyzw and ``(N,)`` components."""
     quaternion = [Column(name, world_from_body[:, i], decimals=12) for i, name in enumerate(("qx", "qy", "qz", "qw"))]
     return [Column("id", ids), *quaternion, Column("component", component)]
 
@@ -37,7 +37,7 @@ def edge_columns(
     outlier: np.ndarray,
     judged: tuple[np.ndarray, np.ndarray, np.ndarray] | None,
 ) -> list[Column]:
-    """Of ``edges.csv``.
+    """Columns of ``edges.csv``.
 
     Args:
         ends: ids of the sources and of the targets, ``(M,)`` each.
@@ -67,7 +67,7 @@ def write_csv(file: BinaryIO, columns: Sequence[Column], *, block_rows: int = _B
     Args:
         file: open for bytes.
         columns: of the same length.
-        block_rows: so many rows are in memory at a time; what is written does not depend on it.
+        block_rows: number of rows in memory at a time; the output does not depend on it.
 
     Raises:
         ValueError: an infinite value.

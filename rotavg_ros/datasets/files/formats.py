@@ -1,4 +1,4 @@
-"""The formats of view-graph files: read by what a file holds, written by its suffix."""
+"""The formats of view-graph files: on reading chosen by the content, on writing by the suffix."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ def write_graph(path: str | Path, graph_file: GraphFile) -> None:
 
 
 def not_stored(path: str | Path, graph_file: GraphFile) -> list[str]:
-    """What of this graph the format that ``path`` stands for has no room for, in words."""
+    """The parts of this graph that the format of ``path`` cannot store, in words."""
     return _format_of_suffix(Path(path)).not_stored(graph_file)  # type: ignore[no-any-return]
 
 
 def stem_of(path: Path) -> str:
-    """The file's name without its suffix, nor that of gzip."""
+    """The file's name without its suffix and that of gzip."""
     return Path(path.stem).stem if path.suffix.lower() == ".gz" else path.stem
 
 

@@ -1,9 +1,9 @@
 """g2o pose graphs and their TORO, iSAM and Vertigo dialects.
 
 An edge line stores the pose of the target in the source frame, so its rotation is the inverse of
-``target_from_source``. Edges between consecutive ids, in either direction, are odometry; of keyframes that are numbered
-with gaps, those between neighbours. Edges that some optimiser may switch off (Sünderhauf & Protzel, IROS 2012; RTAB-Map
-writes them, too) are closures whatever their ids: nobody switches odometry off.
+``target_from_source``. Edges between consecutive ids, in either direction, are odometry; if keyframes are numbered with
+gaps, those between neighbours. Edges that an optimiser may switch off (Sünderhauf & Protzel, IROS 2012; RTAB-Map writes
+them, too) are closures whatever their ids, since odometry is never switched off.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ EDGE_TAGS = {
     b"EDGE_SE3_SWITCHABLE": EdgeTag(3, 4, tuple(range(21)), switch=1),  # RTAB-Map and Vertigo's later versions
     b"EDGE_SE3:QUAT_SWITCHABLE": EdgeTag(3, 4, tuple(range(21)), switch=1),  # Vertigo's first
 }
-# Numbers after the id. Only the id counts: poses in a file are somebody's estimate, not a measurement.
+# Numbers after the id. Only the id is used: poses in a file are an estimate, not a measurement.
 VERTEX_TAGS = {b"VERTEX_SE2": 3, b"VERTEX2": 3, b"VERTEX_SE3:QUAT": 7, b"VERTEX3": 6}
-# What tells nothing about relative rotations between poses: landmarks, priors, an optimiser's switches, planes.
+# Lines without information on relative rotations between poses: landmarks, priors, an optimiser's switches, planes.
 SKIPPED_TAGS = frozenset(
     b"FIX LANDMARK VERTEX_XY VERTEX_XYZ VERTEX_TRACKXYZ VERTEX_POINT_XYZ VERTEX_TAG VERTEX_PLANE VERTEX_SWITCH "
     b"EDGE_XY EDGE_SE2_XY EDGE_SE2_XY_CALIB EDGE_BEARING_SE2_XY EDGE_SE3_XYZ EDGE_SE3_TRACKXYZ EDGE_POINT_XYZ "
@@ -73,9 +73,9 @@ SKIPPED_TAGS = frozenset(
     b"EDGE_PLANE_PRIOR_NORMAL EDGE_PLANE_PRIOR_DISTANCE EDGE_PLANE_IDENTITY EDGE_PLANE_PARALLEL "
     b"EDGE_PLANE_PERPENDICULAR ROBOTLASER1 RAWLASER1".split()
 )
-# Beyond this, rad, a double tells angles apart by 1e-7 at best: no measurement, but something else in its column.
+# Beyond this, rad, a double resolves angles to 1e-7 at best: such a number is not an angle.
 _MAX_ANGLE = 1e9
-# TORO's word for two vertices that are one.
+# TORO's tag for two vertices that are the same.
 _SAME_PLACE = b"EQUIV"
 
 
@@ -83,11 +83,11 @@ def read(path: Path) -> GraphFile:
     """Read a pose graph of EDGE_SE2, EDGE_SE3:QUAT, TORO's, iSAM's and Vertigo's edges.
 
     Landmarks, priors, parameters and self-edges are skipped and counted. Precision is Iθθ, or the mean of the
-    three angular diagonal entries; information is the 3 × 3 block, of spatial edges that are not equally exact about
-    all axes. There are no translations where none is known.
+    three angular diagonal entries; information is the 3 × 3 block, for spatial edges that are not equally exact about
+    all axes. Translations are None if none is known.
 
     Raises:
-        GraphFileError: naming the line that is at fault.
+        GraphFileError: the message names the faulty line.
     """
     skipped: Counter[str] = Counter()
     lone_ids: list[np.ndarray] = []
@@ -159,7 +159,7 @@ class _Edges:
 
 
 def _unknown(tag: bytes) -> str:
-    """What is wrong with a line of that tag, and what to do."""
+    """What is wrong with a line with that tag, and what to do."""
     if tag == _SAME_PLACE:
         return "EQUIV, two vertices that are one, is not read; remove it or state an edge of no turn between them"
     known = ", ".join(sorted(known.decode() for known in EDGE_TAGS))
@@ -194,7 +194,7 @@ def _parse_edges(path: Path, tag: EdgeTag, lines: list[int], rows: list[Row]) ->
 def _squared(root: np.ndarray) -> np.ndarray:
     """``RᵀR`` of upper triangular 3 × 3 matrices, both as ``(K, 6)`` upper triangles, row by row.
 
-    Zero where Rθθ is: the entries are then in some other program's order, and mean we do not know what.
+    Zero where Rθθ is zero: the entries are then in another program's order, which is unknown.
     """
     xx, xy, xt, yy, yt, tt = root.T
     information = (xx * xx, xx * xy, xx * xt, xy * xy + yy * yy, xy * xt + yy * yt, xt * xt + yt * yt + tt * tt)
@@ -202,7 +202,7 @@ def _squared(root: np.ndarray) -> np.ndarray:
 
 
 def _parse_vertices(path: Path, num_values: int, lines: list[int], rows: list[Row]) -> np.ndarray:
-    """Ids of the vertices. Their poses may be anything: a diverged estimate does not spoil the measurements."""
+    """Ids of the vertices. Their poses may be anything: a diverged estimate does not affect the measurements."""
     for line, row in zip(lines, rows, strict=True):
         if len(row) != 1 + num_values:
             what = f"{len(row)} numbers where {1 + num_values} belong; the line is malformed or the file truncated"
@@ -218,8 +218,8 @@ def write(
 ) -> None:
     """Write EDGE_SE2 or EDGE_SE3:QUAT lines, after VERTEX lines that chain the edges' translations.
 
-    The format knows no unknown precision (written as 1) and no edge kind (consecutive ids are odometry). Translations
-    that are not known are zeros, with as good as no information.
+    The format has no unknown precision (written as 1) and no edge kind (consecutive ids are odometry). Unknown
+    translations are zeros with practically no information.
 
     Args:
         body_from_world: ``(N, 4)`` xyzw orientations of the vertices; default: those a breadth-first tree of
@@ -240,7 +240,7 @@ def write(
 
 
 def not_stored(graph_file: GraphFile) -> list[str]:
-    """What of this graph the format has no room for, in words."""
+    """The parts of this graph that the format cannot store, in words."""
     graph = graph_file.graph
     lost = {
         "which edges are odometry (consecutive ids will be)": bool(

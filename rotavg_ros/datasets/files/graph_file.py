@@ -1,4 +1,4 @@
-"""A view-graph as files know it: with the ids, stamps, translations and ground truth that the solver does not need.
+"""A view-graph as stored in files: with the ids, stamps, translations and ground truth that the solver does not need.
 
 :func:`read_graph` and :func:`write_graph` choose the format; the formats themselves are modules with a
 ``read(path)``, a ``write(path, graph_file)`` and a ``not_stored(graph_file)`` each.
@@ -25,21 +25,21 @@ from rotavg_ros.whole_file import replacing
 # Ids are non-negative so that they fit the unsigned 64-bit ids of the messages and of gtsam's keys.
 MAX_NODE_ID = np.iinfo(np.int64).max
 
-# Keyframes of fewer ids, or that joined by less than this share, may as well be cameras.
+# With fewer ids, or a smaller share of neighbours that are joined, the nodes may be cameras instead of keyframes.
 _MIN_CHAIN, _CHAIN_SHARE = 10, 0.9
 
 _GZIP = b"\x1f\x8b"
 
 
 class GraphFileError(UserError):
-    """A file that cannot be read or written as what it should be.
+    """A file that cannot be read or written.
 
     The message names the file, the line where there is one, what is wrong and what to do.
     """
 
     @classmethod
     def at(cls, path: str | Path, line: int | None, what: str) -> GraphFileError:
-        """``path:line: what``, or ``path: what`` where no line is to blame."""
+        """``path:line: what``, or ``path: what`` without a line."""
         return cls(f"{path}:{line}: {what}" if line is not None else f"{path}: {what}")
 
 
@@ -60,7 +60,7 @@ class GraphFile:
         stamps_ns: ``(N,)`` int64 nanoseconds.
         position_gt: ``(N, 3)`` ground truth in the world frame, metres; NaN rows where unknown.
         skipped: number of lines that were left out on reading, by kind.
-        damage: what of a damaged recording could not be read; None: it was whole.
+        damage: what could not be read of a damaged recording; None: it was whole.
         warnings: why the graph may not be what was meant, a line each.
     """
 
@@ -77,7 +77,7 @@ class GraphFile:
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """The graph has the translations, too: a solver sees nothing else. Formats see what is here alone."""
+        """Copy the translations between here, where formats use them, and the graph, which is all a solver sees."""
         if self.edge_translation is None and self.graph.translation is not None:
             object.__setattr__(self, "edge_translation", self.graph.translation.cpu().numpy())
         elif self.edge_translation is not None:
@@ -86,13 +86,13 @@ class GraphFile:
 
     @property
     def consecutive(self) -> np.ndarray:
-        """``(M,)`` bool: what formats without kinds take for odometry, see :func:`joins_consecutive`."""
+        """``(M,)`` bool: edges that formats without kinds take for odometry, see :func:`joins_consecutive`."""
         source, target = (self.node_ids[end.cpu().numpy()] for end in (self.graph.source, self.graph.target))
         return joins_consecutive(source, target)
 
     @property
     def extras(self) -> list[str]:
-        """What only npz has room for, in words, and what no format has."""
+        """The parts that only npz can store, and those that no format can, in words."""
         graph = self.graph
         known = {
             "labels": bool((graph.label != EdgeLabel.AUTOMATIC).any()),
@@ -105,7 +105,7 @@ class GraphFile:
 
     @property
     def in_no_file(self) -> list[str]:
-        """What no format has room for, in words; the rest of it is found by reading."""
+        """The parts that no format can store, in words; everything else is found by reading."""
         return [] if self.graph.route is None else ["which ways odometry went along edges drawn together"]
 
     @classmethod
@@ -161,11 +161,11 @@ class GraphFile:
 
 
 def joins_consecutive(source_ids: np.ndarray, target_ids: np.ndarray) -> np.ndarray:
-    """``(M,)`` bool: which edges are odometry where nothing but ids tells.
+    """``(M,)`` bool: which edges are odometry, judged only by ids.
 
-    Those between consecutive ids; or, where a front end numbers frames and keeps some (0, 5, 10 …), those between ids
-    that follow each other among those that occur. It does if these edges join nearly all such ids, and most of them do
-    not differ by one.
+    These are edges between consecutive ids; or, where a front end numbers frames and keeps some (0, 5, 10 …), edges
+    between ids that follow each other among those that occur. The latter holds if such edges join nearly all ids that
+    follow each other, and most of these do not differ by one.
 
     Args:
         source_ids, target_ids: ``(M,)`` int64.
@@ -182,7 +182,7 @@ def joins_consecutive(source_ids: np.ndarray, target_ids: np.ndarray) -> np.ndar
 
 @contextmanager
 def open_text(path: Path) -> Iterator[io.BufferedReader]:
-    """A text's bytes from the first character on: unpacked where it is gzipped, a byte order mark left out.
+    """A text's bytes from the first character on, decompressed if gzipped, without a byte order mark.
 
     Raises:
         GraphFileError: the file cannot be read, is UTF-16, or is a damaged gzip file.
@@ -205,7 +205,7 @@ def open_text(path: Path) -> Iterator[io.BufferedReader]:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn what the operating system says about ``path`` into a :class:`GraphFileError`."""
+    """Turn the operating system's errors about ``path`` into a :class:`GraphFileError`."""
     try:
         yield
     except FileNotFoundError:
@@ -225,7 +225,7 @@ def writing(path: Path) -> Iterator[Path]:
     """A file to write that takes the place of ``path`` on success, see :func:`~rotavg_ros.whole_file.replacing`.
 
     Raises:
-        GraphFileError: the place cannot be written (missing folder, rights, full disk).
+        GraphFileError: the place cannot be written (missing folder, permissions, full disk).
     """
     try:
         with replacing(path) as temporary:

@@ -41,9 +41,9 @@ def attach_stamps(graph_file: GraphFile, path: str | Path) -> GraphFile:
 def attach_truth(graph_file: GraphFile, path: str | Path) -> GraphFile:
     """The graph with ground truth from a csv file; nodes that it does not mention are NaN.
 
-    Two kinds are known: with the header ``id,qx,qy,qz,qw``, world-from-body orientations by id (further columns,
-    as in our own ``orientations.csv``, are ignored); and without header, rows ``stamp, x, y, heading`` in seconds,
-    metres and radians, matched to the nodes' stamps within 0.15 s.
+    Two kinds are supported: with the header ``id,qx,qy,qz,qw``, world-from-body orientations by id (further columns,
+    as in our own ``orientations.csv``, are ignored); without a header, rows ``stamp, x, y, heading`` in seconds, metres
+    and radians, matched to the nodes' stamps within 0.15 s.
 
     Raises:
         GraphFileError: a malformed line, ground truth by stamp for a graph without stamps, or no node matched.
@@ -104,20 +104,20 @@ def _nearest(ascending: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def nanoseconds(path: Path, line: int, seconds: bytes) -> int:
-    """Exact, where a float of seconds since 1970 would be off by a hundred nanoseconds."""
+    """Exact nanoseconds; a float of seconds since 1970 would be off by a hundred nanoseconds."""
     unsigned = seconds.removeprefix(b"-")
     whole, _, fraction = unsigned.partition(b".")
     if whole.isdigit() and (fraction.isdigit() or not fraction):
         value = int(whole) * 10**9 + int(fraction[:9].ljust(9, b"0"))
         value = value if unsigned == seconds else -value
     else:
-        # Some numbers of seconds are floats whose nanoseconds are none.
+        # Some valid numbers of seconds are too large for nanoseconds.
         value = round(min(max(float(seconds), -_TOO_LARGE), _TOO_LARGE) * 1e9)
     return _in_range(path, line, value, f"stamp {shown(seconds)} is too large; stamps are in seconds")
 
 
 def whole_nanoseconds(path: Path, line: int, stamp: bytes) -> int:
-    """A stamp in nanoseconds, as EuRoC's are."""
+    """A stamp given in nanoseconds, as in EuRoC's files."""
     value = int(stamp) if stamp.removeprefix(b"-").isdigit() else round(float(stamp))
     return _in_range(path, line, value, f"stamp {shown(stamp)} is too large; EuRoC's stamps are in nanoseconds")
 

@@ -14,10 +14,10 @@ from rotavg_ros.datasets.files.text_rows import write_rows
 
 
 def write(path: Path, graph_file: GraphFile) -> None:
-    """Write ODOMETRY lines, which carry the upper triangular root of the information matrix. iSAM knows no vertices.
+    """Write ODOMETRY lines, which carry the upper triangular root of the information matrix. iSAM has no vertices.
 
     Raises:
-        GraphFileError: a graph that is not planar, information that has no root, or a place that cannot be written.
+        GraphFileError: a graph that is not planar, information without a root, or a place that cannot be written.
     """
     if not graph_file.planar:
         raise GraphFileError.at(path, None, "iSAM's format is for graphs in the plane; write .toro or .g2o")
@@ -35,7 +35,7 @@ def write(path: Path, graph_file: GraphFile) -> None:
 
 
 def not_stored(graph_file: GraphFile) -> list[str]:
-    """What of this graph the format has no room for, in words."""
+    """The parts of this graph that the format cannot store, in words."""
     graph = graph_file.graph
     touched = np.union1d(graph.source.cpu().numpy(), graph.target.cpu().numpy())
     alone = ["nodes without an edge"] if len(touched) < graph.num_nodes else []

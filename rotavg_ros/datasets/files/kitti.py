@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from rotavg_ros.datasets.files.graph_file import GraphFileError
 from rotavg_ros.datasets.files.text_rows import parse_rows, read_blocks, refuse
 
-# How far a row of a pose file may be from a rotation matrix.
+# Largest deviation of a pose file's matrix from a rotation.
 _ORTHOGONALITY_TOLERANCE = 1e-3
 
 
@@ -21,7 +21,7 @@ def read_poses(path: str | Path) -> tuple[Rotation, np.ndarray]:
         N rotations world_from_camera, and ``(N, 3)`` positions in the world frame, metres.
 
     Raises:
-        GraphFileError: a malformed line, or a matrix that is no rotation.
+        GraphFileError: a malformed line, or a matrix that is not a rotation.
     """
     path = Path(path)
     rows = [row for block in read_blocks(path) for row in block]

@@ -1,11 +1,11 @@
 """View-graphs of the Lund data sets with ground truth, as MATLAB files (Olsson & Enqvist's scenes).
 
-Of N cameras: ``Rgt`` ``(3N, 3)``, the stacked true R_i; ``Rrel`` ``(3N, 3N)``, whose 3 × 3 block (i, j), i < j, is the
+For N cameras: ``Rgt`` ``(3N, 3)``, the stacked true R_i; ``Rrel`` ``(3N, 3N)``, whose 3 × 3 block (i, j), i < j, is the
 measured ``R_j R_iᵀ`` or zero where there is none; optionally ``H`` ``(3N, 3N)``, whose blocks are the Hessians of the
 two-view problems in the rotation, of unknown scale. Ids are 0 … N-1, and no edge is odometry.
 
-The files do not say in whose frame a Hessian is. The Sphinx's errors do: by Student's t with one degree of freedom they
-are 990 nats likelier with Hessians in the frame of camera j, the target, than in that of i.
+The files do not say in whose frame a Hessian is, but the errors of the Sphinx do: by Student's t with one degree of
+freedom, their log-likelihood is 990 nats higher with Hessians in the frame of camera j, the target, than in that of i.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def read(path: Path) -> GraphFile:
     """Read a Lund file; a Hessian becomes the rotation part of the edge's information.
 
     Raises:
-        GraphFileError: naming the array that is at fault.
+        GraphFileError: the message names the faulty array.
     """
     arrays = _load(path)
     truth = arrays["Rgt"]

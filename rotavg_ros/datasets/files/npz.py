@@ -50,7 +50,7 @@ def read(path: Path) -> GraphFile:
     """Read an npz view-graph. Self-edges are skipped and counted. Nothing is ever unpickled.
 
     Raises:
-        GraphFileError: naming the array that is at fault.
+        GraphFileError: the message names the faulty array.
     """
     arrays, planar = _load(path)
     source, target = arrays["source"], arrays["target"]
@@ -124,12 +124,12 @@ def write(path: Path, graph_file: GraphFile) -> None:
 
 
 def not_stored(graph_file: GraphFile) -> list[str]:
-    """What of this graph the format has no room for, in words."""
+    """The parts of this graph that the format cannot store, in words."""
     return graph_file.in_no_file
 
 
 def _load(path: Path) -> tuple[dict[str, np.ndarray], bool | None]:
-    """The arrays we know, in int64 and float64 and of the right shapes, and the stated planarity."""
+    """The known arrays, as int64 or float64 in the right shapes, and the stated planarity."""
     with reading(path):
         file = path.open("rb")
     with file:
@@ -165,7 +165,7 @@ def _checked(path: Path, name: str, array: np.ndarray) -> np.ndarray:
 
 
 def _check_node_ids(path: Path, node_ids: np.ndarray) -> None:
-    """Rows of nodes are told apart by these."""
+    """Check that ids are non-negative and unique, since they identify the rows of nodes."""
     if (node_ids < 0).any():
         what = f"node_ids holds {node_ids.min()}; ids must be integers from 0"
         raise GraphFileError.at(path, None, what)
@@ -176,7 +176,7 @@ def _check_node_ids(path: Path, node_ids: np.ndarray) -> None:
 
 
 def _rows_of_nodes(path: Path, name: str, arrays: dict[str, np.ndarray], node_ids: np.ndarray) -> np.ndarray:
-    """Rows ascending by id: of ``node_ids`` or of the ids that occur; or, if there are more rows, row = id."""
+    """Rows ascending by id, for ``node_ids`` or the ids that occur; if there are more rows, the row is the id."""
     rows: np.ndarray = arrays[name]
     if "node_ids" in arrays and len(rows) == len(arrays["node_ids"]):
         rows = rows[np.argsort(arrays["node_ids"], kind="stable")]

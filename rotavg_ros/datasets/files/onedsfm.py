@@ -23,7 +23,7 @@ def read(path: Path) -> GraphFile:
     """Read ``EGs.txt``. Self-edges are skipped and counted.
 
     Raises:
-        GraphFileError: naming the line that is at fault.
+        GraphFileError: the message names the faulty line.
     """
     ids, numbers = [], []
     for block in read_blocks(path):
@@ -52,7 +52,7 @@ def read(path: Path) -> GraphFile:
 
 
 def write(path: Path, graph_file: GraphFile) -> None:
-    """Write ``EGs.txt``. The format has no room for kinds, precisions, stamps or nodes without an edge."""
+    """Write ``EGs.txt``. The format cannot store kinds, precisions, stamps or nodes without an edge."""
     graph, ids = graph_file.graph, graph_file.node_ids
     ends = [ids[graph.source.cpu().numpy()], ids[graph.target.cpu().numpy()]]
     matrix = to_matrix(inverse(graph.target_from_source)).cpu().numpy().reshape(-1, 9)
@@ -65,7 +65,7 @@ def write(path: Path, graph_file: GraphFile) -> None:
 
 
 def not_stored(graph_file: GraphFile) -> list[str]:
-    """What of this graph the format has no room for, in words."""
+    """The parts of this graph that the format cannot store, in words."""
     graph = graph_file.graph
     joined = np.unique(np.concatenate((graph.source.cpu().numpy(), graph.target.cpu().numpy())))
     lost = {

@@ -1,4 +1,4 @@
-"""Trajectories in text files: TUM, KITTI and EuRoC's csv, as evo and others know them."""
+"""Trajectories in text files: TUM, KITTI and EuRoC's csv, as in evo and other programs."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class PoseFile:
 
 
 def read_pose_file(path: str | Path) -> PoseFile:
-    """Read a trajectory; commas and the number of columns decide what it is.
+    """Read a trajectory; commas and the number of columns decide the format.
 
     Raises:
         GraphFileError: another format, a malformed line, or stamps that do not ascend.
@@ -77,7 +77,7 @@ def read_pose_file(path: str | Path) -> PoseFile:
 
 
 def _is_heading(cell: bytes) -> bool:
-    """Whether a row's first cell is that of a header; a damaged number is none, so that its line is refused."""
+    """Whether a row's first cell is that of a header; a damaged number does not count, so that its line is refused."""
     try:
         float(cell)
     except ValueError:
@@ -104,7 +104,7 @@ def write_tum(path: Path, stamps_ns: np.ndarray, position: np.ndarray, world_fro
     Raises:
         GraphFileError: the place cannot be written.
     """
-    sign = np.where(stamps_ns < 0, "-", "")  # by itself: before a second of 0 a number has none
+    sign = np.where(stamps_ns < 0, "-", "")  # written separately, since 0 seconds have no sign
     seconds, rest = np.divmod(np.abs(stamps_ns), 10**9)
     with writing(path) as temporary, temporary.open("w", encoding="ascii") as file:
         write_rows(file, f"%s%d.%09d{' %.9f' * 7}\n", [sign, seconds, rest, position, world_from_body])

@@ -1,4 +1,4 @@
-"""A pose graph as vertices and edges, the way g2o's, TORO's and iSAM's files write them."""
+"""A pose graph as vertices and edges, as written to g2o's, TORO's and iSAM's files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rotavg_ros.view_graph import ViewGraph
 # Where the diagonal of a 6 × 6 matrix over x, y, z and the rotation is in the 21 of its upper triangle, row by row.
 POSITION_DIAGONAL = [0, 6, 11]
 ANGULAR_DIAGONAL = [15, 18, 20]
-# Of a position that is not known, m⁻²: as good as none, but the matrix can still be inverted.
+# Information of an unknown position, m⁻²: practically none, but the matrix can still be inverted.
 NO_INFORMATION = 1e-9
 # Where the nine entries of a rotation's 3 × 3 block, row by row, are among these.
 _ANGULAR_BLOCK = [15, 16, 17, 16, 18, 19, 17, 19, 20]
@@ -23,7 +23,7 @@ _ANGULAR_BLOCK = [15, 16, 17, 16, 18, 19, 17, 19, 20]
 
 @dataclass(frozen=True)
 class PoseGraphRows:
-    """What the dialects of pose-graph files write, each in its own words (N vertices, M edges).
+    """The content that the dialects of pose-graph files share (N vertices, M edges).
 
     Attributes:
         ids: ``(N,)``.
@@ -65,7 +65,7 @@ def lay_out(
     information = _information(graph_file)
     nothing = np.zeros(information.shape[1])
     nothing[POSITION_DIAGONAL] = NO_INFORMATION
-    nothing[min(ANGULAR_DIAGONAL) :] = np.nan  # what is stated of the rotation stays
+    nothing[min(ANGULAR_DIAGONAL) :] = np.nan  # the rotation's stated part stays
     information = np.asarray(np.where(is_known | np.isnan(nothing), information, nothing))
     chained, world_from_body = chain_poses(graph, translation, body_from_world)
     return PoseGraphRows(
@@ -80,7 +80,7 @@ def lay_out(
 
 
 def without_position(translation: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """``(M,)`` bool, edges as they are written whose translation is not known.
+    """``(M,)`` bool, edges as read from a file whose translation is not known.
 
     Args:
         translation: ``(M, 3)`` metres.
@@ -99,7 +99,7 @@ def rotation_of(information: np.ndarray) -> np.ndarray | None:
     that its own files state four times the information; GTSAM and Ceres write them without that factor. The scale is
     left as stated, as that of precisions is: all edges have the same, and solves do not depend on it.
 
-    None where every edge is equally exact about all axes, which its precision says already.
+    None if every edge is equally exact about all axes, as its precision already states.
     """
     block = information[:, _ANGULAR_BLOCK].reshape(-1, 3, 3)
     is_round = (block == block[:, :1, :1] * np.eye(3)).all()
@@ -107,7 +107,7 @@ def rotation_of(information: np.ndarray) -> np.ndarray | None:
 
 
 def rotation_information(graph: ViewGraph, precision: np.ndarray) -> np.ndarray:
-    """``(M, 21)``, zero but for the rotation: the graph's information where known, else ``precision`` ``(M,)``."""
+    """``(M, 21)``, zero except for the rotation: the graph's information where known, else ``precision`` ``(M,)``."""
     blocks = precision[:, None, None] * np.eye(3)
     if graph.information is not None:
         stated = graph.information.cpu().numpy()
@@ -118,7 +118,7 @@ def rotation_information(graph: ViewGraph, precision: np.ndarray) -> np.ndarray:
 
 
 def _information(graph_file: GraphFile) -> np.ndarray:
-    """``(M, 21)`` as stated; where nothing is, 1 for positions, known or not, and what the graph has for rotations."""
+    """``(M, 21)`` as stated; otherwise 1 for positions, known or not, and the graph's information for rotations."""
     precision = np.nan_to_num(graph_file.graph.precision.cpu().numpy(), nan=1.0)
     information = rotation_information(graph_file.graph, precision)
     information[:, POSITION_DIAGONAL] = 1

@@ -18,8 +18,8 @@ class RgbdScene:
 
     Attributes:
         graph_file: the view-graph with ground truth. Edges that state no precision have that of a registration whose
-            points lie 1 m from its centre, rms⁻² rad⁻²: the scale means nothing, the differences may. Failed ones
-            count as the worst of the others.
+            points lie 1 m from its centre, rms⁻² rad⁻²: only the differences matter, not the scale. Failed ones get the
+            worst precision of the others.
         registration_rms: ``(M,)`` metres, the root mean square distance of matched points; inf where it failed.
     """
 
@@ -45,7 +45,7 @@ def read_scene(path: str | Path) -> RgbdScene:
         if "registration_rms" not in archive.files:
             raise GraphFileError.at(path, None, "lacks registration_rms; an RGB-D scene has one per edge")
         rms = archive["registration_rms"].astype(np.float64)
-        proper = archive["source"] != archive["target"]  # self-edges are no part of the graph
+        proper = archive["source"] != archive["target"]  # self-edges are not part of the graph
     if rms.shape != proper.shape:
         raise GraphFileError.at(path, None, f"registration_rms has shape {rms.shape}, source has {proper.shape}")
     rms = np.where(rms < _FAILED_RMS, rms, np.inf)[proper]

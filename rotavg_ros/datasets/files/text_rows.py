@@ -1,4 +1,4 @@
-"""Reading and writing rows of numbers in text files: fast where all is well, exact about the line where it is not."""
+"""Reads and writes rows of numbers in text files: fast if there are no errors, and exact about the faulty line."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def parse_rows(path: Path, lines: list[int], rows: list[Row], num_ids: int, num_
         ``(K, num_ids)`` int64 and ``(K, num_values)`` float64.
 
     Raises:
-        GraphFileError: naming the first line that is not of that form.
+        GraphFileError: the message names the first line that is not of that form.
     """
     num_columns = num_ids + num_values
     try:
@@ -76,7 +76,7 @@ def unit_quaternions(path: Path, lines: list[int] | np.ndarray | None, quaternio
 
 
 def refuse(path: Path, lines: list[int] | np.ndarray | None, bad: npt.ArrayLike, what: str) -> None:
-    """Raise for the first row marked in ``bad``; ``lines`` are None where rows are edges of a binary file."""
+    """Raise for the first row marked in ``bad``; ``lines`` is None if rows are edges of a binary file."""
     bad = np.asarray(bad)
     if not bad.any():
         return
@@ -114,6 +114,6 @@ def _problem(row: Row, num_ids: int, num_columns: int) -> str | None:
 
 
 def shown(token: bytes) -> str:
-    """A token of unknown origin, fit for a message."""
+    """A token of unknown content, made safe for a message."""
     text = token[:40].decode("ascii", "backslashreplace")
     return repr(text + "…" if len(token) > 40 else text)

@@ -1,4 +1,4 @@
-"""TORO's pose graphs: written here; :mod:`rotavg_ros.datasets.files.g2o` reads them, and all their relatives."""
+"""TORO's pose graphs: written here; :mod:`rotavg_ros.datasets.files.g2o` reads them and all related formats."""
 
 from __future__ import annotations
 
@@ -35,5 +35,5 @@ def write(path: Path, graph_file: GraphFile) -> None:
 
 
 def _roll_pitch_yaw(quaternions: np.ndarray) -> np.ndarray:
-    """``(K, 3)`` radians, with no roll where the pitch is upright and leaves it open."""
+    """``(K, 3)`` radians; the roll is 0 where a pitch of ±90° leaves it undetermined."""
     return np.asarray(Rotation.from_quat(quaternions).as_euler("xyz", suppress_warnings=True))

@@ -1,1 +1,1 @@
-"""Generators of view-graphs: synthetic photo collections, simulated robots, and what makes clean graphs worse."""
+"""Generators of view-graphs: synthetic photo collections, simulated robots, and ways to corrupt clean graphs."""

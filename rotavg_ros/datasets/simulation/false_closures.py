@@ -1,4 +1,4 @@
-"""Making loop closures false and odometry slip: in graphs with a clean reference, and in simulated ones."""
+"""Makes loop closures false and odometry slip, in graphs with a clean reference and in simulated ones."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def replace_closures(
             int(run.max(initial=-1)) + 1, graph_file.planar, rng, at_least_deg=2 * FALSE_CLOSURE_DEG
         )
         source, target = graph.source.numpy()[chosen], graph.target.numpy()[chosen]
-        # One rotation of the world from the earlier to the later end, whichever way the edge runs.
+        # One rotation of the world from the earlier to the later end, whatever the direction of the edge.
         later_first = (source > target)[:, None]
         wrong = Rotation.from_rotvec(turn.as_rotvec()[run] * np.where(later_first, -1, 1))
         measured = world_from_body[target].inv() * wrong * world_from_body[source]
@@ -104,7 +104,7 @@ def insert_slips(
     Args:
         graph_file: the graph; odometry edges connect consecutive nodes.
         body_from_world: ``(N, 4)`` xyzw, a clean reference.
-        share: of all odometry edges; fewer slip where fewer qualify.
+        share: of all odometry edges; fewer slip if fewer qualify.
         rng: source of every random choice.
         rule: which edges qualify.
 

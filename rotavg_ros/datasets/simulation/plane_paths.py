@@ -20,7 +20,7 @@ def corridor(num_poses: int, rng: np.random.Generator, step_m: float, laps: floa
 
 
 def building(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> FloatArray:
-    """Laps of a rectangular corridor, with looks into rooms on both sides of it."""
+    """Laps of a rectangular corridor, with short visits to rooms on both sides of it."""
     # Rooms add about 60 % to the length of a lap.
     perimeter = num_poses * step_m / laps / 1.6
     width = perimeter / 2 * rng.uniform(0.5, 0.75)
@@ -46,7 +46,7 @@ def building(num_poses: int, rng: np.random.Generator, step_m: float, laps: floa
 
 
 def grid(num_poses: int, rng: np.random.Generator, step_m: float, laps: float) -> FloatArray:
-    """A random walk on a lattice, one pose a cell."""
+    """A random walk on a lattice, one pose per cell."""
     turns = rng.choice([-1, 0, 0, 0, 1], size=num_poses)
     heading = np.cumsum(turns) % 4
     moves = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[heading]
@@ -98,7 +98,7 @@ def direction(angle: FloatArray) -> FloatArray:
 
 
 def fold(distance: FloatArray, length: float) -> FloatArray:
-    """Reflect at both ends of [0, length]: forth and back."""
+    """Reflect at both ends of [0, length]: back and forth."""
     return np.asarray(length - np.abs(distance % (2 * length) - length))
 
 

@@ -29,7 +29,7 @@ _SURROUNDINGS = {
 
 @dataclass(frozen=True)
 class RobotRun:
-    """What such a run is like.
+    """Parameters of such a run.
 
     Attributes:
         world: ``building`` or ``city``.
@@ -54,7 +54,7 @@ class RobotRun:
     closure_noise_deg: float = 1.0
 
     def config(self) -> SlamSimulationConfig:
-        """The simulation of it; every pose is one odometry message.
+        """The configuration of its simulation; every pose is one odometry message.
 
         Raises:
             SlamSimulationError: a value that makes no sense; the message names it.

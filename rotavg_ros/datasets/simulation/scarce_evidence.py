@@ -1,4 +1,4 @@
-"""Runs of which little is known: a slip that few closures tell of, robots that closures alone join."""
+"""Runs with little evidence: a slip that few closures span, and robots joined only by closures."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun
 
 _WITNESSES = (2.0, 30.0)
 _SLIP_DEG = (5.0, 170.0)
-# Witnesses join so many pairs of places at most, or any.
+# Most pairs of places that witnesses join, unless they join any.
 _PLACES = 3
 _ROBOTS = (2, 6)
 
 
 def slip_with_few_witnesses(run: SimulatedRun, rng: np.random.Generator) -> SimulatedRun:
-    """A step is off by 5–170°; of good closures across at most 2 to 30 are left, and such a part of the false.
+    """A step is off by 5–170°; at most 2 to 30 good closures across it are left, and the same share of the false ones.
 
-    The good ones join one to three pairs of places (those nearest to as many of them), or are any. Nothing happens
-    where no good closure lies across. Dead reckoning stays as it was.
+    The good ones join one to three pairs of places (those nearest to as many of them), or are any. Nothing happens if
+    no good closure spans the step. Dead reckoning stays as it was.
 
     Args:
-        run: of which some closures are left out.
+        run: the run, some of whose closures are left out.
         rng: source of every random choice.
     """
     graph = run.graph
@@ -51,7 +51,7 @@ def slip_with_few_witnesses(run: SimulatedRun, rng: np.random.Generator) -> Simu
 
 
 def several_robots(run: SimulatedRun, rng: np.random.Generator) -> SimulatedRun:
-    """One long drive as that of two to six robots: odometry is left out where the next one takes over."""
+    """One long drive as if by two to six robots: odometry is left out where the next one takes over."""
     count, ends = int(rng.integers(_ROBOTS[0], _ROBOTS[1] + 1)), _ends(run)
     first = np.sort(rng.choice(np.arange(1, run.graph.num_nodes), count - 1, replace=False))
     robot = np.searchsorted(first, ends, side="right")
@@ -64,7 +64,7 @@ def _ends(run: SimulatedRun) -> np.ndarray:
 
 
 def _chosen(ends: np.ndarray, count: int, rng: np.random.Generator, closures: np.ndarray) -> np.ndarray:
-    """``(count,)`` of ``closures``, whose ends are ``(C, 2)``: nearest to one to three of them, or any."""
+    """``(count,)`` of ``closures`` with ends ``(C, 2)``: those nearest to one to three of them, or any."""
     places = int(rng.integers(1, _PLACES + 2))
     if places > _PLACES:
         return rng.permutation(closures)[:count]
@@ -76,7 +76,7 @@ def _chosen(ends: np.ndarray, count: int, rng: np.random.Generator, closures: np
 
 
 def _selected(run: SimulatedRun, edges: np.ndarray) -> SimulatedRun:
-    """With some of the edges."""
+    """The run with only some of the edges."""
     return replace(
         run,
         graph=run.graph.select_edges(torch.from_numpy(edges)),

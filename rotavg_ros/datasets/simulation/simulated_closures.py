@@ -15,7 +15,7 @@ from rotavg_ros.view_graph import FALSE_CLOSURE_DEG
 _NEAR_MISS_DEG = (10.0, 30.0)
 # Keyframes over which a front end sees much the same.
 _STRETCH = 20
-# How a closure is false.
+# Whether and how a closure is false.
 _GOOD, _RANDOM, _NEAR_MISS, _GROUPED = range(4)
 
 
@@ -36,13 +36,13 @@ def measure_closures(
     backward = rng.random(count) < config.backward_share
     source, target = np.where(backward, newer, older), np.where(backward, older, newer)
 
-    # What a false closure believes: the world was turned between its ends.
+    # A false closure measures as if the world had been turned between its ends.
     wrong = np.zeros((count, 4))
     wrong[:, 3] = 1
     is_random, is_near_miss, is_grouped = (false == how for how in (_RANDOM, _NEAR_MISS, _GROUPED))
     wrong[is_random] = random_rotations(int(is_random.sum()), planar, rng, at_least_deg=FALSE_CLOSURE_DEG).as_quat()
     wrong[is_near_miss] = random_turns(int(is_near_miss.sum()), _NEAR_MISS_DEG, planar, rng).as_quat()
-    # A group shares one world-frame rotation from the older to the newer end, whichever way the edge runs.
+    # A group shares one world-frame rotation from the older to the newer end, whatever the direction of the edge.
     num_groups = int(group.max(initial=-1)) + 1
     turn = random_rotations(num_groups, planar, rng, at_least_deg=2 * FALSE_CLOSURE_DEG).as_rotvec()
     direction = np.where(backward[is_grouped], -1, 1)[:, None]
@@ -110,7 +110,7 @@ def _places_seen_again(
 def _choose_false_closures(
     config: SlamSimulationConfig, count: int, rng: np.random.Generator
 ) -> tuple[IndexArray, IndexArray]:
-    """For every closure how it is false and, where grouped, its group (else -1).
+    """For every closure, whether and how it is false, and its group if it has one (else -1).
 
     Closures are an arrangement of blocks in random order: single ones, and groups of 4–12 that stay together.
     """

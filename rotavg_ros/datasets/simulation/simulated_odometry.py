@@ -1,4 +1,4 @@
-"""Simulated measurements of odometry, and what all simulated measurements share."""
+"""Simulated odometry, and what all simulated measurements share."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def dead_reckoning(
 def noise_levels(
     config: SlamSimulationConfig, root_mean_square_deg: float, count: int, rng: np.random.Generator
 ) -> FloatArray:
-    """Standard deviation per axis of every edge, radians; the mean square angle is as asked for."""
+    """Standard deviation per axis of every edge, radians, with the given root mean square angle."""
     axes = 1 if config.dimensions == 2 else 3
     spread = np.exp(config.noise_spread * rng.normal(size=count) - config.noise_spread**2)
     return np.asarray(np.radians(root_mean_square_deg) / np.sqrt(axes) * spread)

@@ -1,4 +1,4 @@
-"""What a simulated SLAM run is like: :class:`SlamSimulationConfig`, and the wide family that training draws from."""
+"""Parameters of a simulated SLAM run: :class:`SlamSimulationConfig`, and the wide family that training draws from."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rotavg_ros.errors import UserError
 
 
 class SlamSimulationError(UserError):
-    """A simulation was asked for that does not exist; the message names the field."""
+    """An impossible simulation was requested; the message names the field."""
 
 
 class Precisions(str, Enum):
@@ -45,7 +45,7 @@ class SlamSimulationConfig:
         closures_per_keyframe: loop closures over keyframes (fewer where too few places are seen again).
         closure_radius_m: a closure's ends are at most this far apart.
         min_closure_gap: and at least this many keyframes apart in time …
-        short_range_share: … but for this share, which connects keyframes 2–8 steps apart.
+        short_range_share: … except for this share, which connects keyframes 2–8 steps apart.
         closure_noise_deg: root mean square angle of a good closure's error.
         closure_common_share: share of that error's variance that closures between the same two stretches of the path
             have in common (the same view, the same bias), as in real front ends.
@@ -57,7 +57,7 @@ class SlamSimulationConfig:
         near_miss_share: … and of them off by 10–30° only; the rest is random.
         in_place_share: share of the false closures whose ends are truly near each other; the rest connects places
             that only look alike.
-        precisions: what is stated.
+        precisions: what the edges state.
         odometry_precision_factor, closure_precision_factor: stated over true precision, for ``Precisions.SCALED``.
     """
 

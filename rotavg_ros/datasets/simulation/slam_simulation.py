@@ -70,7 +70,7 @@ class SimulatedRun:
     planar: bool
 
     def to_graph_file(self) -> GraphFile:
-        """The run as a graph with ground truth, as files know it."""
+        """The run as a graph with ground truth, as stored in files."""
         return GraphFile(
             graph=self.graph,
             node_ids=np.arange(self.graph.num_nodes),

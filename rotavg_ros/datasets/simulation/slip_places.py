@@ -1,7 +1,7 @@
-"""Where along its odometry a robot may slip so that good loop closures can tell where it did.
+"""Where along its odometry a robot may slip so that good loop closures can locate the slip.
 
-Two places that the same closures span are one place to them: a slip at the one and a slip at the other agree with
-all of them, and differ in how the map lies in between. So where a slip can be told, the sets of closures differ.
+Closures cannot distinguish two places that they all span: a slip at either place agrees with all of them, and only the
+map in between differs. So a slip can be located only where the sets of spanning closures differ.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ class SlipRule:
     """Which steps of odometry qualify.
 
     Attributes:
-        max_stretch: steps between the neighbouring ends of good closures that contain it, at most.
-        min_across: good closures that span it, at least.
-        min_difference: good closures that span either it or another step, but not both, at least; for every other step
-            that lies more than ``max_stretch`` steps away. If one slip is moved to another such place, with whatever
-            turn, this many good closures at least contradict it. (Nothing is said of several slips moved at once.)
+        max_stretch: largest number of steps between the neighbouring ends of good closures that contain it.
+        min_across: least number of good closures that span it.
+        min_difference: least number of good closures that span either it or another step, but not both, for every other
+            step more than ``max_stretch`` steps away. If one slip is moved to another such place, with any turn, at
+            least this many good closures contradict it. (This does not cover several slips moved at once.)
     """
 
     max_stretch: int = 3
@@ -32,15 +32,15 @@ class SlipRule:
     min_difference: int = 0
 
 
-# Two good closures across, which may be the same that span other places.
+# Two good closures across, which may also span other places.
 CROSSED = SlipRule()
-# A slip is about as rare as two false closures. So two more contradict whoever overlooks this one, or moves it to
-# another place, even where another slip is already.
+# A slip is about as improbable as two false closures. So two closures more than that contradict an answer that overlooks
+# this slip or moves it to another place, even one that already has a slip.
 LOCATABLE = SlipRule(min_across=4, min_difference=4)
 
 
 def slip_places(first: IntArray, last: IntArray, num_nodes: int, rule: SlipRule) -> BoolArray:
-    """``(N,)`` bool: whether step k, from node k to node k + 1, qualifies; never the last, which leads nowhere.
+    """``(N,)`` bool: whether step k, from node k to node k + 1, qualifies; the last entry, without a step, is False.
 
     Args:
         first, last: ``(C,)`` ends of the good closures, ``first`` < ``last``.
@@ -67,7 +67,7 @@ def crossing_difference(first: IntArray, last: IntArray, num_nodes: int, step: i
         first, last: ``(C,)`` ends of the closures, ``first`` < ``last``.
     """
     spans = (first <= step) & (step < last)
-    # A closure that spans both counts off one that counts for spanning this one.
+    # A closure that spans both steps is subtracted from those that span this one.
     sign = np.where(spans, -1, 1)
     change = np.bincount(first, sign, num_nodes) - np.bincount(last, sign, num_nodes)
     return np.asarray(np.rint(spans.sum() + np.cumsum(change)[:-1]), dtype=np.int64)

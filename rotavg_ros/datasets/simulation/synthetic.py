@@ -18,20 +18,20 @@ from torch import Tensor
 
 from rotavg_ros.view_graph import ViewGraph
 
-# The paper calls an edge an outlier beyond this noise.
+# Noise beyond which the paper calls an edge an outlier.
 SFM_OUTLIER_ANGLE = np.radians(20.0)
-# rad², variance per component of the rotation vector of a rotation that may be any: (π²/3 + 2) / 3.
+# rad², variance per component of the rotation vector of a uniformly random rotation: (π²/3 + 2) / 3.
 _ANY_ROTATION = (np.pi**2 / 3 + 2) / 3
 # Beyond this many cameras a list of all pairs takes gigabytes.
 _MAX_NODES_TO_LIST_PAIRS = 4000
 
 
 class NoiseCovariance(NamedTuple):
-    """Covariances of the noise of M edges, of which there are K different ones.
+    """Covariances of the noise of M edges, K of them different.
 
     Attributes:
         of_kind: ``(K, 3, 3)`` rad², in the frames of the edges' sources.
-        kind: ``(M,)`` which of them is each edge's.
+        kind: ``(M,)`` index of each edge's covariance.
     """
 
     of_kind: Tensor
@@ -50,7 +50,7 @@ class SyntheticGraph:
         graph: the measurements.
         body_from_world: ``(N, 4)`` float64, true orientations.
         noise_angle: ``(M,)`` rad, angle between measured and true relative rotation.
-        noise: what whoever drew the graph knows of its edges' noise; None: unknown.
+        noise: true covariances of the edges' noise; None: unknown.
     """
 
     graph: ViewGraph
@@ -68,8 +68,8 @@ class EdgeNoise(NamedTuple):
     """Noise of the M edges of one graph.
 
     Attributes:
-        rotation: of every edge, outliers included, in its source's frame.
-        covariance: to first order; of undisturbed edges, then of disturbed ones.
+        rotation: noise of every edge, outliers included, in its source's frame.
+        covariance: to first order; kind 0 is undisturbed edges, kind 1 disturbed ones.
     """
 
     rotation: Rotation
@@ -88,8 +88,8 @@ class ReleasedRecipe:
         overlap_deg: pairs beyond this relative angle are not kept.
         noise_deg: standard deviation of the noise's angle, per graph, before division by √3.
         outlier_share: share of the edges disturbed further, by a wide normal rotation.
-        planar: turn and noise axes lie in a vertical plane; otherwise anywhere.
-        round_noise: noise axes are anywhere even then.
+        planar: turn and noise axes lie in a vertical plane; otherwise they have any direction.
+        round_noise: noise axes have any direction even if ``planar``.
     """
 
     cameras: tuple[int, int] = (400, 1000)
@@ -157,8 +157,8 @@ class PaperRecipe:
         pair_share: share of all pairs that are measured.
         noise_deg: standard deviation of the noise's angle, drawn once per graph.
         outlier_share: share of the edges replaced by random rotations.
-        planar: cameras are turned about the vertical alone, and noise axes lie in a vertical plane; otherwise both
-            are anywhere (the paper's table 3 says no more than "planar" or not).
+        planar: cameras are turned only about the vertical, and noise axes lie in a vertical plane; otherwise both are
+            arbitrary (the paper's table 3 only says "planar" or not).
     """
 
     cameras: tuple[int, int] = (250, 1000)
@@ -223,7 +223,7 @@ def _random_pairs(n: int, share: tuple[float, float], rng: np.random.Generator) 
 
 
 def _axes(count: int, in_vertical_plane: bool, rng: np.random.Generator) -> np.ndarray:
-    """Unit axes: ``[y, √(1 − y²), 0]`` with uniform y, or anywhere on the sphere."""
+    """Unit axes: ``[y, √(1 − y²), 0]`` with uniform y, or uniform on the sphere."""
     if in_vertical_plane:
         y = rng.uniform(-1, 1, count)
         return np.stack((y, np.sqrt(1 - y * y), np.zeros(count)), axis=1)
@@ -232,7 +232,7 @@ def _axes(count: int, in_vertical_plane: bool, rng: np.random.Generator) -> np.n
 
 
 def _covariance(usual: np.ndarray, disturbed: np.ndarray, which: np.ndarray, m: int) -> NoiseCovariance:
-    """Of ``m`` edges, of which ``which`` are disturbed."""
+    """Covariances of ``m`` edges, of which ``which`` are disturbed."""
     kind = torch.zeros(m, dtype=torch.uint8)
     kind[torch.from_numpy(which)] = 1
     return NoiseCovariance(torch.from_numpy(np.stack((usual, disturbed))), kind)

@@ -1,4 +1,4 @@
-"""Who sees whom, apart from any rotations: topologies of real view-graphs, and drawn ones of their kind."""
+"""Topologies of view-graphs without rotations: those of real graphs, and random ones of their kind."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rotavg_ros.datasets.simulation.synthetic import PaperRecipe, ReleasedRecipe
 
 @dataclass(frozen=True)
 class Topology:
-    """Which of N cameras are joined by M edges.
+    """The topology of N cameras joined by M edges.
 
     Attributes:
         num_nodes: N.
@@ -27,7 +27,7 @@ class Topology:
     target: np.ndarray
 
     def sample(self, recipe: ReleasedRecipe | PaperRecipe, rng: np.random.Generator) -> SyntheticGraph:
-        """Draw orientations and noise by ``recipe``; its own numbers of cameras and pairs play no part."""
+        """Draw orientations and noise by ``recipe``; its own numbers of cameras and pairs are ignored."""
         orientation = recipe.orientations(self.num_nodes, rng)
         return measured(orientation, self.source, self.target, recipe.noise(len(self.source), rng))
 
@@ -36,7 +36,7 @@ def read_topology(path: str | Path) -> Topology:
     """Read an npz archive with ``nodes`` (their number), ``source`` and ``target``. Self-edges are left out.
 
     Raises:
-        GraphFileError: naming what is at fault.
+        GraphFileError: the message names the fault.
     """
     path = Path(path)
     with reading(path):
@@ -93,7 +93,7 @@ class ClusteredTopology:
         wanted = int(rng.uniform(*self.pair_share) * len(first))
         kept = np.zeros(len(first), dtype=bool)
         kept[np.argpartition(distance, wanted)[:wanted]] = True
-        # The tree that joins what would fall apart.
+        # A tree that keeps the graph connected.
         tree = minimum_spanning_tree(coo_array((distance, (first, second)), shape=(num_nodes, num_nodes))).tocoo()
         low, high = np.minimum(tree.row, tree.col), np.maximum(tree.row, tree.col)
         kept |= np.isin(first * num_nodes + second, low.astype(np.int64) * num_nodes + high)

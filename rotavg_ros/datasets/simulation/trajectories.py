@@ -38,7 +38,7 @@ class Way:
     """How a robot moves through a world.
 
     Attributes:
-        world: where.
+        world: the world.
         num_poses: N.
         step_m: distance between consecutive poses.
         laps: about how often every place is visited.
@@ -105,7 +105,7 @@ _PATHS = {
 def _on_terrain(
     path: FloatArray, lane: FloatArray, smoothing: float, tilt_deg: float, rng: np.random.Generator
 ) -> Trajectory:
-    """Put a path on hills and let the robot look where it goes; ``smoothing`` in poses."""
+    """Put a path on hills and let the robot face its direction of travel; ``smoothing`` in poses."""
     headings = np.arctan2(*np.diff(path, axis=0, append=2 * path[-1:] - path[-2:-1]).T[::-1])
     if smoothing > 0:
         path = gaussian_filter1d(path, smoothing, axis=0, mode="nearest") + lane

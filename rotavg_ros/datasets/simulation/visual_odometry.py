@@ -1,4 +1,4 @@
-"""Pose graphs of a visual odometry with loop closures made from the ground truth, as of KITTI's sequences."""
+"""Pose graphs of a visual odometry with loop closures made from the ground truth, e.g. for KITTI's sequences."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError
 from rotavg_ros.datasets.files.kitti import read_poses
 from rotavg_ros.view_graph import EdgeKind
 
-# A place is seen again from less than this distance and angle, at least so many frames later, and noticed this often.
+# A place counts as seen again within this distance and angle and after this many frames; it is checked this often.
 _REVISIT_METRES = 5.0
 _REVISIT_ANGLE = np.radians(45.0)
 _REVISIT_FRAMES = 100
@@ -23,7 +23,7 @@ _FRAMES_PER_CLOSURE = 5
 def odometry_graph(
     predicted: str | Path, truth: str | Path, rng: np.random.Generator, closure_noise_deg: float = 1.0
 ) -> GraphFile:
-    """The steps of an odometry and true loop closures with noise, where the ground truth sees a place again.
+    """An odometry's steps, and true loop closures with noise where the ground truth revisits a place.
 
     Odometry states the precision that its steps have against the ground truth, closures that of their noise.
 
@@ -60,7 +60,7 @@ def odometry_graph(
 
 
 def _revisits(world_from_camera: Rotation, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """``(C,)`` earlier and later frames that see the same place; of several earlier ones the nearest."""
+    """``(C,)`` earlier and later frames that see the same place; the nearest of several earlier ones."""
     tree = cKDTree(position)
     pairs = []
     for later in range(0, len(position), _FRAMES_PER_CLOSURE):

@@ -1,1 +1,1 @@
-"""Pose graphs whose true poses and noise are known to the last digit, and closures that join wrong places."""
+"""Pose graphs whose true poses and noise are known exactly, and closures that join wrong places."""

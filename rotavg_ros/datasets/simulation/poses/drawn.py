@@ -41,7 +41,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Poses:
-    """Where N keyframes truly are.
+    """True poses of N keyframes.
 
     Attributes:
         body_from_world: ``(N, 4)`` xyzw.
@@ -71,9 +71,9 @@ class DrawnPoses:
 
     Attributes:
         graph: what a solver sees, with translations.
-        poses: true.
+        poses: the true poses.
         sigma: ``(M, 2)`` rad and metres, true standard deviation of the components of every edge's noise.
-        stated: ``(M, 2)`` likewise, what the edges state of themselves.
+        stated: ``(M, 2)`` likewise, the deviations that the edges state.
         is_wrong: ``(M,)`` bool, closures that were made false.
     """
 
@@ -89,7 +89,7 @@ class DrawnPoses:
         return np.asarray(~self.graph.is_odometry.numpy())
 
     def errors(self) -> tuple[FloatArray, FloatArray]:
-        """What edges measure, less the truth: rotation vectors in the target's frame, and metres; ``(M, 3)`` each."""
+        """Measurements minus truth: rotation vectors in the target's frame, and metres; ``(M, 3)`` each."""
         rotation, shift = self.poses.source_from_target(self.graph.source.numpy(), self.graph.target.numpy())
         assert self.graph.translation is not None
         turned = Rotation.from_quat(self.graph.target_from_source.numpy()) * rotation
@@ -112,7 +112,7 @@ def redrawn(
     """The edges of a graph, measured once more between given poses.
 
     Args:
-        topology: whose edges' ends, directions and kinds are kept.
+        topology: the graph whose edges' ends, directions and kinds are kept.
         stated: ``(M, 2)`` rad and metres; default: the true deviations.
     """
     sigma = noise.of(topology.is_odometry.numpy())
@@ -144,7 +144,7 @@ def in_order(drawn: DrawnPoses, edges: IndexArray) -> DrawnPoses:
 
 @dataclass(frozen=True)
 class Claims:
-    """What K false closures say.
+    """The measurements of K false closures.
 
     Attributes:
         source, target: ``(K,)`` ends.
@@ -158,7 +158,7 @@ class Claims:
     translation: FloatArray
 
     def reversed(self, which: BoolArray) -> Claims:
-        """The same, some of them from the target's side."""
+        """The same, with some of them reversed."""
         other_way = -self.target_from_source.apply(self.translation).reshape(-1, 3)
         rotation = self.target_from_source.as_quat()
         rotation[which] = self.target_from_source.inv().as_quat()[which]
@@ -171,7 +171,7 @@ class Claims:
 
 
 def with_closures(drawn: DrawnPoses, claims: Claims) -> DrawnPoses:
-    """More closures, all false, that state what the first good one does."""
+    """Add closures, all false, that state the same precision as the first good one."""
     count, graph = len(claims.source), drawn.graph
     first = int(np.flatnonzero(drawn.is_closure)[0])
     assert graph.translation is not None

@@ -1,7 +1,7 @@
 """Closures that join wrong places, on top of the good ones of a drawn graph.
 
-Each kind takes the drawn graph, how many to add and random numbers. A false closure is one in the front end's belief:
-the two keyframes look like one place, so that what it measures is short, and where they truly are is elsewhere.
+Each kind takes the drawn graph, the number to add and a random generator. The front end of a false closure believes that
+the two keyframes show one place, so the measured translation is short although they are truly elsewhere.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from rotavg_ros.datasets.simulation.poses.drawn import (
     with_closures,
 )
 
-# How far from the truth a parallel corridor is, metres, and how far its rotation errs, degrees.
+# Distance of a parallel corridor from the truth, metres, and the error of its rotation, degrees.
 WRONG_METRES = (5.0, 50.0)
 RIGHT_DEG = 5.0
-# Standard deviation per axis of where a place that looks alike is seen, metres.
+# Standard deviation per axis of the measured position of a place that looks alike, metres.
 _SEEN_METRES = 0.5
-# Of a common turn of a run, and beyond it of the noise, degrees: together below what counts as right.
+# Common turn of a run, and largest noise on top of it, degrees: together less than the limit for a right rotation.
 _COMMON_DEG, _MOST_NOISE_DEG = 2.0, 2.9
-# Shares of the smaller dimension of the map within which a symmetric counterpart is passed.
+# Distance within which a symmetric counterpart counts as passed, as a share of the map's smaller dimension.
 _PASSED_WITHIN = 0.1
 _TRIES = 400
 _TOO_SMALL = "hardly two keyframes are that far apart: too small a world for wrong places"
@@ -39,14 +39,14 @@ Add = Callable[[DrawnPoses, int, np.random.Generator], DrawnPoses]
 
 
 def with_share(drawn: DrawnPoses, share: float, add: Add, rng: np.random.Generator) -> DrawnPoses:
-    """As many false closures on top as make this share of all closures."""
+    """Add as many false closures as make this share of all closures."""
     good = int((drawn.is_closure & ~drawn.is_wrong).sum())
     count = round(share / (1 - share) * good)
     return add(drawn, count, rng) if count else drawn
 
 
 def random_places(drawn: DrawnPoses, count: int, rng: np.random.Generator) -> DrawnPoses:
-    """Random rotations between random keyframes that are at least five metres apart, each by itself."""
+    """Independent random rotations between random keyframes that are at least five metres apart."""
     poses = drawn.poses
     source, target = _random_pairs(poses, count, (WRONG_METRES[0], np.inf), rng)
     claims = Claims(source, target, random_rotations(count, poses.planar, rng), _seen(poses, count, rng))
@@ -54,7 +54,7 @@ def random_places(drawn: DrawnPoses, count: int, rng: np.random.Generator) -> Dr
 
 
 def parallel_corridors(drawn: DrawnPoses, count: int, rng: np.random.Generator) -> DrawnPoses:
-    """The rotation is right within 5°, the place wrong by 5–50 m, each by itself."""
+    """The rotation is right within 5°, the place is wrong by 5–50 m, independently for each."""
     poses = drawn.poses
     spare = 3 * count + 20
     source, target = _random_pairs(poses, spare, (WRONG_METRES[0] + 2.0, WRONG_METRES[1] - 2.0), rng)
@@ -68,10 +68,10 @@ def parallel_corridors(drawn: DrawnPoses, count: int, rng: np.random.Generator) 
 
 
 def parallel_corridors_in_runs(drawn: DrawnPoses, count: int, rng: np.random.Generator) -> DrawnPoses:
-    """The same in runs of 4–12 consecutive keyframes that agree on one wrong place, to the noise of good closures.
+    """The same in runs of 4–12 consecutive keyframes that agree on one wrong place, up to the noise of good closures.
 
-    A run joins two stretches that lie as parallel as those of 30 random pairs do; where a path is nowhere parallel to
-    itself, what its closures measure is as long as its stretches part.
+    A run joins the two most parallel stretches among 30 random pairs; where a path is nowhere parallel to itself, the
+    measured translations grow as the stretches diverge.
     """
     poses = drawn.poses
     sources, targets, shifts, turns = [], [], [], []
@@ -104,8 +104,8 @@ def parallel_corridors_in_runs(drawn: DrawnPoses, count: int, rng: np.random.Gen
 def symmetric_building(drawn: DrawnPoses, count: int, rng: np.random.Generator) -> DrawnPoses:
     """Turned by 90°, 180° or 270° about the vertical: half at the right place, half at the wrong one.
 
-    At the right place a room looks the same turned. The wrong place is where the building, turned about the middle of
-    its map, would have the keyframe.
+    At the right place, a room looks the same after a turn. The wrong place is where the keyframe would be if the
+    building were turned about the middle of its map.
     """
     poses = drawn.poses
     at_place = _turned_at_the_place(drawn, count // 2, rng)
@@ -135,7 +135,7 @@ def _turned_at_the_place(drawn: DrawnPoses, count: int, rng: np.random.Generator
 
 
 def _turned_about_the_middle(poses: Poses, count: int, rng: np.random.Generator) -> Claims:
-    """The target is believed to be where the building, turned about the map's middle, has it."""
+    """The target is believed to be where it would be if the building were turned about the map's middle."""
     low, high = poses.position.min(axis=0), poses.position.max(axis=0)
     middle, radius = (low + high) / 2, _PASSED_WITHIN * float((high - low)[:2].min())
     tree = KDTree(poses.position)
@@ -143,7 +143,7 @@ def _turned_about_the_middle(poses: Poses, count: int, rng: np.random.Generator)
     turn = Rotation.from_rotvec(np.radians(90.0) * rng.integers(1, 4, (len(target), 1)) * [0.0, 0.0, 1.0])
     believed = middle + turn.apply(poses.position[target] - middle)
     distance, source = tree.query(believed)
-    # Those that the path passes, the nearest where it passes too few.
+    # Those that the path passes; the nearest ones if it passes too few.
     is_wrong = np.linalg.norm(believed - poses.position[target], axis=1) > WRONG_METRES[0]
     order = np.argsort(np.where(is_wrong & (source != target), np.maximum(distance, radius), np.inf), kind="stable")
     chosen = order[:count]
@@ -165,7 +165,7 @@ def _parallel_stretches(poses: Poses, length: int, rng: np.random.Generator) -> 
         target = np.concatenate((ahead, ahead[:, ::-1]))
         gap = poses.position[target] - poses.position[source]
         parting = np.linalg.norm(gap - gap[:, :1], axis=2).max(axis=1)
-        # Whichever way it is passed, the first pair is as far apart as all should be.
+        # In either direction, the distance of the first pair is the one that all pairs should have.
         distance = np.linalg.norm(gap[:, 0], axis=1)
         parting[(distance < apart[0]) | (distance > apart[1])] = np.inf
         best = int(parting.argmin())
@@ -190,5 +190,5 @@ def _random_pairs(
 
 
 def _seen(poses: Poses, count: int, rng: np.random.Generator) -> FloatArray:
-    """Where places that look alike are seen, ``(count, 3)`` metres in the source's frame."""
+    """Measured positions of places that look alike, ``(count, 3)`` metres in the source's frame."""
     return np.asarray(rng.normal(size=(count, 3)) * _SEEN_METRES * [1, 1, not poses.planar])

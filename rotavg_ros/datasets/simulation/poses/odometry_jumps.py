@@ -1,4 +1,4 @@
-"""Odometry whose position jumps while its heading does not: wheels that spin, a tracker that was lost."""
+"""Odometry whose position jumps while its heading does not: spinning wheels, a tracker that lost track."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from scipy.sparse.csgraph import connected_components
 
 from rotavg_ros.datasets.simulation.poses.drawn import DrawnPoses, IndexArray
 
-# How far, in median steps of the odometry; and the share of the path at either end that no closure may judge.
+# Size of a jump in median steps of the odometry; and share of the path at either end where closures may be missing.
 STEPS = (3.0, 40.0)
 _ENDS = 0.1
 _TRIES = 400
 
 
 def with_jumps(drawn: DrawnPoses, count: int, rng: np.random.Generator) -> DrawnPoses:
-    """So many steps of odometry off by any direction's jump, each by itself; good closures hold all together without.
+    """Let ``count`` odometry steps jump, each in a random direction; without them, good closures still join the graph.
 
     Raises:
-        ValueError: fewer steps than jumps, or hardly any that closures hold together without.
+        ValueError: fewer steps than jumps, or too few steps without which closures still join the graph.
     """
     odometry = np.flatnonzero(drawn.graph.is_odometry.numpy())
     kept = int(_ENDS * len(odometry))

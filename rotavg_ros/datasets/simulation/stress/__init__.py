@@ -1,1 +1,1 @@
-"""Named kinds of robots' graphs that are hard in one known way each: what they are drawn from, and their list."""
+"""Named kinds of robots' graphs, each hard in one known way: how they are drawn, and their list."""

@@ -1,4 +1,4 @@
-"""How closures err, and what edges state of themselves, in ways that the wide family of simulated runs does not."""
+"""Errors of closures, and stated precisions of edges, that do not occur in the wide family of simulated runs."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _QUALITY_FACTOR = 4.0
 # Standard deviation of the logarithm of stated over true precision.
 _SPREAD = 1.5
 _LIE = 30.0
-# Of a place that another one looks like, metres.
+# Radius of a place that looks like another one, metres.
 _ALIKE_RADIUS_M = 3.0
 
 
 def near_misses_in_groups(share: float, drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
-    """A share of the closures, in runs of 4–12, believes in one turn of 10–30° a run."""
+    """A share of the closures, in runs of 4–12, is off by a turn of 10–30° that each run has in common."""
     closures = np.flatnonzero(drawn.is_closure)
     run = random_runs(len(closures), round(share * len(closures)), rng)
     turn = random_turns(int(run.max(initial=-1)) + 1, _NEAR_MISS_DEG, drawn.planar, rng)
@@ -43,7 +43,7 @@ def heavy_tailed(drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
 
 
 def few(good: int, false: int, drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
-    """So many good and false closures are left."""
+    """Only ``good`` good and ``false`` false closures are left."""
     keep = ~drawn.is_closure
     for closures, count in ((drawn.is_closure & ~drawn.is_wrong, good), (drawn.is_wrong, false)):
         keep[rng.permutation(np.flatnonzero(closures))[:count]] = True
@@ -51,14 +51,14 @@ def few(good: int, false: int, drawn: DrawnGraph, rng: np.random.Generator) -> D
 
 
 def repeated(share: float, times: int, drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
-    """A share of the edges is there so many times, the same measurement each time, which tells nothing new."""
+    """A share of the edges occurs ``times`` times with the same measurement, which adds no information."""
     count = np.where(rng.random(drawn.graph.num_edges) < share, times, 1)
     widened = replace(drawn, sigma=drawn.sigma * np.sqrt(count))
     return widened.selected(np.repeat(np.arange(drawn.graph.num_edges), count))
 
 
 def spread_precisions(drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
-    """Stated over true precision is lognormal, 1.5 in the logarithm."""
+    """The ratio of stated to true precision is lognormal, with a standard deviation of 1.5 in the logarithm."""
     return _stating_times(drawn, np.exp(_SPREAD * rng.normal(size=drawn.graph.num_edges)))
 
 
@@ -74,7 +74,7 @@ def odometry_without_precision(drawn: DrawnGraph, _: np.random.Generator) -> Dra
 
 
 def lying_precisions(drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
-    """A tenth of the good closures states 30 times too much; false ones 30 times too much or too little."""
+    """A tenth of the good closures states a precision 30 times too high; false ones 30 times too high or too low."""
     draw = rng.random(drawn.graph.num_edges)
     good = np.where(draw < 0.1, _LIE, 1.0)
     false = np.where(draw < 0.5, _LIE, 1 / _LIE)

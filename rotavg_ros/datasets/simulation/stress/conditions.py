@@ -13,7 +13,7 @@ from rotavg_ros.datasets.simulation.stress import closure_errors, odometry_error
 from rotavg_ros.datasets.simulation.stress.drawn import Change, DrawnGraph, simulated
 from rotavg_ros.datasets.worlds import World
 
-# Half a degree a step and one degree a closure, a fifth of the closures false and random, unless a condition says else.
+# Noise of half a degree a step and one degree a closure; a fifth of the closures is false and random. Conditions differ.
 _USUAL = SlamSimulationConfig(
     num_keyframes=500, closures_per_keyframe=0.4, odometry_noise_deg=0.5, closure_noise_deg=1.0, false_share=0.2
 )
@@ -28,13 +28,13 @@ SPATIAL = ("hills", "sphere")
 
 @dataclass(frozen=True)
 class Condition:
-    """What differs from the usual run.
+    """Differences from the usual run.
 
     Attributes:
         name: of the condition.
         config: fields of the simulation that differ.
-        change: what is done to the simulated run.
-        worlds: in which it is drawn.
+        change: a change to the simulated run.
+        worlds: the worlds in which it is drawn.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""A drawn pose graph of which everything is known: true poses, the label and the true noise of every edge."""
+"""A drawn pose graph with full ground truth: true poses, and the label and true noise of every edge."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rotavg_ros.view_graph import FALSE_CLOSURE_DEG, ViewGraph
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
-# An exact edge counts as this good, rad per component: weights stay finite.
+# Standard deviation assumed for an exact edge, rad per component, so that weights stay finite.
 _SMALLEST_SIGMA = np.radians(0.01)
 _STUDENT_FREEDOM = 3
 
@@ -37,8 +37,8 @@ class DrawnGraph:
         position: ``(N, 3)`` metres, true.
         edge_translation: ``(M, 3)`` measured position of the target in the source frame, metres.
         is_wrong: ``(M,)`` bool, edges that were made wrong: false closures, and odometry that slipped.
-        sigma: ``(M,)`` rad, true standard deviation of the rotation vector's components, about as root mean square
-            over the axes where they differ; of false closures and slips it is that of the noise on top.
+        sigma: ``(M,)`` rad, true standard deviation of the rotation vector's components (root mean square over the axes
+            where they differ); for false closures and slips, of the noise on top.
         planar: all rotations are yaw.
     """
 
@@ -67,7 +67,7 @@ class DrawnGraph:
 
     @property
     def is_intact(self) -> BoolArray:
-        """``(M,)`` bool: neither made wrong, though that may fit by chance, nor so noisy that it is called false."""
+        """``(M,)`` bool: neither made wrong (even if right by chance) nor so noisy that it counts as false."""
         return ~(self.is_wrong | self.is_false)
 
     @property
@@ -99,7 +99,7 @@ class DrawnGraph:
         return body_from_world[self.graph.target.numpy()] * body_from_world[self.graph.source.numpy()].inv()
 
     def to_graph_file(self) -> GraphFile:
-        """With ids and ground truth, as files know it."""
+        """The graph with ids and ground truth, as stored in files."""
         return GraphFile(
             graph=self.graph,
             node_ids=np.arange(self.graph.num_nodes),
@@ -110,22 +110,22 @@ class DrawnGraph:
         )
 
     def measuring(self, measured: Rotation) -> DrawnGraph:
-        """With M other measurements target_from_source."""
+        """The same graph with M other measurements target_from_source."""
         rotation = torch.from_numpy(measured.as_quat(canonical=True))
         return replace(self, graph=replace(self.graph, target_from_source=rotation))
 
     def stating(self, precision: FloatArray) -> DrawnGraph:
-        """With other stated precisions, ``(M,)`` rad⁻², NaN where unknown."""
+        """The same graph with other stated precisions, ``(M,)`` rad⁻², NaN where unknown."""
         return replace(self, graph=replace(self.graph, precision=torch.from_numpy(np.asarray(precision, dtype=float))))
 
     def with_noise(self, edges: BoolArray, vectors: FloatArray, sigma: FloatArray, stated: float) -> DrawnGraph:
-        """Noise on top of what some edges measure.
+        """Add noise to the measurements of some edges.
 
         Args:
             edges: ``(M,)`` bool, K of them.
             vectors: ``(K, 3)`` rotation vectors in the target's frame.
             sigma: ``(K,)`` rad, their true standard deviation per component.
-            stated: rad, the one that these edges state.
+            stated: rad, the standard deviation that these edges state.
         """
         noise = np.zeros((self.graph.num_edges, 3))
         noise[edges] = vectors
@@ -136,12 +136,12 @@ class DrawnGraph:
         return replace(self.measuring(Rotation.from_rotvec(noise) * self.measured), sigma=true).stating(precision)
 
     def gaussian(self, edges: BoolArray, sigma: FloatArray, rng: np.random.Generator, stated: float) -> DrawnGraph:
-        """Gaussian noise on top of what some edges measure; arguments as of :meth:`with_noise`."""
+        """Add Gaussian noise to the measurements of some edges; arguments as for :meth:`with_noise`."""
         vectors = rotation_vectors(self.planar, int(edges.sum()), rng) * np.asarray(sigma)[:, None]
         return self.with_noise(edges, vectors, sigma, stated)
 
     def student(self, edges: BoolArray, scale_deg: float, rng: np.random.Generator) -> DrawnGraph:
-        """Student's t of three degrees of freedom on top, one tail for all components; the scale is what they state.
+        """Add Student's t noise, three degrees of freedom, one tail factor for all components; edges state the scale.
 
         The true standard deviation is the distribution's.
         """
@@ -152,7 +152,7 @@ class DrawnGraph:
         return self.with_noise(edges, vectors, sigma, scale)
 
     def with_wrong_turns(self, edges: IntArray, turns: Rotation) -> DrawnGraph:
-        """Closures that believe that the world was turned between their ends; their noise stays.
+        """Let closures measure as if the world had been turned between their ends; their noise stays.
 
         Args:
             edges: ``(K,)`` indices.
@@ -187,8 +187,8 @@ def per_axis(degrees: float, planar: bool) -> float:
 
 
 def simulated(config: SlamSimulationConfig, rng: np.random.Generator) -> DrawnGraph:
-    """A simulated run. A bias of the odometry counts into its true noise as its mean square."""
-    # The same random numbers without noise on closures tell which of them are wrong.
+    """A simulated run. A bias of the odometry adds its mean square to the variance of its true noise."""
+    # The same random numbers without noise on closures show which of them are wrong.
     exact = simulate_slam_graph(replace(config, closure_noise_deg=0.0), deepcopy(rng))
     run = simulate_slam_graph(config, rng)
     planar = config.dimensions == 2

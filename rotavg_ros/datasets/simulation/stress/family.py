@@ -1,6 +1,6 @@
-"""A wide family of robots' runs whose odometry and closures err by more here than there: what FineNet is trained on.
+"""A wide family of robots' runs in which the noise of odometry and closures varies: the training data of FineNet.
 
-It has the conditions of the stress suite, but of drawn strength, together, and in more worlds.
+It has the conditions of the stress suite, but combined, with random strength, and in more worlds.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from rotavg_ros.datasets.worlds import World
 from rotavg_ros.errors import UserError
 
 _LEAST = 1e-12
-# Probabilities of all that is uneven, and that nothing is.
+# Fields with the probabilities of all causes of uneven noise, and of none.
 _CAUSES = ("even", "uneven", "level", "single", "turns", "speed", "qualities", "heavy", "common")
-# Ends of what may be asked for; of all that is not named, 0 and 1.
+# Bounds of the fields; 0 and 1 for all that are not named.
 _BOUNDS: dict[str, tuple[float, float]] = {
     "odometry_deg": (1e-3, 20.0),
     "closure_deg": (1e-2, 30.0),
@@ -37,25 +37,26 @@ _BOUNDS: dict[str, tuple[float, float]] = {
 
 
 class RobotFamilyError(UserError):
-    """A family of runs that cannot be drawn from; the message names the key and its range."""
+    """An invalid family of runs; the message names the key and its range."""
 
 
 @dataclass(frozen=True)
 class RobotFamily:
-    """From what runs are drawn; pairs are the ends of ranges.
+    """The distribution that runs are drawn from; pairs are the ends of ranges.
 
     Attributes:
-        worlds: names of worlds, each as likely.
-        planar_share: of the runs in worlds that may be flat; all rotations are yaw there.
+        worlds: names of worlds, all equally likely.
+        planar_share: share of planar runs in worlds that may be flat; all their rotations are yaw.
         odometry_deg: root mean square angle of a usual step's error, uniform in the logarithm.
-        closure_deg: the same of a usual closure's.
+        closure_deg: the same for a usual closure.
         closures_per_keyframe: uniform in the logarithm.
         false_share: of the closures.
         grouped_share: probability that those of a run are false in groups that agree.
-        even: probability that nothing of what follows is so, false closures and stated precisions apart; otherwise, …
-        uneven: probability that stretches of odometry err by more, …
-        uneven_factor: … so many times, …
-        uneven_steps: … for so many steps, with three to nine times as many between, …
+        even: probability that none of the following effects occurs, except false closures and stated precisions;
+            otherwise, …
+        uneven: probability that stretches of odometry have larger errors, …
+        uneven_factor: … by this factor, …
+        uneven_steps: … over this number of steps, with three to nine times as many between, …
         level: probability that odometry's noise changes slowly by a drawn level, …
         level_spread: … whose logarithm has this standard deviation.
         single: probability that single steps have levels of their own, of the same spread.
@@ -63,11 +64,11 @@ class RobotFamily:
         per_turn: … by this share of the angle.
         speed: probability that speed varies and odometry errs with it.
         qualities: probability that closures are of two qualities, …
-        quality_factor: … of which the worse errs so many times as much.
-        heavy: probability that closures have levels of their own, of odometry's spread.
-        common: probability that closures of a run err alike.
+        quality_factor: … with this ratio of their errors.
+        heavy: probability that closures have levels of their own, with the spread of odometry's.
+        common: probability that closures of a run have common errors.
         common_share: share of their variance that they then have in common.
-        stated: probability that closures state their own level, else all the same.
+        stated: probability that closures state their own level; otherwise all state the same.
     """
 
     worlds: tuple[str, ...] = tuple(world.value for world in World)
@@ -110,7 +111,7 @@ class RobotFamily:
 
     @classmethod
     def of(cls, content: Any) -> RobotFamily:
-        """From plain values, as a YAML file has them; what is not named is as usual.
+        """From plain values, as in a YAML file; missing keys get their defaults.
 
         Raises:
             RobotFamilyError: an unknown key, or a value of the wrong type or beyond its range.
@@ -135,7 +136,7 @@ class RobotFamily:
         return cls(**values)
 
     def drawn(self, keyframes: int, rng: np.random.Generator) -> DrawnGraph:
-        """One run of so many keyframes."""
+        """One run of ``keyframes`` keyframes."""
         if rng.random() < self.even:
             return RobotFamily.of({**asdict(self), **dict.fromkeys(_CAUSES, 0.0)}).drawn(keyframes, rng)
         closure_deg = _log_uniform(self.closure_deg, rng)
@@ -182,7 +183,7 @@ class RobotFamily:
         )
 
     def _with_speed(self, drawn: DrawnGraph, rng: np.random.Generator) -> tuple[DrawnGraph, FloatArray]:
-        """Odometry whose steps are longer here than there, if so, and by how much more they err then."""
+        """Odometry with steps of varying length, if drawn, and ``(M,)`` the resulting factors on its errors."""
         count = int((~drawn.is_closure).sum())
         if rng.random() >= self.speed:
             return drawn, np.ones(count)
@@ -193,7 +194,7 @@ class RobotFamily:
         return replace(drawn, graph=graph, edge_translation=translation), np.exp(rng.uniform(0.5, 1.5) * fast)
 
     def _levels(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """``(count,)`` by what each step errs more than a usual one, turns and speed apart."""
+        """``(count,)`` factors on the errors of the steps relative to a usual one, apart from turns and speed."""
         level = np.zeros(count)
         if rng.random() < self.uneven:
             steps = int(np.clip(_log_uniform(self.uneven_steps, rng), 2, max(2, count // 3)))
@@ -207,7 +208,7 @@ class RobotFamily:
         return np.exp(level)
 
     def _qualities(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """``(count,)`` by what each closure errs more than a usual one."""
+        """``(count,)`` factors on the errors of the closures relative to a usual one."""
         level = np.zeros(count)
         if rng.random() < self.qualities:
             share, stay = rng.uniform(0.15, 0.85), rng.choice([0.0, 0.0, 0.8, 0.95])
@@ -220,7 +221,7 @@ class RobotFamily:
 
 
 def _smooth(values: FloatArray, steps: float) -> FloatArray:
-    """White noise drawn smooth over so many steps, of standard deviation one again."""
+    """White noise smoothed over ``steps`` steps and scaled back to a standard deviation of one."""
     smooth = gaussian_filter1d(values, steps)
     return np.asarray((smooth - smooth.mean()) / max(float(smooth.std()), _LEAST))
 

@@ -16,9 +16,9 @@ from rotavg_ros.datasets.simulation.stress.conditions import CONDITIONS, WORLDS
 from rotavg_ros.datasets.simulation.stress.drawn import Change, DrawnGraph, per_axis, simulated
 from rotavg_ros.datasets.worlds import World
 
-# Keeps these random numbers apart from all others'.
+# Keeps these random numbers separate from all others.
 _STREAM = 0x57E55
-# Whoever tunes sees the first only; what is reported are the second.
+# Only the first seeds are used for tuning; the second are reported.
 TUNING_SEEDS = range(20)
 REPORTING_SEEDS = range(1000, 1020)
 
@@ -28,9 +28,9 @@ class StressKind:
     """A kind of graphs.
 
     Attributes:
-        world: or the family, before the colon of its name.
-        condition: after it.
-        draw: random numbers → graph.
+        world: the world or family, before the colon of its name.
+        condition: the condition, after the colon.
+        draw: function from a random generator to a graph.
     """
 
     world: str
@@ -42,7 +42,7 @@ class StressKind:
         return f"{self.world}: {self.condition}"
 
     def drawn(self, seed: int) -> DrawnGraph:
-        """The graph of a seed, the same at every call."""
+        """The graph of a seed, the same in every call."""
         return self.draw(np.random.default_rng((seed, _STREAM, zlib.crc32(self.name.encode()))))
 
 
@@ -86,12 +86,12 @@ _CLEAN_TRACK = SlamSimulationConfig(
     world=World.LAPS, num_keyframes=400, laps=4.0, odometry_noise_deg=0.2, closures_per_keyframe=0.3, false_share=0.0
 )
 _WITNESSES = (3, 5, 10, 20)
-# In the names of kinds whose slip is the same data as a false group.
+# Part of the names of kinds whose slip cannot be told from a false group.
 ONE_PAIR = "one pair of places"
 
 
 def _drive(all_noisy: bool, rng: np.random.Generator) -> DrawnGraph:
-    """False closures agree exactly, or to the noise of the good ones."""
+    """False closures agree exactly, or up to the noise of the good ones."""
     drawn = simulated(_DRIVE, rng)
     noisy = drawn.is_closure & (all_noisy | ~drawn.is_wrong)
     sigma = per_axis(_DRIVE_CLOSURE_DEG, drawn.planar)
@@ -100,7 +100,7 @@ def _drive(all_noisy: bool, rng: np.random.Generator) -> DrawnGraph:
 
 
 def _city(grouped: bool, exact: bool, rng: np.random.Generator) -> DrawnGraph:
-    """Closures state one degree, whether they err or not."""
+    """Closures state one degree, whether they have noise or not."""
     config = replace(_CITY, grouped_share=float(grouped), closure_noise_deg=0.0 if exact else 1.0)
     drawn = simulated(config, rng)
     stated = np.where(drawn.is_closure, np.radians(1.0) ** -2, drawn.graph.precision.numpy())
@@ -147,7 +147,7 @@ def _found_before() -> Iterator[StressKind]:
 
 
 def _lone_slips() -> Iterator[StressKind]:
-    """In the plane and on hills by turns."""
+    """Kinds with a single slip, alternately in the plane and on hills."""
     for number, witnesses in enumerate(_WITNESSES):
         spatial = replace(_CLEAN_TRACK, dimensions=3, terrain_tilt_deg=10.0, sway_deg=3.0)
         for from_one_pair in (True, False):

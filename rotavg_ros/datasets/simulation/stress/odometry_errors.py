@@ -1,4 +1,4 @@
-"""How odometry errs in ways that the wide family of simulated runs does not: each is put on exact odometry.
+"""Errors of odometry that do not occur in the wide family of simulated runs: each is added to exact odometry.
 
 Every front end here states one precision for all its steps, that of its usual step.
 """
@@ -17,14 +17,14 @@ _STEP_DEG = 0.2
 _PER_TURN = 0.05
 _UNEVEN_FACTOR = 10
 _UNEVEN_STEPS = 30
-# One stretch of uneven steps begins per so many.
+# Number of steps per stretch of uneven ones.
 _UNEVEN_EVERY = 200
 # Steps over which slowly changing noise keeps its level, and the standard deviation of its logarithm.
 _LEVEL_STEPS, _LEVEL_SPREAD = 150, 1.0
 
 
 def worse_in_turns(drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
-    """0.2° a step, and 5 % of the angle that the step turns by."""
+    """An error of 0.2° a step, and 5 % of the angle that the step turns by."""
     steps = ~drawn.is_closure
     turn_deg = np.degrees(drawn.true_target_from_source[np.flatnonzero(steps)].magnitude())
     usual = per_axis(_STEP_DEG, drawn.planar)
@@ -33,7 +33,7 @@ def worse_in_turns(drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
 
 
 def uneven(drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
-    """0.2° a step, ten times that for thirty steps in a row, once in about 200 steps."""
+    """An error of 0.2° a step, and ten times that for thirty steps in a row, once in about 200 steps."""
     steps = ~drawn.is_closure
     usual = per_axis(_STEP_DEG, drawn.planar)
     count = int(steps.sum())
@@ -49,7 +49,7 @@ def student(drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
 
 
 def yaw_alone(drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
-    """1° a step about the true vertical and nothing besides, as where gravity holds roll and pitch."""
+    """An error of 1° a step about the true vertical only, as where gravity fixes roll and pitch."""
     steps = ~drawn.is_closure
     up = Rotation.from_quat(drawn.body_from_world[drawn.graph.target.numpy()[steps]]).apply([0.0, 0.0, 1.0])
     vectors = up * np.radians(rng.normal(size=(len(up), 1)))
@@ -58,7 +58,7 @@ def yaw_alone(drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
 
 
 def changing_level(drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
-    """A tenth of a degree a step, whose level changes slowly by factors of about three either way."""
+    """An error of a tenth of a degree a step, whose level changes slowly by factors of about three either way."""
     steps = ~drawn.is_closure
     usual = per_axis(0.1, drawn.planar)
     level = gaussian_filter1d(rng.normal(size=int(steps.sum())), _LEVEL_STEPS)

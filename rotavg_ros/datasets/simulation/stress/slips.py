@@ -1,4 +1,4 @@
-"""Odometry that slips: small slips in streets, slips where closures can place them, and one with few witnesses."""
+"""Odometry that slips: small slips in streets, slips where closures can locate them, and one with few witnesses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rotavg_ros.view_graph import EdgeKind, ViewGraph
 _SMALL_DEG = (3.0, 13.0)
 _LONE_DEG = (15.0, 170.0)
 _LOCATABLE_SHARE = 0.01
-# Steps between the slip and the nearest ends of the closures that bracket it, at most.
+# Most steps between the slip and the nearest ends of the closures that bracket it.
 BRACKET = 3
 # Steps over which the ends of closures count as one place.
 PLACE = 20
@@ -26,7 +26,7 @@ _SEEN_AGAIN_M = 1.0
 
 
 class NoWitnesses(Exception):  # noqa: N818 - not an error: the next step is tried
-    """No closures as they are asked for span a step."""
+    """No closures of the requested kind span a step."""
 
 
 def small_slips(share: float, drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
@@ -37,18 +37,18 @@ def small_slips(share: float, drawn: DrawnGraph, rng: np.random.Generator) -> Dr
 
 
 def locatable_slips(drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
-    """One step of a hundred is off by 20–60° where good closures can tell which."""
+    """One step in a hundred is off by 20–60°, where good closures can tell which."""
     spoiled = insert_slips(drawn.to_graph_file(), drawn.body_from_world, _LOCATABLE_SHARE, rng, rule=LOCATABLE)
     return replace(drawn, graph=spoiled.graph_file.graph, is_wrong=drawn.is_wrong | spoiled.spoiled)
 
 
 def lone_slip(witnesses: int, from_one_pair: bool, drawn: DrawnGraph, rng: np.random.Generator) -> DrawnGraph:
-    """One step is off by 15–170°; of the closures across it only so many are left, all good.
+    """One step is off by 15–170°; only ``witnesses`` closures across it are left, all good.
 
     Args:
-        witnesses: closures across.
-        from_one_pair: they join one pair of places; else at least three pairs, whose ends lie within three steps of the
-            slip on either side.
+        witnesses: number of closures across.
+        from_one_pair: whether they join one pair of places; otherwise at least three pairs, whose ends lie within three
+            steps of the slip on either side.
         drawn: without false closures.
     """
     num_nodes = drawn.graph.num_nodes
@@ -75,7 +75,7 @@ def lone_slip(witnesses: int, from_one_pair: bool, drawn: DrawnGraph, rng: np.ra
 
 
 def _one_pair(across: np.ndarray, step: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """``(count, 2)`` of the pairs, whose ends lie in two stretches of a place's length."""
+    """``(count, 2)`` of the pairs, with ends in two stretches of a place's length."""
     for seed in rng.permutation(len(across))[:50]:
         offset = across - across[seed]
         near = across[((offset >= 0) & (offset < PLACE)).all(axis=1)]
@@ -85,7 +85,7 @@ def _one_pair(across: np.ndarray, step: int, count: int, rng: np.random.Generato
 
 
 def _several_pairs(across: np.ndarray, step: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """``(count, 2)`` of the pairs, three pairs of places: ends at the step, begins there, away from it."""
+    """``(count, 2)`` of the pairs, at three pairs of places: ending at the step, beginning there, away from it."""
     before, after = step - across[:, 0], across[:, 1] - step - 1
     beside = (before < BRACKET) & (after >= PLACE), (after < BRACKET) & (before >= PLACE)
     away = (before >= 2 * PLACE) & (after >= 2 * PLACE)
@@ -95,7 +95,7 @@ def _several_pairs(across: np.ndarray, step: int, count: int, rng: np.random.Gen
         found = across[group]
         if len(found) == 0:
             raise NoWitnesses
-        # Those of one place: near a random one of them.
+        # Pairs of one place: those near a random one.
         centre = found[rng.integers(len(found))]
         near = found[(np.abs(found - centre) < PLACE / 2).all(axis=1)]
         if len(near) < size:
@@ -105,11 +105,11 @@ def _several_pairs(across: np.ndarray, step: int, count: int, rng: np.random.Gen
 
 
 def _with_closures(drawn: DrawnGraph, older: IntArray, newer: IntArray, sigma: float) -> DrawnGraph:
-    """Exact closures besides, from older to newer keyframes, in the order in which a robot would report them.
+    """Add exact closures from older to newer keyframes, in the order in which a robot would report them.
 
     Args:
         older, newer: ``(K,)`` keyframes, ``older`` < ``newer``.
-        sigma: rad per component, as they state.
+        sigma: rad per component, the standard deviation that they state.
     """
     body_from_world = Rotation.from_quat(drawn.body_from_world)
     true = (body_from_world[newer] * body_from_world[older].inv()).as_quat()
