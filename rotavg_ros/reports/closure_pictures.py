@@ -11,7 +11,7 @@ from rotavg_ros.reports.theme import WIDTH, Theme
 
 
 def scores(facts: RunFacts, theme: Theme) -> Figure | None:
-    """How many loop closures have which score."""
+    """Histogram of the loop closures' scores."""
     if len(facts.closures) == 0:
         return None
     answer = facts.record.answer
@@ -26,7 +26,7 @@ def scores(facts: RunFacts, theme: Theme) -> Figure | None:
 
 
 def matches(facts: RunFacts, theme: Theme) -> Figure | None:
-    """Every loop closure as a dot: the later of its two moments across, the earlier upwards."""
+    """Every loop closure as a dot: x is the later of its two moments, y the earlier."""
     answer = facts.record.answer
     ends = np.stack([answer.stamp_ns[nodes[facts.closures]] for nodes in (answer.source, answer.target)])
     timed = (ends >= 0).all(axis=0)

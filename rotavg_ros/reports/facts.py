@@ -1,4 +1,4 @@
-"""What a report says about a run, computed once from its record."""
+"""The facts that a report states about a run, computed once from its record."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class Closure:
     """A loop closure as the report's table names it.
 
     Attributes:
-        edge_id: the sender's; None if it gave none.
+        edge_id: the sender's id; None if it gave none.
         source, target: robot, keyframe id and stamp of its ends.
         score: probability that it is false.
         outlier: the verdict.
-        fails: what is held false of it, "rotation" or "place"; empty if it is believed.
-        off_deg, off_m: what the answer leaves of its rotation and translation; NaN where unknown.
+        fails: the part that is judged false, "rotation" or "place"; empty if it is believed.
+        off_deg, off_m: residuals of its rotation and translation in the answer; NaN where unknown.
     """
 
     edge_id: int | None
@@ -81,11 +81,11 @@ class RunFacts:
         return Clock.for_duration(max(float(last_s), self.record.duration_s))
 
     def seconds(self, stamp_ns: NDArray[np.int64] | np.int64) -> FloatArray:
-        """Since the start; exact to a nanosecond before the division."""
+        """Seconds since the start; exact to a nanosecond before the division."""
         return np.asarray((stamp_ns - self.start_ns) / 1e9)
 
     def time(self, stamp_ns: NDArray[np.int64]) -> FloatArray:
-        """Since the start in the clock's unit."""
+        """Time since the start in the clock's unit."""
         return np.asarray(self.clock(self.seconds(stamp_ns)), dtype=np.float64)
 
     @cached_property
@@ -108,12 +108,12 @@ class RunFacts:
 
     @cached_property
     def off_m(self) -> FloatArray:
-        """``(M,)`` metres, what the answer leaves of edges' translations; NaN where unknown."""
+        """``(M,)`` metres, residuals of the edges' translations in the answer; NaN where unknown."""
         off = self.record.answer.residual_m
         return np.full(len(self.record.answer.source), np.nan) if off is None else off
 
     def most_suspicious(self) -> list[Closure]:
-        """The loop closures with the highest scores first; equal ones by how far they are off, then by arrival."""
+        """Loop closures by descending score; equal ones by residual, then by arrival."""
         answer = self.record.answer
         score = np.round(answer.outlier_score[self.closures], _DECIMALS)
         off_deg, off_m = answer.residual_deg[self.closures], np.nan_to_num(self.off_m[self.closures])
@@ -121,13 +121,13 @@ class RunFacts:
         return self._described(self.closures[np.lexsort((-off, -score))])
 
     def believed_but_long(self) -> list[Closure]:
-        """Those that are believed though they are off by more than a false one's translation is, the farthest first."""
+        """Believed closures whose residual exceeds the limit for a false translation, the largest first."""
         off = self.off_m[self.closures]
         long = np.flatnonzero(~self.record.answer.outlier[self.closures] & (np.nan_to_num(off) > FALSE_CLOSURE_M))
         return self._described(self.closures[long[np.argsort(-off[long], kind="stable")]])
 
     def closest_calls(self, limit: int) -> list[Closure]:
-        """The loop closures of which the solver was least sure, the nearest to even first."""
+        """The loop closures with the least certain scores, those nearest to 0.5 first."""
         doubt = np.abs(self.record.answer.outlier_score[self.closures] - 0.5)
         order = np.argsort(doubt, kind="stable")
         return self._described(self.closures[order[doubt[order] < _SURE]][:limit])
@@ -162,12 +162,12 @@ class RunFacts:
 
     @cached_property
     def correction(self) -> tuple[FloatArray, ...]:
-        """Per robot ``(n,)`` radians: how far its first keyframe's frame is turned from odometry to the answer."""
+        """Per robot ``(n,)`` radians: angle from odometry to the answer, both aligned at the first keyframe."""
         return tuple(_turned(robot.odometry_world_from_body, robot.world_from_body) for robot in self.record.robots)
 
 
 def _turned(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Angle of each orientation between two trajectories that are laid together at the first known one."""
+    """Angle between two trajectories' orientations after alignment at the first known one."""
     angle = np.full(len(after), np.nan)
     known = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
     if known.any():

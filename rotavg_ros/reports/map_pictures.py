@@ -23,7 +23,7 @@ _BEFORE: dict[str, Any] = {"linewidth": 1.1, "zorder": 2}
 _AFTER: dict[str, Any] = {"linewidth": 1.7, "zorder": 3}
 _REFERENCE: dict[str, Any] = {"linewidth": 1.0, "linestyle": DASHED, "zorder": 4}
 _NAMES_PER_ROW = 4
-# Lines of closures thin out as they become many.
+# Lines of closures become thinner if there are more than this.
 _FEW_CLOSURES = 200
 
 
@@ -57,7 +57,7 @@ def trajectory(facts: RunFacts, theme: Theme) -> Figure | None:
 
 
 def _lines(robots: Sequence[Tracks], theme: Theme) -> Iterator[Line]:
-    """Times, positions and their look: colours tell before from after or, where there are several, the robots."""
+    """Times, positions and line styles: colours distinguish before and after or, if there are several, the robots."""
     several = len(robots) > 1
     for number, robot in enumerate(robots):
         own = theme.robots[number % len(theme.robots)]
@@ -99,7 +99,7 @@ def graph(facts: RunFacts, theme: Theme) -> Figure | None:
     lines = np.stack(view(position.reshape(-1, 3)), axis=1)[ends[placed]]
     for robot in facts.record.robots:
         track(axes, view, position[robot.nodes], color=theme.muted, linewidth=0.9, zorder=2)
-    # False closures cross the whole map; what is believed lies on top of them.
+    # False closures cross the whole map; believed ones are drawn on top of them.
     for chosen, width, opacity, order in ((is_outlier, 0.8, 0.55, 1), (~is_outlier, 1.8, 0.95, 3)):
         many = max(float(np.sqrt(chosen.sum() / _FEW_CLOSURES)), 1.0)
         colours = theme.scores(score[chosen])

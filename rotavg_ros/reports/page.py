@@ -1,4 +1,4 @@
-"""What the page says and in which order, as plain data; the template only lays it out."""
+"""The content of the page in its order, as plain data; the template only does the layout."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from rotavg_ros.reports.tracks import tracks_of
 from rotavg_ros.view_graph import FALSE_CLOSURE_M
 from rotavg_ros.wording import counted
 
-MOST_CLOSURES = 40  # in the table that is open; edges.csv has all
+MOST_CLOSURES = 40  # in the table that is not folded; edges.csv has all
 _NEARLY_ALL = 0.9
 
 
 @dataclass(frozen=True)
 class Tile:
-    """A number that matters, and what it is."""
+    """An important number, and its meaning."""
 
     value: str
     label: str
@@ -42,7 +42,7 @@ class Section:
     Attributes:
         anchor: its name within the page.
         text: paragraphs.
-        pictures: names of those it shows, where there was something to draw.
+        pictures: names of the pictures it shows, if there was something to draw.
     """
 
     anchor: str
@@ -54,7 +54,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """Everything on the page but the pictures. Notes are what a reader must know before believing the rest."""
+    """Everything on the page except the pictures. Notes are what a reader must know before trusting the rest."""
 
     name: str
     lead: str
@@ -136,7 +136,7 @@ def _tiles(facts: RunFacts) -> list[Tile]:
 
 
 def _where_known(facts: RunFacts) -> str:
-    """At how many keyframes there is a reference, unless it is at nearly all."""
+    """Words on the number of keyframes with a reference; empty if nearly all have one."""
     known = sum(int(np.isfinite(errors.corrected.angle).sum()) for _, errors in facts.compared)
     total = sum(len(robot.stamp_ns) for robot, _ in facts.compared)
     return "" if known > _NEARLY_ALL * total else f" at {known} of {total} keyframes"
@@ -262,7 +262,7 @@ def _inputs(facts: RunFacts) -> Section:
 
 
 def _mean(values: Sequence[NDArray[np.float64]]) -> float:
-    """Of all that is known."""
+    """Mean of all known values."""
     every = np.concatenate(values)
     known = every[np.isfinite(every)]
     return float(known.mean()) if len(known) else float("nan")

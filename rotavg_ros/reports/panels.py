@@ -1,4 +1,4 @@
-"""Panels that pictures are put together from; each draws plain arrays on axes."""
+"""Panels that pictures are composed of; each draws plain arrays on axes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DASHED = (0, (4, 3))
 _AXIS_NAMES = "xyz"
 _COUNT_TICKS = [0, 2, 5, *(digit * 10**power for power in range(1, 9) for digit in (1, 2, 5))]
 _FEW_POINTS = 12
-_FLAT = 0.02  # a run is flat if it is at most this high for its width
+_FLAT = 0.02  # a run is flat if its ratio of height to width is at most this
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Clock:
     """Times of a run in the unit that suits its length.
 
     Attributes:
-        unit: for the name of an axis.
-        seconds: one such unit.
+        unit: name of the unit, for an axis.
+        seconds: length of the unit.
     """
 
     unit: str
@@ -56,7 +56,7 @@ class View:
     Attributes:
         across, up: indices of the axes.
         hidden: index of the third.
-        is_flat: nothing is lost by leaving the third out.
+        is_flat: whether the third axis can be left out without loss.
     """
 
     across: int
@@ -70,7 +70,7 @@ class View:
         points = np.concatenate([np.reshape(position, (-1, 3)) for position in positions] or [np.empty((0, 3))])
         points = points[np.isfinite(points).all(axis=1)]
         extent = np.ptp(points, axis=0) if len(points) else np.array([1.0, 1.0, 0.0])
-        # Equal extents, as of a run that stands still, leave the vertical out.
+        # For equal extents, as when the robot stands still, the vertical is left out.
         hidden = 2 - int(np.argmin(extent[::-1]))
         across, up = (axis for axis in range(3) if axis != hidden)
         return cls(across, up, hidden, bool(extent[hidden] <= _FLAT * extent.max()))
@@ -83,7 +83,7 @@ class View:
 
 
 def track(axes: Axes, view: View, position: FloatArray, **line: Any) -> None:
-    """A trajectory; gaps where positions are unknown. A few positions are dots, for lines between them say little."""
+    """A trajectory with gaps where positions are unknown. If there are few positions, they are drawn as dots."""
     x, y = view(position)
     known = np.isfinite(x) & np.isfinite(y)
     if known.any():
@@ -102,7 +102,7 @@ def segments(axes: Axes, ends: FloatArray, **lines: Any) -> LineCollection:
 
 
 def square_map(axes: Axes) -> None:
-    """Metres are as long to the side as upwards."""
+    """Use the same scale on both axes."""
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.06)
     for axis in (axes.xaxis, axes.yaxis):
@@ -120,8 +120,8 @@ def over_time(
     """Curves over times in any order; unknown values are left out.
 
     Args:
-        unit: goes behind the numbers on the axis.
-        from_zero: the axis begins at zero, and the ground below a curve is tinted.
+        unit: appended to the numbers on the axis.
+        from_zero: whether the axis begins at zero and the area below a curve is tinted.
     """
     order = np.argsort(time, kind="stable")
     for name, (values, colour) in curves.items():
@@ -137,7 +137,7 @@ def over_time(
 
 
 def score_histogram(axes: Axes, groups: Sequence[tuple[str, FloatArray, str]]) -> None:
-    """Scores from 0 to 1 in stacked groups of name, values and colour; few and many are both seen."""
+    """Scores from 0 to 1 in stacked groups of name, values and colour; small and large counts are both visible."""
     groups = [group for group in groups if len(group[1])]
     if groups:
         names, scores, colours = zip(*groups, strict=True)
@@ -159,7 +159,7 @@ def score_histogram(axes: Axes, groups: Sequence[tuple[str, FloatArray, str]]) -
 
 
 def score_bar(axes: Axes, theme: Theme, label: str = "outlier score") -> None:
-    """The colours of scores beside a panel."""
+    """A colour bar of scores beside a panel."""
     bar = axes.figure.colorbar(ScalarMappable(Normalize(0, 1), theme.scores), ax=axes, shrink=0.75, pad=0.02)
     bar.set_label(label, fontsize=9, color=theme.muted)
     bar.ax.tick_params(colors=theme.muted, labelsize=9, length=0)

@@ -1,4 +1,4 @@
-"""Writes a run's report: report.html, which needs nothing beside it, and its pictures as PNG files."""
+"""Writes a run's report: a self-contained report.html, and its pictures as PNG files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ReportError(UserError):
 
 
 class Picture(NamedTuple):
-    """A picture of the report; ``draw`` gives None where there is nothing to draw."""
+    """A picture of the report; ``draw`` returns None if there is nothing to draw."""
 
     name: str
     draw: Callable[[RunFacts, Theme], Figure | None]
@@ -108,9 +108,9 @@ class _Drawn:
 
 
 def write_report(record: RunRecord, folder: Path) -> Path:
-    """Write ``report.html`` and a PNG for every picture there is something to draw for.
+    """Write ``report.html`` and a PNG for every picture that has something to draw.
 
-    Files are complete or not there: each is written beside its place and then moved.
+    Files are either complete or missing: each is written beside its place and then moved.
 
     Args:
         record: the run.

@@ -42,7 +42,7 @@ WHY_REFUSED = {
 
 
 class Column(NamedTuple):
-    """A column's name and how its cells look: ``number``, ``code`` or plain."""
+    """A column's name and the style of its cells: ``number``, ``code`` or plain."""
 
     name: str
     kind: str = ""
@@ -61,7 +61,7 @@ class Table:
     """A table.
 
     Attributes:
-        folded: shown only when asked for, under this line.
+        folded: heading of the fold that hides the table; empty: not folded.
     """
 
     columns: Sequence[Column]
@@ -70,7 +70,7 @@ class Table:
 
 
 def closure_table(closures: Sequence[Closure], facts: RunFacts, folded: str = "") -> Table:
-    """Loop closures with what the answer leaves of them and with both their ends: who, which keyframe, when."""
+    """Loop closures with their residuals and both their ends: robot, keyframe and time."""
     in_metres = [Column("off by, m", "number")] if facts.knows_places else []
     columns = [
         Column("verdict"),
@@ -151,7 +151,7 @@ def _summary(values: NDArray[np.float64]) -> tuple[float, float, float, float]:
 
 
 def rejection_table(rejected: dict[str, int]) -> Table:
-    """What was refused, by reason, most first."""
+    """Refused inputs by reason, the most frequent first."""
     why = {reason.value: text for reason, text in WHY_REFUSED.items()}
     rows = [
         Row((reason, str(count), why.get(reason, "")))
@@ -178,7 +178,7 @@ def topic_table(topics: Sequence[TopicUse]) -> Table:
 
 
 def stage_table(facts: RunFacts) -> Table:
-    """How long the stages of the last solve took."""
+    """Durations of the last solve's stages."""
     answer = facts.record.answer
     rows = [Row((stage, f"{1000 * seconds:.1f}")) for stage, seconds in answer.stage_seconds.items()]
     return Table([Column("stage of the last solve"), Column("milliseconds", "number")], rows, "The last solve's stages")

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-WIDTH = 5.6  # inches of every picture: its text can be read on a phone as well
+WIDTH = 5.6  # inches, for every picture: the text is readable on a phone as well
 _PIXELS_PER_INCH = 170
 _LONGEST_LABEL = 20
 _TITLE_PAD, _LEGEND_ROW = 8, 15  # points
@@ -16,7 +16,7 @@ _TITLE_PAD, _LEGEND_ROW = 8, 15  # points
 
 @dataclass(frozen=True)
 class Theme:
-    """Colours by what they stand for.
+    """Colours by meaning.
 
     Attributes:
         name: ``light`` or ``dark``.
@@ -24,8 +24,8 @@ class Theme:
         odometry, corrected, reference: trajectories and errors before and after.
         kept, flagged: loop closures that are believed and those that are not.
         missed, wrongly_flagged: verdicts that the truth contradicts.
-        between: of a closure whose score is 0.5.
-        robots: one colour each, over and over.
+        between: closures with a score of 0.5.
+        robots: one colour each, repeated cyclically.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Theme:
 
     @property
     def scores(self) -> Colormap:
-        """From a score of 0 (believed) to 1 (false)."""
+        """Colours from a score of 0 (believed) to 1 (false)."""
         return LinearSegmentedColormap.from_list("scores", [self.kept, self.between, self.flagged])
 
     def figure(self, width: float, height: float) -> Figure:
@@ -56,7 +56,7 @@ class Theme:
         """Give a panel its look, its title and the names of its axes.
 
         Args:
-            legend_rows: of the legend above the panel, under its title; 0 for none.
+            legend_rows: number of rows of the legend between title and panel; 0 for none.
         """
         style(axes, title, ink=self.ink, muted=self.muted, grid=self.grid)
         pad = _TITLE_PAD + _LEGEND_ROW * legend_rows
@@ -80,7 +80,7 @@ class Theme:
 
 
 def style(axes: Axes, title: str, *, ink: str, muted: str, grid: str) -> None:
-    """What all pictures look like, whatever their colours."""
+    """The common style of all pictures, whatever their colours."""
     axes.set_title(title, loc="left", fontsize=11, color=ink, pad=8)
     axes.grid(color=grid, linewidth=0.7)
     axes.set_axisbelow(True)
@@ -90,7 +90,7 @@ def style(axes: Axes, title: str, *, ink: str, muted: str, grid: str) -> None:
 
 
 def plain(name: str) -> str:
-    """A name from outside as a label that matplotlib draws as it stands: short, neither mathematics nor private."""
+    """A name from outside as a short label that matplotlib draws literally: neither mathematics nor hidden."""
     printable = "".join(letter if letter.isprintable() else "?" for letter in name)
     if len(printable) > _LONGEST_LABEL:
         printable = printable[: _LONGEST_LABEL - 1] + "…"

@@ -16,12 +16,12 @@ from rotavg_ros.reports.theme import WIDTH, Theme, plain
 
 FloatArray = NDArray[np.float64]
 
-_MOST_ROBOTS = 6  # that get a panel of their own
+_MOST_ROBOTS = 6  # with a panel of their own
 _LEAVES_THE_PLANE = np.radians(0.5)
 
 
 def orientation(facts: RunFacts, theme: Theme) -> Figure | None:
-    """Error of the orientations; without a reference, how far the answer turned the odometry."""
+    """Error of the orientations; without a reference, the rotation from odometry to the answer."""
     compared = list(facts.compared)[:_MOST_ROBOTS]
     if not compared:
         return _correction(facts, theme)
@@ -47,7 +47,7 @@ def orientation(facts: RunFacts, theme: Theme) -> Figure | None:
 
 
 def _leaves_the_plane(facts: RunFacts) -> bool:
-    """Whether the orientation error is more than the heading error."""
+    """Whether the orientation error exceeds the heading error noticeably."""
     angle, heading = (getattr(errors.odometry, name) for _, errors in facts.compared for name in ("angle", "heading"))
     return bool(np.nanmax(np.abs(angle - np.abs(heading)), initial=0.0) > _LEAVES_THE_PLANE)
 
@@ -97,7 +97,7 @@ def uncertainty(facts: RunFacts, theme: Theme) -> Figure | None:
 
 
 def ticks(facts: RunFacts, theme: Theme) -> Figure | None:
-    """How long every tick took, and how the graph grew."""
+    """Duration of every tick, and growth of the graph."""
     ticks = facts.record.ticks
     if not ticks:
         return None
@@ -158,7 +158,7 @@ def _one_line_per_robot(
 
 
 def _column(facts: RunFacts, theme: Theme, count: int) -> tuple[Figure, list[Axes]]:
-    """Panels one above the other, the last of which names the time axis."""
+    """Panels one above the other; the last one labels the time axis."""
     figure = theme.figure(WIDTH, 1.0 + 2.3 * count)
     panels = list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
     panels[-1].set_xlabel(facts.clock.unit)

@@ -1,4 +1,4 @@
-"""A robot's positions before and after, laid together so that they can be drawn on one map."""
+"""A robot's positions before and after, aligned so that they can be drawn on one map."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Tracks:
 
 
 def tracks_of(facts: RunFacts) -> list[Tracks]:
-    """Of every robot that has positions."""
+    """The tracks of all robots that have positions."""
     return [
         _lay_together(robot, comparison, corrected, facts.time(robot.stamp_ns))
         for robot, comparison in zip(facts.record.robots, facts.comparisons, strict=True)
@@ -51,7 +51,7 @@ def tracks_of(facts: RunFacts) -> list[Tracks]:
 def node_positions(facts: RunFacts) -> FloatArray:
     """Corrected position of each of the answer's N keyframes, ``(N, 3)`` metres, NaN where unknown.
 
-    A single robot is laid onto its reference; several stay as the answer has them, for each has its own reference.
+    A single robot is aligned with its reference; several stay as in the answer, since each has its own reference.
     """
     position = np.full((len(facts.record.answer.stamp_ns), 3), np.nan)
     robots = facts.record.robots
@@ -74,7 +74,7 @@ def best_position(robot: RobotRecord) -> FloatArray | None:
 def _lay_together(
     robot: RobotRecord, comparison: RobotComparison | None, corrected: FloatArray, time: FloatArray
 ) -> Tracks:
-    """Everything on the reference as well as possible; without one, odometry starts where the answer does."""
+    """Align everything with the reference as well as possible; without one, odometry starts where the answer does."""
     truth = None if comparison is None else comparison.truth.position
     fit = None if truth is None else fit_onto(corrected, truth)
     odometry = robot.odometry_position

@@ -1,7 +1,7 @@
-"""A training run on disk: tensors of network and optimizer with a word on what they belong to, and atomic writes.
+"""A training run on disk: tensors of network and optimizer with the identity of their run, and atomic writes.
 
-Files are written beside their place and moved into it, so that a run that is killed at any moment leaves whole files
-behind: the old ones or the new ones.
+Files are written beside their place and moved into it, so that a run that is killed at any moment leaves complete files
+behind, either the old ones or the new ones.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ def save_checkpoint(
 
     Args:
         average: the mean weights so far by parameter; empty if none are kept.
-        identity: what the run is; only a run of equal identity may resume it. Plain values.
-        state: how far it has come. Plain values.
+        identity: identifies the run; only a run of equal identity may resume it. Plain values.
+        state: its progress. Plain values.
     """
     tensors = {_NETWORK + key: value for key, value in network.state_dict().items()}
     tensors.update({_AVERAGE + key: value for key, value in average.items()})
@@ -54,7 +54,7 @@ def load_checkpoint(
     average: dict[str, Tensor],
     identity: dict[str, Any],
 ) -> dict[str, Any]:
-    """Bring network, optimizer and mean weights to where the checkpoint left them; returns the state.
+    """Restore network, optimizer and mean weights from a checkpoint; returns the state.
 
     Raises:
         CheckpointError: not a checkpoint, or one of another run.
@@ -103,7 +103,7 @@ def save_text(path: Path, text: str) -> None:
 
 
 def _differences(saved: dict[str, Any], present: dict[str, Any]) -> list[str]:
-    """Keys whose values differ, those of inner dictionaries by their own names."""
+    """Keys whose values differ; those of inner dictionaries are named by themselves."""
     changed = []
     for key in {**present, **saved}:
         before, now = saved.get(key), present.get(key)

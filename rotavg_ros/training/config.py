@@ -1,4 +1,4 @@
-"""What a training run is told: a YAML file whose keys are the fields of :class:`TrainingConfig`."""
+"""The configuration of a training run: a YAML file whose keys are the fields of :class:`TrainingConfig`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class TrainingConfigError(UserError):
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Everything that decides the outcome of a training run, the machine aside.
+    """Everything that decides the outcome of a training run, apart from the machine.
 
     Attributes:
         family: "sfm" or "slam", the networks' profile, or "paper": SfM as the paper's text has it.
@@ -34,15 +34,15 @@ class TrainingConfig:
         epochs: passes over the training graphs.
         batch_graphs: graphs per step, joined into one disjoint graph.
         learning_rate, weight_decay: of Adam; the rate falls to zero along a cosine.
-        warmup_epochs: the rate grows over so many epochs first.
-        averaging: the weights that are validated and kept are an exponential mean over the steps, of which each weighs
-            so many times less than the one after it; 0 for the last step's own.
+        warmup_epochs: number of epochs at the start over which the rate grows.
+        averaging: the weights that are validated and kept are an exponential mean over the steps; this is the weight
+            of each step relative to the next; 0 for the last step's own weights.
         edge_dropout: share of each graph's edges left out anew in every epoch.
-        passes: FineNet: how often it is applied in a row at most, as NeuRoRA-v2 does; it learns from the last pass,
-            and fewer are likelier.
+        passes: FineNet: largest number of passes in a row, as in NeuRoRA-v2; it learns from the last pass, and fewer
+            passes are more likely.
         seed: of data, initial weights and order.
-        goes_on_from: the configuration whose weights this one begins with (``rotavg train --start``); empty: none.
-        robots: of the recipe "robots": worlds, noise, false closures and how uneven they are; None: as usual.
+        goes_on_from: the configuration whose weights this one starts from (``rotavg train --start``); empty: none.
+        robots: for the recipe "robots": worlds, noise, false closures and how uneven they are; None: the defaults.
     """
 
     family: str = "sfm"
@@ -145,7 +145,7 @@ class TrainingConfig:
 
 
 def _whole(value: Any) -> int:
-    """The number, if it is a whole one; ``int`` would cut a fraction off and take ``true`` for 1."""
+    """The number, if it is whole; ``int`` would drop a fraction and take ``true`` for 1."""
     if isinstance(value, bool) or (isinstance(value, float) and not value.is_integer()):
         raise ValueError(value)
     return int(value)

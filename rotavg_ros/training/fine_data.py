@@ -1,4 +1,4 @@
-"""What FineNet is trained on: graphs behind CleanNet and the tree, which are computed once as they do not change."""
+"""Training data of FineNet: graphs after CleanNet and the tree, computed once since they do not change."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rotavg_ros.solver.neurora.tree import bootstrap
 
 
 class Started(Protocol):
-    """A graph where a FineNet begins: what CleanNet says of it, orientations ``(N, 4)``, and truth in their gauge."""
+    """A graph at the start of a FineNet: CleanNet's output, orientations ``(N, 4)``, and the truth in their gauge."""
 
     @property
     def cleaned(self) -> Cleaned: ...
@@ -35,7 +35,7 @@ class Started(Protocol):
 
 
 def validated(graphs: Iterable[Started], fine_tune: Callable[[Cleaned, Tensor], Tensor]) -> dict[str, float]:
-    """Mean and median errors, degrees, of the start and of FineNet applied once and twice; what training lowers."""
+    """Mean and median errors, degrees, of the start and after one and two passes of FineNet, and the objective."""
     rows = []
     for graph in graphs:
         errors, estimate = [orientation_errors(graph.start, graph.truth)], graph.start
@@ -50,10 +50,10 @@ def validated(graphs: Iterable[Started], fine_tune: Callable[[Cleaned, Tensor], 
 
 @dataclass(frozen=True)
 class StartedGraph:
-    """A graph where FineNet begins (N nodes).
+    """A graph at the start of FineNet (N nodes).
 
     Attributes:
-        cleaned: what CleanNet says of it.
+        cleaned: CleanNet's output.
         start: ``(N, 4)`` float64, the tree's orientations.
         truth: ``(N, 4)`` float64, in the gauge of ``start``.
     """
@@ -79,7 +79,7 @@ class FineBatch:
         measured, rectified: ``(M, 4)`` target_from_source before and after CleanNet.
         outlier_logit: ``(M,)``.
         start, truth: ``(N, 4)`` body_from_world.
-        graph: ``(N,)`` of every node.
+        graph: ``(N,)`` index of every node's graph.
         edges: both directions of the edges.
     """
 
@@ -135,7 +135,7 @@ class FineBatch:
         return FineBatch(**moved, edges=edges)
 
     def fine_tune(self, network: FineNet, body_from_world: Tensor) -> tuple[Tensor, Tensor]:
-        """One pass of ``network`` from ``body_from_world`` ``(N, 4)``; what it gives and the scale ``(N, 1)``."""
+        """One pass of ``network`` from ``body_from_world`` ``(N, 4)``; returns the result and the scale ``(N, 1)``."""
         with torch.no_grad():
             raw, clean = (
                 rotations.canonical(edge_residual(body_from_world, relative, self.source, self.target)).t()[:3]

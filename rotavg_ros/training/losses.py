@@ -51,13 +51,13 @@ def fine_net_loss(
     The error ε_v of a node is twice x, y, z of the quaternion R_v,true⁻¹ R_v: along its axis, of length 2 sin(θ/2) for
     an error of θ, which is the rotation vector to within 1 % up to 28°.
 
-    The node term is about a robust mean of each graph's errors, so that no gauge is learned: it is the error that is
-    reported, and weighs as much as the edge term (in the paper, where the gauge is the tree's, a tenth).
+    The node term is relative to a robust mean of each graph's errors, so that no gauge is learned. It is the reported
+    error, and weighs as much as the edge term (a tenth of it in the paper, where the gauge is the tree's).
 
     Args:
         body_from_world, truth: ``(N, 4)``, in about the same gauge.
         scale: ``(N, 1)`` typical residual of the node's graph (half an angle in radians).
-        graph: ``(N,)`` of every node.
+        graph: ``(N,)`` index of every node's graph.
     """
     difference = rotations.canonical(rotations.multiply(rotations.inverse(truth), body_from_world))
     error = 2 * difference[:, :3]
@@ -72,7 +72,7 @@ def fine_net_loss(
 
 
 def paper_fine_net_loss(body_from_world: Tensor, truth: Tensor, edges: DirectedEdges) -> dict[str, Tensor]:
-    """The paper's equation 10 as its text has it: edge term + 0.1 · node term, both of quaternion distances.
+    """The paper's equation 10 as in its text: edge term + 0.1 · node term, both of quaternion distances.
 
     Args:
         body_from_world, truth: ``(N, 4)``, in the same gauge: that of the tree's root.

@@ -1,4 +1,4 @@
-"""Fine-tuning on a user's own robot: how it errs, runs that err alike, and whether the outcome explains it better."""
+"""Fine-tuning on a user's own robot: its errors, simulated runs with such errors, and whether the network improves."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from rotavg_ros.training.config import TrainingConfig
 from rotavg_ros.training.slam_fine_tasks import SlamFineTask, draw_runs
 from rotavg_ros.training.trainer import Trainer
 
-# What is measured on few runs may be off by this factor; shares by this much.
+# Uncertainty of what is measured on few runs: a factor, and a difference for shares.
 _FACTOR, _SHARE = 1.5, 0.1
-# A cause of unevenness is as likely as this where runs show it, and where not.
+# Probability of a cause of unevenness where runs show it, and where they do not.
 _SEEN, _UNSEEN = 0.8, 0.1
-# Levels that spread by less, in the logarithm of σ, are as good as even.
+# Levels with a smaller spread, in the logarithm of σ, count as even.
 _EVEN = 0.15
-# Part of the time in which runs are simulated and solved; every this many of them one is for validation.
+# Share of the time for simulating and solving runs; one in this many of them is for validation.
 _DRAWING, _EVERY = 0.45, 8
 _LEAST_RUNS, _MOST_KEYFRAMES, _MOST_EPOCHS = 16, 800, 60
 _STANDARD_ERRORS = 2.0
@@ -37,10 +37,10 @@ class Verdict:
     """Whether a network explains held-back stretches better than another.
 
     Attributes:
-        gain: nats a closure, in the mean over stretches.
-        standard_error: of that.
-        stretches: how many there were.
-        without: by how much the other one is better than no FineNet, nats a closure.
+        gain: nats per closure, mean over stretches.
+        standard_error: of the gain.
+        stretches: number of stretches.
+        without: by how much the other network is better than no FineNet, nats per closure.
     """
 
     gain: float
@@ -50,12 +50,12 @@ class Verdict:
 
     @property
     def is_better(self) -> bool:
-        """By more than two standard errors."""
+        """Whether the gain exceeds two standard errors."""
         return self.stretches > 1 and self.gain > _STANDARD_ERRORS * self.standard_error
 
 
 def family_of(noises: Sequence[RobotNoise]) -> RobotFamily:
-    """Runs that err as these do, give or take what few runs can tell."""
+    """A family of runs with errors like these, widened by the uncertainty of few runs."""
 
     def around(values: Sequence[float], least: float, most: float) -> tuple[float, float]:
         low, high = min(values) / _FACTOR, max(values) * _FACTOR
@@ -100,11 +100,11 @@ def fine_tune(
     """The package's network after training on runs of a family.
 
     Args:
-        family: that errs as the robot does.
+        family: with the robot's errors.
         noises: of its runs, whose lengths the simulated ones have.
-        folder: of the weights, their card and log.
-        minutes: for all of it.
-        told: gets a line on how far it is.
+        folder: for the weights, their card and log.
+        minutes: time for everything.
+        told: gets a line on the progress.
     """
     begun = time.monotonic()
     lengths = sorted(min(max(noise.keyframes, 60), _MOST_KEYFRAMES) for noise in noises)
@@ -137,7 +137,7 @@ def fine_tune(
 
 
 def compare(runs: Sequence[RobotRun], network: SlamFineNet) -> Verdict:
-    """The network beside the package's, on held-back stretches of runs."""
+    """Compare the network with the package's on held-back stretches of runs."""
     rows = np.concatenate([run.explained([network, load_network(SlamFineNet), None]) for run in runs])
     if len(rows) < 2:
         return Verdict(0.0, 0.0, len(rows), 0.0)

@@ -1,4 +1,4 @@
-"""Training of the networks as the paper's text has them: graphs as drawn, its tree, its losses (NeuRoRA §4)."""
+"""Training of the networks as in the paper's text: graphs as drawn, its tree, its losses (NeuRoRA §4)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rotavg_ros.training.sfm_tasks import GivenGraphs, SfmCleanTask, drawn_graph
 
 
 class PaperCleanTask(SfmCleanTask):
-    """CleanNet as written; the loss is the one that this package's own has, which is the paper's."""
+    """CleanNet as in the paper; the loss is the same as for this package's own, which is the paper's."""
 
     KIND = PaperCleanNet
     CANONICAL = False
@@ -33,10 +33,10 @@ class PaperCleanTask(SfmCleanTask):
 
 @dataclass(frozen=True)
 class RootedGraph:
-    """A graph where the paper's FineNet begins (N nodes).
+    """A graph at the start of the paper's FineNet (N nodes).
 
     Attributes:
-        cleaned: what CleanNet says of it.
+        cleaned: CleanNet's output.
         start: ``(N, 4)`` float64, the orientations of the breadth-first tree, whose root is at the identity.
         truth: ``(N, 4)`` float64, in the same gauge.
     """
@@ -54,7 +54,7 @@ class RootedGraph:
 
 
 class PaperFineTask:
-    """FineNet as written, on what the paper's CleanNet and tree leave (loss: edge + 0.1 · node)."""
+    """FineNet as in the paper, after the paper's CleanNet and tree (loss: edge + 0.1 · node)."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class PaperFineTask:
             yield self._loss(chosen, rng)
 
     def _loss(self, graphs: Sequence[RootedGraph], rng: np.random.Generator) -> dict[str, Tensor]:
-        """Of several graphs as one disjoint graph of its inlier edges, of which a share is left out at random."""
+        """Loss of several graphs as one disjoint graph of inlier edges, a share of which is left out at random."""
         source, target, rectified = [], [], []
         offset = 0
         for graph in graphs:

@@ -62,7 +62,7 @@ def draw(seed: int, graphs_by_nodes: dict[tuple[int, int], int]) -> list[ScoreSa
 
 
 def fit(samples: Sequence[ScoreSample]) -> float:
-    """The scale of greatest likelihood, every kind of graph weighing the same."""
+    """The scale with the greatest likelihood; every kind of graph has the same weight."""
 
     def loss(log_scale: float) -> float:
         return sum(
@@ -78,7 +78,7 @@ def fit(samples: Sequence[ScoreSample]) -> float:
 
 
 def main() -> None:
-    """Fit, and check on graphs that took no part."""
+    """Fit, and check on graphs that were not used for the fit."""
     scale = fit(draw(_SEED, _GRAPHS_BY_NODES))
     print(f"score_scale = {scale:.3f}")
     for sample in draw(_HELD_OUT_SEED, _GRAPHS_BY_NODES):

@@ -41,7 +41,7 @@ class SfmBatch:
         return SfmBatch(**moved, edges=edges)
 
 
-# What the mixtures are made of.
+# Recipes and their shares in the mixtures.
 _MIXTURES = {
     "mixture": {"released": 0.5, "released-spatial": 0.25, "paper": 0.25},
     "broad": {"released": 0.45, "released-spatial": 0.15, "paper": 0.15, "wide": 0.25},
@@ -69,7 +69,7 @@ def sample_graph(recipe: str, nodes: tuple[int, int], rng: np.random.Generator) 
 
 
 def in_canonical_form(sample: SyntheticGraph) -> SyntheticGraph:
-    """The same as solves show it to the networks."""
+    """The same graph in the form in which solves show it to the networks."""
     form = CanonicalForm.of(sample.graph)
     noise_angle = sample.noise_angle.new_empty(form.graph.num_edges)
     noise_angle[form.edge] = sample.noise_angle
@@ -77,7 +77,7 @@ def in_canonical_form(sample: SyntheticGraph) -> SyntheticGraph:
 
 
 def _wide_graph(nodes: tuple[int, int], rng: np.random.Generator) -> SyntheticGraph:
-    """What real graphs are like: noise from small to large, and mostly topologies like those of photo collections."""
+    """A graph like real ones: noise from small to large, and mostly topologies like those of photo collections."""
     low, high = np.log(_WIDE_NOISE_DEG)
     noise_deg = float(np.exp(rng.uniform(low, high)))
     disturbed = ReleasedRecipe(

@@ -1,4 +1,4 @@
-"""Training of the SfM family: CleanNet on measurements, FineNet on what CleanNet and the tree leave."""
+"""Training of the SfM family: CleanNet on measurements, FineNet on the result of CleanNet and the tree."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rotavg_ros.training.sfm_data import SfmBatch, in_canonical_form, join, samp
 
 
 class GivenGraphs(NamedTuple):
-    """Graphs to train on in place of drawn ones."""
+    """Graphs to train on instead of drawn ones."""
 
     training: Sequence[SyntheticGraph]
     validation: Sequence[SyntheticGraph]
@@ -114,7 +114,7 @@ class SfmFineTask(_SfmTask):
         clean_net = clean_net.to(device).eval()
         self._started = [StartedGraph.of(clean_net, graph) for graph in self.graphs]
         self._validation_started = [StartedGraph.of(clean_net, graph) for graph in self.validation]
-        # How likely it is that so many passes go before the one that is learned from: the fewer, the likelier.
+        # Odds of the number of passes before the one that is learned from: fewer are more likely.
         odds = 1 / np.arange(1, config.passes + 1)
         self._odds = odds / odds.sum()
 

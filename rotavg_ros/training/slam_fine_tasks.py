@@ -1,4 +1,4 @@
-"""Training of FineNet of the SLAM profile: how far edges err, end to end through the sparse solve."""
+"""Training of the SLAM profile's FineNet: variances of edges, end to end through the sparse solve."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from rotavg_ros.datasets.simulation.stress.family import RobotFamily
 from rotavg_ros.solver.learning.fine_tuning import Losses, SlamFineNet, SolvedRun, losses_of, losses_under, solved_run
 from rotavg_ros.training.config import TrainingConfig
 
-# A nat per edge by which its variance differs from the true one counts as so much of the logarithm of the mean error:
-# single drawings' errors say little of what weights are worth, all their edges together much.
+# Weight of a nat per edge, for its variance's difference from the true one, relative to the logarithm of the mean error.
+# The error of a single drawing says little about the quality of weights; all its edges together say much.
 NATS_WEIGHT = 0.3
-# Such a share of the runs is shown as it is after FineNet was applied once, so that it learns to be applied twice.
+# Share of the runs that are shown as they are after one pass of FineNet, so that it learns to be applied twice.
 _SECOND_SHARE = 0.2
 
 
 class SlamFineTask:
-    """SlamFineNet on solved runs of a family, each counting the same."""
+    """SlamFineNet on solved runs of a family, all with the same weight."""
 
     def __init__(self, config: TrainingConfig) -> None:
         family = config.robots or RobotFamily()
@@ -32,7 +32,7 @@ class SlamFineTask:
 
     @classmethod
     def on(cls, config: TrainingConfig, runs: list[SolvedRun], validation: list[SolvedRun]) -> SlamFineTask:
-        """On runs that are there already."""
+        """A task on given runs."""
         task = cls.__new__(cls)
         task._begin(config, runs, validation)
         return task
@@ -56,10 +56,10 @@ class SlamFineTask:
             yield {"loss": loss, **terms._asdict()}
 
     def validate(self) -> dict[str, float]:
-        """Logarithms of errors over those without FineNet, and nats, in the mean, as it is applied once."""
+        """Means, after one pass, of the logarithm of the errors relative to no FineNet, and of the nats."""
         samples = [run.first for run in self.validation]
         nothing = [torch.zeros_like(sample.used) for sample in samples]
-        # The same errors are drawn anew every time.
+        # The same errors are drawn every time.
         before = losses_under(nothing, samples, np.random.default_rng(self.config.seed))
         after = losses_of(self.network, samples, np.random.default_rng(self.config.seed))
         figures = {name: float((after._asdict()[name] - value).mean()) for name, value in before._asdict().items()}
@@ -67,7 +67,7 @@ class SlamFineTask:
 
 
 def draw_runs(family: RobotFamily, count: int, nodes: tuple[int, int], rng: np.random.Generator) -> list[SolvedRun]:
-    """So many runs that were solved well enough to learn from."""
+    """``count`` runs that were solved well enough to learn from."""
     runs: list[SolvedRun] = []
     while len(runs) < count:
         keyframes = round(float(np.exp(rng.uniform(*np.log(nodes)))))

@@ -17,8 +17,8 @@ from rotavg_ros.solver.learning.closures import ClosureFeatures, SlamCleanNet, c
 from rotavg_ros.solver.neurora.message_passing import DirectedEdges
 from rotavg_ros.training.config import TrainingConfig
 
-# Of the wide family's runs so many have a slip that few closures tell of (others' are told of by all that span them),
-# and so many are of several robots.
+# Shares of the wide family's runs that have a slip spanned by few closures (elsewhere all that span it are kept), and
+# that are of several robots.
 _FEW_WITNESSES, _SEVERAL_ROBOTS = 0.2, 0.15
 
 
@@ -27,7 +27,7 @@ class SlamSample:
     """One simulated graph as the network sees it.
 
     Attributes:
-        features: of its C closures.
+        features: features of its C closures.
         is_false: ``(C,)`` bool, true noise beyond 10°.
     """
 
@@ -38,7 +38,7 @@ class SlamSample:
 def sample_run(
     nodes: tuple[int, int], rng: np.random.Generator, family: RobotFamily | None = None
 ) -> SlamSample | None:
-    """One graph of a family, else of the wide one; None if it has fewer than two closures."""
+    """One graph of the given family, or of the wide one; None if it has fewer than two closures."""
     keyframes = round(float(np.exp(rng.uniform(*np.log(nodes)))))
     if family is None:
         run = simulate_slam_graph(random_slam_config(rng, keyframes), rng)
@@ -71,7 +71,7 @@ def join(samples: Sequence[SlamSample]) -> SlamSample:
 
 
 class SlamCleanTask:
-    """SlamCleanNet: false or good, each graph weighing the same per closure up to its size's square root."""
+    """SlamCleanNet: false or good; each graph is weighted by the square root of its number of closures."""
 
     def __init__(self, config: TrainingConfig) -> None:
         self.config = config

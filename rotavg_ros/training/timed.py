@@ -1,4 +1,4 @@
-"""Training within a given time: as many epochs as fit, decided once, so that an interrupted run goes on as planned."""
+"""Training within a given time: as many epochs as fit, decided once, so that a resumed run continues as planned."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from rotavg_ros.training.trainer import Trainer, TrainingTask
 
 @dataclass(frozen=True)
 class TimedRun:
-    """A run of a length that was decided by time; ``NAME.run.json`` beside what :class:`Trainer` writes.
+    """A run whose length was decided by time; saved as ``NAME.run.json`` beside the files of :class:`Trainer`.
 
     Attributes:
-        epochs: as many as were thought to fit.
-        seconds: that they took; None: they are not over yet.
+        epochs: number of epochs that were expected to fit.
+        seconds: that they took; None: not finished yet.
     """
 
     epochs: int
@@ -32,13 +32,13 @@ class TimedRun:
 def train_in_time(
     folder: Path, name: str, make_task: Callable[[], TrainingTask], config: TrainingConfig, seconds: float
 ) -> TimedRun:
-    """Train a network for about so many seconds, at least one epoch; what is finished in ``folder`` is left alone.
+    """Train a network for about the given time, at least one epoch; a finished run in ``folder`` is left alone.
 
     Args:
         name: of the network.
         make_task: is called twice at first: the learning rate's schedule needs the number of epochs beforehand, so
             one is timed on a task of its own.
-        config: but for its ``epochs``.
+        config: everything except ``epochs``.
     """
     make_folder(folder)
     path = folder / f"{name}.run.json"
@@ -55,7 +55,7 @@ def train_in_time(
 
 
 def epochs_that_fit(name: str, make_task: Callable[[], TrainingTask], config: TrainingConfig, seconds: float) -> int:
-    """How many follow within ``seconds`` after one that is timed, what it takes to make the task included."""
+    """Number of epochs that fit into ``seconds`` after a timed one, including the time to make the task."""
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as trial:
         trainer = Trainer(make_task(), replace(config, epochs=1), Path(trial), name)
@@ -65,7 +65,7 @@ def epochs_that_fit(name: str, make_task: Callable[[], TrainingTask], config: Tr
 
 
 def _read(path: Path) -> TimedRun | None:
-    """None: none yet, or no such file (a checkpoint beside it then says whether its run can go on)."""
+    """The saved run; None if there is no valid file (a checkpoint beside it then decides whether it can be resumed)."""
     with suppress(OSError, ValueError, TypeError):
         return TimedRun(**json.loads(path.read_text()))
     return None

@@ -28,13 +28,13 @@ _MAX_GRADIENT_NORM = 1.0
 
 
 class TrainingError(UserError):
-    """A training run that cannot start or go on; the message says why."""
+    """A training run that cannot start or continue; the message says why."""
 
 
 class TrainingTask(Protocol):
-    """What is trained on what. Losses and metrics are means; smaller ``objective`` is better.
+    """A network and its training data. Losses and metrics are means; a smaller ``objective`` is better.
 
-    ``batches`` draws from the given generator alone, so that a resumed run sees what an unbroken one would.
+    ``batches`` draws only from the given generator, so that a resumed run sees the same as an uninterrupted one.
     """
 
     @property
@@ -64,7 +64,7 @@ class Trainer:
     What it keeps there for a network called NAME:
 
     - ``NAME.safetensors``, the weights of the best validation, and ``NAME.json``, their model card;
-    - ``NAME.checkpoint.safetensors``, from which a run goes on exactly as if it had never stopped;
+    - ``NAME.checkpoint.safetensors``, from which a run continues exactly as if it had never stopped;
     - ``NAME.log.jsonl``, a line per epoch.
 
     Args:
@@ -72,8 +72,8 @@ class Trainer:
         config: the run's configuration.
         folder: created if missing; a checkpoint there is resumed, one of another run is refused.
         name: of the network, as in :data:`rotavg_ros.solver.networks.NETWORKS`.
-        inputs: what else decides the outcome (fingerprints of other networks), for card and checkpoint.
-        command: how to repeat it, for the card.
+        inputs: other inputs that decide the outcome (fingerprints of other networks), for card and checkpoint.
+        command: the command that repeats the run, for the card.
     """
 
     def __init__(
@@ -113,19 +113,19 @@ class Trainer:
 
     @property
     def seconds(self) -> float:
-        """That its epochs have taken, those before an interruption included."""
+        """Duration of its epochs, including those before an interruption."""
         return self._state.seconds
 
     def run(self, max_epochs: int | None = None) -> dict[str, float]:
         """Train to the end (or ``max_epochs`` more epochs); returns the last validation's figures.
 
         Raises:
-            TrainingError: the loss is no number any more, or a file cannot be written.
+            TrainingError: the loss is not finite, or a file cannot be written.
         """
         last = self.config.epochs if max_epochs is None else min(self.config.epochs, self._state.epoch + max_epochs)
         figures: dict[str, float] = {}
         first = self._state.epoch
-        # A bar only on a terminal; elsewhere the log tells.
+        # A bar only on a terminal; elsewhere the log shows the progress.
         bar = tqdm(range(first, last), self.name, total=last, initial=first, unit="epoch", disable=None)
         for epoch in bar:
             start = time.perf_counter()
@@ -136,7 +136,7 @@ class Trainer:
                 best = min(self._state.best, figures["objective"])
                 is_better = best < self._state.best
                 self._state = _State(epoch + 1, best, seconds)
-                # The checkpoint comes last: whatever a kill interrupts before it is repeated by the resumed run.
+                # The checkpoint comes last: a resumed run repeats everything that was interrupted before it.
                 if is_better:
                     self._save_weights(figures)
             with self._writing():
@@ -158,7 +158,7 @@ class Trainer:
         network.train()
         for group in self.optimizer.param_groups:
             group["lr"] = self._learning_rate(epoch)
-        # Each epoch has its own random numbers, so that a resumed run draws what an unbroken one would.
+        # Each epoch has its own random numbers, so that a resumed run draws the same as an uninterrupted one.
         rng = np.random.default_rng((self.config.seed, epoch))
         totals: dict[str, float] = {}
         for terms in self.task.batches(rng):
@@ -188,7 +188,7 @@ class Trainer:
 
     @contextmanager
     def _averaged(self) -> Iterator[None]:
-        """Inside, the network has the mean weights, if such are kept."""
+        """For a block in which the network has the mean weights, if they are kept."""
         own = {key: value.detach().clone() for key, value in self.task.network.named_parameters()}
         self.task.network.load_state_dict({**self.task.network.state_dict(), **self._average})
         yield
@@ -196,7 +196,7 @@ class Trainer:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Inside, files of the run are written; an older one that cannot be replaced stays as it is."""
+        """For a block that writes files of the run; an older one that cannot be replaced stays as it is."""
         try:
             yield
         except OSError as error:
@@ -229,7 +229,7 @@ class Trainer:
             log.write(json.dumps(row) + "\n")
 
     def _drop_log_after(self, epoch: int) -> None:
-        """Forget lines of epochs that are going to be repeated."""
+        """Remove the log lines of epochs that will be repeated."""
         if self._log_path.exists():
             lines = self._log_path.read_text(errors="replace").splitlines(keepends=True)
             save_text(self._log_path, "".join(lines[:epoch]))

@@ -34,8 +34,8 @@ class SlipRule:
 
 # Two good closures across, which may also span other places.
 CROSSED = SlipRule()
-# A slip is about as improbable as two false closures. So two closures more than that contradict an answer that overlooks
-# this slip or moves it to another place, even one that already has a slip.
+# A slip is about as improbable as two false closures. So two closures more than that contradict an answer that
+# overlooks this slip or moves it to another place, even one that already has a slip.
 LOCATABLE = SlipRule(min_across=4, min_difference=4)
 
 

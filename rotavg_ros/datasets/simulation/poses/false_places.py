@@ -1,7 +1,7 @@
 """Closures that join wrong places, on top of the good ones of a drawn graph.
 
-Each kind takes the drawn graph, the number to add and a random generator. The front end of a false closure believes that
-the two keyframes show one place, so the measured translation is short although they are truly elsewhere.
+Each kind takes the drawn graph, the number to add and a random generator. For a false closure, the front end believes
+that both keyframes show one place, so the measured translation is short although they truly lie elsewhere.
 """
 
 from __future__ import annotations

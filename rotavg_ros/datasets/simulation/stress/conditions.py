@@ -13,7 +13,7 @@ from rotavg_ros.datasets.simulation.stress import closure_errors, odometry_error
 from rotavg_ros.datasets.simulation.stress.drawn import Change, DrawnGraph, simulated
 from rotavg_ros.datasets.worlds import World
 
-# Noise of half a degree a step and one degree a closure; a fifth of the closures is false and random. Conditions differ.
+# Defaults: half a degree a step and one degree a closure, and a fifth of the closures false and random.
 _USUAL = SlamSimulationConfig(
     num_keyframes=500, closures_per_keyframe=0.4, odometry_noise_deg=0.5, closure_noise_deg=1.0, false_share=0.2
 )
