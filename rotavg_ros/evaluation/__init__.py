@@ -1,1 +1,1 @@
-"""How good the solver, the estimator and the node are, beside other methods and beside the truth."""
+"""How good the solver, the estimator and the node are, compared with other methods and with the truth."""

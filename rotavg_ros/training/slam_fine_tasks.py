@@ -12,8 +12,8 @@ from rotavg_ros.datasets.simulation.stress.family import RobotFamily
 from rotavg_ros.solver.learning.fine_tuning import Losses, SlamFineNet, SolvedRun, losses_of, losses_under, solved_run
 from rotavg_ros.training.config import TrainingConfig
 
-# Weight of a nat per edge, for its variance's difference from the true one, relative to the logarithm of the mean error.
-# The error of a single drawing says little about the quality of weights; all its edges together say much.
+# Weight of a nat per edge, for its variance's difference from the true one, relative to the mean error's logarithm. The
+# error of a single drawing says little about the quality of weights; all its edges together say much.
 NATS_WEIGHT = 0.3
 # Share of the runs that are shown as they are after one pass of FineNet, so that it learns to be applied twice.
 _SECOND_SHARE = 0.2

@@ -1,1 +1,1 @@
-"""Time and memory beside the peers, every contender in a process of its own."""
+"""Time and memory compared with the peers, every contender in a process of its own."""

@@ -1,4 +1,4 @@
-"""Time one contender on one graph, in this process alone: ``python -m rotavg_ros.evaluation.benchmark.measure``.
+"""Measure one contender on one graph in this process: ``python -m rotavg_ros.evaluation.benchmark.measure``.
 
 Prints one line of JSON. A process of its own gives every contender the same memory and threads to start from, its own
 peak memory, and nothing of what another left behind.
@@ -25,7 +25,7 @@ from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver import solve
 from rotavg_ros.view_graph import ViewGraph
 
-# Contenders by name, and what reports call them.
+# Contenders by name, and their names in reports.
 LABELS = {
     "neurora": "rotavg",
     "neurora-v1": "rotavg without refinement",
@@ -41,7 +41,7 @@ OURS = frozenset({"neurora", "neurora-v1", "neurora-cuda"})
 
 @dataclass(frozen=True)
 class Measurement:
-    """What came out of one process.
+    """The result of one process.
 
     Attributes:
         contender: of :data:`LABELS`.
@@ -66,17 +66,17 @@ class Measurement:
 
 
 class _Run(NamedTuple):
-    """One solve, and the wall-clock seconds of its stages where it tells them."""
+    """One solve, and the wall-clock seconds of its stages if it reports them."""
 
     answer: Answer
     stages: dict[str, float]
 
 
 def measure(path: Path, contender: str, repeats: int) -> Measurement:
-    """Solve the graph in a file, after a tiny one that pays what a process pays once.
+    """Solve the graph in a file, after a tiny one that pays the one-time costs of a process.
 
     Args:
-        repeats: solves at most; there are fewer where they take more than :data:`ENOUGH_S`.
+        repeats: largest number of solves; fewer if they take more than :data:`ENOUGH_S`.
     """
     case = load(path)
     run = _ours(contender) if contender in OURS else _peer(contender)
@@ -107,7 +107,7 @@ def _ours(contender: str) -> Callable[[ViewGraph], _Run]:
     device = "cuda" if contender.endswith("-cuda") else "cpu"
 
     def run(graph: ViewGraph) -> _Run:
-        graph = replace(graph)  # a graph remembers its components; every repeat is to find them anew
+        graph = replace(graph)  # a graph caches its components; every repeat has to find them anew
         clock = Clock()
         with clock.running():
             solution = solve(graph, method=method, device=device)
@@ -125,7 +125,7 @@ def _peer(contender: str) -> Callable[[ViewGraph], _Run]:
 
 
 def _peak_bytes() -> int:
-    """Largest resident size of this program. Linux's ru_maxrss would count what the starting process had, too."""
+    """Largest resident size of this program. Linux's ru_maxrss would also count that of the starting process."""
     status = Path("/proc/self/status")
     if status.exists():
         (line,) = (line for line in status.read_text(encoding="utf-8").splitlines() if line.startswith("VmHWM:"))
@@ -139,7 +139,7 @@ def main() -> None:
     answer = json.dumps(asdict(measure(Path(path), contender, int(repeats))))
     sys.stdout.write(answer + "\n")
     sys.stdout.flush()
-    os._exit(0)  # libraries of the peers have been seen to crash while they clean up
+    os._exit(0)  # some of the peers' libraries crash during cleanup
 
 
 if __name__ == "__main__":

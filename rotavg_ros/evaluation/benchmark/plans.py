@@ -40,7 +40,7 @@ class Plan:
         return CaseKey(f"{self.family}-{self.nodes}-{self.seed}", self.family, self.seed)
 
     def draw(self) -> Case:
-        """The graph; the same at every call."""
+        """The graph; the same in every call."""
         return FAMILIES[self.family].draw(self, np.random.default_rng((self.seed, self.nodes)))
 
 
@@ -53,7 +53,7 @@ class Series:
         plans: in ascending size.
         draw: draws one of them.
         contenders: of ``measure.py``, in the order in which they run.
-        share: of the time there is, relative to the other families.
+        share: share of the available time, relative to the other families.
     """
 
     title: str
@@ -91,7 +91,7 @@ def _draw_sfm(plan: Plan, rng: np.random.Generator) -> Case:
 
 
 def _draw_recipe(plan: Plan, rng: np.random.Generator) -> Case:
-    """The paper's recipe as it stands: 250–1000 cameras, everything random."""
+    """The paper's recipe unchanged: 250–1000 cameras, everything random."""
     sample = PaperRecipe().sample(rng)
     return Case(plan.key, sample.graph, sample.body_from_world)
 

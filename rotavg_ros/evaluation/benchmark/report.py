@@ -48,7 +48,7 @@ def time_table(family: str, results: Sequence[Result]) -> Table:
 
 
 def summary(results: Mapping[str, Sequence[Result]]) -> list[str]:
-    """How we compare with every peer, in words: on the largest graph that both have solved, and where it is ahead."""
+    """How we compare with every peer, in words: on the largest graph that both solved, and where the peer is ahead."""
     lines = []
     for family, of_family in results.items():
         title = FAMILIES[family].title.partition(":")[0]
@@ -60,7 +60,7 @@ def summary(results: Mapping[str, Sequence[Result]]) -> list[str]:
 
 
 def _against(title: str, peer: str, pairs: Sequence[tuple[Measurement, Measurement]]) -> str:
-    """One line; pairs are of ours and the peer's."""
+    """One line; pairs are our measurement and the peer's."""
     ours, theirs = max(pairs, key=lambda pair: pair[0].edges)
     cpu, wall = _cpu(theirs) / _cpu(ours), _wall(theirs) / _wall(ours)
     line = (
@@ -165,7 +165,7 @@ def _row(contender: str, measured: Measurement, ratio: float | None) -> tuple[Ce
 
 
 def _missing(results: Sequence[Result]) -> tuple[str, ...]:
-    """What has no row, and why."""
+    """Notes on contenders without a row, and why."""
     reasons: dict[str, list[str]] = {}
     for result in results:
         for contender, reason in result.missing.items():

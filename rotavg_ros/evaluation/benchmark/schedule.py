@@ -1,4 +1,4 @@
-"""Which contender runs on which graph: from small to large, and no longer than there is time for."""
+"""Decides which contender runs on which graph: from small to large, within the available time."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from rotavg_ros.evaluation.common.named_peers import is_available
 NO_GPU = "no GPU"
 # Solves grow a little faster than the number of edges.
 _GROWTH = 1.2
-# A process beyond so many times its expected seconds is ended.
+# A process is ended if it takes more than this many times its expected seconds.
 _PATIENCE = 8.0
 _MIN_TIMEOUT_S = 120.0
-# What a peer may take of the time that is left: the largest graphs come last, and some must be left for them.
+# Share of the remaining time that a peer may take: the largest graphs come last and need time, too.
 _SHARE_OF_REST = 0.15
-# Who spreads work over threads reads one of these.
+# Environment variables that set the number of threads of numerical libraries.
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-# What drawing the graph takes is learnt like what a contender takes.
+# Name under which the time for drawing graphs is learnt, like that of a contender.
 _DRAWING = "drawing"
 
 
@@ -40,7 +40,7 @@ class BenchmarkError(UserError):
 
 @dataclass(frozen=True)
 class Result:
-    """What came of one graph: its measurements by contender, and why others have none."""
+    """The results on one graph: its measurements by contender, and why others have none."""
 
     plan: Plan
     measured: dict[str, Measurement] = field(default_factory=dict)
@@ -58,7 +58,7 @@ class _Pace:
 
 @dataclass
 class _Budget:
-    """The time that is left, and what is known of how long things take."""
+    """The time that is left, and the known durations."""
 
     deadline: float
     repeats: int
@@ -96,9 +96,9 @@ class Wishes:
 
     Attributes:
         families: of :data:`FAMILIES`.
-        minutes: about how long in all.
+        minutes: approximate total time.
         pairs: graphs of fewer or more edges are left out.
-        repeats: solves per process at most.
+        repeats: largest number of solves per process.
         contenders: of :data:`LABELS`; others are left out.
     """
 
@@ -110,7 +110,7 @@ class Wishes:
 
 
 def measure_apart(path: Path, contender: str, repeats: int, timeout_s: float) -> Measurement | str:
-    """Measure in a process of its own, ended after ``timeout_s``; what went wrong in its place."""
+    """Measure in a process of its own, ended after ``timeout_s``; returns a message instead if it fails."""
     command = [sys.executable, "-m", measure.__name__, str(path), contender, str(repeats)]
     threads = dict.fromkeys(_THREAD_VARIABLES, str(torch.get_num_threads()))
     try:
@@ -128,7 +128,7 @@ def measure_apart(path: Path, contender: str, repeats: int, timeout_s: float) ->
 
 @dataclass(frozen=True)
 class Stage:
-    """How a benchmark measures, speaks and tells the time.
+    """How a benchmark measures, reports and reads the time.
 
     Attributes:
         measure: file of a graph, contender, repeats, seconds at most → its measurement, or why there is none.
@@ -145,7 +145,7 @@ def run(wishes: Wishes, stage: Stage | None = None) -> dict[str, list[Result]]:
     """Measure; families get their shares of the time, and what those before them have left.
 
     Raises:
-        BenchmarkError: no graph is of such a size, or no contender could be measured on any.
+        BenchmarkError: no graph has such a size, or no contender could be measured on any.
     """
     stage = stage or Stage()
     low, high = wishes.pairs

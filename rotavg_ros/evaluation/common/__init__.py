@@ -1,1 +1,1 @@
-"""What every suite is made of: cases, who solves them, their answers, scores and tables."""
+"""What all suites consist of: cases, contenders, answers, scores and tables."""

@@ -1,4 +1,4 @@
-"""What comes of a case, and what it takes."""
+"""The answer to a case, and the time it takes."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Answer:
-    """What a solver made of a graph (N nodes, M edges).
+    """A solver's answer to a graph (N nodes, M edges).
 
     Attributes:
         body_from_world: ``(N, 4)`` float64 xyzw, every component in a gauge of its own.
         seconds, cpu_seconds: wall-clock and CPU time (of all threads) from the graph in memory to the answer.
         outlier_score: ``(M,)`` probability that the edge is an outlier; None: the solver does not judge edges.
         uncertainty: ``(N,)`` rad, stated standard deviation, NaN where unknown; None: it states none.
-        position: ``(N, 3)`` metres in the world frame; None: orientations alone.
+        position: ``(N, 3)`` metres in the world frame; None: only orientations.
     """
 
     body_from_world: Tensor

@@ -1,4 +1,4 @@
-"""What is solved: a case, and the kinds of cases that a suite draws."""
+"""The problems to solve: cases, and the kinds of cases that a suite draws."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from rotavg_ros.view_graph import FALSE_CLOSURE_DEG, FALSE_CLOSURE_M, ViewGraph
 
 @dataclass(frozen=True)
 class Family:
-    """What differs between photo collections and robots' graphs.
+    """The differences between photo collections and robots' graphs.
 
     Attributes:
         profile: of :func:`rotavg_ros.solver.solve`.
-        outlier_angle: rad; an edge of more noise is an outlier.
+        outlier_angle: rad; an edge with more noise is an outlier.
         undecided: rad; edges whose noise lies between the two do not count in verdicts.
-        trusts_odometry: odometry is known to be good and is not judged; else a kind of edge means nothing.
+        trusts_odometry: whether odometry is known to be good and not judged; otherwise kinds of edges are ignored.
     """
 
     profile: str
@@ -44,19 +44,19 @@ SLAM = Family(
 )
 
 
-# Closures whose places err by something between do not count, since a recorded truth may be off by as much.
+# Closures with translation errors between these do not count, since a recorded truth may be off by as much.
 UNDECIDED_METRES = (1.5, 4.0)
 
 
 @dataclass(frozen=True)
 class PoseTruth:
-    """What is known of positions (N nodes, M edges).
+    """The known truth about positions (N nodes, M edges).
 
     Attributes:
         position: ``(N, 3)`` metres in the truth's world frame; NaN rows where unknown.
-        sigma: ``(M, 2)`` rad and metres per component, of each edge's actual noise (of false closures: of good ones).
-        stated: ``(M, 2)`` likewise, what edges state.
-        floor: metres; in ratios of errors smaller ones count as this.
+        sigma: ``(M, 2)`` rad and metres per component, of each edge's actual noise (for false closures: of good ones).
+        stated: ``(M, 2)`` likewise, as the edges state.
+        floor: metres; in ratios of errors, smaller errors count as this.
     """
 
     position: Tensor
@@ -66,11 +66,11 @@ class PoseTruth:
 
 
 class CaseKey(NamedTuple):
-    """What a case is called; no two cases of a run share it.
+    """The unique key of a case in a run.
 
     Attributes:
         name: of the graph: a data set's, or that of one drawing.
-        kind: what was drawn: a recipe, or what was done to the graph; empty where there is only one.
+        kind: what was drawn: a recipe, or a change to the graph; empty if there is only one kind.
         seed: of the drawing.
     """
 
@@ -84,18 +84,18 @@ class CaseKey(NamedTuple):
 
 @dataclass(frozen=True)
 class Case:
-    """A view-graph to be solved, and what is known of it (N nodes, M edges).
+    """A view-graph to be solved, and the known truth about it (N nodes, M edges).
 
     Attributes:
         key: its name, kind and seed.
         graph: the edges.
-        truth: body_from_world ``(N, 4)`` that errors count against; NaN rows where unknown.
-        family: of photo collections or of robots' graphs.
-        intact: ``(M,)`` bool, edges that whoever spoiled the graph left as they were; None: nobody did.
-        floor: rad; in ratios of errors smaller ones count as this, since the truth is no better.
-        true_precision: ``(M,)`` rad⁻², that of each edge's actual noise, where whoever drew the graph knows it.
-        poses: positions, by which closures are judged, too; None: rotations alone are known.
-        noise_covariance: what whoever drew the graph knows of the edges' noise; None: unknown.
+        truth: body_from_world ``(N, 4)``, the reference for errors; NaN rows where unknown.
+        family: photo collections or robots' graphs.
+        intact: ``(M,)`` bool, edges that were left as they were when the graph was spoiled; None: it was not.
+        floor: rad; in ratios of errors, smaller errors count as this, since the truth is no better.
+        true_precision: ``(M,)`` rad⁻², of each edge's actual noise, if known from the drawing.
+        poses: positions, by which closures are judged, too; None: only rotations are known.
+        noise_covariance: true covariances of the edges' noise; None: unknown.
     """
 
     key: CaseKey
@@ -115,7 +115,7 @@ class Case:
 
     @cached_property
     def place_error(self) -> Tensor:
-        """``(M,)`` metres, by which every edge's translation errs; NaN where unknown."""
+        """``(M,)`` metres, error of every edge's translation; NaN where unknown."""
         translation = self.graph.translation
         if self.poses is None or translation is None:
             return torch.full_like(self.noise, torch.nan)
@@ -125,14 +125,14 @@ class Case:
 
     @property
     def is_inlier(self) -> Tensor:
-        """``(M,)`` bool, the edges that an oracle knows to be good: intact ones, or those of little noise."""
+        """``(M,)`` bool, the edges that an oracle knows to be good: intact ones, or those with little noise."""
         if self.intact is not None:
             return self.intact
         return ~self.is_closure | ((self.noise <= self.family.outlier_angle) & ~self._is_elsewhere(FALSE_CLOSURE_M))
 
     @property
     def is_closure(self) -> Tensor:
-        """``(M,)`` bool: the edges that may be false, all but odometry where that is trusted."""
+        """``(M,)`` bool: the edges that may be false: all, except odometry where that is trusted."""
         return ~self.graph.is_odometry | (not self.family.trusts_odometry)
 
     @property
@@ -143,12 +143,12 @@ class Case:
 
     @property
     def is_good(self) -> Tensor:
-        """``(M,)`` bool: edges that are clearly none, and not because a random one happens to fit."""
+        """``(M,)`` bool: edges that are clearly good, excluding random ones that happen to fit."""
         is_good = (self.noise <= self.family.undecided[0]) & ~self._is_elsewhere(UNDECIDED_METRES[0])
         return self.is_closure & self.is_inlier & is_good
 
     def _is_elsewhere(self, metres: float) -> Tensor:
-        """``(M,)`` bool: translations that err by more, or of unknown error where positions are judged."""
+        """``(M,)`` bool: translations with a larger error, or with an unknown one where positions are judged."""
         if self.poses is None:
             return torch.zeros_like(self.is_closure)
         return ~(self.place_error <= metres)
@@ -160,8 +160,8 @@ class Kind:
 
     Attributes:
         name: of the kind.
-        draw: seed → case, the same at every call; None where this seed's graph has no place for it.
-        is_random: seeds differ; else one drawing tells all.
+        draw: seed → case, the same in every call; None if the kind is impossible on this seed's graph.
+        is_random: whether seeds differ; otherwise one drawing is enough.
     """
 
     name: str
@@ -170,12 +170,12 @@ class Kind:
 
 
 def num_drawings(kinds: Iterable[Kind], seeds: Sequence[int]) -> int:
-    """How many cases :func:`drawings` gives at most: it leaves out what cannot be drawn."""
+    """Largest number of cases that :func:`drawings` yields; it leaves out those that cannot be drawn."""
     return sum(len(seeds) if kind.is_random else 1 for kind in kinds)
 
 
 def drawings(kinds: Iterable[Kind], seeds: Sequence[int]) -> Iterator[Case]:
-    """Every kind with every seed, drawn when it is its turn."""
+    """Every kind with every seed, drawn on demand."""
     for kind in kinds:
         for seed in seeds if kind.is_random else seeds[:1]:
             case = kind.draw(seed)

@@ -1,4 +1,4 @@
-"""Who is compared: the solver's methods and combinations, the peers, and references that are told something."""
+"""The contenders: the solver's methods and combinations, the peers, and references with extra knowledge."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class ContenderError(UserError):
 
 @dataclass(frozen=True)
 class OwnContender:
-    """One that is told more of a case than its graph; it judges edges itself.
+    """A contender that is told more about a case than its graph; it judges edges itself.
 
     Attributes:
-        solve: case → answer; None where it gives up.
-        package: on PyPI, that does the work; None: ours.
+        solve: case → answer; None if it gives up.
+        package: the package on PyPI that does the work; None: ours.
     """
 
     solve: Contender
@@ -44,14 +44,14 @@ class OwnContender:
 
 @dataclass(frozen=True)
 class Roster:
-    """Who may take part in a suite besides the solver's methods.
+    """The contenders that may take part in a suite besides the solver's methods.
 
     Attributes:
         family: of the suite's cases.
         peers: of :data:`rotavg_ros.evaluation.common.named_peers.PEERS`.
         references: case → body_from_world ``(N, 4)``, by name.
-        max_edges: of the largest graph that one of them is given, by name.
-        own: contenders of this suite alone, by name.
+        max_edges: number of edges of the largest graph that a contender is given, by name.
+        own: contenders only of this suite, by name.
     """
 
     family: Family
@@ -61,7 +61,7 @@ class Roster:
     own: Mapping[str, OwnContender] = field(default_factory=dict)
 
     def is_peer(self, name: str) -> bool:
-        """Whether somebody else's package does the work."""
+        """Whether another package does the work."""
         return name in self.peers or (name in self.own and self.own[name].package is not None)
 
     def can_run(self, name: str) -> bool:
@@ -75,12 +75,12 @@ def contenders(
 ) -> dict[str, Contender]:
     """Contenders by name: a method of the solver, several joined by "+", or one of the roster.
 
-    A contender returns None for a case that is too large for it or on which it gives up. Those who judge no edges
-    are given scores by their residuals.
+    A contender returns None for a case that is too large for it or on which it gives up. Those that do not judge edges
+    get scores by their residuals.
 
     Args:
-        weights: folder of networks to use in place of the package's.
-        keep: answers, but for those of such networks, to be found again by a later run.
+        weights: folder of networks to use instead of the package's.
+        keep: stores answers, except those of such networks, for a later run.
 
     Raises:
         ContenderError: an unknown name.
@@ -93,7 +93,7 @@ def warm_up(chosen: Collection[Contender], roster: Roster, case: Case | None = N
     """Let every contender pay its one-time costs on a tiny graph.
 
     Args:
-        case: default: rotations alone, without noise.
+        case: default: only rotations, without noise.
     """
     case = warm_up_case(roster.family) if case is None else case
     for contender in chosen:
@@ -114,7 +114,7 @@ def _contender(name: str, roster: Roster, weights: Path | None, keep: KeptAnswer
         others = (*roster.peers, *roster.references, *roster.own)
         raise ContenderError(unknown_method(unknown[0], (*METHODS, *others)))
     run = partial(_run_method, name, weights)
-    # Networks of a folder are those of one run, and nobody asks for their answers again.
+    # Networks of a folder belong to one run, so their answers are not needed again.
     return run if keep is None or weights is not None else keep.keeping(run, name, (__name__,))
 
 
@@ -137,7 +137,7 @@ def _run_method(name: str, weights: Path | None, case: Case) -> Answer:
     clock = Clock()
     with clock.running():
         solution = solve(case.graph, method=name, profile=case.family.profile, weights=weights)
-    # Where nobody knows positions an edge is false by its rotation alone.
+    # Where positions are unknown, an edge is judged by its rotation alone.
     of_rotation = case.poses is None and solution.rotation_score is not None
     return Answer(
         solution.body_from_world,
@@ -164,7 +164,7 @@ def _run_peer(solver: Callable[[ViewGraph], Answer | None], max_edges: int | Non
 
 
 def _judged(answer: Answer, case: Case) -> Answer:
-    """With scores: its own, or what the residuals say."""
+    """The answer with scores: its own, or those from residuals."""
     if answer.outlier_score is not None:
         return answer
     score = residual_score(case.graph, answer.body_from_world, case.family.outlier_angle)

@@ -1,4 +1,4 @@
-"""Answers on disk: an evaluation of hours goes on where it was interrupted, and repeats only what has changed."""
+"""Answers on disk, so that a long evaluation resumes where it was interrupted, and repeats only what has changed."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from rotavg_ros.results import ResultError, make_folder
 from rotavg_ros.solver import networks
 
 QuestionT = TypeVar("QuestionT")
-# Whose versions an answer may depend on, whoever gives it.
+# Libraries whose versions any answer may depend on.
 _LIBRARIES = ("numpy", "scipy", "torch")
-# What reading a file that is missing or damaged may end in.
+# Exceptions on reading a missing or damaged file.
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile)
-# An array of a file beside the answer's: the names of those, none where there is no answer.
+# Additional array in a file: the names of the answer's arrays, empty if there is no answer.
 _FIELDS = "fields"
 
 
 class KeptAnswers:
     """A folder of answers.
 
-    An answer is found again by the solver's name, the contents of the question, and all that the answer may depend on
-    besides: the sources that the solver's modules reach, the networks' weights if they are among what it reads, the
-    versions of the libraries, and the number of threads, by which CPU times differ. The sources are read once.
+    An answer is found again by the solver's name, the content of the question, and everything else that the answer may
+    depend on: the sources that the solver's modules reach, the networks' weights if it reads them, the versions of the
+    libraries, and the number of threads, which affects CPU times. The sources are read once.
 
     Args:
-        folder: where; it is made.
+        folder: created if missing.
         weights: folder of the networks' weights, with all below it.
 
     Raises:
@@ -58,7 +58,7 @@ class KeptAnswers:
         modules: Sequence[str],
         library: str | None = None,
     ) -> Callable[[QuestionT], Answer | None]:
-        """The solver, but for questions that it has answered before; a file that cannot be read is no answer.
+        """The solver with stored answers to earlier questions; a file that cannot be read is ignored.
 
         Args:
             solver: answers a question of tensors, arrays and plain values.
@@ -93,7 +93,7 @@ class KeptAnswers:
 
 
 def _write(path: Path, answer: Answer | None) -> None:
-    """All at once: whoever is interrupted leaves no half of a file."""
+    """Write an answer atomically, so that an interruption leaves no partial file."""
     given = {} if answer is None else {field.name: getattr(answer, field.name) for field in dataclasses.fields(answer)}
     arrays = {name: np.asarray(value) for name, value in given.items() if value is not None}
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
@@ -133,7 +133,7 @@ def _digest(question: object, *more: str) -> str:
 
 
 def _parts(value: Any) -> Iterator[str | bytes]:
-    """What a value consists of, dataclasses taken apart."""
+    """The parts of a value; dataclasses are taken apart."""
     if dataclasses.is_dataclass(value):
         for field in dataclasses.fields(value):
             yield field.name

@@ -1,4 +1,4 @@
-"""The peers by name: what each needs installed, and its answers, new or kept from an earlier run."""
+"""The peers by name: the packages that they need, and their answers, new or stored by an earlier run."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ PEERS = {
 
 
 def is_available(name: str) -> bool:
-    """Whether what a contender needs is installed; what is no peer needs nothing."""
+    """Whether the package that a contender needs is installed; a contender that is not a peer needs none."""
     return name not in PEERS or is_installed(PEERS[name].package)
 
 
 def is_installed(package: str) -> bool:
-    """Whether it can be found."""
+    """Whether a package can be found."""
     return importlib.util.find_spec(package) is not None
 
 
 def missing(name: str, package: str) -> MissingPeerError:
-    """What to say of a contender whose package is not installed."""
+    """The error for a contender whose package is not installed."""
     return MissingPeerError(f"method {name!r} needs {package}, which is not installed; run: pip install {package}")
 
 
 def peer_solver(name: str, keep: KeptAnswers | None = None) -> Callable[[ViewGraph], Answer | None]:
-    """Solves a view-graph as the peer does; None where the peer gives up.
+    """Solves a view-graph with the peer; None if the peer gives up.
 
     Args:
-        keep: answers, to be found again by a later run.
+        keep: stores answers for a later run.
 
     Raises:
         MissingPeerError: the peer is not installed.

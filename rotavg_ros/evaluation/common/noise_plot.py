@@ -1,4 +1,4 @@
-"""What the noise of a view-graph looks like: histograms of its angles and axes (the paper's Figure 2)."""
+"""Pictures of a view-graph's noise: histograms of its angles and axes (the paper's Figure 2)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ANGLE_BINS = 72
 _EDGES_PER_CELL = 25
 _LATITUDE_CELLS = (8, 24)  # fewest and most, about; twice as many around
 _STEPS_PER_CELL = 8  # cells are drawn in steps of latitude, so that they follow the curved outline
-_MIN_ANGLE_DEG = 0.01  # below it an axis is rounding
+_MIN_ANGLE_DEG = 0.01  # below it an axis is only rounding noise
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class EdgeNoise:
     Attributes:
         angle_deg: ``(M,)``.
         axis: ``(M, 3)`` unit vectors; NaN where the angle is too small for one.
-        is_residual: the truth is unknown and the solution took its place.
+        is_residual: whether the truth is unknown and the solution was used instead.
     """
 
     angle_deg: np.ndarray

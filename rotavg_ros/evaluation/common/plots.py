@@ -23,7 +23,7 @@ def errors(path: Path, scores: Scores, rows: dict[str, str], title: str, referen
     """Mean and median error of every method, averaged over the graphs, on a logarithmic axis.
 
     Args:
-        rows: what to call each contender, in order from the top.
+        rows: displayed name of each contender, in order from the top.
         reference: the contender whose averages are drawn as lines through the picture.
     """
     solved = {name: label for name, label in rows.items() if scores.of(name)}

@@ -19,12 +19,12 @@ class Figure(NamedTuple):
 
 
 def columns(figures: Iterable[Figure]) -> tuple[Column, ...]:
-    """A column a figure."""
+    """One column per figure."""
     return tuple(Column(figure.heading, figure.format) for figure in figures)
 
 
 def average_rows(scores: Scores, names: Iterable[str], figures: Sequence[Figure]) -> list[tuple[Cell, ...]]:
-    """A row a contender: its name, and its averages over the cases that it solved."""
+    """One row per contender: its name, and its averages over the cases that it solved."""
     return [(name, *(scores.mean(name, figure.path) for figure in figures)) for name in names]
 
 
@@ -48,8 +48,8 @@ def per_case(title: str, scores: Scores, figures: Sequence[Figure], key: Mapping
     """A row for every case and method.
 
     Args:
-        key: columns that tell the case: attribute of :class:`~rotavg_ros.evaluation.common.cases.CaseKey` by heading;
-            default: the graph's name alone.
+        key: columns that identify the case: attribute of :class:`~rotavg_ros.evaluation.common.cases.CaseKey` by
+            heading; default: only the graph's name.
     """
     key = key or {"graph": "name"}
     rows = tuple(

@@ -1,4 +1,4 @@
-"""Run contenders on cases and score what they answer: errors in degrees, verdicts on edges, calibration."""
+"""Run contenders on cases and score their answers: errors in degrees, verdicts on edges, calibration."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Score:
 
 
 def score(case: Case, name: str, answer: Answer) -> Score:
-    """One answer, whose edges are judged, against what is known of the case."""
+    """Score an answer with judged edges against the case's truth."""
     assert answer.outlier_score is not None
     errors = orientation_errors(answer.body_from_world, case.truth, case.graph.components())
     errors_deg = np.degrees(errors[torch.isfinite(errors)].numpy())
@@ -72,7 +72,7 @@ def score(case: Case, name: str, answer: Answer) -> Score:
 
 
 def _position_errors(case: Case, answer: Answer) -> tuple[float, float]:
-    """Root mean square in metres, as it is and no smaller than the floor."""
+    """Root mean square error in metres: the plain value, and one no smaller than the floor."""
     if case.poses is None or answer.position is None:
         return float("nan"), float("nan")
     errors = position_errors(answer.position.numpy(), case.poses.position.numpy())
@@ -95,7 +95,7 @@ class Scores:
     interrupted: bool = False
 
     def extend(self, other: Scores) -> None:
-        """Take in the scores of further cases."""
+        """Add the scores of further cases."""
         self.rows += other.rows
         self.interrupted |= other.interrupted
         for name, bins in other.calibration.items():
@@ -108,7 +108,7 @@ class Scores:
         kind: str | None = None,
         cases: Collection[CaseKey] | None = None,
     ) -> Scores:
-        """Those of one contender, on some graphs, of one kind, on some cases; without calibration."""
+        """The scores of one contender, on some graphs, of one kind, on some cases; without calibration."""
         rows = (row for row in self.rows if contender is None or row.contender == contender)
         rows = (row for row in rows if names is None or row.case.name in names)
         rows = (row for row in rows if kind is None or row.case.kind == kind)
@@ -169,7 +169,7 @@ def score_all(
     """Every contender on every case. An interruption (Ctrl-C) ends it after the last case that all have solved.
 
     Args:
-        watch: passes the steps through, one per solve, and may show how far they are.
+        watch: passes the steps through, one per solve, and may show the progress.
     """
     scores = Scores(calibration={name: CalibrationBins() for name in chosen}, interrupted=True)
     of_case = Scores()
@@ -201,6 +201,6 @@ def _calibration(case: Case, answer: Answer) -> CalibrationBins:
 
 
 def geometric_mean(values: Iterable[float]) -> float:
-    """NaN of nothing."""
+    """Geometric mean; NaN if there are no values."""
     collected = list(values)
     return float(gmean(collected)) if collected else float("nan")

@@ -1,4 +1,4 @@
-"""Which source files of its package a module's answers may depend on."""
+"""The source files of its package that a module's answers may depend on."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from pathlib import Path
 def source_files(module: str) -> tuple[Path, ...]:
     """The module's file and those of all modules of its package that it reaches through imports, sorted.
 
-    Packages may lie in packages to any depth, and a package that is imported counts with what its ``__init__`` reaches.
-    Imports inside functions count, relative ones, too, and so does any text that is the name of a module, for it may be
-    imported by name. A package that is only passed on the way to what is imported (``a.b`` in ``from a.b.c import d``)
-    does not: what it gathers for others would make every module depend on all.
+    Packages may be nested to any depth, and an imported package counts with everything that its ``__init__`` reaches.
+    Imports inside functions and relative imports count, and so does any string that is the name of a module, since it
+    may be imported by name. A package that is only on the path of an import (``a.b`` in ``from a.b.c import d``) does
+    not count: through what it collects for others, every module would depend on all.
 
     Args:
         module: dotted name, as in ``__name__``.

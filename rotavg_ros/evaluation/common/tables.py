@@ -13,7 +13,7 @@ from rotavg_ros.results import ResultError, provenance
 
 Cell = str | float | int | None
 
-# A hundredth of a per cent: seeds and machines make figures differ by far more.
+# A hundredth of a per cent: figures vary far more between seeds and machines.
 _CSV_FORMAT = ".5g"
 
 
@@ -62,7 +62,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Report:
-    """What a suite has to say.
+    """The report of a suite.
 
     Attributes:
         name: stem of the Markdown file.

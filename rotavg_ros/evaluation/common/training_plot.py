@@ -1,4 +1,4 @@
-"""Pictures of training runs: what validation said after every epoch."""
+"""Pictures of training runs: the validation's objective after every epoch."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def read_log(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_training(path: Path, logs: Sequence[Path]) -> None:
-    """A panel for each log, with its best epoch, the one that is kept."""
+    """A panel for each log, with its best epoch, whose weights are kept."""
     read = [(log, *read_log(log)) for log in logs]
     figure = Figure(figsize=(4.6 * len(read), 3.6), dpi=150, facecolor="white", layout="constrained")
     panels = figure.subplots(1, len(read), squeeze=False)[0]

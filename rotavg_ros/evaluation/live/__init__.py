@@ -1,1 +1,1 @@
-"""Runs of the estimator and of the node, as a robot lives them."""
+"""Runs of the estimator and of the node with data in time order, as on a robot."""

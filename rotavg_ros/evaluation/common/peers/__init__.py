@@ -1,9 +1,9 @@
 """Independent implementations to compare with: COLMAP's, GTSAM's and Open3D's.
 
 They come with ``pip install pycolmap gtsam open3d`` and are imported only when one of them runs. Each takes a
-view-graph and times its own work alone: the clock starts when the graph is in the peer's form and stops before its
-answer is translated back. Pose-graph methods get rotation factors only, with the precisions that the graph states,
-since rotations are all that the others get; those on poses, in a module of their own, are told deviations.
+view-graph and times only its own work: the clock starts when the graph is in the peer's form and stops before its
+answer is converted back. Pose-graph methods only get rotation factors, with the precisions that the graph states, since
+the others only get rotations; those on poses, in a module of their own, are given deviations.
 """
 
 from rotavg_ros.evaluation.common.peers.colmap_peer import colmap

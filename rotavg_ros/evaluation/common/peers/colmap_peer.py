@@ -14,11 +14,11 @@ from rotavg_ros.view_graph import ViewGraph
 
 
 def colmap(graph: ViewGraph) -> Answer:
-    """COLMAP's rotation averaging (ℓ1 and then Geman–McClure IRLS) with its default options but for one.
+    """COLMAP's rotation averaging (ℓ1 and then Geman–McClure IRLS) with its default options except one.
 
-    By default it withdraws, after the estimate, the orientations of nodes that no edge agrees with to 10°; here it
-    answers for every node, as all others do. Of parallel edges it takes the first. It is told neither a start nor
-    precisions nor which edges are odometry.
+    By default it removes, after the estimate, the orientations of nodes that no edge agrees with to 10°; here it
+    answers for every node, as all others do. It uses the first of parallel edges. It is given neither a start nor
+    precisions, and not told which edges are odometry.
     """
     pycolmap = load("pycolmap")
     options = pycolmap.RotationEstimatorOptions()

@@ -24,7 +24,7 @@ _HUBER_THRESHOLD = 1.345
 _CAUCHY_THRESHOLD = 2.3849
 # Where Geman–McClure's weight is a quarter: the residual that GNC calls an outlier's.
 _GEMAN_MCCLURE_THRESHOLD = float(np.sqrt(chi2.ppf(INLIER_PROBABILITY, 3)))
-# What ties the first node of a component down, rad.
+# Standard deviation of the prior on the first node of a component, rad.
 _ANCHOR_SIGMA = 1e-4
 # Shonan lifts to rotations of at most this dimension before it gives up on a certificate.
 _SHONAN_MAX_DIMENSION = 10

@@ -21,13 +21,13 @@ from rotavg_ros.view_graph import ViewGraph
 
 # For 95 % efficiency under Gaussian noise (Holland & Welsch 1977).
 _CAUCHY_THRESHOLD = 2.3849
-# What ties the first pose down, rad and metres.
+# Standard deviation of the prior on the first pose, rad and metres.
 _ANCHOR_SIGMA = 1e-4
 
 
 @dataclass(frozen=True)
 class _Poses:
-    """GTSAM's words for poses of either dimension.
+    """GTSAM's functions for poses of either dimension.
 
     Attributes:
         pose: quaternion xyzw and position in metres → pose.
@@ -95,7 +95,7 @@ class Isam2:
         self._last, self._node = self._start[0], 0
 
     def add_node(self, clock: Clock) -> None:
-        """The next node with its edges; what iSAM2 needs for it is counted."""
+        """Add the next node with its edges; the time that iSAM2 needs for it is counted."""
         gtsam, words, node = self._gtsam, self._words, self._node
         added, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for edge in self._by_arrival[self._bounds[node] : self._bounds[node + 1]].tolist():
@@ -114,7 +114,7 @@ class Isam2:
         return self._isam.calculateEstimate()
 
     def answer(self, clock: Clock) -> Answer:
-        """The same as every peer has it; it judges no edges."""
+        """The same in the form of all peers; it judges no edges."""
         return _answer(self._words, self.estimate(), self._node, clock, None)
 
 

@@ -16,9 +16,9 @@ from rotavg_ros.errors import UserError
 from rotavg_ros.evaluation.common.answers import Clock
 from rotavg_ros.view_graph import ViewGraph
 
-# Standard deviation per component that an edge without a stated precision counts as, rad.
+# Standard deviation per component assumed for an edge without a stated precision, rad.
 DEFAULT_SIGMA = float(np.radians(1.0))
-# A residual is an outlier's beyond this quantile of its χ² distribution, where a peer asks for a threshold.
+# Quantile of a residual's χ² distribution that is used where a peer needs an outlier threshold.
 INLIER_PROBABILITY = 0.99
 
 
@@ -32,11 +32,11 @@ class MissingPeerError(PeerError):
 
 @contextmanager
 def timed(clock: Clock) -> Iterator[None]:
-    """Count the time of the peer's own work; what it raises when it gives up becomes a PeerError."""
+    """Count the time of the peer's own work; its exceptions on giving up become a PeerError."""
     try:
         with clock.running():
             yield
-    except RuntimeError as error:  # GTSAM's word for a linear system without a solution
+    except RuntimeError as error:  # raised by GTSAM for a linear system without a solution
         raise PeerError(f"the peer gave up: {error}") from None
 
 
