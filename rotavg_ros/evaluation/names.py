@@ -1,6 +1,6 @@
 """Names that the options of ``rotavg evaluate`` and ``rotavg benchmark`` choose from.
 
-They stand here without what they name, so that ``--help`` needs no torch; a test compares them with what runs.
+They are listed here without the code that they name, so that ``--help`` needs no torch; a test compares the two.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ def join(samples: Sequence[SlamSample]) -> SlamSample:
 
 
 class SlamCleanTask:
-    """SlamCleanNet: false or good; each graph is weighted by the square root of its number of closures."""
+    """SlamCleanNet: false or good, each graph weighing the same per closure up to its size's square root."""
 
     def __init__(self, config: TrainingConfig) -> None:
         self.config = config

@@ -1,4 +1,4 @@
-"""A pose graph as a robot lives it: edges in time order, an answer every few keyframes, each judged as it comes."""
+"""A pose graph as on a robot: edges in time order, an answer every few keyframes, each judged as it comes."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from rotavg_ros.online.estimator import OnlineEstimator
 from rotavg_ros.online.options import EstimatorOptions
 
 KEYFRAMES_PER_TICK = 10
-# Early on a truth of few keyframes says little, and nothing can be known yet.
+# Before this many keyframes, errors mean little and closures are too few for a correction.
 SETTLED_KEYFRAMES = 2000
 
 
 @dataclass(frozen=True)
 class IncrementalRun:
-    """What every tick said (T ticks).
+    """The results of every tick (T ticks).
 
     Attributes:
-        case: what was played.
-        keyframes: ``(T,)`` how many there were.
+        case: the case that was played.
+        keyframes: ``(T,)`` number of keyframes.
         error_deg, odometry_error_deg: ``(T,)`` mean error of all keyframes so far, of the answer and of odometry
             alone; NaN before the first keyframe of known orientation.
         flips: ``(T,)`` closures whose flag changed since the tick before.
@@ -50,7 +50,7 @@ class IncrementalRun:
 
     @property
     def worst_excess_deg(self) -> float:
-        """By how much an answer after the first 2000 keyframes was at worst less right than odometry alone."""
+        """Largest excess of an answer's error over that of odometry alone, after the first 2000 keyframes."""
         excess = (self.error_deg - self.odometry_error_deg)[self.keyframes > SETTLED_KEYFRAMES]
         excess = excess[np.isfinite(excess)]
         return float(excess.max()) if len(excess) else float("nan")
@@ -90,7 +90,7 @@ def play(
         edges = answer.edge_id.astype(np.int64)
         closures = edges[is_closure[edges]]
         before = flags.copy()
-        # Where rotations alone are known to be right or wrong, what is said of places does not count.
+        # If only the truth of rotations is known, verdicts on places do not count.
         rotation_score = answer.rotation_score if case.poses is None else None
         flags[edges] = answer.outlier if rotation_score is None else rotation_score > options.outlier_threshold
         is_old = arrival[closures] < len(orientations)

@@ -1,4 +1,4 @@
-"""The estimator over hours of driving, in this process and as fast as it goes: memory, accuracy, time of a tick.
+"""The estimator over hours of driving, in this process and as fast as possible: memory, accuracy, time of a tick.
 
 A robot drives the same course again and again. Its odometry's heading drifts; once a second a place is recognised that
 it passed some laps ago, at times falsely.
@@ -32,10 +32,10 @@ _ROBOT = "robot"
 
 @dataclass(frozen=True)
 class LongRunRow:
-    """The state after so many hours.
+    """The state after some hours.
 
     Attributes:
-        hours: driven.
+        hours: hours driven.
         keyframes, edges: in the graph.
         marginalized, dropped_closures: taken out of it so far.
         resident_mb: memory by which the process has grown since its first solve, of a tiny graph.
@@ -43,9 +43,9 @@ class LongRunRow:
         error_deg: mean of the keyframes in the last answer.
         odometry_error_deg: of the odometry at the same keyframes.
         answer_ms: median CPU time until a tick's answer, since the row before.
-        longest_answer_ms: wall-clock time of the longest.
-        longest_after_ms: the same of what went on after one.
-        message_us: mean CPU time of a message, ticks left out.
+        longest_answer_ms: longest wall-clock time until an answer.
+        longest_after_ms: longest wall-clock time of the work after an answer.
+        message_us: mean CPU time of a message, without ticks.
     """
 
     hours: float
@@ -64,7 +64,7 @@ class LongRunRow:
 
 
 def table(title: str, rows: list[LongRunRow]) -> Table:
-    """The rows as they stand."""
+    """The rows as a table."""
     columns = (
         Column("hours", ".1f"),
         Column("keyframes"),
@@ -98,7 +98,7 @@ class _Course:
 
     @classmethod
     def drive(cls, hours: float, rng: np.random.Generator) -> _Course:
-        """A figure of eight, again and again."""
+        """A figure of eight, repeated."""
         count = max(1, round(3600 * hours * _RATE_HZ))
         phase = 2 * np.pi * np.arange(count + 1) / (_LAP_S * _RATE_HZ)
         step = np.diff(np.stack((_COURSE_M[0] * np.sin(phase), _COURSE_M[1] * np.sin(2 * phase)), axis=1), axis=0)
@@ -142,11 +142,11 @@ class _Course:
 def run(
     hours: float, max_keyframes: int | None, seed: int = 0, progress: Callable[[LongRunRow], None] = lambda row: None
 ) -> list[LongRunRow]:
-    """Drive for so long; a row every hour, or ten in shorter runs.
+    """Drive for some hours; a row every hour, or ten in shorter runs.
 
     Args:
         hours: of driving, in the data's time.
-        max_keyframes: None: the estimator's default, which no run of a day or so reaches.
+        max_keyframes: None: the estimator's default, which runs of about a day do not reach.
         seed: of drift and closures.
         progress: called with every row.
     """
@@ -186,12 +186,12 @@ def run(
 
 @dataclass
 class _Spent:
-    """Since the row before: seconds of every tick, and CPU seconds of messages.
+    """Times since the row before: seconds of every tick, and CPU seconds of messages.
 
     Attributes:
         answer_cpu_s, answer_s, after_s: of each tick, until its answer, and after it.
-        feeding_s: of messages, …
-        messages: … of which there were so many.
+        feeding_s: CPU time of messages.
+        messages: number of messages.
     """
 
     answer_cpu_s: list[float] = field(default_factory=list)
@@ -201,7 +201,7 @@ class _Spent:
     messages: int = 0
 
     def tick(self, online: OnlineEstimator) -> Answer | None:
-        """One, and what a node does after it."""
+        """Do a tick, and what a node does after it."""
         cpu, begun = time.process_time(), time.perf_counter()
         answer = online.tick()
         answered = time.perf_counter()
@@ -234,7 +234,7 @@ def _row(
 
 
 def _warm_up() -> None:
-    """What a process pays once: networks, pages of code."""
+    """Pay a process's one-time costs: networks, pages of code."""
     tiny = OnlineEstimator()
     for index in range(3):
         tiny.add_odometry(_ROBOT, index * NANOSECONDS, (0.0, 0.0, 0.0, 1.0), (index, 0.0, 0.0))

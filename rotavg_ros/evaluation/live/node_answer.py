@@ -17,7 +17,7 @@ class NodeAnswer:
         stamps_ns: ``(K,)`` int64, -1 where unknown.
         world_from_body: ``(K, 4)`` xyzw.
         component: ``(K,)`` int64.
-        edge_ids: ``(M,)`` uint64, the senders' numbers.
+        edge_ids: ``(M,)`` uint64, the senders' ids.
         source_ids, target_ids: ``(M,)`` uint64, keyframes of the edges' ends.
         kind: ``(M,)`` int64 :class:`rotavg_ros.view_graph.EdgeKind`.
         score: ``(M,)`` outlier scores.

@@ -18,7 +18,7 @@ _KEPT = LIGHT.robots[1]  # the corrected trajectory beside it is blue
 
 
 def draw(report: LiveReport, path: Path, title: str) -> None:
-    """Write a PNG (or what else the suffix says) of 2100 × 1200 pixels."""
+    """Write a PNG (or another format by suffix) of 2100 × 1200 pixels."""
     figure = Figure(figsize=(14, 8), dpi=150, facecolor="white")
     grid = figure.add_gridspec(
         2, 2, width_ratios=(1.45, 1), left=0.03, right=0.97, top=0.82, bottom=0.13, wspace=0.1, hspace=0.5

@@ -1,4 +1,4 @@
-"""How good a node's answer on a played bag is, beside odometry and the truth."""
+"""How good a node's answer on a played bag is, compared with odometry and the truth."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class PlayedRun:
     """What is known about a bag that was played (N poses, M edges with the ids 0 … M-1 that the bag gave them).
 
     Attributes:
-        ids: ``(N,)`` keyframe ids where the bag's edges name keyframes by id; None where they name them by stamp.
+        ids: ``(N,)`` keyframe ids if the bag's edges name keyframes by id; None if they name them by stamp.
         stamps_ns: ``(N,)`` int64.
         odometry_world_from_body, odometry_position: ``(N, 4)`` xyzw and ``(N, 3)`` metres, drifting.
         true_world_from_body, true_position: the same, true; NaN rows where unknown; None if all are.
@@ -67,8 +67,8 @@ class LiveReport:
         closure_ends: ``(C, 2)`` indices of the keyframes that each loop closure connects.
         closure_score, closure_flagged: ``(C,)``.
         closure_is_false: ``(C,)`` 1, 0, or NaN where unknown.
-        verdicts: counts over all closures that the bag has, those which the node never reported being unflagged;
-            None where the truth is unknown.
+        verdicts: counts over all closures of the bag, where those that the node never reported count as unflagged;
+            None if the truth is unknown.
         diagnostics: the node's own.
     """
 

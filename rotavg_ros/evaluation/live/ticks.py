@@ -1,4 +1,4 @@
-"""What ticks take, beside iSAM2 on the same poses: a robot goes on driving through a city, two keyframes a tick."""
+"""Times of ticks, compared with iSAM2 on the same poses: a robot drives through a city, two keyframes a tick."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ Watch = Callable[[Iterable[int]], Iterable[int]]
 
 @dataclass(frozen=True)
 class Drive:
-    """What is driven.
+    """The drive.
 
     Attributes:
-        keyframes: before ticks count, with as many closures.
-        ticks: that count.
-        busy: loops beside it that do nothing but keep a core each busy.
+        keyframes: number before ticks are timed, with as many closures.
+        ticks: number of timed ticks.
+        busy: number of parallel loops that only keep a core each busy.
         seed: of the city.
     """
 
@@ -64,12 +64,12 @@ class Drive:
 
 @dataclass(frozen=True)
 class TicksRow:
-    """Of one contender.
+    """The times of one contender.
 
     Attributes:
-        name: whose ticks.
-        answer_ms: ``(T,)`` until all poses, or orientations, are there.
-        after_ms: ``(T,)`` what goes on after that; 0 where nothing does.
+        name: of the contender.
+        answer_ms: ``(T,)`` time until all poses, or orientations, are available.
+        after_ms: ``(T,)`` time of the work after that; 0 if there is none.
         begin_s: seconds before the first tick.
         error_deg: mean over all keyframes of the last answer, against the truth; NaN where it is not asked.
     """
@@ -82,7 +82,7 @@ class TicksRow:
 
 
 def table(rows: list[TicksRow]) -> Table:
-    """Quantiles."""
+    """Quantiles of the times."""
     columns = (
         Column("contender"),
         Column("ticks"),
@@ -106,11 +106,11 @@ def table(rows: list[TicksRow]) -> Table:
 
 
 def run(drive: Drive, watch: Watch = lambda ticks: ticks) -> list[TicksRow]:
-    """Ours by rotations alone and with translations, then iSAM2 on poses (Cauchy's loss).
+    """Ours with rotations alone and with translations, then iSAM2 on poses (Cauchy's loss).
 
     Args:
-        drive: what is driven.
-        watch: passes ticks through and may show how far they are.
+        drive: the drive.
+        watch: passes ticks through and may show the progress.
 
     Raises:
         MissingPeerError: GTSAM is not installed.
@@ -152,7 +152,7 @@ def _ours(name: str, run: SimulatedRun, graph: ViewGraph, drive: Drive, watch: W
 
 def _isam2(run: SimulatedRun, drive: Drive, watch: Watch) -> TicksRow:
     graph = _with_translations(run)
-    # As drawn: it is told what it would have to know.
+    # True deviations: iSAM2 is given what it would have to know.
     sigma = np.empty((graph.num_edges, 2))
     closure = ~graph.is_odometry.numpy()
     precision = graph.precision.double().numpy()
@@ -178,7 +178,7 @@ def _isam2(run: SimulatedRun, drive: Drive, watch: Watch) -> TicksRow:
 
 
 def _error_deg(world_from_body: np.ndarray, run: SimulatedRun) -> float:
-    """Mean error after the first keyframes are laid on each other."""
+    """Mean error after alignment of the first keyframes."""
     both = (np.ascontiguousarray(each, dtype=np.float64) for each in (world_from_body, run.world_from_body))
     found, truth = map(torch.from_numpy, both)
     aligned = rotations.multiply(truth[:1], rotations.inverse(found[:1])).expand_as(found)

@@ -1,4 +1,4 @@
-"""Who is compared on photo collections and scans, and the oracles, which know the outliers."""
+"""The contenders on photo collections and scans, and the oracles, which know the outliers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def oracle(case: Case) -> Tensor:
 
 
 def shaped_oracle(case: Case) -> Tensor:
-    """Our refinement on the true inliers, from the truth, told the noise's shape by the residuals."""
+    """Our refinement on the true inliers, from the truth; the noise's shape is estimated from the residuals."""
     return _told(case, "neurora-without-both")
 
 
@@ -36,7 +36,7 @@ def _told(case: Case, method: str) -> Tensor:
 
 
 def told_covariances(case: Case) -> Answer | None:
-    """Least squares from the truth, weighed by the covariances of the edges' noise; None: unknown."""
+    """Least squares from the truth, weighted by the covariances of the edges' noise; None: unknown."""
     if case.noise_covariance is None:
         return None
     clock = Clock()

@@ -1,4 +1,4 @@
-"""Figures that the NeuRoRA paper publishes (Purkait, Chin & Reid, ECCV 2020), for the columns next to ours.
+"""Figures published in the NeuRoRA paper (Purkait, Chin & Reid, ECCV 2020), for the columns next to ours.
 
 Degrees and seconds as printed there; its machine, its graphs. Facts of a publication, read in its tables 1 to 4.
 """
@@ -20,7 +20,7 @@ class Scene(NamedTuple):
     """A real photo collection: 1DSfM's, Arts Quad or San Francisco.
 
     Attributes:
-        cameras, with_truth: how many, and how many of them have ground truth, over which errors are.
+        cameras, with_truth: number of cameras, and of those with ground truth, to which the errors refer.
         pairs_percent: share of all pairs that have an edge.
         figures: by method.
     """
@@ -37,9 +37,9 @@ class Configuration(NamedTuple):
     Attributes:
         cameras: of every graph.
         pairs_percent: share of all pairs that have an edge.
-        noise_deg: σ of the noise is at most so many degrees.
-        outliers_percent: share of the edges.
-        planar: else in space.
+        noise_deg: largest σ of the noise, degrees.
+        outliers_percent: share of outliers among the edges.
+        planar: planar motion; otherwise in space.
     """
 
     cameras: int

@@ -1,4 +1,4 @@
-"""The paper's own figures as a page, beside what can be measured here and where."""
+"""The paper's own figures as a page, with what can be measured here and where."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ METHODS = (
     "colmap",
     "shonan",
 )
-# Minutes a graph of 2500 cameras.
+# Methods that take minutes for a graph of 2500 cameras.
 SLOW_ON_TOPOLOGIES = ("weiszfeld", "arrigoni", "wang", "shonan")
 LUND, MADRID, TOPOLOGIES = "sfm/lund_sphinx.mat", "sfm/madrid_metropolis/EGs.txt", "sfm/topology"
 # Noise on the real topologies: the released recipe's, as little as real measurements have, and edges of any rotation
@@ -81,7 +81,7 @@ def _on_topology(path: Path, noise: str, number: int, seed: int) -> Case:
 
 
 def madrid_case(data: Path) -> Case:
-    """Madrid Metropolis, whose orientations nobody knows."""
+    """Madrid Metropolis, without ground truth."""
     graph = read_graph(data / MADRID).graph
     unknown = torch.full((graph.num_nodes, 4), torch.nan, dtype=torch.float64)
     return Case(CaseKey("Madrid Metropolis"), graph, unknown)
@@ -121,7 +121,7 @@ def errors_table(title: str, scores: Scores, names: tuple[str, ...], note: str) 
 
 
 def residual_table(title: str, found: Agreement) -> Table:
-    """What the edges say of the answers."""
+    """Residuals of the edges in the answers."""
     rows: list[tuple[Cell, ...]] = [
         (
             name,

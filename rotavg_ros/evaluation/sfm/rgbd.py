@@ -18,15 +18,15 @@ from rotavg_ros.evaluation.common.scoring import Scores
 from rotavg_ros.evaluation.common.tables import Column, Table
 from rotavg_ros.training.sfm_tasks import GivenGraphs
 
-# Methods without networks, and those that are trained in every fold.
+# Methods that are not trained, and those that are trained in every fold.
 UNTRAINED = (
     *("chatterjee", "weiszfeld", "geman-mcclure", "colmap", "shonan"),
     *("neurora-equal-precisions", "neurora-without-consensus", "oracle"),
 )
 TRAINED = ("cleannet-spt", "neurora-v1", "neurora")
-# Before the name of a method with the package's own networks.
+# Prefix of the name of a method with the package's own networks.
 PACKAGE_PREFIX = "package: "
-# Of a fold's training scenes, every so many-th decides which weights are kept.
+# One in this many of a fold's training scenes is for validation, which decides which weights are kept.
 _VALIDATION_STRIDE = 6
 _FIGURES = (
     Figure("mean_deg", "mean °", ".1f"),
@@ -43,7 +43,7 @@ class RgbdEvaluationError(UserError):
 
 @dataclass(frozen=True)
 class Fold:
-    """Scenes to test on and what the networks for them learn on."""
+    """Scenes to test on, and the scenes that the networks for them are trained on."""
 
     test: tuple[Case, ...]
     training: GivenGraphs

@@ -18,18 +18,18 @@ _NAMES = (
 )
 SETTINGS: dict[str, Robustness] = dict(zip(_NAMES, ROBUSTNESS, strict=True))
 PAPER, CHATTERJEE, PIPELINE = METHODS = ("neurora-paper", "chatterjee", "neurora")
-# degrees; the lower end of the text's range (§5.1), since the table states the upper one alone.
+# degrees; the lower end of the text's range (§5.1), since the table only states the upper one.
 _LEAST_NOISE_DEG = 5.0
-# Large graphs are as good as many small ones, and slow to draw: at most so many, from so many cameras on.
+# Largest number of graphs, from this number of cameras on: a large graph is worth many small ones, and slow to draw.
 _FEWER = {10_000: 1, 5000: 3}
 _STREAM = 0x0B57
 
 
 def recipe_of(configuration: Configuration) -> PaperRecipe:
-    """What draws a configuration's graphs, by the recipe of the paper's text.
+    """The recipe that draws a configuration's graphs, from the paper's text.
 
     Number of cameras, share of the pairs and share of the outliers are those stated, the same for every graph. "σ at
-    most 30°" is read as §5.1 has it: a graph's σ is drawn uniformly from 5° to that. "In space": true orientations are
+    most 30°" is read as in §5.1: a graph's σ is drawn uniformly from 5° to that. "In space": true orientations are
     uniform over all rotations, and the noise's axes over all directions.
     """
     pairs, outliers = configuration.pairs_percent / 100, configuration.outliers_percent / 100
@@ -43,12 +43,12 @@ def recipe_of(configuration: Configuration) -> PaperRecipe:
 
 
 def num_graphs(configuration: Configuration, count: int) -> int:
-    """How many graphs are tested when ``count`` are asked for."""
+    """Number of graphs that are tested when ``count`` are requested."""
     return next((min(count, few) for cameras, few in _FEWER.items() if configuration.cameras >= cameras), count)
 
 
 def methods_of(setting: str) -> tuple[str, ...]:
-    """Who solves a setting's graphs; what the paper's authors had no memory for takes hours and tens of gigabytes."""
+    """The methods for a setting's graphs, without one that takes hours and tens of gigabytes (as in the paper)."""
     return tuple(name for name in METHODS if name != CHATTERJEE or SETTINGS[setting].chatterjee is not None)
 
 

@@ -1,4 +1,4 @@
-"""Rows of the robustness page that earlier runs have made: each takes an hour, so a run of some keeps all others."""
+"""Rows of the robustness page from earlier runs: each takes an hour, so a run of some keeps all others."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from rotavg_ros.evaluation.common.tables import Cell, Column, Table
 
 @dataclass(frozen=True)
 class EarlierRows:
-    """Of one table of a folder, as its CSV file has them.
+    """The rows of a table in a folder, read from its CSV file.
 
     Attributes:
-        rows: in the file's order; none where there is no file, or where it has other columns.
+        rows: in the file's order; empty if there is no file, or if it has other columns.
     """
 
     rows: tuple[tuple[Cell, ...], ...]
@@ -32,18 +32,18 @@ class EarlierRows:
         return cls(())
 
     def by(self, *columns: int) -> dict[tuple[Cell, ...], tuple[Cell, ...]]:
-        """Rows by what some columns say."""
+        """Rows by the values of some columns."""
         return {tuple(row[column] for column in columns): row for row in self.rows}
 
     def beside(self, rows: Sequence[tuple[Cell, ...]], *columns: int) -> tuple[tuple[Cell, ...], ...]:
-        """Those that say something else in some columns than all of the given ones, and then these."""
+        """The earlier rows whose values in some columns do not occur in the given rows, then the given rows."""
         given = {tuple(row[column] for column in columns) for row in rows}
         others = (row for row in self.rows if tuple(row[column] for column in columns) not in given)
         return (*others, *rows)
 
 
 def with_earlier(folder: Path, stem: str, table: Table, *columns: int) -> Table:
-    """A table with rows of the folder's one that say something else in some columns than all of its own."""
+    """A table, preceded by the folder's earlier rows whose values in some columns do not occur in it."""
     earlier = EarlierRows.of(folder, stem, table.columns)
     return Table(table.title, table.columns, earlier.beside(table.rows, *columns), table.notes)
 

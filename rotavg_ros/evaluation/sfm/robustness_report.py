@@ -45,10 +45,10 @@ _TRAINING_NOTE = (
 def write(folder: Path, scores: Mapping[str, Scores], trained: Mapping[Configuration, Trained], command: str) -> Path:
     """Write the page, its tables and the picture of training; returns the Markdown file.
 
-    Rows that a page in the folder has of other settings stay, and so do trainings of other configurations.
+    Rows of other settings on a page in the folder are kept, and so are trainings of other configurations.
 
     Args:
-        scores: by setting; what is missing was not run.
+        scores: by setting; missing ones were not run.
         trained: the networks of their configurations.
     """
     introduction = (

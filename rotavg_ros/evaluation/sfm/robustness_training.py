@@ -37,7 +37,7 @@ class Trained:
 
     Attributes:
         folder: their weights and logs.
-        graphs: how many were trained on.
+        graphs: number of training graphs.
         runs: by network, CleanNet first.
     """
 
@@ -47,22 +47,22 @@ class Trained:
 
     @property
     def minutes(self) -> float:
-        """Both together."""
+        """Training time of both together."""
         return sum(run.seconds or 0.0 for run in self.runs.values()) / 60
 
     def log(self, network: str) -> Path:
-        """A line per epoch."""
+        """Path of a network's log, with a line per epoch."""
         return self.folder / f"{network}.log.jsonl"
 
 
 def train(folder: Path, configuration: Configuration, seconds: float, seed: int = 0) -> Trained:
     """Train CleanNet, then FineNet behind it, into a folder below ``folder``; the best validation is kept.
 
-    What is finished there is not trained again, and what was interrupted goes on. Another recipe, time, seed or way of
+    Finished trainings there are not repeated, and interrupted ones are resumed. Another recipe, time, seed or way of
     training has another folder.
 
     Args:
-        seconds: about how long both may take; at least one epoch each is run.
+        seconds: approximate time for both; at least one epoch each is run.
     """
     recipe, config = recipe_of(configuration), replace(TRAINING, seed=seed)
     digest = hashlib.sha256(repr((recipe, config, seconds, num_graphs(recipe))).encode()).hexdigest()[:8]
@@ -76,13 +76,13 @@ def train(folder: Path, configuration: Configuration, seconds: float, seed: int 
 
 
 def num_graphs(recipe: PaperRecipe) -> int:
-    """How many graphs of a recipe networks are trained on: as many as have room."""
+    """Number of training graphs of a recipe: as many as fit in memory."""
     edges = math.comb(recipe.cameras[1], 2) * recipe.pair_share[1]
     return max(1, min(_MOST_GRAPHS, int(_MOST_EDGES / edges)))
 
 
 def training_graphs(recipe: PaperRecipe, seed: int) -> GivenGraphs:
-    """What networks learn on, and a few more to choose among their weights by."""
+    """Training graphs, and a few more for validation."""
     rng = np.random.default_rng((seed, _STREAM))
     drawn = [recipe.sample(rng) for _ in range(num_graphs(recipe) + _VALIDATION_GRAPHS)]
     return GivenGraphs(drawn[_VALIDATION_GRAPHS:], drawn[:_VALIDATION_GRAPHS])
@@ -90,7 +90,7 @@ def training_graphs(recipe: PaperRecipe, seed: int) -> GivenGraphs:
 
 @dataclass(frozen=True)
 class _Tasks:
-    """What is trained, made when its time comes."""
+    """The training tasks, created on demand."""
 
     recipe: PaperRecipe
     config: TrainingConfig

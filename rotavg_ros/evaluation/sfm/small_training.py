@@ -26,8 +26,8 @@ def train_networks(
     """Train a CleanNet and a FineNet into ``folder``, which then serves as ``weights`` of a solve.
 
     Args:
-        seconds: about how long both may take; at least one epoch each is run.
-        from_package: go on from the package's networks instead of random ones.
+        seconds: approximate time for both; at least one epoch each is run.
+        from_package: start from the package's networks instead of random ones.
     """
     config = replace(_CONFIG, seed=seed)
     cpu = torch.device("cpu")
@@ -39,7 +39,7 @@ def train_networks(
 
 
 def _maker(name: str, make_task: Callable[[], TrainingTask], from_package: bool) -> Callable[[], TrainingTask]:
-    """What makes a task whose network begins as asked for."""
+    """A function that makes a task whose network has the requested initial weights."""
 
     def make() -> TrainingTask:
         task = make_task()

@@ -1,4 +1,4 @@
-"""The paper's synthetic table (NeuRoRA §5.1), its rows and more, on both recipes; outlier classification beside it."""
+"""The paper's synthetic table (NeuRoRA §5.1), its rows and more, on both recipes, and outlier classification."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ ROWS: dict[str, str] = {
     "oracle-shaped": "oracle that is told the noise's shape by the residuals",
     "oracle-covariances": "oracle that is told the covariance of every edge's noise",
 }
-# Run on every graph; the other rows take minutes a graph or say little more, so that few graphs do for them.
+# Run on every graph; the other rows take minutes per graph or add little, so few graphs are enough for them.
 CORE = (
     "chatterjee",
     "geman-mcclure",
@@ -106,12 +106,12 @@ PER_GRAPH = (
     Figure("counts.recall", "recall"),
     Figure("roc_area", "roc_area"),
 )
-# Keeps these graphs apart from all that training draws.
+# Keeps these graphs separate from all that training draws.
 _STREAM = 0x5EED
 
 
 def kinds(recipes: Sequence[str], seed: int) -> list[Kind]:
-    """A kind a recipe; the drawings of a run's ``seed`` are counted from 0, each the same whatever their number."""
+    """One kind per recipe; drawings of a run's ``seed`` are numbered from 0, and do not depend on their number."""
     return [Kind(recipe, partial(_draw, recipe, seed)) for recipe in recipes]
 
 
@@ -213,7 +213,7 @@ def _errors(title: str, scores: Scores, names: Sequence[str]) -> Table:
 
 
 def classification(title: str, scores: Scores, classifiers: Mapping[str, str]) -> Table:
-    """How well each contender's score tells outliers, per graph, then averaged; calibration over all edges.
+    """How well each contender's score detects outliers, per graph, then averaged; calibration over all edges.
 
     Args:
         classifiers: row title by contender.

@@ -1,4 +1,4 @@
-"""The SLAM suite: real and classic pose graphs, and what is done to them (false closures, slipping odometry)."""
+"""The SLAM suite: real and classic pose graphs, and changes to them (false closures, slipping odometry)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _REFERENCE_FLOOR = np.radians(0.3)
 _GROUPED_SHARE = 0.3
 _SLIP_SHARE = 0.01
 _SLIP_CLOSURE_SHARE = 0.3
-# Keeps these random numbers apart from all that training draws.
+# Keeps these random numbers separate from all that training draws.
 _STREAM = 0x51A3
 
 AS_RECORDED, GROUPED = "as recorded", "30 % grouped"
@@ -45,12 +45,12 @@ class SlamSuiteError(UserError):
 
 @dataclass(frozen=True)
 class _Source:
-    """Where a graph comes from.
+    """The source of a graph.
 
     Attributes:
         read: folder of the SLAM data, random numbers → graph, with ground truth where there is one.
-        is_spoiled: closures are made false and odometry slips; else the graph stays as it was recorded.
-        is_redrawn: a part of the graph itself is random.
+        is_spoiled: whether closures are made false and odometry slips; otherwise the graph stays as recorded.
+        is_redrawn: whether a part of the graph itself is random.
     """
 
     read: Callable[[Path, np.random.Generator], GraphFile]
@@ -113,7 +113,7 @@ def kinds(data: Path, graphs: Sequence[str], shares: Sequence[float], hard: bool
     Args:
         data: folder of the data sets, with ``slam/``.
         shares: of false closures.
-        hard: false closures in groups and slipping odometry, too.
+        hard: whether to include false closures in groups and slipping odometry.
 
     Raises:
         SlamSuiteError: an unknown graph, or no data.
@@ -169,7 +169,7 @@ def recorded_case(name: str, graph_file: GraphFile) -> Case:
 
 
 def spoiled_case(key: CaseKey, graph_file: GraphFile, share: float) -> Case:
-    """A clean graph made worse as the key's kind says. The oracle uses every edge that was left as it was.
+    """A clean graph corrupted as the key's kind says. The oracle uses every edge that was left as it was.
 
     Args:
         share: of the closures that are made false.
@@ -182,13 +182,13 @@ def spoiled_case(key: CaseKey, graph_file: GraphFile, share: float) -> Case:
         spoiled = insert_slips(spoiled.graph_file, truth, _SLIP_SHARE, rng, rule=SLIP_RULES[key.kind])
         was_spoiled = was_spoiled | spoiled.spoiled
     intact = torch.from_numpy(~was_spoiled)
-    # Rotations were replaced, and translations would tell which.
+    # Only rotations were replaced, so translations would reveal which.
     graph = replace(spoiled.graph_file.graph, translation=None)
     return Case(key, graph, torch.from_numpy(truth), SLAM, intact, floor)
 
 
 def _reference(graph_file: GraphFile) -> tuple[np.ndarray, float]:
-    """What errors count against, ``(N, 4)`` body_from_world, and their floor in radians."""
+    """The reference for errors, ``(N, 4)`` body_from_world, and their floor in radians."""
     if graph_file.body_from_world_gt is not None:
         return graph_file.body_from_world_gt, float(_TRUTH_FLOOR)
     everything = np.ones(graph_file.graph.num_edges, dtype=bool)

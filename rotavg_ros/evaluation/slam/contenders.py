@@ -1,4 +1,4 @@
-"""Who is compared on robots' graphs: odometry alone, least squares, the oracle, and what tables call everyone."""
+"""The contenders on robots' graphs: odometry alone, least squares, the oracle, and all names in tables."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ def ratios(path: Path, scores: Scores, rows: dict[str, str], title: str) -> None
     """Geometric mean of the error over the oracle's under every condition, a line per method; a dot is a case of ours.
 
     Args:
-        rows: what to call each contender.
+        rows: displayed name of each contender.
     """
     conditions = [kind for kind in scores.kinds if scores.ratios(OURS, ORACLE, "floored_deg", kind)]
     figure = Figure(figsize=(10, 5.6), dpi=150, facecolor="white", layout="constrained")

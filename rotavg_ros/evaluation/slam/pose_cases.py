@@ -32,7 +32,7 @@ from rotavg_ros.view_graph import ViewGraph
 REPORTING_SEEDS = range(1000, 1003)
 # Errors of orientations below this count as this.
 _FLOOR = float(np.radians(0.1))
-# Keeps these random numbers apart from all others'.
+# Keeps these random numbers separate from all others.
 _STREAM = 0x905E5
 _SHARE = 0.3
 
@@ -51,7 +51,7 @@ CONDITIONS: dict[str, false_places.Add | None] = {
 
 
 class PoseSuiteError(UserError):
-    """No kind is called so; the message names some that are."""
+    """No kind has such a name; the message lists some that exist."""
 
 
 # What classic graphs' edges are drawn with: deviations per component, rounded, that the recorded edges leave against
@@ -72,7 +72,7 @@ _RECORDED = ("B25b_0.000", "B25b_0.250", "B25b_0.500")
 
 
 class _Building(NamedTuple):
-    """A run through a simulated world, and what its edges err by."""
+    """A run through a simulated world, and the noise of its edges."""
 
     config: SlamSimulationConfig
     noise: Noise
@@ -115,7 +115,7 @@ def kinds(data: Callable[[], Path], names: Sequence[str] = ()) -> list[Kind]:
 
 
 def tiny_case() -> Case:
-    """On which one-time costs are paid: a square, seen to close."""
+    """A square with one closure, on which one-time costs are paid."""
     turn = Rotation.from_rotvec(np.outer(np.arange(5), [0.0, 0.0, np.pi / 2]))
     corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
     topology = ViewGraph.create([0, 1, 2, 3, 0], [1, 2, 3, 4, 4], np.eye(4)[[3] * 5], kind=[0, 0, 0, 0, 1])

@@ -1,4 +1,4 @@
-"""Who is compared on positions, and what each is told of an edge's noise."""
+"""The contenders on positions, and what each is told about an edge's noise."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from rotavg_ros.solver.positions import Translations, fit_positions
 from rotavg_ros.view_graph import FALSE_CLOSURE_M
 
 ROTATIONS_ALONE = "neurora-rotations"
-# How much too small odometry's deviations are told to one of the peers.
+# Factor by which the deviations of odometry that one of the peers is told are too small.
 _WRONG_FACTOR = 5.0
-# Closures that are compared in pairs: four times as many take minutes.
+# Most closures that are compared in pairs: four times as many take minutes.
 _MOST_PAIRED = 2000
 
 
 def odometry(case: Case) -> Answer:
-    """Dead reckoning; a closure is judged by what it leaves."""
+    """Dead reckoning; a closure is judged by its residual."""
     clock = Clock()
     with clock.running():
         position, world_from_body = chain_poses(case.graph, _translation(case))
@@ -95,7 +95,7 @@ def gnc(told: str, case: Case) -> Answer | None:
 
 
 def isam2(case: Case) -> Answer | None:
-    """GTSAM's iSAM2 with Cauchy's loss and the true deviations; a closure is judged by what it leaves."""
+    """GTSAM's iSAM2 with Cauchy's loss and the true deviations; a closure is judged by its residual."""
     try:
         answer = peers.isam2_on_poses(case.graph, _sigma(case), chain_poses(case.graph, _translation(case)))
     except MissingPeerError:

@@ -1,4 +1,4 @@
-"""A lone slip that one pair of places tells of is the same data as closures that are false together.
+"""A lone slip seen by closures between one pair of places cannot be told from closures that are false together.
 
 Whoever is asked cannot know which it was. So over an even mixture of both a score should be one half, and a stated
 uncertainty should cover both truths.
@@ -76,7 +76,7 @@ class Mixture:
         self.if_false.extend(statements(other, answer))
 
     def extend(self, other: Mixture) -> None:
-        """Take in what another has counted."""
+        """Add the counts of another."""
         self.num_graphs += other.num_graphs
         self.num_witnesses += other.num_witnesses
         self.num_sure += other.num_sure

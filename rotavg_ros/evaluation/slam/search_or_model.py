@@ -1,4 +1,4 @@
-"""Why answers of the posterior are wrong: the search missed what is likelier, or the model prefers what is wrong."""
+"""Why answers of the posterior are wrong: the search missed a likelier one, or the model prefers a wrong one."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ RIGHT, SEARCH, MODEL, DIVIDED = "right", "search", "model", "divided"
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Of one case.
+    """The diagnosis of one case.
 
     Attributes:
-        case: which.
-        error_deg: of what is published.
-        truth_error_deg: of what the posterior makes of the true labels and orientations.
-        rise: F found less F from the truth, nats.
-        terms: of F, by how much each rises.
+        case: the case's key.
+        error_deg: error of the published answer.
+        truth_error_deg: error of the posterior's answer when started from the true labels and orientations.
+        rise: F of the found answer minus F from the truth, nats.
+        terms: the rise of each term of F.
     """
 
     case: CaseKey

@@ -1,4 +1,4 @@
-"""How much the posterior's answers depend on what it believes beforehand: each prior halved and doubled."""
+"""How much the posterior's answers depend on its priors: each one is halved and doubled."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rotavg_ros.evaluation.common.tables import Column, Table
 from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver.diagnosis import SlamPriors, orientations_under
 
-# Of probabilities the odds are halved and doubled.
+# For probabilities, the odds are halved and doubled.
 _PROBABILITIES = frozenset(
     ("tails", "outlier_share", "near_miss_share", "common_errors", "turn_errors", "stated_share")
 )

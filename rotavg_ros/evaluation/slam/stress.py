@@ -1,4 +1,4 @@
-"""The stress suite: pose graphs that are hard in one known way each, of which true labels and variances are known."""
+"""The stress suite: pose graphs that are each hard in one known way, with known true labels and variances."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ABLATION_SEEDS = TUNING_SEEDS[:3]
 
 
 class StressSuiteError(UserError):
-    """No kind is called so; the message names some that are."""
+    """No kind has such a name; the message lists some that exist."""
 
 
 def kinds(names: Sequence[str] = (), *, translations: bool = False) -> list[Kind]:

@@ -1,4 +1,4 @@
-"""What a contender says of its own answers on the stress suite, against what is true: probabilities and uncertainty."""
+"""A contender's statements about its answers on the stress suite against the truth: probabilities and uncertainty."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ def rivals(scores: Scores, name: str) -> Iterator[Rival]:
 
 
 def _rival(scores: Scores, kind: str, peer: str, name: str) -> Rival | None:
-    """None where the peer is not better for sure."""
+    """The peer as a rival; None if it is not significantly better."""
     logarithms = np.log(list(scores.ratios(peer, name, _FIGURE, kind).values()))
     if len(logarithms) < 2:
         return None

@@ -19,7 +19,7 @@ from rotavg_ros.view_graph import ViewGraph
 # Noise per step and per closure, degrees per component: odometry that is good, middling and worse than the closures.
 NOISE_DEG = ((0.1, 1.0), (0.5, 1.0), (1.5, 0.5))
 
-# What claims to be exact claims too much; it must not make the average infinite.
+# Least stated standard deviation that is used, rad, so that a claim of exactness does not make the average infinite.
 _SMALLEST_STATED = np.radians(1e-3)
 
 
