@@ -39,7 +39,7 @@ class Stage(NamedTuple):
     """When a stage ends.
 
     Attributes:
-        max_steps: after so many steps.
+        max_steps: largest number of steps.
         converged_step: rad; or when the mean correction is less.
     """
 

@@ -16,7 +16,7 @@ from rotavg_ros.evaluation.common.tables import Cell, Column, Table
 from rotavg_ros.evaluation.slam.uncertainty import normalized_errors
 from rotavg_ros.metrics import CalibrationBins
 
-# Scores outside are sure of themselves, and so many that they hide how the others are.
+# Scores outside this range are certain; they are so numerous that they would hide the calibration of the others.
 UNSURE = (0.05, 0.95)
 # A rotation whose roll and pitch are smaller is one about the vertical.
 _FLAT = 1e-9

@@ -19,7 +19,7 @@ from rotavg_ros.evaluation.slam.stress_calibration import Calibration
 
 _FIGURE = "floored_deg"
 _LARGE, _VERY_LARGE = 2.0, 5.0
-# A peer is better where its error is smaller by this factor at least, and by more than so many standard errors.
+# A peer is better where its error is smaller by at least this factor, and by more than this many standard errors.
 _BETTER, _STANDARD_ERRORS = 1.05, 2.0
 # Who counts as a peer: independent methods, none of which is told what only an oracle knows.
 _PEERS = (*ROSTER.peers, "chatterjee")

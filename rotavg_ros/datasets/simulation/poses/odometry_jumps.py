@@ -11,7 +11,8 @@ from scipy.sparse.csgraph import connected_components
 
 from rotavg_ros.datasets.simulation.poses.drawn import DrawnPoses, IndexArray
 
-# Size of a jump in median steps of the odometry; and share of the path at either end where closures may be missing.
+# Size of a jump in median steps of the odometry; and share of the path at either end without jumps, since there may be
+# no closures to judge them there.
 STEPS = (3.0, 40.0)
 _ENDS = 0.1
 _TRIES = 400
