@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from rotavg_ros import ViewGraph, solve
+from rotavg_ros import ViewGraph, solve, solve_batch
 from rotavg_ros.metrics import orientation_errors
 from test.solver.graphs import as_quaternions, random_truth
 
@@ -91,3 +91,12 @@ def test_of_two_places_that_few_steps_do_not_tell_apart_the_better_one_is_found(
     truth, pairs = clusters(5, 10, 25, 16)
     graph = graph_of(5, truth, pairs, 0.25, "any rotation")
     assert errors_deg(graph, truth).mean() < 4.0
+
+
+def test_components_of_many_and_of_few_edges_begin_each_in_its_own_way() -> None:
+    """Together, of which one alone is sparse; both are led astray by edges that state no rotation."""
+    drawings = [drawn(seed, 150, degree) for seed, degree in ((0, 24), (1, 14))]
+    graphs = [graph_of(seed, *drawing, 0.33, "no rotation") for seed, drawing in enumerate(drawings)]
+    for answer, (truth, _) in zip(solve_batch(graphs), drawings, strict=True):
+        errors = torch.rad2deg(orientation_errors(answer.body_from_world, as_quaternions(truth)))
+        assert float(errors.mean()) < 3.0

@@ -61,13 +61,15 @@ def anyhow(seed: int, cameras: int, degree: int, false_share: float) -> tuple[Vi
     return measured(truth, source, target, noise), truth
 
 
+def twice(graph: ViewGraph) -> ViewGraph:
+    """Two components, each the whole graph."""
+    ends = (torch.cat((end, end + graph.num_nodes)) for end in (graph.source, graph.target))
+    return ViewGraph.create(*ends, graph.target_from_source.repeat(2, 1))
+
+
 def test_each_component_goes_on_from_the_better_start() -> None:
     graph, truth = anyhow(0, 100, 11, 0.5)
-    both = ViewGraph.create(
-        torch.cat((graph.source, graph.source + 100)),
-        torch.cat((graph.target, graph.target + 100)),
-        graph.target_from_source.repeat(2, 1),
-    )
+    both = twice(graph)
     exact, wrong = as_quaternions(truth), as_quaternions(random_truth(100, 5))
     ones = torch.ones(both.num_edges, dtype=torch.float64)
     one, other = torch.cat((exact, wrong)), torch.cat((wrong, exact))
@@ -86,11 +88,7 @@ def test_each_component_goes_on_from_the_better_start() -> None:
 def test_eigenvectors_know_exact_orientations_whatever_they_begin_with() -> None:
     """Of two components; beginning nearly anywhere, each in a gauge of its own."""
     graph, truth = anyhow(1, 60, 14, 0.0)
-    both = ViewGraph.create(
-        torch.cat((graph.source, graph.source + 60)),
-        torch.cat((graph.target, graph.target + 60)),
-        graph.target_from_source.repeat(2, 1),
-    )
+    both = twice(graph)
     start = as_quaternions(random_truth(120, 9))
     found = spectral(both, start, both.components(), torch.ones(both.num_edges, dtype=torch.float64))
     for part in found.split(60):

@@ -65,7 +65,7 @@ def _by_all_alike(graph: ViewGraph, component: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _part(graph: ViewGraph, parent_edge: Tensor) -> Tensor:
-    """Indices of edges, spread evenly over each camera's, at most half of :data:`_SPARSE_DEGREE` per camera."""
+    """Indices of edges, at most half of :data:`_SPARSE_DEGREE` per source, evenly spread, and those of the forest."""
     number = torch.arange(graph.num_edges, device=graph.device)
     count = torch.bincount(graph.source, minlength=graph.num_nodes)
     # The rank of an edge among those with its source; a canonical form is sorted by source.
