@@ -36,6 +36,7 @@ class NoiseDensity:
         log_odds: ``(C,)`` prior log-odds that an edge is good, minus the logarithm of the uniform density; a term of
             P(good | r).
         component: ``(M,)`` component of every edge.
+        log_likelihood: ``(C,)`` nats, of the edges that it was fitted to.
     """
 
     is_other: Tensor
@@ -43,6 +44,7 @@ class NoiseDensity:
     scale: Tensor
     log_odds: Tensor
     component: Tensor
+    log_likelihood: Tensor
 
     @classmethod
     def fitted(
@@ -90,8 +92,9 @@ class NoiseDensity:
         likeliest = likelihood.max(dim=0)
         is_other = likeliest.values > likelihood[0] + priors.ahead
         which = torch.where(is_other, likeliest.indices, 0)[None]
+        of_chosen = likelihood.gather(0, which)[0]
         chosen = [of_all.gather(0, which)[0] for of_all in (log_scale.exp(), good)]
-        return cls(is_other, exponent[which[0], 0], chosen[0], chosen[1].logit() - even, component)
+        return cls(is_other, exponent[which[0], 0], chosen[0], chosen[1].logit() - even, component, of_chosen)
 
     def weigh(self, square: Tensor, edges: slice | Tensor) -> Tensor:
         """Weights of some edges, from their expected squared residuals."""

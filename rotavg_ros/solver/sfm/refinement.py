@@ -26,7 +26,7 @@ the frames of world and cameras nor on the noise's size.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -34,7 +34,6 @@ import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
-from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.noise_density import NoiseDensity
 from rotavg_ros.solver.sfm.noise_shape import NoiseShape
 from rotavg_ros.solver.sfm.priors import RefinementPriors
@@ -66,39 +65,6 @@ class EdgeWeights(NamedTuple):
         return self._replace(shaped=self.shaped * shaped, coarse=self.coarse * coarse)
 
 
-class Start(NamedTuple):
-    """Where a refinement may begin.
-
-    Attributes:
-        body_from_world: ``(N, 4)``.
-        coarse: ``(M,)`` positive factors of the robust weights in coarse steps from there.
-        among: ``(C,)`` bool, components that may begin there; None: all.
-        is_settled: coarse steps on a subset of the edges led there; more are taken only if the start differs from the
-            best one and is not much worse.
-    """
-
-    body_from_world: Tensor
-    coarse: Tensor
-    among: Tensor | None = None
-    is_settled: bool = False
-
-
-class Begun(NamedTuple):
-    """Where coarse steps have led.
-
-    Attributes:
-        body_from_world: ``(N, 4)``.
-        coarse: ``(M,)`` the weights that these steps used.
-        steps: number of steps.
-        rival: another solution in some components, whose cost is too close for so few steps to decide; None: nowhere.
-    """
-
-    body_from_world: Tensor
-    coarse: Tensor
-    steps: int
-    rival: Begun | None = None
-
-
 def refine(
     graph: ViewGraph,
     body_from_world: Tensor,
@@ -121,119 +87,35 @@ def refine(
     if weights is None:
         ones = torch.ones_like(graph.precision)
         weights = EdgeWeights(ones, ones)
-    begun = begin(graph, [Start(body_from_world, weights.coarse)], weights.shaped, structure, priors)
-    return settle(graph, begun, weights, structure, priors)
-
-
-def begin(
-    graph: ViewGraph, starts: Sequence[Start], shaped: Tensor, structure: Structure, priors: RefinementPriors = PRIORS
-) -> Begun:
-    """Coarse steps from several starts; each component keeps the one with clearly the lowest Σ w ‖r‖^½ afterwards.
-
-    That is the cost of the shaped steps, a few of which are taken to tell starts apart. A likelihood would not do: its
-    scale tends to zero where an answer fits as many edges exactly as there are nodes.
-
-    Args:
-        shaped: ``(M,)`` positive factors of the robust weights in shaped steps.
-    """
-    problem, component = Problem(graph, structure, priors), structure.component
-    shaped = shaped.float().clamp(min=priors.least_prior)
-    first, *others = starts
-    orientations, steps = _coarse(problem, first)
-    if not others:
-        return Begun(orientations, first.coarse, steps)
-    # Components in which starts are told apart by further steps; in the others, the coarse steps decide.
-    is_close = torch.zeros_like(structure.roots, dtype=torch.bool)
-    for other in others:
-        if not other.is_settled:
-            is_close = is_close | (True if other.among is None else other.among)
-
-    def told(orientations: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        """Orientations after the further steps, and their cost ``(C,)``."""
-        if bool(is_close.any()):
-            few = min(priors.telling_steps, priors.max_steps - steps)
-            further = _shaped(problem, orientations, EdgeWeights(shaped, shaped), few).orientations
-            orientations = torch.where(is_close[component, None], further, orientations)
-        return orientations, problem.cost(orientations, shaped)
-
-    orientations, least = told(orientations, steps)
-    best, rival = Begun(orientations, first.coarse, steps), None
-    barely, nearest = 1 - priors.same_valley, torch.full_like(least, torch.inf)
-    for other in others:
-        may_begin = torch.ones_like(is_close) if other.among is None else other.among
-        if other.is_settled:
-            cost, apart = problem.cost(other.body_from_world, shaped), _share_apart(problem, best, other)
-            may_begin = may_begin & (cost < (1 + priors.by_a_part) * least) & (apart > priors.rival_share)
-            if not bool(may_begin.any()):
-                continue
-        another, more = _coarse(problem, other)
-        another, cost = told(another, more)
-        found = Begun(another, other.coarse, max(best.steps, more))
-        is_better = may_begin & (cost < barely * least)
-        is_rival = may_begin & ~is_better & (cost < torch.minimum(least / barely, nearest))
-        is_rival &= _share_apart(problem, best, found) > priors.rival_share
-        if bool(is_rival.any()):
-            rival, nearest = _where(problem, is_rival, found, rival or best), torch.where(is_rival, cost, nearest)
-        if bool(is_better.any()):
-            best, least = _where(problem, is_better, found, best), torch.where(is_better, cost, least)
-    is_rival = nearest < least / barely  # a better start may have been found since
-    return best._replace(rival=_where(problem, is_rival, rival, best) if rival and bool(is_rival.any()) else None)
-
-
-def _where(problem: Problem, chosen: Tensor, one: Begun, other: Begun) -> Begun:
-    """``one`` in the chosen components ``(C,)``, ``other`` elsewhere."""
-    of_node = chosen[problem.component]
-    orientations = torch.where(of_node[:, None], one.body_from_world, other.body_from_world)
-    coarse = torch.where(of_node[problem.graph.source], one.coarse, other.coarse)
-    return Begun(orientations, coarse, max(one.steps, other.steps))
-
-
-def _share_apart(problem: Problem, one: Begun, other: Begun | Start) -> Tensor:
-    """``(C,)`` share of each component's nodes whose orientations in the two solutions are far apart."""
-    component, count = problem.component, len(problem.roots)
-    turn = rotations.multiply(rotations.inverse(one.body_from_world), other.body_from_world)
-    moment = turn.new_zeros(count, 4, 4).index_add_(0, component, turn[:, :, None] * turn[:, None])
-    gauge = torch.linalg.eigh(moment).eigenvectors[:, :, -1]
-    return problem.mean((rotations.angle_between(turn, gauge[component]) > NUMBERS.outlier_angle).double())
-
-
-def settle_best(
-    graph: ViewGraph, begun: Begun, weights: EdgeWeights, structure: Structure, priors: RefinementPriors = PRIORS
-) -> tuple[Tensor, EdgeWeights]:
-    """:func:`settle` from ``begun`` and from its rival; each component keeps the result of lower cost.
-
-    Returns:
-        ``(N, 4)`` orientations, and the weights of the coarse steps that led there.
-    """
-    weights = weights._replace(coarse=begun.coarse)
-    orientations = settle(graph, begun, weights, structure, priors)
-    if begun.rival is None:
-        return orientations, weights
-    problem, rival = Problem(graph, structure, priors), begun.rival
-    other = settle(graph, rival, weights, structure, priors)
-    is_better = problem.cost(other, weights.shaped.float()) < problem.cost(orientations, weights.shaped.float())
-    ended = _where(
-        problem, is_better, rival._replace(body_from_world=other), begun._replace(body_from_world=orientations)
-    )
-    return ended.body_from_world, weights._replace(coarse=ended.coarse)
+    orientations, steps = coarse_steps(Problem(graph, structure, priors), body_from_world, weights.coarse)
+    return settle(graph, orientations, weights, structure, priors, steps)
 
 
 def settle(
     graph: ViewGraph,
-    begun: Begun,
+    orientations: Tensor,
     weights: EdgeWeights,
     structure: Structure,
     priors: RefinementPriors = PRIORS,
+    steps: int = 0,
 ) -> Tensor:
-    """Shaped steps until convergence, as many as are left, then steps with the noise's density; ``(N, 4)``."""
+    """Shaped steps until convergence, then steps with the noise's density.
+
+    Args:
+        orientations: ``(N, 4)``, where coarse steps have led.
+        steps: number of these, which count among ``max_steps``.
+
+    Returns:
+        ``(N, 4)`` orientations.
+    """
     problem = Problem(graph, structure, priors)
     weights = weights._replace(shaped=weights.shaped.float().clamp(min=priors.least_prior))
-    settled = _shaped(problem, begun.body_from_world, weights, priors.max_steps - begun.steps)
-    further = min(priors.density.max_steps, priors.max_steps - begun.steps - settled.steps)
+    settled = shaped_steps(problem, orientations, weights, priors.max_steps - steps)
+    further = min(priors.density.max_steps, priors.max_steps - steps - settled.steps)
     return _by_density(problem, settled, weights, further) if further > 0 else settled.orientations
 
 
-class _Settled(NamedTuple):
+class Settled(NamedTuple):
     """Result of ℓ½ steps: orientations ``(N, 4)``, the noise there, variances ``(N,)``, number of steps."""
 
     orientations: Tensor
@@ -242,12 +124,23 @@ class _Settled(NamedTuple):
     steps: int
 
 
-def _coarse(problem: Problem, start: Start) -> tuple[Tensor, int]:
-    """ℓ1 steps until they have settled; also returns their number."""
+def coarse_steps(
+    problem: Problem, orientations: Tensor, weight: Tensor, is_over: Callable[[Tensor], Tensor] | None = None
+) -> tuple[Tensor, int]:
+    """ℓ1 steps until they have settled.
+
+    Args:
+        orientations: ``(N, 4)`` start.
+        weight: ``(M,)`` positive factors of the robust weights.
+        is_over: components ``(C,)`` bool that orientations ``(N, 4)`` need no further steps in; default: none.
+
+    Returns:
+        ``(N, 4)`` float64 orientations; the number of steps.
+    """
     priors = problem.priors
     max_steps = min(priors.max_coarse_steps, priors.max_steps - priors.least_shaped_steps)
-    orientations = start.body_from_world.double()
-    prior = start.coarse.float().clamp(min=priors.least_prior)
+    orientations = orientations.double()
+    prior = weight.float().clamp(min=priors.least_prior)
     measure = Measure(problem.round, problem.evenly(priors.coarse_smoothing**2 / 2), l1_weight, torch.float32)
     is_open = torch.ones_like(problem.roots, dtype=torch.bool)
     for number in range(max_steps):
@@ -255,12 +148,14 @@ def _coarse(problem: Problem, start: Start) -> tuple[Tensor, int]:
         step = problem.step(orientations, measure, problem.pooled(orientations, measure, prior), is_open)
         orientations = _turned(orientations, step.turn)
         is_open = is_open & (problem.mean(step.turn.norm(dim=0)) >= priors.coarse_settled * typical)
+        if is_over is not None:
+            is_open = is_open & ~is_over(orientations)
         if not bool(is_open.any()):
             return orientations, number + 1
     return orientations, max(max_steps, 0)
 
 
-def _shaped(problem: Problem, orientations: Tensor, weights: EdgeWeights, max_steps: int) -> _Settled:
+def shaped_steps(problem: Problem, orientations: Tensor, weights: EdgeWeights, max_steps: int) -> Settled:
     """ℓ½ steps with the noise's estimated shape and size, until convergence."""
     priors, prior = problem.priors, weights.shaped
     noise = problem.round
@@ -293,10 +188,10 @@ def _shaped(problem: Problem, orientations: Tensor, weights: EdgeWeights, max_st
         if not bool(is_open.any()):
             max_steps = number + 1
             break
-    return _Settled(orientations, problem.shapes.carried(noise, orientations), variance, max_steps)
+    return Settled(orientations, problem.shapes.carried(noise, orientations), variance, max_steps)
 
 
-def _by_density(problem: Problem, settled: _Settled, weights: EdgeWeights, max_steps: int) -> Tensor:
+def _by_density(problem: Problem, settled: Settled, weights: EdgeWeights, max_steps: int) -> Tensor:
     """Steps with the density of highest likelihood, in components where that is not the density of ℓ½."""
     priors, prior = problem.priors, weights.shaped
     orientations, noise, variance, _ = settled

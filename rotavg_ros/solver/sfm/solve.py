@@ -25,8 +25,9 @@ from rotavg_ros.solver.neurora.tree import Bootstrapped, bootstrap, breadth_firs
 from rotavg_ros.solver.sfm.consensus.search import CONSENSUS, consensus
 from rotavg_ros.solver.sfm.cycles.evidence import with_triangles
 from rotavg_ros.solver.sfm.options import SfmStages
-from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, Start, begin, refine, settle_best
+from rotavg_ros.solver.sfm.refinement import PRIORS, ROUND, EdgeWeights, refine
 from rotavg_ros.solver.sfm.series import EdgesInSeries
+from rotavg_ros.solver.sfm.starts.choice import Start, begin, settle_best
 from rotavg_ros.solver.sfm.starts.others import other_starts
 from rotavg_ros.solver.sfm.stated.noise import StatedNoise
 from rotavg_ros.solver.sfm.step import Structure
@@ -35,6 +36,10 @@ from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # For graphs with more edges it pays to measure which tile sizes are fastest on this machine.
 _TUNING_PAYS = 200_000
+_NEARLY_AS_GOOD = (
+    "of two answers, in which {} of {} orientations differ by more than 20°, neither fits clearly better; few edges or "
+    "contradicting ones join these views to the others: look whether they fit, or match more pairs"
+)
 
 
 def solve_sfm(graph: ViewGraph, component: Tensor, stages: SfmStages, run: Run) -> Estimate:
@@ -135,19 +140,22 @@ def _refined(cleared: _Cleared, orientations: Tensor, stages: SfmStages, steps: 
         if stages.clean and stages.weighted:
             starts += other_starts(cleared.judged, cleared.is_believed, cleared.parent_edge, component)
         begun = begin(graph, starts, weights.shaped, structure, priors)
-        orientations, weights = settle_best(graph, begun, weights, structure, priors)
+        best = settle_best(graph, begun, weights, structure, priors)
+        orientations, weights = best.body_from_world, best.weights
         if stages.stated:
             noise = StatedNoise.of(graph, structure, priors, stages.stated_shapes)
             orientations, weights = noise.refined(orientations, weights, refinement)
+        doubtful = 0 if best.is_doubtful is None else int(best.is_doubtful.sum())
+        warnings = (_NEARLY_AS_GOOD.format(doubtful, len(component)),) if doubtful else ()
     if not stages.consensus:
-        return _Answer(orientations)
+        return _Answer(orientations, warnings=warnings)
     with watch.stage("consensus"):
         residual = EdgeResiduals(graph, orientations.float()).angles()
         other = consensus(graph, orientations, component, CONSENSUS, residual)
         if other is None:
-            return _Answer(orientations, residual)
+            return _Answer(orientations, residual, warnings)
         if other.body_from_world is None or other.weight is None:
-            return _Answer(orientations, residual, other.warnings)
+            return _Answer(orientations, residual, warnings + other.warnings)
         weights = weights.times(other.weight, other.weight)
         return _Answer(refinement(other.body_from_world, weights=weights), None, other.warnings)
 

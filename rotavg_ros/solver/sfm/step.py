@@ -221,6 +221,15 @@ class Problem:
         of_edge = self.component.index_select(0, self.graph.source)
         return weight.new_zeros(len(self.roots)).index_add(0, of_edge, weight * angle.sqrt())
 
+    def log_likelihood(self, orientations: Tensor, weight: Tensor) -> Tensor:
+        """Nats ``(C,)`` of the edges of some weight ``(M,)`` under round noise of the density that fits them best."""
+        told = (weight > self.priors.density.least_prior).nonzero()[:, 0]
+        angle = EdgeResiduals(self.graph, orientations.float()).angles()
+        of_edge = self.component.index_select(0, self.graph.source)
+        volume = torch.zeros(len(self.roots), dtype=torch.float64, device=angle.device)
+        square = angle[told].double().square()
+        return NoiseDensity.fitted(square, of_edge[told], of_edge, volume, self.priors.density).log_likelihood
+
     def pooled(self, orientations: Tensor, measure: Measure, prior: Tensor) -> Tensor:
         """Prior weights ``(M,)`` under which edges in series weigh according to their expected errors.
 

@@ -11,7 +11,8 @@ from rotavg_ros import ViewGraph, solve
 from rotavg_ros.metrics import orientation_errors
 from rotavg_ros.solver.neurora.stages import trust_all
 from rotavg_ros.solver.neurora.tree import bootstrap
-from rotavg_ros.solver.sfm.refinement import EdgeWeights, Start, begin, refine, settle
+from rotavg_ros.solver.sfm.refinement import EdgeWeights, refine
+from rotavg_ros.solver.sfm.starts.choice import Start, begin, settle_best
 from rotavg_ros.solver.sfm.starts.spectral import spectral
 from rotavg_ros.solver.sfm.step import Structure
 from test.solver.graphs import as_quaternions, measured, random_truth
@@ -82,7 +83,7 @@ def test_each_component_goes_on_from_the_better_start() -> None:
     structure, weights = Structure.of(both), EdgeWeights(ones, ones)
     for first, second in ((one, other), (other, one)):
         begun = begin(both, [Start(first, ones), Start(second, ones)], ones, structure)
-        assert max(errors_deg(settle(both, begun, weights, structure))) < 1.1 * best
+        assert max(errors_deg(settle_best(both, begun, weights, structure).body_from_world)) < 1.1 * best
 
 
 def test_eigenvectors_know_exact_orientations_whatever_they_begin_with() -> None:

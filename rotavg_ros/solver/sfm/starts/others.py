@@ -2,7 +2,7 @@
 
 One wrong edge in a tree turns all nodes behind it, and a network that was not trained on such cameras, or such false
 edges, leads the refinement into a wrong minimum. So the refinement begins at several starts, and a few steps tell which
-is best (``refinement.py``). Where cameras have many edges, a subset of them suffices.
+is best (``choice.py``). Where cameras have many edges, a subset of them suffices.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from rotavg_ros.solver.neurora.cleaned import Cleaned
 from rotavg_ros.solver.neurora.stages import apply_labels, trust_all
 from rotavg_ros.solver.neurora.tree import bootstrap
 from rotavg_ros.solver.sfm.cycles.evidence import by_triangles
-from rotavg_ros.solver.sfm.refinement import Start, begin
+from rotavg_ros.solver.sfm.starts.choice import Start, begin
 from rotavg_ros.solver.sfm.starts.spectral import spectral
 from rotavg_ros.solver.sfm.step import Structure
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # If cameras have fewer edges on average, other starts cost little and need all of the edges.
-_SPARSE_DEGREE = 20
+_SPARSE_DEGREE = 40
 
 
 def is_sparse(graph: ViewGraph, component: Tensor) -> Tensor:

@@ -1,0 +1,203 @@
+"""The refinement from several starts, and the best of the solutions that these lead to.
+
+Coarse steps begin at each start, and end early where they come near a solution that is known. Where several solutions
+cost nearly the same, a few shaped steps are taken from each; where even then another one costs hardly more than the
+best, both are refined to the end, and an answer that is hardly likelier than its rival is called doubtful.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rotavg_ros import rotations
+from rotavg_ros.solver.neurora.numbers import NUMBERS
+from rotavg_ros.solver.sfm.priors import RefinementPriors
+from rotavg_ros.solver.sfm.refinement import PRIORS, EdgeWeights, coarse_steps, settle, shaped_steps
+from rotavg_ros.solver.sfm.step import Problem, Structure
+from rotavg_ros.view_graph import ViewGraph
+
+
+class Start(NamedTuple):
+    """Where a refinement may begin.
+
+    Attributes:
+        body_from_world: ``(N, 4)``.
+        coarse: ``(M,)`` positive factors of the robust weights in coarse steps from there.
+        among: ``(C,)`` bool, components that may begin there; None: all.
+        is_settled: coarse steps on a subset of the edges led there; more are taken only if the start differs from the
+            best one and is not much worse.
+    """
+
+    body_from_world: Tensor
+    coarse: Tensor
+    among: Tensor | None = None
+    is_settled: bool = False
+
+
+class Begun(NamedTuple):
+    """Where coarse steps have led.
+
+    Attributes:
+        body_from_world: ``(N, 4)``.
+        coarse: ``(M,)`` the weights that these steps used.
+        steps: number of steps.
+        rival: another solution in some components, whose cost is too close to decide by; None: nowhere.
+    """
+
+    body_from_world: Tensor
+    coarse: Tensor
+    steps: int
+    rival: Begun | None = None
+
+
+def begin(
+    graph: ViewGraph, starts: Sequence[Start], shaped: Tensor, structure: Structure, priors: RefinementPriors = PRIORS
+) -> Begun:
+    """Coarse steps from several starts; each component keeps the one with clearly the lowest Σ w ‖r‖^½ afterwards.
+
+    That is the cost of the shaped steps, a few of which are taken to tell starts apart. A likelihood would not do: its
+    scale tends to zero where an answer fits as many edges exactly as there are nodes.
+
+    Args:
+        shaped: ``(M,)`` positive factors of the robust weights in shaped steps.
+    """
+    problem = Problem(graph, structure, priors)
+    shaped = shaped.float().clamp(min=priors.least_prior)
+    best = _Found.after(problem, starts[0], shaped)
+    found = [best]
+    for start in starts[1:]:
+        known = best.begun.body_from_world
+        may_begin = torch.ones_like(best.cost, dtype=torch.bool) if start.among is None else start.among
+        if start.is_settled:
+            is_hopeful = problem.cost(start.body_from_world, shaped) < (1 + priors.hopeless) * best.cost
+            may_begin = (
+                may_begin & is_hopeful & (_share_apart(problem, known, start.body_from_world) > priors.rival_share)
+            )
+            if not bool(may_begin.any()):
+                continue
+        one = _Found.after(problem, start, shaped, known)
+        may_begin = may_begin & (_share_apart(problem, known, one.begun.body_from_world) > 0)
+        found.append(one._replace(cost=torch.where(may_begin, one.cost, torch.inf)))
+        best = best.but(problem, found[-1].cost < best.cost, found[-1])
+    # Further steps tell starts apart in components where at least two are near the least cost.
+    is_near = [one.cost < (1 + priors.hopeless) * best.cost for one in found]
+    is_contested = torch.stack(is_near).sum(dim=0) > 1
+    found = [one.told(problem, is_contested & near, shaped) for one, near in zip(found, is_near, strict=True)]
+    best = found[0]
+    for one in found[1:]:
+        best = best.but(problem, one.cost < (1 - priors.same_valley) * best.cost, one)
+    return best.begun._replace(rival=_rival(problem, found, best))
+
+
+class _Found(NamedTuple):
+    """Where a start has led, and its cost ``(C,)``; infinite in components where it is out of the question."""
+
+    begun: Begun
+    cost: Tensor
+
+    @classmethod
+    def after(cls, problem: Problem, start: Start, shaped: Tensor, known: Tensor | None = None) -> _Found:
+        """After coarse steps from ``start``, or as many as lead to the ``known`` solution ``(N, 4)``."""
+        is_over = None if known is None else lambda at: _share_apart(problem, known, at) == 0
+        orientations, steps = coarse_steps(problem, start.body_from_world, start.coarse, is_over)
+        return cls.at(problem, Begun(orientations, start.coarse, steps), orientations, shaped)
+
+    @classmethod
+    def at(cls, problem: Problem, begun: Begun, orientations: Tensor, shaped: Tensor) -> _Found:
+        """At orientations ``(N, 4)`` to which further steps have led."""
+        return cls(begun._replace(body_from_world=orientations), problem.cost(orientations, shaped))
+
+    def told(self, problem: Problem, chosen: Tensor, shaped: Tensor) -> _Found:
+        """After a few shaped steps in the chosen components ``(C,)``."""
+        if not bool(chosen.any()):
+            return self
+        priors, begun = problem.priors, self.begun
+        few = min(priors.telling_steps, priors.max_steps - begun.steps)
+        further = shaped_steps(problem, begun.body_from_world, EdgeWeights(shaped, shaped), few).orientations
+        return self.but(problem, chosen, _Found.at(problem, begun, further, shaped))
+
+    def but(self, problem: Problem, chosen: Tensor, other: _Found) -> _Found:
+        """The same but for the chosen components ``(C,)``, which are those of ``other``."""
+        if not bool(chosen.any()):
+            return self
+        return _Found(_where(problem, chosen, other.begun, self.begun), torch.where(chosen, other.cost, self.cost))
+
+
+def _rival(problem: Problem, found: Sequence[_Found], best: _Found) -> Begun | None:
+    """In each component, the solution of least cost that is another one than ``best`` and hardly costs more."""
+    priors = problem.priors
+    rival = best._replace(cost=(1 + priors.rival_cost) * best.cost)
+    is_any = torch.zeros_like(problem.roots, dtype=torch.bool)
+    for one in found:
+        is_rival = one.cost < rival.cost
+        if bool(is_rival.any()):
+            apart = _share_apart(problem, best.begun.body_from_world, one.begun.body_from_world)
+            is_rival = is_rival & (apart > priors.rival_share)
+            rival, is_any = rival.but(problem, is_rival, one), is_any | is_rival
+    return rival.begun if bool(is_any.any()) else None
+
+
+def _where(problem: Problem, chosen: Tensor, one: Begun, other: Begun) -> Begun:
+    """``one`` in the chosen components ``(C,)``, ``other`` elsewhere."""
+    of_node = chosen[problem.component]
+    orientations = torch.where(of_node[:, None], one.body_from_world, other.body_from_world)
+    coarse = torch.where(of_node[problem.graph.source], one.coarse, other.coarse)
+    return Begun(orientations, coarse, max(one.steps, other.steps))
+
+
+def _share_apart(problem: Problem, one: Tensor, other: Tensor) -> Tensor:
+    """``(C,)`` share of each component's nodes whose orientations in two solutions ``(N, 4)`` are far apart."""
+    return problem.mean((_angles_apart(problem, one, other) > NUMBERS.outlier_angle).double())
+
+
+def _angles_apart(problem: Problem, one: Tensor, other: Tensor) -> Tensor:
+    """``(N,)`` angles between two solutions ``(N, 4)`` after the best alignment of each component."""
+    component, count = problem.component, len(problem.roots)
+    turn = rotations.multiply(rotations.inverse(one), other)
+    moment = turn.new_zeros(count, 4, 4).index_add_(0, component, turn[:, :, None] * turn[:, None])
+    gauge = torch.linalg.eigh(moment).eigenvectors[:, :, -1]
+    return rotations.angle_between(turn, gauge[component])
+
+
+class Best(NamedTuple):
+    """Result of :func:`settle_best`.
+
+    Attributes:
+        body_from_world: ``(N, 4)``.
+        weights: those of the coarse steps that led there.
+        is_doubtful: ``(N,)`` bool, nodes that another solution, under which the edges are nearly as likely, turns far;
+            None: there is no such solution.
+    """
+
+    body_from_world: Tensor
+    weights: EdgeWeights
+    is_doubtful: Tensor | None = None
+
+
+def settle_best(
+    graph: ViewGraph, begun: Begun, weights: EdgeWeights, structure: Structure, priors: RefinementPriors = PRIORS
+) -> Best:
+    """:func:`settle` from ``begun`` and from its rival; each component keeps the result of lower cost.
+
+    Likelihoods decide no better: of 46 tuning graphs with rivals the two disagreed on 11, and the cost was right about
+    those with larger differences (``docs/diary/sfm-refinement.md``). But where they disagree or hardly differ, the
+    answer is doubtful.
+    """
+    weights = weights._replace(coarse=begun.coarse)
+    orientations = settle(graph, begun.body_from_world, weights, structure, priors, begun.steps)
+    if begun.rival is None:
+        return Best(orientations, weights)
+    problem, rival, shaped = Problem(graph, structure, priors), begun.rival, weights.shaped.float()
+    other = settle(graph, rival.body_from_world, weights, structure, priors, rival.steps)
+    own, others = _Found.at(problem, begun, orientations, shaped), _Found.at(problem, rival, other, shaped)
+    is_better = others.cost < own.cost
+    best, worse = own.but(problem, is_better, others).begun, others.but(problem, is_better, own).begun
+    ahead = problem.log_likelihood(best.body_from_world, shaped) - problem.log_likelihood(worse.body_from_world, shaped)
+    angle = _angles_apart(problem, best.body_from_world, worse.body_from_world)
+    is_doubtful = (angle > NUMBERS.outlier_angle) & (ahead < priors.rival_nats)[problem.component]
+    weights = weights._replace(coarse=best.coarse)
+    return Best(best.body_from_world, weights, is_doubtful if bool(is_doubtful.any()) else None)
