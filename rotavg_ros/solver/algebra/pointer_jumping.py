@@ -30,3 +30,34 @@ def follow(pointer: np.ndarray) -> np.ndarray:
     for _, end in doublings(pointer):  # noqa: B007 (the last one counts)
         pass
     return end
+
+
+def levels(parent: np.ndarray) -> np.ndarray:
+    """``(N,)`` number of edges between each node of a forest and its root, which is its own parent."""
+    level = (parent != np.arange(len(parent))).astype(np.int64)
+    for ancestor, _ in doublings(parent):
+        level = level + level[ancestor]
+    return np.asarray(level)
+
+
+def lowest_common_ancestors(parent: np.ndarray, level: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """``(P,)`` where the ways upwards from nodes ``a`` and ``b``, of the same tree each, meet; ``level`` as above."""
+    jumps = [parent, *(farther for _, farther in doublings(parent))]
+    low, high = np.where(level[a] >= level[b], a, b), np.where(level[a] >= level[b], b, a)
+    excess = level[low] - level[high]
+    for power, jump in enumerate(jumps):
+        low = np.where((excess >> power) & 1 == 1, jump[low], low)
+    for jump in reversed(jumps):
+        apart = jump[low] != jump[high]
+        low, high = np.where(apart, jump[low], low), np.where(apart, jump[high], high)
+    return np.asarray(np.where(low == high, low, parent[low]))
+
+
+def sums_of_branches(parent: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """``(N,)`` sum of ``value`` over each node and all below it."""
+    jumps, level, total = [parent, *(farther for _, farther in doublings(parent))], levels(parent), value
+    for power, jump in enumerate(jumps):
+        # What lies less than 2^power edges below a node is in its sum already.
+        (reaches,) = np.nonzero(level >= 1 << power)
+        total = total + np.bincount(jump[reaches], total[reaches], len(parent))
+    return total

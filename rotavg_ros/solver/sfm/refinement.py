@@ -65,6 +65,13 @@ class EdgeWeights(NamedTuple):
         return self._replace(shaped=self.shaped * shaped, coarse=self.coarse * coarse)
 
 
+class Refined(NamedTuple):
+    """Orientations ``(N, 4)``, and Σ w ‖r‖^½ of each component, ``(C,)``, where the shaped steps have led."""
+
+    body_from_world: Tensor
+    cost: Tensor
+
+
 def refine(
     graph: ViewGraph,
     body_from_world: Tensor,
@@ -88,7 +95,7 @@ def refine(
         ones = torch.ones_like(graph.precision)
         weights = EdgeWeights(ones, ones)
     orientations, steps = coarse_steps(Problem(graph, structure, priors), body_from_world, weights.coarse)
-    return settle(graph, orientations, weights, structure, priors, steps)
+    return settle(graph, orientations, weights, structure, priors, steps).body_from_world
 
 
 def settle(
@@ -98,21 +105,19 @@ def settle(
     structure: Structure,
     priors: RefinementPriors = PRIORS,
     steps: int = 0,
-) -> Tensor:
+) -> Refined:
     """Shaped steps until convergence, then steps with the noise's density.
 
     Args:
         orientations: ``(N, 4)``, where coarse steps have led.
         steps: number of these, which count among ``max_steps``.
-
-    Returns:
-        ``(N, 4)`` orientations.
     """
     problem = Problem(graph, structure, priors)
     weights = weights._replace(shaped=weights.shaped.float().clamp(min=priors.least_prior))
     settled = shaped_steps(problem, orientations, weights, priors.max_steps - steps)
     further = min(priors.density.max_steps, priors.max_steps - steps - settled.steps)
-    return _by_density(problem, settled, weights, further) if further > 0 else settled.orientations
+    cost = problem.cost(settled.orientations, weights.shaped)
+    return Refined(_by_density(problem, settled, weights, further) if further > 0 else settled.orientations, cost)
 
 
 class Settled(NamedTuple):

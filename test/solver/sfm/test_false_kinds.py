@@ -48,14 +48,14 @@ def errors_deg(graph: ViewGraph, truth: Rotation, method: str = "neurora") -> np
     return np.asarray(torch.rad2deg(errors).numpy())
 
 
-@pytest.mark.parametrize("degree", [15, 24])
+@pytest.mark.parametrize("degree", [15, 24, 45])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_failed_registrations_near_no_rotation_lead_nowhere(degree: int, seed: int) -> None:
     """A third of the edges: CleanNet believes them, for the cameras of its training that look alike are many."""
     truth, pairs = drawn(seed, 200, degree)
     graph = graph_of(seed, truth, pairs, 0.33, "no rotation")
     assert errors_deg(graph, truth).mean() < 3.0
-    assert errors_deg(graph, truth, "neurora-v2").mean() > 30.0
+    assert errors_deg(graph, truth, "neurora-v2").mean() > 5.0
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -95,7 +95,7 @@ def test_of_two_places_that_few_steps_do_not_tell_apart_the_better_one_is_found(
 
 def test_components_of_many_and_of_few_edges_begin_each_in_its_own_way() -> None:
     """Together, of which one alone is sparse; both are led astray by edges that state no rotation."""
-    drawings = [drawn(seed, 150, degree) for seed, degree in ((0, 24), (1, 14))]
+    drawings = [drawn(seed, 150, degree) for seed, degree in ((0, 45), (1, 14))]
     graphs = [graph_of(seed, *drawing, 0.33, "no rotation") for seed, drawing in enumerate(drawings)]
     for answer, (truth, _) in zip(solve_batch(graphs), drawings, strict=True):
         errors = torch.rad2deg(orientation_errors(answer.body_from_world, as_quaternions(truth)))

@@ -10,15 +10,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from rotavg_ros import rotations
+from rotavg_ros.solver.algebra.residuals import EdgeResiduals
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.sfm.priors import RefinementPriors
 from rotavg_ros.solver.sfm.refinement import PRIORS, EdgeWeights, coarse_steps, settle, shaped_steps
+from rotavg_ros.solver.sfm.starts.parts import Parts
 from rotavg_ros.solver.sfm.step import Problem, Structure
 from rotavg_ros.view_graph import ViewGraph
+
+_ROUNDS = 3
 
 
 class Start(NamedTuple):
@@ -83,14 +88,41 @@ def begin(
         may_begin = may_begin & (_share_apart(problem, known, one.begun.body_from_world) > 0)
         found.append(one._replace(cost=torch.where(may_begin, one.cost, torch.inf)))
         best = best.but(problem, found[-1].cost < best.cost, found[-1])
+    for _ in range(_ROUNDS):
+        last = best
+        for start in _turned(problem, best, shaped):
+            known = best.begun.body_from_world
+            one = _Found.after(problem, start, shaped, known)
+            may_begin = _share_apart(problem, known, one.begun.body_from_world) > 0
+            found.append(one._replace(cost=torch.where(may_begin, one.cost, torch.inf)))
+            best = best.but(problem, found[-1].cost < best.cost, found[-1])
+        if best is last:
+            break
     # Further steps tell starts apart in components where at least two are near the least cost.
     is_near = [one.cost < (1 + priors.hopeless) * best.cost for one in found]
     is_contested = torch.stack(is_near).sum(dim=0) > 1
     found = [one.told(problem, is_contested & near, shaped) for one, near in zip(found, is_near, strict=True)]
     best = found[0]
     for one in found[1:]:
-        best = best.but(problem, one.cost < (1 - priors.same_valley) * best.cost, one)
+        is_better = one.cost < (1 - priors.same_valley) * best.cost
+        is_hardly = ~is_better & (one.cost < best.cost)
+        if bool(is_hardly.any()):
+            apart = _share_apart(problem, best.begun.body_from_world, one.begun.body_from_world)
+            is_better = is_better | (is_hardly & (apart > priors.rival_share))
+        best = best.but(problem, is_better, one)
     return best.begun._replace(rival=_rival(problem, found, best))
+
+
+def _turned(problem: Problem, best: _Found, shaped: Tensor) -> list[Start]:
+    """Starts in which parts of the best solution are turned."""
+    graph, known = problem.graph, best.begun.body_from_world
+    angle = EdgeResiduals(graph, known.float()).angles()
+    parts = Parts.of(graph, angle, shaped, problem.priors.density.least_prior)
+    at = np.ascontiguousarray(known.cpu().numpy().T)
+    better = parts.improved(at)
+    rival = parts.rival(at if better is None else better, problem.priors)
+    turned = (torch.from_numpy(np.ascontiguousarray(one.T)) for one in (better, rival) if one is not None)
+    return [Start(one.to(known), shaped) for one in turned]
 
 
 class _Found(NamedTuple):
@@ -188,12 +220,15 @@ def settle_best(
     answer is doubtful.
     """
     weights = weights._replace(coarse=begun.coarse)
-    orientations = settle(graph, begun.body_from_world, weights, structure, priors, begun.steps)
+
+    def settled(one: Begun) -> _Found:
+        refined = settle(graph, one.body_from_world, weights, structure, priors, one.steps)
+        return _Found(one._replace(body_from_world=refined.body_from_world), refined.cost)
+
+    own = settled(begun)
     if begun.rival is None:
-        return Best(orientations, weights)
-    problem, rival, shaped = Problem(graph, structure, priors), begun.rival, weights.shaped.float()
-    other = settle(graph, rival.body_from_world, weights, structure, priors, rival.steps)
-    own, others = _Found.at(problem, begun, orientations, shaped), _Found.at(problem, rival, other, shaped)
+        return Best(own.begun.body_from_world, weights)
+    problem, shaped, others = Problem(graph, structure, priors), weights.shaped.float(), settled(begun.rival)
     is_better = others.cost < own.cost
     best, worse = own.but(problem, is_better, others).begun, others.but(problem, is_better, own).begun
     ahead = problem.log_likelihood(best.body_from_world, shaped) - problem.log_likelihood(worse.body_from_world, shaped)

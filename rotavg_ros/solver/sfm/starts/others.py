@@ -14,9 +14,10 @@ from rotavg_ros.solver.neurora.cleaned import Cleaned
 from rotavg_ros.solver.neurora.stages import apply_labels, trust_all
 from rotavg_ros.solver.neurora.tree import bootstrap
 from rotavg_ros.solver.sfm.cycles.evidence import by_triangles
-from rotavg_ros.solver.sfm.starts.choice import Start, begin
+from rotavg_ros.solver.sfm.refinement import PRIORS, coarse_steps
+from rotavg_ros.solver.sfm.starts.choice import Start
 from rotavg_ros.solver.sfm.starts.spectral import spectral
-from rotavg_ros.solver.sfm.step import Structure
+from rotavg_ros.solver.sfm.step import Problem, Structure
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
 # If cameras have fewer edges on average, other starts cost little and need all of the edges.
@@ -52,8 +53,9 @@ def other_starts(judged: Cleaned, is_believed: bool, parent_edge: Tensor, compon
         chosen = _part(graph, parent_edge)
         part, weight = graph.select_edges(chosen), allowed[chosen]
         _, by_eigenvectors = _by_all_alike(part, component)
-        begun = begin(part, [Start(by_eigenvectors, weight)], weight, Structure.of(part, component))
-        starts.append(Start(begun.body_from_world, allowed, ~sparse, is_settled=True))
+        problem = Problem(part, Structure.of(part, component), PRIORS)
+        settled, _ = coarse_steps(problem, by_eigenvectors, weight)
+        starts.append(Start(settled, allowed, ~sparse, is_settled=True))
     return starts
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra.compiled import compiled
-from rotavg_ros.solver.algebra.pointer_jumping import doublings, follow
+from rotavg_ros.solver.algebra.pointer_jumping import follow, lowest_common_ancestors
 from rotavg_ros.solver.algebra.quaternion_loops import canonical, inverse, product, unit
 from rotavg_ros.solver.algebra.residuals import edge_residual
 from rotavg_ros.solver.algebra.spanning_forest import (
@@ -198,14 +198,6 @@ def _position(
 
 
 def _path_length(parent: np.ndarray, depth: np.ndarray, level: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Length of the ways between nodes of the same tree, by lifting both to their lowest common ancestor."""
-    jumps = [parent, *(farther for _, farther in doublings(parent))]
-    low, high = np.where(level[a] >= level[b], a, b), np.where(level[a] >= level[b], b, a)
-    excess = level[low] - level[high]
-    for power, jump in enumerate(jumps):
-        low = np.where((excess >> power) & 1 == 1, jump[low], low)
-    for jump in reversed(jumps):
-        apart = jump[low] != jump[high]
-        low, high = np.where(apart, jump[low], low), np.where(apart, jump[high], high)
-    ancestor = np.where(low == high, low, parent[low])
+    """Length of the ways between nodes of the same tree, by way of their lowest common ancestor."""
+    ancestor = lowest_common_ancestors(parent, level, a, b)
     return np.asarray(depth[a] + depth[b] - 2 * depth[ancestor])

@@ -1,0 +1,224 @@
+"""Parts that few edges join to the rest of a graph, and turns of them under which more of these edges agree.
+
+Steps that start from a wrong turn of such a part do not leave it: the part's inner edges hold it together, and of the
+few edges that join it, false ones may fit. So a spanning tree is built along the edges whose ends have most neighbours
+in common. An edge that leaves a part has few, so the tree leaves it only once, and the part is a branch of the tree.
+Each edge that joins a branch to the rest states how the branch would have to turn for the edge to fit. The statement
+that lowers Σ w ‖r‖^½ most leads to a better solution, the one that raises it least to a rival of the best one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from scipy.sparse import csr_array
+from torch import Tensor
+
+from rotavg_ros.solver.algebra import quaternion_rows as rows
+from rotavg_ros.solver.algebra.pointer_jumping import (
+    doublings,
+    follow,
+    levels,
+    lowest_common_ancestors,
+    sums_of_branches,
+)
+from rotavg_ros.solver.algebra.spanning_forest import SpanningForest, minimum_spanning_forest
+from rotavg_ros.solver.neurora.numbers import NUMBERS
+from rotavg_ros.solver.sfm.priors import RefinementPriors
+from rotavg_ros.view_graph import ViewGraph
+
+# A branch that more edges join to the rest is not held in a wrong place by a few false ones.
+_MOST_EDGES = 32
+# Maximum number of edges per source along which the tree is built, where they suffice to connect the graph.
+_TREE_DEGREE = 20
+# Number of pairs of statements that are compared at a time; bounds the memory.
+_AT_A_TIME = 1 << 20
+# Maximum number of rounds in which branches are turned, each after the turns of those before.
+_ROUNDS = 5
+
+
+@dataclass(frozen=True)
+class Turns:
+    """The best turn of each of K branches.
+
+    Attributes:
+        node: ``(K,)`` the branches' topmost nodes.
+        change: ``(K,)`` change of Σ w ‖r‖^½ if this branch alone is turned; infinite if no edge states a far turn.
+        turn: ``(4, K)`` in the world's frame: orientations become body_from_world · turn.
+    """
+
+    node: np.ndarray
+    change: np.ndarray
+    turn: np.ndarray
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Branches of a graph of N nodes and M edges that few edges join to the rest, P such edges in all.
+
+    Attributes:
+        source, target: ``(M,)``.
+        measured: ``(4, M)`` target_from_source.
+        weight: ``(M,)`` w of the cost.
+        forest: the tree of each component.
+        node: ``(P,)`` topmost node of the branch; sorted.
+        edge, inside: ``(P,)`` an edge that joins the branch, and its end within the branch.
+    """
+
+    source: np.ndarray
+    target: np.ndarray
+    measured: np.ndarray
+    weight: np.ndarray
+    forest: SpanningForest
+    node: np.ndarray
+    edge: np.ndarray
+    inside: np.ndarray
+
+    @classmethod
+    def of(cls, graph: ViewGraph, angle: Tensor, weight: Tensor, least_weight: float) -> Parts:
+        """The parts, given residuals of orientations in which most edges fit.
+
+        Args:
+            angle: ``(M,)`` rad, residuals.
+            weight: ``(M,)`` w of the cost.
+            least_weight: edges of less weight join nothing.
+        """
+        source, target = graph.source.cpu().numpy(), graph.target.cpu().numpy()
+        measured = np.ascontiguousarray(graph.target_from_source.double().cpu().numpy().T)
+        forest = _tree(graph, source, target, angle.cpu().numpy() <= NUMBERS.outlier_angle)
+        weights = weight.double().cpu().numpy()
+        used = np.flatnonzero(weights > least_weight)
+        node, edge, inside = _joining(forest, source[used], target[used])
+        return cls(source, target, measured, weights, forest, node, used[edge], inside)
+
+    def turns(self, body_from_world: np.ndarray) -> Turns:
+        """The best turn of each branch, given orientations ``(4, N)``."""
+        node, first, branch = np.unique(self.node, return_index=True, return_inverse=True)
+        count = np.diff(np.append(first, len(branch)))
+        stated = self._stated(body_from_world)
+        weight, angle = self.weight[self.edge], _angle(stated[3])
+        tries = np.flatnonzero(angle > NUMBERS.outlier_angle)
+        size, cost = count[branch[tries]], np.empty(len(tries))
+        for begin, end in pairwise(_bounds(size)):
+            one, of = tries[begin:end], size[begin:end]
+            which = np.repeat(np.arange(len(one)), of)
+            # All statements of the same branch, one after another for each of ``one``.
+            other = np.arange(len(which)) - np.repeat(np.cumsum(of) - of, of) + first[branch[one]][which]
+            cosine = np.einsum("ip,ip->p", stated[:, one[which]], stated[:, other])
+            cost[begin:end] = np.bincount(which, weight[other] * np.sqrt(_angle(cosine)), len(one))
+        order = np.lexsort((tries, cost, branch[tries]))
+        at, best = np.unique(branch[tries[order]], return_index=True)
+        chosen = order[best]
+        change, turn = np.full(len(node), np.inf), _identities(len(node))
+        change[at] = cost[chosen] - np.bincount(branch, weight * np.sqrt(angle), len(node))[at]
+        turn[:, at] = stated[:, tries[chosen]]
+        return Turns(node, change, turn)
+
+    def improved(self, body_from_world: np.ndarray) -> np.ndarray | None:
+        """The orientations ``(4, N)`` after turns that lower the cost; None if none does."""
+        is_turned = False
+        for _ in range(_ROUNDS):
+            turns = self.turns(body_from_world)
+            if not bool((turns.change < 0).any()):
+                break
+            # Of branches that the same edge joins, the one is turned that gains most.
+            branch = np.searchsorted(turns.node, self.node)
+            of_edge, of_branch = np.full(len(self.source), np.inf), np.full(len(turns.node), np.inf)
+            np.minimum.at(of_edge, self.edge, turns.change[branch])
+            np.minimum.at(of_branch, branch, of_edge[self.edge])
+            chosen = (turns.change < 0) & (turns.change <= of_branch)
+            body_from_world, is_turned = self._turned(body_from_world, turns, chosen), True
+        return body_from_world if is_turned else None
+
+    def rival(self, body_from_world: np.ndarray, priors: RefinementPriors) -> np.ndarray | None:
+        """The orientations with a turn, in each component, that raises the cost least; None if all raise it by much.
+
+        Branches are left out that are too small, or too large, to make another solution.
+        """
+        turns, component = self.turns(body_from_world), self.forest.component
+        of_branch = component[turns.node]
+        share = sums_of_branches(self.forest.parent, np.ones(len(component)))[turns.node]
+        share = share / np.bincount(component)[of_branch]
+        is_part = np.minimum(share, 1 - share) > priors.rival_share
+        change = np.where(is_part & (turns.change >= 0), turns.change, np.inf)
+        least = np.full(int(component.max(initial=-1)) + 1, np.inf)
+        np.minimum.at(least, of_branch, change)
+        angle = _angle(rows.residual(body_from_world, self.measured, self.source, self.target)[3])
+        cost = np.bincount(component[self.source], self.weight * np.sqrt(angle), len(least))
+        chosen = (change <= least[of_branch]) & (change < priors.rival_cost * cost[of_branch])
+        return self._turned(body_from_world, turns, chosen) if chosen.any() else None
+
+    def _stated(self, body_from_world: np.ndarray) -> np.ndarray:
+        """``(4, P)`` how each edge's branch would have to turn: W with R_inside W R_outside⁻¹ = measured."""
+        outside = self.source[self.edge] + self.target[self.edge] - self.inside
+        measured = self.measured[:, self.edge]
+        measured = np.where(self.target[self.edge] == self.inside, measured, rows.inverse(measured))
+        at_inside, at_outside = body_from_world[:, self.inside], body_from_world[:, outside]
+        return np.asarray(rows.multiply(rows.inverse(at_inside), rows.multiply(measured, at_outside)))
+
+    def _turned(self, body_from_world: np.ndarray, turns: Turns, chosen: np.ndarray) -> np.ndarray:
+        """The orientations ``(4, N)`` after the turns of the chosen branches ``(K,)``."""
+        turn = _identities(body_from_world.shape[1])
+        turn[:, turns.node[chosen]] = turns.turn[:, chosen]
+        # Inner branches turn first, within the larger ones that they are in.
+        for ancestor, _ in doublings(self.forest.parent):
+            turn = rows.multiply(turn, turn[:, ancestor])
+        return np.asarray(rows.normalize(rows.multiply(body_from_world, turn)))
+
+
+def _tree(graph: ViewGraph, source: np.ndarray, target: np.ndarray, fits: np.ndarray) -> SpanningForest:
+    """The forest along edges that fit and whose ends have most neighbours in common."""
+    count = np.bincount(source, minlength=graph.num_nodes)
+    # The rank of an edge among those with its source; a canonical form is sorted by source.
+    rank, of = np.arange(len(source)) - (np.cumsum(count) - count)[source], count[source]
+    is_spread = (of <= _TREE_DEGREE) | ((rank + 1) * _TREE_DEGREE // of > rank * _TREE_DEGREE // of)
+    few = np.flatnonzero(is_spread & fits)
+    ends = np.concatenate((source[few], target[few])), np.concatenate((target[few], source[few]))
+    adjacency = csr_array((np.ones(len(ends[0]), dtype=np.int32), ends), (graph.num_nodes, graph.num_nodes))
+    common = adjacency[source[few]].multiply(adjacency[target[few]]).sum(axis=1)
+    cost = np.where(fits, 2.0, 3.0)
+    cost[few] = 1 / (1 + np.asarray(common).ravel())
+    return minimum_spanning_forest(graph, torch.from_numpy(cost))
+
+
+def _joining(
+    forest: SpanningForest, source: np.ndarray, target: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Edges that join branches with few of them: the branch's topmost node, the edge, and its end inside; sorted."""
+    parent, is_root, number = forest.parent, forest.parent_edge < 0, np.arange(len(source))
+    level = levels(parent)
+    meeting = lowest_common_ancestors(parent, level, source, target)
+    ends = np.bincount(np.concatenate((source, target)), minlength=len(parent))
+    count = sums_of_branches(parent, ends - 2.0 * np.bincount(meeting, minlength=len(parent)))
+    is_few = (count <= _MOST_EDGES) & ~is_root
+    # The nearest node upwards, itself included, whose branch has few; a root if there is none.
+    nearest = follow(np.where(is_few | is_root, np.arange(len(parent)), parent))
+    found = [(number[:0], number[:0], number[:0])]
+    for end in (source, target):
+        node, edge = nearest[end], number
+        while len(edge):
+            is_below = is_few[node] & (level[node] > level[meeting[edge]])
+            node, edge = node[is_below], edge[is_below]
+            found.append((node, edge, end[edge]))
+            node = nearest[parent[node]]
+    node, edge, inside = (np.concatenate(column) for column in zip(*found, strict=True))
+    order = np.lexsort((edge, node))
+    return node[order], edge[order], inside[order]
+
+
+def _identities(count: int) -> np.ndarray:
+    return np.tile(np.array([[0.0], [0.0], [0.0], [1.0]]), count)
+
+
+def _angle(cosine: np.ndarray) -> np.ndarray:
+    """Angles in rad of rotations whose quaternions have this w, of either sign."""
+    return np.asarray(2 * np.arccos(np.minimum(np.abs(cosine), 1.0)))
+
+
+def _bounds(size: np.ndarray) -> list[int]:
+    """Bounds of stretches whose sizes come to about :data:`_AT_A_TIME` each."""
+    cut = np.flatnonzero(np.diff(np.cumsum(size) // _AT_A_TIME)) + 1
+    return [0, *cut.tolist(), len(size)]
