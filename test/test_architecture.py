@@ -202,11 +202,16 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "compaction": {"measurements"},
         "odometry": {"growing_array", "measurements", "quaternion"},
         "content": {"answer", "graph", "measurements", "options", "quaternion"},
+        "current_content": {"content", "measurements", "options", "state"},
+        "ticks": {"answer", "content", "current_content", "free_memory", "options"},
         "": {"answer", "estimator", "measurements", "options", "state"},
         "answer": {"compaction", "graph", "measurements", "odometry", "quaternion"},
         "graph": {"compaction", "growing_array", "measurements", "odometry", "options", "quaternion"},
         "state": {"answer", "compaction", "content", "graph", "measurements", "odometry", "options"},
-        "estimator": {"answer", "content", "free_memory", "graph", "measurements", "options", "quaternion", "state"},
+        "estimator": {
+            *("answer", "content", "current_content", "graph"),
+            *("measurements", "options", "quaternion", "state", "ticks"),
+        },
     },
     "ros": {
         "": set(),

@@ -14,7 +14,7 @@ from rotavg_ros.evaluation.benchmark import report, schedule
 from rotavg_ros.evaluation.benchmark.measure import ENOUGH_S
 from rotavg_ros.evaluation.common.tables import Report, Table
 from rotavg_ros.evaluation.live import long_run, ticks
-from rotavg_ros.online.estimator import WORK_AFTER
+from rotavg_ros.online.ticks import WORK_AFTER
 from rotavg_ros.results import make_folder
 from rotavg_ros.solver import SECONDS_PER_UNIT
 

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from rotavg_ros.online import free_memory
-from rotavg_ros.online.answer.anchoring import root_orientations
 from rotavg_ros.online.answer.answer import Answer
-from rotavg_ros.online.answer.gauge import fix_gauge
 from rotavg_ros.online.answer.odometry_frame import OdometryFrame, placed_frames
 from rotavg_ros.online.answer.trajectory import Trajectory, corrected_trajectories
-from rotavg_ros.online.content import AcceptedAnswer, Content, ContentState, Counts
+from rotavg_ros.online.content import Content, Counts
+from rotavg_ros.online.current_content import CurrentContent
 from rotavg_ros.online.graph.snapshot import GraphSnapshot
 from rotavg_ros.online.measurements import (
     MAX_ID,
@@ -31,48 +25,15 @@ from rotavg_ros.online.quaternion import Quaternion
 from rotavg_ros.online.state import content as state_content
 from rotavg_ros.online.state import file as state_file
 from rotavg_ros.online.state.discarded import Discarded
-from rotavg_ros.solver import Abandoned, abandonable
-from rotavg_ros.view_graph import EdgeLabel, ViewGraph, ViewGraphError
-
-if TYPE_CHECKING:
-    from rotavg_ros.solver import Solution
-
-# The signature of :func:`rotavg_ros.solve`.
-Solver = Callable[..., "Solution"]
-
-# The signature of :func:`rotavg_ros.solver.advance`.
-Advance = Callable[[object | None, float], float]
-
-# Units of work that a tick has before its answer, 15 ms, and after it, .1 s (see the solver's SECONDS_PER_UNIT). From
-# docs/diary/ticks.md, "Answers first": with 10 to 100 units before it, answers err alike; 95 % take at most .11 s with
-# 100, .02 s with fewer. The work after it decides how soon a whole search ends, and does not affect the last answer.
-TICK_WORK, WORK_AFTER = 30.0, 200.0
-
-
-class TickAbandonedError(Exception):
-    """A tick was abandoned, since its answer is no longer wanted; the message says why."""
-
-
-class _Tick:
-    """A tick that is running.
-
-    Attributes:
-        is_forced: somebody has asked for its answer.
-        abandoned_by: what made its answer worthless; None as long as it is wanted.
-    """
-
-    def __init__(self, is_forced: bool) -> None:
-        self.is_forced = is_forced
-        self.abandoned_by: str | None = None
-
-    def is_abandoned(self) -> bool:
-        return self.abandoned_by is not None
+from rotavg_ros.online.ticks import TICK_WORK, WORK_AFTER, Advance, Solver, Ticks
+from rotavg_ros.view_graph import EdgeLabel, ViewGraphError
 
 
 class OnlineEstimator:
     """Thread-safe: inputs may come while another thread solves; they wait for microseconds.
 
     Only when a full graph is compacted do they wait some tenths of a second, at 200 000 keyframes once in 20 000.
+    :mod:`~rotavg_ros.online.current_content` says which lock guards what.
 
     A tick solves from the previous answer while data flows (warm), and once more from scratch (cold) when the graph
     has not changed since the tick before. So the last answer before silence is what ``rotavg solve`` says of the
@@ -95,32 +56,17 @@ class OnlineEstimator:
                 (:meth:`load`), unless it is empty. It runs within these methods, so it must be quick.
             advance: default: :func:`rotavg_ros.solver.advance` with the default solver, nothing with another.
         """
-        self.options = options or EstimatorOptions()
-        self._solver, self._advance = (solver, advance) if solver else _default_solver()
-        self._lock = threading.Lock()
-        self._tick_lock = threading.Lock()  # one tick at a time; taken before ``_lock``
-        self._paused = False
-        self._running: _Tick | None = None
-        self._after_work = free_memory.AfterWork()
-        self._generation = 0
-        self._time_jumps = 0
-        self._on_discard = on_discard
-        self._content = Content(ContentState.begin(self.options))
+        self._current = CurrentContent(options or EstimatorOptions(), on_discard)
+        self._lock = self._current.lock
+        self._ticks = Ticks(self._current, solver, advance)
 
-    def _start_over(self, state: ContentState) -> None:
-        """Begin with this content; the one before is handed to ``on_discard`` unless it is empty."""
-        discarded = Discarded(self._content.state)
-        self._generation += 1
-        self._content = Content(state)
-        self._content.builder.set_options(self.options)  # they may have changed while a file was read
-        self._abandon_tick("everything was forgotten or replaced meanwhile")
-        if self._on_discard is not None and discarded.num_keyframes:
-            self._on_discard(discarded)
+    @property
+    def _content(self) -> Content:
+        return self._current.content
 
-    def _abandon_tick(self, why: str) -> None:
-        """Make the running tick, if there is one, end soon and change nothing."""
-        if self._running is not None:
-            self._running.abandoned_by = why
+    @property
+    def options(self) -> EstimatorOptions:
+        return self._current.options
 
     def add_odometry(
         self,
@@ -146,29 +92,12 @@ class OnlineEstimator:
         turn, place = plain_numbers(world_from_body), plain_numbers(position)
         message = OdometryMessage(robot, plain_number(stamp_ns), turn or (), place)
         with self._lock:
-            reason, since_jump = self._content.add_odometry(message)
-            if not since_jump:
-                return reason
-            self._time_jumps += 1
-            if self.options.on_time_jump == "new_component":
-                self._content.builder.begin_time_line(robot, len(since_jump))
-            elif self.options.on_time_jump == "reset":
-                self._forget()
-            else:
-                return reason
-            return [self._content.add_odometry(message)[0] for message in since_jump][-1]
+            return self._current.add_odometry(message)
 
     def clock_went_back(self, now_ns: int) -> None:
         """The clock that stamps the data (``/clock``) went back to ``now_ns``; treated as if odometry had shown it."""
         with self._lock:
-            data_time_ns = self._content.state.growth.data_time.now_ns
-            if data_time_ns is None or data_time_ns - now_ns <= self.options.time_jump_ns:
-                return  # no data from after it are known, or odometry has shown the jump already
-            if self.options.on_time_jump == "reset":
-                self._time_jumps += 1
-                self._forget()
-            elif self.options.on_time_jump == "new_component":
-                self._time_jumps += self._content.builder.clock_went_back(now_ns)
+            self._current.clock_went_back(now_ns)
 
     def add_edge(self, edge: EdgeMeasurement, generation: int | None = None) -> RejectReason | None:
         """Take a measured edge.
@@ -181,7 +110,7 @@ class OnlineEstimator:
             why it was refused and counted; None if it was taken, may wait, or is meant for another graph.
         """
         with self._lock:
-            if generation not in (None, self._generation):
+            if generation not in (None, self._current.generation):
                 return None
             return self._content.builder.add_edge(edge)
 
@@ -230,14 +159,12 @@ class OnlineEstimator:
     def counts(self) -> Counts:
         """Present sizes and refusals."""
         with self._lock:
-            return self._content.counts(self._time_jumps)
+            return self._content.counts(self._current.time_jumps)
 
     def set_options(self, options: EstimatorOptions) -> None:
         """Change the options; what was built so far stays, and the next tick solves anew."""
         with self._lock:
-            self.options = options
-            self._content.builder.set_options(options)
-            self._content.solve_anew()
+            self._current.set_options(options)
 
     def trajectories(self, answer: Answer) -> dict[str, Trajectory]:
         """Poses of every robot's keyframes in the answer that have a stamp, see :func:`corrected_trajectories`."""
@@ -278,12 +205,12 @@ class OnlineEstimator:
     @property
     def generation(self) -> int:
         """Counts how often everything was forgotten or replaced; what was sent before may then be new again."""
-        return self._generation
+        return self._current.generation
 
     @property
     def time_jumps(self) -> int:
         """Counts how often the data's time went back."""
-        return self._time_jumps
+        return self._current.time_jumps
 
     @property
     def first_version(self) -> int:
@@ -298,22 +225,17 @@ class OnlineEstimator:
 
     @property
     def paused(self) -> bool:
-        return self._paused
+        return self._current.paused
 
     def pause(self, paused: bool) -> None:
         """While paused, inputs are taken as usual but ticks do nothing and a running one is given up, unless forced."""
         with self._lock:
-            self._paused = paused
-            if paused and self._running is not None and not self._running.is_forced:
-                self._abandon_tick("paused meanwhile")
+            self._current.pause(paused)
 
     def reset(self) -> None:
         """Forget everything, counters included. Answers go on counting up; a running tick is thrown away."""
         with self._lock:
-            self._forget()
-
-    def _forget(self) -> None:
-        self._start_over(ContentState.begin(self.options, self._content.version))
+            self._current.forget()
 
     def save(self, path: Path) -> None:
         """Write everything into one file, whole or not at all.
@@ -334,7 +256,7 @@ class OnlineEstimator:
         state = state_content.restore(state_file.read(path), self.options)
         with self._lock:
             state.version = max(state.version, self._content.version)
-            self._start_over(state)
+            self._current.replace(state)
 
     def tick(self, force_cold: bool = False, work: float = TICK_WORK) -> Answer | None:
         """Solve, if there is anything new.
@@ -352,13 +274,7 @@ class OnlineEstimator:
             UserError: from the solver; the next tick tries again.
             TickAbandonedError: everything was forgotten or replaced meanwhile, or ticks were paused.
         """
-        with self._tick_lock:
-            started = time.perf_counter()
-            answer = self._tick(force_cold, work)
-            if answer is None:
-                return None
-            free_memory.give_back_after(len(answer.source), answer.stage_seconds)
-            return replace(answer, seconds=time.perf_counter() - started)
+        return self._ticks.tick(force_cold, work)
 
     def go_on(self, work: float = WORK_AFTER) -> float:
         """After a tick, continue with the work that it has left; the next tick uses the result.
@@ -372,80 +288,4 @@ class OnlineEstimator:
         Raises:
             UserError, TickAbandonedError: as :meth:`tick`.
         """
-        if self._advance is None:
-            return 0.0
-        with self._tick_lock:
-            with self._lock:
-                if self._paused:
-                    return 0.0
-                memory, running = self._content.memory, _Tick(False)
-                self._running = running
-            try:
-                with abandonable(running.is_abandoned):
-                    spent = self._advance(memory, work)
-            except Abandoned:
-                raise TickAbandonedError(f"abandoned: {running.abandoned_by}") from None
-            self._after_work.spent(spent)
-            return spent
-
-    def _tick(self, force_cold: bool, work: float) -> Answer | None:
-        with self._lock:
-            content, options = self._content, self.options
-            problem = None if self._paused and not force_cold else content.next_problem(force_cold)
-            running = self._running = _Tick(force_cold)
-        if problem is None:
-            return None
-        snapshot, warm_start = problem.snapshot, problem.warm_start()
-        try:
-            with abandonable(running.is_abandoned):
-                solution = self._solver(
-                    _solved_graph(problem.graph, options),
-                    **options.for_solver,
-                    warm_start=warm_start,
-                    memory=None if warm_start is None else problem.goes_on_from,
-                    work=work,
-                    anew=problem.anew,
-                )
-        except Abandoned:
-            raise TickAbandonedError(f"abandoned: {running.abandoned_by}") from None
-        if problem.anew and not solution.is_anew:
-            with self._lock:  # nothing but the solver's memory has changed
-                if options is self.options:
-                    content.remember(solution.memory)
-            return None
-        component = solution.component.cpu()
-        known = problem.known(solution, options.outlier_threshold)
-        with self._lock:
-            roots = root_orientations(content.builder, snapshot, component, problem.answered)
-        body_from_world = fix_gauge(solution.body_from_world.cpu(), component, roots)
-        was_cold = warm_start is None or (problem.anew and solution.is_anew)
-        answer = Answer.of_solution(
-            snapshot,
-            problem.of_all_edges(solution, known),
-            body_from_world,
-            problem.thresholds(options.outlier_threshold, was_cold),
-            content.version + 1,
-            was_cold,
-        )
-        answer = replace(answer, waits=problem.waits)
-        with self._lock:
-            if content is not self._content:  # the solve ended before it noticed that it was abandoned
-                raise TickAbandonedError(f"abandoned: {running.abandoned_by}")
-            revision, memory = snapshot.revision, solution.memory
-            content.accept(
-                AcceptedAnswer(body_from_world, component, answer.outlier, revision, was_cold, memory, known)
-            )
-            if options is not self.options:
-                content.solve_anew()
-        return answer
-
-
-def _default_solver() -> tuple[Solver, Advance]:
-    from rotavg_ros.solver import advance, solve  # loads the networks: not before somebody solves
-
-    return solve, advance
-
-
-def _solved_graph(graph: ViewGraph, options: EstimatorOptions) -> ViewGraph:
-    """The graph without translations unless they are in metres."""
-    return replace(graph, translation=None) if options.translation_scale == "none" else graph
+        return self._ticks.go_on(work)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from rotavg_ros.online import OnlineEstimator
-from rotavg_ros.online.estimator import TickAbandonedError
+from rotavg_ros.online.ticks import TickAbandonedError
 from rotavg_ros.solver.running.work import stop_if_abandoned
 
 from .drives import OPTIONS, closure, drive, feed, final, make

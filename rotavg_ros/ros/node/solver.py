@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 
 from rotavg_ros.online import EstimatorOptions
-from rotavg_ros.online.estimator import Advance
-from rotavg_ros.online.estimator import Solver as Solve
 from rotavg_ros.online.solver_process.client import SolverProcess
 from rotavg_ros.online.solver_process.process import ServerProcess
+from rotavg_ros.online.ticks import Advance
+from rotavg_ros.online.ticks import Solver as Solve
 from rotavg_ros.settings.parameters import NodeParameters
 from rotavg_ros.view_graph import EdgeKind, ViewGraph
 

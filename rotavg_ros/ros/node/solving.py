@@ -17,9 +17,9 @@ from rclpy.node import Node
 from rotavg_ros.errors import UserError
 from rotavg_ros.online import Answer, Discarded, OnlineEstimator
 from rotavg_ros.online.answer.joins import joins
-from rotavg_ros.online.estimator import TICK_WORK, WORK_AFTER, TickAbandonedError
 from rotavg_ros.online.state.file import StateFileError, StateFileInUseError, check_kind
 from rotavg_ros.online.state.lock import StateFileLock
+from rotavg_ros.online.ticks import TICK_WORK, WORK_AFTER, TickAbandonedError
 from rotavg_ros.ros.node.diagnostics import KEPT, NOT_KEPT, of_other_robots
 from rotavg_ros.ros.node.health import Health
 from rotavg_ros.ros.node.intake.forwarding import Forwarding
