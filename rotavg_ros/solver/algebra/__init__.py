@@ -1,1 +1,1 @@
-"""What all solves are made of: sorted edges, sparse systems, spanning forests, quaternions in rows, coarse threads."""
+"""Building blocks of all solves: sorted edges, sparse systems, spanning forests, quaternions in rows."""

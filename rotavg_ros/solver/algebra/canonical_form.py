@@ -1,18 +1,18 @@
 """One form for all descriptions of the same view-graph.
 
-Names of the nodes, order and direction of the edges, copies of an edge and the choice of the cameras' axes say nothing
-about the orientations. Here they are chosen anew, by what was measured alone:
+The names of the nodes, the order and direction of the edges, copies of an edge, and the choice of the cameras' axes
+carry no information about the orientations. The canonical form chooses them by the measurements alone:
 
-- Of edges that state the same rotation between the same nodes, one is kept, with the best that is stated of them.
-- Nodes are sorted by a weighted number of walks, k_v = Σ_u (½ + w_uv) k_u, a few times over, begun with k = 1. w_uv is
-  the cosine of half an edge's angle, which none of those choices changes.
+- Of edges that state the same rotation between the same nodes, one is kept, with the highest precision stated.
+- Nodes are sorted by a weighted number of walks: k_v = Σ_u (½ + w_uv) k_u, iterated a few times from k = 1. w_uv is the
+  cosine of half an edge's angle, which none of those choices changes.
 - Edges run from the earlier node to the later one and are sorted by both.
 - Cameras' axes: those of the second moment Σ s sᵀ of all edges, where s is x, y, z of an edge's quaternion. Turning the
-  cameras' axes by A, R̃_uv → A R̃_uv A⁻¹, turns every s by A, and the moment's axes with them. y has the largest moment,
-  z the least. An axis points to where Σ_v |b_v|² b_v does, b_v = Σ_u s_uv over the edges that arrive at v; this is odd
-  in s, but the same whichever way an edge was stated.
+  cameras' axes by A, R̃_uv → A R̃_uv A⁻¹, turns every s by A, and so the moment's axes. y has the largest moment, z the
+  least. An axis has the direction of Σ_v |b_v|² b_v, where b_v = Σ_u s_uv over the edges that arrive at v; this is odd
+  in s, but does not depend on the direction in which an edge was stated.
 
-Where the data are the same for several nodes or axes, any of them is taken, since then it makes no difference.
+If the data are the same for several nodes or axes, any of them is taken, since it makes no difference.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from rotavg_ros.solver.algebra.sorted_edges import sorted_by_node
 from rotavg_ros.solver.running.threads import for_each, slices, threads_on
 from rotavg_ros.view_graph import EdgeKind, ViewGraph, mean_precision
 
-# So often walks grow by an edge: enough to tell apart what only distant edges tell apart, little beside a solve.
+# Edges of a walk: enough to distinguish nodes that differ only in distant edges, at little cost compared to a solve.
 _WALK_LENGTH = 4
-# So many edges of a component tell its axes; those of the synthetic recipes to about half a degree.
+# Most edges of a component that determine its axes; on the synthetic recipes, to about half a degree.
 _MOST_EDGES = 1 << 15
-# Quaternions are the same if no entry differs by more: far below any measurement, far above rounding.
+# Quaternions are the same if no entry differs by more: far below any measurement's noise, far above rounding errors.
 _SAME = 1e-9
 # With fewer edges a sum takes less time than waking another worker.
 _WORTH_WORKERS = 50_000
@@ -46,11 +46,11 @@ class CanonicalForm:
     """A view-graph of N nodes, M edges and C components in canonical form, and how to get back.
 
     Attributes:
-        graph: in canonical form, with K ≤ M edges, without translations; of copies the highest precision is kept, and
-            the information of the highest mean precision.
-        component: ``(N,)`` of its nodes.
-        node: ``(N,)`` which of the given graph's nodes each is.
-        edge: ``(M,)`` int32, which of its edges stands for each of the given graph's.
+        graph: in canonical form, with K ≤ M edges, without translations; of copies, the highest precision is kept, and
+            the information of highest mean precision.
+        component: ``(N,)`` component of each canonical node.
+        node: ``(N,)`` node of the given graph that each canonical node is.
+        edge: ``(M,)`` int32, canonical edge that stands for each edge of the given graph.
         canonical_from_body: ``(C, 4)`` the canonical axes of each component's cameras.
     """
 
@@ -62,11 +62,11 @@ class CanonicalForm:
 
     @classmethod
     def of(cls, graph: ViewGraph, component: Tensor | None = None, own_axes: bool = True) -> CanonicalForm:
-        """Of a graph.
+        """The canonical form of a graph.
 
         Args:
-            component: ``(N,)`` as it numbers its own, default: computed.
-            own_axes: the cameras' axes are those of the measurements; otherwise they stay as they are given.
+            component: ``(N,)`` the graph's connected components; default: computed.
+            own_axes: whether the measurements determine the cameras' axes; otherwise the axes stay as given.
         """
         component = graph.components() if component is None else component
         form, has_parallels = _form(graph, component, own_axes)
@@ -74,7 +74,7 @@ class CanonicalForm:
             return form
         kept, copy_of = _without_copies(graph)
         graph = _stating_the_highest(graph, kept, copy_of)
-        # Several rotations between the same nodes are sorted by their angles, and so stay.
+        # Different rotations between the same nodes are sorted by their angles; the sorting by nodes keeps this order.
         by_angle = graph.target_from_source[kept, 3].argsort(stable=True)
         form, _ = _form(graph.select_edges(kept[by_angle]), component, own_axes)
         place = torch.empty_like(form.edge)
@@ -82,7 +82,7 @@ class CanonicalForm:
         return replace(form, edge=place[copy_of])
 
     def first_nodes(self) -> Tensor:
-        """``(C,)`` the node of the canonical graph that is the first of each component of the given one."""
+        """``(C,)`` the canonical node of the first node of each component of the given graph."""
         nodes = torch.full((len(self.canonical_from_body),), len(self.node), device=self.node.device)
         first = nodes.scatter_reduce(0, self.component, self.node, "amin")
         place = torch.empty_like(self.node)
@@ -94,14 +94,14 @@ class CanonicalForm:
         return torch.empty_like(value).scatter_(0, self.node, value)
 
     def orientations(self, body_from_world: Tensor) -> Tensor:
-        """Those of the canonical graph → those of the given one, ``(N, 4)``."""
+        """Orientations of the canonical graph → of the given one, ``(N, 4)``."""
         axes = rotations.inverse(self.canonical_from_body)[self.component]
         given = torch.empty_like(body_from_world)
         given[self.node] = rotations.multiply(axes.to(body_from_world), body_from_world)
         return given
 
     def canonical_orientations(self, body_from_world: Tensor) -> Tensor:
-        """The other way round, ``(N, 4)``."""
+        """Orientations of the given graph → of the canonical one, ``(N, 4)``."""
         axes = self.canonical_from_body[self.component].to(body_from_world)
         return rotations.canonical(rotations.multiply(axes, body_from_world[self.node]))
 
@@ -133,7 +133,7 @@ def _form(graph: ViewGraph, component: Tensor, own_axes: bool) -> tuple[Canonica
         measured[part] = _turned(upwards, axes, component, low[part]) if own_axes else upwards
 
     for_each(write, slices(len(low), SLICE_EDGES, low.device))
-    # One number each, seen M times: at millions of edges columns that nobody reads take room.
+    # One number each, expanded to M rows: with millions of edges, columns that nobody reads would take much memory.
     kind, precision, steps = (
         torch.full_like(column[:1], value).expand(len(column))
         for column, value in ((graph.kind, EdgeKind.LOOP_CLOSURE), (graph.precision, torch.nan), (graph.steps, 1.0))
@@ -155,7 +155,7 @@ def _form(graph: ViewGraph, component: Tensor, own_axes: bool) -> tuple[Canonica
 
 
 class _StatedEdges(NamedTuple):
-    """Edges as they are stated, between nodes by their rank.
+    """Edges as stated, between nodes given by their rank.
 
     Attributes:
         source, target: ``(M,)`` int32.
@@ -180,7 +180,7 @@ class _StatedEdges(NamedTuple):
         return cls(source, target, graph.target_from_source)
 
     def in_order(self, num_nodes: int) -> tuple[Tensor, Tensor]:
-        """By the lower end, then by the higher one: the lower end of each ``(M,)`` int64, and which it is, int32."""
+        """Sort by the lower end, then by the higher one: sorted lower ends ``(M,)`` int64, and the order, int32."""
         _, by_high = sorted_by_node(torch.maximum(self.source, self.target), num_nodes)
         low = torch.minimum(self.source, self.target).index_select(0, by_high)
         first, by_low = sorted_by_node(low, num_nodes)
@@ -192,7 +192,7 @@ class _StatedEdges(NamedTuple):
         return torch.maximum(self.source.index_select(0, edges), self.target.index_select(0, edges))
 
     def upwards(self, edges: Tensor) -> Tensor:
-        """What some edges ``(k,)`` measure from the lower to the higher end, ``(k, 4)``."""
+        """Measurements ``(k, 4)`` of some edges ``(k,)``, from the lower to the higher end."""
         is_reversed = self.source.index_select(0, edges) > self.target.index_select(0, edges)
         signs = self.target_from_source.new_tensor([[1.0, 1.0, 1.0, 1.0], [-1.0, -1.0, -1.0, 1.0]])
         return signs.index_select(0, is_reversed.int()).mul_(self.target_from_source.index_select(0, edges))
@@ -216,7 +216,7 @@ def _without_copies(graph: ViewGraph) -> tuple[Tensor, Tensor]:
 
 
 def _stating_the_highest(graph: ViewGraph, kept: Tensor, copy_of: Tensor) -> ViewGraph:
-    """The graph whose ``kept`` edges state the best that any of their copies does."""
+    """The graph, its ``kept`` edges with the highest precision and the best information of any of their copies."""
     if graph.information is not None:
         graph = replace(graph, information=_best_information(graph, kept, copy_of))
     if not bool(graph.precision.isfinite().any()):
@@ -229,14 +229,14 @@ def _stating_the_highest(graph: ViewGraph, kept: Tensor, copy_of: Tensor) -> Vie
 
 
 def _seen_from_the_higher(graph: ViewGraph, is_reversed: Tensor) -> Tensor:
-    """Information ``(M, 3, 3)`` in the frame of the target; in the source's of edges that are to be reversed."""
+    """Information ``(M, 3, 3)`` in the target's frame; in the source's frame if the edge is to be reversed."""
     assert graph.information is not None
     seen = rotations.turn_form(rotations.inverse(graph.target_from_source), graph.information)
     return torch.where(is_reversed[:, None, None], seen, graph.information)
 
 
 def _best_information(graph: ViewGraph, kept: Tensor, copy_of: Tensor) -> Tensor:
-    """Information ``(M, 3, 3)`` whose ``kept`` rows are those of the copies of the highest mean precision.
+    """Information ``(M, 3, 3)``; a ``kept`` row has that of its copy of highest mean precision.
 
     Copies of the same mean precision that differ are averaged, so that their order does not matter.
     """
@@ -280,7 +280,7 @@ def _collected(ends: Sequence[Tensor], weight: Tensor, value: Tensor) -> Tensor:
 
 
 def _axes(source: Tensor, target: Tensor, rows: Tensor, component: Tensor) -> Tensor:
-    """Canonical axes ``(C, 3, 3)`` of the cameras of each component, an axis a row.
+    """Canonical axes ``(C, 3, 3)`` of the cameras of each component, one axis per row.
 
     Args:
         source, target: ``(M,)`` of edges, from lower to higher nodes.
@@ -290,7 +290,8 @@ def _axes(source: Tensor, target: Tensor, rows: Tensor, component: Tensor) -> Te
     count = int(component.max()) + 1 if len(component) else 0
     of_edge = component.index_select(0, source)
     main = torch.linalg.eigh(_moments(rows[:3], of_edge, count)).eigenvectors
-    # The main axis last: then what turns about it have left lies in the plane of the first two coordinates.
+    # The main axis is last. A rotation is a twist about it and a swing, in either order; the swing's vector lies in the
+    # plane of the first two coordinates.
     first, second, along = _in_axes(main.mT, rows[:3], component, source)
     length = (along * along + rows[3] * rows[3]).sqrt().clamp(min=_SAME)  # hypot takes ten times as long
     along, cosine = along / length, rows[3] / length
@@ -306,7 +307,7 @@ def _axes(source: Tensor, target: Tensor, rows: Tensor, component: Tensor) -> Te
 
 
 def evenly_spread(group: Tensor, num_groups: int, largest: int) -> Tensor:
-    """Indices of members, evenly spread, at most about ``largest`` of each group ``(M,)``."""
+    """Indices of evenly spread members, at most about ``largest`` of each group ``(M,)``."""
     if num_groups == 1:
         return torch.arange(0, len(group), 1 + max(0, len(group) - 1) // largest, device=group.device)
     order = group.sort(stable=True).indices
@@ -335,14 +336,14 @@ def _sums(rows: Tensor, group: Tensor, count: int) -> Tensor:
 
 
 def _in_axes(axes: Tensor, vectors: Tensor, component: Tensor, source: Tensor) -> Tensor:
-    """Vectors ``(3, M)`` of edges, given their sources, as the axes ``(C, 3, 3)`` of their components have them."""
+    """Vectors ``(3, M)`` of edges, in the axes ``(C, 3, 3)`` of the components of their sources."""
     if len(axes) == 1:
         return axes[0] @ vectors
     return (axes.permute(1, 2, 0)[:, :, component[source]] * vectors).sum(dim=1)
 
 
 def _turned(measured: Tensor, axes: Tensor, component: Tensor, source: Tensor) -> Tensor:
-    """Quaternions ``(M, 4)`` of edges, given their sources, as the axes ``(C, 3, 3)`` of their components have them."""
+    """Quaternions ``(M, 4)`` of edges, in the axes ``(C, 3, 3)`` of the components of their sources."""
     if len(axes) == 1:
         turn = torch.eye(4, dtype=axes.dtype, device=axes.device)
         turn[:3, :3] = axes[0].t()

@@ -1,8 +1,8 @@
-"""Functions of numbers and arrays that numba compiles: loops over entries that NumPy has no operation for.
+"""Functions on numbers and arrays that numba compiles: loops over entries for which NumPy has no operation.
 
-Their machine code is kept beside the module, or in the user's cache; the first run on a machine compiles it. They let
-go of the interpreter's lock. Sums stay in the order in which they are written, so every machine comes to the same
-numbers. Whoever calls none of them does not load numba, which takes a quarter of a second and 60 MB.
+Their machine code is cached beside the module, or in the user's cache folder; the first run on a machine compiles it.
+They release the interpreter's lock. Sums keep the order in which they are written, so every machine gets the same
+numbers. A program that calls none of them does not load numba, which takes a quarter of a second and 60 MB.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ Function = TypeVar("Function", bound=Callable[..., object])
 
 
 def compiled(function: Function) -> Function:
-    """The function, compiled when it is first called with arguments of their types."""
+    """The function, compiled on its first call with arguments of their types."""
     return cast(Function, _Compiled(function))
 
 
 class _Compiled(Generic[Function]):
-    """Stands for a function until it is called."""
+    """Stands in for a function and compiles it on the first call."""
 
     def __init__(self, function: Function) -> None:
         self._function = function
@@ -33,12 +33,12 @@ class _Compiled(Generic[Function]):
 
     @property
     def dispatcher(self) -> Function:
-        """Numba's."""
+        """Numba's dispatcher of the function."""
         if self._dispatcher is None:
             import numba
 
             function = self._function
-            # What it calls has to be numba's as well.
+            # The functions that it calls must be dispatchers as well.
             for name in function.__code__.co_names:
                 called = function.__globals__.get(name)
                 if isinstance(called, _Compiled):
@@ -51,7 +51,7 @@ class _Compiled(Generic[Function]):
 
 
 def _kept(function: Callable[..., object]) -> object:
-    """Numba's cache, but what a power cut or a full disk left of it stops no solve: it is compiled again."""
+    """Numba's cache; a file damaged by a power cut or a full disk stops no solve: the function is compiled again."""
     from numba.core import caching
 
     numbas: Any = caching.FunctionCache  # without types

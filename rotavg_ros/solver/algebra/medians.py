@@ -7,17 +7,17 @@ from torch import Tensor
 
 
 def median_by_group(value: Tensor, group: Tensor, num_groups: int) -> Tensor:
-    """Lower median (torch's) ``(num_groups,)`` of the values ``(M,)`` of each group; infinite where there are none."""
+    """Lower median (torch's) ``(num_groups,)`` of the values ``(M,)`` of each group; infinite for an empty group."""
     if num_groups == 1 and len(value):
         return value.median()[None]
     return quantile_by_group(value, group, torch.full((num_groups,), 0.5, dtype=torch.float64, device=value.device))
 
 
 def quantile_by_group(value: Tensor, group: Tensor, share: Tensor) -> Tensor:
-    """Lower quantiles ``(G,)`` of the values ``(M,)`` of each group; infinite where there are none.
+    """Lower quantiles ``(G,)`` of the values ``(M,)`` of each group; infinite for an empty group.
 
     Args:
-        share: ``(G,)`` of the values of each group that are lower, from 0 to 1.
+        share: ``(G,)`` share of each group's values below its quantile, from 0 to 1.
     """
     by_value = value.sort()
     by_group = group[by_value.indices].sort(stable=True).indices

@@ -1,9 +1,9 @@
 """Which nodes of a graph to turn together: minimum cuts, and a quick bound on what they could gain.
 
-Every edge costs something if only one of its ends turns, less than nothing if that mends it. The best set of nodes is a
-minimum cut. Most questions have the answer "none", and an electrical flow often proves it: any flow that carries what
-the mended edges gain from end to end within what all the others would lose is a certificate, by weak duality, and one
-factorisation gives such flows for all questions at once.
+An edge has a cost if only one of its ends turns; the cost is negative if that repairs the edge. The best set of nodes
+is a minimum cut. Most questions have the answer "none", and an electrical flow often proves it. By weak duality, a flow
+is a certificate if it carries the gains of the repaired edges from end to end and stays within the losses of all
+others. One factorisation gives such flows for all questions at once.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from rotavg_ros.solver.algebra.sparse.laplacian import FactorisedLaplacian
 
-# scipy's maximum flow counts in integers.
+# SciPy's maximum flow has integer capacities: this many to a unit of cost.
 _UNIT = 1000.0
-# So many numbers stay in a core's cache.
+# Numbers that fit into a core's cache.
 _ENTRIES_AT_ONCE = 32_768
 
 
@@ -29,10 +29,10 @@ class TwoLabels:
     Attributes:
         num_nodes: N.
         source, target: ``(E,)``.
-        to_target, to_source: ``(E, Q)`` ≥ 0, what an edge costs if only its target turns, or only its source, beyond
-            what ``supply`` says.
+        to_target, to_source: ``(E, Q)`` ≥ 0, what an edge costs if only its target turns, or only its source, in
+            addition to ``supply``.
         supply: ``(N, Q)`` what turning a node costs, or gains where it is negative.
-        gain: ``(Q,)`` what all edges together gain at most.
+        gain: ``(Q,)`` upper bound of what all edges together gain.
     """
 
     num_nodes: int
@@ -47,16 +47,16 @@ class TwoLabels:
     def create(
         num_nodes: int, source: np.ndarray, target: np.ndarray, if_target: np.ndarray, if_source: np.ndarray
     ) -> TwoLabels:
-        """From what edges cost if only their target turns, or only their source, more than if neither does ``(E, Q)``.
+        """From the costs of edges if only their target turns, or only their source, relative to neither ``(E, Q)``.
 
-        A minimum cut asks that the two add up to no less than nothing. Where they do not, the larger is raised, so that
-        what a set of nodes is said to gain is what it gains at least. Both arrays are made use of.
+        A minimum cut requires that the two sum to at least zero. Where they do not, the larger one is raised, so the
+        stated gain of a set of nodes is a lower bound. Both arrays are overwritten.
         """
         count = if_target.shape[1]
         gains = np.flatnonzero((if_target < 0) | (if_source < 0))
         edge, question = np.divmod(gains, count)
         target_turns, source_turns = if_target.take(gains), if_source.take(gains)
-        # What an edge gains by turning one end is the node's; turning the other loses as much, which the arc knows.
+        # The gain of turning one end is assigned to that node. Turning the other end loses as much, which the arc has.
         is_target = target_turns < source_turns
         rest = np.maximum(target_turns + source_turns, 0)
         if_target.put(gains, np.where(is_target, 0.0, rest))
@@ -68,10 +68,10 @@ class TwoLabels:
         return TwoLabels(num_nodes, source, target, if_target, if_source, supply.reshape(num_nodes, count), gain)
 
     def gain_bounds(self, system: FactorisedLaplacian) -> np.ndarray:
-        """What turning nodes can gain at most ``(Q,)``: what does not fit of an electrical flow.
+        """Upper bounds ``(Q,)`` of the gain of turning nodes: the electrical flow in excess of the capacities.
 
         Args:
-            system: the graph's Laplacian with any weights; the nearer to what edges can carry, the better the bound.
+            system: the graph's Laplacian with any weights; the closer to the capacities, the tighter the bound.
         """
         potential = system.solve(self.supply)
         excess = np.zeros(len(self.gain))
@@ -88,8 +88,8 @@ class TwoLabels:
     def best_set(self, network: FlowNetwork, system: FactorisedLaplacian, question: int = 0) -> np.ndarray:
         """``(N,)`` bool, the nodes to turn; ``network`` is the graph's, ``system`` as in :meth:`gain_bounds`.
 
-        What the electrical flow carries within what edges have room for is taken off first. All sets still differ in
-        cost by as much (capacities are another way of writing the same cost), and little is left for the maximum flow.
+        The electrical flow, clipped to the capacities, is subtracted first. The costs of all sets still differ by as
+        much, since residual capacities write the same cost in another way, and little is left for the maximum flow.
         """
         forwards, backwards = self.to_target[:, question], self.to_source[:, question]
         potential = system.solve(self.supply[:, [question]])[:, 0]
@@ -100,7 +100,7 @@ class TwoLabels:
 
 
 class FlowNetwork:
-    """A graph laid out for one maximum flow after another: every edge both ways, and a terminal's arc at every node.
+    """A graph laid out for repeated maximum flows: every edge in both directions, and every node's arcs of terminals.
 
     Args:
         num_nodes: N.
@@ -116,22 +116,22 @@ class FlowNetwork:
         arcs, slot = np.unique(begin * self._size + end, return_inverse=True)
         begin, end = np.divmod(arcs, self._size)
         self._end, self._reverse = end, np.searchsorted(arcs, end * self._size + begin)
-        # Arcs back from the nodes to the one terminal, and from the other, carry nothing.
+        # Arcs back from the nodes to the one terminal, and from the other to the nodes, have no capacity.
         kinds = (len(source), len(source), num_nodes, num_nodes, num_nodes, num_nodes)
         carries = np.repeat((True, True, True, False, True, False), kinds)
         self._slot, self._first = slot[carries], np.searchsorted(begin, np.arange(self._size + 1))
 
     def minimum_cut(self, forwards: np.ndarray, backwards: np.ndarray, supply: np.ndarray) -> np.ndarray:
-        """``(N,)`` bool, the most nodes of least cost.
+        """``(N,)`` bool, the set of nodes of least cost; of several, the largest.
 
         Args:
-            forwards, backwards: ``(E,)`` ≥ 0, what an edge costs if only its target is among them, or only its source.
+            forwards, backwards: ``(E,)`` ≥ 0, what an edge costs if only its target is in the set, or only its source.
             supply: ``(N,)`` what a node costs, or gains where it is negative.
         """
         stays, turns = self._num_nodes, self._num_nodes + 1
         values = np.concatenate((forwards, backwards, np.maximum(supply, 0), np.maximum(-supply, 0)))
         capacity = np.rint(_UNIT * np.bincount(self._slot, values, len(self._end))).astype(np.int32)
-        # With both directions of every arc there, capacities and flows have the same layout.
+        # Both directions of every arc are present, so capacities and flows have the same layout.
         chosen = np.flatnonzero(capacity + capacity.take(self._reverse))
         network = self._matrix(chosen, capacity[chosen])
         is_open = network.data > maximum_flow(network, stays, turns).flow.data
@@ -141,6 +141,6 @@ class FlowNetwork:
         return moves[: self._num_nodes]
 
     def _matrix(self, arcs: np.ndarray, values: np.ndarray) -> csr_array:
-        """``values`` at some of the arcs, ascending."""
+        """A sparse matrix with ``values`` at some of the arcs, in ascending order."""
         first = np.searchsorted(arcs, self._first).astype(np.int32)
         return csr_array((values, self._end[arcs].astype(np.int32), first), shape=(self._size, self._size))

@@ -1,4 +1,4 @@
-"""Pointer jumping: what lies along chains of pointers, in as many vectorised rounds as their length has bits."""
+"""Pointer jumping: follow chains of pointers in log₂(length) vectorised rounds."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ Pointers = TypeVar("Pointers", np.ndarray, Tensor)
 
 
 def doublings(pointer: Pointers) -> Iterator[tuple[Pointers, Pointers]]:
-    """Where pointers ``(N,)`` lead in 1, 2, 4, … steps, each with what leads twice as far, until no chain goes on.
+    """Pointers ``(N,)`` over 1, 2, 4, … steps, each with those over twice as many, until every chain has ended.
 
-    A chain ends in an element that points at itself.
+    A chain ends in an element that points to itself.
     """
     while True:
         farther = pointer[pointer]

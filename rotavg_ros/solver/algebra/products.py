@@ -1,7 +1,7 @@
-"""Products and inverses of large dense matrices, on the thread that asks for them.
+"""Products and inverses of large dense matrices, on the calling thread.
 
-NumPy's go to OpenBLAS, which spreads them over the cores and waits busily: beside other work each takes time slices of
-some milliseconds. Torch's obey its number of threads, which is one within a solve.
+NumPy calls OpenBLAS, which spreads the work over the cores and busy-waits: next to other processes, each call takes
+time slices of some milliseconds. Torch obeys its number of threads, which is one within a solve.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ import torch
 
 
 def product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """``left @ right``, of matrices or of many of them."""
+    """``left @ right``, of two matrices or of stacks of matrices."""
     return np.asarray(torch.matmul(torch.from_numpy(left), torch.from_numpy(right)).numpy())
 
 
 def inverse_of(matrix: np.ndarray) -> np.ndarray:
-    """Of ``(n, n)``.
+    """Inverse of ``(n, n)``.
 
     Raises:
         torch.linalg.LinAlgError: it has none.
@@ -25,7 +25,9 @@ def inverse_of(matrix: np.ndarray) -> np.ndarray:
 
 
 def inverse_of_positive(matrix: np.ndarray) -> np.ndarray:
-    """Of a positive definite ``(n, n)``, of which the lower triangle is read, or what rounding has left of one.
+    """Inverse of a positive definite ``(n, n)``, by its lower triangle.
+
+    A matrix that rounding has made indefinite is inverted as any other one.
 
     Raises:
         torch.linalg.LinAlgError: it has none.

@@ -7,7 +7,7 @@ import math
 from rotavg_ros.hamilton import hamilton_product
 from rotavg_ros.solver.algebra.compiled import compiled
 
-# So small a squared sine or angle counts as this, which makes angle / sine what it is in the limit instead of 0/0.
+# Lower bound on a squared sine or angle. It makes angle / sine equal to its limit instead of 0/0.
 MIN_SQUARE = 1e-30
 
 Vector = tuple[float, float, float]
@@ -18,13 +18,13 @@ product = compiled(hamilton_product)
 
 @compiled
 def inverse(a: Quaternion) -> Quaternion:
-    """Of a unit quaternion."""
+    """Inverse of a unit quaternion."""
     return -a[0], -a[1], -a[2], a[3]
 
 
 @compiled
 def unit(a: Quaternion) -> Quaternion:
-    """Of length one, the sign as it is."""
+    """The quaternion scaled to unit length, with the same sign."""
     x, y, z, w = a
     length = math.sqrt(x * x + y * y + z * z + w * w)
     return x / length, y / length, z / length, w / length
@@ -32,14 +32,14 @@ def unit(a: Quaternion) -> Quaternion:
 
 @compiled
 def canonical(a: Quaternion) -> Quaternion:
-    """The same rotation by w ≥ 0."""
+    """The quaternion of the same rotation with w ≥ 0."""
     x, y, z, w = a
     return (-x, -y, -z, -w) if w < 0.0 else (x, y, z, w)
 
 
 @compiled
 def log(a: Quaternion) -> Vector:
-    """Of either sign → rotation vector in radians, of length at most π."""
+    """Unit quaternion of either sign → rotation vector in radians, of length at most π."""
     x, y, z, w = a
     sine = math.sqrt(max(x * x + y * y + z * z, MIN_SQUARE))
     # The sign of w makes the vector the same for a quaternion and its negative.

@@ -1,7 +1,7 @@
 """The row-wise twin of ``rotations.py``: the same algebra in numpy, components in rows, ``(4, n)``.
 
-A SLAM solve of a few hundred edges spends more time in calling operations than in them, and a call of numpy's takes
-half as long as one of torch's. The conventions are those of ``rotations.py``; the tests compare the two.
+A SLAM solve of a few hundred edges spends more time calling operations than computing, and a call to NumPy takes half
+as long as a call to torch. The conventions are those of ``rotations.py``; the tests compare the two.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _log, _exp, _rotate = quaternion_loops.log, quaternion_loops.exp, quaternion_loo
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Hamilton product ``a ∘ b``, ``(4, n)``; either may be one rotation for all, ``(4, 1)``."""
-    # A matrix product would wake all threads of BLAS for this: twice the CPU time of a whole tick.
+    # A matrix product would wake all threads of BLAS, which takes twice the CPU time of a whole tick.
     product = np.empty(np.broadcast_shapes(a.shape, b.shape))
     product[0], product[1], product[2], product[3] = hamilton_product(a, b)
     return product
@@ -72,7 +72,7 @@ def matrices(a: np.ndarray) -> np.ndarray:
 
 
 def residual(correction: np.ndarray, measured: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """``(4, E)`` of either sign: e_uv as ``residuals.edge_residual`` computes it, from ``(4, K)`` and ``(4, E)``."""
+    """e_uv ``(4, E)`` of either sign, as ``residuals.edge_residual`` computes it, from ``(4, K)`` and ``(4, E)``."""
     at_target = correction.take(target, axis=1)
     np.negative(at_target[:3], out=at_target[:3])
     return multiply(at_target, multiply(measured, correction.take(source, axis=1)))
@@ -82,7 +82,7 @@ def residual(correction: np.ndarray, measured: np.ndarray, source: np.ndarray, t
 def residual_vectors(
     correction: np.ndarray, measured: np.ndarray, source: np.ndarray, target: np.ndarray
 ) -> np.ndarray:
-    """``(E, 3)`` rad, of any length at most π: what :func:`log` makes of :func:`residual`, edge by edge."""
+    """Rotation vectors ``(E, 3)`` in rad, of length at most π: :func:`log` of :func:`residual`, edge by edge."""
     vectors = np.empty((len(source), 3))
     for e in range(len(source)):
         u, v = source[e], target[e]
@@ -95,13 +95,13 @@ def residual_vectors(
 
 @compiled
 def spread(orientation: np.ndarray, correction: np.ndarray, between: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-    """Orientations R C ``(N, 4)``, C turned from one correction towards another one.
+    """Orientations R C ``(N, 4)``, where C is interpolated between two corrections.
 
     Args:
         orientation: ``(N, 4)`` R.
         correction: ``(K, 4)``.
-        between: ``(N, 2)`` which two.
-        fraction: ``(N,)`` how far.
+        between: ``(N, 2)`` indices of the two corrections.
+        fraction: ``(N,)`` 0 at the first of them, 1 at the second.
     """
     turned = np.empty((len(orientation), 4))
     last, turn = (-1, -1), (0.0, 0.0, 0.0)
@@ -121,7 +121,7 @@ def spread(orientation: np.ndarray, correction: np.ndarray, between: np.ndarray,
 
 @compiled
 def turned_back(orientation: np.ndarray, which: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Vectors ``(n, 3)``, each turned by the inverse of the orientation that it is ``(n,)`` of, of ``(N, 4)``."""
+    """Vectors ``(n, 3)``, each turned by the inverse of orientation ``which`` ``(n,)`` of ``(N, 4)``."""
     turned = np.empty((len(vector), 3))
     for n in range(len(vector)):
         at = which[n]

@@ -1,4 +1,4 @@
-"""Shortest-path forests by rounds over all edges (Bellman 1958): an accelerator's way, where a CPU takes Dijkstra's.
+"""Shortest-path forests by rounds over all edges (Bellman 1958), for accelerators; a CPU uses Dijkstra's algorithm.
 
 A round costs one pass over the edges, and there are as many rounds as the deepest path has edges: three or four on the
 view-graphs that are dense enough for an accelerator.
@@ -23,7 +23,7 @@ class RelaxedForest(NamedTuple):
 
 
 def hubs(edges: SortedEdges, component: Tensor) -> Tensor:
-    """The node of highest degree in each component, the first of equals, ``(C,)`` int64."""
+    """The node of highest degree in each component ``(C,)`` int64; of several, the first."""
     count = int(component.max()) + 1
     degree = edges.degree.long()
     highest = degree.new_zeros(count).scatter_reduce(0, component, degree, "amax")
@@ -44,7 +44,7 @@ def relaxed_forest(edges: SortedEdges, cost: Tensor, roots: Tensor) -> RelaxedFo
         if torch.equal(shorter, distance):
             break
         distance = shorter
-    # The first edge by which the distance arrives. Costs are positive, so parents are nearer and there is no circle.
+    # The first edge that attains the distance. Costs are positive, so parents are nearer and there is no cycle.
     rows = len(step)
     row = torch.where(arriving == distance[target], torch.arange(rows, device=step.device), rows)
     first = row.new_full((edges.num_nodes,), rows).scatter_reduce(0, target, row, "amin")

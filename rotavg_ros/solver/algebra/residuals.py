@@ -1,8 +1,7 @@
 """Residuals of all edges at given orientations, in slices that stay in a core's cache.
 
-Inside a slice, a quaternion's four components are four contiguous rows: one component of many edges lies together,
-which makes the algebra three times as fast as on rows of four. :func:`edge_residual` is the same formula, to be
-read.
+Within a slice, the four components of the quaternions are four contiguous rows. The algebra is three times as fast as
+on rows of four numbers. :func:`edge_residual` is the same formula, written to be read.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from rotavg_ros.solver.running.threads import for_each, slices
 from rotavg_ros.view_graph import ViewGraph
 
 SLICE_EDGES = 16_384
-# So small a squared sine counts as this, which makes angle / sine two, as it is, instead of 0/0.
+# Lower bound on a squared sine. It makes angle / sine equal to its limit, two, instead of 0/0.
 _MIN_SINE_SQUARED = 1e-30
 
 
@@ -30,9 +29,9 @@ class EdgeResiduals:
 
     Args:
         graph: M edges.
-        body_from_world: ``(N, 4)``; its type is that of the results.
-        measured: ``(4, M)`` of the same type, the graph's measurements as :func:`measured_rows` gives them; default:
-            made of the graph's, slice by slice.
+        body_from_world: ``(N, 4)``; the results have its dtype.
+        measured: ``(4, M)`` of the same dtype, the graph's measurements as :func:`measured_rows` returns them; default:
+            computed from the graph, slice by slice.
     """
 
     def __init__(self, graph: ViewGraph, body_from_world: Tensor, measured: Tensor | None = None) -> None:
@@ -75,7 +74,7 @@ class EdgeResiduals:
 
 
 def measured_rows(target_from_source: Tensor, dtype: torch.dtype) -> Tensor:
-    """Measurements ``(M, 4)`` of any type → their components in rows ``(4, M)``."""
+    """Measurements ``(M, 4)`` of any dtype → their components in rows ``(4, M)``."""
     rows = target_from_source.new_empty(4, len(target_from_source), dtype=dtype)
 
     def write(edges: slice) -> None:

@@ -1,4 +1,4 @@
-"""Working memory that outlives a pass: touching fresh pages costs a small graph as much as a layer of messages."""
+"""Working memory that is reused: with a small graph, touching fresh pages takes as long as a layer of messages."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-# What is larger goes back to the system; there the share of this cost is small.
+# Larger buffers go back to the system; there the share of this cost is small.
 _KEPT_BYTES = 64 << 20
 _lock = threading.Lock()
 _kept: list[Tensor] = []
@@ -17,10 +17,10 @@ _kept: list[Tensor] = []
 
 @contextmanager
 def scratch(rows: int, columns: int, like: Tensor) -> Iterator[Tensor]:
-    """An uninitialised matrix of the type and on the device of ``like``."""
+    """An uninitialised matrix with the dtype and device of ``like``."""
     size = rows * columns
     if like.device.type != "cpu" or size * like.element_size() > _KEPT_BYTES:
-        yield like.new_empty(rows, columns)  # torch keeps an accelerator's memory by itself
+        yield like.new_empty(rows, columns)  # torch itself keeps an accelerator's memory
         return
     with _lock:
         buffer = _kept.pop() if _kept else like.new_empty(0)

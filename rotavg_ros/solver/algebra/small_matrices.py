@@ -1,7 +1,7 @@
 """Many symmetric matrices of a few rows at once.
 
-NumPy's own hand each matrix to LAPACK by itself, which costs microseconds; here each operation is one on all of them,
-or a loop that is compiled.
+NumPy passes each matrix to LAPACK separately, which costs microseconds. Here each operation acts on all matrices at
+once, or is a compiled loop.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ import numpy as np
 
 from rotavg_ros.solver.algebra.compiled import compiled
 
-# Jacobi's turns leave next to nothing beside the diagonal after five rounds or six.
+# Largest number of Jacobi sweeps; after five or six, the entries beside the diagonal are negligible.
 _ROUNDS = 20
 
 
 def inverse_root(matrices: np.ndarray) -> np.ndarray:
-    """``(n, k, k)`` L⁻¹, lower triangular, of L Lᵀ = positive definite matrices ``(n, k, k)`` (Cholesky's L).
+    """L⁻¹ ``(n, k, k)``, lower triangular, of Cholesky's L Lᵀ of positive definite matrices ``(n, k, k)``.
 
     Raises:
         numpy.linalg.LinAlgError: one of them is not positive definite.
@@ -30,7 +30,7 @@ def inverse_root(matrices: np.ndarray) -> np.ndarray:
         if not (rest[row, row] > 0).all():
             raise np.linalg.LinAlgError("a matrix is not positive definite")
         scale = 1 / np.sqrt(rest[row, row])
-        # Elimination of a column takes the same multiples of its row from what has become of the identity.
+        # Eliminating a column subtracts the same multiples of the row from the transformed identity.
         column = rest[row + 1 :, row] * scale
         inverse[row, : row + 1] *= scale
         for below in range(row + 1, size):
@@ -40,7 +40,7 @@ def inverse_root(matrices: np.ndarray) -> np.ndarray:
 
 
 def inverse(matrices: np.ndarray) -> np.ndarray:
-    """``(n, k, k)`` inverses of positive definite matrices.
+    """Inverses ``(n, k, k)`` of positive definite matrices.
 
     Raises:
         numpy.linalg.LinAlgError: one of them is not positive definite.
@@ -51,7 +51,7 @@ def inverse(matrices: np.ndarray) -> np.ndarray:
 
 @compiled
 def eigh(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """``(n, k)`` eigenvalues in no order, and ``(n, k, k)`` unit eigenvectors in columns, by Jacobi's turns."""
+    """Eigenvalues ``(n, k)`` in no order, and unit eigenvectors ``(n, k, k)`` in columns, by Jacobi rotations."""
     count, size, _ = matrices.shape
     value, vector = np.empty((count, size)), np.zeros((count, size, size))
     left = np.empty((size, size))

@@ -1,4 +1,4 @@
-"""Both directions of a view-graph's edges, sorted by the node at which they arrive: what tiled passes walk along."""
+"""Both directions of a view-graph's edges, sorted by the node at which they arrive, for tiled passes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from rotavg_ros.solver.running.threads import for_each, slices
 from rotavg_ros.view_graph import ViewGraph
 
-# Rows that a thread writes before it takes others.
+# Rows that a thread writes at a time.
 _SLICE_EDGES = 1 << 16
 
 
@@ -26,13 +26,13 @@ class Tile(NamedTuple):
 
 @dataclass(frozen=True)
 class SortedEdges:
-    """Directed edges, E = 2M of M edges or both directions of some of them; all tensors on one device.
+    """Both directions of a graph's M edges, E = 2M, or of some of them; all tensors are on one device.
 
     Attributes:
         first: ``(N + 1,)`` int32: rows ``first[v] … first[v+1] - 1`` arrive at node v.
-        source: ``(E,)`` int32, the node from which each comes; in the order of the graph's edges at each node.
+        source: ``(E,)`` int32, the node from which each comes; at each node, in the order of the graph's edges.
         edge: ``(E,)`` int32, the graph's edge.
-        is_reversed: ``(E,)`` bool: runs against that edge's direction.
+        is_reversed: ``(E,)`` bool, whether it runs against that edge's direction.
     """
 
     first: Tensor
@@ -90,7 +90,7 @@ class SortedEdges:
 
     def tiles(self, num_edges: int) -> list[Tile]:
         """All nodes in order, cut into tiles of about ``num_edges`` edges; a node's edges are never split."""
-        if len(self.source) <= num_edges and self.num_nodes:  # an accelerator's case; nothing need be read back
+        if len(self.source) <= num_edges and self.num_nodes:  # so on an accelerator; nothing needs to be read back
             return [Tile(slice(0, self.num_nodes), slice(0, len(self.source)))]
         first = self.first.cpu().numpy()
         cuts = np.searchsorted(first, np.arange(0, first[-1], num_edges), side="left")
@@ -101,7 +101,7 @@ class SortedEdges:
 
 
 def sorted_by_node(arrival: Tensor, num_nodes: int) -> tuple[Tensor, Tensor]:
-    """Where the edges that arrive at each node begin in their order by node, ``(N + 1,)``, and that order; int32."""
+    """Edges sorted by the node at which they arrive: where each node's begin ``(N + 1,)``, and the order; int32."""
     if arrival.device.type == "cpu" and 0 < len(arrival) < 2**31:
         # Transposing a matrix with one entry in every row is a counting sort: a quarter of the time of torch's.
         edge = np.arange(len(arrival) + 1, dtype=np.int32)

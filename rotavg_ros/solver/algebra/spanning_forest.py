@@ -1,7 +1,7 @@
 """Spanning forests of a view-graph and the orientations composed along them.
 
-Forests come from scipy; composing along 10⁴ edges in a row takes log₂(depth) vectorised rounds of pointer jumping,
-in float64.
+Forests come from SciPy. Orientations are composed in float64, in log₂(depth) vectorised rounds of pointer jumping, even
+along 10⁴ edges in a row.
 """
 
 from __future__ import annotations
@@ -71,12 +71,12 @@ def shortest_path_forest(
         priority = -edges.degree.numpy() if root == "hub" else np.zeros(graph.num_nodes)
         roots = _first_per_component(labels, priority)
     costs = np.ones(len(edges.source)) if cost is None else cost.detach().index_select(0, edges.edge).double().numpy()
-    # Rows of the matrix are symmetric, parallel edges included, which Dijkstra's algorithm does not mind.
+    # The matrix has both directions of every edge, and parallel edges too, which Dijkstra's algorithm allows.
     adjacency = csr_array((costs, edges.source.numpy(), edges.first.numpy()), shape=(graph.num_nodes, graph.num_nodes))
     _, parent, _ = dijkstra(adjacency, directed=True, indices=roots, return_predecessors=True, min_only=True)
     parent = np.where(parent < 0, np.arange(graph.num_nodes), parent).astype(np.int64)
 
-    # Each node's edge to its parent: of those that arrive from there, the cheapest, and the first of equals.
+    # A node's edge to its parent: the cheapest of those from there, and the first of those if several are cheapest.
     row = np.flatnonzero(edges.source.numpy() == np.repeat(parent, edges.degree.numpy()))
     child, edge = edges.target().numpy()[row], edges.edge.numpy()[row]
     order = np.lexsort((edge, costs[row], child))
@@ -90,7 +90,7 @@ def minimum_spanning_forest(graph: ViewGraph, cost: Tensor, is_root: NDArray[np.
     """Forest of least total ``cost`` ``(M,)``, rooted at each component's first node.
 
     Args:
-        is_root: ``(N,)`` which nodes may be roots, if a component has any; default: all.
+        is_root: ``(N,)`` nodes that may be roots; in a component without any, the first node is; default: all.
     """
     best = _cheapest_parallel_edges(graph, cost)
     # scipy drops explicit zeros, so costs must be positive.
@@ -122,7 +122,7 @@ def compose_orientations(forest: SpanningForest, graph: ViewGraph) -> Tensor:
 
 
 def compose(parent: Tensor, parent_edge: Tensor, graph: ViewGraph) -> Tensor:
-    """The same from the forest's tensors ``(N,)``, all on the graph's device."""
+    """As :func:`compose_orientations`, from the forest's tensors ``(N,)``, all on the graph's device."""
     child = (parent_edge >= 0).nonzero().squeeze(1)
     edge = parent_edge[child]
     measured = graph.target_from_source[edge].double()
@@ -138,7 +138,7 @@ def compose(parent: Tensor, parent_edge: Tensor, graph: ViewGraph) -> Tensor:
 
 
 def accumulate_to_root(forest: SpanningForest, value: np.ndarray) -> np.ndarray:
-    """Sum of ``value`` ``(N, …)`` over each node's way to its root; a node's value belongs to its parent edge."""
+    """Sum of ``value`` ``(N, …)`` over each node's path to its root; a node's value belongs to its parent edge."""
     total = value * (forest.parent_edge >= 0).reshape(-1, *(1,) * (value.ndim - 1))
     for ancestor, _ in doublings(forest.parent):
         total = total + total[ancestor]
@@ -167,7 +167,7 @@ def _cheapest_parallel_edges(graph: ViewGraph, cost: Tensor) -> _UndirectedEdges
 
 
 def _first_per_component(component: np.ndarray, priority: np.ndarray) -> np.ndarray:
-    """The node of lowest priority value in each component, the earliest of equals."""
+    """The node of lowest priority value in each component; of several, the earliest."""
     order = np.lexsort((np.arange(len(component)), priority, component))
     _, first = np.unique(component[order], return_index=True)
     return order[first]
