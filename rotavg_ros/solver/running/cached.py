@@ -1,7 +1,7 @@
-"""Values that are worked out once, without a lock.
+"""Values that are computed once, without a lock.
 
-Until Python 3.12 ``functools.cached_property`` holds one lock for all objects of a class while a value is worked out. A
-solve that rests there (:mod:`~rotavg_ros.solver.running.resumable`) would keep every other one waiting.
+Until Python 3.12, ``functools.cached_property`` holds one lock for all objects of a class while it computes a value. A
+solve that rests there (:mod:`~rotavg_ros.solver.running.resumable`) would block every other one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ Value = TypeVar("Value")
 
 
 class cached_property(Generic[Value]):  # noqa: N801 - as functools names it
-    """As ``functools.cached_property``; of two threads that ask at once both may work it out."""
+    """As ``functools.cached_property``, but two threads that ask at once may both compute the value."""
 
     def __init__(self, work_out: Callable[[Any], Value]) -> None:
         self._work_out, self._name = work_out, work_out.__name__

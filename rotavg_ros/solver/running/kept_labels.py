@@ -1,4 +1,4 @@
-"""What of a solve's memory can be written down: which edges of a robot's graph were held good, and by what noise."""
+"""The part of a solve's memory that can be written to a file: the labels of a robot's edges, and the noise."""
 
 from __future__ import annotations
 
@@ -11,26 +11,27 @@ import numpy as np
 from rotavg_ros.view_graph import ViewGraph
 
 _NAMES = ("trusted", "noise", "calibration", "places", "pose_noise", "search")
-# What each tick sends from the solver's process to the node's is worth a millisecond.
+# Single precision saves a millisecond: each tick sends these from the solver's process to the node's.
 _TYPES = {"places": np.float32}
 
 
 @dataclass(frozen=True)
 class KeptLabels:
-    """In the place of a memory they lead at once to about what the solve said that they are of.
+    """Labels of a solve. Given in place of its memory, they lead at once to about the same solution.
 
-    What is of edges is NaN where nobody has looked.
+    Edges that no solve has judged are NaN.
 
     Attributes:
-        graph: whose first M edges they are of.
+        graph: its first M edges have the labels.
         trusted: ``(M,)`` 1 for good closures and sound odometry, 0 for others.
         noise: ``(n,)`` parameters of rotations' noise, in the solver's order.
-        calibration: ``(6,)`` rad per step that was taken out of the odometry, and rad out of the closures; ``(0,)`` if
-            nothing was.
-        places: ``(R, M)`` float32 chances of what closures' places may be, and their weights, in the solver's order.
-        pose_noise: ``(m,)`` parameters of the noise of poses, likewise; ``(0,)`` if translations had no say.
-        search: ``(3,)`` closures that the last whole search had, those not explained since, and 1 if another answer was
-            nearly as likely, else 0: what tells when the next one is due.
+        calibration: ``(6,)`` gyroscope bias that was taken out of the odometry, rad per step, and error of the mounting
+            that was taken out of the closures, rad; ``(0,)`` if nothing was.
+        places: ``(R, M)`` float32 probabilities of what closures' places may be, and their weights, in the solver's
+            order.
+        pose_noise: ``(m,)`` parameters of the noise of poses, likewise; ``(0,)`` if translations were not used.
+        search: ``(3,)`` number of closures in the last whole search, number of closures not explained since, and 1 if
+            another answer was nearly as likely, else 0; they decide when the next search is due.
     """
 
     graph: ViewGraph
@@ -43,29 +44,29 @@ class KeptLabels:
 
     @property
     def labels(self) -> KeptLabels:
-        """Themselves, as a memory has them."""
+        """The labels themselves; a memory has the same attribute."""
         return self
 
     @property
     def by_places(self) -> bool:
-        """Whether translations had a say."""
+        """Whether translations were used."""
         return len(self.pose_noise) > 0
 
     def are_known(self, num_edges: int) -> np.ndarray:
-        """``(M',)`` bool, of a graph of so many edges, which somebody has looked at."""
+        """``(M',)`` bool, edges that a solve has judged, in a graph of ``num_edges``."""
         return np.append(~np.isnan(self.trusted), np.zeros(num_edges - len(self.trusted), dtype=bool))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All but the graph."""
+        """Everything but the graph."""
         return {name: getattr(self, name) for name in _NAMES}
 
     @classmethod
     def of_arrays(cls, graph: ViewGraph, arrays: Mapping[str, Any]) -> KeptLabels:
-        """What :meth:`arrays` gave, of the first edges of a graph.
+        """From what :meth:`arrays` returned, for the first edges of a graph.
 
         Raises:
             KeyError: an array is missing.
-            ValueError: they have no such shapes or values.
+            ValueError: shapes or values are impossible.
         """
         found = cls(graph, *(np.asarray(arrays[name], _TYPES.get(name, np.float64)) for name in _NAMES))
         trusted, noise, places = found.trusted, (found.noise, found.pose_noise, found.search), found.places
@@ -86,7 +87,7 @@ class KeptLabels:
         return found
 
     def of_edges(self, edges: np.ndarray, num_edges: int) -> dict[str, np.ndarray]:
-        """Arrays of a graph of so many edges, of which the first M here are ``edges`` ``(M,)``."""
+        """Arrays for a graph of ``num_edges``, in which the M edges here have the indices ``edges`` ``(M,)``."""
         trusted = np.full(num_edges, np.nan)
         places = np.full((len(self.places), num_edges), np.nan, _TYPES["places"])
         trusted[edges], places[:, edges] = self.trusted, self.places

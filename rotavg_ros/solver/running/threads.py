@@ -1,8 +1,8 @@
-"""Coarse parallelism: every worker walks its own stretch of an array, and torch's operations run on one thread each.
+"""Coarse parallelism: every worker processes its own part of an array, and each torch operation runs on one thread.
 
 Torch can spread each operation over the cores by itself, but then every operation of some ten microseconds ends in a
-barrier, and on a machine that does anything else besides, each barrier waits for the scheduler: measured, a solve of
-0.3 s on an idle machine took 4 s beside one busy process. Here threads meet once per layer.
+barrier. On a machine that does anything else, each barrier waits for the scheduler: a solve of 0.3 s on an idle machine
+took 4 s beside one busy process. Here threads meet once per layer.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ _STRETCHES_PER_WORKER = 4
 
 
 class _Crew:
-    """The workers of the solves that run at the moment.
+    """The workers of the solves that are running.
 
-    Torch keeps its number of threads twice: each thread has one of its own, which its operations obey, and the process
-    has one, which a thread takes over when it first meets torch. Setting either sets both. So a thread that solves gets
-    its own number back when it leaves, and the last one to leave gives the process what the first one found.
+    Torch keeps two numbers of threads: each thread has its own, which its operations obey, and the process has one,
+    which a thread copies when it first uses torch. Setting either sets both. So a thread that solves restores its own
+    number when it leaves, and the last one to leave restores the process's number that the first one found.
     """
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class _Crew:
             before = torch.get_num_threads()
             if self._active == 0:
                 self.size = before
-            elif before == 1:  # a thread that meets torch while others solve has taken over their one thread
+            elif before == 1:  # a thread that first uses torch while others solve has copied their number
                 before = self.size
             self._here.before = before
             self._active += 1
@@ -56,14 +56,14 @@ class _Crew:
 
     def leave(self) -> None:
         self._here.depth -= 1
-        if self._here.depth > 0:  # what is around this goes on with one thread for each operation
+        if self._here.depth > 0:  # the enclosing solve goes on with one thread for each operation
             return
         with self._lock:
             self._active -= 1
             torch.set_num_threads(self._here.before)
             if self._active > 0:
                 return
-            if self.size != self._here.before:  # the process's own number, which this thread's has just replaced
+            if self.size != self._here.before:  # restore the process's number, which this thread's has just replaced
                 setter = threading.Thread(target=torch.set_num_threads, args=(self.size,))
                 setter.start()
                 setter.join()
@@ -73,19 +73,19 @@ class _Crew:
                 self._pool = None
 
     def _depth(self) -> int:
-        """How often this thread is inside."""
+        """How many times this thread has entered."""
         return getattr(self._here, "depth", 0)
 
     def pool(self) -> ThreadPoolExecutor:
         with self._lock:
             if self._pool is None:
-                # One that is first needed after another solve has ended would find the process's own number.
+                # A worker that first uses torch after another solve has ended would copy the process's number.
                 self._pool = ThreadPoolExecutor(self.size, thread_name_prefix="rotavg", initializer=_keep_to_one_thread)
             return self._pool
 
 
 def _keep_to_one_thread() -> None:
-    """In the calling thread; asked first, for torch's first look at its number would take over the process's."""
+    """Set the calling thread's number; read it first, since torch's first use would copy the process's number."""
     torch.get_num_threads()
     torch.set_num_threads(1)
 
@@ -105,7 +105,7 @@ def workers() -> Iterator[None]:
 
 @contextmanager
 def without_workers() -> Iterator[None]:
-    """Inside, while the solve that is inside :func:`workers` waits, as if it were not."""
+    """Inside, a solve within :func:`workers` waits and counts as having left it."""
     _crew.leave()
     try:
         yield
@@ -121,10 +121,10 @@ def num_workers() -> int:
 def for_each(work: Callable[[Item], None], items: Sequence[Item], threads: int | None = None) -> None:
     """Call ``work`` for every item, on several threads; what one raises is raised here. Never nested.
 
-    The calling thread works, too: it need not wait until another one is awake.
+    The calling thread works too, so it does not wait until another one is awake.
 
     Args:
-        threads: at most so many; default: all workers.
+        threads: largest number of threads; default: all workers.
     """
     threads = min(len(items), _crew.size if threads is None else min(threads, _crew.size))
     if threads <= 1:
@@ -148,7 +148,7 @@ def for_each(work: Callable[[Item], None], items: Sequence[Item], threads: int |
                 failures.append((number, error))
                 waiting.clear()
 
-    in_context = torch.no_grad()(take_turns)  # gradients are switched off by thread, so every worker needs it said
+    in_context = torch.no_grad()(take_turns)  # gradients are switched off per thread, so in every worker
     pool, context = _crew.pool(), copy_context()
     helpers = [pool.submit(context.copy().run, in_context) for _ in range(threads - 1)]
     take_turns()
@@ -163,17 +163,17 @@ def for_each(work: Callable[[Item], None], items: Sequence[Item], threads: int |
 
 
 def threads_on(device: torch.device) -> int | None:
-    """For :func:`for_each`: all workers on a CPU, one for an accelerator, whose queue a single thread keeps full."""
+    """Threads for :func:`for_each`: all workers on a CPU; one for an accelerator, since one keeps its queue full."""
     return None if device.type == "cpu" else 1
 
 
 def slices(length: int, size: int, device: torch.device) -> list[slice]:
-    """What covers ``range(length)``: slices of ``size`` on a CPU, for its caches, and one slice on an accelerator."""
+    """Slices that cover ``range(length)``: of ``size`` on a CPU, for its caches, and one slice on an accelerator."""
     size = size if device.type == "cpu" else max(length, 1)
     return [slice(start, min(start + size, length)) for start in range(0, length, size)]
 
 
 def stretches(items: Sequence[Item]) -> list[Sequence[Item]]:
-    """The items in a few runs per worker: enough that one which others hold up does not hold up all."""
+    """The items in a few runs per worker: enough that a delayed worker does not delay all."""
     length = max(1, -(-len(items) // (_STRETCHES_PER_WORKER * num_workers())))
     return [items[start : start + length] for start in range(0, len(items), length)]

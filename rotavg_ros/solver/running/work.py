@@ -11,10 +11,10 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 
 # Seconds of CPU that a unit of work takes: .39 to .54 ms in every part of robots' solves where it was measured
-# (docs/diary/ticks.md, "Units of work"). What is spent is counted in units and the same on every machine; seconds are
-# for people, and for a node until its first ticks have told how fast its machine is.
+# (docs/diary/ticks.md, "Units of work"). Work is counted in units, which are the same on every machine; seconds are for
+# people, and for a node until its first ticks have shown how fast its machine is.
 SECONDS_PER_UNIT = 5e-4
-# Entries on one side of a sparse matrix to one unit, with all that is done around a factorisation.
+# Entries on one side of a sparse matrix per unit of work, including everything done around a factorisation.
 ENTRIES = 500.0
 
 
@@ -34,7 +34,7 @@ def abandonable(is_abandoned: Callable[[], bool]) -> Iterator[None]:
     """Inside, a solve of this thread raises :class:`Abandoned` soon after ``is_abandoned`` says so.
 
     Args:
-        is_abandoned: asked some thousand times a second, on several threads at once.
+        is_abandoned: called some thousand times a second, on several threads at once.
     """
     token = _is_abandoned.set(is_abandoned)
     try:
@@ -85,7 +85,7 @@ _rests: ContextVar[Callable[[float], None] | None] = ContextVar("rests", default
 
 @contextmanager
 def resting(rest: Callable[[float], None]) -> Iterator[None]:
-    """Inside, ``rest`` is called with the units of each factorisation before it, and may wait."""
+    """Inside, ``rest`` is called before each factorisation with its units, and may wait."""
     token = _rests.set(rest)
     try:
         yield
@@ -109,7 +109,7 @@ def rest() -> None:
 
 
 def count(units: float) -> None:
-    """Add units that were spent elsewhere for this solve."""
+    """Add units of work that were spent elsewhere for this solve."""
     meter = _meter.get()
     if meter is not None:
         meter.spent += units

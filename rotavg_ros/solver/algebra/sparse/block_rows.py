@@ -1,8 +1,8 @@
-"""Loops over rows of three blocks: products with J and its transpose, and what H⁻¹ says of rows.
+"""Loops over rows of three blocks: products with J and its transpose, and covariances of rows by H⁻¹.
 
-Everywhere J is ``(E, d, 3 d)``, and ``place`` ``(E, 3)`` says which block each third of a row is of, in the order of
-elimination, or -1: of none. ``slot`` ``(E, 3, 3)`` says where H's d² numbers of two blocks of a row begin, or -1; a
-pair has the same ones in either order, and their rows are those of the block that is eliminated first.
+Everywhere J is ``(E, d, 3 d)``. ``place`` ``(E, 3)`` is the block of each third of a row, in the order of elimination;
+-1: none. ``slot`` ``(E, 3, 3)`` is where H's d² entries of a pair of a row's blocks begin, or -1. A pair has the same
+entries in either order; their rows are those of the block that is eliminated first.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def normal_matrix(jacobian: np.ndarray, place: np.ndarray, slot: np.ndarray, num
 
 @compiled
 def gradient(jacobian: np.ndarray, place: np.ndarray, rows: np.ndarray, num_blocks: int) -> np.ndarray:
-    """Jᵀ of rows ``(E, d, n)``, ``(blocks, d, n)``."""
+    """``(blocks, d, n)`` Jᵀ times rows ``(E, d, n)``."""
     num_rows, d, count = rows.shape
     found = np.zeros((num_blocks, d, count))
     for e in range(num_rows):
@@ -55,7 +55,7 @@ def gradient(jacobian: np.ndarray, place: np.ndarray, rows: np.ndarray, num_bloc
 
 @compiled
 def predicted_rows(jacobian: np.ndarray, place: np.ndarray, unknowns: np.ndarray) -> np.ndarray:
-    """J of unknowns ``(blocks, d, n)``, ``(E, d, n)``."""
+    """``(E, d, n)`` J times unknowns ``(blocks, d, n)``."""
     num_rows, d, _ = jacobian.shape
     count = unknowns.shape[2]
     found = np.zeros((num_rows, d, count))
@@ -75,7 +75,7 @@ def predicted_rows(jacobian: np.ndarray, place: np.ndarray, unknowns: np.ndarray
 
 @compiled
 def covariance_of_rows(jacobian: np.ndarray, place: np.ndarray, slot: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """``(E, d, d)`` J H⁻¹ Jᵀ of each row, by H⁻¹'s numbers where H has any; of its own blocks the upper triangle."""
+    """``(E, d, d)`` J H⁻¹ Jᵀ of each row, from H⁻¹ at H's entries; of diagonal blocks the upper triangle is read."""
     num_rows, d, _ = jacobian.shape
     found = np.zeros((num_rows, d, d))
     half = np.empty((d, d))

@@ -1,9 +1,9 @@
-"""The sparse system of poses in a pose graph: a block of unknowns a node.
+"""The sparse system of poses in a pose graph: one block of unknowns per node.
 
-A node's block is its turn (k components) and its shift (m), a run's block what its closures err in common. The three
-blocks of a row are those of its target, its source and its run. H = Jᵀ W J is factorised once for each choice of J
-and W; its inverse between a row's blocks tells what everything else predicts of the row. Of rows that weigh nothing
-beside the others H knows nothing; what it says of those is told from samples of N(0, H⁻¹).
+A node's block is its turn (k components) and its shift (m). A run's block is the common error of its closures. The
+three blocks of a row are those of its target, its source and its run. H = Jᵀ W J is factorised once for each choice
+of J and W. Its inverse between a row's blocks gives the covariance that all rows predict for this row. Rows of
+negligible weight are left out of H's pattern; their covariance is estimated from samples of N(0, H⁻¹).
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.running.work import spend, stop_if_abandoned
 
 _NUM_SAMPLES, _SEED = 48, 0
-# What a solve of one column costs, in what the factor does.
+# Work of a solve for one column relative to that of the factor.
 _SOLVED = 0.1
-# Rows that tell each of their blocks less than this share of what all tell it are nothing; so many of them are worth a
-# pattern without them.
+# A row is negligible if it has less than this share of all rows' information about each of its blocks; number of
+# negligible rows from which a pattern without them pays off.
 _NEXT_TO_NOTHING, _WORTH_LEAVING_OUT = 1e-8, 200
-# What a row decides itself is no more than all but the first: nothing else may tell of it. But for the second it nearly
-# does.
+# Least share of a row that the others determine, also where no other row does; and the share below which the row nearly
+# determines itself.
 _LEAST, _NEARLY = 1e-9, 1e-4
 _NOWHERE = -1
-# Units of work for each row, of where its products stand and what they are.
+# Units of work per row, for the positions of its products, and for the products.
 _ROW = 0.001
 
 
@@ -49,7 +49,7 @@ class BlockEquations:
         ends: ``(E, 2)`` sources and targets.
         run: ``(E,)`` in 0 … R − 1, or -1.
         roots: nodes that stay where they are.
-        loose: nodes of which something is known beforehand: first ones of chains that odometry does not tie to a root.
+        loose: nodes that have a prior: the first ones of chains that odometry does not tie to a root.
     """
 
     def __init__(
@@ -73,12 +73,12 @@ class BlockEquations:
     def factorise(
         self, jacobian: np.ndarray, root_weight: np.ndarray, loose_weight: np.ndarray | None = None
     ) -> BlockFactor:
-        """Of whitened rows.
+        """Factorise H of whitened rows.
 
         Args:
             jacobian: ``(E + R, d, 3 d)`` W^½ J.
-            root_weight: what ties roots down, ``(d,)``.
-            loose_weight: how much is known beforehand of loose nodes, ``(d,)``; None: nothing.
+            root_weight: ``(d,)`` weight that ties roots down.
+            loose_weight: ``(d,)`` weight of the loose nodes' prior; None: they have none.
         """
         stop_if_abandoned()
         pattern = self._pattern_of(jacobian)
@@ -107,9 +107,9 @@ class BlockEquations:
         return pattern
 
     def _count(self, jacobian: np.ndarray) -> np.ndarray:
-        """``(E + R,)`` bool, rows that tell one of their blocks more than next to nothing beside the others.
+        """``(E + R,)`` bool, rows that are not negligible, see :data:`_NEXT_TO_NOTHING`.
 
-        All of them, unless many do not and the rest ties every block to what these do.
+        All rows, unless many are negligible and the others leave the graph in as many parts.
         """
         d, num_blocks = self.size, self.num_blocks
         told = (jacobian**2).sum(axis=1).reshape(-1, 3, d).max(axis=2)
@@ -122,25 +122,25 @@ class BlockEquations:
         return counts if is_worth and self._num_parts(counts) == self._num_parts(everything) else everything
 
     def _num_parts(self, counts: np.ndarray) -> int:
-        """How many parts some of the rows tie nodes together to; a run is held by what is known of it beforehand."""
+        """Number of connected parts of the graph with these rows only; runs connect nothing, since each has a prior."""
         target, source = self.block[: self.num_edges][counts[: self.num_edges], :2].T
         links = coo_array((np.ones(len(target)), (target, source)), shape=(self.num_blocks,) * 2)
         return int(connected_components(links, directed=False)[0])
 
 
 class _Pattern:
-    """Where rows' products stand in H, in the order of elimination.
+    """Positions of rows' products in H, in the order of elimination.
 
     Args:
         equations: of B blocks and rows with blocks ``(E + R, 3)``.
-        counts: ``(E + R,)`` bool, rows that H is made of.
+        counts: ``(E + R,)`` bool, rows that contribute to H.
 
     Attributes:
-        counts, kept: those rows, as they were given and as numbers.
+        counts, kept: those rows, as given and as indices.
         elimination: of H.
-        place: ``(E + R, 3)`` where the blocks of each row stand in the order of elimination, or -1.
-        slot: ``(rows kept, 3, 3)`` where H's numbers of each pair of a row's blocks begin, the same in either order.
-        diagonal: ``(B, d)`` entries.
+        place: ``(E + R, 3)`` positions of each row's blocks in the order of elimination, or -1.
+        slot: ``(rows kept, 3, 3)`` where H's entries of each pair of a row's blocks begin, the same in either order.
+        diagonal: ``(B, d)`` positions of H's diagonal entries.
     """
 
     def __init__(self, equations: BlockEquations, counts: np.ndarray) -> None:
@@ -176,12 +176,12 @@ class BlockFactor:
 
     @property
     def log_det(self) -> float:
-        """Log det H, without what ties the roots down and what is known of loose nodes beforehand."""
+        """Log det H, without the weights of roots and of loose nodes."""
         return self._factor.log_det - self._grounding
 
     @property
     def num_entries(self) -> int:
-        """Of the factor."""
+        """Number of entries of the factor."""
         return self._factor.num_entries
 
     def fit(self, whitened: np.ndarray) -> np.ndarray:
@@ -192,23 +192,23 @@ class BlockFactor:
         return self._by_block(self._factor.solve(right.reshape(-1, whitened.shape[2]), units))
 
     def _by_block(self, ordered: np.ndarray) -> np.ndarray:
-        """``(blocks, d, n)``, in which block v stood at its rank."""
+        """``(blocks, d, n)`` by block, of what is in the order of elimination."""
         elimination = self._factor.elimination
         by_place = ordered.reshape(elimination.num_blocks, elimination.size, -1)
         return np.asarray(by_place.take(elimination.rank, axis=0))
 
     def begun(self, columns: np.ndarray) -> np.ndarray:
-        """U⁻ᵀ of columns ``(blocks, d, n)``, ``(blocks d, n)``: H⁻¹ = U⁻¹ U⁻ᵀ."""
+        """``(blocks d, n)`` U⁻ᵀ of columns ``(blocks, d, n)``, where H⁻¹ = U⁻¹ U⁻ᵀ."""
         ordered = np.empty_like(columns)
         ordered[self._pattern.rank] = columns
         return self._factor.begun(ordered.reshape(-1, columns.shape[2]))
 
     def ended(self, half: np.ndarray) -> np.ndarray:
-        """U⁻¹ of what was :meth:`begun` ``(blocks d, n)``, ``(blocks, d, n)``."""
+        """``(blocks, d, n)`` U⁻¹ of ``(blocks d, n)`` that :meth:`begun` returned."""
         return self._by_block(self._factor.ended(half))
 
     def predicted(self, unknowns: np.ndarray) -> np.ndarray:
-        """Whitened rows ``(E + R, d, n)`` of unknowns ``(blocks, d, n)``."""
+        """Whitened rows ``(E + R, d, n)`` that unknowns ``(blocks, d, n)`` predict."""
         ordered = np.empty_like(unknowns)
         ordered[self._pattern.rank] = unknowns
         return predicted_rows(self._jacobian, self._pattern.place, ordered)
@@ -228,7 +228,7 @@ class BlockFactor:
         return self._factor.ended(drawn.reshape(-1, _NUM_SAMPLES), units).reshape(shape)
 
     def covariance(self, jacobian: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """``(n, d, d)`` of J x, x ~ N(0, H⁻¹), J ``(n, d, 3 d)`` of the blocks of rows ``(n,)``."""
+        """Covariance ``(n, d, d)`` of J x, x ~ N(0, H⁻¹); J ``(n, d, 3 d)`` is for the blocks of rows ``(n,)``."""
         pattern, found = self._pattern, np.empty((len(row), *jacobian.shape[1:2] * 2))
         number = np.cumsum(pattern.counts) - 1
         is_kept = pattern.counts[row]
@@ -241,10 +241,10 @@ class BlockFactor:
         return found
 
     def covariance_between(self, jacobian: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """``(n d, n d)`` the same of some rows together."""
+        """Joint covariance ``(n d, n d)`` of some rows; arguments as of :meth:`covariance`."""
         count, d, _ = jacobian.shape
         elimination = self._factor.elimination
-        # Each block once: rows of a run have some in common.
+        # Each block once: the rows of a run share some.
         block, number = np.unique(self._pattern.place[row], return_inverse=True)
         number = number.reshape(count, 3) - (block[0] < 0)
         block = block[block >= 0]
@@ -261,7 +261,7 @@ class BlockFactor:
 
     @property
     def leverage(self) -> np.ndarray:
-        """``(E + R, d, d)`` Λ = W^½ J H⁻¹ Jᵀ W^½, what of a whitened row its own measurement decides."""
+        """``(E + R, d, d)`` Λ = W^½ J H⁻¹ Jᵀ W^½, the share of a whitened row that its own measurement determines."""
         return self._shares[0]
 
     @property
@@ -274,7 +274,7 @@ class BlockFactor:
         unit = np.eye(self._jacobian.shape[1])
         leverage = self.covariance(self._jacobian, np.arange(len(self._jacobian)))
         redundancy = unit - leverage
-        # Both are positive but for rounding.
+        # Both are positive definite but for rounding.
         low = np.flatnonzero(~(exceed(redundancy, _LEAST) & exceed(leverage, -_LEAST)))
         value, vector = np.linalg.eigh(redundancy[low])
         value = np.clip(value, _LEAST, 1.0)[:, None]
@@ -283,11 +283,11 @@ class BlockFactor:
         return leverage, redundancy
 
     def without(self, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of rows ``(n,)``: (I − Λ)⁻¹, and (I − Λ)⁻¹ Λ, what the others say; ``(n, d, d)`` each."""
+        """Of rows ``(n,)``: (I − Λ)⁻¹, and (I − Λ)⁻¹ Λ, the covariance predicted by the others; ``(n, d, d)`` each."""
         redundancy = self.redundancy[row]
         others = inverse(redundancy)
         covariance = np.matmul(others, self.leverage[row])
-        # Of what a row nearly decides itself the product is a small difference of large numbers.
+        # Where a row nearly determines itself, the product is a small difference of large numbers.
         low = np.flatnonzero(~exceed(redundancy, _NEARLY))
         value, vector = np.linalg.eigh(redundancy[low])
         value = np.clip(value, _LEAST, 1.0)[:, None]

@@ -12,7 +12,7 @@ from rotavg_ros.solver.running.work import stop_if_abandoned
 
 
 class Systems(Protocol):
-    """How vectors are taken apart into the S systems that are solved at once."""
+    """How vectors consist of the S systems that are solved at once."""
 
     def dot(self, a: Tensor, b: Tensor) -> Tensor:
         """Inner products ``(S,)``."""
@@ -21,7 +21,7 @@ class Systems(Protocol):
         """Largest absolute entries ``(S,)``, or ``(1,)`` where all systems end together."""
 
     def spread(self, value: Tensor) -> Tensor:
-        """A number of each system ``(S,)`` → what multiplies vectors by it."""
+        """One number per system ``(S,)`` → a factor for vectors."""
 
 
 class Stop(NamedTuple):
@@ -29,8 +29,8 @@ class Stop(NamedTuple):
 
     Attributes:
         tolerance: largest entry of the preconditioned residual, in the unknowns' unit.
-        relative_tolerance: the same as a share of what it is at zero; the larger of the two counts.
-        max_iterations: at most so many.
+        relative_tolerance: the same, as a share of its value at zero; the larger of the two counts.
+        max_iterations: largest number of iterations.
     """
 
     tolerance: float
@@ -45,11 +45,11 @@ def conjugate_gradients(
     systems: Systems,
     stop: Stop,
 ) -> tuple[Tensor, bool]:
-    """``L⁻¹ b``, and whether it is as good as asked for.
+    """``L⁻¹ b``, and whether it meets the tolerance.
 
     Args:
         product, precondition: ``L x`` and ``M⁻¹ x`` of vectors like ``b``; L positive semidefinite, M near L.
-        right_hand_side: ``b``, of any shape that ``systems`` takes apart.
+        right_hand_side: ``b``, of any shape that ``systems`` knows.
     """
     solution, residual = torch.zeros_like(right_hand_side), right_hand_side.clone()
     scaled = precondition(residual)
@@ -62,7 +62,7 @@ def conjugate_gradients(
         if not bool(is_open.any()):
             return solution, True
         image = product(direction)
-        # A system that is solved to the last bit has nothing left to divide.
+        # A system that is solved to the last bit has no curvature: it would be 0/0.
         curvature = systems.dot(direction, image)
         length = systems.spread(torch.where(is_open & (curvature > 0), energy / curvature, 0.0))
         solution.addcmul_(length, direction)

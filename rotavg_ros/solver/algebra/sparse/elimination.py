@@ -1,8 +1,8 @@
-"""In which order, and in which dense fronts, a sparse symmetric matrix of blocks is eliminated.
+"""The order, and the dense fronts, in which a sparse symmetric matrix of blocks is eliminated.
 
-Blocks are eliminated in an order of little fill. A front is a run of them, its pivots, and the later blocks that these
-are tied to, its rows (Duff and Reid 1983; Liu 1992). What elimination leaves of the rows goes to the front above, each
-front's children being those that leave theirs to it. Children come right before it, so what is left waits on a stack.
+Blocks are eliminated in an order of little fill. A front consists of a run of blocks, its pivots, and of the later
+blocks that these are tied to, its rows (Duff and Reid 1983; Liu 1992). Elimination leaves a matrix between the rows,
+which is added to the parent front. Fronts are in postorder, so these matrices wait on a stack.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from rotavg_ros.solver.algebra.sparse.merging import Fronts, merged
 from rotavg_ros.solver.algebra.sparse.sparse_factor import order_of_little_fill
 from rotavg_ros.solver.running.work import spend
 
-# Seconds to a unit: as long as one takes of a solve by rotations alone, with all that is done around it.
+# Seconds per unit of work: as long as a unit takes in a solve by rotations alone, with everything done around it.
 _UNIT_S = 5e-4
-# A solve may rest after so many seconds.
+# Seconds after which a solve may rest.
 _REST_S = 1e-3
-# What begins a matrix of its own lies at a multiple of so many numbers: products come out alike to the last bit.
+# Every front's matrix begins at a multiple of this many numbers, so that products are the same to the last bit.
 _ALIGNED = 8
-# Units of work for each block, of each part of the pattern.
+# Units of work per block, for each part of finding the pattern.
 _BLOCK = 0.004
 
 
 class Shape(NamedTuple):
-    """Where fronts stand, in single unknowns in the order of elimination, F fronts.
+    """The layout of F fronts, in single unknowns in the order of elimination.
 
     Attributes:
-        begin: ``(F + 1,)`` first pivot of each.
-        row_begin, row: ``(F + 1,)`` and the later unknowns that each front's pivots are tied to, ascending.
-        within: where each of these stands in the front above, among its pivots and then its rows.
-        child_begin, child: ``(F + 1,)`` and the fronts that leave their rows to each, ascending.
-        store: ``(F + 1,)`` where each front's pivots are kept, against these and its rows.
-        entry_begin, entry: ``(F + 1,)`` and where in that the matrix's own numbers stand.
+        begin: ``(F + 1,)`` first pivot of each front.
+        row_begin, row: ``(F + 1,)`` where each front's rows begin; the later unknowns tied to its pivots, ascending.
+        within: position of each of these rows in the parent front, whose pivots come before its rows.
+        child_begin, child: ``(F + 1,)`` where each front's children begin; the children, ascending.
+        store: ``(F + 1,)`` where each front's part of the factor begins: pivots against pivots and rows.
+        entry_begin, entry: ``(F + 1,)`` where each front's entries of the matrix begin; their positions in that part.
     """
 
     begin: np.ndarray
@@ -57,9 +57,9 @@ class Stretch:
     """Fronts that are eliminated without a rest.
 
     Attributes:
-        first, last: of them, the last not included.
-        is_dense: one front so large that products of whole matrices take less.
-        units: of work that they take.
+        first, last: the fronts from ``first`` to ``last`` - 1.
+        is_dense: whether it is one front, so large that products of whole matrices take less time.
+        units: units of work that they take.
     """
 
     first: int
@@ -72,18 +72,18 @@ class Elimination:
     """The order and the fronts of a pattern of blocks.
 
     Args:
-        first, second: ``(E,)`` each, blocks that are tied, in any order and as often as it comes.
+        first, second: ``(E,)`` pairs of tied blocks, in any order, repeated or not.
         num_blocks: B.
-        size: d, unknowns of a block.
+        size: d, unknowns per block.
 
     Attributes:
-        rank: ``(B,)`` where each block stands in the order.
-        shape: where the fronts stand.
+        rank: ``(B,)`` position of each block in the order.
+        shape: the layout of the fronts.
         stretches: of fronts, in order.
-        num_entries: numbers of the matrix, see :meth:`places`.
-        num_waiting: numbers that wait on the stack at most, upwards and downwards.
-        most_rows, most_unknowns: of any front.
-        units: of work that it takes.
+        num_entries: number of entries of the matrix, see :meth:`places`.
+        num_waiting: largest size of the stack, in numbers, upwards or downwards.
+        most_rows, most_unknowns: largest numbers of any front.
+        units: units of work that the elimination takes.
     """
 
     def __init__(self, first: np.ndarray, second: np.ndarray, num_blocks: int, size: int) -> None:
@@ -103,7 +103,7 @@ class Elimination:
         self._lay_out(fronts, lower, upper)
 
     def _lay_out(self, fronts: Fronts, lower: np.ndarray, upper: np.ndarray) -> None:
-        """All of it in single unknowns, with places for what ties blocks ``lower`` ≤ ``upper`` ``(E,)`` or itself."""
+        """Lay out the fronts in single unknowns, with entries for tied blocks ``lower`` ≤ ``upper`` ``(E,)``."""
         d, num_blocks, diagonal = self.size, self.num_blocks, np.arange(self.num_blocks)
         pivots, rows = np.diff(fronts.begin), np.diff(fronts.row_begin)
         width = pivots + rows
@@ -113,7 +113,7 @@ class Elimination:
         self._ties = np.unique(np.concatenate((lower * num_blocks + upper, diagonal * num_blocks + diagonal)))
         lower, upper = self._ties // num_blocks, self._ties % num_blocks
         front = np.searchsorted(fronts.begin, lower, side="right") - 1
-        # Ascending, so that where a block stands among a front's rows can be looked up.
+        # Ascending, so that a block's position among a front's rows can be looked up.
         key = np.repeat(np.arange(len(rows)), rows) * num_blocks + fronts.row
         among = np.searchsorted(key, front * num_blocks + upper) - fronts.row_begin[front]
         is_pivot = upper < fronts.begin[front + 1]
@@ -139,7 +139,7 @@ class Elimination:
         self._count(d * pivots, d * rows)
 
     def _count(self, pivots: np.ndarray, rows: np.ndarray) -> None:
-        """Stretches, and the work that they are."""
+        """Find the stretches, and count their work."""
         products = merging.products(pivots, rows)
         is_dense = products > merging.DENSE
         units = merging.seconds(pivots, rows) / _UNIT_S
@@ -154,11 +154,11 @@ class Elimination:
         self.units = float(units.sum())
 
     def corners(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """``(n,)`` where the entries begin, row by row, that tie blocks of ranks ``first`` ≤ ``second`` ``(n,)``."""
+        """``(n,)`` where entries between blocks of ranks ``first`` ≤ ``second`` ``(n,)`` begin; they go row by row."""
         return np.asarray(self.size**2 * np.searchsorted(self._ties, first * self.num_blocks + second))
 
     def places(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """``(n, d, d)`` all of them."""
+        """``(n, d, d)`` positions of all entries of these pairs of blocks."""
         inside = np.arange(self.size**2).reshape(self.size, self.size)
         return np.asarray(self.corners(first, second)[:, None, None] + inside)
 
@@ -169,7 +169,7 @@ class Elimination:
 
 
 def _upper(first: np.ndarray, second: np.ndarray, num_blocks: int) -> tuple[np.ndarray, np.ndarray]:
-    """The upper triangle's columns, where each begins and its rows."""
+    """The upper triangle by columns: where each begins, and its rows."""
     lower, upper = np.minimum(first, second), np.maximum(first, second)
     ties = np.unique(upper[lower != upper] * num_blocks + lower[lower != upper])
     begin = np.searchsorted(ties, num_blocks * np.arange(num_blocks + 1))
@@ -183,7 +183,7 @@ def _singly(blocks: np.ndarray, size: int) -> np.ndarray:
 
 @compiled
 def _waiting(shape: Shape) -> int:
-    """Numbers that wait on the stack at most, from below to above and the other way."""
+    """Largest size of the stack, in numbers, from children to parents or the other way."""
     child_begin, row_begin = shape.child_begin, shape.row_begin
     num_fronts = len(child_begin) - 1
     up, down, most = 0, 0, 0
@@ -204,7 +204,7 @@ def _waiting(shape: Shape) -> int:
 
 @compiled
 def _stretch(seconds: np.ndarray, is_dense: np.ndarray, longest: float) -> np.ndarray:
-    """``(F,)`` which stretch each front belongs to."""
+    """``(F,)`` stretch of each front."""
     number = np.zeros(len(seconds), np.int64)
     so_far = 0.0
     for f in range(len(seconds)):

@@ -1,4 +1,4 @@
-"""Where a sparse factor has entries: the tree along which columns are eliminated into each other (Liu 1990)."""
+"""Where a sparse factor has entries: the elimination tree (Liu 1990)."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _NOWHERE = -1
 
 @compiled
 def elimination_tree(begin: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What each unknown is eliminated into, and how many entries each column of L has below its diagonal.
+    """Parent of each unknown, and number of entries of each column of L below its diagonal.
 
     Args:
-        begin, row: of the matrix's upper triangle by columns, in the order of elimination.
+        begin, row: the matrix's upper triangle by columns, in the order of elimination.
     """
     size = len(begin) - 1
     above, seen = np.full(size, _NOWHERE, np.int32), np.empty(size, np.int32)

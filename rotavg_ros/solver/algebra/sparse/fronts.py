@@ -1,8 +1,8 @@
-"""Loops over small fronts: Cholesky's factor Uᵀ U, its triangles, and those entries of the inverse that fronts hold.
+"""Loops over small fronts: Cholesky's factor Uᵀ U, solves with its triangles, and the inverse's entries within fronts.
 
-Of a front's matrix, pivots against pivots and rows, only the upper triangle is kept. What is left of its rows waits on
-a stack for the front above; downwards a front finds there what the inverse is between its rows (Takahashi, Fagan and
-Chin 1973; by fronts, Campbell and Davis 1995).
+Of a front's matrix, pivots against pivots and rows, only the upper triangle is kept. What elimination leaves between
+its rows waits on a stack for the parent front. Downwards, a front finds there the inverse between its rows (Takahashi,
+Fagan and Chin 1973; by fronts, Campbell and Davis 1995).
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import numpy as np
 from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.algebra.sparse.elimination import Shape
 
-# Where rounding leaves less than this of a diagonal entry, nothing is known of it but that it is positive.
+# Smallest pivot, as a share of the diagonal entry: where rounding leaves less, only the sign is known.
 _ROUNDING = 1e-15
 
 
 class Room(NamedTuple):
-    """What fronts read and fill.
+    """Arrays that fronts read and fill.
 
     Attributes:
-        entries: the matrix's own numbers, or the inverse's in their places.
-        store: the factor's.
-        stack: what waits for the front above or below.
+        entries: the matrix's entries, or those of the inverse at the same positions.
+        store: the factor's entries.
+        stack: what waits for parents, or for children.
         work: room for one front.
     """
 
@@ -36,7 +36,7 @@ class Room(NamedTuple):
 
 @compiled
 def _own(shape: Shape, f: int, store: np.ndarray) -> np.ndarray:
-    """``(p, p + r)`` where a front's pivots are kept, against these and its rows."""
+    """``(p, p + r)`` a front's part of the factor, pivots against pivots and rows."""
     num_pivots = shape.begin[f + 1] - shape.begin[f]
     width = num_pivots + shape.row_begin[f + 1] - shape.row_begin[f]
     kept: np.ndarray = store[shape.store[f] : shape.store[f] + num_pivots * width].reshape(num_pivots, width)
@@ -45,10 +45,10 @@ def _own(shape: Shape, f: int, store: np.ndarray) -> np.ndarray:
 
 @compiled
 def gather(shape: Shape, f: int, room: Room, own: np.ndarray, left: np.ndarray, top: int) -> int:
-    """A front's matrix: its own numbers ``own`` ``(p, p + r)`` and what those below leave, also to ``left`` ``(r, r)``.
+    """Sum the matrix's entries and what children leave into a front: ``own`` ``(p, p + r)``, ``left`` ``(r, r)``.
 
     Returns:
-        How many numbers still wait on the stack.
+        The size of the stack, in numbers.
     """
     flat = own.reshape(-1)
     flat[:] = 0.0
@@ -76,7 +76,7 @@ def gather(shape: Shape, f: int, room: Room, own: np.ndarray, left: np.ndarray, 
 
 @compiled
 def _diagonal(shape: Shape, f: int, entries: np.ndarray, width: int) -> np.ndarray:
-    """``(p,)`` what the matrix itself has on a front's diagonal."""
+    """``(p,)`` the matrix's own diagonal entries of a front's pivots."""
     diagonal = np.zeros(shape.begin[f + 1] - shape.begin[f])
     for e in range(shape.entry_begin[f], shape.entry_begin[f + 1]):
         if shape.entry[e] % (width + 1) == 0:
@@ -86,7 +86,7 @@ def _diagonal(shape: Shape, f: int, entries: np.ndarray, width: int) -> np.ndarr
 
 @compiled
 def _take(to: np.ndarray, of: np.ndarray, row: int, first: int, last: int) -> None:
-    """From ``to``, the end of a line, what pivots ``first`` … ``last`` of ``of`` take at ``row``."""
+    """Subtract what pivots ``first`` … ``last`` - 1 of ``of`` contribute at ``row`` from ``to``, the end of a line."""
     end = of.shape[1]
     begin, k = end - len(to), first
     while k + 4 <= last:
@@ -104,10 +104,10 @@ def _take(to: np.ndarray, of: np.ndarray, row: int, first: int, last: int) -> No
 
 @compiled
 def eliminate(shape: Shape, first: int, last: int, room: Room, top: int) -> int:
-    """Fronts ``first`` … ``last``, the last not included.
+    """Eliminate fronts ``first`` … ``last`` - 1.
 
     Returns:
-        How many numbers wait on the stack; -1: the matrix is not positive definite.
+        The size of the stack, in numbers; -1: the matrix is not positive definite.
     """
     for f in range(first, last):
         own = _own(shape, f, room.store)
@@ -138,7 +138,7 @@ def eliminate(shape: Shape, first: int, last: int, room: Room, top: int) -> int:
 
 @compiled
 def solve_lower(shape: Shape, first: int, last: int, store: np.ndarray, columns: np.ndarray) -> None:
-    """U⁻ᵀ of columns ``(N, n)``, in place, as far as fronts ``first`` … ``last`` go, the last not included."""
+    """Apply U⁻ᵀ to columns ``(N, n)`` in place, by fronts ``first`` … ``last`` - 1."""
     num_columns = columns.shape[1]
     for f in range(first, last):
         start, row = shape.begin[f], shape.row[shape.row_begin[f] : shape.row_begin[f + 1]]
@@ -167,7 +167,7 @@ def solve_lower(shape: Shape, first: int, last: int, store: np.ndarray, columns:
 
 @compiled
 def solve_upper(shape: Shape, first: int, last: int, store: np.ndarray, columns: np.ndarray) -> None:
-    """U⁻¹ of columns ``(N, n)``, in place, as far as fronts ``last`` - 1 … ``first`` go."""
+    """Apply U⁻¹ to columns ``(N, n)`` in place, by fronts ``last`` - 1 … ``first``."""
     num_columns = columns.shape[1]
     for f in range(last - 1, first - 1, -1):
         start, row = shape.begin[f], shape.row[shape.row_begin[f] : shape.row_begin[f + 1]]
@@ -179,7 +179,7 @@ def solve_upper(shape: Shape, first: int, last: int, store: np.ndarray, columns:
                 value[num_pivots + i] = columns[row[i], c]
             for k in range(num_pivots - 1, -1, -1):
                 line = own[k]
-                # Four sums at once.
+                # Four partial sums.
                 a, b, left, right = 0.0, 0.0, 0.0, 0.0
                 i = k + 1
                 while i + 4 <= width:
@@ -197,12 +197,12 @@ def solve_upper(shape: Shape, first: int, last: int, store: np.ndarray, columns:
 
 @compiled
 def invert(shape: Shape, first: int, last: int, room: Room, top: int) -> int:
-    """Fronts ``last`` - 1 … ``first``: of the inverse Z what stands where the matrix's own numbers do.
+    """Entries of the inverse Z at the positions of the matrix's entries, by fronts ``last`` - 1 … ``first``.
 
     Where j is a pivot and i > j,  Z_ij = − Σ_k U_jk Z_ki / U_jj,  k > j;  Z_jj = (1 / U_jj − Σ_k U_jk Z_kj) / U_jj.
 
     Returns:
-        How many numbers wait on the stack.
+        The size of the stack, in numbers.
     """
     for f in range(last - 1, first - 1, -1):
         own = _own(shape, f, room.store)
@@ -244,10 +244,10 @@ def invert(shape: Shape, first: int, last: int, room: Room, top: int) -> int:
 
 @compiled
 def hand_down(shape: Shape, f: int, found: np.ndarray, room: Room, top: int) -> int:
-    """A front's part of Z ``(p + r, p + r)`` to those below, and to where the matrix has numbers.
+    """Pass a front's part of Z ``(p + r, p + r)`` to its children, and store it at the matrix's entries.
 
     Returns:
-        How many numbers wait on the stack.
+        The size of the stack, in numbers.
     """
     flat = found.reshape(-1)  # its first rows are those of the pivots
     for e in range(shape.entry_begin[f], shape.entry_begin[f + 1]):

@@ -4,8 +4,8 @@ Residuals are rotations of the world frame. Where noise has the same variance ab
 scalar, and the three components of a correction share one scalar Laplacian ``L = Bᵀ W B``, grounded at the roots (one
 per connected component). SfM's shaped steps weigh edges by 3 × 3 matrices: ``sfm/laplacians/block.py``.
 
-A solve factorises the same pattern with ever new weights, so what depends on the pattern alone is done once: the order
-of elimination, where each weight goes, and Bᵀ.
+A solve factorises the same pattern with many choices of weights. What depends only on the pattern is computed once: the
+order of elimination, the positions of the weights, and Bᵀ.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from rotavg_ros.solver.running.work import stop_if_abandoned
 
 # How much stiffer than its own edges a root is tied to zero.
 _GROUNDING = 1e6
-# A graph with more than this share of all pairs, and so many edges per node, fills in completely, and dense Cholesky is
-# then many times faster; with fewer it is no faster however small the graph, and OpenBLAS spreads it over the cores,
-# which wait for each other longer than they work.
+# A graph with more than this share of all pairs, and more than this many edges per node, fills in completely, and dense
+# Cholesky is then many times faster. With fewer it is no faster, however small the graph: OpenBLAS spreads it over the
+# cores, which wait for each other longer than they work.
 _DENSE_SHARE, _DENSE_EDGES_PER_NODE = 0.01, 8
 _DENSE_MAX_NODES = 5000
-# From eight columns on, SuperLU's many little products are large enough for OpenBLAS to spread each over the cores,
+# From eight columns on, SuperLU's many small products are large enough for OpenBLAS to spread each over the cores,
 # which costs more than it saves: 48 columns on 8600 nodes took 180 ms of CPU time at once and 28 ms in fours.
-# Six are on one thread only in smaller graphs: with them ticks of 10 000 keyframes took twice the CPU time.
+# Six columns stay on one thread only in smaller graphs: ticks of 10 000 keyframes took twice the CPU time with six.
 _COLUMNS_AT_ONCE = 4
 _ENTRIES_AT_ONCE = 100_000
 
@@ -60,7 +60,7 @@ class LaplacianPattern:
     def __init__(self, num_nodes: int, source: np.ndarray, target: np.ndarray, roots: np.ndarray) -> None:
         self.num_nodes, self.source, self.target, self.roots = num_nodes, source, target, roots
         self._incidence = incidence_matrix(num_nodes, source, target)
-        # Where each node stands in the order of elimination, which the first factorisation finds.
+        # Position of each node in the order of elimination, which the first factorisation finds.
         self._rank: np.ndarray | None = None
         self._lay_out(np.arange(num_nodes))
 
@@ -93,18 +93,18 @@ class LaplacianPattern:
     def _matrix(self, weight: np.ndarray) -> csc_array:
         """``L``, rows and columns in the order of elimination as far as it is known."""
         values = np.bincount(self._slot, np.concatenate((-weight, -weight, weight, weight)), len(self._row))
-        # Counts of nothing are integers, also with weights.
+        # NumPy counts an empty array in integers, even with weights.
         values = values.astype(np.float64, copy=False)
         values[self._root_slot] += root_stiffness(weight)
         return csc_array((values, self._row, self._first), shape=(self.num_nodes, self.num_nodes))
 
     def _factorize_sparse(self, matrix: csc_array) -> Callable[[np.ndarray], np.ndarray]:
-        """How to solve."""
+        """A function that solves with the factor."""
         is_ordered = self._rank is not None
         factor = SparseFactor(matrix, is_ordered=is_ordered)
         rank = np.arange(self.num_nodes) if self._rank is None else self._rank
         if not is_ordered:
-            # This one is in the nodes' own order; from the next one on, the matrix is laid out in that of elimination.
+            # This matrix is in the nodes' own order; later ones are in the order of elimination.
             self._rank = factor.rank
             self._lay_out(self._rank)
         return partial(_solve_sparse, factor, np.argsort(rank), rank)
@@ -160,7 +160,7 @@ class FactorisedLaplacian:
         variances of estimated differences, with a relative error of √(2/k).
         """
         root = np.sqrt(self.weight)[:, None]
-        # Of a large graph a few columns at a time stay in a core's cache from the signs to the solution.
+        # In a large graph, only a few columns at a time stay in a core's cache from the signs to the solution.
         count = max(_COLUMNS_AT_ONCE, _ENTRIES_AT_ONCE // max(len(root), 1))
         columns = (signs[:, start : start + count] for start in range(0, signs.shape[1], count))
         return np.concatenate([self.solve(self.incidence_sum(root * few)) for few in columns], axis=1)

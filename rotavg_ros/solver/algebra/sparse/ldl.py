@@ -1,20 +1,20 @@
-"""L D Lᵀ of a sparse symmetric positive definite matrix, and those entries of its inverse that tell of its own rows.
+"""L D Lᵀ of a sparse symmetric positive definite matrix, and those entries of its inverse that its own rows need.
 
-H = Jᵀ W J, rows of J with three unknowns at most. L is made row by row along the elimination tree (Liu 1990; Davis
-2005).
-Wherever L has an entry the inverse Z follows from those to its lower right (Takahashi, Fagan and Chin 1973; Erisman and
-Tinney 1975), column j after all later ones:
+H = Jᵀ W J, where a row of J has at most three unknowns. L is computed row by row along the elimination tree (Liu 1990;
+Davis 2005).
+Wherever L has an entry, the inverse Z follows from those to its lower right (Takahashi, Fagan and Chin 1973; Erisman
+and Tinney 1975), column j after all later ones:
 
     Z_ij = − Σ_k Z_ik L_kj,    Z_jj = 1 / D_j − Σ_k L_kj Z_kj,    i, k where column j of L has entries.
 
-So what H says of each of its rows, j H⁻¹ jᵀ, is exact and costs about two factors. For any other pair of unknowns
+So the variance of each of H's own rows, j H⁻¹ jᵀ, is exact and costs about two factors. For any other pair of unknowns
 
     Z_uv = Σ_j y_j z_j / D_j,    L y = e_u,  L z = e_v,
 
-and y has entries only on u's way up the elimination tree.
+and y has entries only on u's path up the elimination tree.
 
-Closures that join what lies far apart leave a clique of unknowns at the end of any order, and there nearly all the
-arithmetic is: L's last columns, all full, are made by a dense factor, and Z's by a dense inverse.
+Closures between distant nodes leave a clique of unknowns at the end of any order, and nearly all the arithmetic is
+there. L's last columns, which are full, are computed by a dense factor, and Z's by a dense inverse.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.running.work import spend
 
 _NOWHERE = -1
-# So many full columns are worth a dense factor.
+# Number of full columns from which a dense factor pays off.
 _MANY = 100
-# Products in one unit of work: of columns, of a dense factor, and of entries with rows that go up the tree.
+# Products per unit of work: of columns, of a dense factor, and of entries with rows that are followed up the tree.
 _PRODUCTS, _DENSE_PRODUCTS, _FAR_PRODUCTS = 1e6, 2e7, 2.4e6
-# So many rows that go up the tree are held; and of unknowns that do, so many numbers.
+# Most rows that are followed up the tree at once; and most numbers in memory for unknowns that are.
 _IN_MEMORY, _NUMBERS = 1024, 2e7
 
 
@@ -47,15 +47,15 @@ class RowPattern:
 
     Args:
         column: ``(E, 3)`` unknowns of each row.
-        value: ``(E, 3)`` J's numbers there; with 0 a row has not that unknown.
+        value: ``(E, 3)`` J's entries there; 0: the row does not have that unknown.
         size: N unknowns.
-        rank: ``(N,)`` where each stands in the order of elimination; None: in one of little fill.
+        rank: ``(N,)`` position of each in the order of elimination; None: an order of little fill is found.
 
     Attributes:
-        rank: likewise.
-        num_entries: of H, on the diagonal and on one side of it.
-        num_factor_entries: of L.
-        units: of work that a factor costs, by its products; an inverse where it has entries costs as much.
+        rank: the same.
+        num_entries: number of entries of H, on the diagonal and on one side of it.
+        num_factor_entries: number of entries of L.
+        units: units of work of a factor, by its products; the inverse at its entries takes as much.
     """
 
     def __init__(self, column: np.ndarray, value: np.ndarray, size: int, rank: np.ndarray | None = None) -> None:
@@ -69,7 +69,7 @@ class RowPattern:
         factor_begin = np.append(0, np.cumsum(counts))
         rows = factor_rows(begin, row, above, factor_begin)
         self.shape = Shape(begin, row, above, factor_begin, rows, _first_full(counts))
-        # As floating-point numbers: whole ones overflow in millions of unknowns.
+        # As floating-point numbers: integers overflow with millions of unknowns.
         by_column = counts[: self.shape.full].astype(np.float64) ** 2
         self.units = float(by_column.sum()) / _PRODUCTS + float(size - self.shape.full) ** 3 / _DENSE_PRODUCTS
 
@@ -82,12 +82,12 @@ class RowPattern:
         return len(self.shape.factor_row)
 
     def factorise(self, weight: np.ndarray, extra: np.ndarray) -> LDL:
-        """Of H with weights ``(E,)``, and ``extra`` ``(N,)`` on its diagonal."""
+        """The factor of H with weights ``(E,)``, and ``extra`` ``(N,)`` added to its diagonal."""
         entries = _weighted(self._slot, self.value, weight, self.shape.begin, extra[self.node])
         lower, diagonal, left = loops.factorise(self.shape, entries, self.shape.full)
         if len(left):
             root, info = torch.linalg.cholesky_ex(torch.from_numpy(left))
-            if int(info):  # rounding has left no root: column by column none is needed
+            if int(info):  # rounding has left no root; column by column, none is needed
                 lower, diagonal, _ = loops.factorise(self.shape, entries, self.size)
             else:
                 loops.put_full(self.shape, root.numpy(), lower, diagonal)
@@ -99,8 +99,8 @@ class LDL:
     """A factor, in the order of elimination.
 
     Attributes:
-        pattern: where it has entries.
-        lower: of L below its diagonal of ones, column by column.
+        pattern: of its entries.
+        lower: entries of L below its diagonal of ones, column by column.
         diagonal: ``(N,)`` D.
     """
 
@@ -110,7 +110,7 @@ class LDL:
 
     @property
     def log_det(self) -> float:
-        """Of H."""
+        """Log determinant of H."""
         return float(np.log(self.diagonal).sum())
 
     def solve(self, right_hand_side: np.ndarray) -> np.ndarray:
@@ -122,7 +122,7 @@ class LDL:
 
     @cached_property
     def _full(self) -> np.ndarray:
-        """Z where L's columns are full."""
+        """Z between the unknowns whose columns of L are full."""
         root = torch.from_numpy(loops.full_root(self.pattern.shape, self.lower, self.diagonal))
         return np.asarray(torch.cholesky_inverse(root).numpy())
 
@@ -164,18 +164,18 @@ class LDL:
         return variance
 
     def _by_ends(self, ends: np.ndarray, begin: np.ndarray, column: np.ndarray, value: np.ndarray) -> np.ndarray:
-        """``(n,)`` j H⁻¹ jᵀ of rows that have few unknowns among them: each of these goes up the tree once.
+        """``(n,)`` j H⁻¹ jᵀ of rows that share few unknowns: each of these is followed up the tree once.
 
         Args:
             ends: ``(m,)`` unknowns, ascending.
-            begin: ``(m + 1,)`` where the way of each begins.
+            begin: ``(m + 1,)`` where the path of each begins.
             column, value: ``(n, 3)`` rows.
         """
         shape = self.pattern.shape
         spend(len(ends) * len(self.lower) / _FAR_PRODUCTS)
         way, left = loops.up_the_tree(shape, self.lower, self.diagonal, ends, begin)
         if len(self._full):
-            # Of Z = C⁻ᵀ C⁻¹ where columns are full: what is left, by C⁻¹.
+            # Where columns are full, Z = C⁻ᵀ C⁻¹: multiply the remainder by C⁻¹.
             root = torch.from_numpy(loops.full_root(shape, self.lower, self.diagonal))
             left = torch.linalg.solve_triangular(root, torch.from_numpy(left).T, upper=False).T.contiguous().numpy()
         number = np.searchsorted(ends, column)
@@ -183,7 +183,7 @@ class LDL:
 
 
 def _first_full(counts: np.ndarray) -> int:
-    """The first of the last columns that are full, by numbers of entries ``(N,)``; N where they are few."""
+    """The first of the full columns at the end, from numbers of entries ``(N,)``; N if they are few."""
     size = len(counts)
     lacking = np.flatnonzero(counts != np.arange(size)[::-1])
     first = int(lacking[-1]) + 1 if len(lacking) else 0
@@ -191,7 +191,7 @@ def _first_full(counts: np.ndarray) -> int:
 
 
 def _ties(column: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of unknowns that some row has both."""
+    """Pairs of unknowns that occur in one row."""
     pairs = [(0, 1), (0, 2), (1, 2)]
     both = [(value[:, a] != 0) & (value[:, b] != 0) for a, b in pairs]
     first = np.concatenate([column[is_tied, a] for is_tied, (a, _) in zip(both, pairs, strict=True)])
@@ -201,7 +201,7 @@ def _ties(column: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 @compiled
 def _lay_out(column: np.ndarray, value: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """H's upper triangle by columns, each beginning with the diagonal; and where pairs of a row's unknowns stand."""
+    """H's upper triangle by columns, each beginning with the diagonal; and positions of pairs of a row's unknowns."""
     count = np.zeros(size + 1, np.int64)
     for e in range(len(column)):
         for a in range(3):
@@ -247,7 +247,7 @@ def _lay_out(column: np.ndarray, value: np.ndarray, size: int) -> tuple[np.ndarr
 def _weighted(
     slot: np.ndarray, value: np.ndarray, weight: np.ndarray, begin: np.ndarray, extra: np.ndarray
 ) -> np.ndarray:
-    """H's numbers."""
+    """Entries of H."""
     entries = np.zeros(begin[-1])
     for j in range(len(extra)):
         entries[begin[j]] = extra[j]

@@ -1,6 +1,6 @@
-"""Loops over L's entries: the factor, its triangles, and the inverse where L has any.
+"""Loops over L's entries: the factor, solves with its triangles, and the inverse at L's entries.
 
-The formulas stand in :mod:`~rotavg_ros.solver.algebra.sparse.ldl`.
+The formulas are in :mod:`~rotavg_ros.solver.algebra.sparse.ldl`.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ import numpy as np
 from rotavg_ros.solver.algebra.compiled import compiled
 
 _NOWHERE = -1
-# Where rounding leaves less than this of a diagonal entry, nothing is known of it but that it is positive.
+# Smallest pivot, as a share of the diagonal entry: where rounding leaves less, only the sign is known.
 _ROUNDING = 1e-15
-# So many rows go up the tree together.
+# Rows that are followed up the tree together.
 _AT_ONCE = 8
 
 
 class Shape(NamedTuple):
-    """Where entries stand, in the order of elimination.
+    """Positions of entries, in the order of elimination.
 
     Attributes:
-        begin, row: of H's upper triangle by columns, each beginning with the diagonal.
-        above: ``(N,)`` what each unknown is eliminated into, or -1.
-        factor_begin, factor_row: of L below its diagonal, by columns.
-        full: from this column on L has all entries; N where they are too few for a dense factor.
+        begin, row: H's upper triangle by columns, each beginning with the diagonal.
+        above: ``(N,)`` parent of each unknown in the elimination tree, or -1.
+        factor_begin, factor_row: L below its diagonal, by columns.
+        full: from this column on, L has all entries; N if such columns are too few for a dense factor.
     """
 
     begin: np.ndarray
@@ -38,13 +38,13 @@ class Shape(NamedTuple):
 
 @compiled
 def factorise(shape: Shape, entries: np.ndarray, full: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """L's numbers and D before column ``full``, of H's numbers, and what is left of H from there on, its lower half."""
+    """L and D before column ``full``, from H's entries; and the lower half of what is left of H from there on."""
     begin, row, above, factor_begin, factor_row, _ = shape
     size = len(above)
     lower, diagonal = np.empty(len(factor_row)), np.empty(size)
     remaining = np.zeros((size - full, size - full))
     free = factor_begin[:-1].copy()
-    # Row k of L solves L₁ D₁ l = h for the rows before; it has entries on ways up the tree alone, in that order.
+    # Row k of L solves L₁ D₁ l = h with the rows before it; it has entries only on paths up the tree, in that order.
     work, seen = np.zeros(size), np.empty(size, np.int32)
     way, waiting = np.empty(size, np.int32), np.empty(size, np.int32)
     for k in range(size):
@@ -86,7 +86,7 @@ def factorise(shape: Shape, entries: np.ndarray, full: int) -> tuple[np.ndarray,
 
 @compiled
 def put_full(shape: Shape, root: np.ndarray, lower: np.ndarray, diagonal: np.ndarray) -> None:
-    """L and D where columns are full, of a root C with C Cᵀ = L D Lᵀ."""
+    """Fill L and D where columns are full, from a root C with C Cᵀ = L D Lᵀ."""
     _, _, _, factor_begin, _, full = shape
     for j in range(len(root)):
         diagonal[full + j] = root[j, j] ** 2
@@ -97,7 +97,7 @@ def put_full(shape: Shape, root: np.ndarray, lower: np.ndarray, diagonal: np.nda
 
 @compiled
 def full_root(shape: Shape, lower: np.ndarray, diagonal: np.ndarray) -> np.ndarray:
-    """That root."""
+    """The root C of :func:`put_full`."""
     _, _, above, factor_begin, _, full = shape
     size = len(above) - full
     root = np.zeros((size, size))
@@ -111,7 +111,7 @@ def full_root(shape: Shape, lower: np.ndarray, diagonal: np.ndarray) -> np.ndarr
 
 @compiled
 def solve(shape: Shape, lower: np.ndarray, diagonal: np.ndarray, columns: np.ndarray) -> None:
-    """``(N, k)`` columns in place."""
+    """Solve for ``(N, k)`` columns in place."""
     _, _, _, factor_begin, factor_row, _ = shape
     size, width = columns.shape
     for j in range(size):
@@ -132,7 +132,7 @@ def solve(shape: Shape, lower: np.ndarray, diagonal: np.ndarray, columns: np.nda
 def selected_inverse(
     shape: Shape, lower: np.ndarray, diagonal: np.ndarray, whole: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Z's diagonal and its entries where L has any, of the ``whole`` of it where columns are full."""
+    """Z's diagonal, and Z at L's entries, given the ``whole`` of Z where columns are full."""
     _, _, _, factor_begin, factor_row, full = shape
     size = len(diagonal)
     own, inverse = np.empty(size), np.empty(len(lower))
@@ -173,7 +173,7 @@ def selected_inverse(
 
 @compiled
 def is_near(shape: Shape, column: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """``(n,)`` whether all pairs of a row's unknowns are entries of L."""
+    """``(n,)`` bool, whether all pairs of a row's unknowns are entries of L."""
     _, _, _, factor_begin, factor_row, _ = shape
     near = np.ones(len(column), np.bool_)
     for e in range(len(column)):
@@ -192,7 +192,7 @@ def is_near(shape: Shape, column: np.ndarray, value: np.ndarray) -> np.ndarray:
 def row_variance(
     shape: Shape, own: np.ndarray, inverse: np.ndarray, column: np.ndarray, value: np.ndarray
 ) -> np.ndarray:
-    """Values j Z jᵀ of rows whose pairs of unknowns all are entries of L."""
+    """Values j Z jᵀ of rows whose pairs of unknowns are all entries of L."""
     _, _, _, factor_begin, factor_row, _ = shape
     variance = np.empty(len(column))
     for e in range(len(column)):
@@ -214,9 +214,10 @@ def row_variance(
 def far_variance(
     shape: Shape, lower: np.ndarray, diagonal: np.ndarray, column: np.ndarray, value: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Values j Z jᵀ of any rows: squares of L⁻¹ jᵀ over D, along the ways up the tree of a row's unknowns.
+    """Values j Z jᵀ of any rows: squares of L⁻¹ jᵀ over D, along the paths of a row's unknowns up the tree.
 
-    Only as far as columns are not full; and what is left of jᵀ there, ``(n, N - full)``, between which Z stands.
+    They sum over columns that are not full. The second result is the remainder ``(n, N - full)`` of jᵀ in the full
+    ones, between which Z is known.
     """
     _, _, above, factor_begin, factor_row, full = shape
     size = len(above)
@@ -235,7 +236,7 @@ def far_variance(
                         way[count] = j
                         count += 1
                         j = above[j]
-        # What comes later in the order leads back to nothing that was before.
+        # What comes later in the order never leads back to what was before.
         for j in np.sort(way[:count]):
             for c in range(_AT_ONCE):
                 left[c] = work[j, c]
@@ -255,7 +256,7 @@ def far_variance(
 
 @compiled
 def ways(shape: Shape, ends: np.ndarray) -> np.ndarray:
-    """``(m + 1,)`` how many unknowns lie on the ways up the tree from all before each, as far as none is full."""
+    """``(m + 1,)`` where each path up the tree begins if all are stored in a row, each up to the full columns."""
     begin = np.zeros(len(ends) + 1, np.int64)
     for e in range(len(ends)):
         j, count = ends[e], 0
@@ -270,7 +271,7 @@ def ways(shape: Shape, ends: np.ndarray) -> np.ndarray:
 def up_the_tree(
     shape: Shape, lower: np.ndarray, diagonal: np.ndarray, ends: np.ndarray, begin: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """D^-½ L⁻¹ of single unknowns along their ways; and what is left where columns are full, ``(m, N - full)``."""
+    """D^-½ L⁻¹ of single unknowns along their paths; and the remainder where columns are full, ``(m, N - full)``."""
     _, _, above, factor_begin, factor_row, full = shape
     work, way = np.zeros(len(above)), np.empty(begin[-1])
     remaining = np.empty((len(ends), len(above) - full))
@@ -297,7 +298,7 @@ def variance_by_ways(
     number: np.ndarray,
     value: np.ndarray,
 ) -> np.ndarray:
-    """Values j Z jᵀ of rows ``(n, 3)`` by what :func:`up_the_tree` tells of ends: ways that have met stay together."""
+    """Values j Z jᵀ of rows ``(n, 3)`` from the paths of :func:`up_the_tree`: paths that have met stay together."""
     ends, begin, way, left = of_ends
     variance = np.empty(len(number))
     for n in range(len(number)):

@@ -1,7 +1,7 @@
 """Which columns of a sparse Cholesky factor are eliminated as one dense front.
 
-Columns that are tied to the same later ones are one front (fundamental supernodes, Liu, Ng and Peyton 1993), and a
-front takes in those below it that cost more by themselves.
+Columns tied to the same later ones form one front (fundamental supernodes, Liu, Ng and Peyton 1993). A front absorbs
+its children where that costs less than eliminating them separately.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ import numpy as np
 
 from rotavg_ros.solver.algebra.compiled import compiled
 
-# What a front takes besides its arithmetic, seconds; numbers multiplied and moved a second, on one core of 2020. They
-# decide on merging and are what work is counted in; no answer depends on them.
+# Seconds that a front takes besides its arithmetic; multiplications and moved numbers per second, on one core of 2020.
+# They decide which fronts are merged and how much work is counted; no answer depends on them.
 _FRONT_S, _PRODUCTS_PER_S, _MOVES_PER_S = 1.5e-6, 3e9, 5e8
-# Where products are as many as this, those of whole matrices take less, and so many are made a second.
+# From this number of multiplications on, products of whole matrices take less time; their multiplications per second.
 DENSE, _DENSE_PER_S = 4e5, 2.5e10
 _NOWHERE = -1
 
 
 class Fronts(NamedTuple):
-    """In blocks, in the order of elimination.
+    """Fronts in blocks, in the order of elimination.
 
     Attributes:
-        place: ``(B,)`` where each block of the order before stands in this one.
+        place: ``(B,)`` position in this order of each block of the order before.
         begin: ``(F + 1,)`` first pivot of each front.
-        above: ``(F,)`` the front that each leaves its rows to, -1: none.
+        above: ``(F,)`` parent of each front, which takes what is left of its rows; -1: none.
         row_begin, row, within: as :class:`~rotavg_ros.solver.algebra.sparse.elimination.Shape` has them.
     """
 
@@ -40,14 +40,14 @@ class Fronts(NamedTuple):
 
 @compiled
 def products(pivots: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Numbers that are multiplied to eliminate so many pivots beside so many rows."""
+    """Number of multiplications to eliminate ``pivots`` that are tied to ``rows``."""
     number: np.ndarray = pivots * pivots * pivots / 6 + pivots * pivots * rows / 2 + pivots * rows * rows / 2
     return number
 
 
 @compiled
 def seconds(pivots: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """What fronts of so many pivots and rows take."""
+    """Seconds that fronts of ``pivots`` and ``rows`` take."""
     number = products(pivots, rows)
     rate = np.where(number > DENSE, _DENSE_PER_S, _PRODUCTS_PER_S)
     taken: np.ndarray = _FRONT_S + number / rate + (rows * rows + pivots * (pivots + rows)) / _MOVES_PER_S
@@ -55,13 +55,13 @@ def seconds(pivots: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 class _Tree(NamedTuple):
-    """Columns of L that become fronts, S supernodes, as linked lists that end with :data:`_NOWHERE`.
+    """S supernodes of L, which are merged to fronts; linked lists end with :data:`_NOWHERE`.
 
     Attributes:
-        first, last: ``(S,)`` columns of each by itself.
-        pivots, rows: ``(S,)`` blocks of each with all that it has taken in.
-        head, follows: ``(S,)`` the first of those that are one with each, and the one after each, in that order.
-        below, beside: ``(S,)`` the first front below each, and the next one below the same.
+        first, last: ``(S,)`` first and last column of each supernode.
+        pivots, rows: ``(S,)`` blocks of each, including all that it has absorbed.
+        head, follows: ``(S,)`` first supernode of each front, and the next one of the same front, in their order.
+        below, beside: ``(S,)`` first child of each front, and its next sibling.
     """
 
     first: np.ndarray
@@ -105,7 +105,7 @@ def merged(
 
 @compiled
 def _supernodes(above: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, _Tree]:
-    """``(B,)`` which each column is of, and these: columns tied to the same later ones (Liu, Ng and Peyton 1993)."""
+    """Supernode of each column ``(B,)``, and the supernodes: columns tied to the same later ones."""
     num_blocks = len(above)
     num_below = np.zeros(num_blocks, np.int64)
     for j in range(num_blocks):
@@ -130,14 +130,14 @@ def _supernodes(above: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, _Tre
 
 @compiled
 def _cost(pivots: int, rows: int, size: int) -> float:
-    """Seconds of a front of so many blocks."""
+    """Seconds that a front takes, given blocks of ``size`` unknowns."""
     taken: float = seconds(np.array([size * pivots]), np.array([size * rows]))[0]
     return taken
 
 
 @compiled
 def _take_in(tree: _Tree, s: int, cost: np.ndarray, size: int) -> None:
-    """Make those below one with a front that cost more by themselves, those of many rows first."""
+    """Absorb children that would cost more by themselves, those of many rows first."""
     below = _listed(tree, tree.below[s])
     tree.below[s] = _NOWHERE
     for at in np.argsort(-tree.rows[below], kind="mergesort"):
@@ -158,7 +158,7 @@ def _take_in(tree: _Tree, s: int, cost: np.ndarray, size: int) -> None:
 
 @compiled
 def _listed(tree: _Tree, first: int) -> np.ndarray:
-    """``(n,)`` a front and all after it that are below the same."""
+    """``(n,)`` a front and its later siblings."""
     many, each = 0, first
     while each >= 0:
         many += 1
@@ -172,7 +172,7 @@ def _listed(tree: _Tree, first: int) -> np.ndarray:
 
 @compiled
 def _upwards(tree: _Tree) -> np.ndarray:
-    """``(F,)`` fronts, every one right after all below it."""
+    """``(F,)`` fronts in postorder."""
     count = len(tree.first)
     order, waiting = np.empty(count, np.int64), np.empty(count, np.int64)
     num_fronts, end = 0, 0
@@ -195,7 +195,7 @@ def _upwards(tree: _Tree) -> np.ndarray:
 
 @compiled
 def _laid_out(tree: _Tree, order: np.ndarray, num_blocks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``(B,)`` where each block stands, ``(F + 1,)`` where each front begins, and ``(F,)`` the one above it."""
+    """Position of each block ``(B,)``, first pivot of each front ``(F + 1,)``, and parent of each front ``(F,)``."""
     place, begin, over = (
         np.empty(num_blocks, np.int64),
         np.zeros(len(order) + 1, np.int64),
@@ -214,7 +214,7 @@ def _laid_out(tree: _Tree, order: np.ndarray, num_blocks: int) -> tuple[np.ndarr
             part = tree.follows[part]
         begin[f + 1] = at
         child = tree.below[order[f]]
-        while child >= 0:  # these come before
+        while child >= 0:  # children come before
             over[number[child]] = f
             child = tree.beside[child]
     return place, begin, over
@@ -222,7 +222,7 @@ def _laid_out(tree: _Tree, order: np.ndarray, num_blocks: int) -> tuple[np.ndarr
 
 @compiled
 def _within(begin: np.ndarray, over: np.ndarray, row_begin: np.ndarray, row: np.ndarray) -> np.ndarray:
-    """Where each of a front's rows stands in the front above, among its pivots and then its rows."""
+    """Position of each of a front's rows in the parent front, whose pivots come before its rows."""
     within = np.empty(len(row), np.int64)
     for f in range(len(over)):
         g = over[f]

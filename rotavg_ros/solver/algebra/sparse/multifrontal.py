@@ -1,8 +1,8 @@
-"""Cholesky's factor of a sparse symmetric matrix of blocks, and the inverse where that has numbers, by dense fronts.
+"""Cholesky's factor of a sparse symmetric matrix of blocks, and the inverse at its entries, by dense fronts.
 
-Small fronts are loops (:mod:`~rotavg_ros.solver.algebra.sparse.fronts`), many at once; of a large one all arithmetic is
-products of dense matrices, which take a tenth of the time that entry by entry would. Between both a solve may rest, and
-other threads run within them.
+Small fronts are processed by loops (:mod:`~rotavg_ros.solver.algebra.sparse.fronts`), many at once. A large one is
+processed by products of dense matrices, which take a tenth of the time of loops over entries. A solve may rest between
+them, and other threads run during them.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from rotavg_ros.solver.algebra.sparse.fronts import Room
 from rotavg_ros.solver.running.cached import cached_property
 from rotavg_ros.solver.running.work import spend, stop_if_abandoned
 
-# Where rounding leaves a large front without a pivot, so much of its largest diagonal is added, and ever more, up to
-# that.
+# Where rounding leaves a large front without a positive pivot, its diagonal is raised by the first share of its largest
+# diagonal entry, then by the second number times as much each time, up to the third share.
 _LIFT, _MORE, _NO_ROUNDING = 1e-15, 16.0, 1.0
-# What the inverse takes, in what the factor does.
+# Work of the inverse relative to that of the factor.
 _INVERSE = 2.0
-# So many columns are worth products of whole matrices.
+# Number of columns from which products of whole matrices pay off.
 _MANY = 4
 _NOT_DEFINITE = "a matrix that is to be factorised is not positive definite"
 
 
 class Cholesky:
-    """Uᵀ U of a matrix.
+    """The factorisation Uᵀ U of a matrix.
 
     Args:
         elimination: of its pattern.
-        entries: ``(num_entries,)`` the matrix at :meth:`Elimination.places`, those of a diagonal block whole or its
-            upper triangle.
+        entries: ``(num_entries,)`` the matrix at :meth:`Elimination.places`; of diagonal blocks, the upper triangle is
+            enough.
 
     Raises:
         RuntimeError: the matrix is far from positive definite.
@@ -54,7 +54,7 @@ class Cholesky:
                 raise RuntimeError(_NOT_DEFINITE)
 
     def _own(self, front: int) -> np.ndarray:
-        """``(p, p + r)`` of a front."""
+        """``(p, p + r)`` a front's part of the factor."""
         shape = self.elimination.shape
         num_pivots = shape.begin[front + 1] - shape.begin[front]
         width = num_pivots + shape.row_begin[front + 1] - shape.row_begin[front]
@@ -62,7 +62,7 @@ class Cholesky:
         return self._store[begin : begin + num_pivots * width].reshape(num_pivots, width)
 
     def _eliminate_dense(self, front: int, room: Room, top: int) -> int:
-        """As :func:`fronts.eliminate`, of one."""
+        """As :func:`fronts.eliminate`, for one large front."""
         own = self._own(front)
         num_pivots = len(own)
         num_rows = own.shape[1] - num_pivots
@@ -79,12 +79,12 @@ class Cholesky:
 
     @property
     def num_entries(self) -> int:
-        """Of the factor."""
+        """Number of entries of the factor."""
         return self.elimination.num_factor_entries
 
     @property
     def log_det(self) -> float:
-        """Of the matrix."""
+        """Log determinant of the matrix."""
         shape = self.elimination.shape
         pivots, rows = np.diff(shape.begin), np.diff(shape.row_begin)
         number = np.arange(shape.begin[-1]) - np.repeat(shape.begin[:-1], pivots)
@@ -92,11 +92,11 @@ class Cholesky:
         return 2 * float(np.log(self._store[diagonal]).sum())
 
     def solve(self, right_hand_side: np.ndarray, units: float = 0.0) -> np.ndarray:
-        """The solution of ``(B d, k)`` columns, blocks in the order of elimination; ``units`` as :meth:`ended` has."""
+        """The solution for ``(B d, k)`` columns, blocks in the order of elimination; ``units`` as in :meth:`ended`."""
         return self.ended(self.begun(right_hand_side, units / 2), units / 2)
 
     def begun(self, right_hand_side: np.ndarray, units: float = 0.0) -> np.ndarray:
-        """U⁻ᵀ of columns ``(B d, k)``; where they have numbers and in fronts above those. ``units`` as below."""
+        """U⁻ᵀ of columns ``(B d, k)``; fronts where these are zero take no time. ``units`` as in :meth:`ended`."""
         shape, columns = self.elimination.shape, np.array(right_hand_side, order="C")
         for stretch in self.elimination.stretches:
             self._spend(units, stretch)
@@ -115,7 +115,7 @@ class Cholesky:
 
         Args:
             half: the columns.
-            units: of work that this is, spent stretch by stretch; 0: somebody counts them elsewhere.
+            units: units of work, spent stretch by stretch; 0: they are counted elsewhere.
         """
         shape, columns = self.elimination.shape, np.array(half, order="C")
         for stretch in reversed(self.elimination.stretches):
@@ -130,18 +130,18 @@ class Cholesky:
         return columns
 
     def _spend(self, units: float, stretch: Stretch) -> None:
-        """A stretch's part of what is done with all of them; it may rest in any case."""
+        """Spend a stretch's share of the units; the solve may rest here even if they are 0."""
         spend(units * stretch.units / self.elimination.units)
 
     def _dense(self, front: int) -> tuple[torch.Tensor, torch.Tensor, slice, np.ndarray]:
-        """U of a front's pivots and of its rows, and where in a column these stand."""
+        """U of a front's pivots and of its rows, and the positions of pivots and rows in a column."""
         shape, own = self.elimination.shape, torch.from_numpy(self._own(front))
         row = shape.row[shape.row_begin[front] : shape.row_begin[front + 1]]
         return own[:, : len(own)], own[:, len(own) :], slice(shape.begin[front], shape.begin[front + 1]), row
 
     @cached_property
     def inverse(self) -> np.ndarray:
-        """``(num_entries,)`` the inverse, where the matrix has numbers."""
+        """``(num_entries,)`` the inverse at the matrix's entries."""
         elimination = self.elimination
         shape, found, top = elimination.shape, np.empty(elimination.num_entries), 0
         stack, work = _numbers(elimination.num_waiting), _numbers(elimination.most_unknowns**2)
@@ -156,7 +156,7 @@ class Cholesky:
         return found
 
     def _invert_dense(self, front: int, room: Room, top: int) -> int:
-        """As :func:`fronts.invert`, of one."""
+        """As :func:`fronts.invert`, for one large front."""
         own = self._own(front)
         num_pivots, width = own.shape
         num_rows = width - num_pivots
@@ -174,12 +174,12 @@ class Cholesky:
 
 
 def _numbers(count: int) -> np.ndarray:
-    """Room in memory of torch's own, whose products come out alike to the last bit wherever that lies."""
+    """An uninitialised array of torch's, in which products are the same to the last bit wherever it lies."""
     return np.asarray(torch.empty(count, dtype=torch.float64).numpy())
 
 
 def _lower_root(matrix: torch.Tensor) -> torch.Tensor:
-    """L of L Lᵀ, of a matrix of which the lower triangle is read; lifted where rounding has left it no root."""
+    """L of L Lᵀ = the matrix, by its lower triangle; its diagonal is raised where rounding has left no root."""
     lower: torch.Tensor
     lower, info = torch.linalg.cholesky_ex(matrix)
     lift = _LIFT

@@ -1,12 +1,12 @@
-"""Sparse factors that any thread may let go of.
+"""Sparse factors that any thread may release.
 
-SciPy's SuperLU lists the memory that it takes in a dictionary of the thread that runs, and frees only what the list of
-the thread that lets go of it has. A factor that is made on one thread and let go of on another stays in the process for
-good. Solves run on threads of their own here, and factors outlive them; so one thread, which lasts as long as the
-process, makes them all and lets them all go. Any thread may solve with them.
+SciPy's SuperLU records the memory that it allocates in a dictionary of the current thread. It frees only what the
+dictionary of the releasing thread has. A factor that is made on one thread and released on another is leaked. Here,
+solves run on their own threads, and factors outlive them. So one thread, which lasts as long as the process, makes and
+releases all factors. Any thread may solve with them.
 
-Where the interpreter takes down a thread whose list is not empty, at exit and in a forked process, SciPy leaves an
-error behind that nobody has raised. So before either all factors are let go of; one that is asked again is made again.
+If the interpreter ends a thread whose dictionary is not empty, at exit or in a forked process, SciPy leaves an error
+set that nobody has raised. So all factors are released before either; one that is used again is made again.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import SuperLU, spilu, splu
 
-# What is tied to nothing by itself, beside ties of one: enough for any order of elimination, too little to let fill
-# that lies far apart vanish.
+# Weight that ties each unknown to zero, where ties between unknowns weigh 1. It is enough for any order of elimination,
+# and too little to make fill between distant unknowns vanish.
 _SLIGHTLY = 1e-6
 
 
 def tied_matrix(first: np.ndarray, second: np.ndarray, size: int) -> csc_array:
-    """A positive definite matrix of the pattern, of which no fill vanishes: a Laplacian and next to nothing.
+    """A positive definite matrix of the pattern whose fill does not vanish: a Laplacian plus a small diagonal.
 
     Args:
-        first, second: ``(n,)`` unknowns that are tied, in any order and as often as it comes.
-        size: unknowns.
+        first, second: ``(n,)`` pairs of tied unknowns, in any order, repeated or not.
+        size: number of unknowns.
     """
     is_tie = first != second
     first, second = first[is_tie], second[is_tie]
@@ -48,10 +48,10 @@ def tied_matrix(first: np.ndarray, second: np.ndarray, size: int) -> csc_array:
 
 
 def order_of_little_fill(first: np.ndarray, second: np.ndarray, size: int) -> np.ndarray:
-    """``(N,)`` where each unknown stands in an order of elimination of minimum degree, for such ties.
+    """Position ``(N,)`` of each unknown in a minimum-degree order of elimination, for ties as in :func:`tied_matrix`.
 
-    SuperLU tells it of a factor alone. It is chosen before anything is eliminated, so a factor that drops all fill has
-    the same, and takes a tenth of the time where much fills in.
+    SuperLU gives the order only with a factor. It chooses the order before it eliminates anything, so a factor that
+    drops all fill has the same order, and takes a tenth of the time where there is much fill.
     """
     found: list[np.ndarray] = []
     _keeper.wait_for(partial(_put_in_order, found, tied_matrix(first, second, size)))
@@ -75,19 +75,19 @@ class SparseFactor:
 
     Args:
         matrix: to be factorised.
-        is_ordered: whether its rows and columns are in the order in which they are to be eliminated.
-        relax, panel: columns that SuperLU merges, and that it works on at once. Supernodes of pose graphs are small:
-            with one it takes three quarters of the time that its own defaults take.
+        is_ordered: whether its rows and columns are in the order of elimination already.
+        relax, panel: numbers of columns that SuperLU merges and processes at once. Supernodes of pose graphs are small:
+            with 1 it takes three quarters of the time of its own defaults.
 
     Raises:
         RuntimeError: the matrix is exactly singular.
     """
 
     def __init__(self, matrix: csc_array, *, is_ordered: bool, relax: int = 1, panel: int = 1) -> None:
-        # Nobody else may hold what is inside: the last to let go of it has to be the keeper.
+        # Nobody else may hold a reference to the factor: the keeper must be the last to release it.
         self._held: list[SuperLU] = []
         order = "NATURAL" if is_ordered else "MMD_AT_PLUS_A"
-        # Whoever has the matrix may give it other values, in another array.
+        # A shallow copy, since the caller may give its matrix another array of values.
         self._make = partial(_factorise, self._held, copy(matrix), order, (relax, panel))
         _keeper.wait_for(self._make)
         _live.add(self)
@@ -100,7 +100,7 @@ class SparseFactor:
         return self._held[0]
 
     def let_go(self) -> None:
-        """Of what is inside, on the thread of the keeper."""
+        """Release the factor; to be called on the keeper's thread."""
         self._held.clear()
 
     def solve(self, right_hand_side: np.ndarray) -> np.ndarray:
@@ -109,17 +109,17 @@ class SparseFactor:
 
     @property
     def rank(self) -> np.ndarray:
-        """``(N,)`` where each row stands in the order of elimination."""
+        """``(N,)`` position of each row in the order of elimination."""
         return np.asarray(self._factor.perm_c.astype(np.int64))
 
     @property
     def num_entries(self) -> int:
-        """Of L and U together."""
+        """Number of entries of L and U together."""
         return int(self._factor.nnz)
 
     @property
     def log_det(self) -> float:
-        """Of the matrix."""
+        """Log determinant of the matrix."""
         return float(np.log(np.abs(self._factor.U.diagonal())).sum())
 
 
@@ -132,7 +132,7 @@ def _factorise(held: list[SuperLU], matrix: csc_array, order: str, widths: tuple
 
 
 def _let_all_go() -> None:
-    """Before a fork, and at exit."""
+    """Release all factors, before a fork and at exit."""
 
     def let_go() -> None:
         for factor in list(_live):
@@ -143,15 +143,15 @@ def _let_all_go() -> None:
 
 
 class _Keeper:
-    """A thread that does what it is given, one after another."""
+    """A thread that executes tasks, one after another."""
 
     def __init__(self) -> None:
         self.begin()
 
     def begin(self) -> None:
-        """Anew, as in a process that was forked, which has none of its parent's threads."""
+        """Start over; so in a forked process, which has none of its parent's threads."""
         self._lock = threading.Lock()
-        # Finalizers put into it, in the middle of anything.
+        # A simple queue, since finalizers put tasks into it at any moment.
         self._tasks: SimpleQueue[tuple[Callable[[], None], Future[None] | None]] = SimpleQueue()
         self._thread: threading.Thread | None = None
 
@@ -161,7 +161,7 @@ class _Keeper:
         return self._thread is not None
 
     def wait_for(self, task: Callable[[], None]) -> None:
-        """Until it is done; what it raises is raised here."""
+        """Execute a task and wait until it is done; what it raises is raised here."""
         with self._lock:
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="rotavg-factors", daemon=True)
@@ -171,7 +171,7 @@ class _Keeper:
         done.result()
 
     def leave(self, task: Callable[[], None]) -> None:
-        """Have it done some time."""
+        """Execute a task later, without waiting."""
         self._tasks.put((task, None))
 
     def _run(self) -> None:
