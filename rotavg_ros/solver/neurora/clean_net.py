@@ -14,10 +14,10 @@ from rotavg_ros.solver.neurora.network_store import StoredNetwork
 
 @dataclass(frozen=True)
 class CleanEdges:
-    """What CleanNet says of M edges.
+    """CleanNet's result for M edges.
 
     Attributes:
-        target_from_source: ``(M, 4)`` the measurement with its predicted noise taken off.
+        target_from_source: ``(M, 4)`` the measurements without their predicted noise.
         outlier_logit: ``(M,)`` log-odds of being an outlier.
     """
 
@@ -28,12 +28,12 @@ class CleanEdges:
 class CleanNet(StoredNetwork):
     """Local consistency of every edge with its neighbourhood of four hops.
 
-    The features of an edge are the measured quaternion R̃_uv, node states begin empty. From the message m_uv of the
-    last layer (``message_passing.py``), and m_vu of the reversed edge, two linear heads say
+    The features of an edge are the measured quaternion R̃_uv; node states are initially empty. From the message m_uv of
+    the last layer (``message_passing.py``), and m_vu of the reversed edge, two linear heads compute
 
         n_uv = ½ (H m_uv + h + R̃_uv⁻¹ (H m_vu + h)⁻¹ R̃_uv)      the noise, as a change of the identity quaternion,
-        R̂_uv = R̃_uv · (1 + n_uv) / ‖1 + n_uv‖                    what is left of the measurement without it,
-        logit = ½ (g·m_uv + g·m_vu) + g₀                          log-odds of the edge to be an outlier.
+        R̂_uv = R̃_uv · (1 + n_uv) / ‖1 + n_uv‖                    the measurement without the noise,
+        logit = ½ (g·m_uv + g·m_vu) + g₀                          log-odds that the edge is an outlier.
 
     A solve runs the same formula in ``tiled/networks.py``: ``clean_edges``.
     """
@@ -47,7 +47,7 @@ class CleanNet(StoredNetwork):
         self.outlier_head = nn.Linear(HIDDEN_WIDTH, 1)
 
     def forward(self, target_from_source: Tensor, edges: DirectedEdges) -> CleanEdges:
-        """Measurements ``(M, 4)`` → what CleanNet says of them."""
+        """Measurements ``(M, 4)`` → corrected measurements and log-odds."""
         num_edges = len(target_from_source)
         features = torch.cat((target_from_source, rotations.inverse(target_from_source)))
         no_states = features.new_zeros(edges.num_nodes, 0)
@@ -61,8 +61,8 @@ class CleanNet(StoredNetwork):
 
 def correct(target_from_source: Tensor, forward: Tensor, backward: Tensor) -> Tensor:
     """Measurements ``(M, 4)`` without the noise that the messages of their two directions predict, ``(M, 4)`` each."""
-    # R̃_uv = clean · noise holds for the edge as given; the reversed edge's noise is seen from the other end,
-    # so it is carried over by the measurement before the two predictions are averaged.
+    # R̃_uv = clean · noise holds for the edge as given. The reversed edge's noise is in the frame of the other end, so
+    # the measurement carries it over before the two predictions are averaged.
     carried = rotations.multiply(
         rotations.multiply(rotations.inverse(target_from_source), rotations.inverse(backward)), target_from_source
     )

@@ -17,7 +17,7 @@ class Cleaned:
     """A view-graph after CleanNet.
 
     Attributes:
-        graph: the rectified measurements, in the network's single precision: at millions of edges double takes room.
+        graph: the rectified measurements, in the network's single precision, which saves memory with millions of edges.
         measured: the graph as it was given.
         outlier_probability: ``(M,)`` float32.
         edges: all of the graph's edges, sorted.

@@ -10,18 +10,18 @@ from rotavg_ros.solver.neurora.message_passing import HIDDEN_WIDTH, DirectedEdge
 from rotavg_ros.solver.neurora.network_store import StoredNetwork
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 
-# Of an edge: three vectors, which change their sign with its direction, and two numbers, which do not.
+# Features of an edge: three vectors, which change sign with its direction, and two numbers, which do not.
 ODD_FEATURES, EVEN_FEATURES = 9, 2
-# Of a node: its orientation and how many edges it has.
+# Features of a node: its orientation and its number of edges.
 NODE_FEATURES = 5
 
 
 class FineNet(StoredNetwork):
     """One correction of all orientations.
 
-    The state of a node begins as h_v = [R_v, log(1 + degree)/4] of the current estimate R_v, an edge's features are
-    those of :func:`edge_features`, made of its residuals e_uv; from the last state (``message_passing.py``) one linear
-    head gives the tangent of half the correction's angle, along its axis, in units of the scale s:
+    A node's initial state is h_v = [R_v, log(1 + degree)/4], with the current estimate R_v. The features of an edge are
+    those of :func:`edge_features`, computed from its residuals e_uv. From the last state (``message_passing.py``), one
+    linear head gives the tangent of half the correction's angle, along its axis, in units of the scale s:
 
         t_v = s (H h_v + b),        R_v ← R_v · [t_v, 1] / ‖[t_v, 1]‖.
 
@@ -40,7 +40,7 @@ class FineNet(StoredNetwork):
             NODE_FEATURES, ODD_FEATURES + EVEN_FEATURES, odd_width=ODD_FEATURES, wiring=Wiring(accumulates=True)
         )
         self.correction_head = nn.Linear(HIDDEN_WIDTH, 3)
-        # It begins as no correction at all.
+        # Initially there is no correction.
         nn.init.zeros_(self.correction_head.weight)
         nn.init.zeros_(self.correction_head.bias)
 
@@ -50,7 +50,7 @@ class FineNet(StoredNetwork):
         Args:
             body_from_world: ``(N, 4)`` current estimate R_v.
             features: ``(M, ODD_FEATURES + EVEN_FEATURES)`` of the edges as given, from :func:`edge_features`.
-            scale: s, ``(N, 1)`` or ``(1, 1)``, what the features are measured in.
+            scale: s, ``(N, 1)`` or ``(1, 1)``, the unit of the features.
         """
         backward = torch.cat((-features[:, :ODD_FEATURES], features[:, ODD_FEATURES:]), dim=1)
         states = node_features(body_from_world, 1 / edges.inverse_degree)
@@ -58,7 +58,7 @@ class FineNet(StoredNetwork):
         return self.correct(body_from_world, states, scale)
 
     def correct(self, body_from_world: Tensor, states: Tensor, scale: Tensor) -> Tensor:
-        """Orientations ``(N, 4)`` corrected by what the last node states ``(N, hidden)`` say."""
+        """Orientations ``(N, 4)``, corrected by the last node states ``(N, hidden)``."""
         # t_v, the tangent of half the angle, along the axis.
         tangent = self.correction_head(states) * scale
         correction = nn.functional.normalize(torch.cat((tangent, torch.ones_like(tangent[:, :1])), dim=1), dim=1)
@@ -67,12 +67,12 @@ class FineNet(StoredNetwork):
 
 
 def edge_features(raw: Tensor, rectified: Tensor, outlier_logit: Tensor, scale: Tensor) -> Tensor:
-    """What FineNet sees of k edges, ``(ODD_FEATURES + EVEN_FEATURES, k)``.
+    """FineNet's features of k edges, ``(ODD_FEATURES + EVEN_FEATURES, k)``.
 
     Args:
         raw, rectified: ``(3, k)`` x, y, z of the residual quaternions (w ≥ 0) of the measurements as they are and
             after CleanNet.
-        outlier_logit: ``(k,)`` CleanNet's.
+        outlier_logit: ``(k,)`` CleanNet's log-odds.
         scale: s, ``(k,)`` or a number, the median length of ``raw``.
     """
     raw, rectified = raw / scale, rectified / scale
@@ -83,6 +83,6 @@ def edge_features(raw: Tensor, rectified: Tensor, outlier_logit: Tensor, scale: 
 
 
 def node_features(body_from_world: Tensor, degree: Tensor) -> Tensor:
-    """``(N, NODE_FEATURES)``; ``degree`` ``(N, 1)`` is the number of edges, at nodes without any whatever it may be."""
+    """Features of nodes ``(N, NODE_FEATURES)``; ``degree`` ``(N, 1)`` may be infinite at nodes without edges."""
     known = torch.where(degree.isfinite(), degree, 0).to(body_from_world)
     return torch.cat((body_from_world, known.log1p() / NUMBERS.log_degree_unit), dim=1)

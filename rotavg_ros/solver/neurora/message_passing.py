@@ -10,10 +10,10 @@ so a message ``m_uv = D a_uv + d`` is linear, ReLU, linear. In :class:`MessagePa
 ``update``.
 
 Node states are projected (A, B) before they are gathered, and D commutes with the mean, so it is applied to nodes, not
-to edges. That edges remember is the authors' released code rather than the paper's text; on equal training it lifts
+to edges. That edges remember follows the authors' released code, not the paper's text; with equal training it raises
 CleanNet's accuracy from 94.1 to 95.8 %.
 
-This is the specification, and what training differentiates; solves run the same formula through ``tiled/passes.py``.
+This is the specification, which training differentiates; solves run the same formula through ``tiled/passes.py``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Wiring:
 
     Attributes:
         remembers: edges keep their activation from layer to layer, as in the authors' released code; otherwise
-            a layer sees an edge's features alone, as in the paper's text.
+            a layer sees only an edge's features, as in the paper's text.
         accumulates: from the second layer on, updates are added to the node states.
     """
 
@@ -78,7 +78,7 @@ class MessagePassingLayer(nn.Module):
         node_width: width of the incoming node states; 0 where they are still empty.
         edge_width: width of the edge features.
         hidden_width: width of messages and outgoing node states.
-        accumulates: the update is added to the node's state, which must be as wide, in place of becoming it.
+        accumulates: whether the update is added to the node's state, which must be as wide, instead of replacing it.
     """
 
     def __init__(
@@ -119,13 +119,13 @@ class MessagePassingLayer(nn.Module):
 
 
 class MessagePassingNetwork(nn.Module):
-    """A stack of :class:`MessagePassingLayer`; heads are the business of the networks built on it.
+    """A stack of :class:`MessagePassingLayer`; heads belong to the networks that are built on it.
 
     Args:
         node_width: width of the initial node states, 0 for none.
         edge_width: width of the edge features ``x``, which every layer sees.
-        odd_width: so many of them, the first, change their sign where an edge is reversed; of a rotation, x, y and z.
-        wiring: default: edges remember.
+        odd_width: number of leading features that change sign when an edge is reversed; of a rotation, x, y and z.
+        wiring: how layers are joined; default: edges remember.
     """
 
     def __init__(

@@ -15,7 +15,7 @@ from torch import nn
 
 from rotavg_ros.errors import UserError, asking_about
 
-# Raised when a network's definition changes so that older weights no longer fit it.
+# Incremented when a network's definition changes so that older weights no longer fit it.
 ARCHITECTURE_VERSION = "1"
 WEIGHTS_FOLDER = Path(__file__).parents[1] / "weights"
 _REMEDY = "reinstall the package or train it with `rotavg train`"
@@ -29,7 +29,7 @@ class StoredNetwork(nn.Module):
     """A network whose weights are kept in a file.
 
     Attributes:
-        NAME: of the file, without its ending.
+        NAME: of the file, without its extension.
     """
 
     NAME: ClassVar[str]
@@ -40,7 +40,7 @@ Network = TypeVar("Network", bound=StoredNetwork)
 
 @dataclass(frozen=True)
 class Networks:
-    """Where the networks run, and the folder that has those of the user's."""
+    """The device on which networks run, and the folder that holds the user's own."""
 
     device: str
     folder: Path | None = None
@@ -53,10 +53,10 @@ class Networks:
 
 
 def check_folder(folder: Path) -> None:
-    """That a user's folder has a network: without any it would pass silently, for every one may come from the package.
+    """Check that a user's folder has a network; otherwise the package's networks would be used without a word.
 
     Raises:
-        WeightsError: it has none.
+        WeightsError: the folder has none.
     """
     names = sorted(path.name for path in WEIGHTS_FOLDER.glob("*.safetensors"))
     with asking_about(folder, WeightsError):
@@ -68,7 +68,7 @@ def check_folder(folder: Path) -> None:
 
 
 def metadata(name: str) -> dict[str, str]:
-    """What a weights file says of itself."""
+    """Metadata of a weights file."""
     return {"network": name, "architecture_version": ARCHITECTURE_VERSION}
 
 
@@ -104,7 +104,7 @@ def read_network(kind: type[Network], path: Path) -> Network:
         with safe_open(path, framework="pt") as file:
             stated = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
-    except FileNotFoundError:  # safetensors' word for a file without permission, too
+    except FileNotFoundError:  # safetensors raises this also for a file without permission
         if path.exists():
             raise WeightsError(f"{path}: permission denied; check the file's rights") from None
         raise WeightsError(f"{path}: missing; {_REMEDY}") from None

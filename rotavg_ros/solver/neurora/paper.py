@@ -1,7 +1,7 @@
-"""CleanNet and FineNet as the paper's text has them (NeuRoRA §4), beside those that this package develops.
+"""CleanNet and FineNet as in the paper's text (NeuRoRA §4), beside those that this package develops.
 
-Layers see an edge's features and the states of its ends, and no memory of the layer before; edge features are
-quaternions alone. Solves and training are otherwise the package's own, so that differences are those of the method.
+Layers see an edge's features and the states of its ends, but no activation of the previous layer; edge features are
+only quaternions. Solves and training are otherwise the package's own, so that differences are those of the method.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _FORGETFUL = Wiring(remembers=False)
 
 
 class PaperCleanNet(CleanNet):
-    """The paper's §4.1: x_uv = R̃_uv, node states begin empty, heads on the last layer's messages.
+    """The paper's §4.1: x_uv = R̃_uv, initially empty node states, heads on the last layer's messages.
 
-    Both directions of an edge are averaged, so that the direction in which it is given does not matter; of this the
-    paper says nothing.
+    Both directions of an edge are averaged, so that the direction in which it is given does not matter; the paper does
+    not mention this.
     """
 
     NAME = "paper-clean-net"
@@ -40,7 +40,7 @@ class PaperFineNet(StoredNetwork):
 
         R_v ← R_v · normalise(1 + H h_v + b),        e_uv = R_v⁻¹ R̂_uv R_u
 
-    All are quaternions, and R̂_uv is what CleanNet has left of the measurement.
+    All are quaternions, and R̂_uv is the measurement as corrected by CleanNet.
     """
 
     NAME = "paper-fine-net"
@@ -49,7 +49,7 @@ class PaperFineNet(StoredNetwork):
         super().__init__()
         self.network = MessagePassingNetwork(node_width=4, edge_width=4, wiring=_FORGETFUL)
         self.correction_head = nn.Linear(HIDDEN_WIDTH, 4)
-        # It begins as no correction at all.
+        # Initially there is no correction.
         nn.init.zeros_(self.correction_head.weight)
         nn.init.zeros_(self.correction_head.bias)
 
@@ -65,7 +65,7 @@ class PaperFineNet(StoredNetwork):
         return self.correct(body_from_world, states)
 
     def correct(self, body_from_world: Tensor, states: Tensor) -> Tensor:
-        """Orientations ``(N, 4)`` corrected by what the last node states ``(N, hidden)`` say."""
+        """Orientations ``(N, 4)``, corrected by the last node states ``(N, hidden)``."""
         change = self.correction_head(states)
         unit = rotations.identity(1, dtype=change.dtype, device=change.device)
         correction = nn.functional.normalize(unit + change, dim=1)

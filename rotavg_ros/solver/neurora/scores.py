@@ -1,4 +1,4 @@
-"""How likely an edge is an outlier, by the residual that orientations leave."""
+"""The probability that an edge is an outlier, from its residual."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from rotavg_ros.view_graph import ViewGraph
 def residual_score(
     graph: ViewGraph, body_from_world: Tensor, outlier_angle: float, component: Tensor | None = None
 ) -> Tensor:
-    """Probability that an edge's noise exceeds ``outlier_angle`` (radians) as its residual has it, ``(M,)`` float64.
+    """Probability ``(M,)`` float64 that an edge's noise exceeds ``outlier_angle`` (radians), from its residual.
 
-    The residual is the noise but for the error of the orientations at the edge's ends: one half at the outlier angle,
-    and the closer to certainty on either side, the better the ends are known.
+    The residual differs from the noise by the error of the orientations at the edge's ends. The probability is one half
+    at the outlier angle; the better the ends are known, the closer it is to certainty on either side.
     """
     return residual_probability(*residual_and_uncertainty(graph, body_from_world, component), outlier_angle)
 
 
 def residual_probability(angle: Tensor, uncertainty: Tensor, outlier_angle: float) -> Tensor:
-    """The same of residuals and uncertainties ``(M,)``, as :func:`residual_and_uncertainty` gives them."""
+    """The same, from residuals and uncertainties ``(M,)`` of :func:`residual_and_uncertainty`."""
     return torch.sigmoid((angle - outlier_angle) / (NUMBERS.score_scale * uncertainty)).double()
 
 
@@ -32,11 +32,12 @@ def residual_and_uncertainty(
 ) -> tuple[Tensor, Tensor]:
     """Residual angle of every edge and, up to a constant, the error of the orientations at its ends.
 
-    A node's error falls with the root of its number of edges d: median residual · √(1/d_source + 1/d_target), the
-    median of each ``component`` ``(N,)`` for itself; default: of all edges.
+    A node's error is inversely proportional to the root of its number of edges d: median residual
+    · √(1/d_source + 1/d_target).
 
     Args:
-        angle: ``(M,)`` rad, what is known of the residuals; default: computed.
+        component: ``(N,)`` the median is taken for each component separately; default: for all edges.
+        angle: ``(M,)`` rad, the residuals; default: computed.
 
     Returns:
         Both ``(M,)`` float32 radians.

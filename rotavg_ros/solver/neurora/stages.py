@@ -18,7 +18,7 @@ from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 def clean(network: CleanNet, graph: ViewGraph) -> Cleaned:
     """CleanNet, without gradients: rectify every measurement and score it.
 
-    The network may be on another device than the graph; what comes back is on the graph's.
+    The network may be on another device than the graph; the result is on the graph's.
     """
     device = next(network.parameters()).device
     edges = SortedEdges.of(graph)
@@ -30,7 +30,7 @@ def clean(network: CleanNet, graph: ViewGraph) -> Cleaned:
 
 
 def trust_all(graph: ViewGraph) -> Cleaned:
-    """What stands in for CleanNet in methods without it: every measurement as it is."""
+    """Stands in for CleanNet in methods without it: keeps every measurement as it is."""
     nobody = torch.zeros(graph.num_edges, device=graph.device)
     return Cleaned(graph, graph, nobody, SortedEdges.of(graph))
 
@@ -46,7 +46,7 @@ def apply_labels(cleaned: Cleaned, label: Tensor) -> Cleaned:
 def fine_tune(network: FineNet, cleaned: Cleaned, body_from_world: Tensor, component: Tensor | None = None) -> Tensor:
     """FineNet over the inlier edges, without gradients, ``(N, 4)`` float64.
 
-    The network may be on another device than the graph; what comes back is on the graph's.
+    The network may be on another device than the graph; the result is on the graph's.
 
     Args:
         component: ``(N,)`` the graph's connected components; default: computed.

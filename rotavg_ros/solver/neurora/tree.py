@@ -17,20 +17,20 @@ from rotavg_ros.solver.neurora.cleaned import Cleaned
 from rotavg_ros.solver.neurora.numbers import NUMBERS
 from rotavg_ros.solver.running.threads import for_each, threads_on
 
-# So many edges tell which of two trees fits better.
+# Number of edges that decide which of two trees fits better.
 _MISFIT_SAMPLE = 16_384
-# With fewer a look at them takes less time than waking another worker.
+# With fewer edges, comparing takes less time than waking another worker.
 _WORTH_WORKERS = 8_192
 
 
 class Bootstrapped(NamedTuple):
-    """Where FineNet begins.
+    """FineNet's start.
 
     Attributes:
         body_from_world: ``(N, 4)`` float64.
         roots: ``(C,)`` the trees' roots, in the order of the components.
-        parent, parent_edge: ``(N,)`` the trees: a root is its own parent, by the edge -1.
-        cleaned: without CleanNet's corrections where the measurements as they are were better.
+        parent, parent_edge: ``(N,)`` the trees: a root is its own parent, and its edge is -1.
+        cleaned: without CleanNet's corrections where the uncorrected measurements were better.
     """
 
     body_from_world: Tensor
@@ -43,8 +43,8 @@ class Bootstrapped(NamedTuple):
 def bootstrap(cleaned: Cleaned, component: Tensor | None = None) -> Bootstrapped:
     """Orientations along a shortest-path tree that avoids outliers.
 
-    A tree is composed of rectified measurements or of those as they are, whichever fits the latter better: where noise
-    is far below what CleanNet was trained on, rectifying does harm.
+    A tree is composed of the rectified or of the original measurements, whichever fit the original ones better: where
+    the noise is far below that of CleanNet's training, rectifying does harm.
 
     Args:
         component: ``(N,)`` the graph's connected components; default: computed.
@@ -72,7 +72,7 @@ def breadth_first(cleaned: Cleaned, component: Tensor | None = None) -> Bootstra
     """The paper's tree as its text has it: fewest inlier edges from the node that has most of them.
 
     An edge is an inlier if its outlier probability is below ε. Parts of a component that no inlier edge joins are
-    joined by as few outliers as can be, of which the paper says nothing.
+    joined by as few outliers as possible; the paper does not say how.
 
     Args:
         component: ``(N,)`` the graph's connected components; default: computed.
@@ -95,7 +95,7 @@ def _cheapest_forest(cleaned: Cleaned, cost: Tensor, roots: Tensor, component: T
 
 
 def _misfits(cleaned: Cleaned, candidates: Sequence[Tensor], component: Tensor) -> list[Tensor]:
-    """Median angle between the inliers as measured and as each of ``candidates`` has them, per component."""
+    """Median angle per component between the inliers as measured and as each of ``candidates`` predicts them."""
     sample = cleaned.is_inlier.nonzero().squeeze(1)
     sample = sample[:: 1 + len(sample) // _MISFIT_SAMPLE]
     edges = cleaned.measured.select_edges(sample)

@@ -26,9 +26,9 @@ from rotavg_ros.solver.running.threads import for_each, slices
 
 
 def clean_edges(network: CleanNet, target_from_source: Tensor, edges: SortedEdges) -> CleanEdges:
-    """What CleanNet says of the measurements ``(M, 4)``, in its own precision; ``edges`` are all of the graph's."""
+    """CleanNet's result for measurements ``(M, 4)``, in its own precision; ``edges`` are all edges of the graph."""
     num_edges, like = len(target_from_source), network.noise_head.weight
-    # As the edges are sorted.
+    # In the order of the sorted edges.
     directed_logit = like.new_empty(2 * num_edges)
     # The heads are linear in the message, and that is linear in the activation.
     last = cast(MessagePassingLayer, network.network.layers[-1]).message_output
@@ -42,9 +42,9 @@ def clean_edges(network: CleanNet, target_from_source: Tensor, edges: SortedEdge
         directed_logit[tile.edges] = opinion[4]
 
     no_states = like.new_zeros(edges.num_nodes, 0)
-    # Predicted noise takes the place of measurements, whose four numbers it has.
+    # Predicted noise overwrites the measurements, since both have four numbers.
     noise = visit_activations(network.network, no_states, target_from_source.to(like.dtype), edges, collect)
-    # In which row the opinion is of an edge as it was given, then of the same edge reversed.
+    # Row of the result for each edge as it was given, then for the same edge reversed.
     place = edges.edge.new_empty(2 * num_edges)
     clean, logit = like.new_empty(num_edges, 4), like.new_empty(num_edges)
 
@@ -81,13 +81,13 @@ def fine_tuned(network: FineNet, cleaned: Cleaned, body_from_world: Tensor, comp
     edges = cleaned.edges.select(cleaned.is_inlier)
     states = node_features(body_from_world, edges.degree[:, None])
     with walk_over(network.network, features, edges) as walk:
-        del features, edges  # they make room for activations
+        del features, edges  # frees memory for activations
         states = walk.node_states(states)
     return network.correct(body_from_world, states, scale)
 
 
 def _scale_and_features(cleaned: Cleaned, body_from_world: Tensor, component: Tensor) -> tuple[Tensor, Tensor]:
-    """What residuals are in units of, as :func:`typical_size` gives it, and the edges' features ``(M, …)``."""
+    """The unit of residuals from :func:`typical_size`, and the edges' features ``(M, …)``."""
     measured, is_inlier = cleaned.measured, cleaned.is_inlier
     num_edges = measured.num_edges
     residuals = [EdgeResiduals(graph, body_from_world) for graph in (measured, cleaned.graph)]
@@ -113,10 +113,11 @@ def _scale_and_features(cleaned: Cleaned, body_from_world: Tensor, component: Te
 
 
 def typical_size(vectors: Tensor, node: Tensor, group_of_node: Tensor) -> Tensor:
-    """Median length of the vectors ``(3, k)`` of a node's group, ``(N, 1)``, or ``(1, 1)`` where there is but one.
+    """Median length of the vectors ``(3, k)`` of a node's group, ``(N, 1)``, or ``(1, 1)`` if there is only one.
 
     Args:
-        node: ``(k,)`` of every vector; group_of_node: ``(N,)``.
+        node: ``(k,)`` node of every vector.
+        group_of_node: ``(N,)``.
     """
     length = (vectors * vectors).sum(dim=0).sqrt_()
     if not bool((group_of_node > 0).any()):

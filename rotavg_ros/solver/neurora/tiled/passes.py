@@ -1,8 +1,8 @@
 """Message passing for solves: the formula of ``message_passing.py`` in tiles that fit a core's cache.
 
-Node states are projected before they are gathered. Directed edges are sorted by target and walked in tiles; what an
-edge remembers is overwritten in place, so that no copy of all edges is made. A tile has all edges of its nodes, so
-means are complete and workers never meet within a layer.
+Node states are projected before they are gathered. Directed edges are sorted by target and processed in tiles. An
+edge's activation is overwritten in place, so that no copy of all edges is made. A tile has all edges of its nodes, so
+means are complete and workers never wait for each other within a layer.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rotavg_ros.solver.running.work import stop_if_abandoned
 
 
 class Tuning(NamedTuple):
-    """Edges of a tile, and threads at most; ``tuning.py`` measures what is best."""
+    """Number of edges per tile and largest number of threads; ``tuning.py`` measures what is fastest."""
 
     tile_edges: int
     threads: int
@@ -30,18 +30,18 @@ class Tuning(NamedTuple):
 
 _tuning = Tuning(tile_edges=8192, threads=1 << 10)
 
-# Gets a tile, the last layer's activations of its edges, ``(edges of the tile, hidden)``, and where to write as many
-# numbers of each edge as it has features.
+# Gets a tile, the last layer's activations of its edges ``(edges of the tile, hidden)``, and an array to write to, with
+# as many numbers per edge as it has features.
 Visit = Callable[[Tile, Tensor, Tensor], None]
 
 
 def current_tuning() -> Tuning:
-    """What passes take now."""
+    """The present tuning of passes."""
     return _tuning
 
 
 def set_tuning(tuning: Tuning) -> None:
-    """For all passes from now on."""
+    """Set the tuning of all passes from now on."""
     global _tuning
     _tuning = tuning
 
@@ -52,8 +52,8 @@ def node_states(network: MessagePassingNetwork, nodes: Tensor, features: Tensor,
     Args:
         nodes: ``(N, node_width)`` initial states.
         features: ``(M, edge_width)`` float32 of the graph's edges as given; the first ``network.odd_width`` columns
-            change their sign where an edge is reversed.
-        edges: over which messages run.
+            change sign where an edge is reversed.
+        edges: the edges over which messages run.
     """
     with walk_over(network, features, edges) as walk:
         return walk.node_states(nodes)
@@ -62,10 +62,12 @@ def node_states(network: MessagePassingNetwork, nodes: Tensor, features: Tensor,
 def visit_activations(
     network: MessagePassingNetwork, nodes: Tensor, features: Tensor, edges: SortedEdges, visit: Visit
 ) -> Tensor:
-    """Show the last layer's activations to ``visit``, tile by tile and on several threads; else as above.
+    """Pass the last layer's activations to ``visit``, tile by tile and on several threads.
+
+    The other arguments are those of :func:`node_states`.
 
     Returns:
-        ``(E, edge_width)`` what it has written, in the place of the features, as the edges are sorted.
+        ``(E, edge_width)`` what ``visit`` has written, in the order of the sorted edges.
     """
     last = len(network.layers) - 1
     walking = walk_over(network, features, edges)
@@ -79,21 +81,21 @@ def visit_activations(
 
 @contextmanager
 def walk_over(network: MessagePassingNetwork, features: Tensor, edges: SortedEdges) -> Iterator[Walk]:
-    """A pass of a network, as :func:`node_states` has it. Features and edges are read before, and not held inside."""
+    """A pass of a network; arguments as in :func:`node_states`. Features and edges are read first, then released."""
     layers = [cast(MessagePassingLayer, layer) for layer in network.layers]
     num_edges = len(edges.source)
     with scratch(num_edges, layers[0].message_output.in_features, features) as activation:
         state = _State(activation, features.new_empty(num_edges, features.shape[1]))
         walk = Walk(layers, network.odd_width, features, edges, state)
-        del features, edges  # what the caller does not hold, either, makes room for activations
+        del features, edges  # if the caller does not hold them either, this frees memory for activations
         yield walk
 
 
 class _State(NamedTuple):
-    """What is known of E directed edges; apart from each other, since contiguous rows are copied faster.
+    """State of E directed edges, in separate arrays, since contiguous rows are copied faster.
 
     Attributes:
-        activation: ``(E, hidden)`` of the layer before.
+        activation: ``(E, hidden)`` from the previous layer.
         features: ``(E, edge_width)``, with the signs of their directions.
     """
 
@@ -105,7 +107,7 @@ class Walk:
     """One pass of a network over one graph.
 
     Args:
-        features: ``(M, edge_width)``; they and the edges are read here and no more.
+        features: ``(M, edge_width)``; they and the edges are read only in the constructor.
         state: working memory.
     """
 
@@ -119,7 +121,7 @@ class Walk:
     ) -> None:
         self.layers, self.first, self.state = layers, edges.first, state
         self.hidden, self.width = state.activation.shape[1], features.shape[1]
-        # Whether layers see what the one before has left of an edge.
+        # Whether layers see an edge's activation from the previous layer.
         self.remembers = layers[-1].edge_projection.in_features > self.width
         on_cpu = features.device.type == "cpu"
         num_edges = len(edges.source)
@@ -132,10 +134,10 @@ class Walk:
         self.pair_offsets = torch.arange(0, 2 * longest + 1, 2, dtype=torch.int32, device=features.device)
         self.row_numbers = torch.arange(longest, dtype=torch.int32, device=features.device)
         self.is_connected = (edges.degree > 0)[:, None]
-        # Rows of the two projections of the node states, one upon the other, that every edge adds up.
+        # The two rows that every edge sums, of the stacked projections of the node states.
         self.ends = edges.source.new_empty(num_edges, 2)
-        # Of the features of edges as given, and of edges reversed: a row of signs for every edge, since torch is slow
-        # at spreading one sign over a few columns.
+        # Signs of the features of edges as given, and of reversed edges. Every edge gets a row of signs, since torch is
+        # slow at broadcasting one sign over a few columns.
         signs = features.new_ones(2, self.width)
         signs[1, :odd_width] = -1
         nodes, degree = torch.arange(edges.num_nodes, dtype=torch.int32, device=features.device), edges.degree
@@ -152,16 +154,16 @@ class Walk:
         for_each(begin, self.stretches, self.threads)
 
     def node_states(self, nodes: Tensor) -> Tensor:
-        """The last node states ``(N, hidden)``, of initial ones ``(N, node_width)``."""
+        """The last node states ``(N, hidden)``, from the initial ones ``(N, node_width)``."""
         for layer in range(len(self.layers)):
             nodes = self.layer(layer, nodes)
         return nodes
 
     def layer(self, index: int, nodes: Tensor, visit: Visit | None = None) -> Tensor:
-        """One layer; returns the new node states, or ``nodes`` where ``visit`` takes the activations instead."""
+        """One layer; returns the new node states, or ``nodes`` if ``visit`` takes the activations instead."""
         layer = self.layers[index]
         is_last = index == len(self.layers) - 1
-        # The specification has features before activations.
+        # As in the specification, features come before activations.
         projection = layer.edge_projection
         weight = projection.weight.t().contiguous()
         of_features, of_activation = weight[: self.width], weight[self.width :]
@@ -183,7 +185,7 @@ class Walk:
                 if len(of_activation):
                     activation.addmm_(before, of_activation)
                 if self.remembers and not is_last:
-                    activation = torch.clamp_min(activation, 0, out=before)  # ReLU, and where it is remembered
+                    activation = torch.clamp_min(activation, 0, out=before)  # ReLU, written to where it is remembered
                 else:
                     activation.relu_()
                 if visit is not None:
@@ -208,9 +210,9 @@ class Walk:
 
 
 def _bags(table: Tensor, rows: Tensor, offsets: Tensor, mode: str) -> Tensor:
-    """Sum or mean of ``table[rows[offsets[i] : offsets[i + 1]]]`` for every i; zero where that is empty.
+    """Sum or mean of ``table[rows[offsets[i] : offsets[i + 1]]]`` for every i; zero if it is empty.
 
-    Measured against index_select, index_add, segment_reduce and numpy's reduceat, this is the fastest by 1.5 to 20.
+    It is 1.5 to 20 times as fast as index_select, index_add, segment_reduce and numpy's reduceat.
     """
     result = torch.embedding_bag(
         table, rows, offsets, False, {"sum": 0, "mean": 1}[mode], False, None, include_last_offset=True

@@ -1,4 +1,4 @@
-"""How large a tile and how many threads message passing takes on this machine: measured once, in about 100 ms."""
+"""The size of tiles and the number of threads of message passing on this machine: measured once, in about 100 ms."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _tuned = False
 
 
 def tune() -> Tuning:
-    """Measure, unless this process has done so; from now on inference takes what was fastest."""
+    """Measure, unless this process has done so; from now on, inference uses what was fastest."""
     global _tuned
     with _lock, workers():
         if not _tuned:
@@ -35,7 +35,7 @@ def tune() -> Tuning:
 
 @torch.no_grad()
 def measure(num_edges: int = _EDGES) -> Tuning:
-    """What is fastest on a random graph of so many edges, inside of the workers; passes take what was tried last."""
+    """The fastest tuning on a random graph of ``num_edges``, within the workers; sets passes to the last one tried."""
     generator = torch.Generator().manual_seed(0)
     source = torch.randint(_NODES, (num_edges,), generator=generator)
     target = (source + torch.randint(1, _NODES, (num_edges,), generator=generator)) % _NODES
