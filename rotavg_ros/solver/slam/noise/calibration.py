@@ -12,16 +12,16 @@ from rotavg_ros.solver.slam.noise.gyro_bias import without_bias
 from rotavg_ros.solver.slam.noise.mounting import without_mounting
 from rotavg_ros.view_graph import ViewGraph
 
-# In the order in which they are looked for.
+# In the order in which they are estimated.
 PARTS = ("bias", "mounting")
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Systematic errors of one robot, or common to all.
+    """Systematic errors of one robot, or those common to all robots.
 
     Attributes:
-        bias: ``(3,)`` rad per step that odometry turns too much, in the body's frame.
+        bias: ``(3,)`` rad per step by which odometry turns too far, in the body's frame.
         mounting: ``(3,)`` rad, deviation of the closures' sensor from its stated mounting, in the body's frame.
     """
 

@@ -1,4 +1,4 @@
-"""How likely an uncertain rotation is to be larger than a given angle."""
+"""The probability that an uncertain rotation is larger than a given angle."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from scipy.special import ndtr
 
 from rotavg_ros.view_graph import FALSE_CLOSURE_DEG
 
-# The noise that makes a closure false.
+# Noise above which a closure is false, rad.
 OUTLIER_ANGLE = np.radians(FALSE_CLOSURE_DEG)
 _SMALLEST = 1e-9
 
@@ -15,8 +15,8 @@ _SMALLEST = 1e-9
 def exceedance(length: np.ndarray, variance: np.ndarray, angle: float, components: int) -> np.ndarray:
     """P(‖x‖ > angle) for rotation vectors x ~ N(m, variance · I) with ‖m‖ = ``length``, ``(E,)``.
 
-    In one component this is a difference of normal distribution functions; in three the noncentral χ distribution has
-    them, too, and a difference of densities.
+    In one component this is a difference of normal distribution functions; in three components (noncentral χ), there
+    is a difference of densities as well.
 
     Args:
         length: ``(E,)`` rad.

@@ -1,9 +1,10 @@
 """A constant bias of the odometry's gyroscope, estimated from loop closures that disagree with it.
 
 A bias β turns every step of the odometry a little further, ``M̃ = M exp(β)`` with β in the body's frame. Along a chain
-the errors ``R_k⁻¹ β`` add up in the world's frame to a rotation vector that is linear in β, so a closure's residual
-with the odometry is too, as long as it is small. Every closure alone proposes a bias; the one that most closures agree
-to is refined by expectation–maximisation, taken out of the odometry, and estimated again about the better chain.
+the errors ``R_k⁻¹ β`` add up in the world's frame to a rotation vector that is linear in β. So a closure's residual
+against the odometry is linear in β too, as long as it is small. Each closure proposes a bias. The one that most
+closures agree with is refined by expectation–maximisation, taken out of the odometry, and estimated again for the
+better chain.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
 from rotavg_ros.solver.slam.noise.model import NoiseModel
 from rotavg_ros.view_graph import ViewGraph
 
-# Proposals come from so many closures, those that span the least odometry first: their angles have not wrapped around.
+# Number of closures that propose a bias: those that span the least odometry, since their angles do not wrap around.
 _MAX_PROPOSALS = 60
-# More closures than this say no more of three numbers.
+# More closures than this do not improve an estimate of three numbers.
 _MAX_CLOSURES = 1500
 _EM_ITERATIONS = 10
 # Prior standard deviation of a component of the bias, rad per step.
@@ -39,7 +40,7 @@ class BiasEstimate(NamedTuple):
 
     Attributes:
         bias: ``(3,)`` rad per step.
-        explained: share of the closures that are good with it, less the share that are good without.
+        explained: share of the closures that are good with it, minus the share that are good without it.
     """
 
     bias: np.ndarray
@@ -49,11 +50,12 @@ class BiasEstimate(NamedTuple):
 def estimate_bias(
     graph: ViewGraph, forest: SpanningForest, closure_graph: ClosureGraph, noise: NoiseModel
 ) -> BiasEstimate:
-    """The bias that the closures speak of; zeros where none can be told.
+    """The bias that the closures indicate; zeros if they determine none.
 
     Args:
         graph: the view-graph.
         forest: along which ``closure_graph`` was contracted.
+        closure_graph: the contraction.
         noise: of steps and closures without the bias.
     """
     closure = np.flatnonzero(closure_graph.is_closure & np.isfinite(closure_graph.path_steps))
@@ -62,7 +64,7 @@ def estimate_bias(
         return BiasEstimate(np.zeros(3), 0.0)
     nodes = closure_graph.nodes
     drift = drift_per_bias(graph, forest, closure_graph)
-    # From the older end on, from whichever it is stated: what is left is linear in the bias to first order alone.
+    # From the older end on, whichever way it is stated: the residual is linear in the bias only to first order.
     is_forward = closure_graph.is_forward[closure, None]
     ends = nodes[closure_graph.source[closure]], nodes[closure_graph.target[closure]]
     design = np.where(is_forward, 1.0, -1.0)[:, :, None] * (drift[ends[0]] - drift[ends[1]])
@@ -85,7 +87,7 @@ def estimate_bias(
         normal @ design[proposed] + np.eye(3) / _PRIOR_BIAS**2, normal @ residual[proposed, :, None]
     )[..., 0]
     proposals = np.concatenate((np.zeros((1, 3)), proposals))
-    # To choose among proposals single precision will do.
+    # Single precision is enough to choose among proposals.
     single = (array.astype(np.float32) for array in (design, measured, proposals))
     of_proposals = log_odds(_squared_angles(*single)).astype(np.float32)
     softplus = np.maximum(of_proposals, 0) + np.log(1 + np.exp(-np.abs(of_proposals)))
@@ -102,7 +104,7 @@ def estimate_bias(
 
 
 def _squared_angles(design: np.ndarray, measured: np.ndarray, biases: np.ndarray) -> np.ndarray:
-    """What is left of closures ``(C, 4)`` under each of B biases ``(B, 3)``, ``(B, C)`` rad²; design ``(C, 3, 3)``."""
+    """``(B, C)`` rad², squared residuals of closures ``(C, 4)`` under B biases ``(B, 3)``; design ``(C, 3, 3)``."""
     by_bias = biases @ design.transpose(2, 1, 0).reshape(3, -1)
     predicted = by_bias.reshape(len(biases), 3, len(design))
     half = np.sqrt(np.einsum("bic,bic->bc", predicted, predicted)) / 2
@@ -115,8 +117,8 @@ def _squared_angles(design: np.ndarray, measured: np.ndarray, biases: np.ndarray
 def without_bias(graph: ViewGraph, bias: np.ndarray) -> ViewGraph:
     """The graph with ``bias`` ``(3,)`` rad per step taken out of its odometry, whichever way an edge runs.
 
-    Translations stay as older ends see them, but for those of several steps: the later ones follow what the earlier
-    ones turned.
+    Translations stay the same in the frame of the older end. Those of several steps change, since later steps follow
+    the turns of earlier ones.
     """
     is_forward = torch.from_numpy(runs_forward(graph))[:, None]
     by_bias, shift = graph.steps[:, None] * torch.from_numpy(bias), torch.zeros((graph.num_edges, 3)).double()
@@ -145,7 +147,7 @@ def without_bias(graph: ViewGraph, bias: np.ndarray) -> ViewGraph:
 
 
 def _turning_less(graph: ViewGraph, onwards: torch.Tensor, by_bias: torch.Tensor) -> torch.Tensor:
-    """Routes ``(R, 38)`` of edges whose turns, from older to newer ends ``(M, 4)``, ``(M, 3)`` rad is taken out of."""
+    """Routes ``(R, 38)`` without ``(M, 3)`` rad in the turns ``(M, 4)`` of edges from older to newer ends."""
     assert graph.route is not None and graph.routes is not None
     known = torch.nonzero(graph.route >= 0).squeeze(1)
     by_bias, mean = by_bias[known], by_bias[known] / graph.steps[known, None]
@@ -156,7 +158,7 @@ def _turning_less(graph: ViewGraph, onwards: torch.Tensor, by_bias: torch.Tensor
 
 
 def drift_per_bias(graph: ViewGraph, forest: SpanningForest, closure_graph: ClosureGraph) -> np.ndarray:
-    """``(N, 3, 3)``: world-frame rotation vector of each node's odometry error per bias, from its root on."""
+    """``(N, 3, 3)``: odometry error of each node from its root on, a world-frame rotation vector, per bias."""
     child = np.flatnonzero(forest.parent_edge >= 0)
     edge = forest.parent_edge[child]
     source, target = graph.source.numpy()[edge], graph.target.numpy()[edge]

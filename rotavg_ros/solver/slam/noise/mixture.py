@@ -1,9 +1,9 @@
-"""Expectation–maximisation for rotations that differ by noise of two kinds, or by anything.
+"""Expectation–maximisation for rotations that differ by two kinds of noise, or by an arbitrary rotation.
 
 A discrepancy between two estimates is Gaussian in k components with variance ``steps · step_variance + closures ·
 closure_variance``, or one of them is false and it is uniform over all rotations (or, as a near miss, over those by a
-small angle). The step in which both variances are estimated treats each discrepancy as the sum of its two parts, of
-which only the sum is seen.
+small angle). The maximisation step treats each discrepancy as the sum of its two parts, of which only the sum is
+observed.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-# One pseudo-observation each, in rad²: they keep variances off zero.
+# One pseudo-observation each, rad²: they keep variances away from zero.
 _PRIOR_STEP_SQUARE = np.radians(0.02) ** 2
 _PRIOR_CLOSURE_SQUARE = np.radians(0.3) ** 2
 _SHARE_BOUNDS = (0.005, 0.995)
-# Rotations by less than this are near misses: places that look alike are often nearly the same.
+# Smaller rotations, rad, are near misses: places that look alike are often nearly the same.
 NEAR_MISS = np.radians(35.0)
-# Log-likelihood that is no gain, in nats.
+# Smaller gains of the log-likelihood do not count, nats.
 _TOLERANCE = 0.01
 
 
@@ -32,7 +32,7 @@ class Discrepancies:
         squared_angle: ``(D,)`` rad².
         steps: ``(D,)`` odometry steps that each passes.
         closures: number of closures in each.
-        weight: what each counts for.
+        weight: weight of each.
         near_share: share of the false ones that are near misses (:data:`NEAR_MISS`).
     """
 
@@ -43,7 +43,7 @@ class Discrepancies:
     near_share: float = 0.0
 
     def thinned(self, size: int) -> Discrepancies:
-        """Evenly spread rows, about ``size``, that weigh as much as all of them."""
+        """About ``size`` evenly spread rows that weigh as much as all of them."""
         stride = max(1, len(self.steps) // size)
         rows = slice(None, None, stride)
         return replace(
@@ -95,7 +95,7 @@ class MixtureFit:
 
     def __init__(self, kinds: Sequence[Discrepancies], components: int) -> None:
         self._k = components
-        # In single precision exponentials and logarithms take a fifth of the time.
+        # Exponentials and logarithms take a fifth of the time in single precision.
         squared_angle = np.concatenate([kind.squared_angle for kind in kinds], dtype=np.float32)
         log_false = np.concatenate([kind.log_false_density(components) for kind in kinds], dtype=np.float32)
         self._half_square = squared_angle / 2
@@ -105,16 +105,17 @@ class MixtureFit:
         self._closures = np.repeat([kind.closures for kind in kinds], size).astype(np.float32)
         self._weight = np.repeat([kind.weight for kind in kinds], size)
         self._size = size
-        # (D, kinds): sums over each kind are one product.
+        # (D, kinds): sums over each kind are a single product.
         kind = np.repeat(np.arange(len(kinds)), size)
         self._membership = (np.eye(len(kinds))[kind] * self._weight[:, None]).astype(np.float32)
         self._total = np.array([kind.weight * len(kind.steps) for kind in kinds])
         self._constant = float(self._weight @ log_false)
 
     def maximise(self, models: Mixtures, iterations: int, *, hold_step: bool = False) -> tuple[Mixtures, np.ndarray]:
-        """So many iterations of each model, fewer if none gains; with the log-likelihoods ``(S,)`` before the last.
+        """Iterate each model, until none gains; also the log-likelihoods ``(S,)`` before the last iteration.
 
         Args:
+            iterations: largest number.
             hold_step: keep the variance of a step.
         """
         last = np.full(len(models.step_variance), -np.inf)
@@ -129,7 +130,7 @@ class MixtureFit:
     def converge(self, model: Mixtures, max_steps: int) -> Mixtures:
         """One model until its likelihood no longer grows, by squared extrapolation (Varadhan & Roland 2008).
 
-        Two steps tell how fast they become shorter, and so where they would end.
+        Two steps show how fast the steps shrink, and so where they would end.
         """
         last = -np.inf
         for _ in range(max_steps // 3):
@@ -142,7 +143,7 @@ class MixtureFit:
             length, turn = once - at, twice - 2 * once + at
             factor = max(float(np.linalg.norm(length)) / max(float(np.linalg.norm(turn)), 1e-12), 1.0)
             ahead, log_likelihood = self.step(_mixtures(at + 2 * factor * length + factor**2 * turn))
-            # Where the extrapolation overshoots, the two steps stand.
+            # Where the extrapolation overshoots, the result of the two steps is kept.
             model = ahead if log_likelihood[0] >= last else second
         return model
 
@@ -164,7 +165,7 @@ class MixtureFit:
         good = np.divide(odds, either, out=odds)
         log_likelihood = np.log(either, out=either) @ self._weight
         log_likelihood += self._constant + np.log(models.false_share) @ self._total
-        # Of what is good, the part that is the steps'; and expected squares of both parts, given their sum.
+        # The steps' part of the good share; and expected squares of both parts, given their sum.
         values = np.empty((4, *good.shape), dtype=np.float32)
         values[0] = good
         np.multiply(part, good, out=values[1])
@@ -184,13 +185,13 @@ class MixtureFit:
 
 
 def _coordinates(model: Mixtures) -> np.ndarray:
-    """One model as a vector that may be anything."""
+    """One model as an unconstrained vector."""
     share = model.false_share[0]
     return np.concatenate((np.log(model.step_variance), np.log(model.closure_variance), np.log(share / (1 - share))))
 
 
 def _mixtures(coordinates: np.ndarray) -> Mixtures:
-    """The inverse; variances stay within reason."""
+    """The inverse of :func:`_coordinates`; variances are kept within reasonable bounds."""
     variances = np.exp(np.clip(coordinates[:2], -40.0, 5.0))
     share = np.clip(1 / (1 + np.exp(-coordinates[2:])), *_SHARE_BOUNDS)
     return Mixtures(variances[:1], variances[1:], share[None])

@@ -1,9 +1,9 @@
-"""The noise of a SLAM graph: Gaussian odometry steps and closures, and closures that are wrong altogether.
+"""The noise of a SLAM graph: Gaussian odometry steps and closures, and closures that are entirely wrong.
 
 An inlier's discrepancy with another estimate is Gaussian in k components (k = 1 where all rotations share an axis, else
 3); a false closure is uniform over all rotations. Stated precisions are often nonsense, so both variances are
-estimated: at first by expectation–maximisation over the closures' discrepancies against odometry, which grow with
-the number of steps passed while the closures' own noise does not.
+estimated. The first estimate is by expectation–maximisation over the closures' discrepancies against odometry: these
+grow with the number of steps passed, while the closures' own noise does not.
 """
 
 from __future__ import annotations
@@ -17,27 +17,29 @@ import numpy as np
 from rotavg_ros.solver.slam.graph.agreement import AgreementPairs
 from rotavg_ros.solver.slam.noise.mixture import Discrepancies, MixtureFit, Mixtures, log_uniform_density
 
-# What is assumed where there is nothing to estimate from.
+# rad², assumed where there are no data to estimate from.
 _PRIOR_STEP_VARIANCE = np.radians(0.3) ** 2
 _PRIOR_CLOSURE_VARIANCE = np.radians(2.0) ** 2
-# Neighbours tell the noise of good closures, but not how many are false.
+# Neighbours determine the noise of good closures, but not how many are false.
 _NEIGHBOURS_OUTLIER_SHARE = 0.3
 _EM_STARTS_STEP_DEG = (0.02, 0.1, 0.5, 2.0)
-# By components: about one axis, closures of 8° and anything are hard to tell apart, and the odometry decides.
+# By components: about one axis, closures with noise of 8° are hard to tell from random ones, and the odometry decides.
 _EM_STARTS_CLOSURE_DEG = {1: (0.3, 2.0), 3: (0.3, 2.0, 8.0)}
 # False share of the odometry's discrepancies and of the neighbours' to start from.
 _EM_START_SHARES = (0.5, 0.7)
-# Of the false ones so many are taken for near misses, off by 10–30° as where the same place is seen from elsewhere. If
-# there were none, a graph with many would look as if all of its closures erred by 8°, and its odometry not at all.
+# Share of false closures that are assumed to be near misses, off by 10–30°, as where the same place is seen from
+# elsewhere. With a share of 0, a graph with many of them would seem to have closures that all err by 8°, and odometry
+# that does not err at all.
 _NEAR_MISS_SHARE = 0.2
 # Rows of either kind used to choose among the starts, and to converge.
 _EM_THINNED = (1000, 5000)
-# Of the starts, so many are kept after so many iterations each.
+# Rounds: number of starts that are kept, after a number of iterations of each.
 _EM_ROUNDS = ((3, 4), (1, 4))
 _EM_MAX_STEPS = 60
-# The likelihood hardly knows a small graph's drift, and closures that err in the tails look like drift. Of all step
-# variances that are less likely by no more than this, down to a share of the likeliest, the least is taken: odometry
-# that is trusted too far costs a few good closures until more of them come, a false closure believed bends the map.
+# The likelihood hardly determines a small graph's drift, and closures with errors in the tails look like drift. Of the
+# step variances that are less likely by at most this, nats, the least is taken, down to a share of the likeliest one.
+# Odometry that is trusted too much costs a few good closures until more of them come; a false closure that is believed
+# bends the map.
 _STEP_DOUBT = 5.0
 _STEP_DOUBT_SHARES = np.array([0.85, 0.7, 0.55, 0.47, 0.4]) ** 2
 _DOUBT_ITERATIONS = 8
@@ -71,7 +73,7 @@ class NoiseModel:
 
     @property
     def prior_log_odds(self) -> float:
-        """Log-odds of good against false before anything is measured."""
+        """Prior log-odds of good against false."""
         return float(np.log1p(-self.outlier_share) - np.log(self.outlier_share))
 
 
@@ -81,7 +83,7 @@ def pair_variance(pairs: AgreementPairs, noise: NoiseModel) -> np.ndarray:
 
 
 def agree(pairs: AgreementPairs, noise: NoiseModel) -> np.ndarray:
-    """Which pairs differ by so little that both are rather good than random, ``(P,)`` bool."""
+    """``(P,)`` bool, pairs that differ by so little that they are more likely both good than random."""
     return noise.inlier_log_odds(pairs.squared_angle, pair_variance(pairs, noise)) > 0
 
 
@@ -91,11 +93,11 @@ def discrepancies(
     """Discrepancies of every closure with the odometry (``(C,)`` each; infinite steps: none), and between neighbours.
 
     Args:
-        near_share: share of the false closures that are near misses, as their neighbours see them. Odometry drifts by
-            as much, so that it cannot tell.
+        near_share: share of the false closures that are near misses, for discrepancies between neighbours. Odometry
+            drifts by as much, so it cannot tell them.
     """
     on_chain = np.isfinite(path_steps)
-    # Every closure has as many pairs; together they count as one.
+    # Every closure has equally many pairs, which together count as one.
     per_closure = len(pairs.first) / max(len(np.unique(pairs.first)), 1)
     return [
         Discrepancies(squared_angle[on_chain], np.maximum(path_steps[on_chain], 1.0), 1, 1.0),
@@ -106,14 +108,15 @@ def discrepancies(
 def estimate_noise(data: Sequence[Discrepancies], components: int) -> NoiseModel:
     """Two variances and an outlier share by expectation–maximisation from several starts; the likeliest is kept.
 
-    Of the step variance, the lower end of what is nearly as likely.
+    The step variance is the lower end of those that are nearly as likely.
 
     A discrepancy is Gaussian with variance ``steps · step_variance + closures · closure_variance`` or uniform. The
-    closures' own agreement holds the estimate up where odometry has drifted past recognition or most closures are
+    closures' agreement with each other keeps the estimate sound where odometry has drifted too far or most closures are
     false; their discrepancy with the chain separates the two variances.
 
     Args:
-        data: of closures with the odometry, and of neighbouring closures.
+        data: discrepancies of closures with the odometry, and between neighbouring closures.
+        components: k.
     """
     few = MixtureFit([kind.thinned(_EM_THINNED[0]) for kind in data], components)
     likeliest = _likeliest(data, few, components)
@@ -133,7 +136,7 @@ def _model(mixture: Mixtures, components: int) -> NoiseModel:
 
 
 def _likeliest(data: Sequence[Discrepancies], few: MixtureFit, components: int) -> Mixtures | None:
-    """The likeliest of all models, chosen by a ``few`` of the data; None without data."""
+    """The likeliest of all models; starts are chosen by a ``few`` of the data. None without data."""
     if not any(len(kind.steps) for kind in data):
         return None
     starts = np.radians(list(product(_EM_STARTS_STEP_DEG, _EM_STARTS_CLOSURE_DEG[components]))) ** 2
@@ -145,11 +148,11 @@ def _likeliest(data: Sequence[Discrepancies], few: MixtureFit, components: int) 
 
 
 def noise_between_neighbours(pairs: AgreementPairs, components: int) -> NoiseModel:
-    """The noise as neighbouring closures see it: without the odometry that lies farther between, so immune to slips."""
+    """The noise by neighbouring closures alone: long odometry has no influence, so slips have none."""
     data = discrepancies(np.empty(0), np.empty(0), pairs, 0.0)
     likeliest = _likeliest(data, MixtureFit([kind.thinned(_EM_THINNED[0]) for kind in data], components), components)
     model = _prior(components) if likeliest is None else _model(likeliest, components)
-    # Where few closures share their ends, odometry takes their noise for its own; but none is better than a step.
+    # Where few closures share their ends, odometry's variance absorbs theirs; but no closure is better than a step.
     closure_variance = max(model.closure_variance, model.step_variance)
     return replace(model, closure_variance=closure_variance, outlier_share=_NEIGHBOURS_OUTLIER_SHARE)
 
@@ -169,7 +172,7 @@ def _least_drift(data: MixtureFit, likeliest: Mixtures) -> Mixtures:
 
 
 def judge_by_chain(model: NoiseModel, squared_angle: np.ndarray, path_steps: np.ndarray) -> np.ndarray:
-    """Log-odds of each closure to be good from its discrepancy with the odometry alone, without a prior."""
+    """Log-odds that each closure is good, from its discrepancy with the odometry alone, without a prior."""
     finite = np.isfinite(path_steps)
     variance = np.where(finite, path_steps, 0.0) * model.step_variance + model.closure_variance
     return np.where(finite, model.inlier_log_odds(squared_angle, variance), 0.0)

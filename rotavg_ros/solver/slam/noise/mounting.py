@@ -28,24 +28,24 @@ from rotavg_ros.solver.slam.noise.mixture import log_uniform_density
 from rotavg_ros.solver.slam.noise.model import NoiseModel
 from rotavg_ros.view_graph import EdgeLabel, ViewGraph
 
-# Proposals come from closures that turn by more than this, rad, those that span the least odometry first: so many, each
-# with the next that turns about an axis farther from its own than this, rad, if there is one.
+# Proposals come from closures that turn by more than the first, rad: the third is their largest number, those that span
+# the least odometry first. Each is paired with the next one whose axis differs by more than the second, rad, if any.
 _LEAST_TURN, _LEAST_APART, _MAX_PROPOSALS = np.radians(20.0), np.radians(20.0), 60
-# More closures than this say no more of three numbers.
+# More closures than this do not improve an estimate of three numbers.
 _MAX_CLOSURES = 1500
 _COMPONENTS = 3
 _EM_ITERATIONS = 10
-# Two mountings are others if they differ by more than this, rad.
+# Two mountings are distinct if they differ by more than this, rad.
 _FAR = np.radians(60.0)
-# A mounting is worth a search if it makes closures, as if they were independent, likelier by so many nats than the one
-# that is said, and by so many each: less costs more time than it is worth, and of a mounting that is not far off the
-# posterior tells by itself. Noise is held for what it is with the mounting that is said, so F decides between two.
+# A mounting is worth a search if closures, taken as independent, are likelier than with the stated one by the first in
+# all and by the second each, nats. Smaller gains are not worth the time; small deviations are found by the posterior
+# itself. The noise is that under the stated mounting, so F decides between two mountings.
 _WORTH, _WORTH_EACH = 10.0, 0.05
-# Axes that differ by less, rad, are worth neither a search nor a word.
+# Axes that differ by less, rad, are worth neither a search nor a warning.
 ALIKE = np.radians(1.0)
-# So short is no axis.
+# A shorter vector has no axis.
 _NO_TURN = 1e-6
-# A sensor may be mounted anyhow: the variance of a component of the rotation vector of a random turn, rad².
+# Prior of a mounting that may be anything: variance of a component of a random rotation's vector, rad².
 ANY_TURN = rotations.RANDOM_VARIANCE
 
 
@@ -64,21 +64,22 @@ def without_mounting(graph: ViewGraph, mounting: np.ndarray) -> ViewGraph:
 
 
 def is_about_as_said(mounting: np.ndarray, spread: float) -> bool:
-    """Whether c ``(3,)`` rad is likelier to be an inaccuracy of standard deviation ``spread``, rad, than a mistake."""
+    """Whether c ``(3,)`` rad is likelier an inaccuracy of standard deviation ``spread``, rad, than a mistake."""
     near = spread**-2
     return bool((mounting**2).sum() * (near - 1 / ANY_TURN) < 3 * np.log(near * ANY_TURN))
 
 
 def estimate_mountings(graph: ViewGraph, closure_graph: ClosureGraph, noise: NoiseModel) -> list[np.ndarray]:
-    """The mountings that the closures may speak of, beside odometry, however far they are from what is said.
+    """Mountings that closures suggest when compared with odometry, however far from the stated one.
 
-    With quaternions (v, w) of M and of the odometry's R, v_M = C v_R. Few closures propose a C, which is refined by
-    expectation–maximisation (Wahba's problem, by Kabsch's method). Besides the likeliest, the likeliest of those far
-    from it: where all turns are small, or half a turn, a sensor that is upside down would see about the same.
+    With quaternions (v, w) of M and of the odometry's R, v_M = C v_R. One or two closures propose a C, which is refined
+    by expectation–maximisation (Wahba's problem, by Kabsch's method). There are two candidates: the likeliest one, and
+    the likeliest of those far from it. Where all turns are small, or half a turn, a sensor that is upside down would
+    see about the same.
 
     Args:
         graph: the view-graph.
-        closure_graph: of it, drawn together.
+        closure_graph: its contraction.
         noise: of steps and closures.
 
     Returns:
@@ -120,15 +121,15 @@ def estimate_mountings(graph: ViewGraph, closure_graph: ClosureGraph, noise: Noi
 
 
 def may_be_told(graph: ViewGraph) -> bool:
-    """Whether as many closures turn as c has components: one false one is about some axis, and makes no sensor's."""
+    """Whether at least as many closures turn as c has components, since a single false one must not determine c."""
     turned = rotations.angle(graph.target_from_source[_may_tell(graph)])
     return int((turned > _LEAST_TURN).sum()) >= _COMPONENTS
 
 
 def between_axes(graph: ViewGraph) -> list[np.ndarray]:
-    """Where odometry turns about one axis alone and closures about another: c ``(3,)`` rad, either way round.
+    """If odometry turns about a single axis and closures about another one: c ``(3,)`` rad, for both signs of the axis.
 
-    So it is with a robot in the plane whose closures are of a planar sensor that sits tilted; nothing else looks so.
+    This is a robot in the plane whose closures come from a tilted planar sensor; nothing else looks like this.
     """
     axes = []
     for edges in (graph.is_odometry, _may_tell(graph)):
@@ -142,17 +143,17 @@ def between_axes(graph: ViewGraph) -> list[np.ndarray]:
 
 
 def _vectors(sensor_from_body: np.ndarray) -> list[np.ndarray]:
-    """``(3,)`` rad each, of rotations ``(P, 3, 3)``."""
+    """Rotation vectors ``(3,)`` rad of rotations ``(P, 3, 3)``."""
     return list(rotations.log(rotations.from_matrix(torch.from_numpy(sensor_from_body))).numpy())
 
 
 def _may_tell(graph: ViewGraph) -> Tensor:
-    """``(M,)`` closures that nobody has rejected."""
+    """``(M,)`` bool, closures that nobody has rejected."""
     return ~graph.is_odometry & (graph.label != EdgeLabel.REJECTED)
 
 
 def _proposals(turned: np.ndarray, measured: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """``(P, 3, 3)`` C that take one closure's axis, or those of two, from odometry's ``(C, 4)`` to what is stated."""
+    """``(P, 3, 3)`` C that map one closure's axis, or those of two, from odometry ``(C, 4)`` to the measurement."""
     tells = np.flatnonzero(2 * np.arccos(np.minimum(turned[:, 3], 1.0)) > _LEAST_TURN)
     tells = tells[np.argsort(variance[tells], kind="stable")][:_MAX_PROPOSALS]
     if len(tells) == 0:
@@ -167,18 +168,18 @@ def _proposals(turned: np.ndarray, measured: np.ndarray, variance: np.ndarray) -
 
 
 def _angle(matrices: np.ndarray) -> np.ndarray:
-    """``(…)`` rad, of rotations ``(…, 3, 3)``."""
+    """Angles ``(…)`` rad of rotations ``(…, 3, 3)``."""
     return np.asarray(np.arccos(((np.trace(matrices, axis1=-2, axis2=-1) - 1) / 2).clip(-1, 1)))
 
 
 def _axes(quaternions: np.ndarray) -> np.ndarray:
-    """``(n, 3)`` of rotations ``(n, 4)``, of length one."""
+    """Unit axes ``(n, 3)`` of rotations ``(n, 4)``."""
     vectors = quaternions[:, :3]
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True).clip(_NO_TURN))
 
 
 def _nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Of matrices ``(…, 3, 3)``, Σ b aᵀ: the rotations that take the a nearest to the b, and else turn the least."""
+    """The rotations that take a nearest to b, given Σ b aᵀ ``(…, 3, 3)``; if several do, that of the least angle."""
     size = np.linalg.norm(matrix, axis=(-2, -1))[..., None, None]
     left, _, right = np.linalg.svd(matrix + _NO_TURN * size * np.eye(3))
     left[..., 2] *= (np.linalg.det(left) * np.linalg.det(right))[..., None]
@@ -192,7 +193,7 @@ def _conjugated(sensor_from_body: np.ndarray, turned: np.ndarray) -> np.ndarray:
 
 
 def turned_per_mounting(target_from_source: Tensor) -> np.ndarray:
-    """``(n, 3, 3)``: by how much closures ``(n, 4)`` are off for each c, in the source's frame: M⁻¹ − I."""
+    """``(n, 3, 3)`` M⁻¹ − I: the error of closures ``(n, 4)`` per c, in the source's frame."""
     return np.asarray(rotations.to_matrix(rotations.inverse(target_from_source)).numpy() - np.eye(3))
 
 

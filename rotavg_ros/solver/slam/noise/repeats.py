@@ -1,8 +1,9 @@
-"""How dense other false closures lie about the turn of each: kernel estimates over those detected before, or all.
+"""The density of other false closures at the turn of each: kernel estimates over those detected before, or all.
 
-Places that look alike are mistaken for each other again and again. Those of a closure's run weigh apart from those that
-were detected shortly before, and these from all: a run that begins repeats nobody, whatever the last one did. Within a
-run a place that was mistaken for another one is so again; from there, the other one for it, by the inverse turn.
+Places that look alike are mistaken for each other repeatedly. There are separate estimates for closures of the same
+run, for those detected shortly before, and for all: a run that begins repeats nothing, whatever the last one did.
+Within a run, a place that was mistaken for another one is mistaken again; seen from the other place, by the inverse
+turn.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ import numpy as np
 
 from rotavg_ros.solver.algebra.compiled import compiled
 
-# What repeats differ by, as a kernel's width.
+# Widths of the kernels: standard deviations of the difference between repeats, degrees.
 REPEAT_DEG = 0.05 * 2.0 ** np.arange(9)
-# One width for all, or each as likely for every closure.
+# Either one of the widths for all closures, or all of them, equally likely for each closure.
 KERNELS = len(REPEAT_DEG) + 1
-# Of a run, of those shortly before, of all.
+# Estimates: over the run, over those detected shortly before, over all.
 _WHOSE = 3
-# A kernel ends at so many widths, where it is 4e-6 of its height.
+# A kernel is cut off at this many widths, where it is 4e-6 of its height.
 _FARTHEST = 5.0
 
 
@@ -28,8 +29,8 @@ class Closures(NamedTuple):
 
     Attributes:
         older, newer: ``(C,)`` ends, in steps along the odometry.
-        turn: ``(C, 4)`` of the world, by which each is wrong if it is false, from its older to its newer end.
-        is_told: ``(C,)`` bool, whether anything else tells that turn.
+        turn: ``(C, 4)`` rotation of the world by which each is wrong if it is false, from its older to its newer end.
+        is_told: ``(C,)`` bool, whether anything else predicts that turn.
     """
 
     older: np.ndarray
@@ -39,12 +40,13 @@ class Closures(NamedTuple):
 
 
 class Near(NamedTuple):
-    """What some closures are compared with.
+    """Which closures are compared with which.
 
     Attributes:
         rows: ``(n,)`` the closures.
         others: ``(F,)`` those that they may be compared with, in the order of their detection.
-        between: ``(n, 4)`` with which of these: from the first to before the second, and from the third on.
+        between: ``(n, 4)`` two ranges of these for each: from the first number to before the second, and from the third
+            to before the fourth.
     """
 
     rows: np.ndarray
@@ -53,12 +55,12 @@ class Near(NamedTuple):
 
 
 class Repeats(NamedTuple):
-    """Of n closures.
+    """Estimates for n closures.
 
     Attributes:
-        density: ``(3, S, n)`` for each kernel, of turns like those of its run, of false closures that were detected
-            shortly before or join the same places, and of any.
-        has_any: ``(3, n)`` bool, whether there are such.
+        density: ``(3, S, n)`` density of each turn with each kernel, among those of its run, among false closures that
+            were detected shortly before or join the same places, and among all.
+        has_any: ``(3, n)`` bool, whether there are such closures.
     """
 
     density: np.ndarray
@@ -71,12 +73,12 @@ class Repeats(NamedTuple):
 
 
 def repeats(closures: Closures, near: Near, gap: float, components: int) -> Repeats:
-    """Of some closures.
+    """Estimates for some closures.
 
     Args:
-        closures: all.
-        near: n of them, and false ones that they are compared with.
-        gap: ends are near that are at most so many steps apart.
+        closures: all closures.
+        near: n of them, and the false ones that they are compared with.
+        gap: steps; ends at most this far apart are near each other.
         components: k.
     """
     return Repeats(*_repeats(closures, near, gap, _Kernels.of(components)))
@@ -86,9 +88,9 @@ class _Kernels(NamedTuple):
     """Normal densities.
 
     Attributes:
-        height: ``(S − 1,)`` of each at no difference.
+        height: ``(S − 1,)`` of each at zero difference.
         broadest: rad, standard deviation of the last.
-        least_cosine: of half the angle at which that one ends.
+        least_cosine: cosine of half the angle at which the last is cut off.
     """
 
     height: np.ndarray
@@ -103,13 +105,14 @@ class _Kernels(NamedTuple):
 
 
 def places_near(when: np.ndarray, asked: np.ndarray, is_one: np.ndarray | None, window: int) -> np.ndarray:
-    """``(n, 4)`` which of some closures were detected not long before, and after, others: first and end, of both.
+    """``(n, 4)`` ranges of closures detected shortly before and after each of some others: begin and end of both.
 
     Args:
-        when: ``(F,)`` when they were detected, ascending.
-        asked: ``(n,)`` when those others were.
-        is_one: ``(n,)`` bool, which of the others are some of them: nobody is near itself; None: those before alone.
-        window: so many before, and after, at most.
+        when: ``(F,)`` when the closures were detected, ascending.
+        asked: ``(n,)`` when the others were detected.
+        is_one: ``(n,)`` bool, which of the others are among the closures, since none is near itself; None: only those
+            before.
+        window: largest number before, and after.
     """
     earlier = np.searchsorted(when, asked)
     later = np.full_like(earlier, len(when)) if is_one is None else earlier + is_one
@@ -159,7 +162,7 @@ def _repeats(closures: Closures, compared: Near, gap: float, kernels: _Kernels) 
                 kernel = np.exp(broadest * (2 * np.arccos(min(cosine, 1.0))) ** 2)
                 for s in range(widths - 1, -1, -1):
                     of_one[s] = kernel
-                    kernel = (kernel * kernel) ** 2  # half as wide: to the fourth power
+                    kernel = (kernel * kernel) ** 2  # half as wide: the fourth power
                 for whose in range(_WHOSE):
                     if weight[whose] > 0:
                         for s in range(widths):

@@ -1,4 +1,4 @@
-"""How far steps of odometry turn, which is not told by their own noise."""
+"""How far steps of odometry turn, estimated without their own noise."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from rotavg_ros.view_graph import ViewGraph
 
 
 def squared_turns(graph: ViewGraph, forest: SpanningForest, step_variance: float) -> np.ndarray:
-    """``(N,)`` rad², squares of odometry's turns from each node's root on.
+    """``(N,)`` rad², sums of the squared turns of odometry's steps from each node's root on.
 
-    What is measured of a step's turn has its noise in it, and the steps that err by most would seem to be those that
-    turn by most. So a step counts as its neighbours turn, but for the probability that it turns by something else:
-    that its turn is any up to half a turn, not theirs with the noise of all, with even odds beforehand. Of an
-    edge that several were drawn together into, all are alike.
+    A step's measured turn includes its noise, so the steps that err most would seem to turn most. Therefore a step
+    counts with the mean square of its neighbours, but for the probability that it turns otherwise. The two hypotheses
+    have even prior odds: its turn is that of the neighbours with the noise of all, or any up to half a turn. All steps
+    of an edge that several were merged into count alike.
 
     Args:
         graph: N nodes.
@@ -30,7 +30,7 @@ def squared_turns(graph: ViewGraph, forest: SpanningForest, step_variance: float
     steps, square = np.zeros(len(is_step)), np.zeros(len(is_step))
     steps[is_step] = graph.steps.numpy()[edge]
     square[is_step] = _of_edges(graph)[edge] / steps[is_step]
-    # Of the steps at either end of each, wherever the root is.
+    # Sums over the steps at both ends of each, wherever the root is.
     total, count = square.copy(), is_step.astype(np.float64)
     np.add.at(total, forest.parent[is_step], square[is_step])
     np.add.at(count, forest.parent[is_step], 1.0)
@@ -45,7 +45,7 @@ def squared_turns(graph: ViewGraph, forest: SpanningForest, step_variance: float
 
 
 def _of_edges(graph: ViewGraph) -> np.ndarray:
-    """``(M,)`` rad², sums over the steps that each edge stands for; as if all turned alike where it does not say."""
+    """``(M,)`` rad², sums over the steps that each edge stands for; if they are unknown, as if all turned alike."""
     even = ((rotations.log(graph.target_from_source) ** 2).sum(dim=1) / graph.steps).numpy()
     known = turned_along(graph)
     return np.asarray(even if known is None else np.where(np.isnan(known), even, known))

@@ -15,15 +15,16 @@ from torch import Tensor
 from rotavg_ros import rotations
 from rotavg_ros.solver.algebra import quaternion_rows
 
-# A robot stays upright whose tilt varies by no more than this standard deviation of a component, rad; and turns about
-# the vertical so far that no other direction of the world is that steady in its body.
+# A robot is upright if the standard deviation of its tilt, per component, is at most the first, rad, and if it turns so
+# far about the vertical that the mean of no other direction of the world in its body is longer than the second.
 _MOST_TILT, _TURNS = np.radians(15.0), 0.8
-# An axis is nearly the vertical within this, rad; and odometry errs about it most if by so many times the variance.
+# An axis is nearly vertical within the first, rad. Odometry errs mostly about one axis if its variance is more than the
+# second number times that of the next one.
 _NEARLY_VERTICAL, _STANDS_OUT = np.radians(20.0), 2.0
-# What a step of odometry errs by about other axes than the vertical, over what it errs by about that: standard
-# deviation of the logarithm, and the least.
+# Ratio of an odometry step's error about the other axes to that about the vertical: standard deviation of its
+# logarithm, and its least value.
 TILT_SPREAD, LEAST_TILT = 1.5, 0.03
-# Bodies that tilt by less are told apart by nobody, rad.
+# Lower bound of a body's tilt, rad: smaller ones cannot be distinguished.
 _LEAST_TILT = np.radians(2.0)
 
 
@@ -41,10 +42,10 @@ class Vertical:
 
     @classmethod
     def of(cls, body_from_world: Tensor) -> Vertical | None:
-        """From orientations ``(N, 4)``; None if the body keeps no direction of the world, or more than one.
+        """From orientations ``(N, 4)``; None if no direction of the world is constant in the body, or more than one.
 
-        Of a direction n of the world the body sees R n. Its mean has the length 1 − τ² where it tilts by N(0, τ²) about
-        two axes.
+        A direction n of the world is R n in the body. If the body tilts by N(0, τ²) about two axes, the mean of R n has
+        the length 1 − τ².
         """
         mean = rotations.to_matrix(body_from_world).mean(dim=0).double()
         _, length, directions = torch.linalg.svd(mean)
@@ -56,10 +57,10 @@ class Vertical:
     def sharpened(self, residual: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """``(3,)`` the axis about which odometry errs most, if that is nearly the vertical; else the vertical.
 
-        A robot on slopes does not keep the vertical on average. Where gravity holds the other axes this is nearer.
+        A robot on slopes is not upright on average. Where gravity stabilises the other axes, this axis is closer.
 
         Args:
-            residual: ``(n, 3)`` rad, of odometry, in the world.
+            residual: ``(n, 3)`` rad, of odometry, in the world's frame.
             variance: ``(n,)`` rad².
         """
         square, axes = np.linalg.eigh((residual.T / variance) @ residual)
@@ -68,14 +69,14 @@ class Vertical:
         return np.asarray(axes[:, 2] if stands_out and is_near else self.axis)
 
     def density_ratio(self, turn: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-        """``(n,)`` by how much likelier turns are about the vertical, by any angle, than they are among all turns.
+        """``(n,)`` ratio of the density of turns about the vertical, by any angle, to that of all turns.
 
-        A turn is one about the vertical and a swing of that. Both ends tilt, so the swing is N(0, 2 τ² + p) in two
-        components; all turns have the volume 8 π², those about an axis 2 π.
+        A turn consists of a turn about the vertical and a swing of the vertical. Both ends tilt, so the swing is
+        N(0, 2 τ² + p) in two components. All turns have the volume 8 π², those about an axis 2 π.
 
         Args:
             turn: ``(n, 3)`` rad.
-            predicted: ``(n,)`` rad², variance p of what these are counted from.
+            predicted: ``(n,)`` rad², variance p of the prediction that the turns are relative to.
         """
         quaternion = quaternion_rows.exp(np.ascontiguousarray(turn.T))
         about = np.hypot(quaternion[3], self.axis @ quaternion[:3])

@@ -1,1 +1,1 @@
-"""Evidence from other closures about the wrong places that each may join: places are mistaken repeatedly."""
+"""Evidence from other closures about the wrong places that each may join, since places are mistaken repeatedly."""

@@ -1,9 +1,9 @@
 """How exactly closures repeat each other's wrong places: in one of a few ways, shared by all closures.
 
-Some front ends mistake places to within centimetres, others to within metres; some runs of false closures stay where
-they began, others drift. If each closure had its own way, each would pay anew for being exact, and a run of fifty false
-ones would cost more than a bent map that they fit. So ways are shared: the probability of each follows from the
-closures detected before (a Pólya urn).
+Some front ends repeat a wrong place to within centimetres, others to within metres. Some runs of false closures stay
+where they began, others drift. If each closure had its own way, each would pay separately for being exact, and a run of
+fifty false ones would cost more than a bent map that fits them. So ways are shared: the probability of each follows
+from the closures detected before (a Pólya urn).
 """
 
 from __future__ import annotations
@@ -16,24 +16,25 @@ import numpy as np
 from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.slam.noise.repeats import Near
 
-# Squared widths of what repeats differ by, in those of two good closures: so many, each a sixteenth of the one before.
+# Variances of the difference between repeats, relative to that between two good closures: the largest, and how many.
+# Each is a sixteenth of the one before.
 _BROADEST, WIDTHS = 256.0, 3
-# A kernel ends at so many widths, where it is 4e-6 of its height.
+# A kernel is cut off at this many widths, where it is 4e-6 of its height.
 _FARTHEST = 5.0
-# No density is less.
+# Lower bound of a density.
 _LEAST = 1e-300
-# A repeat differs by one of them from the closure before, or from the mean of all before that it follows.
+# A repeat differs by one of these widths from the closure before, or from the mean of all before in its chain.
 WAYS = 2 * WIDTHS
 
 
 class Errors(NamedTuple):
-    """By what C closures are off from what all else says, from their older to their newer ends.
+    """Errors of C closures relative to the prediction by all else, from their older to their newer ends.
 
     Attributes:
         turn, shift: ``(C, k)`` rad and ``(C, m)`` metres.
-        turn_variance: ``(C,)`` rad² per component, of good ones.
-        shift_variance: ``(C,)`` m² per component, of a good one.
-        is_told: ``(C,)`` bool, whether all else says anything of it: if not, nobody knows by what it is off.
+        turn_variance: ``(C,)`` rad² per component, of a good closure.
+        shift_variance: ``(C,)`` m² per component, of a good closure.
+        is_told: ``(C,)`` bool, whether all else predicts it; if not, its error is unknown.
     """
 
     turn: np.ndarray
@@ -47,9 +48,9 @@ class Chains(NamedTuple):
     """Chains of C closures, each of which may repeat the one before.
 
     Attributes:
-        order: ``(C,)`` closures as they were detected.
+        order: ``(C,)`` closures in the order of detection.
         follows: ``(C,)`` the closure before each, or -1.
-        linked: ``(C,)`` chance that each repeats that one.
+        linked: ``(C,)`` probability that each repeats that one.
     """
 
     order: np.ndarray
@@ -58,12 +59,12 @@ class Chains(NamedTuple):
 
 
 class InTurn(NamedTuple):
-    """C closures as they were detected.
+    """C closures in the order of detection.
 
     Attributes:
-        order: ``(C,)`` closures, the first first.
+        order: ``(C,)`` closures, the first detected first.
         run: ``(C,)`` number of each one's run.
-        by_those_before: whether those before alone tell, and not all others.
+        by_those_before: whether only those before are evidence, instead of all others.
     """
 
     order: np.ndarray
@@ -73,15 +74,15 @@ class InTurn(NamedTuple):
 
 @compiled
 def shared_ways(kernels: np.ndarray, beforehand: np.ndarray, tells: np.ndarray, told: InTurn) -> np.ndarray:
-    """``(C, W)`` how likely each way is to each closure.
+    """``(C, W)`` probability of each way for each closure.
 
-    What all tell counts for one closure within a run.
+    Within a run, the evidence of all closures together counts as one closure.
 
     Args:
-        kernels: ``(C, W)`` densities of each closure in each way; zeros of those that tell nothing.
-        beforehand: ``(W,)`` of closures that are counted beforehand, in each way.
-        tells: ``(C,)`` chances that each is one of those that the ways are of.
-        told: by which others.
+        kernels: ``(C, W)`` density of each closure in each way; zeros for those that are no evidence.
+        beforehand: ``(W,)`` prior counts of closures, per way.
+        tells: ``(C,)`` probability that each is a repeat.
+        told: which others are evidence.
     """
     count, ways = kernels.shape
     number, in_run = beforehand.copy(), np.zeros((told.run.max() + 1 if count else 0, ways))
@@ -103,17 +104,19 @@ def shared_ways(kernels: np.ndarray, beforehand: np.ndarray, tells: np.ndarray, 
 
 @compiled
 def kernels_along(off: np.ndarray, variance: np.ndarray, chains: Chains) -> tuple[np.ndarray, np.ndarray]:
-    """``(C, W)`` densities in each way: of each closure by those that it follows, and of that one by those after it.
+    """``(C, W)`` densities per way: of each closure by those that it follows, and of the one before by those after.
+
+    Densities are zero where a closure follows none.
 
     Args:
-        off: ``(C, n)`` what each is off by.
-        variance: ``(C,)`` per component, of good ones.
-        chains: which follow which; zeros where none is followed.
+        off: ``(C, n)`` error of each.
+        variance: ``(C,)`` per component, of a good closure.
+        chains: which follow which.
     """
     order, follows, linked = chains
     count = len(off)
     of_later, of_earlier = np.zeros((count, WAYS)), np.zeros((count, WAYS))
-    # The mean of those of a run so far, and how many these are.
+    # The mean of each chain so far, and the number of its closures.
     mean, number = off.copy(), np.ones(count)
     for c in order:
         before = follows[c]
@@ -136,17 +139,17 @@ def kernels_along(off: np.ndarray, variance: np.ndarray, chains: Chains) -> tupl
 def repeated_anywhere(
     errors: Errors, alone: np.ndarray, wrong: np.ndarray, near: Near
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``(C, W²)`` densities of turns and shifts like those of others near, or their opposites.
+    """``(C, W²)`` densities of turns and shifts, from the errors of others near, or their opposites.
 
-    And ``(C,)`` how many these others are, and how many of them are likely to be off alike.
+    And, ``(C,)`` each, the expected numbers of these others, and of those that are off alike.
 
-    A place that was mistaken for another one is so again, or from there the other one for it. Densities are of each
-    width of turns with each of shifts.
+    A place that was mistaken for another one is mistaken again; seen from the other place, the error is opposite. There
+    is a density for each pair of a width of turns and a width of shifts.
 
     Args:
         errors: of all closures.
-        alone: ``(C,)`` density of turn and shift, if no other has to do with it.
-        wrong: ``(C,)`` chances to join wrong places, seen nearly at the right angle.
+        alone: ``(C,)`` density of turn and shift, without any relation to another closure.
+        wrong: ``(C,)`` probability of joining wrong places, seen nearly at the right angle.
         near: which to compare with which.
     """
     rows, others, between = near
@@ -156,7 +159,7 @@ def repeated_anywhere(
     turned, shifted = np.empty(WIDTHS), np.empty(WIDTHS)
     asks, tells = np.zeros(len(wrong), np.bool_), np.zeros(len(wrong), np.bool_)
     asks[rows], tells[others] = True, True
-    # Whoever is compared with those after it, and tells as well as asks, is so with each of them both ways at once.
+    # Closures on both sides of the comparison are compared with those after them in both directions at once.
     both_ways = asks & tells & (between[:, 2] < between[:, 3]).any()
     for n in range(len(rows)):
         row = rows[n]
@@ -193,13 +196,13 @@ def repeated_anywhere(
 def _fill(
     kernels: np.ndarray, off: np.ndarray, last: np.ndarray, mean: np.ndarray, noise: tuple[float, float, float]
 ) -> None:
-    """``(W,)`` densities of one closure by the last one of a run and by the mean of so many.
+    """``(W,)`` densities of one closure given the last one of its chain, and given the mean of the chain.
 
     Args:
-        kernels: to be filled, by the last one first, from the broadest on.
-        off: ``(n,)`` of the closure.
-        last, mean: ``(n,)`` of the others.
-        noise: variances per component, of the one and of each of the others, and how many these are.
+        kernels: to be filled; those given the last one come first, the broadest first.
+        off: ``(n,)`` error of the closure.
+        last, mean: ``(n,)`` errors of the others.
+        noise: variance per component of the closure and of each of the others, and the number of the others.
     """
     own, other, number = noise
     size = len(off)
@@ -211,7 +214,7 @@ def _fill(
 
 @compiled
 def _apart(off: np.ndarray, other: np.ndarray, sign: int) -> float:
-    """Square of what one is off from another, or from its opposite."""
+    """Squared distance of one error from another one (``sign`` 1), or from its opposite (-1)."""
     square = 0.0
     for d in range(len(off)):
         square += (off[d] - sign * other[d]) ** 2
@@ -220,7 +223,7 @@ def _apart(off: np.ndarray, other: np.ndarray, sign: int) -> float:
 
 @compiled
 def _kernels(kernels: np.ndarray, square: float, variance: float, components: int) -> None:
-    """``(widths,)`` densities of a difference of so many components, ``variance`` in each, from the broadest on."""
+    """Fill ``(widths,)`` densities of a difference, given ``variance`` per component, the broadest first."""
     broadest = _BROADEST * variance
     kernel, root = math.exp(-square / (2 * broadest)), math.sqrt(2 * math.pi * broadest)
     height, higher = 1.0, 1.0
@@ -230,6 +233,6 @@ def _kernels(kernels: np.ndarray, square: float, variance: float, components: in
     for width in range(WIDTHS):
         kernels[width] = kernel * height
         height *= higher
-        # A sixteenth as wide: to the sixteenth power.
+        # A sixteenth of the variance: the sixteenth power.
         for _ in range(4):
             kernel *= kernel

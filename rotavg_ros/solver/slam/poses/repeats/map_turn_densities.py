@@ -1,8 +1,8 @@
 """The sums over pairs of closures behind :meth:`~rotavg_ros.solver.slam.poses.repeats.map_turns.MapTurns.repeats`.
 
-Of two closures that are turned alike, one's turn and shift differ from what the other's turn of the map would have by
-something of which the variance is known (the lever of the other's turn included). The density of such a difference is a
-normal one of turns, and one of a few widths of shifts given the turn.
+Each closure's turn of the map predicts the turn and shift of another one. If the two are turned alike, the variance of
+the difference from this prediction is known, including the lever arm of the turn. The density of the difference is
+normal for turns, and of a few widths for shifts, given the turn.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ import numpy as np
 from rotavg_ros.solver.algebra.compiled import compiled
 from rotavg_ros.solver.slam.noise.repeats import Near
 
-# Squared widths of what two differ by, in its variance, which is known only about: each so many times the one before.
+# The variance of a difference is known only roughly, so there are several: each this many times the one before.
 _BROADER = 16.0
-# So many of closures anywhere, and of those that follow each other.
+# Number of variances for closures anywhere, and for those that follow each other.
 WIDTHS, WIDTHS_AFTER = 2, 3
-# Turns alike up to so many standard deviations.
+# Turns are alike up to this many standard deviations.
 _FARTHEST = 4.0
-# What is less likely the same turn than this adds nothing.
+# Probabilities of being the same turn that are smaller than this are neglected.
 _NEGLIGIBLE = 1e-8
-# So small a squared sine counts as this; no density is less than the other.
+# Lower bounds of a squared sine, and of a density.
 _TINY, _LEAST = 1e-30, 1e-300
 
 
-# Where in a row of a closure its shift, its place and its covariance begin, after its turn.
+# Columns in a closure's row where its shift, its place and its covariance begin, after its turn.
 _SHIFT, _PLACE, _COVARIANCE = 4, 7, 10
 
 
@@ -39,7 +39,7 @@ class Axes(NamedTuple):
 
 
 def closure_rows(turn: np.ndarray, shift: np.ndarray, place: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """``(C, 10 + d²)`` of closures, what is read together beside each other.
+    """``(C, 10 + d²)`` one row per closure, so that what is read together is contiguous.
 
     Args:
         turn: ``(4, C)`` unit quaternions.
@@ -53,17 +53,17 @@ def closure_rows(turn: np.ndarray, shift: np.ndarray, place: np.ndarray, covaria
 def repeated_density(
     turned: np.ndarray, axes: Axes, chance: np.ndarray, log_alone: np.ndarray, among: Near, of_all: Near
 ) -> tuple[np.ndarray, np.ndarray]:
-    """``(C,)`` how surely others are turned alike, and ``(C, W)`` the density of each shift by these, of each width.
+    """``(C,)`` expected number of others that are turned alike, at most 1; ``(C, W)`` densities of each shift by these.
 
-    Each of those others stands for all that seem to be off by the turn by which it is, weighed by precision.
+    Each of the others is represented by the mean of all that seem to be off by the same turn, weighted by precision.
 
     Args:
         turned: the closures as :func:`closure_rows`.
         axes: of turns and shifts.
-        chance: ``(C,)`` that each joins places that are turned and wrong.
-        log_alone: ``(C,)`` nats, density of its shift if no other has to do with it.
-        among: closures that tell of others, with each other.
-        of_all: those that are asked for, with these.
+        chance: ``(C,)`` probability that each joins wrong places that are turned.
+        log_alone: ``(C,)`` nats, log density of its shift without any relation to another closure.
+        among: the closures that are evidence, compared with each other.
+        of_all: the closures that are asked for, compared with these.
     """
     count, k = len(chance), axes.turns.shape[1]
     size = k + axes.shifts.shape[1]
@@ -71,7 +71,7 @@ def repeated_density(
     most = 1
     for t in range(len(tells)):
         most = max(most, 1 + near[t, 1] - near[t, 0] + near[t, 3] - near[t, 2])
-    # Of each that tells, which are off by the same turn, and how likely they are so.
+    # For each closure that is evidence: which are off by the same turn, and with which probability.
     number = np.ones(len(tells), np.int64)
     alike, how = np.empty((len(tells), most), np.int64), np.empty((len(tells), most))
     difference, root, same = np.empty(size), np.empty((size + 1, size)), np.empty(WIDTHS)
@@ -106,7 +106,7 @@ def repeated_density(
                     variance[found, 0], variance[found, 1] = of_turn, of_shift
                     found += 1
         for n in range(found):
-            # The mean over all that are like this one.
+            # The mean over all that are turned like this one.
             t = listed[n]
             total, of_turn = 0.0, 0.0
             difference[:] = 0.0
@@ -133,10 +133,10 @@ def repeated_density(
 
 @compiled
 def repeated_after(turned: np.ndarray, axes: Axes, later: np.ndarray, earlier: np.ndarray) -> np.ndarray:
-    """``(2, P, W)`` densities of shifts: of the later of two by the turn of the earlier one, and the other way round.
+    """``(2, P, W)`` densities of shifts: of the later closure by the turn of the earlier one, and vice versa.
 
     Args:
-        turned: closures as :func:`closure_rows`, with the variances of what two near each other do not share.
+        turned: closures as :func:`closure_rows`, with the part of the covariance that neighbours do not share.
         axes: of turns and shifts.
         later, earlier: ``(P,)`` closures.
     """
@@ -155,16 +155,16 @@ def repeated_after(turned: np.ndarray, axes: Axes, later: np.ndarray, earlier: n
 
 @compiled
 def _difference(turned: np.ndarray, axes: Axes, row: int, other: int, difference: np.ndarray) -> tuple[float, float]:
-    """Between one closure and what the turn of another would have it be.
+    """Compute the difference between one closure and what the turn of another predicts for it.
 
     Args:
         turned: closures.
         axes: of turns and shifts.
-        row, other: which.
+        row, other: the two closures.
         difference: ``(k + m,)`` rad and metres, to be filled.
 
     Returns:
-        Variances per component of what the other says, rad² and m²; negative if their turns are not the same.
+        Variances per component of the prediction, rad² and m²; negative if their turns are not the same.
     """
     turns, shifts = axes
     k, m = turns.shape[1], shifts.shape[1]
@@ -177,7 +177,7 @@ def _difference(turned: np.ndarray, axes: Axes, row: int, other: int, difference
     a0, a1, a2, a3 = turned[row, 0], turned[row, 1], turned[row, 2], turned[row, 3]
     b0, b1, b2, b3 = turned[other, 0], turned[other, 1], turned[other, 2], turned[other, 3]
     w = a3 * b3 + a0 * b0 + a1 * b1 + a2 * b2
-    # cos a ≥ 1 − a²/2: whoever is turned otherwise by far is told without a sine.
+    # cos a ≥ 1 − a²/2: turns that differ by far are recognised without a sine.
     if abs(w) < 1 - _FARTHEST**2 * (own + of_turn) / 8:
         return -1.0, -1.0
     x = -a3 * b0 + a0 * b3 - a1 * b2 + a2 * b1
@@ -190,7 +190,7 @@ def _difference(turned: np.ndarray, axes: Axes, row: int, other: int, difference
     scale = angle / sine * (1.0 if w >= 0 else -1.0)
     for d in range(k):
         difference[d] = scale * (x * turns[0, d] + y * turns[1, d] + z * turns[2, d])
-    # The other's turn of the way from its place to this one's.
+    # The vector from the other's place to this one's, turned by the other's turn.
     arm0 = turned[row, _PLACE] - turned[other, _PLACE]
     arm1 = turned[row, _PLACE + 1] - turned[other, _PLACE + 1]
     arm2 = turned[row, _PLACE + 2] - turned[other, _PLACE + 2]
@@ -205,7 +205,7 @@ def _difference(turned: np.ndarray, axes: Axes, row: int, other: int, difference
     for e in range(m):
         s0, s1, s2 = shifts[0, e], shifts[1, e], shifts[2, e]
         difference[k + e] = off0 * s0 + off1 * s1 + off2 * s2
-        # sᵀ (t ×) = (s × t)ᵀ: by what the other's turn moves it along this axis.
+        # sᵀ (t ×) = (s × t)ᵀ: how far the other's turn moves it along this axis.
         l0, l1, l2 = s1 * t2 - s2 * t1, s2 * t0 - s0 * t2, s0 * t1 - s1 * t0
         of_shift += turned[other, _COVARIANCE + (k + e) * size + k + e]
         for d in range(k):
@@ -226,14 +226,14 @@ def _densities(
     root: np.ndarray,
     same: np.ndarray,
 ) -> float:
-    """Squares of what turns differ by, in standard deviations; and densities of what shifts differ by, given that.
+    """The squared difference of turns, in standard deviations; and densities of the difference of shifts, given it.
 
     Args:
         turned, row: one of the closures.
-        difference: ``(k + m,)`` to what another says.
-        said: rad² and m² per component, of what another says; k.
-        root: ``(k + m + 1, k + m)`` room for Cholesky's factor, and what is left of the difference.
-        same: ``(W,)`` densities, to be filled, the narrower one first.
+        difference: ``(k + m,)`` from the other's prediction.
+        said: variances of that prediction, rad² and m² per component; k.
+        root: ``(k + m + 1, k + m)`` room for Cholesky's factor, and for the whitened difference.
+        same: ``(W,)`` densities, to be filled, the narrowest first.
     """
     of_turn, of_shift, k = said
     size = len(difference)

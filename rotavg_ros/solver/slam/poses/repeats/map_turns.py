@@ -1,6 +1,6 @@
-"""Closures that are false by the same turn of the map: a symmetric building seen as if turned about its centre.
+"""Closures that are false by the same turn of the map, as in a symmetric building that is seen turned about its centre.
 
-Such closures agree on one turn about one point, wherever they were detected, and not on one shift.
+Such closures agree on one turn about one point, wherever they were detected, but not on one shift.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from rotavg_ros.solver.slam.poses.closures import Predictions, Told
 from rotavg_ros.solver.slam.poses.repeats.map_turn_densities import Axes, closure_rows, repeated_after, repeated_density
 from rotavg_ros.solver.slam.poses.rows import PoseProblem
 
-# Whoever is elsewhere with less than this chance tells nobody anything.
+# Closures that join wrong, turned places with less than this probability are no evidence.
 _LEAST_CHANCE = 0.01
 
 
 @dataclass(frozen=True)
 class MapTurns:
-    """By what turn of the map each of C closures is false, if it is, seen from its older end; world frame.
+    """The turn of the map by which each of C closures is wrong if it is false, seen from its older end; world frame.
 
     Attributes:
         turn: ``(4, C)`` unit quaternions.
-        shift: ``(C, 3)`` metres, by what the turned map has the newer end elsewhere, …
-        place: ``(C, 3)`` … from where it is.
-        covariance: ``(C, k + m, k + m)`` of turns and shifts, the closures' own noise included.
+        shift: ``(C, 3)`` metres by which the turned map moves the newer end from its place.
+        place: ``(C, 3)`` metres, place of the newer end.
+        covariance: ``(C, k + m, k + m)`` of turns and shifts, including the closures' own noise.
         own: ``(C, k + m, k + m)`` of that noise alone.
         bases: ``(3, k)`` axes of turns and ``(3, m)`` of shifts.
     """
@@ -43,23 +43,23 @@ class MapTurns:
     def of(
         cls, problem: PoseProblem, position: np.ndarray, predictions: Predictions, closure_variance: np.ndarray
     ) -> MapTurns:
-        """By what closures are off from what all else says.
+        """From the deviations of closures from the predictions by all else.
 
         Args:
             problem: the graph.
             position: ``(K, 3)`` metres, of the key nodes.
-            predictions: what all else says.
+            predictions: of closures by all else.
             closure_variance: ``(C,)`` m² per component, of good closures.
         """
         closure, (turns, shifts), drawn = problem.mode.problem.closure, problem.bases, problem.drawn
         k, m = turns.shape[1], shifts.shape[1]
         is_forward = problem.told.sign > 0
-        # A correction turns bodies from the world, the map the other way.
+        # A correction turns body_from_world; the map turns by its inverse.
         turn = quaternion_rows.exp(-turns @ predictions.mean[:, :k].T)
         shift = predictions.mean[:, k:] @ shifts.T
         change = np.zeros((len(closure), k + m, k + m))
         change[:, :k, :k], change[:, k:, k:] = -np.eye(k), np.eye(m)
-        # Where the newer end is the source: the other way round, F⁻¹. Translations are the older end's in any case.
+        # If the newer end is the source: the inverse, F⁻¹. Translations are in the older end's frame in any case.
         is_back = np.flatnonzero(~is_forward)
         inverse = quaternion_rows.inverse(turn[:, is_back])
         turn[:, is_back], shift[is_back] = inverse, -shift[is_back]
@@ -80,18 +80,18 @@ class MapTurns:
     def repeats(
         self, elsewhere: np.ndarray, log_alone: np.ndarray, told: Told, asked: np.ndarray, *, in_order: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """``(C,)`` how surely there is one that is turned alike, up to 1; ``(C, W)`` densities of shifts by these.
+        """``(C,)`` expected number of others that are turned alike, at most 1; ``(C, W)`` densities of shifts by these.
 
-        Densities are of shifts given the turn, which is counted with the rotations, and of so many widths. They are
-        kernel estimates over other closures, each of which stands for all that seem to be off by the turn by which it
-        is (weighed by precision).
+        Densities are of shifts, given the turn, which counts with the rotations; there is one per width. They are
+        kernel estimates over other closures, each represented by the mean of all that seem to be off by the same turn
+        (weighted by precision).
 
         Args:
-            elsewhere: ``(C,)`` chance that each joins places that are turned and wrong.
-            log_alone: ``(C,)`` nats, density of its shift if no other has to do with it.
+            elsewhere: ``(C,)`` probability that each joins wrong places that are turned.
+            log_alone: ``(C,)`` nats, log density of its shift without any relation to another closure.
             told: whose translations are known, and the order of detection.
-            asked: ``(C,)`` bool, of which: zeros of the others.
-            in_order: given those before alone.
+            asked: ``(C,)`` bool, the closures to compute; the others get zeros.
+            in_order: whether only closures detected before are evidence.
         """
         chance = elsewhere * told.is_known
         tells = told.detection[chance[told.detection] > _LEAST_CHANCE]
@@ -104,9 +104,9 @@ class MapTurns:
         return repeated_density(turned, self._axes, chance, log_alone, among, of_all)
 
     def repeats_after(self, later: np.ndarray, earlier: np.ndarray) -> np.ndarray:
-        """``(2, P, W)`` densities of shifts given turns: of the later of two by the earlier one, and the other way.
+        """``(2, P, W)`` densities of shifts, given turns: of the later closure by the earlier one, and vice versa.
 
-        What all else says of two that follow each other is off by about the same, and does not count.
+        The errors of the predictions for two closures that follow each other are about the same, so they do not count.
 
         Args:
             later, earlier: ``(P,)`` closures.

@@ -1,4 +1,4 @@
-"""Evidence from the closures before and after a closure, and all others, about whether it joins wrong places."""
+"""Evidence from the closures before and after a closure, and from all others, about whether it joins wrong places."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rotavg_ros.solver.slam.poses.repeats.exactness import (
 )
 from rotavg_ros.solver.slam.poses.repeats.map_turns import MapTurns
 
-# Least distance of shares from zero and one; closures less likely wrong than this are not used as evidence.
+# Least distance of shares from zero and one; and probability of being wrong below which a closure is no evidence.
 _SHARE = _LEAST_CHANCE = 0.01
 
 
@@ -30,13 +30,13 @@ class Repeats:
     """Evidence from others about the wrong places that each of C closures may join.
 
     Attributes:
-        has_alike: ``(C,)`` how surely one before or after joins wrong places, seen nearly at the right angle, …
-        alike: ``(C,)`` … and density of each one's turn and shift if it joins those; times the chances of these.
-        has_turned: ``(C,)`` how surely one before or after joins wrong places by a false rotation, …
-        turned: ``(C, W)`` … and densities of its shift, given the turn, if it joins those; times the chances of these.
-        has_elsewhere: ``(C,)`` how surely there is one anywhere that joins wrong places at nearly the right angle; …
-        elsewhere: ``(C, W)`` … and densities of turn and shift by these, times that.
-        number: ``(C,)`` how many of all, it included, are off by about the same.
+        has_alike: ``(C,)`` probability that one before or after joins wrong places, seen nearly at the right angle.
+        alike: ``(C,)`` density of each one's turn and shift if it joins the same places, times that probability.
+        has_turned: ``(C,)`` probability that one before or after joins wrong places by a false rotation.
+        turned: ``(C, W)`` densities of its shift, given the turn, if it joins the same places, times that probability.
+        has_elsewhere: ``(C,)`` expected number, at most 1, of others that join wrong places at nearly the right angle.
+        elsewhere: ``(C, W)`` densities of turn and shift by these, times that number.
+        number: ``(C,)`` expected number of closures, it included, that are off by about the same.
     """
 
     has_alike: np.ndarray
@@ -49,26 +49,27 @@ class Repeats:
 
     @property
     def has_any(self) -> np.ndarray:
-        """``(C,)`` how surely one before or after joins wrong places."""
+        """``(C,)`` probability that a closure before or after joins wrong places."""
         return np.asarray(self.has_alike + self.has_turned)
 
 
 def repeats_of(
     errors: Errors, maps: MapTurns, before: np.ndarray, told: Told, alone: np.ndarray, *, in_order: bool
 ) -> Repeats:
-    """By the closures that follow each other, if both join the same wrong places; and by all wrong ones.
+    """Evidence from closures that follow each other, if both join the same wrong places; and from all wrong ones.
 
-    A front end goes on finding a wrong place once it has, and finds it again on the next lap, or from there the other
-    one. So a false closure costs once what makes its places alike: how they are turned, and where they are.
+    A front end that has found a wrong place continues to find it. It finds it again on the next lap, or finds the first
+    place from the wrong one. So false closures pay only once for what makes two places look alike: their relative
+    rotation and position.
 
     Args:
         errors: of all closures.
-        maps: by what turns of the map they are off.
-        before: ``(J + 1, C)`` chances of classes.
+        maps: the turns of the map by which they are off.
+        before: ``(J + 1, C)`` probabilities of classes.
         told: which follows which.
-        alone: ``(C,)`` density of turn and shift at a wrong place that is seen nearly at the right angle, if no other
-            has to do with it; zero where it is not: none elsewhere is looked for then.
-        in_order: of those before alone.
+        alone: ``(C,)`` density of turn and shift at a wrong place that is seen nearly at the right angle, without any
+            relation to another closure; zero: not compared with closures elsewhere.
+        in_order: whether only closures detected before are evidence.
     """
     can_tell = told.is_known & errors.is_told
     alike, turned = before[GOOD:-1].sum(axis=0), before[-1]
@@ -82,7 +83,7 @@ def repeats_of(
     tells = told.detection[(alike * can_tell)[told.detection] > _LEAST_CHANCE]
     near = told.detected_near(np.flatnonzero(can_tell & (alone > 0)), tells, in_order=in_order)
     density, total, number = repeated_anywhere(errors, alone, alike, near)
-    # Of false rotations: off by the same shift, or by the same turn of the map.
+    # False rotations are off by the same shift, or by the same turn of the map.
     ways = np.concatenate((np.stack([of_shifts.by_last] * 2), maps.repeats_after(pairs.later, pairs.earlier)), axis=2)
     certain = np.ones((2, len(pairs.later)))
     return Repeats(
@@ -97,12 +98,13 @@ def repeats_of(
 
 
 class _Pairs(NamedTuple):
-    """P pairs of closures of which one follows the other.
+    """P pairs of closures, where one follows the other.
 
     Attributes:
         later, earlier: ``(P,)`` closures.
         follows: ``(C,)`` the one before each, or -1.
-        ends: which of a pair is told of by which; only the later one if that is told by those before alone.
+        ends: pairs of arrays: the closures that get evidence, and those that it comes from. Later from earlier ones,
+            and unless only closures before are evidence, also the other way round.
     """
 
     later: np.ndarray
@@ -117,7 +119,7 @@ class _Pairs(NamedTuple):
         return cls(later, earlier, follows, ((later, earlier), (earlier, later))[: 1 if in_order else 2])
 
     def mean_over(self, weight: np.ndarray, each: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
-        """``(C,)`` of values of pairs, one ``(P,)`` for each end, the mean over neighbours of these times weights."""
+        """``(C,)`` mean over neighbours of weight times value; values ``(P,)`` are given for each end of the pairs."""
         count = len(self.follows)
         neighbours = sum(np.bincount(end, minlength=count) for end, _ in self.ends)
         summed = (
@@ -131,7 +133,7 @@ class _Exactness(NamedTuple):
 
     Attributes:
         density: ``(P,)`` for each end of a pair, if it repeats the other.
-        by_last: ``(P, widths)`` of either end by the other alone.
+        by_last: ``(P, widths)`` of either end, given only the other.
     """
 
     density: list[np.ndarray]
@@ -150,7 +152,7 @@ class _Exactness(NamedTuple):
 
 
 def wrong_share(before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndarray:
-    """``(C,)`` how likely each is to join wrong places, by all others and by its run most (Beta, Bernoulli)."""
+    """``(C,)`` probability that each joins wrong places, by all others and mostly by its run (Beta–Bernoulli)."""
     wrong, any_one = _wrong_places(before, told)
     overall = _overall(wrong, any_one, priors)
     in_run, of_run = np.bincount(told.run, wrong)[told.run] - wrong, np.bincount(told.run, any_one)[told.run] - any_one
@@ -158,10 +160,10 @@ def wrong_share(before: np.ndarray, told: Told, priors: PlacePriors) -> np.ndarr
 
 
 def log_places(before: np.ndarray, told: Told, priors: PlacePriors) -> float:
-    """Nats, that closures join right and wrong places as they do, each by how common wrong ones are among the others.
+    """Log probability, nats, of which closures join wrong places, each by the share of wrong ones among the others.
 
     Args:
-        before: ``(J + 1, C)`` chances of classes.
+        before: ``(J + 1, C)`` probabilities of classes.
         told: runs.
         priors: of places.
     """
@@ -170,14 +172,14 @@ def log_places(before: np.ndarray, told: Told, priors: PlacePriors) -> float:
 
 
 def log_all_right(before: np.ndarray, told: Told, priors: PlacePriors, count: int) -> float:
-    """Nats, that so many closures of a run all join right places, one after the other, by the same share."""
+    """Log probability, nats, that ``count`` closures of a run all join right places, in turn, by the same share."""
     right = 1 - _overall(*_wrong_places(before, told), priors)
     number = np.arange(count)
     return float(np.log((right + number) / (1 + number)).sum())
 
 
 def _wrong_places(before: np.ndarray, told: Told) -> tuple[np.ndarray, np.ndarray]:
-    """``(C,)`` each: chance of a wrong place, and of any that a closure can tell of."""
+    """Two arrays ``(C,)``: probability of a wrong place, and of any place that a closure can be evidence of."""
     return before[GOOD:-1].sum(axis=0) * told.is_known, (1 - before[-1]) * told.is_known
 
 
