@@ -101,13 +101,13 @@ class EstimatorOptions:
     )
     max_keyframes: int = option(
         200_000,
-        "at so many keyframes those that can best be spared are taken out, first without any loss, then with some",
+        "at this many keyframes, those that can best be spared are removed, first without any loss, then with some",
         within=(1, 100_000_000),
         live=True,
     )
     max_edges: int = option(
         2_000_000,
-        f"at so many edges, or {EDGES_PER_KEYFRAME} times max_keyframes, the loop closures that can best be spared "
+        f"at this many edges, or {EDGES_PER_KEYFRAME} times max_keyframes, the loop closures that can best be spared "
         "are dropped",
         within=(1, 1_000_000_000),
         live=True,

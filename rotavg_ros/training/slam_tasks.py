@@ -71,7 +71,11 @@ def join(samples: Sequence[SlamSample]) -> SlamSample:
 
 
 class SlamCleanTask:
-    """SlamCleanNet: false or good, each graph weighing the same per closure up to its size's square root."""
+    """SlamCleanNet: classifies closures as false or good.
+
+    The loss is the mean cross-entropy over all closures of a batch: a graph has a weight in proportion to its closures.
+    Validation averages over graphs.
+    """
 
     def __init__(self, config: TrainingConfig) -> None:
         self.config = config

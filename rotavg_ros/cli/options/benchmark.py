@@ -64,13 +64,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--ticks",
         type=positive_whole_number,
         metavar="N",
-        help="so many ticks of the estimator beside iSAM2's instead, on a graph that grows",
+        help="this many ticks of the estimator beside iSAM2's instead, on a graph that grows",
     )
     parser.add_argument(
         "--busy",
         type=whole_number,
         metavar="N",
-        help="of --ticks: so many loops beside them, each on a core (default: 0)",
+        help="with --ticks: number of busy loops beside them, each on a core (default: 0)",
     )
     parser.add_argument(
         "--seconds", type=positive_number, metavar="S", help=f"of each run of a node (default: {SOAK_SECONDS:g})"

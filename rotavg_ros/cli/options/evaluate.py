@@ -62,7 +62,7 @@ def _add_synthetic(parser: argparse.ArgumentParser) -> None:
         type=whole_number,
         default=5,
         metavar="N",
-        help="so many graphs for all rows but the main ones, unless --methods names them (default: 5)",
+        help="number of graphs for all rows but the main ones, unless --methods names them (default: 5)",
     )
 
 

@@ -39,6 +39,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=whole_number,
         default=200,
         metavar="N",
-        help="about so many of the answers go into run.mcap, evenly over the time; 0: all (default: 200)",
+        help="about this many answers go into run.mcap, evenly spread over time; 0: all (default: 200)",
     )
     parser.add_argument("--no-report", action="store_true", help="leave out report.html and its pictures")

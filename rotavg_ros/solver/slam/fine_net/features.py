@@ -19,13 +19,14 @@ from torch import Tensor
 
 from rotavg_ros.solver.slam.fine_net.evidence import Evidence
 
-# Stretches of odometry reach so many steps to either side; closures are pooled by either end, and by run.
+# Steps by which stretches of odometry reach to either side; and by which ends of closures that are pooled may differ.
+# Closures are pooled by run as well.
 _STRETCHES = (4.0, 12.0, 36.0, 108.0)
 _NEAR_ENDS = (5.0, 25.0)
-# Squares of standardised discrepancies below this are as good as none, and logarithms stay finite.
+# Added to squares before their logarithm, so that smaller ones are as good as zero; and largest absolute logarithm.
 _LEAST = 0.1
 _LARGEST_LOG = 6.0
-# Beyond so many standard deviations a discrepancy counts as this in one of the means.
+# In one of the means, squares of standardised discrepancies are capped at this, three standard deviations.
 _CAPPED = 9.0
 
 

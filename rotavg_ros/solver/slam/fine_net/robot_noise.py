@@ -22,7 +22,7 @@ from rotavg_ros.solver.slam.posterior.rows import residuals, tails
 _TOLD = 0.5
 # Fewer say nothing of how edges of a kind differ.
 _LEAST_EDGES = 6
-# Closures are held back in so many stretches at most, of so many closures at least.
+# Closures are held back in stretches: most stretches, and least closures of one.
 _STRETCHES, _IN_STRETCH = 16, 6
 # Solves after closures are held back.
 _SOLVES = 4

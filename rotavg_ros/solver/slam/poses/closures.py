@@ -78,7 +78,8 @@ class Told:
 
     Attributes:
         rotation_variance: ``(C,)`` rad² per component, of a good closure's turn.
-        false_odds: ``(C,)`` nats: log density of the turn if false, plus the prior log-odds of that.
+        false_odds: ``(C,)`` nats: log density of the turn if false, plus the prior log-odds of being false. Near misses
+            have the prediction's variance added. For a labelled closure, only what that adds to the log density.
         is_known: ``(C,)`` bool, whether a translation is stated.
         label: ``(C,)`` +1 if the closure is labelled accepted, −1 if rejected, else 0.
         run: ``(C,)`` number of the closure's run.

@@ -170,6 +170,7 @@ def _laid_on(orientation: torch.Tensor, growth: Growth) -> torch.Tensor:
     return torch.cat((orientation, rotations.normalize(rotations.multiply(growth.turn, orientation[anchor]))))
 
 
-# The mean squared effect of a random walk's heading error along the way is a third of that of its final variance; one
-# component of the turn, about the way itself, does not move the end.
+# Errors of the heading move the end of the way. If they are a random walk, the squared displacement is a third of that
+# of a constant error with the final variance. The displacement is across the way: in the plane, that is one of its two
+# components, so the variance per component is half of the sum.
 WALK, ACROSS = 3.0, 0.5

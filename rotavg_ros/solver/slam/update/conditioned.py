@@ -31,9 +31,9 @@ from rotavg_ros.solver.slam.update.linear import Linear
 from rotavg_ros.solver.slam.update.moved import Hangs, shifted, turned
 from rotavg_ros.view_graph import ViewGraph
 
-# Columns of so many closures are worked out at once.
+# Number of closures whose columns are computed at once.
 _AT_ONCE = 8
-# Which of the new closures are good is asked so many times, given those that were last.
+# Rounds of judging the new closures, each given the ones that were good in the last.
 _ROUNDS = 3
 # The precision of a translation that is not known, in that of one anywhere on the map.
 _NOTHING = 1e-6
@@ -85,7 +85,7 @@ def conditioned(
         growth: how its nodes hang on those of the last solve.
         edge: ``(n,)`` the closures, in the order in which they came.
         columns: of the first ones.
-        most: of so many more columns are worked out now; what is left has a score by its residual, and moves nothing.
+        most: closures whose columns are computed now, at most; the rest get scores by residual, and move nothing.
     """
     system = _System.of(linear, laid, growth, edge)
     known = len(columns.edge)
@@ -357,7 +357,7 @@ class _System:
 
 
 def _log_normal(mean: np.ndarray, covariance: np.ndarray, times: int) -> np.ndarray:
-    """``(n,)`` log N(0, covariance) of ``(n, d, q)``; the determinant counts so many times."""
+    """``(n,)`` log N(0, covariance) of ``(n, d, q)``; the determinant counts ``times`` times."""
     size = mean.shape[1]
     square = (mean * np.linalg.solve(covariance, mean)).sum(axis=(1, 2))
     log_det = np.linalg.slogdet(covariance)[1] + size * np.log(2 * np.pi)

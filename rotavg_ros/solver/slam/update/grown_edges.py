@@ -12,7 +12,7 @@ _COLUMNS = ("source", "target", "target_from_source", "kind", "label", "steps")
 
 
 def begins_with(graph: ViewGraph, earlier: ViewGraph, count: int | None = None) -> bool:
-    """Whether edges of ``earlier``, all or so many, come first in ``graph``, as they were, and others have no label."""
+    """Whether ``graph`` begins with all edges of ``earlier``, or the first ``count``, and no other edge has a label."""
     count = earlier.num_edges if count is None else count
     if count > graph.num_edges or bool((graph.label[count:] != EdgeLabel.AUTOMATIC).any()):
         return False

@@ -176,11 +176,11 @@ class Judge:
 
 
 class _Others(NamedTuple):
-    """What others say of wrong places of C closures, if they are theirs.
+    """Evidence from others about the wrong places of C closures, if they join the same ones.
 
     Attributes:
-        has_any: ``(C,)`` how surely there are such.
-        density: ``(C,)`` by these, times that.
+        has_any: ``(C,)`` expected number of such others, at most 1.
+        density: ``(C,)`` density by these, times that number.
     """
 
     has_any: np.ndarray
@@ -189,13 +189,13 @@ class _Others(NamedTuple):
     def share(
         self, repeats: float, alone: tuple[np.ndarray, np.ndarray], in_turn: InTurn, priors: PlacePriors
     ) -> np.ndarray:
-        """``(C,)`` of closures that repeat one of these, where there are any.
+        """Share ``(C,)`` of closures that repeat one of these, where there are any.
 
         Args:
-            repeats: so many do, of those that are counted beforehand.
-            alone: ``(C,)`` each: nats, if it repeats nobody; and chance that it joins wrong places.
-            in_turn: by which others it is told.
-            priors: how many are counted.
+            repeats: prior count of closures that do.
+            alone: ``(C,)`` each: log density, nats, if it repeats none; and probability that it joins wrong places.
+            in_turn: which others are evidence.
+            priors: prior count of all closures.
         """
         log_alone, wrong = alone
         is_told = self.has_any > _LEAST_CHANCE

@@ -26,14 +26,14 @@ _AGREE = 3.0
 # Minimum number of closures for a jump; a single one is explained equally well by a wrong place.
 _LEAST_WITNESSES = 2
 _WRONG = 0.5
-# So many shifts are looked at, those first of which single closures say most; and so many of them, and so many places
-# of either end, for stretches that lie elsewhere.
+# Shifts that are examined, at most, those first that single closures support most; number of these for which stretches
+# that lie elsewhere are examined as well; and number of places of either end of a stretch.
 _LOOKED_AT, _STRETCHES, _ENDS = 48, 4, 1000
 # Positions that differ by less, in steps, are the same.
 _SAME_PLACE = 1e-9
 # Largest error of a step that jumped, relative to the length that it reports.
 _AS_FAR = 2.0
-# No chance is less.
+# Lower bound of a probability.
 _LEAST = 1e-12
 
 
@@ -283,7 +283,7 @@ class _Witnesses:
         weight = (into.astype(np.float64) - out) / self.spread
         shift = (weight @ self.shift) / max(float(np.abs(weight).sum()), np.finfo(np.float64).tiny)
         back = -1 if end < 0 else int(self.segment[end])
-        # With so many that are right after all, wrong ones are less common among all others as well.
+        # If these are right after all, wrong ones are less common among all others as well.
         told, priors, chance = pose.problem.told, pose.problem.priors, pose.solved.places.chance
         gained += log_places(_right(chance, freed), told, priors) - log_places(chance, told, priors)
         return Jump(int(self.segment[begin]), back, pose.problem.bases[1] @ shift, gained, freed)

@@ -25,13 +25,13 @@ from rotavg_ros.solver.slam.poses.repeats.neighbours import log_all_right
 from rotavg_ros.solver.slam.poses.search.settling import LEAST_GAIN, SLACK, Rival, moved
 from rotavg_ros.solver.slam.poses.solved import PoseMode
 
-# So many runs are looked at, those first that are off by the fewest standard deviations; of so many closures at least,
-# and so many of longer ones: what these come to tells the others.
+# Number of runs that are examined, those first that are off by the fewest standard deviations; their least number of
+# closures; and most closures of a run, whose result decides about the others.
 _LOOKED_AT, _LEAST_MEMBERS, _MOST_MEMBERS = 32, 2, 96
 _WRONG = 0.5
 # Runs are doubted that would be as far off by chance with less than this probability.
 _UNLIKELY = 0.05
-# So many runs are believed, or doubted, at most, one after the other; each time so many are asked which gains most.
+# Most runs that are believed, or doubted, one after the other; and number of runs that are tried each time for doubt.
 _MAX_RUNS, _MAX_DOUBTED = 8, 4
 
 

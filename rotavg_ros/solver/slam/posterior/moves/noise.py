@@ -43,9 +43,9 @@ _MIN_SPREAD = 0.2
 _JOINT = (("run_steps",), ("common_share",))
 # By what a variance changes when other noise is believed, at most and in steps.
 SCALES = np.exp(np.linspace(-3.6, 1.2, 25))
-# Labels are settled from a variance of odometry's steps so many times as large, too.
+# Labels are also settled starting from a variance of odometry's steps that is this many times as large.
 _WORSE_STEPS = 4.0
-# After so many solves F is about what it will be.
+# Number of solves after which F is near its final value.
 _FIRST_SOLVES = 2
 
 
@@ -81,7 +81,7 @@ def propose_worse_odometry(mode: Mode) -> Iterator[Proposal]:
 
 
 def _opens_labels(mode: Mode, factor: float) -> bool:
-    """Whether a closure's label, decided now, would be open if what is predicted of it varied so many times as much."""
+    """Whether a closure's label, decided now, would be open if its prediction had ``factor`` times the variance."""
     problem, told, closure = mode.problem, mode.left_out, mode.problem.closure
     noise = mode.state.noise
     own, tailed = variances(problem, noise)[closure], tails(problem, noise).of(closure)

@@ -21,11 +21,11 @@ from rotavg_ros.solver.slam.posterior.state import State
 SETTLING = 4
 # What relabelling and bending may gain beyond what residuals tell of a part that is turned back, nats.
 OPTIMISM = 10.0
-# A turn explains a closure that is off by it to so many standard deviations, or to this angle, rad.
+# A turn explains a closure whose error differs from it by at most this many standard deviations, or this angle, rad.
 _AGREE, _AGREE_ANGLE = 3.0, np.radians(2.0)
 # One false closure costs less than a slip.
 LEAST_WITNESSES = 2
-# A slip is moved by so many segments at most.
+# Largest number of segments by which a slip is moved.
 _FARTHEST_SHIFT = 8
 # Positions that differ by less, in steps, are the same.
 SAME_PLACE = 1e-9
