@@ -3,12 +3,13 @@
 The estimator has two locks:
 
 - :attr:`CurrentContent.lock` guards the :class:`CurrentContent` and everything that its content reaches. Every input,
-  query and change holds it, mostly for microseconds. A tick holds it while it copies its problem and while it hands in
-  its answer, but not while it solves. Nobody holds it while a file is read or written. ``on_discard`` is called with
-  it held.
+  query and change holds it, mostly for microseconds. A tick holds it while it copies its problem, while it reads where
+  its answer is anchored, and while it hands in its answer, but not while it solves. Nobody holds it while a state file
+  is read or written. ``on_discard`` is called with it held.
 - The lock of :class:`~rotavg_ros.online.ticks.Ticks` is held during a whole tick, and during the work after one. So
   these run one at a time, and each finds the answer and the solver's memory that the one before has left, unless the
-  content was replaced. It also guards the unfinished work in the solver's memory, which goes on without the first lock.
+  content or the options were replaced. It also guards the unfinished work in the solver's memory, which goes on without
+  the first lock.
 
 A thread that needs both takes the lock of the ticks first. The options, the counters, :attr:`CurrentContent.paused`
 and :attr:`RunningTick.abandoned_by` may be read without a lock; they are changed under the first.

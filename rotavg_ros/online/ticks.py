@@ -41,8 +41,7 @@ class TickAbandonedError(Exception):
 class Ticks:
     """What runs while inputs come: ticks, and the work after them, one at a time.
 
-    The locks are described in :mod:`~rotavg_ros.online.current_content`; :attr:`_lock` is taken before that of the
-    content.
+    Their lock is taken before that of the content; :mod:`~rotavg_ros.online.current_content` says what each guards.
     """
 
     def __init__(self, current: CurrentContent, solver: Solver | None = None, advance: Advance | None = None) -> None:
@@ -59,7 +58,7 @@ class Ticks:
         self._after_work = free_memory.AfterWork()
 
     def tick(self, force_cold: bool, work: float) -> Answer | None:
-        """Solve, if there is anything new; see :meth:`OnlineEstimator.tick`."""
+        """Solve, if there is anything new; see :meth:`~rotavg_ros.online.estimator.OnlineEstimator.tick`."""
         with self._lock:
             started = time.perf_counter()
             answer = self._tick(force_cold, work)
@@ -69,7 +68,10 @@ class Ticks:
             return replace(answer, seconds=time.perf_counter() - started)
 
     def go_on(self, work: float) -> float:
-        """Continue with the work that the last tick has left; see :meth:`OnlineEstimator.go_on`."""
+        """Continue with the work that the last tick has left.
+
+        See :meth:`~rotavg_ros.online.estimator.OnlineEstimator.go_on`.
+        """
         if self._advance is None:
             return 0.0
         current = self._current
