@@ -9,8 +9,8 @@ carry no information about the orientations. The canonical form chooses them by 
 - Edges run from the earlier node to the later one and are sorted by both.
 - Cameras' axes: those of the second moment Σ s sᵀ of all edges, where s is x, y, z of an edge's quaternion. Turning the
   cameras' axes by A, R̃_uv → A R̃_uv A⁻¹, turns every s by A, and so the moment's axes. y has the largest moment, z the
-  least. An axis has the direction of Σ_v |b_v|² b_v, where b_v = Σ_u s_uv over the edges that arrive at v; this is odd
-  in s, but does not depend on the direction in which an edge was stated.
+  least. An axis is directed so that Σ_v |b_v|² b_v has a positive component along it, where b_v = Σ_u s_uv over the
+  edges that arrive at v. This sum is odd in s, but does not depend on the direction in which an edge was stated.
 
 If the data are the same for several nodes or axes, any of them is taken, since it makes no difference.
 """

@@ -56,7 +56,8 @@ class TwoLabels:
         gains = np.flatnonzero((if_target < 0) | (if_source < 0))
         edge, question = np.divmod(gains, count)
         target_turns, source_turns = if_target.take(gains), if_source.take(gains)
-        # The gain of turning one end is assigned to that node. Turning the other end loses as much, which the arc has.
+        # The gain of turning one end is assigned to that node. Turning the other end loses as much, which the arc
+        # accounts for.
         is_target = target_turns < source_turns
         rest = np.maximum(target_turns + source_turns, 0)
         if_target.put(gains, np.where(is_target, 0.0, rest))
@@ -100,7 +101,7 @@ class TwoLabels:
 
 
 class FlowNetwork:
-    """A graph laid out for repeated maximum flows: every edge in both directions, and every node's arcs of terminals.
+    """A graph laid out for repeated maximum flows: every edge in both directions, and terminal arcs at every node.
 
     Args:
         num_nodes: N.

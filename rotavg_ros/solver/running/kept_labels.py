@@ -19,7 +19,7 @@ _TYPES = {"places": np.float32}
 class KeptLabels:
     """Labels of a solve. Given in place of its memory, they lead at once to about the same solution.
 
-    Edges that no solve has judged are NaN.
+    Values of edges that no solve has judged are NaN.
 
     Attributes:
         graph: its first M edges have the labels.

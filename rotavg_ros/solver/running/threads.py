@@ -105,7 +105,7 @@ def workers() -> Iterator[None]:
 
 @contextmanager
 def without_workers() -> Iterator[None]:
-    """Inside, a solve within :func:`workers` waits and counts as having left it."""
+    """Inside, a solve that waits within :func:`workers` counts as having left it."""
     _crew.leave()
     try:
         yield

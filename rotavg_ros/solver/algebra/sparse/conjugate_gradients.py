@@ -12,7 +12,7 @@ from rotavg_ros.solver.running.work import stop_if_abandoned
 
 
 class Systems(Protocol):
-    """How vectors consist of the S systems that are solved at once."""
+    """How vectors are divided into the S systems that are solved at once."""
 
     def dot(self, a: Tensor, b: Tensor) -> Tensor:
         """Inner products ``(S,)``."""
@@ -49,7 +49,7 @@ def conjugate_gradients(
 
     Args:
         product, precondition: ``L x`` and ``M⁻¹ x`` of vectors like ``b``; L positive semidefinite, M near L.
-        right_hand_side: ``b``, of any shape that ``systems`` knows.
+        right_hand_side: ``b``, of any shape that ``systems`` can divide.
     """
     solution, residual = torch.zeros_like(right_hand_side), right_hand_side.clone()
     scaled = precondition(residual)

@@ -1,4 +1,4 @@
-"""Where a sparse factor has entries: the elimination tree (Liu 1990)."""
+"""The pattern of a sparse factor, from its elimination tree (Liu 1990)."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ class MixtureFit:
         self._constant = float(self._weight @ log_false)
 
     def maximise(self, models: Mixtures, iterations: int, *, hold_step: bool = False) -> tuple[Mixtures, np.ndarray]:
-        """Iterate each model, until none gains; also the log-likelihoods ``(S,)`` before the last iteration.
+        """Iterate the models until none gains; returns also the log-likelihoods ``(S,)`` before the last iteration.
 
         Args:
             iterations: largest number.

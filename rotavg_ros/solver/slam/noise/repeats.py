@@ -16,7 +16,7 @@ from rotavg_ros.solver.algebra.compiled import compiled
 
 # Widths of the kernels: standard deviations of the difference between repeats, degrees.
 REPEAT_DEG = 0.05 * 2.0 ** np.arange(9)
-# Either one of the widths for all closures, or all of them, equally likely for each closure.
+# Kernels: either of one of the widths for all closures, or of all widths, equally likely for each closure.
 KERNELS = len(REPEAT_DEG) + 1
 # Estimates: over the run, over those detected shortly before, over all.
 _WHOSE = 3
