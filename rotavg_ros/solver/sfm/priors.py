@@ -197,8 +197,8 @@ class RefinementPriors:
         telling_steps: number of shaped steps after which starts are compared. With none, the coarse steps decide, a
             quarter faster and 1 % worse; with twice as many, 1 % better and a fifth slower
             (``docs/diary/sfm-refinement.md``).
-        same_valley: relative difference of costs below which two starts may lead to the same minimum and differ only in
-            where the steps stopped.
+        same_valley: relative difference of costs below which two solutions in which nearly all cameras agree may differ
+            only in where the steps stopped.
         hopeless: a start is given up whose cost exceeds the least by this share: after its coarse steps, or before
             any if it was found from a subset of the edges.
         rival_cost: largest relative excess of the cost of a solution that is refined beside the best one.

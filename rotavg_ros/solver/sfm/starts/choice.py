@@ -215,9 +215,9 @@ def settle_best(
 ) -> Best:
     """:func:`settle` from ``begun`` and from its rival; each component keeps the result of lower cost.
 
-    Likelihoods decide no better: of 46 tuning graphs with rivals the two disagreed on 11, and the cost was right about
-    those with larger differences (``docs/diary/sfm-refinement.md``). But where they disagree or hardly differ, the
-    answer is doubtful.
+    Likelihoods decide no better: of 50 tuning graphs with a rival the two disagreed on 10, and the cost was right about
+    6, among them the two with the largest differences. But where the edges are hardly likelier under the answer, or
+    less so, it is doubtful.
     """
     weights = weights._replace(coarse=begun.coarse)
 
