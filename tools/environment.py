@@ -16,6 +16,7 @@ import sys
 import sysconfig
 import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -46,7 +47,7 @@ class SetupError(Exception):
 def main(for_tests: bool = False) -> None:
     steps = [install_requirements, build_workspace, install_package]
     if for_tests:
-        steps.append(build_test_interfaces)
+        steps.append(prepare_tests)
     started = time.monotonic()
     try:
         check_machine()
@@ -110,7 +111,8 @@ def install_requirements() -> bool:
         if stale:
             say("installing the pinned requirements (some minutes and 2 GB the first time)")
             files = [argument for file in REQUIREMENTS for argument in ("--requirement", file)]
-            pip("install", "--constraint", CONSTRAINTS, *files)
+            pip("install", "--no-compile", "--constraint", CONSTRAINTS, *files)
+            compile_bytecode()
             python_include = ask_venv("import sysconfig; print(sysconfig.get_paths()['include'])")[0]
             numpy_include = ask_venv("import numpy; print(numpy.get_include())")[0]
             repair_cmake_exports(VENV, Path(python_include), Path(numpy_include))
@@ -135,6 +137,14 @@ def build_workspace() -> bool:
     return stale
 
 
+def prepare_tests() -> bool:
+    """Both at once, for numba takes one core."""
+    with ThreadPoolExecutor() as pool:
+        begun = [pool.submit(step) for step in (build_test_interfaces, compile_loops)]
+    done = [step.result() for step in begun]
+    return any(done)
+
+
 def build_test_interfaces() -> bool:
     """Build stand-ins for others' message packages, apart from the workspace: only tests that ask for them see them."""
     packages = sorted(folder.parent for folder in TEST_INTERFACES.glob("*/package.xml"))
@@ -148,6 +158,20 @@ def build_test_interfaces() -> bool:
                 *("--build-base", str(TEST_BUILD), "--install-base", str(TEST_BUILD / "install"), "--merge-install"),
                 *COLCON_BUILD_OPTIONS,
             )
+    return stale
+
+
+def compile_loops() -> bool:
+    """Have numba compile the solver's loops; else each process of the tests begins with that, for a minute.
+
+    If it fails, the tests tell why.
+    """
+    program = Path(__file__).with_name("compile_loops.py")
+    sources = [file for file in sorted((ROOT / "rotavg_ros").rglob("*.py")) if b"@compiled" in file.read_bytes()]
+    with stamp("machine_code", [*sources, program, CONSTRAINTS]) as stale:
+        if stale:
+            say("compiling the solver's loops for the tests")
+            subprocess.run([str(VENV / "bin" / "python"), str(program)], cwd=ROOT, check=False, capture_output=True)
     return stale
 
 
@@ -186,6 +210,13 @@ def ask_venv(code: str) -> list[str]:
     return answer.stdout.splitlines()
 
 
+def compile_bytecode() -> None:
+    """Compile what is installed, on all cores; pip takes a minute for it on one. What no Python can compile is left."""
+    folders = VENV.glob("lib/python3.*/site-packages")
+    command = [str(VENV / "bin" / "python"), "-m", "compileall", "-q", "-j", "0", *map(str, folders)]
+    subprocess.run(command, env=clean_environment(), check=False, capture_output=True)
+
+
 def pip(*arguments: str | Path) -> None:
     """Run the environment's pip; a terminal shows in one line what it is at, an error brings all that it said."""
     command = [VENV / "bin" / "python", "-m", "pip", "--disable-pip-version-check", *arguments]
@@ -219,7 +250,9 @@ def clean_environment() -> dict[str, str]:
     foreign = ("AMENT_", "CMAKE_", "COLCON_", "ROS_", "PYTHON", "VIRTUAL_ENV", "LD_LIBRARY_PATH", "_ROS_WHEELS")
     kept = {name: value for name, value in os.environ.items() if not name.startswith(foreign)}
     path = f"{VENV / 'bin'}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
-    return {**kept, "PATH": path, "AMENT_PREFIX_PATH": str(VENV), "CMAKE_PREFIX_PATH": str(VENV), OPT_OUT: "1"}
+    ours = {"PATH": path, "AMENT_PREFIX_PATH": str(VENV), "CMAKE_PREFIX_PATH": str(VENV), OPT_OUT: "1"}
+    # Else colcon has make begin no second job while the load is as high as cores are many.
+    return {**kept, **ours, "MAKEFLAGS": f"-j{len(os.sched_getaffinity(0))}"}
 
 
 def run(command: list[str | Path], environ: dict[str, str] | None = None, output: bool = False) -> str:

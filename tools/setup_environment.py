@@ -2,7 +2,8 @@
 
 Usage: python3 tools/setup_environment.py [--for-tests]
 
-With --for-tests it also builds the message packages below test/interfaces/, into build/test_interfaces.
+With --for-tests it also builds the message packages below test/interfaces/, into build/test_interfaces, and has numba
+compile the solver's loops.
 
 Every step is skipped when its inputs have not changed since it last succeeded, so a second call takes seconds and an
 interrupted one goes on where it stopped. This file stays free of new syntax, so that an old Python can still say what
