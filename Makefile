@@ -1,9 +1,11 @@
 # Two commands: `make demo` and `make test`. Both set everything up by themselves in .venv, build, install and log.
+# `make test-large` runs what takes long by nature and `make test` leaves out.
 
 PYTHON ?= python3
 BIN := .venv/bin
+AT_A_TIME := -n 3 --dist loadfile --no-loadscope-reorder
 
-.PHONY: setup demo test bench lint clean
+.PHONY: setup demo test test-large bench lint clean
 
 setup:
 	@$(PYTHON) tools/setup_environment.py
@@ -14,10 +16,15 @@ demo: setup
 		$(if $(STAMPS),--stamps "$(STAMPS)")
 
 # make test [ARGS="-k node -x"]; without ARGS several files at a time (those over DDS mostly wait, and have few tests each:
-# by number of tests they would come last), without the largest graphs
+# by number of tests they would come last), without those of test-large
 test:
 	@$(PYTHON) tools/setup_environment.py --for-tests
-	@$(BIN)/python -m pytest $(if $(strip $(ARGS)),$(ARGS),-n 3 --dist loadfile --no-loadscope-reorder -m "not large")
+	@$(BIN)/python -m pytest $(if $(strip $(ARGS)),$(ARGS),$(AT_A_TIME) -m "not large")
+
+# After a change of solver, online or node, and before a release.
+test-large:
+	@$(PYTHON) tools/setup_environment.py --for-tests
+	@$(BIN)/python -m pytest $(AT_A_TIME) -m large
 
 # make bench [ARGS="--minutes 5 --max-pairs 200000"]: beside COLMAP and GTSAM, and the node under load; docs/results/
 bench: setup

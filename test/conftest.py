@@ -41,8 +41,8 @@ os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="rotavg-test-log-")
 atexit.register(shutil.rmtree, os.environ["ROS_LOG_DIR"], ignore_errors=True)
 os.environ["MPLBACKEND"] = "Agg"
 
-# No test measures wall-clock time, hypothesis' deadline per example included.
-settings.register_profile("rotavg", deadline=None)
+# No test measures wall-clock time, hypothesis' deadline per example included. New examples come with every run.
+settings.register_profile("rotavg", deadline=None, max_examples=30)
 settings.load_profile("rotavg")
 
 torch.set_num_threads(min(MAX_THREADS, os.cpu_count() or 1))

@@ -44,6 +44,7 @@ def test_help_says_what_can_go_wrong(function: object) -> None:
     assert "Returns:" in (function.__doc__ or "") or function not in (solve, solve_batch)
 
 
+@pytest.mark.large
 def test_type_checkers_know_what_is_imported_late(tmp_path: Path) -> None:
     pytest.importorskip("mypy")
     (tmp_path / "user.py").write_text(

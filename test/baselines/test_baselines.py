@@ -89,7 +89,7 @@ def test_a_wrong_start_is_forgotten(name: str, tolerance: float) -> None:
 
 
 @every_method
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.large) for seed in (1, 2))])
 def test_thirty_percent_outliers(method: Baseline, seed: int) -> None:
     """On all pairs, so that outliers are nowhere the majority, where ℓ1 would follow them."""
     graph, truth = dense_graph(40, seed, noise=np.radians(1), outlier_share=0.3, pair_share=1.0)
@@ -104,7 +104,7 @@ def test_warm_start_from_every_other_method(method: Baseline) -> None:
 
 
 @every_method
-@settings(max_examples=10)
+@settings(max_examples=3)
 @given(seed=st.integers(0, 2**16))
 def test_the_gauge_of_the_start_does_not_matter(method: Baseline, seed: int) -> None:
     graph, truth = dense_graph(12, seed=5, noise=0.02, outlier_share=0.1)
@@ -114,7 +114,7 @@ def test_the_gauge_of_the_start_does_not_matter(method: Baseline, seed: int) -> 
 
 
 @every_method
-@settings(max_examples=10)
+@settings(max_examples=3)
 @given(seed=st.integers(0, 2**16))
 def test_numbering_does_not_matter(method: Baseline, seed: int) -> None:
     """Nodes permuted, edges shuffled, some of them turned round; from a given start, since trees break ties."""
@@ -136,7 +136,7 @@ def test_numbering_does_not_matter(method: Baseline, seed: int) -> None:
 
 
 @every_method
-@settings(max_examples=20)
+@settings(max_examples=6)
 @given(seed=st.integers(0, 2**16), num_edges=st.integers(1, 30))
 def test_nonsense_gives_rotations(method: Baseline, seed: int, num_edges: int) -> None:
     generator = torch.Generator().manual_seed(seed)

@@ -233,7 +233,10 @@ def test_paths_that_cannot_be_looked_at(
         assert "permission denied; check the" in refused(capsys, *command)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGINT, *(pytest.param(number, marks=pytest.mark.large) for number in (signal.SIGTERM, signal.SIGHUP))],
+)
 def test_interrupt(graph_path: Path, tmp_path: Path, number: signal.Signals) -> None:
     """While a graph is being read."""
     stuck = "import os, signal, time; from rotavg_ros.datasets.files import g2o"

@@ -97,6 +97,7 @@ def test_robustness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert [row["mean °"] for row in again] == [row["mean °"] for row in rows[24:27]] * 2
 
 
+@pytest.mark.large
 @pytest.mark.usefixtures("tiny_rows")
 def test_the_page_of_robustness_is_there_after_every_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An interruption in the second row leaves the first, and no third is begun."""
@@ -117,6 +118,7 @@ def test_the_page_of_robustness_is_there_after_every_row(tmp_path: Path, monkeyp
 
 
 @pytest.mark.usefixtures("tiny_rows")
+@pytest.mark.large
 def test_what_was_solved_of_a_row_that_was_interrupted_is_shown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -142,6 +144,7 @@ def test_what_was_solved_of_a_row_that_was_interrupted_is_shown(
 
 
 @pytest.mark.usefixtures("tiny_rows")
+@pytest.mark.large
 def test_the_page_of_robustness_keeps_what_other_runs_have_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -26,8 +26,14 @@ def share_of_false_closures(graph_file: GraphFile) -> float:
     return float((noise[~graph.is_odometry.numpy()] > np.radians(10)).mean())
 
 
-@pytest.mark.parametrize("world", ["building", "city"])
-@pytest.mark.parametrize("dimensions", ["2", "3"])
+@pytest.mark.parametrize(
+    ("world", "dimensions"),
+    [
+        ("building", "2"),
+        ("city", "3"),
+        *(pytest.param(*case, marks=pytest.mark.large) for case in (("building", "3"), ("city", "2"))),
+    ],
+)
 def test_a_run_as_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str], world: str, dimensions: str) -> None:
     options = ["--world", world, "--dimensions", dimensions, "--false-share", "0.4", "--grouped"]
     run = simulate(tmp_path / "run", *options)

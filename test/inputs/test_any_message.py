@@ -92,7 +92,7 @@ MESSAGES = {
 
 @pytest.mark.parametrize("type_name", EDGE_CONVERTERS)
 @given(data=st.data())
-@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.too_slow])
 def test_whatever_a_message_says_what_comes_out_is_sound(type_name: str, data) -> None:
     """Nothing raises, and only unit quaternions, sound precisions and proper edges get into the graph."""
     estimator = OnlineEstimator(EstimatorOptions(keyframe_source="edges"), lambda *_, **__: None)

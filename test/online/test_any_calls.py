@@ -199,7 +199,9 @@ class Calls(RuleBasedStateMachine):
             assert np.degrees((first.inv() * second).magnitude().max()) < TOLERANCE_DEG
 
 
-@pytest.mark.parametrize("length", [12, 30])
-def test_any_calls_in_any_order(length: int) -> None:
-    limits = settings(max_examples=50, stateful_step_count=length, derandomize=True)
+@pytest.mark.parametrize(
+    ("length", "examples"), [(12, 15), (30, 5), *(pytest.param(n, 50, marks=pytest.mark.large) for n in (12, 30))]
+)
+def test_any_calls_in_any_order(length: int, examples: int) -> None:
+    limits = settings(max_examples=examples, stateful_step_count=length, derandomize=True)
     run_state_machine_as_test(Calls, settings=limits)

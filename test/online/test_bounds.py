@@ -26,7 +26,7 @@ def test_memory_stays_flat_however_long_it_drives() -> None:
     )
     online = OnlineEstimator(options, lambda *_, **__: None)
     blocks = []
-    for index in range(6000):
+    for index in range(3000):
         stamp_ns = index * SECOND // 2
         angle = 0.5 * np.sin(0.001 * index)
         online.add_odometry("r", stamp_ns, (0.0, 0.0, np.sin(angle), np.cos(angle)), (0, 0, 0))
@@ -34,13 +34,13 @@ def test_memory_stays_flat_however_long_it_drives() -> None:
             target = KeyframeReference("r" if index % 4 else f"ghost {index}", stamp_ns=stamp_ns)
             source = KeyframeReference("r", stamp_ns=max(0, stamp_ns - 10 * SECOND))
             online.add_edge(EdgeMeasurement(index, source, target, IDENTITY))
-        if index in (3999, 5999):
+        if index in (1999, 2999):
             gc.collect()
             blocks.append(sys.getallocatedblocks())
     counts = online.counts()
     assert 90 <= counts.keyframes <= 100 and counts.edges <= 300 + 50 and counts.pending <= 50
-    assert counts.marginalized > 500 and counts.dropped_closures > 100 and not counts.is_full
-    assert blocks[1] < blocks[0] + 500  # Python's objects, in 2000 messages
+    assert counts.marginalized > 250 and counts.dropped_closures > 50 and not counts.is_full
+    assert blocks[1] < blocks[0] + 250  # Python's objects, in 1000 messages
 
 
 def test_where_nothing_can_be_spared_a_full_graph_ties_edges_to_what_there_is() -> None:

@@ -33,8 +33,15 @@ def error_deg(case: DrawnGraph, graph: ViewGraph, answer: Answer) -> float:
     return float(np.degrees(orientation_errors(found, truth, graph.components()).numpy().mean()))
 
 
-@pytest.mark.parametrize("with_places", [False, True])
-@pytest.mark.parametrize("kind", ["building: 30 % random", "hills: 30 % grouped"])
+@pytest.mark.parametrize(
+    ("kind", "with_places"),
+    [
+        ("building: 30 % random", False),
+        ("hills: 30 % grouped", True),
+        pytest.param("building: 30 % random", True, marks=pytest.mark.large),
+        pytest.param("hills: 30 % grouped", False, marks=pytest.mark.large),
+    ],
+)
 def test_a_robot_that_was_switched_off_and_on_is_joined_at_once(kind: str, with_places: bool) -> None:
     case = next(one for one in KINDS if one.name == kind).drawn(1)
     graph = replace(case.graph, translation=torch.from_numpy(case.edge_translation) if with_places else None)

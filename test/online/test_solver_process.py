@@ -133,7 +133,7 @@ def test_a_process_that_dies_is_an_error_and_the_next_solve_starts_another():
             time.sleep(0.01)
         assert solver(small, **OPTIONS).method == "neurora"
         assert solver.pid != before
-        large = graph(20_000)
+        large = graph(6000)
         threading.Timer(0.3, os.kill, (solver.pid, signal.SIGKILL)).start()
         with pytest.raises(UserError, match=r"the solver's process has died \(exit code -9"):
             solver(large, **OPTIONS)
@@ -202,6 +202,7 @@ assert solver(graph).method == "neurora" and solver.pid == copy.pid
 """
 
 
+@pytest.mark.large
 def test_a_copy_that_dies_is_followed_by_another_interpreter():
     code = """\
 os.kill(copy.pid, signal.SIGKILL)
@@ -221,13 +222,20 @@ assert solver(graph).method == "neurora" and solver.pid != copy.pid
     )
 
 
+@pytest.mark.large
 def test_a_copy_outlives_the_terminal_where_whoever_made_it_does():
     ignoring = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
     code = "os.kill(solver.pid, signal.SIGHUP)\nassert solver(graph).method == 'neurora' and solver.pid == copy.pid\n"
     subprocess.run([sys.executable, "-c", ignoring + _WITH_A_COPY + code], check=True, timeout=120)
 
 
-@pytest.mark.parametrize("end", ["solver.close()", "os._exit(0)", "os.kill(os.getpid(), signal.SIGKILL)", ""])
+@pytest.mark.parametrize(
+    "end",
+    [
+        "os.kill(os.getpid(), signal.SIGKILL)",
+        *(pytest.param(end, marks=pytest.mark.large) for end in ("solver.close()", "os._exit(0)", "")),
+    ],
+)
 def test_no_copy_outlives_whoever_made_it(end: str):
     code = f"print(solver.pid, flush=True)\n{end}\n"
     ended = subprocess.run([sys.executable, "-c", _WITH_A_COPY + code], capture_output=True, text=True, timeout=120)
@@ -238,6 +246,7 @@ def test_no_copy_outlives_whoever_made_it(end: str):
         time.sleep(0.01)
 
 
+@pytest.mark.large
 def test_modules_of_the_folder_where_it_is_started_are_none_of_its(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for name in ("queue", "torch", "pickle"):
         (tmp_path / f"{name}.py").write_text("raise RuntimeError('a user's own module')")

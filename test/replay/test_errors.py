@@ -266,7 +266,7 @@ def interrupt_replay(bag: Path, output: Path, number: signal.Signals, *options: 
         assert process.poll() is None, process.stderr
         assert time.monotonic() < deadline
         time.sleep(0.1)
-    time.sleep(3)  # the first message makes the first keyframe
+    time.sleep(1)  # the first message makes the first keyframe
     process.send_signal(number)
     told, complaints = process.communicate(timeout=300)
     return process.returncode, told, complaints
@@ -281,7 +281,7 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path, small: Path) -> None:
     assert not list(output.glob(".unfinished*"))
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.large)])
 def test_an_interrupted_replay_leaves_the_older_answer_alone(
     tmp_path: Path, small: Path, number: signal.Signals
 ) -> None:

@@ -35,7 +35,7 @@ def test_a_recorded_robot(
     assert summary["rejected"] == {}
 
 
-@pytest.mark.slow
+@pytest.mark.large
 def test_b25b_from_graph_to_positions(shared_data: Path, tmp_path: Path) -> None:
     graph = shared_data / "slam" / "b25b" / "B25b_0.500.g2o"
     companions = ["--stamps", str(graph.with_name("B25b_timestamps.txt"))]

@@ -18,10 +18,12 @@ from rotavg_ros.replay.plan import Input, Wishes, make_plan
 from .bag_forms import StoragePlugin, Writer
 from .conftest import SELDOM
 
+FIRST_S = 60
+
 
 @pytest.fixture(scope="module")
 def looped(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The simulated run twice, with the same stamps in its messages; closures refer to stamps or to keyframes."""
+    """The simulated run's beginning twice, with the same stamps; closures refer to stamps or to keyframes."""
     folder = tmp_path_factory.mktemp("looped") / "looped"
     writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
     with writer, BagReader(bag) as reader:
@@ -29,16 +31,18 @@ def looped(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             topic: writer.add_connection(topic, kind, typestore=typestore()) for topic, kind in reader.topics.items()
         }
         for turn in range(2):
-            later_ns = turn * (reader.end_ns - reader.start_ns + 10**9)
+            later_ns = turn * (FIRST_S + 1) * 10**9
             for message in reader.messages():
-                writer.write(connections[message.topic], message.time_ns + later_ns, message.data)
+                if message.time_ns < reader.start_ns + FIRST_S * 10**9:
+                    writer.write(connections[message.topic], message.time_ns + later_ns, message.data)
     return folder
 
 
 @pytest.fixture(scope="module")
 def once(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("once") / "answer"
-    assert main(["replay", str(bag), "--output", str(output), "--no-report", *SELDOM]) == 0
+    duration = ["--duration", str(FIRST_S)]
+    assert main(["replay", str(bag), "--output", str(output), "--no-report", *duration, *SELDOM]) == 0
     return output
 
 

@@ -74,8 +74,7 @@ def test_command_line_starts(how: str) -> None:
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("where", ["ros2 run", "pip"])
+@pytest.mark.parametrize(("where", "how"), [("ros2 run", signal.SIGINT), ("pip", signal.SIGTERM)])
 def test_node_starts_and_ends_cleanly(where, how, start_process, probe_node, wait_until) -> None:
     script = (
         executable_for_ros2_run("rotavg_node") if where == "ros2 run" else Path(sys.executable).with_name("rotavg_node")

@@ -41,7 +41,7 @@ class After:
 
 @pytest.mark.parametrize("profile", ["slam", "sfm"])
 def test_a_solve_asks_all_the_way_and_ends_at_once_when_told(profile: str) -> None:
-    graph = chain_with_closures(300, 600, EdgeKind.ODOMETRY if profile == "slam" else EdgeKind.LOOP_CLOSURE)
+    graph = chain_with_closures(150, 100, EdgeKind.ODOMETRY if profile == "slam" else EdgeKind.LOOP_CLOSURE)
     never = After(10**9)
     with abandonable(never):
         whole = solve(graph, profile=profile)

@@ -51,7 +51,7 @@ def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> Non
 
 
 def test_information_goes_along() -> None:
-    graph = _graph()
+    graph = _graph(30)
     rng = np.random.default_rng(1)
     factors = torch.from_numpy(rng.standard_normal((graph.num_edges, 3, 3)))
     information = factors @ factors.mT + 0.05 * torch.eye(3)
@@ -78,6 +78,7 @@ def test_waits_do_not_grow_with_the_graph() -> None:
     assert counts[1] <= counts[0] + 2  # a deeper tree takes a round more
 
 
+@pytest.mark.large
 def test_batches_warm_starts_and_loose_graphs_stay_together() -> None:
     """Where the graph is loosely knit, the CPU factorises; the rest is as above."""
     graphs = [_graph(), _graph(40, 0.2, 1), ViewGraph.create([], [], np.empty((0, 4)), num_nodes=3)]

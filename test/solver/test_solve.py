@@ -239,9 +239,8 @@ def test_mistakes_are_one_line(options: dict[str, object], message: str) -> None
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("name", "odometry_deg"), [pytest.param("sphere2500", 47.0, marks=pytest.mark.large), ("manhattan", 24.2)]
-)
+@pytest.mark.large
+@pytest.mark.parametrize(("name", "odometry_deg"), [("sphere2500", 47.0), ("manhattan", 24.2)])
 def test_classic_graphs_with_thirty_percent_false_closures(shared_data: Path, name: str, odometry_deg: float) -> None:
     folder = shared_data / "slam"
     graph_file = attach_truth(read_graph(folder / f"{name}.g2o"), folder / f"{name}_ground_truth.csv")

@@ -268,6 +268,7 @@ def test_a_solve_states_them_and_the_next_ones_keep_them() -> None:
     assert any("rotations inverted" in text for text in solve(inverted, method="spt").warnings)
 
 
+@pytest.mark.large
 def test_warnings_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     graph = simulated(1)
     inverted = changed(graph, rotations.inverse, ~graph.is_odometry)

@@ -191,7 +191,9 @@ def assert_gtsam_agrees(factors: gtsam.NonlinearFactorGraph, graph_file: GraphFi
         np.testing.assert_allclose(factor.measured().translation(), translation[:size], atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["sphere2500", "manhattan", "b25b/B25b_0.000"])
+@pytest.mark.parametrize(
+    "name", ["sphere2500", *(pytest.param(name, marks=pytest.mark.large) for name in ("manhattan", "b25b/B25b_0.000"))]
+)
 def test_directions_against_gtsam(shared_data: Path, tmp_path: Path, name: str) -> None:
     path = shared_data / "slam" / f"{name}.g2o"
     graph_file = read_graph(path)

@@ -102,7 +102,7 @@ def test_ate_is_evos() -> None:
     assert orientations_alone.mean_deg == found.mean_deg
 
 
-@pytest.mark.parametrize("graph", ["building", "hills"])
+@pytest.mark.parametrize("graph", [pytest.param("building", marks=pytest.mark.large), "hills"])
 def test_the_oracle_is_near_the_truth_and_judges_rightly(graph: str) -> None:
     for case in drawings(pose_cases.kinds(no_data, [f"{graph}: 30"]), [0]):
         found = score(case, ORACLE, answer_of(ORACLE, case))
@@ -122,6 +122,7 @@ def test_everyone_solves_the_tiny_case_and_says_so() -> None:
     assert set(PEERS) <= ROWS.keys()
 
 
+@pytest.mark.large
 def test_wrong_places_do_not_bend_the_positions() -> None:
     """Ours and the peers that are told the truth, beside the oracle; rotations alone flag none of them."""
     pytest.importorskip("gtsam")

@@ -16,7 +16,7 @@ from rotavg_ros.evaluation.slam import uncertainty
 from ..laps import NUM_NODES, laps
 
 
-@pytest.mark.parametrize("factor", [1.0, 2.0])
+@pytest.mark.parametrize("factor", [pytest.param(1.0, marks=pytest.mark.large), 2.0])
 def test_normalized_error_is_error_over_stated(factor: float) -> None:
     graph_file = laps()
     truth = least_squares(graph_file.graph, np.ones(graph_file.graph.num_edges, dtype=bool))

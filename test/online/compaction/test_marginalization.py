@@ -163,8 +163,8 @@ def contracted(graph: ViewGraph) -> tuple[ViewGraph, np.ndarray]:
     [
         ("grid: odometry worse in turns", False, 0.15),
         ("drive: 26 closures, 16 agree with noise", True, 0.03),
-        ("hills: gyroscope bias, 30 % random", True, 0.05),
-        ("building: odometry worse in turns", True, 0.3),
+        pytest.param("hills: gyroscope bias, 30 % random", True, 0.05, marks=pytest.mark.large),
+        pytest.param("building: odometry worse in turns", True, 0.3, marks=pytest.mark.large),
     ],
 )
 def test_nor_does_it_of_odometry_that_errs_in_turns_or_whose_translations_count(kind, translations, sigmas):

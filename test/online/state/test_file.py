@@ -238,7 +238,7 @@ def work(pipe):
             os.write(pipe, count.to_bytes(4, "little"))
 
 saved = 0
-for _ in range(50):
+for _ in range(20):
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
@@ -260,7 +260,7 @@ print(saved)
 
 
 def test_killed_at_any_moment_only_what_came_since_the_last_save_is_lost(tmp_path):
-    """Fifty processes, one after the other, that feed, solve and save, until SIGKILL at a random moment."""
+    """Twenty processes, one after the other, that feed, solve and save, until SIGKILL at a random moment."""
     command = [sys.executable, "-c", KILL, tmp_path / "state.npz"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
     assert ended.returncode == 0, ended.stderr

@@ -49,7 +49,7 @@ def apart_deg(one: Answer, other: Answer) -> float:
     return float(np.degrees(2 * np.arccos(np.minimum(cosine, 1.0))).max())
 
 
-@pytest.mark.parametrize("with_places", [False, True])
+@pytest.mark.parametrize("with_places", [False, pytest.param(True, marks=pytest.mark.large)])
 def test_it_answers_at_once_and_ends_where_a_solve_from_nothing_does(with_places: bool, tmp_path: Path) -> None:
     graph, path = drawn(with_places), tmp_path / "state.npz"
     online = OnlineEstimator(OPTIONS)
@@ -125,6 +125,7 @@ def test_labels_of_another_graph_are_not_kept(tmp_path: Path) -> None:
     assert not is_without_a_search(answered(loaded(path)))
 
 
+@pytest.mark.large
 def test_other_options_other_answers(tmp_path: Path) -> None:
     graph, path = drawn(True), tmp_path / "state.npz"
     online = OnlineEstimator(OPTIONS)

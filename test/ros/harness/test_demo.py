@@ -13,7 +13,7 @@ import pytest
 from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.simulation.slam_simulation import SlamSimulationConfig, simulate_slam_graph
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow]
+pytestmark = pytest.mark.ros
 
 ROTAVG = [sys.executable, "-m", "rotavg_ros.cli.main"]
 PATIENCE_S = 180.0
@@ -21,7 +21,7 @@ PATIENCE_S = 180.0
 
 def test_a_simulated_run(tmp_path: Path, start_process: Callable) -> None:
     output = tmp_path / "demo"
-    demo = start_process(*ROTAVG, "demo", "--output", output, "--laps", "2", "--seed", "1")
+    demo = start_process(*ROTAVG, "demo", "--output", output, "--laps", "1", "--seed", "1")
     assert demo.wait(PATIENCE_S) == 0, demo.output
     summary = json.loads((output / "summary.json").read_text())
     errors, false = summary["orientation_error_deg"], summary["false_closures"]
@@ -34,14 +34,15 @@ def test_a_simulated_run(tmp_path: Path, start_process: Callable) -> None:
         assert words in demo.output
 
 
+@pytest.mark.large
 def test_somebodys_own_graph_without_truth(tmp_path: Path, start_process: Callable) -> None:
-    run = simulate_slam_graph(SlamSimulationConfig(num_keyframes=400), np.random.default_rng(0))
+    run = simulate_slam_graph(SlamSimulationConfig(num_keyframes=200), np.random.default_rng(0))
     write_graph(tmp_path / "mine.g2o", run.to_graph_file())
     output = tmp_path / "demo"
-    demo = start_process(*ROTAVG, "demo", "--graph", tmp_path / "mine.g2o", "--output", output, "--rate", "20")
+    demo = start_process(*ROTAVG, "demo", "--graph", tmp_path / "mine.g2o", "--output", output, "--rate", "60")
     assert demo.wait(PATIENCE_S) == 0, demo.output
     summary = json.loads((output / "summary.json").read_text())
-    assert summary["keyframes"] == 400
+    assert summary["keyframes"] == 200
     assert summary["orientation_error_deg"] is None
     assert "no ground truth was given" in demo.output
 

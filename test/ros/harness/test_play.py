@@ -82,6 +82,7 @@ def test_a_burst_arrives_whole_and_unchanged(
     assert f"{1500} on /odom" in player.output
 
 
+@pytest.mark.large
 def test_the_rate_is_kept_for_a_sensor_subscriber(
     bag: Path, probe_node: rclpy.node.Node, start_process: Callable
 ) -> None:
@@ -128,13 +129,14 @@ def test_a_subscriber_that_hangs_is_told_of(
     subscriber.stop(signal.SIGKILL)  # it hears no other
 
 
+@pytest.mark.large
 def test_plays_to_nobody_when_told_so(bag: Path, start_process: Callable) -> None:
     player = start_process(*ROTAVG, "play", bag, "--wait-for-subscribers", "0", "--rate", "0")
     assert player.wait() == 0
     assert "played" in player.output
 
 
-@pytest.mark.parametrize("playing", [False, True])
+@pytest.mark.parametrize("playing", [pytest.param(False, marks=pytest.mark.large), True])
 def test_interrupted(
     bag: Path, probe_node: rclpy.node.Node, start_process: Callable, playing: bool, wait_until: Callable
 ) -> None:

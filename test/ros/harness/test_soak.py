@@ -20,6 +20,7 @@ def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv(variable, "")  # the soak chooses; this puts them back
 
 
+@pytest.mark.large
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="this process may use one core alone")
 def test_a_node_on_one_core_and_on_two() -> None:
     rows = small_robots.run([80], 2.0)

@@ -81,7 +81,9 @@ def noting(live_node, tmp_path: Path) -> NotingNode:
     return NotingNode(live_node, tmp_path)
 
 
-@pytest.mark.parametrize("service", ["reset", "load", "pause"])
+@pytest.mark.parametrize(
+    "service", ["reset", *(pytest.param(name, marks=pytest.mark.large) for name in ("load", "pause"))]
+)
 def test_services_answer_while_a_solve_blocks_and_have_it_end(noting: NotingNode, tmp_path: Path, service: str) -> None:
     live = noting.live
     noting.start(*EVERY_MESSAGE, f"state_file:={tmp_path / 'state.npz'}")
@@ -107,6 +109,7 @@ def test_services_answer_while_a_solve_blocks_and_have_it_end(noting: NotingNode
     assert live.status["level"] == ("0" if service == "pause" else "1")
 
 
+@pytest.mark.large
 def test_who_waits_for_an_answer_is_told_that_it_was_abandoned(noting: NotingNode) -> None:
     live = noting.live
     noting.start(*EVERY_MESSAGE[:2], "solve_period_s:=3600.0")
@@ -128,6 +131,7 @@ def test_who_waits_for_an_answer_is_told_that_it_was_abandoned(noting: NotingNod
     assert nothing.success and "no keyframes" in nothing.message
 
 
+@pytest.mark.large
 def test_a_large_solve_stops(noting: NotingNode, large_array: Callable[[], RelativeRotationArray]) -> None:
     live = noting.live
     noting.start("keyframe_source:=edges", "solve_period_s:=3600.0")
@@ -167,6 +171,7 @@ def large_array() -> Callable[[], RelativeRotationArray]:
     return make
 
 
+@pytest.mark.large
 def test_a_parameter_set_on_an_empty_graph_breaks_nothing(live_node) -> None:
     from rcl_interfaces.srv import SetParameters
     from rclpy.parameter import Parameter

@@ -29,10 +29,8 @@ def rotavg(*arguments: str | Path) -> str:
 
 
 @pytest.mark.ros
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("threshold", "num_edges"), [("0.500", 8479), pytest.param("0.000", 8803, marks=pytest.mark.large)]
-)
+@pytest.mark.large
+@pytest.mark.parametrize(("threshold", "num_edges"), [("0.500", 8479), ("0.000", 8803)])
 def test_b25b_live_agrees_with_ground_truth_and_with_the_offline_solve(
     threshold: str,
     num_edges: int,

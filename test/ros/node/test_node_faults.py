@@ -155,19 +155,19 @@ def answer_to_good_stream() -> Answer:
     return answer
 
 
-def test_ten_thousand_malformed_messages_are_counted_by_reason_and_change_nothing(live_node) -> None:
+def test_a_thousand_malformed_messages_are_counted_by_reason_and_change_nothing(live_node) -> None:
     """Mixed into a good stream, on every topic."""
     live_node.start(*EVERY_MESSAGE, "pending_capacity:=1000")
     draw = random.Random(5)
-    per_kind = 1000
+    per_kind = 100
     edges = [malformed(kind, draw) for kind in KINDS for _ in range(per_kind)]
-    ghosts = [closure(10**9 + index, 0, 1) for index in range(500)]  # they wait for what never comes
+    ghosts = [closure(10**9 + index, 0, 1) for index in range(100)]  # they wait for what never comes
     for index, edge in enumerate(ghosts):
         edge.target = KeyframeReference(robot=f"ghost {index}" if index % 2 else "", id=2**64 - 2 - index)
     edges += ghosts
     draw.shuffle(edges)
-    broken = [malformed_odometry(draw.choice(ODOMETRY_KINDS), draw) for _ in range(500)]
-    rounds = 100
+    broken = [malformed_odometry(draw.choice(ODOMETRY_KINDS), draw) for _ in range(100)]
+    rounds = 50
     for number in range(rounds):
         if number < LENGTH:
             feed_good(live_node, number, number + 1)
@@ -196,7 +196,7 @@ def test_malformed_odometry_is_counted_and_changes_nothing(live_node) -> None:
     live_node.start(*EVERY_MESSAGE)
     feed_good(live_node, 0, LENGTH)
     before = live_node.wait_for_silence()
-    number = len(live_node.orientations)
+    number, expected = len(live_node.orientations), {}
     for index, reason in enumerate(
         ("nan_rotation", "zero_quaternion", "unnormalized_quaternion", "out_of_order_odometry", "repeated_stamp")
     ):
@@ -214,12 +214,14 @@ def test_malformed_odometry_is_counted_and_changes_nothing(live_node) -> None:
             message.header.stamp = Time(sec=1000 + LENGTH - 1)
         for _ in range(3):
             live_node.odometry.publish(message)
-        live_node.spin_until(lambda reason=reason: live_node.status.get(f"dropped {reason}") == "3")
+        expected[f"dropped {reason}"] = "3"
+    live_node.spin_until(lambda: expected.items() <= live_node.status.items())
     assert live_node.answers[-1] == before and len(live_node.orientations) == number
     feed_good(live_node, LENGTH, LENGTH + 5)
     assert len(live_node.wait_for_silence().keyframe_ids) == LENGTH + 5
 
 
+@pytest.mark.large
 def test_edges_to_what_never_comes_wait_within_bounds(live_node) -> None:
     live_node.start(*EVERY_MESSAGE, "pending_capacity:=100", "pending_timeout_s:=20.0")
     feed_good(live_node, 0, 10)
@@ -235,6 +237,7 @@ def test_edges_to_what_never_comes_wait_within_bounds(live_node) -> None:
     assert live_node.status["pending"] == "0"
 
 
+@pytest.mark.large
 def test_a_full_graph_goes_on_and_what_is_left_is_right(live_node) -> None:
     live_node.start(*EVERY_MESSAGE, "max_keyframes:=30")
     for index in range(100):
@@ -257,15 +260,15 @@ def test_a_full_graph_goes_on_and_what_is_left_is_right(live_node) -> None:
 def test_a_flood_is_survived_and_every_loss_counted(live_node) -> None:
     """Small queue, best effort: whatever did not come is known to be missing."""
     live_node.start(*EVERY_MESSAGE[:2], "solve_period_s:=0.2", "odometry_queue_depth:=50", reliable_odometry=False)
-    sent = 10_000
+    sent = 3000
     messages = [odometry(index) for index in range(sent)]
     for message in messages:
         live_node.odometry.publish(message)
     # The last number tells what is missing before it, so send until one gets through after the flood.
     ahead = sent
-    live_node.spin_for(2.0)
+    live_node.spin_for(1.0)
     live_node.odometry.publish(odometry(ahead))
-    live_node.spin_for(2.0)
+    live_node.spin_for(1.0)
 
     def accounted() -> int:
         status = live_node.status
@@ -280,10 +283,12 @@ def test_a_flood_is_survived_and_every_loss_counted(live_node) -> None:
     [
         ("keyframe_angle_deg:=fast", "keyframe_angle_deg is 'fast'; it must be a number"),
         ("edge_topics:=['x:nobodys_msgs/msg/Edge']", "nobodys_msgs/msg/Edge"),
-        ("qos_overrides./odom.subscription.depth:=many", "odom"),
+        pytest.param("qos_overrides./odom.subscription.depth:=many", "odom", marks=pytest.mark.large),
         ("odometry_topics:=[]", "odometry_topics is empty"),
-        ("use_sim_time:=perhaps", "use_sim_time"),
-        ("state_file:=/no/such/folder/state", "there is no folder /no/such/folder"),
+        pytest.param("use_sim_time:=perhaps", "use_sim_time", marks=pytest.mark.large),
+        pytest.param(
+            "state_file:=/no/such/folder/state", "there is no folder /no/such/folder", marks=pytest.mark.large
+        ),
         ("world_frame:=''", "world_frame is ''; name the frame"),
         ("weights:=/no/such/folder", "/no/such/folder: has no weights"),
     ],
@@ -315,7 +320,9 @@ def test_a_foreign_state_file_is_refused_at_the_start(tmp_path: Path) -> None:
     assert path.read_bytes() == content
 
 
-@pytest.mark.parametrize("kind", ["a FIFO", "a folder", "a device"])
+@pytest.mark.parametrize(
+    "kind", ["a FIFO", *(pytest.param(kind, marks=pytest.mark.large) for kind in ("a folder", "a device"))]
+)
 def test_a_state_file_that_is_no_file_is_refused_at_the_start(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "state"
     {"a FIFO": os.mkfifo, "a folder": os.mkdir, "a device": lambda path: path.symlink_to("/dev/null")}[kind](path)
@@ -326,6 +333,7 @@ def test_a_state_file_that_is_no_file_is_refused_at_the_start(tmp_path: Path, ki
     assert ended.stderr.count("\n") == 1 and os.listdir(tmp_path) == ["state"]
 
 
+@pytest.mark.large
 def test_two_nodes_on_one_state_file(live_node, tmp_path: Path) -> None:
     """The second is refused, until the first has ended, even by SIGKILL."""
     path = tmp_path / "state" / "state.npz"
@@ -375,6 +383,7 @@ def test_without_a_package_it_is_one_line(package: str) -> None:
     assert ended.stderr.count("\n") == 1
 
 
+@pytest.mark.large
 def test_a_huge_array_silences_nothing(live_node) -> None:
     """Reports come, odometry is answered and services are served while it is taken, and single edges stay behind it."""
     live_node.start("keyframe_source:=edges", "solve_period_s:=3600.0", "odometry_timeout_s:=1000.0")
@@ -396,7 +405,7 @@ def test_a_huge_array_silences_nothing(live_node) -> None:
     assert live_node.status["lost messages"] == "0"
 
 
-@pytest.mark.parametrize("damage", ["truncated", "another version"])
+@pytest.mark.parametrize("damage", ["truncated", pytest.param("another version", marks=pytest.mark.large)])
 def test_networks_that_cannot_be_used_are_told_at_the_start(tmp_path: Path, damage: str) -> None:
     """A copy of the package with damaged weights, started as it is."""
     package = shutil.copytree(Path(rotavg_ros.__file__).parent, tmp_path / "rotavg_ros")

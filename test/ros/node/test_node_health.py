@@ -54,7 +54,7 @@ def says(live_node, level: int, *words: str) -> None:
 
 def test_silence_refusals_and_contradictions_are_warned_of_and_pass(live_node) -> None:
     # A period that no solve exceeds on a busy machine, which would be warned of for a minute.
-    live_node.start(*EVERY_MESSAGE, "solve_period_s:=2.0", "odometry_timeout_s:=8.0")
+    live_node.start(*EVERY_MESSAGE, "solve_period_s:=1.0", "odometry_timeout_s:=5.0")
     says(live_node, WARN, "no odometry yet")
     live_node.turn(0, 20)
     says(live_node, OK, "ok")
@@ -77,7 +77,7 @@ def test_a_solver_that_fails_or_hangs_stops_nothing_else(live_node, tmp_path: Pa
     order = tmp_path / "order"
     order.write_text("work")
     # A period that no solve exceeds on a busy machine, which would be warned of for a minute.
-    options = (*EVERY_MESSAGE, "solver_process:=false", "solve_period_s:=2.0")
+    options = (*EVERY_MESSAGE, "solver_process:=false", "solve_period_s:=1.0")
     live_node.start(*options, command=[sys.executable, "-c", SABOTAGED, order])
     live_node.turn(0, 10)
     live_node.wait_for_silence()

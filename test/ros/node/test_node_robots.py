@@ -53,6 +53,7 @@ def rotations(answer: AbsoluteOrientations) -> Rotation:
     return Rotation.from_quat(np.asarray(answer.orientations).reshape(-1, 4))
 
 
+@pytest.mark.large
 def test_three_robots_in_three_processes_and_a_node_that_listens_to_all(
     live_node, spoken, example, start_process
 ) -> None:
@@ -105,6 +106,7 @@ def test_three_robots_in_three_processes_and_a_node_that_listens_to_all(
     assert {status.name for status in statuses} == {f"{name}/rotavg: estimator" for name in ("a", "b", "c", "fleet")}
 
 
+@pytest.mark.large
 def test_nodes_of_other_domains_hear_nothing(live_node, start_process, monkeypatch, other_domain_id) -> None:
     """Two nodes, same names, same topics: only the domain keeps them apart."""
     live_node.start()

@@ -39,6 +39,7 @@ def test_a_bag_that_is_played_again_begins_a_component(live_node, tmp_path) -> N
     assert len(np.load(path)["keyframe_id"]) == 50 and os.listdir(path.parent) == ["state.npz"]
 
 
+@pytest.mark.large
 def test_what_reset_and_load_discard_is_kept_beside_the_state_file(live_node, tmp_path) -> None:
     path = tmp_path / "state.npz"
     live_node.start(*EVERY_MESSAGE, f"state_file:={path}", "autosave_period_s:=0.2", "on_time_jump:=reset")
@@ -65,6 +66,7 @@ def test_what_reset_and_load_discard_is_kept_beside_the_state_file(live_node, tm
     live_node.spin_until(lambda: live_node.status["keyframes"] == "30")
 
 
+@pytest.mark.large
 def test_with_reset_a_bag_that_is_played_again_begins_a_new_graph(live_node) -> None:
     live_node.start(*EVERY_MESSAGE, "on_time_jump:=reset")
     live_node.turn(0, 30)
@@ -80,6 +82,7 @@ def test_with_reset_a_bag_that_is_played_again_begins_a_new_graph(live_node) -> 
     assert all(len(answer.keyframe_ids) <= 20 for answer in live_node.answers[count:])
 
 
+@pytest.mark.large
 def test_a_clock_that_goes_back_is_an_error_where_that_is_asked_for(live_node) -> None:
     live_node.start(*EVERY_MESSAGE, "on_time_jump:=error")
     live_node.turn(0, 10)
@@ -92,7 +95,9 @@ def test_a_clock_that_goes_back_is_an_error_where_that_is_asked_for(live_node) -
     live_node.spin_until(lambda: live_node.status["keyframes"] == "9" and live_node.status["level"] != "2")
 
 
-@pytest.mark.parametrize(("policy", "kept"), [("new_component", "33"), ("reset", "3")])
+@pytest.mark.parametrize(
+    ("policy", "kept"), [pytest.param("new_component", "33", marks=pytest.mark.large), ("reset", "3")]
+)
 def test_simulated_time_that_restarts(live_node, policy: str, kept: str) -> None:
     """The clock tells it before any odometry does; a clock that stands still in between stops nothing."""
     live_node.start(*EVERY_MESSAGE, "use_sim_time:=true", f"on_time_jump:={policy}")

@@ -30,7 +30,6 @@ def by_edge(flags: Any, values: Sequence[float]) -> dict[tuple[int, ...], float]
 
 
 @pytest.mark.ros
-@pytest.mark.slow
 def test_a_replay_says_what_the_live_node_says(tmp_path: Path, live_node, start_process) -> None:
     run = simulate_slam_graph(RobotRun(laps=1.5, false_share=0.4, dimensions=3).config(), np.random.default_rng(11))
     write_run_bag(tmp_path / "bag", run)

@@ -52,8 +52,16 @@ def test_a_photo_collection_is_solved_without_numba() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
-@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
-@pytest.mark.parametrize("left", [b"", bytes(200)])
+@pytest.mark.parametrize(
+    ("suffix", "left"),
+    [
+        ("nbi", b""),
+        *(
+            pytest.param(*case, marks=pytest.mark.large)
+            for case in (("nbi", bytes(200)), ("nbc", b""), ("nbc", bytes(200)))
+        ),
+    ],
+)
 def test_what_a_power_cut_left_of_machine_code_is_made_again(suffix: str, left: bytes, tmp_path: Path) -> None:
     (tmp_path / "module.py").write_text(
         "from rotavg_ros.solver.algebra.compiled import compiled\n"

@@ -124,7 +124,14 @@ def _furthest_deg(found: Tensor, expected: Tensor) -> float:
     return float(torch.rad2deg(orientation_errors(found, expected)).max())
 
 
-@pytest.mark.parametrize("method", [*NETWORK_METHODS, "neurora-paper~axes", *BASELINES])
+# Of the baselines these two take tens of seconds.
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param(name, marks=pytest.mark.large if name in ("wang", "weiszfeld") else ())
+        for name in (*NETWORK_METHODS, "neurora-paper~axes", *BASELINES)
+    ],
+)
 @pytest.mark.parametrize("kind", ["released", "paper"])
 def test_the_cameras_axes_do_not_matter(kind: str, method: str) -> None:
     sample = SAMPLES[kind]

@@ -32,9 +32,11 @@ def renumbered(graph: ViewGraph, rng: np.random.Generator) -> tuple[ViewGraph, t
     "kind",
     [
         "building: 30 % random",
-        "sphere: 50 % random",
-        "grid: 30 % near misses in groups",
         "hills: gyroscope bias, 30 % random",
+        *(
+            pytest.param(kind, marks=pytest.mark.large)
+            for kind in ("sphere: 50 % random", "grid: 30 % near misses in groups")
+        ),
     ],
 )
 def test_other_numbers_of_keyframes_change_nothing(kind: str) -> None:
@@ -45,7 +47,9 @@ def test_other_numbers_of_keyframes_change_nothing(kind: str) -> None:
     torch.testing.assert_close(found.outlier_score, expected.outlier_score, atol=0.01, rtol=0)
 
 
-@pytest.mark.parametrize("kind", ["building: closures of 6°", "hills: gyroscope bias, 30 % random"])
+@pytest.mark.parametrize(
+    "kind", ["building: closures of 6°", pytest.param("hills: gyroscope bias, 30 % random", marks=pytest.mark.large)]
+)
 def test_nor_do_they_with_translations(kind: str) -> None:
     graph = next(drawings(stress.kinds((kind,), translations=True), [3])).graph
     changed, number = renumbered(graph, np.random.default_rng(0))
@@ -65,7 +69,7 @@ def drawn(kind: str, seed: int) -> DrawnGraph:
     return next(each for each in KINDS if each.name == kind).drawn(seed)
 
 
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.large)])
 def test_a_slip_is_found_wherever_the_keyframe_of_the_first_number_lies(seed: int) -> None:
     """The tree has its root there; what comes before it is as far from it as what comes after."""
     graph = drawn("lone slip: 10 witnesses, three pairs of places", seed).graph
@@ -79,7 +83,7 @@ def test_a_slip_is_found_wherever_the_keyframe_of_the_first_number_lies(seed: in
     assert found.warnings == expected.warnings or len(found.warnings) == len(expected.warnings) == 1
 
 
-@pytest.mark.parametrize("seed", [0, 2, 3])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.large) for seed in (2, 3))])
 def test_a_second_robot_that_slipped_is_joined_in_the_middle_of_its_path(seed: int) -> None:
     """Closures enter its chain there. The witnesses of its slip lie on both sides."""
     one, other = drawn("building: 30 % random", seed), drawn("lone slip: 10 witnesses, three pairs of places", seed)

@@ -82,7 +82,7 @@ def test_the_network_counts_less_the_more_is_false() -> None:
     assert -2 < said[0] < said[1] < said[2] < 0
 
 
-@pytest.mark.parametrize("keyframes", [2480, 3120, 3360])
+@pytest.mark.parametrize("keyframes", [2480, *(pytest.param(count, marks=pytest.mark.large) for count in (3120, 3360))])
 def test_a_robot_whose_closures_are_mostly_false_so_far_is_hardly_worse_off(shared_data: Path, keyframes: int) -> None:
     """The moments of B25b at which false closures passed as drift and the answer was off by up to 3.7° more.
 

@@ -29,7 +29,8 @@ from rotavg_ros.ros.node.intake.wiring import Input
 pytestmark = pytest.mark.ros
 
 SPEAKER = Path(__file__).with_name("tf_speaker.py")
-EVERY_MESSAGE = ("keyframe_angle_deg:=0.0", "keyframe_distance_m:=0.0", "solve_period_s:=0.1")
+# A period that no solve exceeds on a busy machine, which would be warned of for a minute.
+EVERY_MESSAGE = ("keyframe_angle_deg:=0.0", "keyframe_distance_m:=0.0", "solve_period_s:=1.0")
 PATIENT = "odometry_timeout_s:=1000.0"
 SECONDS = 12
 CAMERAS = {
@@ -95,7 +96,11 @@ def residuals(live_node, number: int) -> tuple[float, float]:
     return flags.residuals_deg[place], flags.residuals_m[place]
 
 
-@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@pytest.mark.parametrize(
+    "camera",
+    [pytest.param(CAMERAS["about z"], marks=pytest.mark.large), CAMERAS["about x"]],
+    ids=["about z", "about x"],
+)
 def test_edges_of_a_camera_before_and_after_its_transform(
     foreign_packages, live_node, start_process, camera: Rotation
 ) -> None:
@@ -121,6 +126,7 @@ def test_edges_of_a_camera_before_and_after_its_transform(
     assert live_node.status["waiting for frames"] == "0"
 
 
+@pytest.mark.large
 def test_a_camera_that_nobody_places(foreign_packages, live_node, start_process) -> None:
     """Its edges are taken as they are, with a warning; when its transform comes after all, it counts from then on."""
     camera = CAMERAS["about x"]
@@ -152,6 +158,7 @@ def test_a_camera_that_nobody_places(foreign_packages, live_node, start_process)
     live_node.spin_until(lambda: any("is in frame camera" not in said for _, said in live_node.said))
 
 
+@pytest.mark.large
 def test_an_orientation_that_was_given_wins(foreign_packages, live_node, start_process) -> None:
     camera = MAST * CAMERAS["about x"]
     start_process(sys.executable, SPEAKER, *mounted(CAMERAS["about z"]))  # another one than the edges are measured with

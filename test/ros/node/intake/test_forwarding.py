@@ -113,6 +113,7 @@ def test_believed_closures_go_on_as_they_came_and_are_revoked_and_reinstated(liv
     assert {edge.id for edge in passed[9:]} == set(range(10)) - FALSE
 
 
+@pytest.mark.large
 def test_arrays_and_a_delay(live_node) -> None:
     passed = listen(live_node, RelativeRotationArray, "/trusted")
     start(
@@ -133,6 +134,7 @@ def test_arrays_and_a_delay(live_node) -> None:
     assert [edge for each in passed for edge in each.edges] == [edge for edge in sent if edge.id not in FALSE]
 
 
+@pytest.mark.large
 def test_closures_that_share_an_id_are_told_of(live_node) -> None:
     listen(live_node, RelativeRotation, "/trusted")
     start(live_node, "forward_topics:=['relative_rotations:trusted']")
@@ -173,9 +175,13 @@ def test_a_whole_graph_goes_out_without_its_false_edges(foreign_packages, live_n
     ("entry", "said"),
     [
         ("nothing", "'nothing' names no two topics; write topic:output"),
-        ("other:trusted", "other is none of edge_topics"),
+        pytest.param("other:trusted", "other is none of edge_topics", marks=pytest.mark.large),
         ("relative_rotations:relative_rotation_arrays", "relative_rotation_arrays is listened to; choose another"),
-        ("relative_rotations:/relative_rotations", "is /relative_rotations, which is listened to"),
+        pytest.param(
+            "relative_rotations:/relative_rotations",
+            "is /relative_rotations, which is listened to",
+            marks=pytest.mark.large,
+        ),
         ("relative_rotations:odom", "is /odom, which is listened to"),
     ],
 )

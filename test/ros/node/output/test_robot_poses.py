@@ -152,6 +152,7 @@ def test_pose_and_tf_lie_on_the_corrected_path(foreign_packages, live_node, star
     assert (Rotation.from_quat(turn).inv() * world_from_odometry).magnitude() < 1e-6
 
 
+@pytest.mark.large
 def test_a_correction_is_spread_over_time(live_node) -> None:
     run, poses = Circle(), []
     live_node.probe.create_subscription(Odometry, "/corrected_odometry", poses.append, 1000)

@@ -54,7 +54,7 @@ def _resident_mb() -> float:
     return int(line.split()[1]) / 1024
 
 
-@pytest.mark.parametrize("makes_here", [False, True])
+@pytest.mark.parametrize("makes_here", [False, pytest.param(True, marks=pytest.mark.large)])
 def test_whichever_thread_lets_go_of_it_its_memory_is_free_again(makes_here: bool) -> None:
     """SciPy's own would keep 20 MB of each."""
     matrix, held = _matrix(2000, 3e-3), []

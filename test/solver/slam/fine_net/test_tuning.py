@@ -44,7 +44,7 @@ def error_deg(case: DrawnGraph, solution: Solution) -> float:
 def test_errors_are_smaller_where_odometry_is_uneven() -> None:
     ratios = []
     for kind in ("building: uneven odometry", "hills: uneven odometry"):
-        for seed in (101, 102, 103):
+        for seed in (101,):
             case = drawn(kind, seed)
             with_it, without_it = (
                 error_deg(case, solve(case.graph, profile="slam", method=method))

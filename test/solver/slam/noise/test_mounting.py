@@ -135,9 +135,25 @@ def test_between_two_axes_it_is_exact(vector: np.ndarray) -> None:
     assert min(apart) < 1e-5 < max(apart)
 
 
-@pytest.mark.parametrize("vector", [np.radians([8.0, -9.0, 6.0]), np.radians([10.0, 5.0, -25.0]), OPTICAL])
-@pytest.mark.parametrize("kind", ["hills: 30 % random", "sphere: 30 % random", "hills: gyroscope bias, 30 % random"])
-def test_the_answer_is_what_it_would_be(kind: str, vector: np.ndarray) -> None:
+VECTORS = {"little": np.radians([8.0, -9.0, 6.0]), "more": np.radians([10.0, 5.0, -25.0]), "camera": OPTICAL}
+# One of each kind and each mounting by default.
+ALWAYS = [
+    ("hills: 30 % random", "camera"),
+    ("sphere: 30 % random", "little"),
+    ("hills: gyroscope bias, 30 % random", "more"),
+]
+
+
+@pytest.mark.parametrize(
+    ("kind", "mounting"),
+    [
+        pytest.param(kind, mounting, marks=() if (kind, mounting) in ALWAYS else pytest.mark.large)
+        for kind, _ in ALWAYS
+        for mounting in VECTORS
+    ],
+)
+def test_the_answer_is_what_it_would_be(kind: str, mounting: str) -> None:
+    vector = VECTORS[mounting]
     case, as_said = drawn(kind, 1 if kind.startswith("hills: g") else 0), solved(kind, 1 if "gyro" in kind else 0)
     graph = mounted(case.graph, vector)
     solution = solve(graph, profile="slam")
@@ -245,7 +261,10 @@ def test_rejected_closures_tell_nothing() -> None:
     assert not mounting_of(solution).any() and not any("mounted" in text for text in solution.warnings)
 
 
-@pytest.mark.parametrize("kind", ["hills: 30 % random", "sphere: 30 % random", "grid: 30 % random"])
+@pytest.mark.parametrize(
+    "kind",
+    ["hills: 30 % random", "sphere: 30 % random", pytest.param("grid: 30 % random", marks=pytest.mark.large)],
+)
 def test_a_few_degrees_are_told_and_nothing_is_turned(kind: str) -> None:
     """Odometry's axes may be at fault as well; what the note says to set is right if they are not."""
     case, vector = drawn(kind), np.radians([3.0, -3.5, 2.0])

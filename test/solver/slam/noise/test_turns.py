@@ -66,7 +66,7 @@ def test_it_does_not_depend_on_the_root(root: int) -> None:
     np.testing.assert_allclose(counted, counted_deg(turns, 1.0), rtol=1e-9)
 
 
-@pytest.mark.parametrize("seed", [0, 5])
+@pytest.mark.parametrize("seed", [0, pytest.param(5, marks=pytest.mark.large)])
 def test_no_gyroscope_is_biased_where_noise_is_as_large_as_turns_differ(seed: int, shared_data: Path) -> None:
     """On a sphere that is driven around in circles a bias turns each circle by a little, which closures hardly tell."""
     graph = read_graph(shared_data / "slam" / "sphere2500.g2o").graph

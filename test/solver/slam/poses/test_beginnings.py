@@ -14,7 +14,13 @@ from rotavg_ros.evaluation.slam import cases
 
 
 # The longest is right by rotations alone.
-@pytest.mark.parametrize("beginning", list(cases.BEGINNINGS)[:-1])
+@pytest.mark.parametrize(
+    "beginning",
+    [
+        pytest.param(name, marks=() if name == "first 20 %" else pytest.mark.large)
+        for name in list(cases.BEGINNINGS)[:-1]
+    ],
+)
 def test_no_slip_is_invented_for_corridors_seen_from_behind(shared_data: Path, beginning: str) -> None:
     """By rotations alone a slip of half a turn is as likely; none of its witnesses joins the right places."""
     kind = next(kind for kind in cases.kinds(shared_data, ["B25b_0.000"], []) if kind.name == beginning)
@@ -32,10 +38,10 @@ def test_no_slip_is_invented_for_corridors_seen_from_behind(shared_data: Path, b
     ("first", "last", "most_deg"),
     [
         # Of 61 closures none joins the right places, and 30 say one and the same wrong thing: odometry has 3.0°.
-        (0.45, 0.9, 3.5),
+        pytest.param(0.45, 0.9, 3.5, marks=pytest.mark.large),
         # Odometry has 2.8°; a slip of half a turn with none of its witnesses in place had been likelier.
         pytest.param(0.3, 1.0, 3.3, marks=pytest.mark.large),
-        (0.3, 0.7, 2.0),
+        pytest.param(0.3, 0.7, 2.0, marks=pytest.mark.large),
     ],
 )
 def test_a_stretch_of_a_real_run_by_itself_is_no_worse_than_its_odometry(

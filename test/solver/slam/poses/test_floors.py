@@ -116,12 +116,13 @@ def check(made: Building, farthest: float) -> None:
     assert np.sqrt((errors**2).mean()) < farthest
 
 
-@pytest.mark.parametrize("seed", [0, 8])
+@pytest.mark.parametrize("seed", [0, pytest.param(8, marks=pytest.mark.large)])
 def test_floors_stay_apart(seed: int) -> None:
     """No closure of another floor is believed, though runs of them would fit a map that is bent."""
     check(building(seed), 0.6)
 
 
+@pytest.mark.large
 def test_gravity_tells_floors_apart() -> None:
     """Most closures of upper floors are of another one, but odometry that hardly tilts does not lose a floor."""
     made = building(1, false_share=0.65, tilts=0.05)

@@ -51,7 +51,13 @@ def jumped(graph: ViewGraph, step: int, shift: tuple[float, float, float]) -> Vi
 
 # In the first building the second jump takes the first one back, and in the first hills they are ten steps apart:
 # neither pays by itself.
-@pytest.mark.parametrize(("world", "seed"), [("building", 5), ("building", 8), ("hills", 3), ("hills", 7)])
+@pytest.mark.parametrize(
+    ("world", "seed"),
+    [
+        ("building", 5),
+        *(pytest.param(*case, marks=pytest.mark.large) for case in (("building", 8), ("hills", 3), ("hills", 7))),
+    ],
+)
 def test_closures_across_a_jump_are_right(world: str, seed: int) -> None:
     case = case_of(f"{world}: {pose_cases.JUMPS}", seed)
     solution = solve(case.graph)
@@ -84,7 +90,7 @@ def test_false_closures_that_agree_are_no_jump(condition: str, seed: int) -> Non
     assert float(solution.outlier_score[case.graph.is_odometry].max()) < 0.05
 
 
-@pytest.mark.parametrize("share", [0.3, 0.4])
+@pytest.mark.parametrize("share", [0.3, pytest.param(0.4, marks=pytest.mark.large)])
 def test_a_robot_whose_steps_are_short_jumps_nowhere(shared_data: Path, share: float) -> None:
     """27 of the first closures agree on 13 m, at steps of 14 cm; with jumps as far as anything the map was worse."""
     graph = read_graph(shared_data / "slam" / "b25b" / "B25b_0.000.g2o").graph
@@ -95,6 +101,7 @@ def test_a_robot_whose_steps_are_short_jumps_nowhere(shared_data: Path, share: f
     assert not (solution.outlier_score > 0.5)[begun.is_odometry].any()
 
 
+@pytest.mark.large
 def test_a_jump_is_one_however_its_step_is_written() -> None:
     """From the newer end to the older one; and a map ten times as large has it at the same step."""
     case = case_of(f"building: {pose_cases.JUMPS}", 6)

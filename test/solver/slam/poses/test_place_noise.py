@@ -81,6 +81,7 @@ def test_absurd_odometry_breaks_nothing(metres: float, tells: bool) -> None:
     assert (answer.position is not None) == tells
 
 
+@pytest.mark.large
 def test_closures_that_tell_directions_rather_than_lengths() -> None:
     """Each is short by a factor of its own, as those of two views by one camera are: odometry tells lengths."""
     short, told = [], []

@@ -80,19 +80,23 @@ def held_run() -> ViewGraph:
     return held_by_gravity(simulated(2, **HILLS, closures_per_keyframe=0.3, false_share=0.2), 0.3)
 
 
-@pytest.mark.parametrize("made", [lambda: displaced(run_of(1), 0.3, 1)[0], held_run], ids=["plane", "gravity"])
+@pytest.mark.parametrize(
+    "made",
+    [lambda: displaced(run_of(1), 0.3, 1)[0], pytest.param(held_run, marks=pytest.mark.large)],
+    ids=["plane", "gravity"],
+)
 def test_updates_say_what_a_whole_solve_says(made: Callable[[], ViewGraph]) -> None:
     """And no closure's flag goes to and fro between an update, which judges by both, and a whole solve."""
     graph = made()
     answer = solve(up_to(graph, 250))
     flips, last, updates = 0, answer.outlier_score > 0.5, 0
-    for nodes in range(252, 401, 2):
+    for nodes in range(252, 321, 2):
         answer = go_on(up_to(graph, nodes), answer)
         updates += "update" in answer.stage_seconds and "refine" not in answer.stage_seconds
         flags = answer.outlier_score > 0.5
         flips += int((flags[: len(last)] != last).sum())
         last = flags
-    whole = solve(up_to(graph, 400))
+    whole = solve(up_to(graph, nodes))
     assert updates > 5
     assert answer.position is not None and answer.rotation_score is not None
     assert flips < 10

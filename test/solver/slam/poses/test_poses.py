@@ -135,7 +135,7 @@ def test_what_is_drawn_together_is_the_whole_graphs_optimum(kind: str, backward:
     assert np.degrees(off.max()) < 0.05 and apart.max() < 0.01
 
 
-@pytest.mark.parametrize("hills", [False, True])
+@pytest.mark.parametrize("hills", [False, pytest.param(True, marks=pytest.mark.large)])
 def test_translations_make_orientations_better(hills: bool) -> None:
     gained = []
     for seed in range(4):
@@ -222,7 +222,13 @@ def test_the_order_of_edges_does_not_matter() -> None:
     torch.testing.assert_close(first.outlier_score[order], second.outlier_score, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["lone slip: 5 witnesses, three", "2 robots", "grid: gyroscope bias"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "lone slip: 5 witnesses, three",
+        *(pytest.param(kind, marks=pytest.mark.large) for kind in ("2 robots", "grid: gyroscope bias")),
+    ],
+)
 def test_the_direction_of_edges_does_not_matter(kind: str) -> None:
     """A translation errs along the axes of the older end, from whichever end it is stated."""
     graph = next(drawings(stress.kinds((kind,), translations=True), [1])).graph

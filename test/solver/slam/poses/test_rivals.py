@@ -34,7 +34,10 @@ def found_of(kind: str, seed: int, without: Collection[str] = ()) -> tuple[ViewG
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("kind", "gain"), [("hills: 30 % near misses", 50.0), ("3 robots: half random", -1.0)])
+@pytest.mark.parametrize(
+    ("kind", "gain"),
+    [("hills: 30 % near misses", 50.0), pytest.param("3 robots: half random", -1.0, marks=pytest.mark.large)],
+)
 def test_a_labelling_follows_its_places_to_one_that_is_likelier(kind: str, gain: float) -> None:
     """Near misses of rotation whose places are far off; and where rotations are right already, nothing is lost."""
     graph, translation, found = found_of(kind, 6)
@@ -85,6 +88,7 @@ def test_places_are_asked_of_the_labelling_without_slips_too() -> None:
     assert [len(mode.slipped) for mode in rivals.modes] == [0]
 
 
+@pytest.mark.large
 @torch.no_grad()
 def test_begun_beside_a_labelling_of_the_same_closures_ends_as_from_nothing() -> None:
     """Slips elsewhere, or a single closure that is held otherwise: the same poses, up to where iterations rest."""

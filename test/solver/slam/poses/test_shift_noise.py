@@ -47,6 +47,7 @@ def right_verdicts(drawn: DrawnPoses) -> float:
     return float((flagged == drawn.is_wrong)[drawn.is_closure].mean())
 
 
+@pytest.mark.large
 def test_a_map_does_not_crumple_while_places_are_sorted_out() -> None:
     """Odometry of 10 % a step: were its variance free from the first solves on, it would make room for all runs."""
     drawn = city(0, 0.05)
@@ -57,12 +58,13 @@ def test_a_map_does_not_crumple_while_places_are_sorted_out() -> None:
     assert right_verdicts(drawn) > 0.97
 
 
-@pytest.mark.parametrize("seed", [1, 5])
+@pytest.mark.parametrize("seed", [1, pytest.param(5, marks=pytest.mark.large)])
 def test_false_runs_are_found_from_the_noise_that_odometry_tells(seed: int) -> None:
     """From the usual noise alone a tenth of the closures and more is judged wrongly."""
     assert right_verdicts(torus(seed)) > 0.97
 
 
+@pytest.mark.large
 @torch.no_grad()
 def test_the_noise_to_begin_with_is_what_odometry_tells() -> None:
     levels = [likeliest_level(pose_mode(city(0, step_m).graph)) for step_m in (0.0005, 0.05)]

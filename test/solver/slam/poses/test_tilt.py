@@ -79,6 +79,7 @@ def mean_error(run: SimulatedRun, graph: ViewGraph, method: str) -> float:
     return float(orientation_errors(solve(graph, method=method).body_from_world, truth).rad2deg().mean())
 
 
+@pytest.mark.large
 @pytest.mark.parametrize(("has_places", "ratio"), [(True, 0.85), (False, 0.92)])
 def test_orientations_are_better_by_it(has_places: bool, ratio: float) -> None:
     """And where nothing is held, nothing is lost."""

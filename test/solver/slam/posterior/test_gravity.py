@@ -62,7 +62,7 @@ def test_where_all_axes_err_alike_both_variances_come_out_so() -> None:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("seed", [2, 4, 5])
+@pytest.mark.parametrize("seed", [2, *(pytest.param(seed, marks=pytest.mark.large) for seed in (4, 5))])
 def test_what_errs_about_one_axis_has_no_tails_for_that(seed: int) -> None:
     """Squares of one normal component are spread like those of three that have tails."""
     run = simulated(seed, **HILLS, closures_per_keyframe=0.3, false_share=0.2)

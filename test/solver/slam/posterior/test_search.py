@@ -66,7 +66,7 @@ def test_a_slip_that_three_pairs_of_places_tell_of_is_found(witnesses: int) -> N
     assert not (solution.outlier_score.numpy() > 0.5)[case.is_closure].any()
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.large), 1])
 def test_odometry_that_is_off_by_some_degrees_now_and_then_has_wide_tails(seed: int) -> None:
     """By 3 to 13° at one percent of the steps: as slips, each would have to pay for itself."""
     case = drawn("city: small slips, 30 % grouped, noisy closures", seed)
@@ -76,7 +76,7 @@ def test_odometry_that_is_off_by_some_degrees_now_and_then_has_wide_tails(seed: 
     assert error < 0.85 * before
 
 
-@pytest.mark.parametrize("seed", [4, 14, 15])
+@pytest.mark.parametrize("seed", [4, *(pytest.param(seed, marks=pytest.mark.large) for seed in (14, 15))])
 def test_false_closures_of_a_while_are_false_together(seed: int) -> None:
     """Whatever run each is of: one by one they would cost more than bending the odometry to them."""
     kind = "building: 30 % near misses in groups"
@@ -86,7 +86,13 @@ def test_false_closures_of_a_while_are_false_together(seed: int) -> None:
     assert error_deg(case.graph, without_bursts, case.body_from_world) > 1.5
 
 
-@pytest.mark.parametrize(("kind", "seed"), [("grid: 4° steps, 50 % random", 9), ("building: 4° steps, 50 % random", 4)])
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        pytest.param("grid: 4° steps, 50 % random", 9, marks=pytest.mark.large),
+        ("building: 4° steps, 50 % random", 4),
+    ],
+)
 def test_odometry_may_err_far_more_than_is_believed_beforehand(kind: str, seed: int) -> None:
     """By thirteen times: held for as good as usual, it makes nearly all closures false."""
     case, solution = drawn(kind, seed), solved(kind, seed)
@@ -177,6 +183,7 @@ def test_there_is_an_answer_without_any_part(name: str) -> None:
     assert bool(((solution.outlier_score >= 0) & (solution.outlier_score <= 1)).all())
 
 
+@pytest.mark.large
 def test_two_stretches_that_slips_turned_alike_are_turned_back_together() -> None:
     """Closures join them to each other, so neither goes back alone."""
     kind = "building: locatable slips, 30 % random"
@@ -205,7 +212,7 @@ def test_without_repeats_slips_are_invented() -> None:
     assert error_deg(case.graph, solved(name, 0), case.body_from_world) < 1.5
 
 
-@pytest.mark.parametrize("world", ["building", "hills"])
+@pytest.mark.parametrize("world", [pytest.param("building", marks=pytest.mark.large), "hills"])
 def test_a_bias_is_taken_out_and_told_better_than_without_it(world: str) -> None:
     """Also about axes that closures tell badly; the oracle, which does not know of it, has 1.9° on hills."""
     case = drawn(f"{world}: gyroscope bias, 30 % random", 0)
@@ -220,7 +227,7 @@ def test_a_bias_is_taken_out_and_told_better_than_without_it(world: str) -> None
     assert found.cost < as_it_is.cost - 5
 
 
-@pytest.mark.parametrize("world", ["hills", "city"])
+@pytest.mark.parametrize("world", ["hills", pytest.param("city", marks=pytest.mark.large)])
 def test_odometry_that_errs_in_turns_is_recognised(world: str) -> None:
     name = f"{world}: odometry worse in turns"
     case = drawn(name, 3)

@@ -50,8 +50,14 @@ def laps(
     return graph, truth, is_false, np.isin(np.arange(len(source)), list(slips))
 
 
-@pytest.mark.parametrize("planar", [True, False])
-@pytest.mark.parametrize("false_share", [0.0, 0.3])
+@pytest.mark.parametrize(
+    ("planar", "false_share"),
+    [
+        (True, 0.0),
+        (False, 0.3),
+        *(pytest.param(*case, marks=pytest.mark.large) for case in ((True, 0.3), (False, 0.0))),
+    ],
+)
 def test_slips_and_false_closures_are_told_apart(planar: bool, false_share: float) -> None:
     graph, truth, is_false, is_slip = laps(planar, false_share)
     solution = solve(graph, profile="slam")
@@ -129,13 +135,23 @@ def test_groups_of_false_closures_do_not_pass_for_slips() -> None:
         # What the rest predicts of a closure, of passes before: 4.6 times the oracle's error.
         pytest.param("manhattan", "80 % random", 0.8, 2, 2.5, id="verdicts change much", marks=pytest.mark.large),
         # Slips that made a solution reject five of eight closures were not searched for: 300 times.
-        pytest.param("intel", slam_cases.SLIPS, 0.3, 4, 10.0, id="some agreeing closures rejected, of most"),
+        pytest.param(
+            "intel",
+            slam_cases.SLIPS,
+            0.3,
+            4,
+            10.0,
+            id="some agreeing closures rejected, of most",
+            marks=pytest.mark.large,
+        ),
         # A false group that no good closure crosses passed for a slip: 3.3 times.
         pytest.param("KITTI_06", slam_cases.GROUPED, 0.3, 18, 1.5, id="a step that a group contradicts"),
         # Nine slips, none of which pays by itself where most closures are held false, and no cuts: 67 times.
         pytest.param("CSAIL", slam_cases.LOCATABLE_SLIPS, 0.3, 100, 1.5, id="slips that only together pay"),
         # Slips that passed for wide tails of odometry, and no cuts: 7.6 instead of 2.9 degrees.
-        pytest.param("manhattan", slam_cases.LOCATABLE_SLIPS, 0.3, 0, 1.5, id="slips that tails hide"),
+        pytest.param(
+            "manhattan", slam_cases.LOCATABLE_SLIPS, 0.3, 0, 1.5, id="slips that tails hide", marks=pytest.mark.large
+        ),
         # A slip that one bundle of closures spans was not searched for: 3.8 times.
         pytest.param("KITTI_05", slam_cases.SLIPS, 0.3, 42, 1.5, id="a step that all closures contradict"),
     ],

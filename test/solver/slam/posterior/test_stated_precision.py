@@ -51,7 +51,7 @@ def with_precisions(graph: ViewGraph, stated: str, seed: int) -> ViewGraph:
     return replace(graph, precision=precision)
 
 
-def mean_errors(stated: str, num_seeds: int = 4) -> np.ndarray:
+def mean_errors(stated: str, num_seeds: int = 2) -> np.ndarray:
     errors = []
     for seed in range(num_seeds):
         solution = solve(with_precisions(run(seed).graph, stated, seed), profile="slam")

@@ -48,8 +48,14 @@ def turned_deg(one: Solution, other: Solution) -> np.ndarray:
     return np.degrees(rotations.angle_between(one.body_from_world, other.body_from_world).numpy())
 
 
-@pytest.mark.parametrize("planar", [True, False])
-@pytest.mark.parametrize("translations", [False, True])
+@pytest.mark.parametrize(
+    ("translations", "planar"),
+    [
+        (False, True),
+        (True, False),
+        *(pytest.param(*same, marks=pytest.mark.large) for same in ((False, False), (True, True))),
+    ],
+)
 def test_it_is_near_the_solve_that_follows(translations: bool, planar: bool) -> None:
     graph, is_false = drawn(translations=translations, planar=planar)
     before = solve(first(graph, KNOWN), profile="slam")
@@ -88,7 +94,7 @@ def test_it_is_near_the_solve_that_follows(translations: bool, planar: bool) -> 
         assert quick.edge_precision is not None and bool((quick.edge_precision[new[flags[0]]] == 0).all())
 
 
-@pytest.mark.parametrize("translations", [False, True])
+@pytest.mark.parametrize("translations", [False, pytest.param(True, marks=pytest.mark.large)])
 def test_the_gauge_and_the_order_of_ends_change_nothing(translations: bool) -> None:
     graph, _ = drawn(translations=translations, planar=False)
     is_new = torch.arange(graph.num_edges) >= first(graph, KNOWN).num_edges
@@ -120,8 +126,9 @@ def test_what_is_not_reckoned_in_yet_has_a_score_by_its_residual() -> None:
     assert (flagged == is_false[new]).mean() > 0.8
 
 
-@pytest.mark.parametrize("translations", [False, True])
-@pytest.mark.parametrize("number", [1, 5])
+@pytest.mark.parametrize(
+    ("number", "translations"), [(1, False), (5, True), pytest.param(1, True, marks=pytest.mark.large), (5, False)]
+)
 def test_closures_between_keyframes_that_are_known(translations: bool, number: int) -> None:
     """Nothing is new but closures: one, and some of them false."""
     graph, _ = drawn(translations=translations, planar=False)

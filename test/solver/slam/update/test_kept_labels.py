@@ -38,7 +38,7 @@ def apart_deg(one: Solution, other: Solution) -> float:
     [
         "building: 30 % random",
         "hills: gyroscope bias, 30 % random",
-        "building: locatable slips, 30 % random",
+        pytest.param("building: locatable slips, 30 % random", marks=pytest.mark.large),
         "hills: 30 % near misses in groups",
         "sphere: uneven odometry",
     ],
@@ -55,7 +55,7 @@ def test_they_lead_to_the_same_answer(kind: str) -> None:
     assert again.work < 0.3 * first.work
 
 
-@pytest.mark.parametrize("translations", [False, True])
+@pytest.mark.parametrize("translations", [False, pytest.param(True, marks=pytest.mark.large)])
 def test_a_graph_that_has_grown_goes_on_from_them(translations: bool) -> None:
     whole, _ = simulated(translations=translations, planar=True)
     before = until(whole, whole.num_nodes - 10)

@@ -225,6 +225,7 @@ def test_what_cannot_be_gone_on_from_is_solved_from_scratch_in_silence_too() -> 
     assert torch.equal(found.body_from_world, cold.body_from_world)
 
 
+@pytest.mark.large
 @pytest.mark.parametrize("with_places", [False, True])
 def test_a_graph_that_has_lost_keyframes_is_gone_on_from_by_its_labels(with_places: bool) -> None:
     """A full map drops keyframes every now and then: no tick waits for a whole search, and nothing is forgotten."""

@@ -44,7 +44,9 @@ def error_deg(graph: ViewGraph, orientation: torch.Tensor, truth: np.ndarray) ->
     return float(np.degrees(errors.numpy().mean()))
 
 
-@pytest.mark.parametrize("kind", ["building: 30 % random", "hills: gyroscope bias, 30 % random"])
+@pytest.mark.parametrize(
+    "kind", ["building: 30 % random", pytest.param("hills: gyroscope bias, 30 % random", marks=pytest.mark.large)]
+)
 def test_updates_end_where_the_whole_search_does(kind: str) -> None:
     case = drawn(kind, 1)
     count = case.graph.num_nodes - 40
@@ -65,6 +67,7 @@ def test_updates_end_where_the_whole_search_does(kind: str) -> None:
     assert int(flagged.sum()) <= 1
 
 
+@pytest.mark.large
 @pytest.mark.parametrize("degrees", [13.0, 100.0])
 def test_closures_that_come_are_turned_back_as_those_before(degrees: float) -> None:
     """With translations: by updates, from labels alone, and by the tangent before an update has ended."""
