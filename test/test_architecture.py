@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator, Mapping
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -309,9 +310,15 @@ def module_name(file: Path) -> str:
 MODULES = {module_name(file): file for file in files()}
 
 
+@cache
+def nodes_of(file: Path) -> list[ast.AST]:
+    """All that a file's syntax is made of."""
+    return list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+
+
 def imported(file: Path) -> Iterator[str]:
     """Full names of all modules that a file imports, anywhere in it, also for type checking only."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in nodes_of(file):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -417,7 +424,7 @@ def test_a_folder_holds_no_more_than_can_be_held_in_the_head() -> None:
 
 def test_parameters_that_travel_together_are_a_class() -> None:
     for name, file in MODULES.items():
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        for node in nodes_of(file):
             if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
                 given = [*node.args.posonlyargs, *node.args.args]
                 if f"{name}.{node.name}" not in BY_KEYWORD:

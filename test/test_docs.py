@@ -54,7 +54,7 @@ NOT_RUN = {
     "rotavg play b25b": "the same",
     "rotavg demo": "starts a node and plays for 12 s; test/ros/harness/test_demo.py",
     "rotavg convert B25b_0.000.g2o": "data that is no part of the repository; test/ros/node/test_node_b25b.py",
-    "python examples/three_robots.py": "test/ros runs it",
+    "python examples/three_robots.py": "minutes; `make test-large` runs it",
 }
 # Where the lines of the diagnostics come from.
 WARNING = (diagnostics, forwarding, wiring, frame_correction, parameter_server)

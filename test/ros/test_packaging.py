@@ -74,7 +74,15 @@ def test_command_line_starts(how: str) -> None:
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize(("where", "how"), [("ros2 run", signal.SIGINT), ("pip", signal.SIGTERM)])
+@pytest.mark.parametrize(
+    ("where", "how"),
+    [
+        ("ros2 run", signal.SIGINT),
+        ("pip", signal.SIGTERM),
+        pytest.param("ros2 run", signal.SIGTERM, marks=pytest.mark.large),
+        pytest.param("pip", signal.SIGINT, marks=pytest.mark.large),
+    ],
+)
 def test_node_starts_and_ends_cleanly(where, how, start_process, probe_node, wait_until) -> None:
     script = (
         executable_for_ros2_run("rotavg_node") if where == "ros2 run" else Path(sys.executable).with_name("rotavg_node")

@@ -266,9 +266,9 @@ def test_a_flood_is_survived_and_every_loss_counted(live_node) -> None:
         live_node.odometry.publish(message)
     # The last number tells what is missing before it, so send until one gets through after the flood.
     ahead = sent
-    live_node.spin_for(1.0)
+    live_node.spin_for(2.0)
     live_node.odometry.publish(odometry(ahead))
-    live_node.spin_for(1.0)
+    live_node.spin_for(2.0)
 
     def accounted() -> int:
         status = live_node.status
