@@ -21,7 +21,7 @@ PATIENCE_S = 180.0
 
 def test_a_simulated_run(tmp_path: Path, start_process: Callable) -> None:
     output = tmp_path / "demo"
-    demo = start_process(*ROTAVG, "demo", "--output", output, "--laps", "1", "--seed", "1")
+    demo = start_process(*ROTAVG, "demo", "--output", output, "--laps", "2", "--seed", "1")
     assert demo.wait(PATIENCE_S) == 0, demo.output
     summary = json.loads((output / "summary.json").read_text())
     errors, false = summary["orientation_error_deg"], summary["false_closures"]

@@ -41,7 +41,7 @@ def test_a_replay_says_what_the_live_node_says(tmp_path: Path, live_node, start_
     published = live_node.wait_for_silence()
     live_flags = live_node.flags[-1]
 
-    words = [word for setting in [*settings, "solve_period_s:=2.0"] for word in ("-p", setting)]
+    words = [word for setting in [*settings, "solve_period_s:=40.0"] for word in ("-p", setting)]
     output = ["--output", str(tmp_path / "replayed"), "--no-report"]
     assert main(["replay", str(tmp_path / "bag"), *output, *words]) == 0
     with AnyReader([tmp_path / "replayed" / "run.mcap"]) as reader:
