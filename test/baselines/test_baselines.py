@@ -96,7 +96,13 @@ def test_thirty_percent_outliers(method: Baseline, seed: int) -> None:
     assert np.degrees(worst_error(method(graph, None), truth, graph)) < 2
 
 
-@every_method
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param(method, id=name, marks=pytest.mark.large if name == "wang" else ())
+        for name, method in BASELINES.items()
+    ],
+)
 def test_warm_start_from_every_other_method(method: Baseline) -> None:
     graph, truth = dense_graph(30, seed=4, noise=np.radians(1), outlier_share=0.2)
     for other in BASELINES.values():

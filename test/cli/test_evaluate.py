@@ -277,6 +277,7 @@ def test_a_picture_is_no_folder(kind: str, folder: str, tmp_path: Path, monkeypa
     assert {path.name for path in tmp_path.iterdir()} == {"pictures", "graph.g2o", "log"}
 
 
+@pytest.mark.large
 def test_rgbd(tmp_path: Path) -> None:
     """Two folds of two scenes each; what is trained differs from the package's networks, which run beside it."""
     folder = tmp_path / "rgbd" / "redwood_fgr"

@@ -293,6 +293,7 @@ def test_an_interrupted_replay_leaves_the_older_answer_alone(
     assert {path: path.read_bytes() for path in output.iterdir()} == before
 
 
+@pytest.mark.large
 def test_the_workplace_of_a_killed_replay_is_in_nobodys_way(tmp_path: Path, small: Path) -> None:
     output = tmp_path / "out"
     assert interrupt_replay(small, output, signal.SIGKILL)[0] == -signal.SIGKILL

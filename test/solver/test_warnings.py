@@ -254,6 +254,7 @@ def _joined(a: ViewGraph, b: ViewGraph) -> ViewGraph:
     return ViewGraph.create(*both, kind=torch.cat((a.kind, b.kind)))
 
 
+@pytest.mark.large
 def test_a_solve_states_them_and_the_next_ones_keep_them() -> None:
     graph = simulated(0)
     inverted = changed(graph, rotations.inverse, ~graph.is_odometry)

@@ -26,6 +26,7 @@ def test_incremental_run_ends_like_the_batch_solve() -> None:
     assert np.isnan(run.worst_excess_deg)  # a short run settles nothing
 
 
+@pytest.mark.large
 def test_a_right_rotation_is_not_flagged_for_the_wrong_place_that_it_joins(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a case whose rotations alone are judged."""
     monkeypatch.setattr(incremental, "KEYFRAMES_PER_TICK", 250)

@@ -84,6 +84,7 @@ def test_a_node_that_dies(tmp_path: Path, start_process: Callable, wait_until: C
     assert "Traceback" not in demo.output
 
 
+@pytest.mark.large
 def test_interrupted(tmp_path: Path, start_process: Callable, wait_until: Callable) -> None:
     demo = start_process(*ROTAVG, "demo", "--output", tmp_path / "demo", "--laps", "1")
     wait_until(lambda: len(children_of(demo.pid)) > 1, demo)

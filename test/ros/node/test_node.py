@@ -143,6 +143,7 @@ def test_orientation_on_every_odometry_message(live_node) -> None:
     assert now.header.frame_id == "map"
 
 
+@pytest.mark.large
 def test_nothing_is_recomputed_when_nothing_changed(live_node) -> None:
     live_node.start("keyframe_angle_deg:=10.0", "solve_period_s:=0.05")
     feed(live_node)

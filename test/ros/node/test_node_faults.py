@@ -354,6 +354,7 @@ def test_two_nodes_on_one_state_file(live_node, tmp_path: Path) -> None:
     assert os.listdir(path.parent) == []
 
 
+@pytest.mark.large
 def test_a_clean_end_during_a_long_solve(live_node) -> None:
     """A graph that takes long to solve; the signal comes a moment after the solve has begun."""
     live_node.start("keyframe_source:=edges", "solve_period_s:=0.05")

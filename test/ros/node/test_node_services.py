@@ -63,6 +63,7 @@ def outlier(live_node, edge_id: int) -> bool:
     return bool(np.array(flags.outliers)[np.array(flags.edge_ids) == edge_id][0])
 
 
+@pytest.mark.large
 def test_solve_now_answers_with_its_solution_and_only_if_something_is_new(live_node) -> None:
     live_node.start(*EVERY_MESSAGE[:2], HOUR)
     feed(live_node, 0, 20)

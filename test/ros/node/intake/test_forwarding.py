@@ -146,6 +146,7 @@ def test_closures_that_share_an_id_are_told_of(live_node) -> None:
     live_node.spin_until(lambda: said in live_node.status["message"])
 
 
+@pytest.mark.large
 def test_a_whole_graph_goes_out_without_its_false_edges(foreign_packages, live_node, start_process) -> None:
     words = [
         "edge_topics:=['graph:rtabmap_msgs/msg/MapGraph', 'kimera:pose_graph_tools_msgs/msg/PoseGraph']",

@@ -144,6 +144,7 @@ def test_one_topic_under_two_names() -> None:
     assert ended.stderr == "rotavg_node: error: topic /odom is /odom, which is listened to already; name it once\n"
 
 
+@pytest.mark.large
 def test_tf_places_only_frames_that_can_be(foreign_packages, live_node, start_process) -> None:
     live_node.start(*EVERY_MESSAGE, PATIENT, "publish_tf:=true")
     places = start_process(sys.executable, "-c", LISTENING)

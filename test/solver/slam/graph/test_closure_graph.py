@@ -127,7 +127,7 @@ def test_graphs_without_closures_or_without_odometry() -> None:
     assert contracted.num_segments == 0 and contracted.num_nodes == 3
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.large)])
 def test_nodes_that_hang_on_a_graph_by_odometry_lie_as_in_the_grown_one(seed: int) -> None:
     """On branches, edges in either direction."""
     rng = np.random.default_rng(seed)

@@ -27,7 +27,7 @@ def _turned(graph: ViewGraph, edges: torch.Tensor) -> ViewGraph:
     return replace(graph, source=source, target=target, target_from_source=measurement)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.large) for seed in range(1, 3))])
 def test_repetitions_change_nothing(seed: int) -> None:
     """Edges that are there up to five times, in either direction and any order: the answer of the graph without."""
     graph = _noisy_graph(60, 30, seed)
@@ -42,7 +42,7 @@ def test_repetitions_change_nothing(seed: int) -> None:
     torch.testing.assert_close(often.outlier_score, once.outlier_score[copies], atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.large) for seed in range(1, 2))])
 def test_of_copies_that_state_other_precisions_the_highest_counts(seed: int) -> None:
     """Whichever comes first; one that states none says nothing of it."""
     graph, rng = _noisy_graph(60, 30, seed), np.random.default_rng(seed)

@@ -82,7 +82,7 @@ def test_without_jumps_they_are_flagged() -> None:
 
 
 @pytest.mark.parametrize("condition", ["30 % parallel corridors in runs", "30 % symmetric building", "30 % random"])
-@pytest.mark.parametrize("seed", [5, 6])
+@pytest.mark.parametrize("seed", [5, pytest.param(6, marks=pytest.mark.large)])
 def test_false_closures_that_agree_are_no_jump(condition: str, seed: int) -> None:
     case = case_of(f"building: {condition}", seed)
     solution = solve(case.graph)

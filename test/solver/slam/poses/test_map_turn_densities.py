@@ -23,7 +23,7 @@ def covariances(rng: Generator, size: int, turns: int) -> np.ndarray:
 
 @pytest.mark.parametrize("planar", [True, False])
 @pytest.mark.parametrize("in_order", [True, False])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.large) for seed in range(1, 5))])
 def test_each_counts_all_that_are_turned_like_those_near_it(planar: bool, in_order: bool, seed: int) -> None:
     rng = np.random.default_rng(seed)
     axes = Axes(*(np.eye(3)[:, 2:], np.eye(3)[:, :2]) if planar else (np.eye(3), np.eye(3)))

@@ -49,6 +49,7 @@ def test_a_labelling_follows_its_places_to_one_that_is_likelier(kind: str, gain:
     assert changed > 10 if gain > 0 else changed < 10
 
 
+@pytest.mark.large
 @torch.no_grad()
 def test_tearing_robots_apart_makes_nothing_likelier() -> None:
     """All closures false: where three robots are then is known by nobody, and no room to be anywhere is gained."""

@@ -36,7 +36,7 @@ def held_wrong(pose: PoseMode) -> tuple[PoseMode, np.ndarray]:
     return estimate_poses(pose.problem, start=start), members
 
 
-@pytest.mark.parametrize("seed", [1, 2, 5])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.large) for seed in (2, 5))])
 def test_a_run_that_is_right_is_likelier_to_be(seed: int) -> None:
     pose = pose_mode(graph_of(simulated(seed)))
     without, members = held_wrong(pose)
@@ -48,7 +48,7 @@ def test_a_run_that_is_right_is_likelier_to_be(seed: int) -> None:
     assert (believed.solved.places.right[list(best)] > 0.5).all()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.large) for seed in range(1, 3))])
 def test_a_run_of_wrong_places_is_not(seed: int) -> None:
     run = simulated(seed, false_share=0.3, grouped_share=1.0)
     pose = pose_mode(graph_of(run))
@@ -69,7 +69,7 @@ def bent(seed: int) -> tuple[Rival, np.ndarray]:
     return Rival(problem.mode, estimate_poses(problem, hold=True, start=start)), members
 
 
-@pytest.mark.parametrize("seed", [1, 2, 6])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.large) for seed in (2, 6))])
 def test_a_run_that_bends_the_map_is_doubted(seed: int) -> None:
     rival, members = bent(seed)
     assert (rival.pose.solved.places.right[members] > 0.5).all()
@@ -80,7 +80,7 @@ def test_a_run_that_bends_the_map_is_doubted(seed: int) -> None:
     assert (likelier.pose.solved.places.right[members] < 0.5).all()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.large) for seed in range(1, 3))])
 def test_nothing_is_doubted_where_all_is_right(seed: int) -> None:
     pose = pose_mode(graph_of(simulated(seed)))
     rival = Rival(pose.problem.mode, estimate_poses(pose.problem, hold=True, start=PoseStart.at(pose)))
@@ -88,7 +88,7 @@ def test_nothing_is_doubted_where_all_is_right(seed: int) -> None:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.large) for seed in range(1, 2))])
 def test_what_a_run_has_in_common_is_what_all_other_rows_say(seed: int) -> None:
     """By dense normal equations without the run's own row."""
     pose = pose_mode(graph_of(simulated(seed)))

@@ -81,7 +81,7 @@ def test_what_is_advised_is_not_what_was_done_already() -> None:
         assert [advice in warning for warning in warnings if "slipped once" in warning] == [True]
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.large)])
 def test_slips_that_nearly_cancel_do_not_pass_for_drift(seed: int) -> None:
     graph, truth, is_false, is_slip = laps(
         planar=True, false_share=0.3, seed=seed, num_laps=3, slips={25: 50.0, 29: -40.0, 90: -35.0, 100: 30.0}

@@ -88,6 +88,7 @@ def test_all_that_an_update_does_is_counted_where_it_is_done() -> None:
     assert pieces[0] > 0.0 and pieces[1] > 0.0
 
 
+@pytest.mark.large
 def test_ticks_answer_at_once_and_the_rest_leads_to_the_same_answer() -> None:
     case = drawn("building: 30 % random", 1)
     graph = until(case.graph, count := 300)
