@@ -51,6 +51,7 @@ def between(a: Quaternion, b: Rotation) -> float:
     return float(np.degrees((Rotation.from_quat([a.x, a.y, a.z, a.w]).inv() * b).magnitude()))
 
 
+@pytest.mark.large
 def test_faults_of_odometry_make_no_false_edge(live_node) -> None:
     live_node.start(*EVERY_MESSAGE)
     for index in range(RESTART):

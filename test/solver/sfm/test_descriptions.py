@@ -158,7 +158,9 @@ def test_networks_see_the_same_graph_in_any_axes(kind: str, axes: Tensor) -> Non
 
 @pytest.mark.parametrize("method", [*NETWORK_METHODS, *AS_WRITTEN])
 @pytest.mark.parametrize("description", DESCRIPTIONS)
-@pytest.mark.parametrize("kind", SAMPLES)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=() if kind in ("released", "paper") else pytest.mark.large) for kind in SAMPLES]
+)
 def test_names_order_directions_and_copies_do_not_matter(kind: str, description: str, method: str) -> None:
     graph = SAMPLES[kind].graph
     expected = _solved(graph, method)

@@ -165,6 +165,7 @@ def test_the_answer_is_what_it_would_be(kind: str, mounting: str) -> None:
     assert error_deg(case, blind) > 1.25 * error_deg(case, solution)
 
 
+@pytest.mark.large
 def test_a_camera_on_a_robot_in_the_plane() -> None:
     """Its odometry turns about z alone; with translations, which do not tell where the camera looks."""
     case = drawn("grid: 30 % random")

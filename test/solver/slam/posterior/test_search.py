@@ -227,7 +227,8 @@ def test_a_bias_is_taken_out_and_told_better_than_without_it(world: str) -> None
     assert found.cost < as_it_is.cost - 5
 
 
-@pytest.mark.parametrize("world", ["hills", pytest.param("city", marks=pytest.mark.large)])
+@pytest.mark.large
+@pytest.mark.parametrize("world", ["hills", "city"])
 def test_odometry_that_errs_in_turns_is_recognised(world: str) -> None:
     name = f"{world}: odometry worse in turns"
     case = drawn(name, 3)
