@@ -44,7 +44,7 @@ def test_ablation_cases_are_tuning_seeds_of_every_kind() -> None:
 SOLVED = [kind for kind in stress.kinds() if "15 000" not in kind.name]
 
 
-# Every sixth kind by default: of each world some.
+# Every sixth kind by default.
 @pytest.mark.parametrize(
     "kind",
     [
