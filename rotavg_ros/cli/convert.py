@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.files import formats
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.errors import UserError, asking_about
+from rotavg_ros.whole_file import real
 
 
 class ConvertError(UserError):
@@ -44,7 +46,8 @@ FORMATS = (
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, attach the content of further files, write."""
-    _check_output(arguments.input, arguments.output, overwrite=arguments.overwrite)
+    inputs = [path for path in (arguments.input, arguments.stamps, arguments.truth) if path is not None]
+    _check_output(inputs, arguments.output, overwrite=arguments.overwrite)
     with working(f"converting {arguments.input}"):
         graph_file = format_of(arguments.input).read_graph(arguments.input)
         if arguments.stamps is not None:
@@ -65,16 +68,21 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _check_output(source: Path, output: Path, *, overwrite: bool) -> None:
+def _check_output(inputs: Sequence[Path], output: Path, *, overwrite: bool) -> None:
     with asking_about(output, ConvertError):
         exists, is_folder = output.exists(), output.is_dir()
-    with asking_about(source, ConvertError):
-        is_source = exists and source.exists() and output.samefile(source)
     if exists and not overwrite:
         raise ConvertError(f"{output}: exists already; choose another OUTPUT or give --overwrite")
     # Everything outside the view-graph would be lost: comments, landmarks, a bag's other topics.
-    if is_source:
-        raise ConvertError(f"{output}: is the INPUT itself; choose another OUTPUT")
+    for path in inputs:
+        with asking_about(path, ConvertError):
+            is_input = exists and path.exists() and output.samefile(path)
+            is_inside = real(output) in real(path).parents and path.exists()
+        if is_input:
+            which = "the INPUT itself" if path is inputs[0] else "an input as well"
+            raise ConvertError(f"{output}: is {which}; choose another OUTPUT")
+        if is_inside:
+            raise ConvertError(f"{output}: would be replaced, and {path} is in it; choose another OUTPUT")
     bags, files = FORMATS
     suffix = output.suffix.lower()
     if suffix and suffix in bags.suffixes and not is_folder:

@@ -43,6 +43,23 @@ def test_an_existing_output_is_kept(tmp_path: Path, graph_path: Path, capsys: py
     assert main(["convert", str(graph_path), bag, "--overwrite"]) == 0
 
 
+@pytest.mark.parametrize("inside", ["bag.mcap", "graph.g2o", "stamps.txt"])
+def test_a_bag_with_an_input_in_it_is_kept(
+    tmp_path: Path, graph_path: Path, capsys: pytest.CaptureFixture[str], inside: str
+) -> None:
+    bag = tmp_path / "bag"
+    assert main(["convert", str(graph_path), str(bag)]) == 0
+    within = bag / inside
+    if inside != "bag.mcap":
+        within.write_bytes(graph_path.read_bytes())
+    words = [str(graph_path), "--stamps", str(within)] if inside == "stamps.txt" else [str(within)]
+    before = {path: path.read_bytes() for path in bag.iterdir()}
+    capsys.readouterr()
+    assert main(["convert", *words, str(bag), "--overwrite"]) == 2
+    assert f"{bag}: would be replaced, and {within} is in it; choose another OUTPUT" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in bag.iterdir()} == before
+
+
 @pytest.mark.parametrize("name", ["nothing", "nothing.mcap", "nothing.bag"])
 def test_a_bag_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
     assert main(["convert", str(tmp_path / name), str(tmp_path / "x.g2o")]) == 2
