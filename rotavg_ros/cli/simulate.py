@@ -7,11 +7,12 @@ import argparse
 import numpy as np
 
 from rotavg_ros.bags.run_bag import write_run_bag
-from rotavg_ros.bags.writer import refuse_existing
+from rotavg_ros.bags.writer import BagWriteError, refuse_existing
 from rotavg_ros.cli.progress import working
 from rotavg_ros.datasets.files.formats import write_graph
 from rotavg_ros.datasets.simulation.robot_run import RobotRun
 from rotavg_ros.datasets.simulation.slam_simulation import SimulatedRun, simulate_slam_graph
+from rotavg_ros.whole_file import real
 
 
 def simulate(arguments: argparse.Namespace) -> SimulatedRun:
@@ -33,6 +34,8 @@ def simulate(arguments: argparse.Namespace) -> SimulatedRun:
 def run(arguments: argparse.Namespace) -> int:
     """Simulate and write."""
     refuse_existing(arguments.output, overwrite=arguments.overwrite)
+    if arguments.graph is not None and real(arguments.output) in real(arguments.graph).parents:
+        raise BagWriteError(f"{arguments.graph}: is in the bag, which is written after it; choose another --graph")
     with working("simulating"):
         simulated = simulate(arguments)
         # First the step that is more likely to fail, so that a failed command leaves no bag behind.

@@ -92,6 +92,15 @@ def test_mistakes_are_one_line(
     assert not (tmp_path / "run").exists()
 
 
+def test_a_graph_is_not_replaced_by_its_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    simulate(tmp_path / "run")
+    capsys.readouterr()
+    graph = tmp_path / "run" / "graph.g2o"
+    assert main(["simulate", "--output", str(tmp_path / "run"), "--overwrite", "--graph", str(graph)]) == 2
+    said = capsys.readouterr().err
+    assert said == f"rotavg: error: {graph}: is in the bag, which is written after it; choose another --graph\n"
+
+
 def test_an_existing_bag_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     simulate(tmp_path / "run")
     assert main(["simulate", "--output", str(tmp_path / "run")]) == 2
