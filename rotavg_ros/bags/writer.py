@@ -15,6 +15,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rotavg_ros.bags import bulk
 from rotavg_ros.bags.message_types import typestore
 from rotavg_ros.errors import UserError, asking_about
+from rotavg_ros.whole_file import real
 
 _UNLIMITED = QosTime(2147483647, 4294967295)
 
@@ -39,8 +40,9 @@ class BagWriter:
         self._path = Path(path)
         self._compressed = compressed
         self._overwrite = overwrite
+        self._place = real(self._path)
         # The bag grows inside a hidden folder beside its place, since a recording is named after its own folder.
-        self._workplace = self._path.with_name(f".{self._path.name}.unfinished")
+        self._workplace = self._place.parent / f".{self._place.name}.unfinished"
         self._writer: Writer | None = None
         self._connections: dict[str, Connection] = {}
 
@@ -48,7 +50,7 @@ class BagWriter:
         refuse_existing(self._path, overwrite=self._overwrite)
         try:
             shutil.rmtree(self._workplace, ignore_errors=True)
-            self._writer = Writer(self._workplace / self._path.name, version=8, storage_plugin=StoragePlugin.MCAP)
+            self._writer = Writer(self._workplace / self._place.name, version=8, storage_plugin=StoragePlugin.MCAP)
             if self._compressed:
                 self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             self._writer.open()
@@ -113,9 +115,9 @@ class BagWriter:
             shutil.rmtree(self._workplace, ignore_errors=True)
 
     def _take_place(self) -> None:
-        if self._path.exists():
-            shutil.rmtree(self._path)
-        (self._workplace / self._path.name).rename(self._path)
+        if self._place.exists():
+            shutil.rmtree(self._place)
+        (self._workplace / self._place.name).rename(self._place)
 
     def _cannot_write(self, error: OSError) -> BagWriteError:
         return BagWriteError(f"{self._path}: cannot be written: {error.strerror or error}")
@@ -130,12 +132,15 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
     with asking_about(path, BagWriteError):
         exists = path.exists()
         may_go = exists and path.is_dir() and _is_bag_or_empty(list(path.iterdir()))
+        is_here = may_go and real(path) in (Path.cwd(), *Path.cwd().parents)
     if not exists:
         return
     if not overwrite:
         raise BagWriteError(f"{path}: exists already; choose another --output or give --overwrite")
     if not may_go:
         raise BagWriteError(f"{path}: is not a bag, so --overwrite leaves it alone; choose another --output")
+    if is_here:
+        raise BagWriteError(f"{path}: is the folder you are in, so it cannot be replaced; choose another --output")
 
 
 def _is_bag_or_empty(content: Sequence[Path]) -> bool:

@@ -108,6 +108,29 @@ def test_overwrite_spares_what_is_not_a_bag(tmp_path: Path) -> None:
         write_odometry(tmp_path / "file", overwrite=True)
 
 
+def test_a_bag_behind_a_link_is_written_where_it_lies(tmp_path: Path) -> None:
+    write_odometry(tmp_path / "disk" / "run", 5)
+    (tmp_path / "link").symlink_to(tmp_path / "disk" / "run")
+    write_odometry(tmp_path / "link", 3, overwrite=True)
+    assert (tmp_path / "link").is_symlink()
+    with BagReader(tmp_path / "disk" / "run") as bag:
+        assert bag.num_messages() == 3
+
+
+@pytest.mark.parametrize("name", [".", "inside/.."])
+def test_the_folder_one_is_in_is_no_place_for_a_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    write_odometry(tmp_path / "run", 5)
+    (tmp_path / "run" / "inside").mkdir()
+    monkeypatch.chdir(tmp_path / "run")
+    with pytest.raises(BagWriteError, match=f"^{re.escape(name)}: is the folder you are in"):
+        write_odometry(Path(name), overwrite=True)
+    monkeypatch.chdir(tmp_path)
+    write_odometry(Path("run/inside/.."), 3, overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    with BagReader(tmp_path / "run") as bag:
+        assert bag.num_messages() == 3
+
+
 def test_an_interrupted_recording_leaves_nothing(tmp_path: Path) -> None:
     write_odometry(tmp_path / "run", 5)
 
