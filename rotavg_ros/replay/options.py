@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,32 @@ class ReplayOptionError(UserError):
     """A parameter that the node does not have, or an invalid value."""
 
 
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]
+    """Takes for numbers what ROS takes for numbers: 1e-1, but no dates (2024-01-31) and no times (1:30)."""
+
+
+_YAML = "tag:yaml.org,2002:"
+_OF_ROS = {
+    "int": re.compile(r"[-+]?(0[0-7]*|[1-9]\d*|0x[\da-fA-F]+)$"),
+    "float": re.compile(r"[-+]?((\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|\.(inf|Inf|INF))$|\.(nan|NaN|NAN)$"),
+}
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag.removeprefix(_YAML) not in (*_OF_ROS, "timestamp")]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+for _kind, _pattern in _OF_ROS.items():
+    _Loader.add_implicit_resolver(f"{_YAML}{_kind}", _pattern, list("-+.0123456789"))
+
+
+def _content(text: str) -> Any:
+    """A YAML document."""
+    loader = _Loader(text)
+    try:
+        return loader.get_single_data()
+    finally:
+        loader.dispose()
+
+
 def read_parameter_file(path: Path) -> tuple[Values, list[str]]:
     """The node's parameters in a file for ``--params-file``; those that only rclpy uses are ignored.
 
@@ -36,7 +63,7 @@ def read_parameter_file(path: Path) -> tuple[Values, list[str]]:
             value.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = _content(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise ReplayOptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     except yaml.YAMLError as error:
@@ -90,7 +117,7 @@ def read_settings(words: Iterable[str]) -> Values:
         if not separator:
             raise ReplayOptionError(f"-p {word}: write name:=value")
         try:
-            value = yaml.safe_load(text)
+            value = _content(text)
         except yaml.YAMLError:
             value = text
         values[name] = _checked(name, value, "-p")

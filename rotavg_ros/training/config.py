@@ -108,7 +108,7 @@ class TrainingConfig:
             content = yaml.safe_load(path.read_text())
         except OSError as error:
             raise TrainingConfigError(f"{path}: cannot be read ({error.strerror}); give a YAML file") from None
-        except (UnicodeDecodeError, yaml.YAMLError) as error:
+        except (ValueError, yaml.YAMLError) as error:  # not UTF-8, a date that does not exist
             reason = str(error).splitlines()[0]
             raise TrainingConfigError(f"{path}: not a readable YAML file ({reason})") from None
         if not isinstance(content, dict):

@@ -14,7 +14,7 @@ from rotavg_ros.bags.message_types import ODOMETRY, RELATIVE_ROTATION, typestore
 from rotavg_ros.bags.messages import Edge, Keyframe, edge_message, odometry_message
 from rotavg_ros.bags.reader import BagReader
 from rotavg_ros.bags.writer import BagWriter
-from rotavg_ros.replay.options import ReplayOptionError, read_parameter_file
+from rotavg_ros.replay.options import ReplayOptionError, read_parameter_file, read_settings
 from rotavg_ros.replay.plan import Plan, Wishes, make_plan
 from rotavg_ros.settings.parameters import NodeParameters
 from rotavg_ros.settings.text import to_yaml
@@ -191,6 +191,24 @@ def test_what_the_node_takes_is_taken(tmp_path: Path, content: dict, notes: list
     path = tmp_path / "node.yaml"
     path.write_text(yaml.safe_dump(content, sort_keys=False))
     assert read_parameter_file(path) == (ANGLE, [f"{path}: {note}" for note in notes])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "value"),
+    [
+        ("keyframe_angle_deg", "1e1", 10.0),
+        ("keyframe_angle_deg", ".5E1", 5.0),
+        ("keyframe_angle_deg", "08", 8.0),
+        ("max_keyframes", "010", 8),
+        ("world_frame", "2024-13-45", "2024-13-45"),
+        ("world_frame", "2024-01-31", "2024-01-31"),
+        ("robots", "[1:30, 1_000]", ("1:30", "1_000")),
+    ],
+)
+def test_numbers_are_those_that_are_numbers_to_the_node(tmp_path: Path, name: str, text: str, value: object) -> None:
+    (tmp_path / "node.yaml").write_text(f"/rotavg:\n  ros__parameters:\n    {name}: {text}\n")
+    for values in (read_settings([f"{name}:={text}"]), read_parameter_file(tmp_path / "node.yaml")[0]):
+        assert values == {name: value} and type(values[name]) is type(value)
 
 
 def test_a_file_of_two_nodes_is_not_mixed(tmp_path: Path) -> None:
