@@ -148,8 +148,11 @@ def _from_ids(content: _Content) -> GraphFile:
         edge_translation=_translations(edges) if content.has_translations else None,
         skipped={"self-edges": len(content.edges) - len(proper)} if len(proper) < len(content.edges) else {},
     )
-    stamp_of = {end.id: end.stamp_ns for edge in edges for end in (edge.source, edge.target)}
+    stated = [end for edge in edges for end in (edge.source, edge.target) if end.stamp_ns]
+    stamp_of = {end.id: end.stamp_ns for end in stated}
     stamp_of.update(zip(note.get("lone_ids", []), note.get("lone_stamps_ns", []), strict=False))
+    if not any(stamp_of.values()) and "stamps" not in note:
+        return graph_file
     stamps_ns = np.array([stamp_of.get(node_id, 0) for node_id in graph_file.node_ids.tolist()], dtype=np.int64)
     return replace(graph_file, stamps_ns=stamps_ns)
 
@@ -216,7 +219,8 @@ def _nearest(stamps_ns: NDArray[np.int64], end: Keyframe) -> int:
 
 def _with_truth(graph_file: GraphFile, content: _Content) -> GraphFile:
     """Add ground truth to the nodes of the same stamps; drop stamps that were only made up for the bag."""
-    assert graph_file.stamps_ns is not None
+    if graph_file.stamps_ns is None:
+        return graph_file
     nodes_at: dict[int, list[int]] = {}
     for node, stamp in enumerate(graph_file.stamps_ns.tolist()):
         nodes_at.setdefault(stamp, []).append(node)

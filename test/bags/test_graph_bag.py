@@ -179,6 +179,16 @@ def test_self_edges_are_skipped_and_counted(tmp_path: Path) -> None:
     assert graph_file.stamps_ns.tolist() == [5, 6]
 
 
+@pytest.mark.parametrize(("first", "again", "stamps"), [(0, 0, None), (5, 0, [5, 6]), (0, 5, [5, 6]), (0, 0, [0, 6])])
+def test_a_stamp_that_is_not_stated_is_none(tmp_path: Path, first: int, again: int, stamps: list[int] | None) -> None:
+    second = Keyframe(9, stamps[1] if stamps else 0)
+    bag = bag_of_edges(tmp_path / "bag", [edge(0, Keyframe(3, first), second), edge(1, Keyframe(3, again), second)])
+    read = read_graph_bag(bag)
+    assert (read.stamps_ns if read.stamps_ns is None else read.stamps_ns.tolist()) == stamps
+    write_graph_bag(tmp_path / "written", read)
+    assert_same(read_graph_bag(tmp_path / "written"), read)
+
+
 @pytest.mark.parametrize(
     ("edges", "complaint"),
     [
