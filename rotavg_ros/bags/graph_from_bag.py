@@ -176,9 +176,6 @@ def _from_stamps(content: _Content) -> GraphFile:
     source = np.concatenate((np.arange(num_steps), ends[usable, 0]))
     target = np.concatenate((np.arange(1, num_steps + 1), ends[usable, 1]))
     order = np.argsort(np.maximum(source, target), kind="stable")
-    translations = None
-    if content.has_translations:
-        translations = np.concatenate((steps, _translations(closures)))[order]
     skipped = {
         "odometry messages without a pose": len(content.odometry) - len(sound),
         "edges without odometry at their stamps, or with both ends at one": int((~usable).sum()),
@@ -191,7 +188,7 @@ def _from_stamps(content: _Content) -> GraphFile:
         kind=np.array([EdgeKind.ODOMETRY] * num_steps + [edge.kind for edge in closures])[order],
         precision=np.array([np.nan] * num_steps + [edge.precision for edge in closures])[order],
         planar=are_about_z(source_from_target),
-        edge_translation=translations,
+        edge_translation=np.concatenate((steps, _translations(closures)))[order],
         skipped={what: count for what, count in skipped.items() if count},
     )
     return replace(graph_file, stamps_ns=stamps_ns)

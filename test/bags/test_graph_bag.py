@@ -230,6 +230,20 @@ def test_what_odometry_cannot_place_is_skipped_and_counted(tmp_path: Path) -> No
     assert graph_file.graph.kind.tolist() == [0, 0, 1]
 
 
+def test_odometrys_steps_are_kept_where_no_closure_states_a_translation(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic(EDGE_TOPIC, RELATIVE_ROTATION)
+        bag.add_topic(ODOM_TOPIC, ODOMETRY)
+        left = np.array([0, 0, np.sqrt(0.5), np.sqrt(0.5)])
+        for index in range(3):
+            stamp = (index + 1) * 10**9
+            bag.write(ODOM_TOPIC, stamp, odometry_message(stamp, np.array([0.0, index, 0.0]), left, "odom"))
+        closure = edge(0, Keyframe(None, 10**9), Keyframe(None, 3 * 10**9))
+        bag.write(EDGE_TOPIC, 4 * 10**9, edge_message(closure))
+    read = read_graph_bag(tmp_path / "bag")
+    np.testing.assert_allclose(read.edge_translation, [[1, 0, 0], [1, 0, 0], [np.nan] * 3], atol=1e-12)
+
+
 def bag_of_a_camera(path: Path, frame: str, *, with_transform: bool, in_array: bool) -> tuple[Rotation, Path]:
     """Two odometry messages, a quarter of a turn apart, and the closure between them as a camera sees it."""
     turn, camera = Rotation.from_euler("z", 90, degrees=True), Rotation.from_euler("zx", [90, 90], degrees=True)
