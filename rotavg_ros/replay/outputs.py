@@ -6,8 +6,9 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -110,11 +111,28 @@ def write_tables(folder: Path, record: RunRecord) -> None:
     with (folder / "edges.csv").open("wb") as file:
         write_csv(file, _edge_columns(answer))
     several = len(record.robots) > 1
-    for robot in record.robots:
-        name = re.sub(r"[^\w.-]+", "_", robot.robot).strip("_") or "robot"
+    for robot, name in zip(record.robots, _file_names([robot.robot for robot in record.robots]), strict=True):
         prefix = f"{name}_" if several else ""
         _write_trajectory(folder, f"{name}" if several else "trajectory", f"{prefix}odometry", robot)
     write_graph_of_run(folder / "graph.g2o", record)
+
+
+def _file_names(robots: Sequence[str]) -> list[str]:
+    """What each robot's files are called: its name as far as files can have it, and a number where two would share."""
+    names: list[str] = []
+    taken: set[str] = set()
+    for robot in robots:
+        wanted = re.sub(r"[^\w.-]+", "_", robot).strip("_") or "robot"
+        numbered = (f"{wanted}_{number}" for number in count(2))
+        name = next(name for name in chain([wanted], numbered) if taken.isdisjoint(_stems(name)))
+        names.append(name)
+        taken |= _stems(name)
+    return names
+
+
+def _stems(name: str) -> set[str]:
+    """Names of a robot's trajectories, corrected and of its odometry."""
+    return {name, f"{name}_odometry"}
 
 
 def write_summary(folder: Path, record: RunRecord, bag: Path, outcome: Outcome) -> dict[str, Any]:

@@ -72,6 +72,23 @@ def test_names_that_no_topic_can_have(bag: Path, tmp_path: Path) -> None:
     assert set(summary["robots"]) == {"my robot", "1"}
 
 
+@pytest.mark.parametrize(
+    ("robots", "files"),
+    [
+        (("a b", "a/b"), ("a_b", "a_b_2")),
+        (("red", "red_odometry"), ("red", "red_odometry_2")),
+        (("red_odometry", "red"), ("red_odometry", "red_2")),
+    ],
+)
+def test_robots_whose_files_would_have_one_name(
+    bag: Path, tmp_path: Path, robots: tuple[str, str], files: tuple[str, str]
+) -> None:
+    words = ["--odometry", "/red/odom", "--odometry", "/blue/odom", "--robots", *robots]
+    assert main(["replay", str(bag), "--output", str(tmp_path / "out"), "--no-report", *words]) == 0
+    written = {path.name for path in (tmp_path / "out").iterdir() if path.suffix in (".tum", ".kitti")}
+    assert written == {f"{name}{suffix}" for name in files for suffix in (".tum", ".kitti", "_odometry.tum")}
+
+
 def test_each_robots_odometry_is_that_of_the_graph(bag: Path, tmp_path: Path) -> None:
     """Formats without kinds take edges between consecutive ids for odometry: each robot's own steps, and no closure."""
     topics = ["--odometry", "/red/odom", "--odometry", "/blue/odom"]
