@@ -135,6 +135,11 @@ class NodeParameters:
                 f"robots has {len(self.robots)} entries and odometry_topics {len(self.odometry_topics)}; "
                 "give one robot per topic"
             )
+        robot_of: dict[str, str] = {}
+        for robot, prefix in self.prefixes().items():
+            other = robot_of.setdefault(prefix, robot)
+            if other != robot:
+                raise OptionError(f"robots names {other!r} and {robot!r}, whose topics would both begin with {prefix}")
         if len(self.edge_robots) not in (1, len(self.edge_topics)):
             raise OptionError(
                 f"edge_robots has {len(self.edge_robots)} entries; give 1, or one per edge topic "

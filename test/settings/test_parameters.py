@@ -77,6 +77,10 @@ def test_a_change_keeps_the_rest_and_ignores_other_nodes_parameters() -> None:
         ({"keyframe_distance_m": -1}, "keyframe_distance_m is -1.0; it must be between 0 and 1e+06"),
         ({"gauge": "up"}, "gauge is 'up'; choose from odometry, identity"),
         ({"robots": ["a", "b"]}, "robots has 2 entries and odometry_topics 1; give one robot per topic"),
+        (
+            {"robots": ["1", "robot_1"], "odometry_topics": ["a", "b"]},
+            "robots names '1' and 'robot_1', whose topics would both begin with robot_1/",
+        ),
         ({"edge_topics": ["graph:rtabmap_msgs/msg/MapGraph"]}, "edge topic 'graph:rtabmap_msgs/msg/MapGraph' brings "),
         ({"autosave_period_s": 5.0}, "autosave_period_s is set but state_file is empty; name a file"),
     ],

@@ -24,18 +24,14 @@ def checked_prefixes(prefixes: Mapping[str, str]) -> Mapping[str, str]:
     """The prefixes of the robots' topics (:meth:`NodeParameters.prefixes`), checked.
 
     Raises:
-        UserError: a name cannot be part of a topic's, or two robots would have the same topics.
+        UserError: a name cannot be part of a topic's.
     """
-    robot_of: dict[str, str] = {}
     for robot, prefix in prefixes.items():
         if prefix and not _PREFIX.fullmatch(prefix):
             raise UserError(
                 f"robots names {robot!r}, which cannot be part of a topic's name: use letters, digits and _, and no "
                 "digit first but in a number"
             )
-        other = robot_of.setdefault(prefix, robot)
-        if other != robot:
-            raise UserError(f"robots names {other!r} and {robot!r}, whose topics would both begin with {prefix}")
     return prefixes
 
 
