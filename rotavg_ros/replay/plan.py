@@ -15,7 +15,7 @@ from rotavg_ros.errors import UserError, asking_about
 from rotavg_ros.inputs import EDGE_CONVERTERS, ODOMETRY_CONVERTERS
 from rotavg_ros.replay.pace import Pace, WorkRates
 from rotavg_ros.replay.record import TopicUse
-from rotavg_ros.replay.topics import Candidate, Candidates, find_candidates
+from rotavg_ros.replay.topics import Candidate, Candidates, can_be_read_as, find_candidates
 from rotavg_ros.settings.parameters import NodeParameters
 
 # Parameters that name topics, and for each the parameters with values per topic, with the number of values.
@@ -186,6 +186,8 @@ def _chosen(
                 f"{bag.path}: {topic} is {type_name}, of which no {what} can be made; candidates: {names}; "
                 f"types: {', '.join(converters)}"
             )
+        if type_name != recorded[topic] and not can_be_read_as(bag, topic, type_name):
+            raise PlanError(f"{bag.path}: {topic} is {recorded[topic]} and cannot be read as {type_name}")
         inputs.append(Input(topic, type_name))
     return tuple(inputs)
 

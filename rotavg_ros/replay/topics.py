@@ -107,6 +107,20 @@ def _states_orientation(bag: BagReader, candidate: Candidate) -> bool:
     return False
 
 
+def can_be_read_as(bag: BagReader, topic: str, type_name: str) -> bool:
+    """Whether the first messages of a topic have the fields of another type, as those of a renamed package do."""
+    for _, _, message in islice(bag.decoded([topic]), _FIRST_EDGES):
+        try:
+            if type_name in ODOMETRY_CONVERTERS:
+                with suppress(RejectedInputError):
+                    ODOMETRY_CONVERTERS[type_name](message, IDENTITY)
+            else:
+                list(EDGE_CONVERTERS[type_name](Source("robot"))(message))
+        except (AttributeError, TypeError):
+            return False
+    return True
+
+
 def _has_odometry_edges(bag: BagReader, candidate: Candidate) -> bool:
     convert = EDGE_CONVERTERS[candidate.type_name](Source("robot"))
     for _, _, message in islice(bag.decoded([candidate.topic]), _FIRST_EDGES):

@@ -150,6 +150,12 @@ def test_nothing_it_was_given_is_overwritten(tmp_path: Path, small: Path, capsys
     [
         (["--odometry", "/odometry"], "no topic /odometry; candidates for odometry: /odom"),
         (["--odometry", "/wind"], "/wind is geometry_msgs/msg/Vector3Stamped, of which no odometry can be made"),
+        (
+            ["--odometry", "/odom:sensor_msgs/msg/Imu"],
+            "/odom is nav_msgs/msg/Odometry and cannot be read as sensor_msg",
+        ),
+        (["--edges", "/odom:rtabmap_msgs/msg/MapGraph"], "and cannot be read as rtabmap_msgs/msg/MapGraph"),
+        (["--reference", "/odom:geometry_msgs/msg/PoseStamped"], "and cannot be read as geometry_msgs/msg/PoseStamped"),
         (["--edges", "/loops"], "no topic /loops; candidates for relative rotations: none"),
         (["--reference", "truth.tum"], "truth.tum: no such file, and no topic of that name; candidates for a"),
         (["--odometry", "none"], "nothing to replay"),
