@@ -89,6 +89,22 @@ class RunFacts:
         return np.asarray(self.clock(self.seconds(stamp_ns)), dtype=np.float64)
 
     @cached_property
+    def tick_time(self) -> FloatArray:
+        """Time of each tick, since the start in the clock's unit.
+
+        Where the keyframes' stamps are of another clock than the recorder's, as a simulation's are, the first tick is
+        the start. Clocks that differ by more than the run lasts are not the same.
+        """
+        ticks = np.array([tick.stamp_ns for tick in self.record.ticks], dtype=np.int64)
+        stamps = self.record.answer.stamp_ns
+        known = stamps[stamps >= 0]
+        if len(ticks) and len(known):
+            apart_ns = max(int(ticks.min()) - int(known.max()), int(known.min()) - int(ticks.max()))
+            if apart_ns > 1e9 * max(self.record.duration_s, 1.0):
+                ticks = ticks - ticks.min() + self.start_ns
+        return self.time(ticks)
+
+    @cached_property
     def closures(self) -> NDArray[np.intp]:
         """``(C,)`` indices of the answer's loop closures."""
         return np.flatnonzero(self.record.answer.kind == EdgeKind.LOOP_CLOSURE)

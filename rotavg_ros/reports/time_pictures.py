@@ -101,7 +101,7 @@ def ticks(facts: RunFacts, theme: Theme) -> Figure | None:
     ticks = facts.record.ticks
     if not ticks:
         return None
-    time = facts.time(np.array([tick.stamp_ns for tick in ticks], dtype=np.int64))
+    time = facts.tick_time
     milliseconds = np.array([1000 * tick.seconds for tick in ticks])
     cold = np.array([tick.was_cold for tick in ticks])
     figure = theme.figure(WIDTH, 4.6)
@@ -129,7 +129,7 @@ def flips(facts: RunFacts, theme: Theme) -> Figure | None:
     ticks = facts.record.ticks
     if not ticks or len(facts.closures) == 0:
         return None
-    time = facts.time(np.array([tick.stamp_ns for tick in ticks], dtype=np.int64))
+    time = facts.tick_time
     changed = np.array([tick.flips for tick in ticks])
     figure = theme.figure(WIDTH, 4.2)
     upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": (1.3, 1)})

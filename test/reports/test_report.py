@@ -225,6 +225,15 @@ def test_a_folder_that_cannot_be_written(record: RunRecord, tmp_path: Path) -> N
         write_report(record, tmp_path / "file")
 
 
+@pytest.mark.parametrize("later_s", [-1e9, 0.0, 2.0, 1e9])
+def test_ticks_are_shown_since_the_start_whatever_the_recorders_clock(record: RunRecord, later_s: float) -> None:
+    moved = [replace(tick, stamp_ns=tick.stamp_ns + round(1e9 * later_s)) for tick in record.ticks]
+    facts = RunFacts(replace(record, ticks=tuple(moved)))
+    usual = RunFacts(record).tick_time
+    begin = later_s if abs(later_s) < record.duration_s else -float(usual[0] * facts.clock.seconds)
+    np.testing.assert_allclose(facts.tick_time, usual + begin / facts.clock.seconds, atol=1e-9)
+
+
 def judged(record: RunRecord, outlier: np.ndarray, rotation_score: np.ndarray) -> RunFacts:
     """The record with verdicts on its closures: outliers that fail by their rotations where those score high."""
     answer = record.answer
