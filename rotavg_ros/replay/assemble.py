@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -32,7 +33,7 @@ def assemble(bag: BagReader, plan: Plan, outcome: Outcome) -> RunRecord:
     trajectories = outcome.estimator.trajectories(answer)
     references = _references(bag, plan, outcome, trajectories)
     return RunRecord(
-        name=bag.path.stem,
+        name=Path(os.path.abspath(bag.path)).stem,  # `.` has none
         duration_s=(outcome.end_ns - outcome.start_ns) / 1e9,
         answer=answer,
         robots=tuple(

@@ -129,6 +129,12 @@ def test_what_can_be_read_of_a_damaged_bag_is_replayed(
     assert capsys.readouterr().err.startswith(f"rotavg: warning: {bag}: the bag is damaged: ") or broken is corrupted
 
 
+def test_the_bag_one_is_in_has_a_name(tmp_path: Path, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(small)
+    assert main(["replay", ".", "--output", str(tmp_path / "out"), "-p", "solve_period_s:=100.0"]) == 0
+    assert "<h1>small</h1>" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
 def test_nothing_it_was_given_is_overwritten(tmp_path: Path, small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = make_bag(tmp_path / "run")  # whose file has the name of the answer's
     truth = tmp_path / "out" / "trajectory.tum"
