@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rotavg_ros.datasets.files.corrected_graph import is_told, write_corrected_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.planar import are_about_z
 from rotavg_ros.online import Answer
 from rotavg_ros.replay.record import RunRecord
+from rotavg_ros.solver.positions import Translations, fit_positions
 from rotavg_ros.view_graph import EdgeKind
 
 # Largest height of a step that still counts as planar, metres.
@@ -30,10 +32,7 @@ def write_graph_of_run(path: Path, record: RunRecord) -> None:
         GraphFileError: the file cannot be written.
     """
     answer = record.answer
-    position = np.zeros((len(answer.keyframe_id), 3))
-    for robot in record.robots:
-        if robot.position is not None:
-            position[robot.nodes] = np.nan_to_num(robot.position)
+    position = np.nan_to_num(_positions(record))
     turns = np.concatenate((answer.target_from_source, answer.world_from_body))
     is_flat = bool((np.abs(np.nan_to_num(answer.translation[:, 2])) <= _FLAT_M).all())
     ids = keyframe_ids(answer)
@@ -53,6 +52,36 @@ def write_graph_of_run(path: Path, record: RunRecord) -> None:
     judged = None if precision is None or answer.rotation_score is None else (answer.rotation_score, precision)
     told = is_told(answer.outlier, answer.kind == EdgeKind.ODOMETRY, judged)
     write_corrected_graph(path, graph_file, answer.world_from_body[order], position[order], told, precision)
+
+
+def _positions(record: RunRecord) -> NDArray[np.float64]:
+    """``(N, 3)`` metres, NaN where unknown: those of the trajectories; of keyframes without stamps, in none, fitted."""
+    answer = record.answer
+    position = np.full((len(answer.keyframe_id), 3), np.nan)
+    for robot in record.robots:
+        if robot.position is not None:
+            position[robot.nodes] = robot.position
+    placed = np.isfinite(position).all(axis=1)
+    if placed.all():
+        return position
+    fitted = answer.position
+    if fitted is None:
+        edges = Translations(
+            answer.source,
+            answer.target,
+            answer.translation,
+            answer.kind == EdgeKind.ODOMETRY,
+            np.where(answer.outlier, 1.0, answer.outlier_score),
+            answer.steps,
+        )
+        fitted = fit_positions(answer.world_from_body, edges, position)
+    # A component is one rigid map: its placed keyframes tell where its others are.
+    for component in np.unique(answer.component[~placed]):
+        members = answer.component == component
+        both = members & placed & np.isfinite(fitted).all(axis=1)
+        shift = np.median(position[both] - fitted[both], axis=0) if both.any() else np.zeros(3)
+        position[members & ~placed] = fitted[members & ~placed] + shift
+    return position
 
 
 def keyframe_ids(answer: Answer) -> np.ndarray:

@@ -102,3 +102,26 @@ def test_each_robots_odometry_is_that_of_the_graph(bag: Path, tmp_path: Path) ->
         ids = [int(row["id"]) for row in csv.DictReader(file)]
     assert ids == [*range(COUNT), *range(COUNT + 1, 2 * COUNT + 1)]
     assert ids == graph_file.node_ids.tolist()
+
+
+@pytest.mark.parametrize("closes_by_place", [False, True])
+@pytest.mark.parametrize("stamped", [0, 5])
+def test_keyframes_without_stamps_have_a_place_in_the_graph(
+    tmp_path: Path, closes_by_place: bool, stamped: int
+) -> None:
+    """A square of four sides, five steps each, by ids; the trajectory has those with stamps, the graph has all."""
+    corner = Rotation.from_euler("z", [[90 if index % 5 == 4 else 0] for index in range(20)], degrees=True)
+    with BagWriter(tmp_path / "square") as bag:
+        bag.add_topic("/relative_rotations", RELATIVE_ROTATION)
+        ends = [Keyframe(index, (index + 1) * 10**9 if index < stamped else 0) for index in range(21)]
+        for index in range(20):
+            step = np.array([1.0, 0.0, 0.0])
+            edge = Edge(10**9, index, 0, ends[index], ends[index + 1], corner[index].as_quat(), 1e4, 0, step)
+            bag.write("/relative_rotations", 10**9, edge_message(edge))
+        place = np.zeros(3) if closes_by_place else None
+        closure = Edge(10**9, 20, 0, ends[0], ends[20], np.array([0, 0, 0, 1.0]), 1e4, 1, place)
+        bag.write("/relative_rotations", 10**9, edge_message(closure))
+    assert main(["replay", str(tmp_path / "square"), "--output", str(tmp_path / "out"), "--no-report"]) == 0
+    rows = [line.split() for line in (tmp_path / "out" / "graph.g2o").read_text().splitlines() if "VERTEX" in line]
+    corners = np.array([row[2:4] for row in rows[::5]], dtype=float)
+    np.testing.assert_allclose(corners, [[0, 0], [5, 0], [5, 5], [0, 5], [0, 0]], atol=1e-3)
