@@ -78,8 +78,9 @@ def load_config(name: str) -> TrainingConfig:
     shipped = _shipped()
     path = Path(name)
     with asking_about(path, TrainingConfigError):
-        exists = path.exists()
-    if not exists:
+        # An --output may have the name of a configuration.
+        is_given = path.exists() and not (name in shipped and path.is_dir())
+    if not is_given:
         if name not in shipped:
             raise TrainingConfigError(f"{name}: no such file; the package's own are {', '.join(shipped)}")
         path = shipped[name]

@@ -10,6 +10,7 @@ from safetensors.torch import load_file
 
 from rotavg_ros import solve
 from rotavg_ros.cli.main import main
+from rotavg_ros.cli.train import load_config
 from rotavg_ros.datasets.simulation.synthetic import PaperRecipe
 from rotavg_ros.solver.networks import NETWORKS, PaperCleanNet, read_network
 from rotavg_ros.solver.neurora.network_store import WEIGHTS_FOLDER, load_network
@@ -127,6 +128,14 @@ def test_bad_configurations(text: str, message: str, tmp_path: Path, capsys: pyt
     error = capsys.readouterr().err
     assert f"{path}: " in error
     assert message in error
+
+
+def test_a_folder_of_a_configurations_name_is_not_meant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run into it can be resumed by the same command."""
+    meant = load_config("sfm-clean-net")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sfm-clean-net").mkdir()
+    assert load_config("sfm-clean-net") == meant
 
 
 def test_output_that_is_a_file(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
