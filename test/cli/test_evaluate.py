@@ -264,6 +264,16 @@ def test_plot_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert main(["plot", "training", str(tmp_path / "none"), "--output", str(picture)]) == 2
 
 
+def test_names_in_pictures_are_no_mathematics(tmp_path: Path) -> None:
+    graph, log = tmp_path / "a$_$b.g2o", tmp_path / "a$_$b.log.jsonl"
+    graph.write_text("EDGE_SE2 0 1 1 0 0.1 1 0 0 1 0 1\n")
+    log.write_text('{"epoch": 0, "validation_objective": 1}\n')
+    for kind, read in (("statistics", graph), ("training", log)):
+        picture = tmp_path / f"{kind}.png"
+        assert main(["plot", kind, str(read), "--output", str(picture)]) == 0
+        assert picture.read_bytes().startswith(b"\x89PNG")
+
+
 @pytest.mark.parametrize("kind", ["statistics", "training"])
 @pytest.mark.parametrize("folder", [".", "/", "pictures"])
 def test_a_picture_is_no_folder(kind: str, folder: str, tmp_path: Path, monkeypatch, capsys) -> None:

@@ -54,7 +54,7 @@ def draw_training(path: Path, logs: Sequence[Path]) -> None:
             fontsize=8,
             color=MUTED,
         )
-        style(axes, log.name.removesuffix(".log.jsonl"))
+        style(axes, log.name.removesuffix(".log.jsonl").replace("$", r"\$"))  # no mathematics
         axes.set_xlabel("epoch", fontsize=9, color=MUTED)
         axes.set_ylabel("validation", fontsize=9, color=MUTED)
     figure.savefig(path)

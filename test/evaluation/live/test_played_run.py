@@ -90,7 +90,7 @@ def test_without_truth_nothing_is_claimed(simulated: SimulatedRun, tmp_path: Pat
     assert report.verdicts is None
     assert np.isfinite(report.corrected_position).all()
     np.testing.assert_allclose(report.corrected_position[0], report.odometry_position[0])
-    draw(report, tmp_path / "picture.png", "no truth")
+    draw(report, tmp_path / "picture.png", "no$_$truth.g2o")
     with Image.open(tmp_path / "picture.png") as image:
         assert image.size == (2100, 1200)
 
