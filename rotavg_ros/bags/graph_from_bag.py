@@ -226,9 +226,12 @@ def _with_truth(graph_file: GraphFile, content: _Content) -> GraphFile:
     for stamp, true_position, true_orientation in content.truth:
         if nodes := nodes_at.get(stamp):
             node = nodes.pop(0) if len(nodes) > 1 else nodes[0]
-            position[node], orientation[node] = true_position, np.array(true_orientation) * _CONJUGATE
+            position[node] = true_position
+            if abs(float(np.linalg.norm(true_orientation)) - 1) <= UNIT_NORM_TOLERANCE:
+                orientation[node] = np.array(true_orientation) * _CONJUGATE
     if content.truth:
-        graph_file = replace(graph_file, body_from_world_gt=orientation)
+        if np.isfinite(orientation).any():
+            graph_file = replace(graph_file, body_from_world_gt=orientation)
         if content.note.get("position_gt", True):
             graph_file = replace(graph_file, position_gt=position)
     if not content.note.get("stamps", True):

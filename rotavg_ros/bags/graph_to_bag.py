@@ -53,11 +53,10 @@ def write_graph_bag(path: str | Path, graph_file: GraphFile, *, overwrite: bool 
     has_odometry = bool(graph.is_odometry.any())
     if has_odometry:
         events += [(int(stamp), 0, node) for node, stamp in enumerate(stamps_ns)]
-    truth_known = (
-        np.zeros(graph.num_nodes, dtype=bool)
-        if graph_file.body_from_world_gt is None
-        else np.isfinite(graph_file.body_from_world_gt).all(axis=1)
-    )
+    truth_position, truth_orientation = _truth(graph_file)
+    truth_known = np.isfinite(truth_orientation).all(axis=1)
+    if graph_file.position_gt is not None:
+        truth_known |= np.isfinite(truth_position).all(axis=1)
     events += [(int(stamps_ns[node]), 1, int(node)) for node in np.flatnonzero(truth_known)]
     events += [(int(stamp), 2, edge) for edge, stamp in enumerate(published_ns)]
 
@@ -69,7 +68,6 @@ def write_graph_bag(path: str | Path, graph_file: GraphFile, *, overwrite: bool 
         if truth_known.any():
             bag.add_topic(TRUTH_TOPIC, ODOMETRY)
         odom_position, odom_orientation = _dead_reckoning(graph_file) if has_odometry else (None, None)
-        truth_position, truth_orientation = _truth(graph_file, truth_known)
         edges = _edges(graph_file, stamps_ns, published_ns)
         sequence = 0
         for stamp, what, index in sorted(events):
@@ -112,12 +110,12 @@ def _dead_reckoning(graph_file: GraphFile) -> tuple[NDArray[np.float64], NDArray
     return chain_poses(graph_file.graph, translation)
 
 
-def _truth(graph_file: GraphFile, known: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    position, orientation = np.zeros((len(known), 3)), np.zeros((len(known), 4))
-    if graph_file.position_gt is not None:
-        position = np.nan_to_num(graph_file.position_gt)
-    if known.any():
-        assert graph_file.body_from_world_gt is not None
+def _truth(graph_file: GraphFile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Positions, the origin for a file without any, and world-from-body orientations; NaN rows where unknown."""
+    position = np.zeros((graph_file.graph.num_nodes, 3)) if graph_file.position_gt is None else graph_file.position_gt
+    orientation = np.full((len(position), 4), np.nan)
+    if graph_file.body_from_world_gt is not None:
+        known = np.isfinite(graph_file.body_from_world_gt).all(axis=1)
         orientation[known] = Rotation.from_quat(graph_file.body_from_world_gt[known]).inv().as_quat(canonical=True)
     return position, orientation
 

@@ -116,7 +116,7 @@ def _reference(name: str, records: list[OdometryRecord], options: EstimatorOptio
     length = np.linalg.norm(orientation, axis=1)
     is_last = np.concatenate(((np.diff(stamp_ns) > 0) | (np.diff(time_line) > 0), [True]))[: len(records)]
     sound = np.isfinite(length) & (length > 0) & is_last
-    has_position = bool(np.isfinite(position[sound]).all())
+    has_position = bool(np.isfinite(position[sound]).all(axis=1).any())
     return Reference(
         name,
         stamp_ns[sound],

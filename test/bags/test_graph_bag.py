@@ -17,7 +17,7 @@ from rotavg_ros.bags.run_bag import write_run_bag
 from rotavg_ros.bags.topics import EDGE_ARRAY_TOPIC, EDGE_TOPIC, ODOM_TOPIC, TRUTH_TOPIC
 from rotavg_ros.bags.writer import BagWriteError, BagWriter
 from rotavg_ros.cli.main import main
-from rotavg_ros.datasets.files.formats import read_graph
+from rotavg_ros.datasets.files.formats import read_graph, write_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.datasets.files.ground_truth import attach_stamps, attach_truth
 from rotavg_ros.datasets.simulation.robot_run import RobotRun
@@ -77,6 +77,42 @@ def test_round_trip_without_odometry(tmp_path: Path) -> None:
     with BagReader(tmp_path / "bag") as bag:
         assert bag.topics == {EDGE_TOPIC: RELATIVE_ROTATION}
     assert_same(read_graph_bag(tmp_path / "bag"), graph_file)
+
+
+@pytest.mark.parametrize("knows", ["all but some", "orientations", "positions"])
+def test_round_trip_of_a_truth_with_gaps(tmp_path: Path, knows: str) -> None:
+    """What is not known stays so, and what is known of a node stays without the rest."""
+    graph_file = simulated(num_keyframes=60).to_graph_file()
+    assert graph_file.position_gt is not None and graph_file.body_from_world_gt is not None
+    position, orientation = graph_file.position_gt.copy(), graph_file.body_from_world_gt.copy()
+    position[3], orientation[5], position[7], orientation[7] = np.nan, np.nan, np.nan, np.nan
+    graph_file = replace(
+        graph_file,
+        position_gt=None if knows == "orientations" else position,
+        body_from_world_gt=None if knows == "positions" else orientation,
+    )
+    write_graph_bag(tmp_path / "bag", graph_file)
+    assert_same(read_graph_bag(tmp_path / "bag"), graph_file)
+
+
+def test_a_true_pose_that_is_none_is_not_known(tmp_path: Path) -> None:
+    """As of a motion capture that has lost the robot."""
+    graph_file = simulated(num_keyframes=60).to_graph_file()
+    write_graph_bag(tmp_path / "bag", graph_file)
+    with BagReader(tmp_path / "bag") as whole, BagWriter(tmp_path / "lost") as lost:
+        for topic, kind in whole.topics.items():
+            lost.add_topic(topic, kind)
+        for message in whole.messages([EDGE_TOPIC]):
+            lost.write_raw(message.topic, message.time_ns, message.data)
+        for index, (topic, time_ns, message) in enumerate(whole.decoded([TRUTH_TOPIC])):
+            message.pose.pose.orientation.w *= index % 4 > 0
+            message.pose.pose.orientation.z *= index % 4 > 0
+            lost.write(topic, time_ns, message)
+    read = read_graph_bag(tmp_path / "lost")
+    assert read.body_from_world_gt is not None
+    assert np.isnan(read.body_from_world_gt).any(axis=1).tolist() == [index % 4 == 0 for index in range(60)]
+    write_graph(tmp_path / "lost.npz", read)
+    assert read_graph(tmp_path / "lost.npz").body_from_world_gt is not None
 
 
 def test_round_trip_of_a_real_robot(tmp_path: Path, shared_data: Path) -> None:

@@ -224,6 +224,21 @@ def test_an_output_that_exists_is_refused_and_then_replaced(
     assert main(["replay", str(small), "--output", str(tmp_path / "file"), "--overwrite"]) == 2
 
 
+def test_a_reference_that_loses_its_position_now_and_then(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        for topic in ("/odom", "/ground_truth"):
+            bag.add_topic(topic, ODOMETRY)
+        for index in range(50):
+            stamp, position = 10**9 + index * 10**8, np.array([0.1 * index, 0.01 * index**2, 0.0])
+            for topic in ("/odom", "/ground_truth"):
+                lost = topic == "/ground_truth" and index == 20
+                message = odometry_message(stamp, position * (np.nan if lost else 1), np.array([0, 0, 0, 1.0]), "odom")
+                bag.write(topic, stamp, message)
+    assert main(["replay", str(tmp_path / "bag"), "--output", str(tmp_path / "out")]) == 0
+    (said,) = json.loads((tmp_path / "out" / "summary.json").read_text())["robots"].values()
+    assert said["position_error_rms_m"]["odometry"] == pytest.approx(0.0, abs=1e-9)
+
+
 @pytest.mark.parametrize(
     ("content", "says"),
     [
