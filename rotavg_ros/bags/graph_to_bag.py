@@ -57,11 +57,12 @@ def write_graph_bag(path: str | Path, graph_file: GraphFile, *, overwrite: bool 
     truth_known = np.isfinite(truth_orientation).all(axis=1)
     if graph_file.position_gt is not None:
         truth_known |= np.isfinite(truth_position).all(axis=1)
+    truth_known = np.isin(stamps_ns, stamps_ns[truth_known])  # nodes of one stamp are told apart by their order
     events += [(int(stamps_ns[node]), 1, int(node)) for node in np.flatnonzero(truth_known)]
     events += [(int(stamp), 2, edge) for edge, stamp in enumerate(published_ns)]
 
     with BagWriter(path, overwrite=overwrite) as bag:
-        bag.set_note(GRAPH_NOTE, json.dumps(_note(graph_file)))
+        bag.set_note(GRAPH_NOTE, json.dumps(_note(graph_file, stamps_ns)))
         bag.add_topic(EDGE_TOPIC, RELATIVE_ROTATION)
         if has_odometry:
             bag.add_topic(ODOM_TOPIC, ODOMETRY)
@@ -90,7 +91,7 @@ def _check_stamps(path: Path, node_ids: NDArray[np.int64], stamps_ns: NDArray[np
         raise BagWriteError(f"{path}: {stamp}; a bag's stamps lie between 1970 and 2038: give others with --stamps")
 
 
-def _note(graph_file: GraphFile) -> dict[str, object]:
+def _note(graph_file: GraphFile, stamps_ns: NDArray[np.int64]) -> dict[str, object]:
     graph = graph_file.graph
     lone = np.ones(graph.num_nodes, dtype=bool)
     lone[graph.source.numpy()] = lone[graph.target.numpy()] = False
@@ -99,7 +100,7 @@ def _note(graph_file: GraphFile) -> dict[str, object]:
         "stamps": graph_file.stamps_ns is not None,
         "position_gt": graph_file.position_gt is not None,
         "lone_ids": graph_file.node_ids[lone].tolist(),
-        "lone_stamps_ns": [] if graph_file.stamps_ns is None else graph_file.stamps_ns[lone].tolist(),
+        "lone_stamps_ns": stamps_ns[lone].tolist(),
     }
 
 

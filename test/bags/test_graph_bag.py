@@ -95,6 +95,31 @@ def test_round_trip_of_a_truth_with_gaps(tmp_path: Path, knows: str) -> None:
     assert_same(read_graph_bag(tmp_path / "bag"), graph_file)
 
 
+def test_round_trip_of_a_truth_of_some_nodes_of_a_stamp(tmp_path: Path) -> None:
+    graph_file = simulated(num_keyframes=60).to_graph_file()
+    assert graph_file.body_from_world_gt is not None
+    orientation = graph_file.body_from_world_gt.copy()
+    orientation[::3] = np.nan
+    stamps_ns = np.arange(60) // 4 * 10**9
+    graph_file = replace(graph_file, stamps_ns=stamps_ns, body_from_world_gt=orientation, position_gt=None)
+    write_graph_bag(tmp_path / "bag", graph_file)
+    assert_same(read_graph_bag(tmp_path / "bag"), graph_file)
+
+
+def test_round_trip_of_the_truth_of_a_node_without_edges(tmp_path: Path) -> None:
+    graph_file = simulated(num_keyframes=60).to_graph_file()
+    graph = graph_file.graph
+    chosen = torch.nonzero((graph.source != 20) & (graph.target != 20)).squeeze(1)
+    lone = replace(
+        graph_file,
+        graph=graph.select_edges(chosen),
+        edge_translation=None if graph_file.edge_translation is None else graph_file.edge_translation[chosen.numpy()],
+        stamps_ns=None,
+    )
+    write_graph_bag(tmp_path / "bag", lone)
+    assert_same(read_graph_bag(tmp_path / "bag"), lone)
+
+
 def test_a_true_pose_that_is_none_is_not_known(tmp_path: Path) -> None:
     """As of a motion capture that has lost the robot."""
     graph_file = simulated(num_keyframes=60).to_graph_file()
