@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -26,7 +27,7 @@ from rotavg_ros.bags.topics import (
 )
 from rotavg_ros.datasets.files.graph_file import MAX_NODE_ID, GraphFile
 from rotavg_ros.datasets.planar import are_about_z
-from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, ViewGraphError
+from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, ViewGraphError, where_possible
 
 # Largest difference between a stamp that names a keyframe and the stamp of its odometry message.
 _MAX_KEYFRAME_DISTANCE_NS = 50_000_000
@@ -35,6 +36,8 @@ _MAX_KEYFRAME_DISTANCE_NS = 50_000_000
 _Pose = tuple[int, list[float], list[float]]
 
 _EDGES = {EDGE_TOPIC: RELATIVE_ROTATION, EDGE_ARRAY_TOPIC: RELATIVE_ROTATION_ARRAY}
+
+_REPEATED = "edges that are sent again"
 
 _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 
@@ -48,6 +51,7 @@ class _Content:
     truth: list[_Pose] = field(default_factory=list)
     note: dict[str, Any] = field(default_factory=dict)
     edge_topics: str = ""
+    repeated: int = 0
     warnings: tuple[str, ...] = ()
 
     @property
@@ -66,9 +70,9 @@ def read_graph_bag(path: str | Path) -> GraphFile:
 
     Where the edges name their ends by id, they are the graph, in the order of the edges' own numbers. Where they name
     them by stamp, every odometry message is a keyframe, consecutive ones are joined by odometry edges, and an end
-    belongs to the nearest odometry message within 0.05 s; edges without such a message are skipped and counted. Edges
-    between sensors are converted to the body's frame by the bag's static transforms. From a damaged bag, everything
-    that can be read is used.
+    belongs to the nearest odometry message within 0.05 s; edges without such a message are skipped and counted, as are
+    those that are the same as one before, since the sender has repeated itself. Edges between sensors are converted to
+    the body's frame by the bag's static transforms. From a damaged bag, everything that can be read is used.
 
     Raises:
         BagReadError: an unreadable bag, one without edges, or one that needs odometry and has none.
@@ -87,6 +91,8 @@ def read_graph_bag(path: str | Path) -> GraphFile:
         graph_file = _from_ids(content) if content.by_id else _from_stamps(content)
     except ViewGraphError as error:
         raise BagReadError(f"{path}: {content.edge_topics}: {error}") from None
+    if graph_file.graph.num_edges == 0:
+        raise BagReadError(f"{path}: {content.edge_topics}: no edge joins two keyframes; there is no graph")
     return _with_truth(replace(graph_file, damage=damage, warnings=content.warnings), content)
 
 
@@ -109,7 +115,9 @@ def _read(bag: BagReader) -> _Content:
             content.truth.append(read_odometry(message))
         else:
             frames.take(message)
-    content.edges = list(map(frames.edge_of_body, content.edges))  # the last transform may come after the edges
+    once = {(edge.id, edge.source, edge.target, edge.source_from_target.tobytes()): edge for edge in content.edges}
+    content.repeated = len(content.edges) - len(once)
+    content.edges = list(map(frames.edge_of_body, once.values()))  # the last transform may come after the edges
     content.warnings = frames.warnings
     return content
 
@@ -145,8 +153,8 @@ def _from_ids(content: _Content) -> GraphFile:
         kind=np.array([edge.kind for edge in edges]),
         precision=np.array([edge.precision for edge in edges]),
         planar=bool(note.get("planar", are_about_z(source_from_target))),
-        edge_translation=_translations(edges) if content.has_translations else None,
-        skipped={"self-edges": len(content.edges) - len(proper)} if len(proper) < len(content.edges) else {},
+        edge_translation=_possible(_translations(edges)) if content.has_translations else None,
+        skipped=_counted({"self-edges": len(content.edges) - len(proper), _REPEATED: content.repeated}),
     )
     stated = [end for edge in edges for end in (edge.source, edge.target) if end.stamp_ns]
     stamp_of = {end.id: end.stamp_ns for end in stated}
@@ -179,6 +187,7 @@ def _from_stamps(content: _Content) -> GraphFile:
     skipped = {
         "odometry messages without a pose": len(content.odometry) - len(sound),
         "edges without odometry at their stamps, or with both ends at one": int((~usable).sum()),
+        _REPEATED: content.repeated,
     }
     graph_file = GraphFile.from_ids(
         source[order],
@@ -188,10 +197,14 @@ def _from_stamps(content: _Content) -> GraphFile:
         kind=np.array([EdgeKind.ODOMETRY] * num_steps + [edge.kind for edge in closures])[order],
         precision=np.array([np.nan] * num_steps + [edge.precision for edge in closures])[order],
         planar=are_about_z(source_from_target),
-        edge_translation=np.concatenate((steps, _translations(closures)))[order],
-        skipped={what: count for what, count in skipped.items() if count},
+        edge_translation=_possible(np.concatenate((steps, _translations(closures))))[order],
+        skipped=_counted(skipped),
     )
     return replace(graph_file, stamps_ns=stamps_ns)
+
+
+def _counted(skipped: dict[str, int]) -> dict[str, int]:
+    return {what: count for what, count in skipped.items() if count}
 
 
 def _is_sound(message: _Pose) -> bool:
@@ -204,6 +217,11 @@ def _translations(edges: Sequence[Edge]) -> NDArray[np.float64]:
     """``(n, 3)`` metres; NaN where unknown."""
     rows = [np.full(3, np.nan) if edge.translation is None else edge.translation for edge in edges]
     return np.array(rows).reshape(-1, 3)
+
+
+def _possible(translation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``(n, 3)`` metres; NaN where it is none, as files state it."""
+    return np.asarray(where_possible(torch.from_numpy(translation)))
 
 
 def _nearest(stamps_ns: NDArray[np.int64], end: Keyframe) -> int:

@@ -260,6 +260,7 @@ def test_a_stamp_that_is_not_stated_is_none(tmp_path: Path, first: int, again: i
         ([replace(edge(0, Keyframe(1, 0), Keyframe(2, 0)), kind=7)], "unknown kind 7"),
         ([edge(0, Keyframe(None, 0), Keyframe(2, 0))], "no topic /odom"),
         ([], "no topic /odom"),
+        ([edge(0, Keyframe(1, 0), Keyframe(1, 0))], "no edge joins two keyframes"),
     ],
 )
 def test_what_makes_no_graph_is_refused(tmp_path: Path, edges: list[Edge], complaint: str) -> None:
@@ -303,6 +304,41 @@ def test_odometrys_steps_are_kept_where_no_closure_states_a_translation(tmp_path
         bag.write(EDGE_TOPIC, 4 * 10**9, edge_message(closure))
     read = read_graph_bag(tmp_path / "bag")
     np.testing.assert_allclose(read.edge_translation, [[1, 0, 0], [1, 0, 0], [np.nan] * 3], atol=1e-12)
+
+
+@pytest.mark.parametrize("by_stamp", [False, True])
+def test_an_edge_that_is_sent_again_counts_once(tmp_path: Path, by_stamp: bool) -> None:
+    """As in a replay; another measurement of the same pair, or another edge of the same number, is not the same."""
+    first, last = (Keyframe(None if by_stamp else index, (index + 1) * 10**9) for index in (0, 2))
+    once = edge(0, first, last)
+    again, other = replace(once, sequence=7), replace(once, source_from_target=np.array([0, 0, 1.0, 0]))
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic(EDGE_TOPIC, RELATIVE_ROTATION)
+        bag.add_topic(ODOM_TOPIC, ODOMETRY)
+        for index in range(3):
+            stamp = (index + 1) * 10**9
+            bag.write(ODOM_TOPIC, stamp, odometry_message(stamp, np.zeros(3), np.array([0, 0, 0, 1.0]), "odom"))
+        for message in (once, other, again, replace(once, source=last, target=first)):
+            bag.write(EDGE_TOPIC, 4 * 10**9, edge_message(message))
+    read = read_graph_bag(tmp_path / "bag")
+    assert int((read.graph.kind == 1).sum()) == 3
+    assert read.skipped == {"edges that are sent again": 1}
+
+
+def test_translations_that_are_none_are_not_known(tmp_path: Path) -> None:
+    """What is written can be read."""
+    far, lost = (
+        replace(edge(0, Keyframe(1, 0), Keyframe(2, 0)), translation=np.array([x, 0, 0])) for x in (2e9, np.inf)
+    )
+    near = replace(edge(1, Keyframe(2, 0), Keyframe(3, 0)), translation=np.array([1.0, 0, 0]))
+    for number, unknown in enumerate((far, lost)):
+        read = read_graph_bag(bag_of_edges(tmp_path / f"bag{number}", [unknown, near]))
+        np.testing.assert_array_equal(read.edge_translation, [[np.nan] * 3, [1, 0, 0]])
+        for suffix in (".npz", ".g2o"):
+            write_graph(tmp_path / f"graph{suffix}", read)
+            np.testing.assert_array_equal(
+                read_graph(tmp_path / f"graph{suffix}").edge_translation, read.edge_translation
+            )
 
 
 def bag_of_a_camera(path: Path, frame: str, *, with_transform: bool, in_array: bool) -> tuple[Rotation, Path]:
