@@ -26,7 +26,7 @@ from rotavg_ros.bags.topics import (
     static_transforms,
 )
 from rotavg_ros.datasets.files.graph_file import MAX_NODE_ID, GraphFile
-from rotavg_ros.datasets.planar import are_about_z
+from rotavg_ros.datasets.planar import are_about_z, are_level
 from rotavg_ros.view_graph import UNIT_NORM_TOLERANCE, EdgeKind, ViewGraphError, where_possible
 
 # Largest difference between a stamp that names a keyframe and the stamp of its odometry message.
@@ -144,6 +144,7 @@ def _from_ids(content: _Content) -> GraphFile:
     ends = np.array([(edge.source.id, edge.target.id) for edge in edges], dtype=np.int64)
     ends = ends.reshape(-1, 2)
     source_from_target = np.array([edge.source_from_target for edge in edges]).reshape(-1, 4)
+    translations = _possible(_translations(edges)) if content.has_translations else None
     note = content.note
     graph_file = GraphFile.from_ids(
         ends[:, 0],
@@ -152,8 +153,8 @@ def _from_ids(content: _Content) -> GraphFile:
         lone_ids=np.array(note.get("lone_ids", []), dtype=np.int64),
         kind=np.array([edge.kind for edge in edges]),
         precision=np.array([edge.precision for edge in edges]),
-        planar=bool(note.get("planar", are_about_z(source_from_target))),
-        edge_translation=_possible(_translations(edges)) if content.has_translations else None,
+        planar=bool(note.get("planar", are_about_z(source_from_target) and are_level(translations))),
+        edge_translation=translations,
         skipped=_counted({"self-edges": len(content.edges) - len(proper), _REPEATED: content.repeated}),
     )
     stated = [end for edge in edges for end in (edge.source, edge.target) if end.stamp_ns]
@@ -184,6 +185,7 @@ def _from_stamps(content: _Content) -> GraphFile:
     source = np.concatenate((np.arange(num_steps), ends[usable, 0]))
     target = np.concatenate((np.arange(1, num_steps + 1), ends[usable, 1]))
     order = np.argsort(np.maximum(source, target), kind="stable")
+    translations = _possible(np.concatenate((steps, _translations(closures))))
     skipped = {
         "odometry messages without a pose": len(content.odometry) - len(sound),
         "edges without odometry at their stamps, or with both ends at one": int((~usable).sum()),
@@ -196,8 +198,8 @@ def _from_stamps(content: _Content) -> GraphFile:
         lone_ids=np.arange(len(stamps_ns)),
         kind=np.array([EdgeKind.ODOMETRY] * num_steps + [edge.kind for edge in closures])[order],
         precision=np.array([np.nan] * num_steps + [edge.precision for edge in closures])[order],
-        planar=are_about_z(source_from_target),
-        edge_translation=_possible(np.concatenate((steps, _translations(closures))))[order],
+        planar=are_about_z(source_from_target) and are_level(translations),
+        edge_translation=translations[order],
         skipped=_counted(skipped),
     )
     return replace(graph_file, stamps_ns=stamps_ns)

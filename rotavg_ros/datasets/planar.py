@@ -1,4 +1,4 @@
-"""Rotations about z, as in planar pose graphs and ground truth."""
+"""Rotations about z and steps that stay level, as in planar pose graphs and ground truth."""
 
 from __future__ import annotations
 
@@ -6,11 +6,18 @@ import numpy as np
 
 # Largest x and y of a rotation about z (half angles): allows for the rounding of 32-bit numbers, which is 6e-8.
 _ROUNDING = 1e-6
+# Largest height of a step that still counts as planar, metres.
+_FLAT_M = 1e-6
 
 
 def are_about_z(quaternions: np.ndarray) -> bool:
     """Whether all of ``(K, 4)`` xyzw rotations are about z."""
     return bool((np.abs(quaternions[:, :2]) <= _ROUNDING).all())
+
+
+def are_level(steps: np.ndarray | None) -> bool:
+    """Whether none of ``(K, 3)`` metres, NaN or None where unknown, goes up or down."""
+    return steps is None or bool((np.abs(np.nan_to_num(steps[:, 2])) <= _FLAT_M).all())
 
 
 def quaternion_of_heading(heading: np.ndarray) -> np.ndarray:

@@ -9,14 +9,12 @@ from numpy.typing import NDArray
 
 from rotavg_ros.datasets.files.corrected_graph import is_told, write_corrected_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
-from rotavg_ros.datasets.planar import are_about_z
+from rotavg_ros.datasets.planar import are_about_z, are_level
 from rotavg_ros.online import Answer
 from rotavg_ros.replay.record import RunRecord
 from rotavg_ros.solver.positions import Translations, fit_positions
 from rotavg_ros.view_graph import EdgeKind
 
-# Largest height of a step that still counts as planar, metres.
-_FLAT_M = 1e-6
 # Ids of one robot that span more than this are replaced by consecutive numbers, so that ids of several robots fit.
 _MOST_BETWEEN = 1 << 40
 
@@ -34,7 +32,7 @@ def write_graph_of_run(path: Path, record: RunRecord) -> None:
     answer = record.answer
     position = np.nan_to_num(_positions(record))
     turns = np.concatenate((answer.target_from_source, answer.world_from_body))
-    is_flat = bool((np.abs(np.nan_to_num(answer.translation[:, 2])) <= _FLAT_M).all())
+    is_flat = are_level(answer.translation)
     ids = keyframe_ids(answer)
     graph_file = GraphFile.from_ids(
         ids[answer.source],

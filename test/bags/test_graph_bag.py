@@ -341,6 +341,32 @@ def test_translations_that_are_none_are_not_known(tmp_path: Path) -> None:
             )
 
 
+@pytest.mark.parametrize("climb", [0.0, 0.5])
+@pytest.mark.parametrize("by_stamp", [False, True])
+def test_a_lift_leaves_the_plane(tmp_path: Path, by_stamp: bool, climb: float) -> None:
+    """Though it turns about the vertical alone: formats in the plane would lose its heights."""
+    ends = [Keyframe(None if by_stamp else index, (index + 1) * 10**9) for index in range(3)]
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic(EDGE_TOPIC, RELATIVE_ROTATION)
+        bag.add_topic(ODOM_TOPIC, ODOMETRY)
+        for index in range(3):
+            stamp, position = (index + 1) * 10**9, np.array([0.0, 0.0, climb * index])
+            bag.write(ODOM_TOPIC, stamp, odometry_message(stamp, position, np.array([0, 0, 0, 1.0]), "odom"))
+        for number, (source, target) in enumerate(((0, 1), (1, 2), (0, 2))):
+            up = np.array([0, 0, climb * (target - source)])
+            seen = replace(edge(number, ends[source], ends[target]), translation=None if by_stamp else up)
+            bag.write(EDGE_TOPIC, 4 * 10**9, edge_message(seen))
+    read = read_graph_bag(tmp_path / "bag")
+    assert read.planar == (climb == 0)
+    for suffix in (".g2o", ".toro", ".npz"):
+        write_graph(tmp_path / f"graph{suffix}", read)
+        again = read_graph(tmp_path / f"graph{suffix}")
+        np.testing.assert_allclose(again.edge_translation, read.edge_translation, atol=1e-12)
+    arrays = dict(np.load(tmp_path / "graph.npz"))
+    np.savez(tmp_path / "graph.npz", **{name: array for name, array in arrays.items() if name != "planar"})
+    assert read_graph(tmp_path / "graph.npz").planar == read.planar
+
+
 def bag_of_a_camera(path: Path, frame: str, *, with_transform: bool, in_array: bool) -> tuple[Rotation, Path]:
     """Two odometry messages, a quarter of a turn apart, and the closure between them as a camera sees it."""
     turn, camera = Rotation.from_euler("z", 90, degrees=True), Rotation.from_euler("zx", [90, 90], degrees=True)

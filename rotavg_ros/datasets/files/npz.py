@@ -20,7 +20,7 @@ import numpy as np
 
 from rotavg_ros.datasets.files.graph_file import GraphFile, GraphFileError, reading, writing
 from rotavg_ros.datasets.files.text_rows import refuse, unit_quaternions
-from rotavg_ros.datasets.planar import are_about_z
+from rotavg_ros.datasets.planar import are_about_z, are_level
 from rotavg_ros.view_graph import MAX_TRANSLATION, STEPS, EdgeKind, EdgeLabel, are_steps
 
 _SHAPES: dict[str, tuple[int, ...]] = {  # of one row
@@ -87,7 +87,7 @@ def read(path: Path) -> GraphFile:
         quaternions[proper],
         lone_ids=np.concatenate((source[~proper], arrays.get("node_ids", source[:0]))),
         kind=kind[proper],
-        planar=turns_about_z if planar is None else planar,
+        planar=turns_about_z and are_level(arrays.get("edge_translation")) if planar is None else planar,
         **{name: arrays[name][proper] for name in (*_OF_EDGES, *_EDGE_EXTRAS) if name in arrays},
         skipped={} if proper.all() else {"self-edge": int((~proper).sum())},
     )
