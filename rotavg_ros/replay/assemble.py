@@ -45,6 +45,8 @@ def assemble(bag: BagReader, plan: Plan, outcome: Outcome) -> RunRecord:
         options=plan.parameters.values(),
         wall_seconds=outcome.wall_seconds,
         interrupted=outcome.interrupted or outcome.damage is not None,
+        warnings=outcome.warnings,
+        damage=None if outcome.damage is None else outcome.damage.removeprefix(f"{bag.path}: "),
     )
 
 

@@ -136,6 +136,8 @@ class RunRecord:
         options: the parameters as users write them, by the node's names.
         wall_seconds: duration of the replay.
         interrupted: whether it was stopped by Ctrl-C, or by damage to the bag, before its end.
+        warnings: about how the bag was read, and edges that were not used.
+        damage: what could not be read of the bag; None: nothing.
     """
 
     name: str
@@ -148,3 +150,5 @@ class RunRecord:
     options: dict[str, object]
     wall_seconds: float
     interrupted: bool
+    warnings: tuple[str, ...] = ()
+    damage: str | None = None

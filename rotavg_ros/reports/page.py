@@ -145,7 +145,9 @@ def _where_known(facts: RunFacts) -> str:
 def _notes(facts: RunFacts) -> list[str]:
     record = facts.record
     notes = []
-    if record.interrupted:
+    if record.damage is not None:
+        notes.append(f"This is what can be read of the bag, not all of it: {record.damage}.")
+    elif record.interrupted:
         notes.append("The replay was interrupted: this is what was done by then, not the whole bag.")
     if len(record.answer.stamp_ns) and len(facts.closures) == 0:
         notes.append(
@@ -156,7 +158,8 @@ def _notes(facts: RunFacts) -> list[str]:
             f"The graph falls into {record.answer.num_components} parts that no edge connects; each is right only "
             "within itself."
         )
-    notes += [f"{warning[:1].upper()}{warning[1:]}." for warning in record.answer.warnings]
+    warnings = (*record.warnings, *record.answer.warnings)
+    notes += [f"{warning[:1].upper()}{warning[1:]}." for warning in warnings]
     if facts.num_flagged_odometry:
         count = counted(facts.num_flagged_odometry, "odometry edge")
         notes.append(f"{count} contradict the rest of the graph: a slip, a jump, or a wrong stamp.")

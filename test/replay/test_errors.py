@@ -125,6 +125,10 @@ def test_what_can_be_read_of_a_damaged_bag_is_replayed(
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["damage"] in error and summary["interrupted"] and summary["keyframes"] > 0
     assert (tmp_path / "out" / "trajectory.tum").exists()
+    quick = ["--output", str(tmp_path / "told"), "-p", "solve_period_s:=100.0"]
+    assert main(["replay", str(bag), *quick]) == 0
+    assert f"not all of it: the bag is damaged: {says}" in (tmp_path / "told" / "report.html").read_text("utf-8")
+    capsys.readouterr()
     assert main(["replay", str(bag), "--list"]) == 0
     assert capsys.readouterr().err.startswith(f"rotavg: warning: {bag}: the bag is damaged: ") or broken is corrupted
 

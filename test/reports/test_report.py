@@ -163,6 +163,15 @@ def test_warnings_stand_above_all_results(record: RunRecord, tmp_path: Path) -> 
 
 
 @pytest.mark.usefixtures("few_pictures")
+def test_what_was_not_used_of_the_bag_is_told(record: RunRecord, tmp_path: Path) -> None:
+    partly = replace(record, warnings=("3 edges were not used",), damage="the bag is damaged", interrupted=True)
+    text = Page(write_report(partly, tmp_path)).text
+    assert "3 edges were not used." in text
+    assert "This is what can be read of the bag, not all of it: the bag is damaged." in text
+    assert "interrupted" not in text
+
+
+@pytest.mark.usefixtures("few_pictures")
 def test_a_reference_at_another_time(record: RunRecord, tmp_path: Path) -> None:
     (robot,) = record.robots
     assert robot.reference is not None
