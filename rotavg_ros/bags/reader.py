@@ -97,8 +97,11 @@ class BagReader:
 
     @property
     def topics(self) -> dict[str, str]:
-        """Message type of every topic, in the order of their names."""
-        return {connection.topic: connection.msgtype for connection in sorted(self._all(), key=lambda c: c.topic)}
+        """Message type of every topic, in the order of their names; of several types, that of most messages."""
+        counts: dict[str, Counter[str]] = {}
+        for connection in sorted(self._all(), key=lambda c: c.topic):
+            counts.setdefault(connection.topic, Counter())[connection.msgtype] += connection.msgcount
+        return {topic: of_type.most_common(1)[0][0] for topic, of_type in counts.items()}
 
     @property
     def is_ros2(self) -> bool:
@@ -163,9 +166,13 @@ class BagReader:
     ) -> Iterator[tuple[str, int, Any]]:
         """Messages as (topic, time in ns, message), of those recorded from ``start_ns`` on and before ``stop_ns``.
 
-        Types of packages that are not installed are decoded by the definitions in the bag.
+        Types of packages that are not installed are decoded by the definitions in the bag. Where a topic has several
+        types, its messages of others than :attr:`topics` says are left out.
         """
+        type_of = self.topics
         for connection, time_ns, data in self._records(topics, start_ns, stop_ns):
+            if connection.msgtype != type_of.get(connection.topic, connection.msgtype):
+                continue
             reader = self._open()  # a new one after the bag has turned out to be damaged
             if connection.msgtype not in reader.typestore.fielddefs:
                 raise BagReadError(

@@ -349,6 +349,20 @@ def test_bags_of_others_with_types_of_their_own(tmp_path: Path, mode: Compressio
     assert (topic, time_ns, message.value, message.name) == ("/thing", 10, 2.5, "x")
 
 
+def test_a_topic_of_two_types_is_of_the_one_with_more_messages(tmp_path: Path) -> None:
+    store, pose = typestore(), "geometry_msgs/msg/PoseStamped"
+    with Writer(tmp_path / "two", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections = {kind: writer.add_connection("/odom", kind, typestore=store) for kind in (ODOMETRY, pose)}
+        for index in range(5):
+            odometry = odometry_message(START_NS + index, np.arange(3.0), np.array([0, 0, 0, 1.0]), "odom")
+            messages = {ODOMETRY: odometry, pose: store.types[pose](odometry.header, odometry.pose.pose)}
+            for kind in (ODOMETRY, pose) if index % 2 else (ODOMETRY,):
+                writer.write(connections[kind], START_NS + index, store.serialize_cdr(messages[kind], kind))
+    with BagReader(tmp_path / "two") as bag:
+        assert bag.topics == {"/odom": ODOMETRY}
+        assert [message.child_frame_id for _, _, message in bag.decoded(["/odom"])] == ["base_link"] * 5
+
+
 def test_real_bags(shared_data: Path) -> None:
     with BagReader(shared_data / "bags" / "husky_test1.bag") as bag:
         assert not bag.is_ros2
