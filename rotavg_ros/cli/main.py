@@ -6,10 +6,11 @@ import argparse
 import importlib
 import io
 import os
+import re
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from rotavg_ros.cli.command_line import command_line
 from rotavg_ros.cli.interruption import Interruption
@@ -51,12 +52,17 @@ class UsageError(UserError):
 
 
 class _Parser(argparse.ArgumentParser):
-    """Reports mistakes in one line, and accepts an optional last positional argument anywhere.
+    """Reports mistakes in one line, and accepts an optional last positional argument anywhere, and numbers like -1e-3.
 
-    Before Python 3.13, argparse assumes that such an argument was left out if an option comes before it.
+    Before Python 3.13, argparse assumes that such an argument was left out if an option comes before it, and before
+    3.14 that such a number is an option.
     """
 
     _between_options = False
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._negative_number_matcher = re.compile(r"-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
 
     def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
         """As in :class:`argparse.ArgumentParser`."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rotavg_ros.bags.graph_from_bag import read_graph_bag
-from rotavg_ros.cli.main import main
+from rotavg_ros.cli.main import main, parse
 from rotavg_ros.datasets.files.formats import read_graph
 from rotavg_ros.datasets.files.graph_file import GraphFile
 from rotavg_ros.metrics import true_edge_noise
@@ -99,6 +99,12 @@ def test_a_graph_is_not_replaced_by_its_bag(tmp_path: Path, capsys: pytest.Captu
     assert main(["simulate", "--output", str(tmp_path / "run"), "--overwrite", "--graph", str(graph)]) == 2
     said = capsys.readouterr().err
     assert said == f"rotavg: error: {graph}: is in the bag, which is written after it; choose another --graph\n"
+
+
+@pytest.mark.parametrize("number", ["-2", "-0.5", "-.5", "-3.", "-1e-3", "-2.5E+1"])
+def test_a_number_below_zero_is_no_option(number: str) -> None:
+    parsed = parse(["simulate", "--output", "run", "--odometry-bias-deg-per-min", number])
+    assert parsed.odometry_bias_deg_per_min == float(number)
 
 
 def test_an_existing_bag_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
