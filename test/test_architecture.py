@@ -123,7 +123,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "uncertainty": {"priors", "probes"},
         "cycles": {"priors"},
         "consensus": {"cycles", "priors"},
-        "starts": {"cycles", "refinement", "step"},
+        "starts": {"cycles", "priors", "refinement", "step"},
         "solve": {
             *("consensus", "cycles", "options", "refinement", "series", "starts", "stated"),
             *("step", "uncertainty"),

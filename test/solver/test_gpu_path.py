@@ -34,7 +34,7 @@ def _forget(traffic: Traffic) -> None:
         record.clear()
 
 
-@pytest.mark.parametrize(("method", "waits"), [("neurora", 250), ("neurora-v2", 59), ("neurora-round", 250)])
+@pytest.mark.parametrize(("method", "waits"), [("neurora", 283), ("neurora-v2", 59), ("neurora-round", 284)])
 def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> None:
     graph = _graph()
     with pretended_gpu() as traffic:
@@ -46,7 +46,10 @@ def test_a_solve_goes_over_the_bus_once_each_way(method: str, waits: int) -> Non
     edges, nodes = graph.num_edges, graph.num_nodes
     # The seven columns of a view-graph, and every node's component.
     assert sorted(traffic.to_gpu) == sorted([(edges,)] * 6 + [(edges, 4), (nodes,)])
-    assert sorted(traffic.from_gpu) == sorted([(edges,), (nodes, 4)])
+    answer = [(edges,), (nodes, 4)]
+    # Parts that few edges join are looked for on the CPU: in the graph, given its residuals, weights and an answer.
+    looked_at = [] if method == "neurora-v2" else [(edges,)] * 8 + [(edges, 4), (nodes, 4)]
+    assert sorted(traffic.from_gpu) == sorted(answer + looked_at)
     assert len(traffic.waits) <= waits
 
 

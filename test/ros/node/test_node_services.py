@@ -118,7 +118,7 @@ def test_label_edge_decides_until_it_is_handed_back(live_node) -> None:
     for edge_id, (source, target) in enumerate([(0, 20), (1, 22), (2, 25), (3, 28)], start=1):
         live_node.edges.publish(edge(edge_id, source, target))
     live_node.edges.publish(edge(9, 5, 29, wrong_rad=1.5))
-    live_node.wait_for_silence()
+    live_node.wait_for_silence(closures=5)
     assert outlier(live_node, 9) and not outlier(live_node, 2)
     for edge_id, label, expected in (
         (2, LabelEdge.Request.REJECT, True),

@@ -86,8 +86,9 @@ class Parts:
             weight: ``(M,)`` w of the cost.
             least_weight: edges of less weight join nothing.
         """
-        source, target = graph.source.cpu().numpy(), graph.target.cpu().numpy()
-        measured = np.ascontiguousarray(graph.target_from_source.double().cpu().numpy().T)
+        graph = graph.to("cpu")
+        source, target = graph.source.numpy(), graph.target.numpy()
+        measured = np.ascontiguousarray(graph.target_from_source.double().numpy().T)
         forest = _tree(graph, source, target, angle.cpu().numpy() <= NUMBERS.outlier_angle)
         weights = weight.double().cpu().numpy()
         used = np.flatnonzero(weights > least_weight)
