@@ -182,6 +182,9 @@ def shaped_steps(problem: Problem, orientations: Tensor, weights: EdgeWeights, m
             measure = Measure(noise, variance, l_half_weight, dtype, unit=unit)
             pooled = problem.pooled(orientations, measure, prior)
             dispersion = torch.where(is_held, dispersion, problem.dispersion(sample, measure, pooled))
+            if step is not None and len(is_held) > 1 and bool(is_held.any()):
+                of_edge = is_held[problem.component].index_select(0, problem.graph.source)
+                measure = measure._replace(source_share=step.source_share, is_held=of_edge)
         step = problem.step(orientations, measure, problem.pooled(orientations, measure, prior), is_open)
         variance = (dispersion[problem.component] / step.weight).clamp(min=priors.least_square / 2)
         length = (step.decrement / (dispersion * problem.num_nodes)).sqrt()

@@ -72,6 +72,8 @@ class Measure(NamedTuple):
         source_share: ``(M,)`` probability that each edge's noise is in its source's frame; None: from residuals.
         unit: ``(6, M)`` entries of T in the world's frame: residuals r count as T r (``stated/shape.py``), and the
             noise's shape is that of T r; None: T = 1.
+        is_held: ``(M,)`` bool, edges that have their ``source_share``, if there is one; others' is from residuals.
+            None: all.
     """
 
     shape: NoiseShape
@@ -80,6 +82,7 @@ class Measure(NamedTuple):
     dtype: torch.dtype
     source_share: Tensor | None = None
     unit: Tensor | None = None
+    is_held: Tensor | None = None
 
     def in_units(self, vector: Tensor, edges: slice | Tensor) -> Tensor:
         """``T r`` of some edges with residuals ``(3, k)``; or ``T`` times their pulls."""
@@ -117,18 +120,31 @@ class Expected(NamedTuple):
         return full(torch.lerp(at_target[1:], at_source[1:], source_share))
 
     @classmethod
-    def of(cls, vector: Tensor, at_source: Tensor, at_target: Tensor, source_share: Tensor | None = None) -> Expected:
-        """From residuals, given :meth:`Measure.rows` of both ends, and the source share if it is held fixed."""
+    def of(
+        cls,
+        vector: Tensor,
+        at_source: Tensor,
+        at_target: Tensor,
+        source_share: Tensor | None = None,
+        is_held: Tensor | None = None,
+    ) -> Expected:
+        """From residuals, given :meth:`Measure.rows` of both ends, and the source share where it is held fixed.
+
+        Args:
+            is_held: ``(k,)`` bool, edges whose source share is held; None: all.
+        """
         variance = at_source[0] + at_target[0]
         if len(at_source) == 1:  # noise is round: Ω = 1
             square = _dot(vector, vector)
             return cls(vector, square, variance, torch.full_like(square, 0.5))
-        if source_share is not None:
+        if source_share is not None and is_held is None:
             pull = times(torch.lerp(at_target[1:], at_source[1:], source_share), vector)
             return cls(pull, _dot(vector, pull), variance, source_share)
         pulls = [times(end[1:], vector) for end in (at_source, at_target)]
         squares = [_dot(vector, pull) for pull in pulls]
         share = share_of_first(*squares)
+        if source_share is not None and is_held is not None:
+            share = torch.where(is_held, source_share, share)
         square = torch.lerp(squares[1], squares[0], share)
         return cls(torch.lerp(pulls[1], pulls[0], share), square, variance, share)
 
@@ -307,7 +323,9 @@ class Problem:
         residuals = EdgeResiduals(graph, orientations.to(dtype), measured)
         rows, prior = measure.rows(dtype), prior.to(dtype)
         held = None if measure.source_share is None else measure.source_share.to(dtype)
-        weights = SplitWeights(torch.empty_like(prior), torch.empty_like(prior) if held is None else held)
+        is_held = measure.is_held
+        share = torch.empty_like(prior) if held is None or is_held is not None else held
+        weights = SplitWeights(torch.empty_like(prior), share)
         matrix = None if measure.unit is None else prior.new_empty(6, graph.num_edges)
         parts = stretches(slices(graph.num_edges, SLICE_EDGES, graph.device))
         # Components in rows: adding columns up by node is a dozen times as fast as adding up rows.
@@ -318,10 +336,11 @@ class Problem:
                 source, target = graph.source[edges], graph.target[edges]
                 at_source, at_target = rows.index_select(1, source), rows.index_select(1, target)
                 vector = measure.in_units(residuals.vectors(edges), edges)
-                expected = Expected.of(vector, at_source, at_target, None if held is None else held[edges])
+                shares = (None if value is None else value[edges] for value in (held, is_held))
+                expected = Expected.of(vector, at_source, at_target, *shares)
                 robust = measure.weigh(expected.square + expected.variance, edges).mul_(prior[edges])
                 weights.total[edges] = robust
-                if held is None:
+                if share is not held:
                     weights.source_share[edges] = expected.source_share
                 pull = measure.in_units(expected.pull.mul_(robust), edges)
                 if matrix is not None and measure.unit is not None:

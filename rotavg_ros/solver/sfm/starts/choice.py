@@ -8,6 +8,7 @@ best, both are refined to the end, and an answer that is hardly likelier than it
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ from rotavg_ros.solver.sfm.starts.parts import Parts
 from rotavg_ros.solver.sfm.step import Problem, Structure
 from rotavg_ros.view_graph import ViewGraph
 
+# Maximum number of times that parts of the best solution are turned.
 _ROUNDS = 3
 
 
@@ -72,57 +74,74 @@ def begin(
     """
     problem = Problem(graph, structure, priors)
     shaped = shaped.float().clamp(min=priors.least_prior)
-    best = _Found.after(problem, starts[0], shaped)
-    found = [best]
+    first = _Found.after(problem, starts[0], shaped)
+    search = _Search(problem, shaped, [first], first)
     for start in starts[1:]:
+        search.add(start)
+    for _ in range(_ROUNDS if len(starts) > 1 else 0):
+        has_gained = [search.add(start) for start in search.turned()]
+        if not any(has_gained):
+            break
+    return search.chosen()
+
+
+@dataclass
+class _Search:
+    """Where starts have led so far, and the best of it; weights ``(M,)`` of the cost."""
+
+    problem: Problem
+    shaped: Tensor
+    found: list[_Found]
+    best: _Found
+
+    def add(self, start: Start) -> bool:
+        """Coarse steps from a start; returns whether it is the best so far, in some component."""
+        problem, priors, best = self.problem, self.problem.priors, self.best
         known = best.begun.body_from_world
         may_begin = torch.ones_like(best.cost, dtype=torch.bool) if start.among is None else start.among
         if start.is_settled:
-            is_hopeful = problem.cost(start.body_from_world, shaped) < (1 + priors.hopeless) * best.cost
-            may_begin = (
-                may_begin & is_hopeful & (_share_apart(problem, known, start.body_from_world) > priors.rival_share)
-            )
+            may_begin = may_begin & (_share_apart(problem, known, start.body_from_world) > priors.rival_share)
+            cost = problem.cost(start.body_from_world, self.shaped)
+            may_begin = may_begin & (cost < (1 + priors.hopeless) * best.cost)
             if not bool(may_begin.any()):
-                continue
-        one = _Found.after(problem, start, shaped, known)
+                return False
+        one = _Found.after(problem, start, self.shaped, known)
         may_begin = may_begin & (_share_apart(problem, known, one.begun.body_from_world) > 0)
-        found.append(one._replace(cost=torch.where(may_begin, one.cost, torch.inf)))
-        best = best.but(problem, found[-1].cost < best.cost, found[-1])
-    for _ in range(_ROUNDS):
-        last = best
-        for start in _turned(problem, best, shaped):
-            known = best.begun.body_from_world
-            one = _Found.after(problem, start, shaped, known)
-            may_begin = _share_apart(problem, known, one.begun.body_from_world) > 0
-            found.append(one._replace(cost=torch.where(may_begin, one.cost, torch.inf)))
-            best = best.but(problem, found[-1].cost < best.cost, found[-1])
-        if best is last:
-            break
-    # Further steps tell starts apart in components where at least two are near the least cost.
-    is_near = [one.cost < (1 + priors.hopeless) * best.cost for one in found]
-    is_contested = torch.stack(is_near).sum(dim=0) > 1
-    found = [one.told(problem, is_contested & near, shaped) for one, near in zip(found, is_near, strict=True)]
-    best = found[0]
-    for one in found[1:]:
-        is_better = one.cost < (1 - priors.same_valley) * best.cost
-        is_hardly = ~is_better & (one.cost < best.cost)
-        if bool(is_hardly.any()):
-            apart = _share_apart(problem, best.begun.body_from_world, one.begun.body_from_world)
-            is_better = is_better | (is_hardly & (apart > priors.rival_share))
-        best = best.but(problem, is_better, one)
-    return best.begun._replace(rival=_rival(problem, found, best))
+        one = one._replace(cost=torch.where(may_begin, one.cost, torch.inf))
+        is_better = one.cost < best.cost
+        self.found.append(one)
+        self.best = best.but(problem, is_better, one)
+        return bool(is_better.any())
 
+    def turned(self) -> list[Start]:
+        """Starts in which parts of the best solution are turned."""
+        problem, known = self.problem, self.best.begun.body_from_world
+        angle = EdgeResiduals(problem.graph, known.float()).angles()
+        parts = Parts.of(problem.graph, angle, self.shaped, problem.priors.density.least_prior)
+        at = np.ascontiguousarray(known.cpu().numpy().T)
+        better = parts.improved(at)
+        rival = parts.rival(at if better is None else better, problem.priors)
+        turned = (torch.from_numpy(np.ascontiguousarray(one.T)) for one in (better, rival) if one is not None)
+        return [Start(one.to(known), self.shaped) for one in turned]
 
-def _turned(problem: Problem, best: _Found, shaped: Tensor) -> list[Start]:
-    """Starts in which parts of the best solution are turned."""
-    graph, known = problem.graph, best.begun.body_from_world
-    angle = EdgeResiduals(graph, known.float()).angles()
-    parts = Parts.of(graph, angle, shaped, problem.priors.density.least_prior)
-    at = np.ascontiguousarray(known.cpu().numpy().T)
-    better = parts.improved(at)
-    rival = parts.rival(at if better is None else better, problem.priors)
-    turned = (torch.from_numpy(np.ascontiguousarray(one.T)) for one in (better, rival) if one is not None)
-    return [Start(one.to(known), shaped) for one in turned]
+    def chosen(self) -> Begun:
+        """The best solution after further steps from those near it, and its rival."""
+        problem, priors = self.problem, self.problem.priors
+        # Further steps tell solutions apart in components where at least two are near the least cost.
+        is_near = [one.cost < (1 + priors.hopeless) * self.best.cost for one in self.found]
+        is_contested = torch.stack(is_near).sum(dim=0) > 1
+        found = [
+            one.told(problem, is_contested & near, self.shaped) for one, near in zip(self.found, is_near, strict=True)
+        ]
+        best = found[0]
+        for one in found[1:]:
+            is_better = one.cost < (1 - priors.same_valley) * best.cost
+            is_hardly = ~is_better & (one.cost < best.cost)
+            if bool(is_hardly.any()):
+                apart = _share_apart(problem, best.begun.body_from_world, one.begun.body_from_world)
+                is_better = is_better | (is_hardly & (apart > priors.rival_share))
+            best = best.but(problem, is_better, one)
+        return best.begun._replace(rival=_rival(problem, found, best))
 
 
 class _Found(NamedTuple):
