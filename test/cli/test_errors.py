@@ -271,6 +271,7 @@ g2o.read = read
     assert "SystemError: fault" in python(f"{raising.format('ValueError')}\n{ROTAVG}", *solve).stderr
 
 
+@pytest.mark.large
 def test_ignored_signals_stay_ignored(graph_path: Path, tmp_path: Path) -> None:
     """As ``nohup`` has it."""
     ignored = (
@@ -281,6 +282,7 @@ def test_ignored_signals_stay_ignored(graph_path: Path, tmp_path: Path) -> None:
     assert (result.returncode, result.stderr) == (0, "")
 
 
+@pytest.mark.large
 def test_terminal_without_unicode(graph_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONIOENCODING", "ascii")
     result = python(ROTAVG, "solve", graph_path, "--output", tmp_path / "out")

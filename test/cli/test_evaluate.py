@@ -69,6 +69,7 @@ def tiny_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robustness_training, "_MOST_GRAPHS", 2)
 
 
+@pytest.mark.large
 @pytest.mark.usefixtures("tiny_rows")
 def test_robustness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     command = ["evaluate", "robustness", "--graphs", "1", "--minutes", "0.001", "--keep", str(tmp_path / "keep")]

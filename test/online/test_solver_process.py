@@ -141,6 +141,7 @@ def test_a_process_that_dies_is_an_error_and_the_next_solve_starts_another():
         solver.close()
 
 
+@pytest.mark.large
 def test_another_process_goes_on_from_the_labels_of_one_that_has_died():
     solver, whole = SolverProcess(threads=1), graph()
     try:

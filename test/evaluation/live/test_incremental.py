@@ -15,6 +15,7 @@ from rotavg_ros.evaluation.slam import pose_cases
 from ..laps import NUM_NODES, answer_of, spoiled
 
 
+@pytest.mark.large
 def test_incremental_run_ends_like_the_batch_solve() -> None:
     case = spoiled()
     run = incremental.play(case)

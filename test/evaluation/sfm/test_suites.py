@@ -34,6 +34,7 @@ def test_rows_can_all_run() -> None:
     contenders([name for name in synthetic.ROWS if name not in ROSTER.peers], ROSTER)
 
 
+@pytest.mark.large
 def test_networks_trained_on_given_graphs_can_be_used(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     recipe = PaperRecipe(cameras=(12, 16), pair_share=(0.5, 0.5))

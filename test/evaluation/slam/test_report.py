@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from rotavg_ros.evaluation.common.contenders import contenders
 from rotavg_ros.evaluation.common.scoring import score_all
 from rotavg_ros.evaluation.live import incremental
@@ -14,6 +16,7 @@ from rotavg_ros.evaluation.slam.uncertainty import UncertaintyCheck
 from ..laps import spoiled
 
 
+@pytest.mark.large
 def test_report(tmp_path: Path) -> None:
     names = ["neurora", "odometry", "oracle"]
     chosen = contenders(names, ROSTER)

@@ -189,6 +189,7 @@ def test_an_array_of_thousands_of_edges_arrives_whole(live_node) -> None:
     assert turned == pytest.approx(np.degrees(1.0))
 
 
+@pytest.mark.large
 def test_path_and_markers_for_those_who_look(live_node) -> None:
     live_node.start(*EVERY_MESSAGE)
     feed(live_node)

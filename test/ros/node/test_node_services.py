@@ -95,6 +95,7 @@ def test_reset_forgets_and_latches_an_empty_answer(live_node) -> None:
     assert live_node.status["dropped"] == "0"
 
 
+@pytest.mark.large
 def test_pause_keeps_what_comes_and_resume_solves_it(live_node) -> None:
     live_node.start(*EVERY_MESSAGE)
     assert live_node.call("pause", SetBool, data=True).success

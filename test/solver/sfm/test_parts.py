@@ -104,7 +104,7 @@ def test_both_ways_are_refined_where_as_many_edges_say_either(is_wrong: bool) ->
     assert bool(best.is_doubtful.all())
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_where_as_many_edges_say_either_the_answer_says_so(seed: int) -> None:
     """Which of the two is right nobody can tell."""
     graph, truth = halves(seed, good=3, false=3)
@@ -114,7 +114,7 @@ def test_where_as_many_edges_say_either_the_answer_says_so(seed: int) -> None:
     assert any("of two answers, in which 80 of 80 orientations" in warning for warning in solution.warnings)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_where_edges_agree_there_is_no_doubt(seed: int) -> None:
     graph, truth = halves(seed, good=8, false=0)
     solution = solve(graph)

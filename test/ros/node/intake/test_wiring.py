@@ -116,6 +116,7 @@ def test_edges_that_wait_for_keyframes_of_another_numbering(live_node) -> None:
     says(live_node, "1 edges wait for keyframes, such as 900 of robot", "keyframe_source")
 
 
+@pytest.mark.large
 def test_nobody_where_somebody_should_be(live_node, start_process) -> None:
     start_alone(
         live_node,
