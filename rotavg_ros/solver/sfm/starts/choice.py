@@ -26,6 +26,8 @@ from rotavg_ros.view_graph import ViewGraph
 
 # Maximum number of times that parts of the best solution are turned.
 _ROUNDS = 3
+# With more edges, looking for such parts would take seconds.
+_MOST_EDGES = 1_000_000
 
 
 class Start(NamedTuple):
@@ -116,6 +118,8 @@ class _Search:
     def turned(self) -> list[Start]:
         """Starts in which parts of the best solution are turned."""
         problem, known = self.problem, self.best.begun.body_from_world
+        if problem.graph.num_edges > _MOST_EDGES:
+            return []
         angle = EdgeResiduals(problem.graph, known.float()).angles()
         parts = Parts.of(problem.graph, angle, self.shaped, problem.priors.density.least_prior)
         at = np.ascontiguousarray(known.cpu().numpy().T)
